@@ -1,0 +1,1 @@
+"""After the flight: evaluation, identification of lags, report."""

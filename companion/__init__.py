@@ -1,0 +1,1 @@
+"""What runs on board, beside the flight controller."""

@@ -1,0 +1,87 @@
+"""Degrees exist in messages and files only; everything between is metres from one origin.
+
+The frame is the transverse Mercator projection of WGS84 with scale 1 at the origin. Against the
+geodesic its scale error is x^2 / (2 R^2): 0.3 mm per km at 5 km east of the origin.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from pyproj import CRS, Geod, Transformer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+WGS84 = Geod(ellps="WGS84")
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFrame:
+    """Metres east and north of `latitude_deg`, `longitude_deg` (WGS84).
+
+    >>> frame = LocalFrame(latitude_deg=35.996, longitude_deg=114.543)
+    >>> east_m, north_m = frame.to_local(35.996, 114.544)
+    >>> round(east_m, 2), round(north_m, 4)
+    (90.16, 0.0005)
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    _forward: Transformer = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not (abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0):
+            raise ValueError(f"origin is no position: {self.latitude_deg}, {self.longitude_deg}")
+        forward = Transformer.from_crs(CRS.from_epsg(4326), self.crs, always_xy=True)
+        object.__setattr__(self, "_forward", forward)
+
+    @property
+    def crs(self) -> CRS:
+        """Return the projection, for reading maps straight into this frame."""
+        return CRS.from_proj4(
+            f"+proj=tmerc +lat_0={self.latitude_deg!r} +lon_0={self.longitude_deg!r} +k=1 "
+            "+x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
+        )
+
+    def to_local(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """Return (east_m, north_m); infinite where the projection has no answer."""
+        east_m, north_m = self._forward.transform(longitude_deg, latitude_deg)
+        return float(east_m), float(north_m)
+
+    def to_geographic(self, east_m: float, north_m: float) -> tuple[float, float]:
+        """Return (latitude_deg, longitude_deg)."""
+        longitude_deg, latitude_deg = self._forward.transform(east_m, north_m, direction="INVERSE")
+        return float(latitude_deg), float(longitude_deg)
+
+    def to_geographic_all(
+        self, east_m: Sequence[float], north_m: Sequence[float]
+    ) -> tuple[list[float], list[float]]:
+        """Return (latitudes_deg, longitudes_deg) of many points at once."""
+        longitude_deg, latitude_deg = self._forward.transform(
+            list(east_m), list(north_m), direction="INVERSE"
+        )
+        return list(latitude_deg), list(longitude_deg)
+
+
+def look_ahead_point(
+    latitude_deg: float, longitude_deg: float, *, course_deg: float, distance_m: float
+) -> tuple[float, float]:
+    """Return the (latitude_deg, longitude_deg) that lies `distance_m` ahead along the geodesic.
+
+    P1's Table 1 (Wang et al. 2024) solves it with Vincenty's direct formulae; `pyproj.Geod`
+    gives the same point to better than a micrometre at these distances and always converges.
+    """
+    ahead = WGS84.fwd(longitude_deg, latitude_deg, course_deg, distance_m)
+    return float(ahead[1]), float(ahead[0])
+
+
+def course_deg(velocity_east_m_s: float, velocity_north_m_s: float) -> float:
+    """Return the direction of motion, clockwise from north, 0 to 360.
+
+    >>> course_deg(1.0, 0.0)
+    90.0
+    """
+    return math.degrees(math.atan2(velocity_east_m_s, velocity_north_m_s)) % 360.0

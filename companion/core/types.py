@@ -1,0 +1,283 @@
+"""What flows through the core: inputs, the vehicle's state, plans, decisions.
+
+Everything is frozen; units are in names; missing is `None`, never 0. All times are seconds on
+the companion's monotonic clock, unless a name says otherwise (`boot_s`: the autopilot's clock).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from itertools import pairwise
+
+
+class Fix(IntEnum):
+    """Quality of the GNSS fix, in the order of trust (MAVLink GPS_FIX_TYPE 0 to 6)."""
+
+    NONE = 0
+    NO_FIX = 1
+    FIX_2D = 2
+    FIX_3D = 3
+    DGPS = 4
+    RTK_FLOAT = 5
+    RTK_FIXED = 6
+
+
+class Method(StrEnum):
+    """How a change of rate is placed; see `schedule.py`."""
+
+    NONE = "none"
+    LOOK_AHEAD = "look-ahead"
+    SCHEDULED = "scheduled"
+
+
+class Inhibit(StrEnum):
+    """Every reason not to spray: in the journal, on the page, in STATUSTEXT."""
+
+    NOT_ENABLED = "not-enabled"
+    NO_POSITION = "no-position"
+    STALE_POSITION = "stale-position"
+    INVALID_POSITION = "invalid-position"
+    FAR_FROM_FIELD = "far-from-field"
+    NO_HEARTBEAT = "no-heartbeat"
+    STALE_HEARTBEAT = "stale-heartbeat"
+    NOT_ARMED = "not-armed"
+    WRONG_MODE = "wrong-mode"
+    NOT_IN_AIR = "not-in-air"
+    FIX_TOO_LOW = "fix-too-low"
+    ESTIMATOR_UNHEALTHY = "estimator-unhealthy"
+    HEADING_UNKNOWN = "heading-unknown"
+    SPEED_UNKNOWN = "speed-unknown"
+    SPEED_BELOW_MIN = "speed-below-min"
+    SPEED_ABOVE_MAX = "speed-above-max"
+    SPEED_DISAGREES = "speed-disagrees"
+    HEIGHT_UNKNOWN = "height-unknown"
+    HEIGHT_BELOW_MIN = "height-below-min"
+    HEIGHT_ABOVE_MAX = "height-above-max"
+    WIND_ABOVE_MAX = "wind-above-max"
+    OUTPUT_FAULT = "output-fault"
+    STOPPING = "stopping"
+
+
+# --------------------------------------------------------------------------------------- inputs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Telemetry:
+    """One position message of the autopilot (GLOBAL_POSITION_INT), decoded.
+
+    `received_s` is when its first byte was read. A velocity of `None` means that the autopilot
+    did not know it. Course is not in it: it follows from the velocity.
+    """
+
+    received_s: float
+    boot_s: float
+    latitude_deg: float
+    longitude_deg: float
+    relative_altitude_m: float
+    velocity_north_m_s: float | None
+    velocity_east_m_s: float | None
+    velocity_down_m_s: float | None
+    heading_deg: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeedReport:
+    """Ground speed by a second way (VFR_HUD): the cross-check of the velocity."""
+
+    received_s: float
+    ground_speed_m_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GnssReport:
+    """Quality of the GNSS fix (GPS_RAW_INT)."""
+
+    received_s: float
+    fix: Fix
+    horizontal_accuracy_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimatorReport:
+    """Whether the autopilot trusts its own position (EKF_STATUS_REPORT, ESTIMATOR_STATUS)."""
+
+    received_s: float
+    healthy: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeartbeatReport:
+    """A heartbeat of the vehicle's autopilot. `mode` is its name: AUTO, GUIDED, LOITER, ..."""
+
+    received_s: float
+    autopilot: str
+    armed: bool
+    mode: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandedReport:
+    """Whether the vehicle flies (EXTENDED_SYS_STATE); `None` where the autopilot cannot tell."""
+
+    received_s: float
+    in_air: bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindReport:
+    """Wind speed, from the autopilot or from the operator."""
+
+    received_s: float
+    speed_m_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RcReport:
+    """Pulse widths of the pilot's channels, channel 1 first (RC_CHANNELS); 0 is no signal."""
+
+    received_s: float
+    pulse_us: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OperatorCommand:
+    """The operator's wish to spray or to stop, and by which way it came."""
+
+    received_s: float
+    enable: bool
+    source: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputReport:
+    """What the executor of plans says of itself; a fault inhibits."""
+
+    received_s: float
+    healthy: bool
+    text: str = ""
+
+
+Input = (
+    Telemetry
+    | SpeedReport
+    | GnssReport
+    | EstimatorReport
+    | HeartbeatReport
+    | LandedReport
+    | WindReport
+    | RcReport
+    | OperatorCommand
+    | OutputReport
+)
+
+
+# ---------------------------------------------------------------------------------------- state
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleState:
+    """Where the autopilot's position reference is and how it moves, true at `time_s`.
+
+    East and north are metres in the flight's `LocalFrame`. Heading (the nose) is not course (the
+    motion). What follows `position_received_s` says how far the rest may be trusted.
+    """
+
+    time_s: float
+    east_m: float
+    north_m: float
+    velocity_east_m_s: float
+    velocity_north_m_s: float
+    acceleration_east_m_s2: float
+    acceleration_north_m_s2: float
+    heading_deg: float | None
+    yaw_rate_deg_s: float
+    height_m: float
+    velocity_known: bool
+    position_received_s: float
+    position_valid: bool
+    checked_speed_m_s: float | None
+    fix: Fix | None
+    estimator_healthy: bool | None
+    heartbeat_received_s: float | None
+    armed: bool
+    mode: str | None
+    in_air: bool | None
+    wind_m_s: float | None
+    output_healthy: bool
+    enabled: bool
+
+
+# ---------------------------------------------------------------------------------------- plans
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimedChange:
+    """Valve number `valve` (index from the left) takes `duty` at `at_s`.
+
+    `restart` marks a change of zone: the executor begins a new PWM period there. Without it (a
+    trim for the speed) the next period is early enough.
+    """
+
+    at_s: float
+    valve: int
+    duty: float
+    restart: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.duty <= 1.0:
+            raise ValueError(f"duty outside [0, 1]: {self.duty}")
+        if not abs(self.at_s) < float("inf"):
+            raise ValueError(f"time of a change is not finite: {self.at_s}")
+        if not self.valve >= 0:
+            raise ValueError(f"valve index is negative: {self.valve}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SprayPlan:
+    """The whole future of all valves, until the lease ends; closed after that.
+
+    `duty` holds from `issued_s`, one value a valve; `changes` follow in order of time. A newer
+    plan (by `sequence`) replaces what has not happened yet. An executor that is given the same
+    duty again does nothing.
+    """
+
+    sequence: int
+    issued_s: float
+    duty: tuple[float, ...]
+    changes: tuple[TimedChange, ...]
+    lease_until_s: float
+
+    def __post_init__(self) -> None:
+        if not all(0.0 <= duty <= 1.0 for duty in self.duty):
+            raise ValueError(f"duty outside [0, 1]: {self.duty}")
+        if not self.issued_s < self.lease_until_s < float("inf"):
+            raise ValueError(f"lease ends at {self.lease_until_s}, issued at {self.issued_s}")
+        if any(change.valve >= len(self.duty) for change in self.changes):
+            raise ValueError("a change names a valve that the plan does not have")
+        if not all(a.at_s <= b.at_s for a, b in pairwise(self.changes)):
+            raise ValueError("changes are not in order of time")
+
+    @property
+    def is_off(self) -> bool:
+        """Whether every valve is closed, now and later."""
+        return not any(self.duty) and not any(change.duty for change in self.changes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decision:
+    """One step of the core: one row of the journal. Replay must give the same again.
+
+    `rate_l_ha` is what each valve's footprint is prescribed now (`None`: nothing, closed).
+    `flow_l_min` is the flow that the duties now in force stand for, all valves together.
+    """
+
+    now_s: float
+    state: VehicleState | None
+    inhibits: frozenset[Inhibit]
+    plan: SprayPlan
+    rate_l_ha: tuple[float | None, ...]
+    target_flow_l_min: float
+    flow_l_min: float
+    late_count: int = 0
+    unresolved_count: int = 0

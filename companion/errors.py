@@ -1,0 +1,37 @@
+"""Errors that the application raises on purpose.
+
+    VrsprayError
+     +-- ConfigError      the operator's file is wrong: the message names file, key, value and fix
+     +-- MapError         a prescription cannot be used
+     +-- LinkError        the link to the autopilot cannot be opened or was lost
+     +-- ActuatorError    the valve driver refused or did not answer
+     +-- JournalError     a journal cannot be opened, read or written
+
+A wrong argument inside our own code is a `ValueError`: a bug, not a condition.
+"""
+
+from __future__ import annotations
+
+
+class VrsprayError(Exception):
+    """Base of all errors that the command line reports in one line, without a traceback."""
+
+
+class ConfigError(VrsprayError):
+    """The configuration file cannot be used."""
+
+
+class MapError(VrsprayError):
+    """A prescription, boundary or exclusion file cannot be used."""
+
+
+class LinkError(VrsprayError):
+    """The link to the autopilot cannot be opened or was lost."""
+
+
+class ActuatorError(VrsprayError):
+    """The valve driver refused an order or did not answer."""
+
+
+class JournalError(VrsprayError):
+    """A journal cannot be opened, read or written."""

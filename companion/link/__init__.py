@@ -1,0 +1,1 @@
+"""MAVLink: bytes to our types and back, transports, component behaviour."""

@@ -1,0 +1,1 @@
+"""Prescription files become `core.prescription.Prescription`; one format a file."""

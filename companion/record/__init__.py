@@ -1,0 +1,1 @@
+"""The journal of a flight: one GeoPackage file."""

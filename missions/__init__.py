@@ -1,0 +1,1 @@
+"""Before the flight: field to mission."""

@@ -1,0 +1,1 @@
+"""Instead of the flight: vehicle, sprayer and flight controller, simulated."""
