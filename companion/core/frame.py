@@ -25,7 +25,7 @@ class LocalFrame:
     >>> frame = LocalFrame(latitude_deg=35.996, longitude_deg=114.543)
     >>> east_m, north_m = frame.to_local(35.996, 114.544)
     >>> round(east_m, 2), round(north_m, 4)
-    (90.16, 0.0005)
+    (90.17, 0.0005)
     """
 
     latitude_deg: float

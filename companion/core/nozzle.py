@@ -1,0 +1,202 @@
+"""From flow to duty: what the nozzle sets were measured to deliver.
+
+The curve is measured, not assumed: flow against duty is not a straight line (P1 Table 2), and
+P1's Eq. 2 contradicts its own table by up to 22 % of flow.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PwmLimits:
+    """What the valves can follow; `duty_max` is the last duty below fully open."""
+
+    frequency_hz: float
+    duty_min: float
+    duty_max: float
+    min_on_s: float
+    min_off_s: float
+
+    def __post_init__(self) -> None:
+        if not 0.1 <= self.frequency_hz <= 1000.0:
+            raise ValueError(f"frequency_hz must lie in [0.1, 1000], got {self.frequency_hz}")
+        if not 0.0 <= self.duty_min < self.duty_max <= 1.0:
+            raise ValueError(
+                f"0 <= duty_min < duty_max <= 1 must hold, got {self.duty_min}, {self.duty_max}"
+            )
+        if not (self.min_on_s >= 0.0 and self.min_off_s >= 0.0):
+            raise ValueError("min_on_s and min_off_s must not be negative")
+        if not self.min_on_s + self.min_off_s < self.period_s:
+            raise ValueError("min_on_s and min_off_s together must be shorter than a period")
+
+    @property
+    def period_s(self) -> float:
+        """Return the length of a PWM period."""
+        return 1.0 / self.frequency_hz
+
+
+def _pchip_slopes(x: tuple[float, ...], y: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the derivatives of Fritsch and Carlson's monotone cubic (SIAM J. Num. Anal. 1980)."""
+    steps = [b - a for a, b in pairwise(x)]
+    rises = [(d - c) / h for (c, d), h in zip(pairwise(y), steps, strict=True)]
+    if len(x) == 2:
+        return (rises[0], rises[0])
+    slopes = [_end_slope(steps[0], steps[1], rises[0], rises[1])]
+    for (h0, h1), (d0, d1) in zip(pairwise(steps), pairwise(rises), strict=True):
+        w0, w1 = 2 * h1 + h0, h1 + 2 * h0
+        slopes.append(0.0 if d0 * d1 <= 0.0 else (w0 + w1) / (w0 / d0 + w1 / d1))
+    slopes.append(_end_slope(steps[-1], steps[-2], rises[-1], rises[-2]))
+    return tuple(slopes)
+
+
+def _end_slope(h0: float, h1: float, d0: float, d1: float) -> float:
+    """Return the one-sided, shape-preserving slope at an end of the curve."""
+    slope = ((2 * h0 + h1) * d0 - h0 * d1) / (h0 + h1)
+    if slope * d0 <= 0.0:
+        return 0.0
+    if d0 * d1 <= 0.0 and abs(slope) > 3 * abs(d0):
+        return 3 * d0
+    return slope
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowCurve:
+    """Measured flow of a whole nozzle set against duty; strictly increasing, or refused.
+
+    >>> curve = FlowCurve(duty=(0.2, 0.5, 1.0), flow_l_min=(1.0, 2.0, 4.0))
+    >>> round(curve.duty_for(2.0), 6)
+    0.5
+    """
+
+    duty: tuple[float, ...]
+    flow_l_min: tuple[float, ...]
+    _slopes: tuple[float, ...] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if len(self.duty) != len(self.flow_l_min) or len(self.duty) < 2:
+            raise ValueError("a flow curve needs at least two (duty, flow) points")
+        for name, values in (("duty", self.duty), ("flow_l_min", self.flow_l_min)):
+            if not all(a < b for a, b in pairwise(values)):
+                raise ValueError(f"{name} must be strictly increasing, got {list(values)}")
+        if not all(0.0 <= duty <= 1.0 for duty in self.duty):
+            raise ValueError(f"duty must lie in [0, 1], got {list(self.duty)}")
+        if not self.flow_l_min[0] >= 0.0 or not self.flow_l_min[-1] < 1e6:
+            raise ValueError(f"flow_l_min must be finite and not negative: {self.flow_l_min}")
+        object.__setattr__(self, "_slopes", _pchip_slopes(self.flow_l_min, self.duty))
+
+    def duty_for(self, flow_l_min: float) -> float:
+        """Return the duty that gives `flow_l_min`, held to the measured range.
+
+        A demand below half of the smallest measured flow closes the valve; the curve says
+        nothing there, and zero is nearer to it than the smallest flow.
+        """
+        flows = self.flow_l_min
+        if not flow_l_min >= flows[0] / 2 or flow_l_min <= 0.0:
+            return 0.0
+        if flow_l_min <= flows[0]:
+            return self.duty[0]
+        if flow_l_min >= flows[-1]:
+            return self.duty[-1]
+        i = bisect_right(flows, flow_l_min) - 1
+        h = flows[i + 1] - flows[i]
+        t = (flow_l_min - flows[i]) / h
+        y0, y1 = self.duty[i], self.duty[i + 1]
+        m0, m1 = self._slopes[i] * h, self._slopes[i + 1] * h
+        a, b = 2 * (y0 - y1) + m0 + m1, 3 * (y1 - y0) - 2 * m0 - m1
+        return min(max(((a * t + b) * t + m0) * t + y0, y0), y1)
+
+    def flow_for(self, duty: float) -> float:
+        """Return the flow at `duty`: the inverse of `duty_for`, to 1e-9 of the range.
+
+        Below the first measured duty the flow falls in proportion to zero.
+
+        >>> curve = FlowCurve(duty=(0.2, 0.5, 1.0), flow_l_min=(1.0, 2.0, 4.0))
+        >>> round(curve.flow_for(curve.duty_for(1.7)), 6)
+        1.7
+        """
+        if not duty > 0.0:
+            return 0.0
+        if duty <= self.duty[0]:
+            return self.flow_l_min[0] * duty / self.duty[0] if self.duty[0] > 0.0 else 0.0
+        if duty >= self.duty[-1]:
+            return self.flow_l_min[-1]
+        i = bisect_right(self.duty, duty) - 1
+        low, high = self.flow_l_min[i], self.flow_l_min[i + 1]
+        for _ in range(60):
+            middle = 0.5 * (low + high)
+            if self.duty_for(middle) < duty:
+                low = middle
+            else:
+                high = middle
+        return 0.5 * (low + high)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NozzleSet:
+    """Valves (indices from the left) that spray together, and their measured curve."""
+
+    valves: tuple[int, ...]
+    curve: FlowCurve
+
+    def __post_init__(self) -> None:
+        if not self.valves or len(set(self.valves)) != len(self.valves):
+            raise ValueError(f"a nozzle set needs valves, each once, got {self.valves}")
+
+    @property
+    def flow_min_l_min(self) -> float:
+        """Return the smallest measured flow."""
+        return self.curve.flow_l_min[0]
+
+    @property
+    def flow_max_l_min(self) -> float:
+        """Return the largest measured flow."""
+        return self.curve.flow_l_min[-1]
+
+
+# P1: eight nozzles below 4 L/min, twelve above; the hysteresis keeps a flow near 4 from
+# switching sets back and forth (reference point of the change: 3.7 down, 4.1 up for P1's sets).
+SET_DOWN_FRACTION = 3.7 / 4.0
+SET_UP_FRACTION = 4.1 / 4.0
+
+
+def choose_set(sets: tuple[NozzleSet, ...], flow_l_min: float, *, current: int) -> int:
+    """Return the index of the set to use for `flow_l_min`, with hysteresis around `current`.
+
+    Sets are ordered from the smallest to the largest flow. The change between two neighbours
+    lies in the middle of the flows that both can deliver.
+    """
+    index = min(max(current, 0), len(sets) - 1)
+    while index + 1 < len(sets):
+        if not flow_l_min > _middle(sets[index], sets[index + 1]) * SET_UP_FRACTION:
+            break
+        index += 1
+    while index > 0:
+        if not flow_l_min < _middle(sets[index - 1], sets[index]) * SET_DOWN_FRACTION:
+            break
+        index -= 1
+    return index
+
+
+def _middle(small: NozzleSet, large: NozzleSet) -> float:
+    """Return the flow at which the change between two sets is centred."""
+    return 0.5 * (small.flow_max_l_min + max(large.flow_min_l_min, 0.0))
+
+
+def allowed_duty(duty: float, limits: PwmLimits) -> float:
+    """Return the nearest duty that the valves can follow: closed, the PWM window, or open.
+
+    >>> pwm = PwmLimits(frequency_hz=11, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
+    >>> [allowed_duty(d, pwm) for d in (0.05, 0.15, 0.5, 0.93, 0.97)]
+    [0.0, 0.2, 0.5, 0.9, 1.0]
+    """
+    if not duty >= limits.duty_min / 2 or duty <= 0.0:
+        return 0.0
+    if duty <= limits.duty_min:
+        return limits.duty_min
+    if duty <= limits.duty_max:
+        return duty
+    return limits.duty_max if duty < 0.5 * (limits.duty_max + 1.0) else 1.0

@@ -1,0 +1,25 @@
+"""From application rate to flow: the speed-and-width law of every rate controller."""
+
+from __future__ import annotations
+
+# 1 L/ha over 1 m of width at 1 m/s is 1e-4 L/s. In the trade's own form this is
+# flow [L/min] = rate [L/ha] * speed [km/h] * width [m] / 600.
+L_MIN_PER_L_HA_M2_S = 60.0 / 10_000.0
+
+
+def flow_for_rate(rate_l_ha: float, speed_m_s: float, width_m: float) -> float:
+    """Return the flow in L/min that puts `rate_l_ha` on a strip `width_m` wide (P1 Eq. 1).
+
+    >>> round(flow_for_rate(rate_l_ha=15.0, speed_m_s=6.0, width_m=5.0), 3)
+    2.7
+    """
+    return rate_l_ha * speed_m_s * width_m * L_MIN_PER_L_HA_M2_S
+
+
+def rate_for_flow(flow_l_min: float, speed_m_s: float, width_m: float) -> float:
+    """Return the rate in L/ha that `flow_l_min` puts down; the inverse of `flow_for_rate`.
+
+    >>> round(rate_for_flow(flow_l_min=2.7, speed_m_s=6.0, width_m=5.0), 6)
+    15.0
+    """
+    return flow_l_min / (speed_m_s * width_m * L_MIN_PER_L_HA_M2_S)
