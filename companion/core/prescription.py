@@ -1,16 +1,29 @@
 """The prescription: which rate belongs where, and where spraying is allowed at all.
 
 Built once, immutable. A zone is one polygon with one rate; the field is where spraying is
-allowed (the boundary, or the outline of all zones, less the exclusions).
+allowed: the boundary, or the outline of all zones, less the exclusions. Look-ups go through one
+STRtree of polygons, crossings through one STRtree of edges, so their cost does not grow with the
+number of zones.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Literal
 
-if TYPE_CHECKING:
-    from shapely import MultiPolygon, Polygon
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely import Geometry, MultiPolygon, Polygon, STRtree
+
+Overlap = Literal["error", "max", "min", "mean", "last"]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Gaps between neighbouring zones up to this width are digitising errors, not borders: they are
+# closed when the outline of the zones is the border.
+SLIVER_M = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,7 +37,168 @@ class Zone:
     def __post_init__(self) -> None:
         if not 0.0 <= self.rate_l_ha < 100_000.0:
             raise ValueError(f"rate of zone {self.name} is no rate: {self.rate_l_ha}")
+        if self.polygon.is_empty or not self.polygon.is_valid:
+            raise ValueError(f"zone {self.name} is empty or not a valid polygon")
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Directed edges with their polygon on the left: (n, 4) east, north, east, north [m].
+
+    `owner` is the index of the zone that an edge belongs to.
+    """
+
+    ends: Floats
+    owner: Ints
+    tree: STRtree
+
+    def near(self, west_m: float, south_m: float, east_m: float, north_m: float) -> Ints:
+        """Return the indices of the edges whose boxes meet this box."""
+        return self.tree.query(shapely.box(west_m, south_m, east_m, north_m))
 
 
 class Prescription:
-    """Zones with rates and the field they may be sprayed on; see `build`."""
+    """Zones with rates and the field that they may be sprayed on.
+
+    Args:
+        zones: polygons with rates, in the flight's frame; later ones lie on top for `last`.
+        boundary: where spraying is allowed; without it the outline of all zones.
+        exclusions: where it is not.
+        overlap: what holds where zones overlap. Whoever loads a map refuses overlaps under
+            `error`; slivers that remain take the smaller rate.
+        default_rate_l_ha: the rate inside the field where there is no zone; None closes.
+        sha256: of the file that the zones came from.
+    """
+
+    def __init__(
+        self,
+        zones: Sequence[Zone],
+        *,
+        boundary: Polygon | MultiPolygon | None = None,
+        exclusions: Sequence[Polygon | MultiPolygon] = (),
+        overlap: Overlap = "error",
+        default_rate_l_ha: float | None = None,
+        sha256: str = "",
+    ) -> None:
+        self.zones = tuple(zones)
+        self.overlap: Overlap = overlap
+        self.default_rate_l_ha = default_rate_l_ha
+        self.sha256 = sha256
+        self._zone_rates = tuple(zone.rate_l_ha for zone in zones)
+        self._parts, self._part_zone = _parts([zone.polygon for zone in zones])
+        self._part_tree = STRtree(self._parts)
+        self.field = _field(self._parts, boundary, exclusions)
+        field_parts, _ = _parts([self.field])
+        self._field_parts = field_parts
+        self._field_tree = STRtree(field_parts)
+        self.zone_edges = _edges(self._parts, self._part_zone)
+        self.field_edges = _edges(field_parts, np.zeros(len(field_parts), dtype=np.int64))
+        for parts in (self._parts, field_parts):
+            shapely.prepare(parts)
+        self.bounds_m: tuple[float, float, float, float] = (
+            self.field.bounds if not self.field.is_empty else (0.0, 0.0, 0.0, 0.0)
+        )
+        self._rate_of: dict[frozenset[int], float | None] = {}
+
+    @property
+    def area_m2(self) -> float:
+        """Return the area of all zones, overlaps counted twice."""
+        return float(shapely.area(self._parts).sum())
+
+    def rate_of(self, zones: frozenset[int]) -> float | None:
+        """Return the rate where exactly these zones lie, by the overlap policy."""
+        try:
+            return self._rate_of[zones]
+        except KeyError:
+            rate = self._rate_of[zones] = self._combine(zones)
+            return rate
+
+    def _combine(self, zones: frozenset[int]) -> float | None:
+        rates = [self._zone_rates[zone] for zone in zones]
+        if not rates:
+            return self.default_rate_l_ha
+        if self.overlap == "max":
+            return max(rates)
+        if self.overlap == "mean":
+            return sum(rates) / len(rates)
+        if self.overlap == "last":
+            return self._zone_rates[max(zones)]
+        return min(rates)
+
+    def zones_at(self, east_m: Floats, north_m: Floats) -> list[frozenset[int]]:
+        """Return, for each point, the indices of the zones that it lies in."""
+        found: list[set[int]] = [set() for _ in range(len(east_m))]
+        points, parts = self._hits(self._part_tree, self._parts, east_m, north_m)
+        for point, part in zip(points.tolist(), self._part_zone[parts].tolist(), strict=True):
+            found[point].add(part)
+        return [frozenset(zones) for zones in found]
+
+    def inside(self, east_m: Floats, north_m: Floats) -> NDArray[np.bool_]:
+        """Return, for each point, whether spraying is allowed there."""
+        allowed = np.zeros(len(east_m), dtype=np.bool_)
+        points, _ = self._hits(self._field_tree, self._field_parts, east_m, north_m)
+        allowed[points] = True
+        return allowed
+
+    def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
+        """Return the rate at each point [L/ha]; NaN outside the field or without a rate."""
+        allowed = self.inside(east_m, north_m)
+        rates = [self.rate_of(zones) for zones in self.zones_at(east_m, north_m)]
+        array = np.array([np.nan if rate is None else rate for rate in rates], dtype=np.float64)
+        array[~allowed] = np.nan
+        return array
+
+    def rate_at(self, east_m: float, north_m: float) -> float | None:
+        """Return the rate at one point [L/ha]; None outside the field or without a rate."""
+        rate = float(self.rates_at(np.array([east_m]), np.array([north_m]))[0])
+        return None if np.isnan(rate) else rate
+
+    @staticmethod
+    def _hits(
+        tree: STRtree, parts: NDArray[np.object_], east_m: Floats, north_m: Floats
+    ) -> tuple[Ints, Ints]:
+        """Return pairs (point, part) where the part contains the point."""
+        points, candidates = tree.query(shapely.points(east_m, north_m))
+        within = shapely.contains_xy(parts[candidates], east_m[points], north_m[points])
+        return points[within], candidates[within]
+
+
+def _parts(
+    polygons: Sequence[Polygon | MultiPolygon],
+) -> tuple[NDArray[np.object_], Ints]:
+    """Return all single polygons, rings turned so that the inside is on the left, and whose."""
+    if not polygons:
+        return np.empty(0, dtype=object), np.empty(0, dtype=np.int64)
+    parts, owner = shapely.get_parts(np.array(polygons, dtype=object), return_index=True)
+    return shapely.orient_polygons(parts), owner.astype(np.int64)
+
+
+def _edges(parts: NDArray[np.object_], owner: Ints) -> Edges:
+    """Return every edge of every ring; shells run anticlockwise, holes clockwise."""
+    rings, ring_part = shapely.get_rings(parts, return_index=True)
+    coordinates, ring = shapely.get_coordinates(rings, return_index=True)
+    same_ring = ring[1:] == ring[:-1]
+    ends = np.hstack([coordinates[:-1], coordinates[1:]])[same_ring]
+    owners = owner[ring_part[ring[:-1][same_ring]]]
+    lines = shapely.linestrings(ends.reshape(-1, 2, 2)) if len(ends) else np.empty(0, object)
+    return Edges(ends=ends, owner=owners.astype(np.int64), tree=STRtree(lines))
+
+
+def _field(
+    parts: NDArray[np.object_],
+    boundary: Polygon | MultiPolygon | None,
+    exclusions: Sequence[Polygon | MultiPolygon],
+) -> Polygon | MultiPolygon:
+    """Return the ground that may be sprayed."""
+    field: Geometry
+    if boundary is None:
+        grown = shapely.buffer(parts, SLIVER_M / 2, join_style="mitre")
+        field = shapely.buffer(shapely.union_all(grown), -SLIVER_M / 2, join_style="mitre")
+    else:
+        field = boundary
+    if exclusions:
+        field = shapely.difference(field, shapely.union_all(list(exclusions)))
+    if isinstance(field, Polygon | MultiPolygon):
+        return field
+    polygons = [part for part in shapely.get_parts(field) if isinstance(part, Polygon)]
+    return MultiPolygon(polygons)
