@@ -7,7 +7,12 @@ that flies a zig-zag backwards keeps its boom, and its left valve stays on its l
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,23 +42,35 @@ class Boom:
     width_m: float
     valves: tuple[Valve, ...]
     height_m: float = 3.5
+    right_m: Floats = field(init=False, repr=False, compare=False)
+    forward_m: Floats = field(init=False, repr=False, compare=False)
+    half_width_m: Floats = field(init=False, repr=False, compare=False)
+    reach_m: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width_m < 1000.0:
             raise ValueError(f"boom width must be positive, got {self.width_m}")
         if not self.valves:
             raise ValueError("a boom needs at least one valve")
+        for name, values in (
+            ("right_m", [valve.right_m for valve in self.valves]),
+            ("forward_m", [valve.forward_m for valve in self.valves]),
+            ("half_width_m", [valve.width_m / 2 for valve in self.valves]),
+        ):
+            object.__setattr__(self, name, np.array(values, dtype=np.float64))
+        far = np.hypot(np.abs(self.right_m) + self.half_width_m, self.forward_m)
+        object.__setattr__(self, "reach_m", float(far.max()))
 
 
 def body_axes(heading_deg: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the unit vectors (east, north) of forward and of right.
 
-    >>> body_axes(90.0)[0]
-    (1.0, 0.0)
+    >>> forward, right = body_axes(90.0)
+    >>> round(forward[0], 12), round(right[1], 12)
+    (1.0, -1.0)
     """
     heading_rad = math.radians(heading_deg)
     sin, cos = math.sin(heading_rad), math.cos(heading_rad)
-    sin, cos = round(sin, 15) + 0.0, round(cos, 15) + 0.0
     return (sin, cos), (cos, -sin)
 
 

@@ -39,6 +39,10 @@ class PwmLimits:
         return 1.0 / self.frequency_hz
 
 
+# Points of the table from which the inverse of a curve starts.
+INVERSE_POINTS = 256
+
+
 def _pchip_slopes(x: tuple[float, ...], y: tuple[float, ...]) -> tuple[float, ...]:
     """Return the derivatives of Fritsch and Carlson's monotone cubic (SIAM J. Num. Anal. 1980)."""
     steps = [b - a for a, b in pairwise(x)]
@@ -75,6 +79,7 @@ class FlowCurve:
     duty: tuple[float, ...]
     flow_l_min: tuple[float, ...]
     _slopes: tuple[float, ...] = field(init=False, repr=False, compare=False)
+    _inverse: tuple[list[float], list[float]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if len(self.duty) != len(self.flow_l_min) or len(self.duty) < 2:
@@ -87,6 +92,10 @@ class FlowCurve:
         if not self.flow_l_min[0] >= 0.0 or not self.flow_l_min[-1] < 1e6:
             raise ValueError(f"flow_l_min must be finite and not negative: {self.flow_l_min}")
         object.__setattr__(self, "_slopes", _pchip_slopes(self.flow_l_min, self.duty))
+        low, high = self.flow_l_min[0], self.flow_l_min[-1]
+        flows = [low + (high - low) * i / INVERSE_POINTS for i in range(INVERSE_POINTS + 1)]
+        flows[-1] = high
+        object.__setattr__(self, "_inverse", (flows, [self.duty_for(flow) for flow in flows]))
 
     def duty_for(self, flow_l_min: float) -> float:
         """Return the duty that gives `flow_l_min`, held to the measured range.
@@ -110,7 +119,7 @@ class FlowCurve:
         return min(max(((a * t + b) * t + m0) * t + y0, y0), y1)
 
     def flow_for(self, duty: float) -> float:
-        """Return the flow at `duty`: the inverse of `duty_for`, to 1e-9 of the range.
+        """Return the flow at `duty`: the inverse of `duty_for`, to a millionth of the range.
 
         Below the first measured duty the flow falls in proportion to zero.
 
@@ -124,15 +133,11 @@ class FlowCurve:
             return self.flow_l_min[0] * duty / self.duty[0] if self.duty[0] > 0.0 else 0.0
         if duty >= self.duty[-1]:
             return self.flow_l_min[-1]
-        i = bisect_right(self.duty, duty) - 1
-        low, high = self.flow_l_min[i], self.flow_l_min[i + 1]
-        for _ in range(60):
-            middle = 0.5 * (low + high)
-            if self.duty_for(middle) < duty:
-                low = middle
-            else:
-                high = middle
-        return 0.5 * (low + high)
+        flows, duties = self._inverse
+        i = bisect_right(duties, duty) - 1
+        slope = (flows[i + 1] - flows[i]) / (duties[i + 1] - duties[i])
+        flow = flows[i] + slope * (duty - duties[i])
+        return flow + slope * (duty - self.duty_for(flow))  # one secant step: below 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

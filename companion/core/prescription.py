@@ -41,11 +41,15 @@ class Zone:
             raise ValueError(f"zone {self.name} is empty or not a valid polygon")
 
 
+# The owner of the polygons and edges of the field, beside the zones' 0, 1, 2, ...
+FIELD = -1
+
+
 @dataclass(frozen=True, slots=True)
 class Edges:
     """Directed edges with their polygon on the left: (n, 4) east, north, east, north [m].
 
-    `owner` is the index of the zone that an edge belongs to.
+    `owner` is the index of the zone that an edge belongs to, or `FIELD`.
     """
 
     ends: Floats
@@ -85,25 +89,19 @@ class Prescription:
         self.default_rate_l_ha = default_rate_l_ha
         self.sha256 = sha256
         self._zone_rates = tuple(zone.rate_l_ha for zone in zones)
-        self._parts, self._part_zone = _parts([zone.polygon for zone in zones])
-        self._part_tree = STRtree(self._parts)
-        self.field = _field(self._parts, boundary, exclusions)
+        zone_parts, owner = _parts([zone.polygon for zone in zones])
+        self.area_m2 = float(shapely.area(zone_parts).sum())
+        self.field = _field(zone_parts, boundary, exclusions)
         field_parts, _ = _parts([self.field])
-        self._field_parts = field_parts
-        self._field_tree = STRtree(field_parts)
-        self.zone_edges = _edges(self._parts, self._part_zone)
-        self.field_edges = _edges(field_parts, np.zeros(len(field_parts), dtype=np.int64))
-        for parts in (self._parts, field_parts):
-            shapely.prepare(parts)
+        self._parts = np.concatenate([zone_parts, field_parts])
+        self._owner = np.concatenate([owner, np.full(len(field_parts), FIELD, dtype=np.int64)])
+        self._tree = STRtree(self._parts)
+        shapely.prepare(self._parts)
+        self.edges = _edges(self._parts, self._owner)
         self.bounds_m: tuple[float, float, float, float] = (
             self.field.bounds if not self.field.is_empty else (0.0, 0.0, 0.0, 0.0)
         )
         self._rate_of: dict[frozenset[int], float | None] = {}
-
-    @property
-    def area_m2(self) -> float:
-        """Return the area of all zones, overlaps counted twice."""
-        return float(shapely.area(self._parts).sum())
 
     def rate_of(self, zones: frozenset[int]) -> float | None:
         """Return the rate where exactly these zones lie, by the overlap policy."""
@@ -125,42 +123,38 @@ class Prescription:
             return self._zone_rates[max(zones)]
         return min(rates)
 
+    def owners_at(self, east_m: Floats, north_m: Floats) -> list[set[int]]:
+        """Return, for each point, the zones that it lies in, and `FIELD` if it is inside."""
+        found: list[set[int]] = [set() for _ in range(len(east_m))]
+        points, parts = self._tree.query(shapely.points(east_m, north_m))
+        within = shapely.contains_xy(self._parts[parts], east_m[points], north_m[points])
+        owners = self._owner[parts[within]]
+        for point, owner in zip(points[within].tolist(), owners.tolist(), strict=True):
+            found[point].add(owner)
+        return found
+
     def zones_at(self, east_m: Floats, north_m: Floats) -> list[frozenset[int]]:
         """Return, for each point, the indices of the zones that it lies in."""
-        found: list[set[int]] = [set() for _ in range(len(east_m))]
-        points, parts = self._hits(self._part_tree, self._parts, east_m, north_m)
-        for point, part in zip(points.tolist(), self._part_zone[parts].tolist(), strict=True):
-            found[point].add(part)
-        return [frozenset(zones) for zones in found]
+        return [frozenset(found - {FIELD}) for found in self.owners_at(east_m, north_m)]
 
     def inside(self, east_m: Floats, north_m: Floats) -> NDArray[np.bool_]:
         """Return, for each point, whether spraying is allowed there."""
-        allowed = np.zeros(len(east_m), dtype=np.bool_)
-        points, _ = self._hits(self._field_tree, self._field_parts, east_m, north_m)
-        allowed[points] = True
-        return allowed
+        found = self.owners_at(east_m, north_m)
+        return np.array([FIELD in owners for owners in found], dtype=np.bool_)
 
     def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
         """Return the rate at each point [L/ha]; NaN outside the field or without a rate."""
-        allowed = self.inside(east_m, north_m)
-        rates = [self.rate_of(zones) for zones in self.zones_at(east_m, north_m)]
-        array = np.array([np.nan if rate is None else rate for rate in rates], dtype=np.float64)
-        array[~allowed] = np.nan
-        return array
+        rates = np.full(len(east_m), np.nan)
+        for i, owners in enumerate(self.owners_at(east_m, north_m)):
+            if FIELD in owners:
+                rate = self.rate_of(frozenset(owners - {FIELD}))
+                rates[i] = np.nan if rate is None else rate
+        return rates
 
     def rate_at(self, east_m: float, north_m: float) -> float | None:
         """Return the rate at one point [L/ha]; None outside the field or without a rate."""
         rate = float(self.rates_at(np.array([east_m]), np.array([north_m]))[0])
         return None if np.isnan(rate) else rate
-
-    @staticmethod
-    def _hits(
-        tree: STRtree, parts: NDArray[np.object_], east_m: Floats, north_m: Floats
-    ) -> tuple[Ints, Ints]:
-        """Return pairs (point, part) where the part contains the point."""
-        points, candidates = tree.query(shapely.points(east_m, north_m))
-        within = shapely.contains_xy(parts[candidates], east_m[points], north_m[points])
-        return points[within], candidates[within]
 
 
 def _parts(

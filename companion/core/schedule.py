@@ -1,8 +1,30 @@
-"""From rates along the path to timed changes of duty: each ahead of its crossing by its lag."""
+"""From rates along the path to timed changes of duty: each ahead of its crossing by its own lag.
+
+A change of rate is ordered at crossing - lag(kind) - output delay, so that the volume-equivalent
+step lies on the crossing. At the border the rule is stricter: off is complete before the strip's
+first contact with the outside, on begins after its last. The schedule keeps no state of its own:
+it is computed anew in every step from a path that begins a little in the past, so that a change
+already ordered is found again and not ordered twice.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
+
+from companion.core.crossings import Crossing, Route
+from companion.core.types import Method, TimedChange
+
+Reference = Literal["volume", "settled"]
+
+# Duties nearer than this are the same order: half a step of the finest servo resolution.
+DUTY_STEP = 0.001
+# Beyond this share a change of duty at once is a late change of zone and not a trim for speed.
+TRIM_MAX_SHARE = 0.08
+# How far ahead of its time a change that was already ordered is left alone when the prediction
+# moves it back: without this, noise would revert it for a moment and order it again.
+STICKY_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,6 +45,7 @@ class LagModel:
     off_end_s: float
     output_s: float
     position_s: float = 0.0
+    reference: Reference = "volume"
 
     def __post_init__(self) -> None:
         for name in ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s", "output_s"):
@@ -35,3 +58,199 @@ class LagModel:
             raise ValueError("on_start_s (first flow) cannot be later than on_s")
         if not self.off_end_s >= self.off_s:
             raise ValueError("off_end_s (last flow) cannot be earlier than off_s")
+
+    @property
+    def longest_s(self) -> float:
+        """Return the farthest that an order may lie ahead of its crossing."""
+        return max(self.on_s, self.off_end_s, self.up_s, self.down_s) * 2.0 + self.output_s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """How far ahead of its crossing each kind of change is ordered, all delays together."""
+
+    on_s: float
+    off_s: float
+    up_s: float
+    down_s: float
+    border_on_s: float
+    border_off_s: float
+    dwell_min_s: float
+
+    @classmethod
+    def of(cls, method: Method, lag: LagModel, *, look_ahead_s: float, period_s: float) -> Timing:
+        """Return the leads of a method: none, P1's one look-ahead time, or the identified lags.
+
+        P1 (Wang et al. 2024) looks S = V (T1 + T2 + T3) ahead for every change: at the speed V
+        that is the one lead T1 + T2 + T3.
+        """
+        dwell_s = max(lag.off_end_s - lag.on_start_s, period_s)
+        if method is not Method.SCHEDULED:
+            lead = look_ahead_s if method is Method.LOOK_AHEAD else 0.0
+            return cls(
+                on_s=lead, off_s=lead, up_s=lead, down_s=lead,
+                border_on_s=lead, border_off_s=lead, dwell_min_s=0.0,
+            )  # fmt: skip
+        rise_s = fall_s = 0.0
+        if lag.reference == "settled":  # P1 puts the end of the change on the boundary
+            rise_s, fall_s = lag.on_s - lag.on_start_s, lag.off_end_s - lag.off_s
+        return cls(
+            on_s=lag.on_s + rise_s + lag.output_s,
+            off_s=lag.off_s + fall_s + lag.output_s,
+            up_s=lag.up_s + rise_s + lag.output_s,
+            down_s=lag.down_s + fall_s + lag.output_s,
+            border_on_s=lag.on_start_s + lag.output_s,
+            border_off_s=lag.off_end_s + lag.output_s,
+            dwell_min_s=dwell_s,
+        )
+
+    def lead_s(self, before: float, after: float, *, border: bool) -> float:
+        """Return the lead of a change from one duty to another."""
+        if before <= 0.0:
+            return self.border_on_s if border else self.on_s
+        if after <= 0.0:
+            return self.border_off_s if border else self.off_s
+        return self.up_s if after > before else self.down_s
+
+
+# (rate_l_ha, speed_m_s) -> duty of the valve in question
+Dosing = Callable[[float, float], float]
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """A change of one valve with the moment at which it is due."""
+
+    at_s: float
+    duty: float
+    rate_l_ha: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ValveSchedule:
+    """What one valve does from now on; `changes` begin with what is due at once, if anything."""
+
+    changes: tuple[TimedChange, ...]
+    late: bool
+    unresolved_count: int
+    rate_now_l_ha: float | None
+
+
+def resolve(route: Route, dwell_min_s: float) -> tuple[Route, int]:
+    """Return the route without zones too short for the lag, and how many were given up.
+
+    A stay shorter than a change takes is not chased: the neighbouring rate that misapplies least
+    is held through it. Closed ground is never given up: where no spray may fall stays closed, and
+    an opening too short to be used is not made.
+    """
+    kept: list[Crossing] = list(route[:1])
+    dropped = 0
+    i = 1
+    while i < len(route):
+        crossing = route[i]
+        following = route[i + 1] if i + 1 < len(route) else None
+        stay_s = float("inf") if following is None else following.at_s - crossing.at_s
+        before = kept[-1].rate_l_ha
+        if (
+            following is None
+            or stay_s >= dwell_min_s
+            or crossing.rate_l_ha is None
+            or not dwell_min_s > 0.0
+        ):
+            if crossing.rate_l_ha != before:
+                kept.append(crossing)
+            i += 1
+            continue
+        dropped += 1
+        after = following.rate_l_ha
+        if after is None:
+            merged = None
+        elif before is None:
+            merged = after  # open for what follows, rather than open twice
+        else:
+            rate = crossing.rate_l_ha
+            merged = before if abs(rate - before) <= abs(rate - after) else after
+        if merged is None and before is not None:
+            # close already here: the rest of the way to the closed ground is too short
+            kept.append(Crossing(crossing.at_s, None, following.border, crossing.speed_m_s))
+        elif merged != before:
+            kept.append(Crossing(crossing.at_s, merged, crossing.border, crossing.speed_m_s))
+        i += 1
+    return tuple(kept), dropped
+
+
+def orders(route: Route, timing: Timing, dosing: Dosing) -> list[Order]:
+    """Return the orders of one valve along its route, in order of time.
+
+    The first has no time: it held before the path began. An order that would be due before the
+    one ahead of it takes its place: the plant could not follow both.
+    """
+    first = route[0]
+    duty = 0.0 if first.rate_l_ha is None else dosing(first.rate_l_ha, first.speed_m_s)
+    made = [Order(float("-inf"), duty, first.rate_l_ha)]
+    for crossing in route[1:]:
+        rate = crossing.rate_l_ha
+        duty = 0.0 if rate is None else dosing(rate, crossing.speed_m_s)
+        at_s = crossing.at_s - timing.lead_s(made[-1].duty, duty, border=crossing.border)
+        while len(made) > 1 and made[-1].at_s >= at_s:
+            made.pop()
+        made.append(Order(at_s, duty, rate))
+    return made
+
+
+def schedule(
+    route: Route,
+    *,
+    valve: int,
+    timing: Timing,
+    dosing: Dosing,
+    in_force: float,
+    speed_soon_m_s: float,
+    now_s: float,
+    until_s: float,
+) -> ValveSchedule:
+    """Return the changes of one valve from `now_s` until the lease ends.
+
+    `in_force` is the duty that the last plan has brought about by now, `speed_soon_m_s` the
+    footprint's speed when a trim ordered now would act.
+    """
+    unresolved, due = 0, 0
+    made: list[Order] = []
+    rate = route[0].rate_l_ha
+    if len(route) > 1:
+        resolved, unresolved = resolve(route, timing.dwell_min_s)
+        made = orders(resolved, timing, dosing)
+        while due + 1 < len(made) and made[due + 1].at_s <= now_s:
+            due += 1
+        if due + 1 < len(made) and _already_ordered(made[due], made[due + 1], in_force, now_s):
+            due += 1
+        rate = made[due].rate_l_ha
+    duty = 0.0 if rate is None else dosing(rate, speed_soon_m_s)
+    changes = []
+    late = False
+    if abs(duty - in_force) >= DUTY_STEP or (duty == 0.0) != (in_force == 0.0):
+        restart = not 0.0 < abs(duty - in_force) <= TRIM_MAX_SHARE * in_force or duty == 0.0
+        late = restart and due > 0
+        changes.append(TimedChange(at_s=now_s, valve=valve, duty=duty, restart=restart))
+    changes.extend(
+        TimedChange(at_s=order.at_s, valve=valve, duty=order.duty)
+        for order in made[due + 1 :]
+        if order.at_s < until_s
+    )
+    return ValveSchedule(tuple(changes), late, unresolved, _rate_at(route, now_s))
+
+
+def _already_ordered(now: Order, following: Order, in_force: float, now_s: float) -> bool:
+    """Whether the next order stands already and is only a moment ahead of its time."""
+    if not following.at_s - now_s < STICKY_S:
+        return False
+    to_next = abs(following.duty - in_force)
+    return to_next <= 0.03 * max(following.duty, in_force) and to_next < abs(now.duty - in_force)
+
+
+def _rate_at(route: Route, now_s: float) -> float | None:
+    rate = route[0].rate_l_ha
+    for crossing in route:
+        if crossing.at_s <= now_s:
+            rate = crossing.rate_l_ha
+    return rate

@@ -51,12 +51,10 @@ class Inhibit(StrEnum):
     SPEED_BELOW_MIN = "speed-below-min"
     SPEED_ABOVE_MAX = "speed-above-max"
     SPEED_DISAGREES = "speed-disagrees"
-    HEIGHT_UNKNOWN = "height-unknown"
     HEIGHT_BELOW_MIN = "height-below-min"
     HEIGHT_ABOVE_MAX = "height-above-max"
     WIND_ABOVE_MAX = "wind-above-max"
     OUTPUT_FAULT = "output-fault"
-    STOPPING = "stopping"
 
 
 # --------------------------------------------------------------------------------------- inputs

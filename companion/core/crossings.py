@@ -1,0 +1,465 @@
+"""Where and when each valve's footprint crosses the next boundary: exactly, on the geometry.
+
+The predicted path of every footprint is a short chain of chords (one, on a straight pass). Edges
+near the swept box come from one tree query; one vectorised side test finds those that a chord
+cuts. A side is half-open, so that a path through a vertex crosses once. Edges have their polygon
+on the left, so that each cut says which zone is entered or left, and nothing is sampled.
+
+At the border the whole strip counts, not its centre: it is closed while any part of it is
+outside, seen in the skewed frame of path and boom.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.core.boom import Boom
+from companion.core.estimator import ACCELERATION_TIME_S
+from companion.core.prescription import FIELD, SLIVER_M, Prescription
+from companion.core.types import VehicleState
+
+Across = Literal["centre", "mean", "max"]
+Border = Literal["inside", "volume"]
+Floats = NDArray[np.float64]
+
+# Below these, a second of flight deviates from a straight line by less than a decimetre and the
+# tenth of a second that an order looks ahead by less than a centimetre.
+STRAIGHT_YAW_RATE_DEG_S = 3.0
+STRAIGHT_LATERAL_M_S2 = 0.4
+CURVE_CHORDS = 6
+# A boom that lies nearly along its own motion covers no strip that could be judged.
+ACROSS_MIN = 0.2
+SAMPLES_ACROSS = 5
+START_NUDGE_M = 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Paths:
+    """Predicted paths of points of the boom: (points, knots) arrays, knots at `time_s`."""
+
+    time_s: tuple[float, ...]
+    east_m: Floats
+    north_m: Floats
+    speed_m_s: Floats
+    middle: tuple[tuple[float, float], ...]
+    right: tuple[tuple[float, float], ...]
+
+    def box(self, reach_m: float) -> tuple[float, float, float, float]:
+        """Return west, south, east, north of all within `reach_m` of the middle's path."""
+        east, north = zip(*self.middle, strict=True)
+        return (
+            min(east) - reach_m,
+            min(north) - reach_m,
+            max(east) + reach_m,
+            max(north) + reach_m,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """From `at_s` on the footprint is prescribed `rate_l_ha`; None is closed.
+
+    `border` marks a change that the border rule makes (nothing may fall outside), `speed_m_s` is
+    the footprint's own speed there.
+    """
+
+    at_s: float
+    rate_l_ha: float | None
+    border: bool
+    speed_m_s: float
+
+
+# A valve's future: the first entry holds at the start of the path, the others are crossings.
+Route = tuple[Crossing, ...]
+
+
+def predict(
+    state: VehicleState, right_m: Floats, forward_m: Floats, *, back_s: float, ahead_s: float
+) -> Paths:
+    """Return the paths of points of the boom from `back_s` ago to `ahead_s` from now.
+
+    The same motion as `estimator.estimate`: constant velocity plus a fading acceleration, and a
+    constant yaw rate.
+    """
+    heading_deg = state.heading_deg if state.heading_deg is not None else 0.0
+    speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+    lateral = 0.0
+    if speed > 0.0:
+        lateral = (
+            state.velocity_east_m_s * state.acceleration_north_m_s2
+            - state.velocity_north_m_s * state.acceleration_east_m_s2
+        ) / speed
+    turning = not (
+        abs(state.yaw_rate_deg_s) < STRAIGHT_YAW_RATE_DEG_S and abs(lateral) < STRAIGHT_LATERAL_M_S2
+    )
+    chords = CURVE_CHORDS if turning else 1
+    knots = [-back_s + (back_s + ahead_s) * i / chords for i in range(chords + 1)]
+    shape = (len(right_m), chords + 1)
+    east, north, pace = np.empty(shape), np.empty(shape), np.empty(shape)
+    middle = [
+        _knot(state, dt_s, heading_deg, turning, right_m, forward_m, (east, north, pace), i)
+        for i, dt_s in enumerate(knots)
+    ]
+    rights = []
+    for a, b in pairwise(knots):
+        turned_deg = state.yaw_rate_deg_s * (a + b) / 2 if turning else 0.0
+        angle = math.radians(heading_deg + turned_deg)
+        rights.append((math.cos(angle), -math.sin(angle)))
+    return Paths(
+        time_s=tuple(state.time_s + dt_s for dt_s in knots),
+        east_m=east,
+        north_m=north,
+        speed_m_s=pace,
+        middle=tuple(middle),
+        right=tuple(rights),
+    )
+
+
+def _knot(
+    state: VehicleState,
+    dt_s: float,
+    heading_deg: float,
+    turning: bool,
+    right_m: Floats,
+    forward_m: Floats,
+    into: tuple[Floats, Floats, Floats],
+    column: int,
+) -> tuple[float, float]:
+    """Write east, north and speed of all points at `dt_s` from now into a column.
+
+    Returns the position reference itself.
+    """
+    ahead_s = max(dt_s, 0.0)
+    gained = ACCELERATION_TIME_S * (1.0 - math.exp(-ahead_s / ACCELERATION_TIME_S))
+    carried = ACCELERATION_TIME_S * (ahead_s - gained)
+    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
+    velocity_east = state.velocity_east_m_s + ae * gained
+    velocity_north = state.velocity_north_m_s + an * gained
+    turned_deg = state.yaw_rate_deg_s * dt_s if turning else 0.0
+    angle = math.radians(heading_deg + turned_deg)
+    sin, cos = math.sin(angle), math.cos(angle)
+    offset_east = right_m * cos + forward_m * sin
+    offset_north = forward_m * cos - right_m * sin
+    east, north, pace = into
+    middle_east = state.east_m + state.velocity_east_m_s * dt_s + ae * carried
+    middle_north = state.north_m + state.velocity_north_m_s * dt_s + an * carried
+    east[:, column] = middle_east + offset_east
+    north[:, column] = middle_north + offset_north
+    if turning:
+        yaw_rate = math.radians(state.yaw_rate_deg_s)
+        pace[:, column] = np.hypot(
+            velocity_east + yaw_rate * offset_north, velocity_north - yaw_rate * offset_east
+        )
+    else:
+        pace[:, column] = math.hypot(velocity_east, velocity_north)
+    return middle_east, middle_north
+
+
+@dataclass(frozen=True, slots=True)
+class _Cut:
+    """A path cuts an edge: which polygon (`owner`), and whether it is entered."""
+
+    at_s: float
+    along_m: float
+    speed_m_s: float
+    owner: int
+    enters: bool
+
+
+def _cuts(paths: Paths, ends: Floats, owner: NDArray[np.int64]) -> list[list[_Cut]]:
+    """Return, for each point, where its path cuts the edges, in order of time."""
+    found: list[list[_Cut]] = [[] for _ in range(len(paths.east_m))]
+    if not len(ends):
+        return found
+    along = np.zeros(len(found))
+    for chord in range(len(paths.time_s) - 1):
+        along = along + _chord_cuts(paths, chord, ends, owner, along, found)
+    for cuts in found:
+        if len(cuts) > 1:  # leaving before entering, where both are at one place
+            cuts.sort(key=lambda cut: (round(cut.along_m / 1e-6), cut.enters))
+    return found
+
+
+def _chord_cuts(
+    paths: Paths,
+    chord: int,
+    ends: Floats,
+    owner: NDArray[np.int64],
+    along: Floats,
+    found: list[list[_Cut]],
+) -> Floats:
+    """Add the cuts of one chord to `found`; return the lengths of the chords."""
+    px, py = paths.east_m[:, chord], paths.north_m[:, chord]
+    dx, dy = paths.east_m[:, chord + 1] - px, paths.north_m[:, chord + 1] - py
+    length = np.hypot(dx, dy)
+    corners = ends.reshape(-1, 2)
+    left = dx[:, None] * corners[:, 1] - dy[:, None] * corners[:, 0]
+    is_left = left >= (dx * py - dy * px)[:, None]
+    points, hits = np.nonzero(is_left[:, 0::2] != is_left[:, 1::2])
+    if not len(points):
+        return length
+    l0, l1 = left[points, 2 * hits], left[points, 2 * hits + 1]
+    share = (l0 - (dx * py - dy * px)[points]) / (l0 - l1)
+    x0, y0, x1, y1 = ends[hits].T
+    reach = length[points]
+    s = (x0 + share * (x1 - x0) - px[points]) * dx[points]
+    s += (y0 + share * (y1 - y0) - py[points]) * dy[points]
+    s /= np.maximum(reach, 1e-12)
+    first = START_NUDGE_M if chord == 0 else 0.0
+    rows = np.nonzero((s > first) & (s <= reach))[0]
+    columns = (points[rows], s[rows], reach[rows], owner[hits[rows]], (l0 > l1)[rows])
+    before = along.tolist()
+    for point, s_m, reach_m, who, enters in zip(*(c.tolist() for c in columns), strict=True):
+        at_s, speed = _time_on_chord(paths, chord, point, s_m, reach_m)
+        found[point].append(_Cut(at_s, before[point] + s_m, speed, who, enters))
+    return length
+
+
+def _time_on_chord(
+    paths: Paths, chord: int, point: int, s: float, reach: float
+) -> tuple[float, float]:
+    """Return when the path is `s` metres along the chord, and its speed there.
+
+    Speed changes evenly along a chord: s = v0 t + (v1 - v0) t^2 / 2T, scaled to the chord's end.
+    """
+    t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
+    v0, v1 = paths.speed_m_s.item(point, chord), paths.speed_m_s.item(point, chord + 1)
+    if not v0 + v1 > 1e-9:
+        return t0, 0.0
+    share = s / reach
+    spread = (v1 * v1 - v0 * v0) * share + v0 * v0
+    speed = math.sqrt(max(spread, 0.0))
+    tau = share * (v0 + v1) / (v0 + speed) if v0 + speed > 0.0 else 0.0
+    return t0 + tau * (t1 - t0), speed
+
+
+def find_routes(
+    prescription: Prescription,
+    state: VehicleState,
+    boom: Boom,
+    *,
+    back_s: float,
+    ahead_s: float,
+    border: Border,
+    border_buffer_m: float,
+    across: Across,
+) -> tuple[Route, ...]:
+    """Return what each valve is prescribed along its predicted path, left to right."""
+    paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
+    reach_m = boom.reach_m + border_buffer_m + SLIVER_M
+    near = prescription.edges.near(*paths.box(reach_m))
+    ends, owner = prescription.edges.ends[near], prescription.edges.owner[near]
+    bases = prescription.owners_at(*_starts(paths))
+    cuts = _cuts(paths, ends, owner)
+    if across == "centre":
+        rates = _rates(prescription, paths, bases, cuts)
+    else:
+        rates = _rates_across(prescription, state, boom, (ends, owner), across, back_s, ahead_s)
+    closed = [
+        _centre_outside(FIELD in base, found, paths.time_s[0])
+        for base, found in zip(bases, cuts, strict=True)
+    ]
+    if border == "inside":
+        _add_contacts(paths, ends[owner == FIELD], boom, border_buffer_m, closed)
+    speeds = paths.speed_m_s[:, (0, -1)].tolist()
+    return tuple(
+        _combine(rates[valve], closed[valve], paths, speeds[valve], border)
+        for valve in range(len(boom.valves))
+    )
+
+
+# A timeline: (at_s, rate, speed_m_s), the first entry at the start of the path.
+_Steps = list[tuple[float, float | None, float]]
+
+
+def _rates(
+    prescription: Prescription, paths: Paths, bases: list[set[int]], found: list[list[_Cut]]
+) -> list[_Steps]:
+    """Return the rate along each point's path."""
+    start_s = paths.time_s[0]
+    paces = paths.speed_m_s[:, 0].tolist()
+    timelines = []
+    for base, cuts, pace in zip(bases, found, paces, strict=True):
+        inside = base - {FIELD}
+        rate = prescription.rate_of(frozenset(inside))
+        steps: _Steps = [(start_s, rate, pace)]
+        zone_cuts = [cut for cut in cuts if cut.owner != FIELD]
+        for i, cut in enumerate(zone_cuts):
+            if cut.enters:
+                inside.add(cut.owner)
+            else:
+                inside.discard(cut.owner)
+            if i + 1 < len(zone_cuts) and zone_cuts[i + 1].along_m - cut.along_m < SLIVER_M:
+                continue  # the next zone begins here: a gap this narrow is none
+            new = prescription.rate_of(frozenset(inside))
+            if new != rate:
+                steps.append((cut.at_s, new, cut.speed_m_s))
+                rate = new
+        timelines.append(steps)
+    return timelines
+
+
+def _starts(paths: Paths) -> tuple[Floats, Floats]:
+    """Return the starts of the paths, a hair ahead, so that none lies on an edge it just cut."""
+    dx = paths.east_m[:, 1] - paths.east_m[:, 0]
+    dy = paths.north_m[:, 1] - paths.north_m[:, 0]
+    scale = START_NUDGE_M / np.maximum(np.hypot(dx, dy), START_NUDGE_M)
+    return paths.east_m[:, 0] + dx * scale, paths.north_m[:, 0] + dy * scale
+
+
+def _rates_across(
+    prescription: Prescription,
+    state: VehicleState,
+    boom: Boom,
+    edges: tuple[Floats, NDArray[np.int64]],
+    across: Across,
+    back_s: float,
+    ahead_s: float,
+) -> list[_Steps]:
+    """Return the mean or the maximum over each strip, from points across it."""
+    shares = (np.arange(SAMPLES_ACROSS) + 0.5) / SAMPLES_ACROSS * 2.0 - 1.0
+    right = (boom.right_m[:, None] + boom.half_width_m[:, None] * shares).ravel()
+    forward = np.repeat(boom.forward_m, SAMPLES_ACROSS)
+    paths = predict(state, right, forward, back_s=back_s, ahead_s=ahead_s)
+    every = _rates(
+        prescription, paths, prescription.owners_at(*_starts(paths)), _cuts(paths, *edges)
+    )
+    timelines = []
+    for valve in range(len(boom.valves)):
+        parts = every[valve * SAMPLES_ACROSS : (valve + 1) * SAMPLES_ACROSS]
+        events = sorted({(at_s, speed) for part in parts for at_s, _, speed in part})
+        steps: _Steps = []
+        for at_s, speed in events:
+            now = [_value_at(part, at_s) for part in parts]
+            rates = [rate for rate in now if rate is not None]
+            if not rates:
+                value = None
+            elif across == "max":
+                value = max(rates)
+            else:
+                value = sum(rates) / len(parts)
+            if not steps or steps[-1][1] != value:
+                steps.append((at_s, value, speed))
+        timelines.append(steps)
+    return timelines
+
+
+def _value_at(steps: _Steps, at_s: float) -> float | None:
+    value = steps[0][1]
+    for start_s, rate, _ in steps:
+        if start_s > at_s:
+            break
+        value = rate
+    return value
+
+
+_Intervals = list[tuple[float, float]]
+
+
+def _centre_outside(inside: bool, cuts: list[_Cut], start_s: float) -> _Intervals:
+    """Return when the strip's centre is outside the field."""
+    intervals: _Intervals = []
+    since_s = start_s
+    for cut in cuts:
+        if cut.owner != FIELD:
+            continue
+        if inside and not cut.enters:
+            inside, since_s = False, cut.at_s
+        elif not inside and cut.enters:
+            inside = True
+            intervals.append((since_s, cut.at_s))
+    if not inside:
+        intervals.append((since_s, math.inf))
+    return intervals
+
+
+def _add_contacts(
+    paths: Paths, ends: Floats, boom: Boom, buffer_m: float, closed: list[_Intervals]
+) -> None:
+    """Add to `closed` when an edge of the border lies within a strip."""
+    if len(ends):
+        for chord in range(len(paths.time_s) - 1):
+            _add_chord_contacts(paths, chord, ends, boom, buffer_m, closed)
+
+
+def _add_chord_contacts(
+    paths: Paths, chord: int, ends: Floats, boom: Boom, buffer_m: float, closed: list[_Intervals]
+) -> None:
+    """Add the contacts of one chord, in the skewed frame of path and boom."""
+    px, py = paths.east_m[:, chord], paths.north_m[:, chord]
+    dx, dy = paths.east_m[:, chord + 1] - px, paths.north_m[:, chord + 1] - py
+    length = np.hypot(dx, dy)
+    rx, ry = paths.right[chord]
+    safe = np.maximum(length, 1e-12)
+    turn = (dx * ry - dy * rx) / safe  # sine of the angle from path to boom
+    if not bool(np.all(np.abs(turn) >= ACROSS_MIN)):
+        for intervals in closed:
+            intervals.append((paths.time_s[chord], paths.time_s[chord + 1]))
+        return
+    ux, uy, t2 = (dx / safe)[:, None], (dy / safe)[:, None], turn[:, None]
+    ax, ay = ends[:, 0] - px[:, None], ends[:, 1] - py[:, None]
+    bx, by = ends[:, 2] - px[:, None], ends[:, 3] - py[:, None]
+    across_0, across_1 = (ux * ay - uy * ax) / t2, (ux * by - uy * bx) / t2
+    along_0, along_1 = (ax * ry - ay * rx) / t2, (bx * ry - by * rx) / t2
+    half = (boom.half_width_m + buffer_m)[:, None]
+    touching = (np.minimum(across_0, across_1) <= half) & (np.maximum(across_0, across_1) >= -half)
+    valves, hits = np.nonzero(touching)
+    for valve, hit in zip(valves.tolist(), hits.tolist(), strict=True):
+        limits = _clip(
+            (float(across_0[valve, hit]), float(along_0[valve, hit])),
+            (float(across_1[valve, hit]), float(along_1[valve, hit])),
+            float(half[valve, 0]),
+        )
+        first, last = limits[0] - buffer_m, limits[1] + buffer_m
+        reach = float(length[valve])
+        if last < 0.0 or first > reach:
+            continue
+        begin = _time_on_chord(paths, chord, valve, max(first, 0.0), reach)[0]
+        end = _time_on_chord(paths, chord, valve, min(last, reach), reach)[0]
+        beyond = last > reach and chord == len(paths.time_s) - 2
+        closed[valve].append((begin, math.inf if beyond else end))
+
+
+def _clip(a: tuple[float, float], b: tuple[float, float], half_m: float) -> tuple[float, float]:
+    """Return the least and greatest `along` of the edge a-b within the strip's width."""
+    (u0, s0), (u1, s1) = a, b
+    if u0 == u1:
+        return min(s0, s1), max(s0, s1)
+    ends = []
+    for u, s in (a, b):
+        held = min(max(u, -half_m), half_m)
+        ends.append(s if held == u else s0 + (s1 - s0) * (held - u0) / (u1 - u0))
+    return min(ends), max(ends)
+
+
+def _combine(
+    rates: _Steps,
+    closed: _Intervals,
+    paths: Paths,
+    speeds: list[float],
+    border: Border,
+) -> Route:
+    """Return one timeline of rates, closed where the border rule says so."""
+    if not closed:
+        return tuple(Crossing(at_s, rate, False, speed) for at_s, rate, speed in rates)
+    strict = border == "inside"
+    ends = {t for interval in closed for t in interval if t < math.inf}
+    start_s, end_s = paths.time_s[0], paths.time_s[-1]
+    pace = {at_s: speed for at_s, _, speed in rates}
+    route: list[Crossing] = []
+    shut_before = False
+    for at_s in sorted(ends | set(pace) | {start_s}):
+        shut = any(begin <= at_s < end for begin, end in closed)
+        rate = None if shut else _value_at(rates, at_s)
+        if not route or rate != route[-1].rate_l_ha:
+            share = (at_s - start_s) / (end_s - start_s)
+            speed = pace.get(at_s, speeds[0] + share * (speeds[1] - speeds[0]))
+            route.append(Crossing(at_s, rate, strict and shut != shut_before, speed))
+        shut_before = shut
+    return tuple(route)
