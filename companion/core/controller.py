@@ -24,6 +24,8 @@ __all__ = ["Across", "Border", "Memory", "Setup", "step"]
 # Below this share of its width across the motion, a boom that flies askew is dosed as at it: the
 # flow that the law asks for would fall towards nothing while the strip is a blur.
 SKEW_MIN = 0.3
+# How long the crossings found after one position are carried on while no other comes.
+ROUTES_KEPT_S = 0.11
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +74,7 @@ class Setup:
         """Return how far ahead a path must reach: the lease, the longest lead and a short stay."""
         timing = self.timing
         lead_s = max(timing.on_s, timing.off_s, timing.up_s, timing.down_s, timing.border_off_s)
-        return self.lease_s + lead_s + 2.0 * timing.dwell_min_s + 0.05
+        return self.lease_s + lead_s + 2.0 * timing.dwell_min_s + ROUTES_KEPT_S + 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +84,9 @@ class Memory:
     plan: SprayPlan | None = None
     set_index: int = 0
     set_rate_l_ha: float | None = None
+    routes: tuple[Route, ...] = ()
+    routes_at_s: float = -math.inf
+    position_received_s: float = -math.inf
 
 
 def step(
@@ -93,16 +98,7 @@ def step(
     if reasons or state is None:
         return _closed(setup, state, reasons, sequence, now_s)
     in_force = duty_in_force(memory.plan, now_s, len(setup.boom.valves))
-    routes = find_routes(
-        setup.prescription,
-        state,
-        setup.boom,
-        back_s=setup.back_s,
-        ahead_s=setup.ahead_s,
-        border=setup.border,
-        border_buffer_m=setup.border_buffer_m,
-        across=setup.across,
-    )
+    routes, routes_at_s = _routes(setup, state, memory, now_s)
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
     index, set_rate = _nozzle_set(setup, routes, memory, speed_m_s)
     until_s = now_s + setup.lease_s
@@ -133,7 +129,40 @@ def step(
     )
     plan = guard(plan, reasons, lease_s=setup.lease_s)
     decision = _decision(setup, state, plan, valves, index, speed_m_s)
-    return decision, Memory(plan=plan, set_index=index, set_rate_l_ha=set_rate)
+    return decision, Memory(
+        plan=plan,
+        set_index=index,
+        set_rate_l_ha=set_rate,
+        routes=routes,
+        routes_at_s=routes_at_s,
+        position_received_s=state.position_received_s,
+    )
+
+
+def _routes(
+    setup: Setup, state: VehicleState, memory: Memory, now_s: float
+) -> tuple[tuple[Route, ...], float]:
+    """Return the valves' routes and when they were found.
+
+    Without a new position the prediction is the old one carried on, and so are its crossings.
+    """
+    if (
+        state.position_received_s == memory.position_received_s
+        and 0.0 <= now_s - memory.routes_at_s <= ROUTES_KEPT_S
+        and memory.routes
+    ):
+        return memory.routes, memory.routes_at_s
+    routes = find_routes(
+        setup.prescription,
+        state,
+        setup.boom,
+        back_s=setup.back_s,
+        ahead_s=setup.ahead_s,
+        border=setup.border,
+        border_buffer_m=setup.border_buffer_m,
+        across=setup.across,
+    )
+    return routes, now_s
 
 
 def duty_in_force(plan: SprayPlan | None, now_s: float, valve_count: int) -> tuple[float, ...]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,8 +61,7 @@ class Paths:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Crossing:
+class Crossing(NamedTuple):
     """From `at_s` on the footprint is prescribed `rate_l_ha`; None is closed.
 
     `border` marks a change that the border rule makes (nothing may fall outside), `speed_m_s` is
@@ -161,8 +160,7 @@ def _knot(
     return middle_east, middle_north
 
 
-@dataclass(frozen=True, slots=True)
-class _Cut:
+class _Cut(NamedTuple):
     """A path cuts an edge: which polygon (`owner`), and whether it is entered."""
 
     at_s: float

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from companion.core.crossings import Crossing, Route
 from companion.core.types import Method, TimedChange
@@ -117,8 +117,7 @@ class Timing:
 Dosing = Callable[[float, float], float]
 
 
-@dataclass(frozen=True, slots=True)
-class Order:
+class Order(NamedTuple):
     """A change of one valve with the moment at which it is due."""
 
     at_s: float
@@ -126,8 +125,7 @@ class Order:
     rate_l_ha: float | None
 
 
-@dataclass(frozen=True, slots=True)
-class ValveSchedule:
+class ValveSchedule(NamedTuple):
     """What one valve does from now on; `changes` begin with what is due at once, if anything."""
 
     changes: tuple[TimedChange, ...]
