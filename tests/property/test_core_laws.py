@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -75,7 +76,7 @@ def test_any_inhibit_closes_every_valve_and_every_plan_expires(
 )
 def test_duty_never_falls_when_flow_rises(flows: list[float], one: float, more: float) -> None:
     flows = sorted(flows)
-    if min(b - a for a, b in zip(flows, flows[1:], strict=False)) < 1e-3:
+    if min(b - a for a, b in itertools.pairwise(flows)) < 1e-3:
         return
     curve = FlowCurve(
         duty=tuple(np.linspace(0.2, 1.0, len(flows)).tolist()), flow_l_min=tuple(flows)
@@ -220,7 +221,7 @@ def test_crossings_are_those_of_an_independent_intersection(
         merged = [(s, rate) for s, rate in expected if s > 1e-6]
         found = [((c.at_s - 9.7) * 5.0, c.rate_l_ha) for c in route[1:]]
         inside = [pair for pair in found if pair[1] is not None]
-        short = any(b - a < 0.05 for (a, _), (b, _) in zip(merged, merged[1:], strict=False))
+        short = any(b - a < 0.05 for (a, _), (b, _) in itertools.pairwise(merged))
         if short:
             continue  # slivers are merged on purpose
         assert len(inside) == len(merged)

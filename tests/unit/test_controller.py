@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -256,7 +257,7 @@ def test_in_a_turn_each_valve_is_dosed_by_its_own_speed() -> None:
     )
     decision, _ = step(setup(prescription=field), state, Memory(), 10.0)
     duty = duty_in_force(decision.plan, 10.0, 6)
-    assert all(left > right for left, right in zip(duty, duty[1:], strict=False))
+    assert all(left > right for left, right in itertools.pairwise(duty))
     assert CURVE.flow_for(duty[0]) / CURVE.flow_for(duty[5]) == pytest.approx(
         (SPEED + 2.5 * math.radians(20)) / (SPEED - 2.5 * math.radians(20)), rel=0.02
     )

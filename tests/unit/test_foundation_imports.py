@@ -1,0 +1,101 @@
+"""Who imports what: the rules of docs/architecture.md that import-linter does not know."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("companion", "missions", "sitl", "analysis")
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+
+# Where each of these may be imported; a folder stands for all below it.
+ALLOWED = {
+    "pymavlink": ("companion/link", "sitl/stub"),
+    "mavsdk": ("missions/upload.py",),
+    "serial": ("companion/link", "sitl/stub"),
+    "pydantic": ("companion/config",),
+    "shapefile": ("companion/maps",),
+}
+CORE_ALLOWED = {
+    "numpy": None,
+    "shapely": {"prescription.py", "crossings.py"},
+    "pyproj": {"frame.py"},
+}
+PURE = {
+    "__future__", "bisect", "collections", "dataclasses", "enum", "functools", "heapq",
+    "itertools", "math", "operator", "typing",
+}  # fmt: skip
+
+
+def imports(source: str) -> Iterator[str]:
+    """Yield the full name of all that a source imports, wherever it does so."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def test_all_kinds_of_imports_are_seen() -> None:
+    source = "import a.b\nfrom c import d\nif x:\n    from e.f import g as h\n"
+    assert list(imports(source)) == ["a.b", "c.d", "e.f.g"]
+
+
+@pytest.mark.parametrize("library", ALLOWED)
+def test_library_is_imported_only_where_it_belongs(library: str) -> None:
+    importing = [
+        relative(path)
+        for path in SOURCES
+        if any(name.split(".")[0] == library for name in imports(path.read_text()))
+    ]
+    assert [name for name in importing if not name.startswith(ALLOWED[library])] == []
+
+
+def test_mavutil_is_imported_nowhere() -> None:
+    everything = [*SOURCES, *(ROOT / "tests").rglob("*.py")]
+    importing = [
+        relative(path)
+        for path in everything
+        if any("mavutil" in name.split(".") for name in imports(path.read_text()))
+    ]
+    assert importing == []
+
+
+def test_simulation_never_uses_our_own_link() -> None:
+    importing = [
+        relative(path)
+        for path in (ROOT / "sitl").rglob("*.py")
+        if any(name.startswith("companion.link") for name in imports(path.read_text()))
+    ]
+    assert importing == []
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "companion/core").glob("*.py")), ids=lambda path: path.name
+)
+def test_core_imports_nothing_that_is_not_pure(path: Path) -> None:
+    for name in imports(path.read_text()):
+        top = name.split(".")[0]
+        if top in CORE_ALLOWED:
+            files = CORE_ALLOWED[top]
+            assert files is None or path.name in files, f"{path.name} imports {top}"
+        else:
+            assert top in PURE or name.startswith("companion.core"), f"{path.name} imports {name}"
+
+
+def test_command_line_imports_other_packages_only_when_they_are_called() -> None:
+    path = ROOT / "companion/cli.py"
+    if not path.exists():
+        pytest.skip("there is no command line yet")
+    body = ast.parse(path.read_text()).body
+    at_once = [node for node in body if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = list(imports("\n".join(ast.unparse(node) for node in at_once)))
+    assert [name for name in names if name.split(".")[0] in PACKAGES[1:]] == []
