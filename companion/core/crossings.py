@@ -178,9 +178,6 @@ def _cuts(paths: Paths, ends: Floats, owner: NDArray[np.int64]) -> list[list[_Cu
     along = np.zeros(len(found))
     for chord in range(len(paths.time_s) - 1):
         along = along + _chord_cuts(paths, chord, ends, owner, along, found)
-    for cuts in found:
-        if len(cuts) > 1:  # leaving before entering, where both are at one place
-            cuts.sort(key=lambda cut: (round(cut.along_m / 1e-6), cut.enters))
     return found
 
 
@@ -211,11 +208,18 @@ def _chord_cuts(
     s /= np.maximum(reach, 1e-12)
     first = START_NUDGE_M if chord == 0 else 0.0
     rows = np.nonzero((s > first) & (s <= reach))[0]
-    columns = (points[rows], s[rows], reach[rows], owner[hits[rows]], (l0 > l1)[rows])
-    before = along.tolist()
-    for point, s_m, reach_m, who, enters in zip(*(c.tolist() for c in columns), strict=True):
-        at_s, speed = _time_on_chord(paths, chord, point, s_m, reach_m)
-        found[point].append(_Cut(at_s, before[point] + s_m, speed, who, enters))
+    # In order of the path; leaving before entering, where both are at one place.
+    enters = l0 > l1
+    rows = rows[np.lexsort((enters[rows], np.round(s[rows], 6)))]
+    points, s = points[rows], s[rows]
+    share = s / reach[rows]
+    v0, v1 = paths.speed_m_s[points, chord], paths.speed_m_s[points, chord + 1]
+    speed = np.sqrt(v0 * v0 + (v1 * v1 - v0 * v0) * share)
+    t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
+    at_s = t0 + share * (v0 + v1) / np.maximum(v0 + speed, 1e-9) * (t1 - t0)
+    columns = (points, at_s, along[points] + s, speed, owner[hits[rows]], enters[rows])
+    for point, *cut in zip(*(column.tolist() for column in columns), strict=True):
+        found[point].append(_Cut(*cut))
     return length
 
 
@@ -224,7 +228,8 @@ def _time_on_chord(
 ) -> tuple[float, float]:
     """Return when the path is `s` metres along the chord, and its speed there.
 
-    Speed changes evenly along a chord: s = v0 t + (v1 - v0) t^2 / 2T, scaled to the chord's end.
+    Speed changes evenly along a chord: s = v0 t + (v1 - v0) t^2 / 2T, scaled to the chord's end
+    (as in `_chord_cuts`, where it is solved for all cuts at once).
     """
     t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
     v0, v1 = paths.speed_m_s.item(point, chord), paths.speed_m_s.item(point, chord + 1)
