@@ -18,8 +18,8 @@ from companion.core.types import Method, TimedChange
 
 Reference = Literal["volume", "settled"]
 
-# Duties nearer than this are the same order: half a step of the finest servo resolution.
-DUTY_STEP = 0.001
+# Duties nearer than this are the same order: a fiftieth of a percent of the flow.
+DUTY_STEP = 0.0001
 # Beyond this share a change of duty at once is a late change of zone and not a trim for speed.
 TRIM_MAX_SHARE = 0.08
 # How far ahead of its time a change that was already ordered is left alone when the prediction

@@ -1,0 +1,245 @@
+"""The closed loop without sockets: vehicle, navigation, core, output, plant; a plain loop.
+
+Faster than real time and the same to the bit for the same seed. The controller sees messages and
+nothing else; the truth goes into a `FlightRecord`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from analysis.flight_record import Fidelity, FlightMeta, FlightRecord
+from companion.core.controller import Memory, Setup, step
+from companion.core.estimator import Track, estimate, observe
+from companion.core.types import (
+    Decision,
+    EstimatorReport,
+    Fix,
+    GnssReport,
+    HeartbeatReport,
+    Inhibit,
+    Input,
+    LandedReport,
+    OperatorCommand,
+    Telemetry,
+)
+from sitl.board import DriverBoard
+from sitl.navigation import Navigation
+from sitl.outputs import AveragedOutput, GpioOutput, Output, ServoOutput
+from sitl.plant import AveragedPlant, PulsedPlant
+from sitl.wang import POLL_S, WangController
+
+if TYPE_CHECKING:
+    from sitl.profile import PlantProfile
+    from sitl.trajectory import Trajectory
+
+# Steps between positions, as the runtime has them.
+STEP_S = 0.05
+SAMPLE_S: dict[Fidelity, float] = {"pulsed": 0.002, "averaged": 0.010}
+TAIL_S = 1.0
+# A position message is on its way this long: autopilot, wire, reader.
+MESSAGE_DELAY_S = 0.005
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightOptions:
+    """How a flight is simulated; `noise` and `scatter` off is perfect knowledge."""
+
+    fidelity: Fidelity = "pulsed"
+    output: Literal["gpio", "servo"] = "gpio"
+    board: Literal["restarting", "free-running"] = "restarting"
+    seed: int = 1
+    position_rate_hz: float = 10.0
+    estimator_lag_s: float = 0.031
+    noise: bool = True
+    scatter: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightResult:
+    """The truth of a flight and what the controller said of it."""
+
+    record: FlightRecord
+    steps: int
+    late: int
+    unresolved: int
+    inhibits: frozenset[Inhibit]
+    simulated_s: float
+
+
+Progress = Callable[[float], None]
+
+
+def fly(
+    setup: Setup,
+    trajectory: Trajectory,
+    profile: PlantProfile,
+    options: FlightOptions,
+    *,
+    speed_m_s: float,
+    wang: WangController | None = None,
+    method: str | None = None,
+    observer: Callable[[Decision], None] | None = None,
+) -> FlightResult:
+    """Fly `trajectory` with our controller, or with P1's where `wang` is given."""
+    if not options.scatter:
+        profile = replace(profile, lag_scatter=0.0, flow_scatter=0.0)
+    start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
+    plant, output = _sprayer(profile, options, start_s)
+    inputs = _inputs(setup, trajectory, options)
+    if wang is not None:
+        said = _fly_wang(wang, inputs, output, start_s)
+    else:
+        said = _fly_ours(setup, inputs, output, start_s, observer)
+    output.finish(end_s + TAIL_S / 2)
+    sample_s = SAMPLE_S[options.fidelity]
+    times = start_s + sample_s * np.arange(math.floor((end_s + TAIL_S - start_s) / sample_s) + 1)
+    path = trajectory.at(times)
+    record = FlightRecord(
+        time_s=times,
+        east_m=path.east_m,
+        north_m=path.north_m,
+        heading_deg=path.heading_deg,
+        volume_ml=plant.volume_ml(times),
+        boom=setup.boom,
+        prescription=setup.prescription,
+        pwm_period_s=profile.pwm.period_s,
+        orders=tuple(output.orders),
+        meta=FlightMeta(
+            speed_m_s=speed_m_s,
+            method=method or setup.method.value,
+            fidelity=options.fidelity,
+            output=options.output,
+            seed=options.seed,
+        ),
+    )
+    return FlightResult(
+        record=record,
+        steps=said.steps,
+        late=said.late,
+        unresolved=said.unresolved,
+        inhibits=frozenset(said.inhibits),
+        simulated_s=end_s - start_s,
+    )
+
+
+def _sprayer(
+    profile: PlantProfile, options: FlightOptions, start_s: float
+) -> tuple[AveragedPlant | PulsedPlant, Output]:
+    if options.fidelity == "averaged":
+        averaged = AveragedPlant(profile, seed=options.seed, start_s=start_s)
+        return averaged, AveragedOutput(averaged)
+    pulsed = PulsedPlant(profile, seed=options.seed, start_s=start_s)
+    if options.output == "gpio":
+        return pulsed, GpioOutput(pulsed, start_s=start_s)
+    board = DriverBoard(
+        profile.pwm,
+        profile.valve_count,
+        seed=options.seed,
+        start_s=start_s,
+        kind=options.board,
+    )
+    return pulsed, ServoOutput(pulsed, board)
+
+
+def _inputs(setup: Setup, trajectory: Trajectory, options: FlightOptions) -> Iterator[Input]:
+    """Return all that the companion receives, in the order of arrival."""
+    navigation = Navigation(
+        trajectory,
+        setup.frame,
+        seed=options.seed,
+        start_s=float(trajectory.time_s[0]),
+        position_rate_hz=options.position_rate_hz,
+        estimator_lag_s=options.estimator_lag_s if options.noise else 0.0,
+        message_delay_s=MESSAGE_DELAY_S if options.noise else 0.0,
+        jitter_s=0.003 if options.noise else 0.0,
+        noise=options.noise,
+    )
+    start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
+    return heapq.merge(
+        _statuses(start_s, end_s), navigation.advance(end_s), key=lambda item: item.received_s
+    )
+
+
+def _statuses(start_s: float, end_s: float) -> Iterator[Input]:
+    """Yield what a healthy vehicle in a mission says besides its position."""
+    yield HeartbeatReport(received_s=start_s, autopilot="ardupilot", armed=True, mode="AUTO")
+    yield OperatorCommand(received_s=start_s, enable=True, source="command")
+    for i in range(math.ceil((end_s - start_s) / 0.5) + 1):
+        now_s = start_s + 0.5 * i
+        yield HeartbeatReport(received_s=now_s, autopilot="ardupilot", armed=True, mode="AUTO")
+        yield GnssReport(received_s=now_s, fix=Fix.RTK_FIXED)
+        yield EstimatorReport(received_s=now_s, healthy=True)
+        yield LandedReport(received_s=now_s, in_air=True)
+
+
+@dataclass(slots=True)
+class _Said:
+    """Counts of what the controller said."""
+
+    inhibits: set[Inhibit]
+    steps: int = 0
+    late: int = 0
+    unresolved: int = 0
+
+
+def _fly_ours(
+    setup: Setup,
+    inputs: Iterator[Input],
+    output: Output,
+    start_s: float,
+    observer: Callable[[Decision], None] | None,
+) -> _Said:
+    """Run the core as the runtime does: at every position, and 20 times a second at least."""
+    track, memory, said = Track(), Memory(), _Said(set())
+    next_s = start_s
+
+    def decide(now_s: float) -> None:
+        nonlocal memory, next_s
+        decision, memory = step(setup, estimate(track, now_s), memory, now_s)
+        output.submit(decision.plan, now_s=now_s)
+        next_s = now_s + STEP_S
+        said.steps += 1
+        said.late += decision.late_count
+        said.unresolved += decision.unresolved_count
+        said.inhibits |= decision.inhibits
+        if observer is not None:
+            observer(decision)
+
+    for item in inputs:
+        while next_s <= item.received_s:
+            decide(next_s)
+        track = observe(track, item, setup)
+        if isinstance(item, Telemetry):
+            decide(item.received_s)
+    return said
+
+
+def _fly_wang(
+    wang: WangController, inputs: Iterator[Input], output: Output, start_s: float
+) -> _Said:
+    """Run P1's controller: poll, compute, order; the plans come out in order of time."""
+    said = _Said(set())
+    next_s = start_s + POLL_S
+    pending = []
+    for item in inputs:
+        while next_s <= item.received_s:
+            plan = wang.poll(next_s)
+            if plan is not None:
+                pending.append(plan)
+            while pending and pending[0].issued_s <= next_s:
+                output.submit(pending[0], now_s=pending[0].issued_s)
+                pending.pop(0)
+            said.steps += 1
+            next_s += POLL_S
+        if isinstance(item, Telemetry):
+            wang.hear(item)
+    for plan in pending:
+        output.submit(plan, now_s=plan.issued_s)
+    return said

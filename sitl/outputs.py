@@ -1,0 +1,176 @@
+"""What lies between a plan and the plant in a simulated flight: the output path.
+
+`gpio` is the pulse engine itself, `servo` a pulse width on an autopilot's output, delayed by its
+frame and turned into pulses by a driver board. In averaged fidelity a change of duty acts as it
+is. All of them keep the changes that were carried out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Protocol
+
+from companion.core.types import SprayPlan, TimedChange
+from companion.output.pwm import PulseEngine
+
+if TYPE_CHECKING:
+    from sitl.board import DriverBoard
+    from sitl.plant import AveragedPlant, PulsedPlant
+
+
+class Output(Protocol):
+    """Takes plans, drives the plant, keeps what was carried out."""
+
+    @property
+    def orders(self) -> list[TimedChange]:
+        """Return the changes of duty carried out so far, in order of time."""
+
+    def submit(self, plan: SprayPlan, *, now_s: float) -> None:
+        """Carry out what was due before `now_s`, then replace the future."""
+
+    def finish(self, end_s: float) -> None:
+        """Carry out all until `end_s`; the lease closes what is left open."""
+
+
+@dataclass(slots=True)
+class PlanFollower:
+    """The changes of plans, each at its time, until the lease ends: what every executor does."""
+
+    valve_count: int
+    orders: list[TimedChange] = field(default_factory=list)
+    duty: list[float] = field(init=False)
+    _plan: SprayPlan | None = None
+
+    def __post_init__(self) -> None:
+        self.duty = [0.0] * self.valve_count
+
+    def submit(self, plan: SprayPlan, *, now_s: float) -> list[TimedChange]:
+        """Return the changes that happened before `now_s`, and take the new plan."""
+        done = self.advance(now_s)
+        for valve, duty in enumerate(plan.duty):
+            if duty != self.duty[valve]:
+                done.append(self._take(TimedChange(at_s=now_s, valve=valve, duty=duty)))
+        self._plan = plan
+        return done + self.advance(now_s)
+
+    def advance(self, until_s: float) -> list[TimedChange]:
+        """Return the changes up to `until_s` that were not returned yet."""
+        plan = self._plan
+        if plan is None:
+            return []
+        done = []
+        due = 0
+        for change in plan.changes:
+            if change.at_s > until_s or change.at_s >= plan.lease_until_s:
+                break
+            due += 1
+            if change.duty != self.duty[change.valve]:
+                done.append(self._take(change))
+        rest = plan.changes[due:]
+        self._plan = replace(plan, duty=tuple(self.duty), changes=rest) if due else plan
+        if plan.lease_until_s <= until_s:
+            self._plan = None
+            done += [
+                self._take(TimedChange(at_s=plan.lease_until_s, valve=valve, duty=0.0))
+                for valve, duty in enumerate(self.duty)
+                if duty != 0.0
+            ]
+        return done
+
+    def _take(self, change: TimedChange) -> TimedChange:
+        self.duty[change.valve] = change.duty
+        self.orders.append(change)
+        return change
+
+
+class AveragedOutput:
+    """Duties act as they are."""
+
+    def __init__(self, plant: AveragedPlant) -> None:
+        self._plant = plant
+        self._follower = PlanFollower(plant.profile.valve_count)
+
+    @property
+    def orders(self) -> list[TimedChange]:
+        """Return the changes carried out so far."""
+        return self._follower.orders
+
+    def submit(self, plan: SprayPlan, *, now_s: float) -> None:
+        """Carry out what was due, then replace the future."""
+        self._act(self._follower.submit(plan, now_s=now_s))
+
+    def finish(self, end_s: float) -> None:
+        """Carry out all until `end_s`."""
+        self._act(self._follower.advance(end_s))
+
+    def _act(self, changes: list[TimedChange]) -> None:
+        for change in changes:
+            self._plant.record_change(change.at_s, change.valve, change.duty)
+
+
+class GpioOutput:
+    """The pulse engine, to the edge."""
+
+    def __init__(self, plant: PulsedPlant, *, start_s: float) -> None:
+        profile = plant.profile
+        self._plant = plant
+        self._engine = PulseEngine(
+            profile.pwm, profile.valve_count, start_s=start_s, overrun_s=profile.overrun_s
+        )
+        self._follower = PlanFollower(profile.valve_count)
+
+    @property
+    def orders(self) -> list[TimedChange]:
+        """Return the changes carried out so far."""
+        return self._follower.orders
+
+    def submit(self, plan: SprayPlan, *, now_s: float) -> None:
+        """Carry out what was due, then replace the future."""
+        self._follower.submit(plan, now_s=now_s)
+        self._engine.submit(plan, now_s=now_s)
+        self._plant.record(self._engine.advance(now_s))
+
+    def finish(self, end_s: float) -> None:
+        """Carry out all until `end_s`."""
+        self._follower.advance(end_s)
+        self._plant.record(self._engine.advance(end_s))
+
+
+class ServoOutput:
+    """Orders of pulse widths to the autopilot, its servo frame, and a driver board."""
+
+    def __init__(
+        self,
+        plant: PulsedPlant,
+        board: DriverBoard,
+        *,
+        wire_s: float = 0.002,
+        closed_us: float = 1000.0,
+        full_us: float = 2000.0,
+    ) -> None:
+        self._plant = plant
+        self._board = board
+        self._wire_s = wire_s
+        self._closed_us, self._span_us = closed_us, full_us - closed_us
+        self._follower = PlanFollower(plant.profile.valve_count)
+
+    @property
+    def orders(self) -> list[TimedChange]:
+        """Return the changes carried out so far."""
+        return self._follower.orders
+
+    def submit(self, plan: SprayPlan, *, now_s: float) -> None:
+        """Carry out what was due, then replace the future."""
+        self._order(self._follower.submit(plan, now_s=now_s))
+        self._plant.record(self._board.advance(now_s))
+
+    def finish(self, end_s: float) -> None:
+        """Carry out all until `end_s`."""
+        self._order(self._follower.advance(end_s))
+        self._plant.record(self._board.advance(end_s))
+
+    def _order(self, changes: list[TimedChange]) -> None:
+        for change in changes:
+            # Whole microseconds go over the wire, a few milliseconds after the planned time.
+            pulse_us = round(self._closed_us + change.duty * self._span_us)
+            self._board.order(change.at_s + self._wire_s, change.valve, pulse_us)
