@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from companion.core.types import Decision, Input, SprayPlan
@@ -9,6 +10,10 @@ from companion.core.types import Decision, Input, SprayPlan
 
 class PlanExecutor(Protocol):
     """Carries a plan out to the millisecond and closes everything when its lease ends."""
+
+    @property
+    def fault(self) -> str | None:
+        """Why the outputs cannot be trusted, in a few words, latched; None while all is well."""
 
     async def start(self) -> None:
         """Take the outputs and order all of them closed."""
@@ -18,6 +23,29 @@ class PlanExecutor(Protocol):
 
     async def stop(self) -> None:
         """Order all outputs closed and let go; may be called twice and before `start`."""
+
+
+class VehicleLink(Protocol):
+    """Messages of one vehicle in, this component's own messages out."""
+
+    @property
+    def fault(self) -> str | None:
+        """Why nothing reaches the vehicle, in a few words; None while the link is up."""
+
+    async def open(self, wake: Callable[[], None]) -> None:
+        """Open the link; from then on `wake` is called whenever `receive` has something new."""
+
+    def receive(self) -> Sequence[Input]:
+        """Return what came in since the last call, in its order; never waits."""
+
+    def tell(self, decision: Decision | None, now_s: float) -> None:
+        """Send what is due by itself; called at every step, at least 20 times a second."""
+
+    def tell_fault(self, text: str) -> None:
+        """Tell the operator once of something that does not work."""
+
+    async def close(self) -> None:
+        """Let go of the link; may be called twice and before `open`."""
 
 
 class Recorder(Protocol):

@@ -55,7 +55,7 @@ class FlightOptions:
     output: Literal["gpio", "servo"] = "gpio"
     board: Literal["restarting", "free-running"] = "restarting"
     seed: int = 1
-    position_rate_hz: float = 10.0
+    position_rate_hz: float = 20.0
     estimator_lag_s: float = 0.031
     noise: bool = True
     scatter: bool = True

@@ -81,7 +81,6 @@ async def no_task_left_behind(no_thread_left_behind: None) -> AsyncIterator[None
     """Fail a test that leaves a task running; one that was just cancelled may end."""
     before = asyncio.all_tasks()
     yield
-    await asyncio.sleep(0)
     left = asyncio.all_tasks() - before - {asyncio.current_task()}
     for task in left:
         task.cancel()

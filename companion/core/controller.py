@@ -258,7 +258,7 @@ def _speed_soon(setup: Setup, state: VehicleState, speed_m_s: float) -> float:
         state.velocity_east_m_s * state.acceleration_east_m_s2
         + state.velocity_north_m_s * state.acceleration_north_m_s2
     )
-    return max(speed_m_s + along / speed_m_s * setup.timing.up_s, 0.0)
+    return max(speed_m_s + along / speed_m_s * (setup.timing.up_s + 0.5 * setup.pwm.period_s), 0.0)
 
 
 def _in_order(valves: list[ValveSchedule]) -> tuple[TimedChange, ...]:

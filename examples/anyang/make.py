@@ -9,8 +9,8 @@ so that the table cannot be taken at its word.
 
 The order is searched with a fixed seed: each pass has each rate once, neighbours along a pass
 differ by at least 20 % of the larger (but for the plots whose rates are told), so that a change
-stands clear of the sprayer's own noise, and steps up are as many as steps down, in all, whichever way a pass
-is flown. Run it again and nothing changes: `python examples/anyang/make.py [FOLDER]`.
+stands clear of the sprayer's own noise, and steps up are as many as steps down, in all, whichever
+way a pass is flown. Run it again and nothing changes: `python examples/anyang/make.py [FOLDER]`.
 """
 
 from __future__ import annotations

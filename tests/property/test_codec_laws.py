@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -26,7 +28,9 @@ def _frames() -> list[bytes]:
 
 
 FRAMES = _frames()
-streams = st.lists(st.sampled_from(FRAMES), max_size=12).map(lambda list_: FRAMES[0] + b"".join(list_))
+streams = st.lists(st.sampled_from(FRAMES), max_size=12).map(
+    lambda list_: FRAMES[0] + b"".join(list_)
+)
 
 
 @st.composite
@@ -67,7 +71,7 @@ def test_any_split_of_a_valid_stream_gives_the_same_messages(
     stream: bytes, cuts: list[int]
 ) -> None:
     ends = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    chunks = [stream[a:b] for a, b in zip(ends, ends[1:], strict=False)]
+    chunks = [stream[a:b] for a, b in itertools.pairwise(ends)]
     assert messages_of(chunks) == messages_of([stream])
     assert len(messages_of([stream])) >= 1
 

@@ -180,8 +180,7 @@ def test_a_strip_over_two_zones_takes_what_the_setting_says(across: str, rate: f
         nozzle_sets=(NozzleSet(valves=(0,), curve=CURVE),),
         across=across,
     )
-    north = 3.5 if across != "mean" else 3.5
-    decision, _ = step(given, flying(10.0, 20.0, north_m=north), Memory(), 10.0)
+    decision, _ = step(given, flying(10.0, 20.0, north_m=3.5), Memory(), 10.0)
     expected = rate if across != "mean" else (20.0 * 3 + 25.0 * 2) / 5
     assert decision.rate_l_ha == (pytest.approx(expected),)
 

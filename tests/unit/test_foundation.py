@@ -195,11 +195,13 @@ def test_a_change_of_what_is_needed_sets_up_again(tmp_path: Path, changed: str) 
 
 @needs_make
 def test_an_old_python_is_refused_with_the_way_out(tmp_path: Path) -> None:
-    command, _ = fresh_project(tmp_path, is_old=True)
+    command, log = fresh_project(tmp_path, is_old=True)
     result = subprocess.run(command, check=False, capture_output=True, text=True)
     assert result.returncode != 0
     assert "needs Python >= 3.11: make PYTHON=" in result.stderr
     assert not (tmp_path / ".venv").exists()
+    assert PROJECT["project"]["requires-python"] == ">=3.11"
+    assert "sys.version_info < (3, 11)" in log.read_text()
 
 
 @needs_make
@@ -213,6 +215,17 @@ def test_ci_runs_lint_and_tests() -> None:
     script = ROOT / ".ci/run"
     assert os.access(script, os.X_OK)
     assert "make --keep-going lint test" in script.read_text()
+
+
+def test_image_copies_only_what_exists_and_is_not_ignored() -> None:
+    lines = re.findall(
+        r"^COPY (?!--from)(.+) \S+$", (ROOT / "Dockerfile").read_text(), re.MULTILINE
+    )
+    copied = [name for line in lines for name in line.split()]
+    allowed = re.findall(r"^!(\S+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE)
+    assert {"companion", "examples"} <= set(copied)
+    assert [name for name in copied if not (ROOT / name).exists()] == []
+    assert {name.split("/")[0] for name in copied} == set(allowed)
 
 
 # ------------------------------------------------------------------------------- nothing is left

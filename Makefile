@@ -1,0 +1,78 @@
+# Each target sets up what it needs; setting up twice does nothing.
+# Needed beforehand: Python >= 3.11 with venv, make, a package index.
+
+PYTHON ?= python3
+SEED ?=
+ARGS ?=
+
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+LOCKS := requirements/build.txt requirements/dev.txt
+INSTALLED := .venv/.installed
+COMPILE = $(BIN)/uv pip compile --universal --python-version 3.11 --generate-hashes \
+	--no-emit-index-url --no-header --no-annotate --quiet $(ARGS)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test lint format-check ruff mypy imports bench faults test-gpio docs lock clean
+
+help: ## what there is
+	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-10s %s\n", $$1, $$2}' Makefile
+
+setup: $(INSTALLED) ## the virtual environment, from the lock files
+
+demo: $(INSTALLED) ## fly the demo; pictures and figures in demo-out
+	$(BIN)/vrspray demo --out demo-out $(ARGS)
+
+test: $(INSTALLED) ## all tests (ARGS="-k lag" for some)
+	$(BIN)/pytest $(ARGS)
+
+lint: format-check ruff mypy imports ## format, ruff, mypy, import rules
+
+format-check: $(INSTALLED)
+	$(BIN)/ruff format --check .
+
+ruff: $(INSTALLED)
+	$(BIN)/ruff check .
+
+mypy: $(INSTALLED)
+	$(BIN)/mypy
+
+imports: $(INSTALLED)
+	$(BIN)/lint-imports
+
+bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
+	$(BIN)/python -m tests.bench $(SEED)
+
+faults: ## faults injected over many flights
+	@echo "make faults: not part of this version; it needs the fault campaign." >&2; exit 1
+
+test-gpio: ## GPIO output against a simulated chip
+	@echo "make test-gpio: not part of this version; it needs the GPIO engine and a kernel with gpio-sim." >&2; exit 1
+
+docs: $(INSTALLED) ## every link in the documents leads somewhere
+	$(BIN)/pytest --quiet tests/unit/test_foundation.py -k link
+
+lock: | $(BIN)/python ## choose and pin versions anew (ARGS=--upgrade for the newest)
+	[ -x $(BIN)/uv ] || $(PIP) install --quiet uv
+	$(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['build-system']['requires'], sep='\n')" \
+		| $(COMPILE) - --output-file requirements/build.txt >/dev/null
+	$(COMPILE) pyproject.toml --extra dev --output-file requirements/dev.txt >/dev/null
+	$(COMPILE) pyproject.toml --extra plot --constraint requirements/dev.txt --output-file requirements/plot.txt >/dev/null
+	$(COMPILE) pyproject.toml --constraint requirements/dev.txt --output-file requirements/run.txt >/dev/null
+
+clean: ## everything that was made, but for the environment and recorded flights
+	rm -rf demo-out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+		|| { echo "vrspray needs Python >= 3.11: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
+	@echo "Setting up .venv (once) ..." >&2
+	@$(PYTHON) -m venv .venv || { rm -rf .venv; exit 1; }
+
+# The project itself goes in without isolation, so that its build tool is a pinned one as well.
+$(INSTALLED): pyproject.toml $(LOCKS) | $(BIN)/python
+	@$(PIP) install --quiet --require-hashes $(LOCKS:%=--requirement %)
+	@$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@

@@ -1,0 +1,222 @@
+"""The border: how far inside it the spray ends and begins, and what fell beyond it.
+
+Exclusions are borders: the field is what may be sprayed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from analysis.changes import SPEED_MIN_M_S, Run, bisect
+from analysis.lag import DWELL_MIN_S, Step, Verdict
+from analysis.strips import GRAZE_M, Strip
+from analysis.track import Ints, Track, in_field
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from companion.core.prescription import Prescription
+
+# Flow has ended below this part of what it was.
+ENDED_BELOW = 0.02
+# Cumulative volumes are rounded; less than this in one step is nothing.
+NOTHING_ML = 1e-9
+ELEMENT_M = 0.1
+# How long before and after a change the strip must keep in the field.
+AROUND_S = 1.0
+BESIDE_S = 0.5
+# A controller may keep a strip closed whose end comes this near to the border.
+CLEAR_M = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BorderCrossing:
+    """One crossing of the border by a strip that sprays on its inner side.
+
+    `margin_m` is from the strip's first contact with the outside back to where the flow ended, or
+    from its last contact on to where the flow began; >= 0 means that nothing fell outside.
+    """
+
+    valve: int
+    kind: Literal["closing", "opening"]
+    time_s: float
+    margin_m: float
+
+
+def border_crossings(strip: Strip, prescription: Prescription) -> list[BorderCrossing]:
+    """Return the margins of one strip at every border that it sprayed up to or from."""
+    found: list[BorderCrossing] = []
+    for first, last, early_s, late_s in _passes(strip.stretches):
+        if not min(first.dwell_s, last.dwell_s) >= DWELL_MIN_S:
+            continue
+        kinds: tuple[tuple[Literal["opening", "closing"], Run, float, float], ...] = (
+            ("opening", first, first.start_s, early_s),
+            ("closing", last, last.end_s, late_s),
+        )
+        for kind, stretch, cross_s, far_s in kinds:
+            if not stretch.rate_l_ha > 0.0 or not _crosses(strip.track, cross_s):
+                continue
+            margin_m = _margin_m(strip, prescription, stretch, cross_s, far_s)
+            if margin_m is not None:
+                found.append(
+                    BorderCrossing(
+                        valve=strip.track.valve, kind=kind, time_s=cross_s, margin_m=margin_m
+                    )
+                )
+    return found
+
+
+def _passes(stretches: Sequence[Run]) -> Iterator[tuple[Run, Run, float, float]]:
+    """Yield the first and the last stretch of each visit to the field, and how far each reaches.
+
+    Flow between two visits belongs to the nearer one.
+    """
+    first: Run | None = None
+    early_s = stretches[0].start_s
+    for i, run in enumerate(stretches):
+        if not run.inside:
+            early_s = run.start_s + 0.5 * run.dwell_s if i else run.start_s
+            continue
+        first = first or run
+        if i + 1 == len(stretches):
+            yield first, run, early_s, run.end_s
+        elif not stretches[i + 1].inside:
+            after = stretches[i + 1]
+            share = 1.0 if i + 2 == len(stretches) else 0.5
+            yield first, run, early_s, after.start_s + share * after.dwell_s
+            first = None
+
+
+def _crosses(track: Track, time_s: float) -> bool:
+    """Return whether the record goes on beyond a border and the aircraft moves there."""
+    within = track.time_s[0] < time_s < track.time_s[-1]
+    return bool(within and track.value(track.speed_m_s, time_s) > SPEED_MIN_M_S)
+
+
+def _margin_m(
+    strip: Strip, prescription: Prescription, stretch: Run, cross_s: float, far_s: float
+) -> float | None:
+    """Return the margin at one border; None where the strip did not spray or never was inside."""
+    track = strip.track
+    opening = far_s < cross_s
+    near_s = stretch.end_s if opening else stretch.start_s
+    flow_s = _flow_end_s(track, near_s, far_s)
+    contact_s = _contact_s(strip, prescription, near_s, cross_s)
+    if flow_s is None or contact_s is None:
+        return None
+    flow_m = track.value(track.distance_m, flow_s)
+    contact_m = track.value(track.distance_m, contact_s)
+    return flow_m - contact_m if opening else contact_m - flow_m
+
+
+def _flow_end_s(track: Track, near_s: float, far_s: float) -> float | None:
+    """Return the outermost time with flow between a time inside and a time outside."""
+    first, last = track.sample(min(near_s, far_s)), track.sample(max(near_s, far_s)) + 1
+    drops = np.diff(track.volume_ml[first : last + 1])
+    if not len(drops) or not drops.max() > NOTHING_ML:
+        return None
+    flowing = np.flatnonzero(drops > ENDED_BELOW * drops.max())
+    # Interval i lies between samples i and i + 1: the outer one counts.
+    index = flowing[0] if far_s < near_s else flowing[-1] + 1
+    return float(track.time_s[first + index])
+
+
+def _contact_s(
+    strip: Strip, prescription: Prescription, near_s: float, cross_s: float
+) -> float | None:
+    """Return when the strip first touches the outside (or last does) around a crossing."""
+    grazing_s = _edge_s(strip, prescription, (near_s, cross_s), widen_m=-GRAZE_M)
+    exact_s = _edge_s(strip, prescription, (near_s, cross_s), widen_m=None)
+    if grazing_s is None or exact_s is None:
+        return grazing_s
+    # At an oblique border the strip's end goes over by ever more between the two; along a border
+    # it stays where it is until the crossing.
+    nearly_s = np.array([exact_s + 0.9 * (grazing_s - exact_s)])
+    oblique = not strip.track.wholly_inside(prescription, nearly_s, widen_m=-0.8 * GRAZE_M)[0]
+    return exact_s if oblique else grazing_s
+
+
+def _edge_s(
+    strip: Strip, prescription: Prescription, span_s: tuple[float, float], *, widen_m: float | None
+) -> float | None:
+    """Return the time next to the crossing at which the strip is wholly inside, to 0.01 mm."""
+    near_s, cross_s = span_s
+    track = strip.track
+    whole = strip.whole if widen_m is None else strip.grazing
+    marks_s = track.time_s[track.marks]
+    low_s, high_s = min(span_s), max(span_s)
+    inside = np.flatnonzero(whole & (marks_s > low_s) & (marks_s < high_s))
+    if not len(inside):
+        return None
+    mark = inside[-1] if cross_s > near_s else inside[0]
+    beyond = marks_s[mark + 1] if cross_s > near_s else marks_s[mark - 1]
+    options = {} if widen_m is None else {"widen_m": widen_m}
+    edge = bisect(
+        lambda t: track.wholly_inside(prescription, t, **options),
+        np.array([marks_s[mark]]),
+        np.array([beyond]),
+    )
+    return float(edge[0])
+
+
+def off_target_ml(strips: Sequence[Strip], prescription: Prescription) -> float:
+    """Return the volume that fell outside the field.
+
+    A strip is split into elements of at most 0.1 m across, each judged at its exact point at
+    every sample that something falls.
+    """
+    total_ml = 0.0
+    for strip in strips:
+        track = strip.track
+        samples = _doubtful(strip)
+        drops = track.volume_ml[samples + 1] - track.volume_ml[samples]
+        samples, drops = samples[drops > NOTHING_ML], drops[drops > NOTHING_ML]
+        if not len(samples):
+            continue
+        time_s = 0.5 * (track.time_s[samples] + track.time_s[samples + 1])
+        count = int(np.ceil(track.width_m / ELEMENT_M - 1e-9))
+        for offset in (np.arange(count) + 0.5) / count - 0.5:
+            east_m, north_m = track.points(time_s, float(offset * track.width_m))
+            outside = ~in_field(prescription, east_m, north_m)
+            total_ml += float(drops[outside].sum()) / count
+    return total_ml
+
+
+def _doubtful(strip: Strip) -> Ints:
+    """Return the samples before which and after which the strip is not surely in the field."""
+    marks = strip.track.marks
+    sure = strip.whole[1:] & strip.whole[:-1]
+    doubtful = np.repeat(~sure, np.diff(marks))
+    return np.flatnonzero(doubtful).astype(np.int64)
+
+
+def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Step]) -> list[Step]:
+    """Return the steps with those apart where the strip reaches over the border.
+
+    There the border decides whether the valve is open, not the rate under the strip's centre. A
+    valve that stays closed misses a change only where its strip keeps clear of the border.
+    """
+    marks_s = strip.track.time_s[strip.track.marks]
+    found: list[Step] = []
+    for step in steps:
+        change = step.change
+        missed = step.verdict is Verdict.MISSED
+        if not (missed or (step.verdict is Verdict.MEASURED and not change.border)):
+            found.append(step)
+            continue
+        index = np.flatnonzero(np.abs(marks_s - change.time_s) <= AROUND_S)
+        if change.border:
+            index = index[strip.rates_at(marks_s[index]) > 0.0]
+        clear = strip.grazing[index].all()
+        if clear and missed and step.dry:
+            index = index[:: max(len(index) // 10, 1)]
+            beside = np.abs(marks_s[index] - change.time_s) > (BESIDE_S if change.border else 0.0)
+            clear = strip.track.wholly_inside(
+                prescription, marks_s[index[beside]], widen_m=CLEAR_M
+            ).all()
+        held = replace(step, verdict=Verdict.BORDER, lag_distance_m=None)
+        found.append(step if clear else held)
+    return found

@@ -1,0 +1,71 @@
+"""What fell on the ground against what was prescribed there: misapplied volume, dose of zones."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.changes import SPEED_MIN_M_S
+from analysis.smoothing import rise_over
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.strips import Strip
+    from companion.core.prescription import Prescription
+
+
+def misapplied_percent(strips: Sequence[Strip]) -> float | None:
+    """Return the volume in the wrong place, too much or too little, over the prescribed one.
+
+    Both are averaged along the track over one PWM period, every 0.1 m, where the strip is wholly
+    in the field. What falls outside is not in it; see `off_target_ml`.
+    """
+    wrong_ml = 0.0
+    asked_ml = 0.0
+    for strip in strips:
+        track = strip.track
+        marks, metres = track.marks, np.gradient(track.distance_m[track.marks])
+        run_m = rise_over(track.distance_m, track.period_steps)[marks]
+        given = rise_over(track.volume_ml, track.period_steps)[marks]
+        asked = rise_over(strip.asked_ml, track.period_steps)[marks]
+        counts = strip.grazing & (run_m > SPEED_MIN_M_S * track.period_s)
+        weight = metres[counts] / run_m[counts]
+        wrong_ml += float((np.abs(given - asked)[counts] * weight).sum())
+        asked_ml += float((asked[counts] * weight).sum())
+    return 100.0 * wrong_ml / asked_ml if asked_ml > 0.0 else None
+
+
+def volume_error_percent(
+    strips: Sequence[Strip], prescription: Prescription
+) -> tuple[float | None, dict[str, float]]:
+    """Return applied against prescribed volume, in all and by zone, along what was flown.
+
+    A zone is where the strips' centres are; where zones overlap, their names are joined. Zones
+    that nothing is prescribed for have no error in percent.
+    """
+    given_ml: dict[frozenset[int], float] = defaultdict(float)
+    asked_ml: dict[frozenset[int], float] = defaultdict(float)
+    for strip in strips:
+        inside = [run for run in strip.runs if run.inside]
+        ends_s = np.array([(run.start_s, run.end_s) for run in inside]).reshape(-1, 2)
+        for totals, values in ((given_ml, strip.track.volume_ml), (asked_ml, strip.asked_ml)):
+            volumes = np.diff(strip.track.at(values, ends_s), axis=1)[:, 0]
+            for run, volume_ml in zip(inside, volumes.tolist(), strict=True):
+                totals[run.zones] += volume_ml
+    by_zone = {
+        "+".join(prescription.zones[zone].name for zone in sorted(zones)): _error_percent(
+            given_ml[zones], asked
+        )
+        for zones, asked in asked_ml.items()
+        if asked > 0.0
+    }
+    asked_all = sum(asked_ml.values())
+    overall = _error_percent(sum(given_ml.values()), asked_all) if asked_all > 0.0 else None
+    return overall, by_zone
+
+
+def _error_percent(given_ml: float, asked_ml: float) -> float:
+    return 100.0 * (given_ml - asked_ml) / asked_ml

@@ -1,0 +1,172 @@
+"""How well a flight put the prescription on the ground: every metric, in one call.
+
+Used by the demo, the report and the benchmarks, so that a figure means the same everywhere. Signs:
++ is too late, further along the track. docs/metrics.md has the definitions; the modules beside
+this one have one metric each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from analysis.border import BorderCrossing, border_crossings, held_by_border, off_target_ml
+from analysis.dose import misapplied_percent, volume_error_percent
+from analysis.flight_record import FlightMeta, FlightRecord, whole_boom
+from analysis.flow_accuracy import flow_accuracy
+from analysis.lag import Step, Verdict, measure_steps
+from analysis.published import P1_RESULTS
+from analysis.settled import SettledStep, measure_settled
+from analysis.strips import Strip, strips_of
+from analysis.switches import Switch, switches_of
+
+__all__ = [
+    "P1_RESULTS",
+    "Distances",
+    "Evaluation",
+    "FlightMeta",
+    "FlightRecord",
+    "evaluate",
+    "limit_ratio",
+    "whole_boom",
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Distances:
+    """Signed distances in metres, summed up; None without any."""
+
+    mean: float | None
+    mean_abs: float | None
+    max_abs: float | None
+    min: float | None
+    max: float | None
+    count: int
+
+    @staticmethod
+    def of(values_m: Iterable[float | None]) -> Distances:
+        """Return the summary of the values that there are."""
+        values = np.array([value for value in values_m if value is not None])
+        if not len(values):
+            return Distances(mean=None, mean_abs=None, max_abs=None, min=None, max=None, count=0)
+        return Distances(
+            mean=float(values.mean()),
+            mean_abs=float(np.abs(values).mean()),
+            max_abs=float(np.abs(values).max()),
+            min=float(values.min()),
+            max=float(values.max()),
+            count=len(values),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluation:
+    """Every metric of one flight; None where the flight had nothing to measure it on.
+
+    `apart` and `missed` go with `lag_distance_m`; the settled lag has its own. `steps`,
+    `settled_steps`, `crossings` and `switches` are each single one, for pictures and tables.
+    """
+
+    meta: FlightMeta
+    lag_distance_m: Distances
+    apart: int
+    missed: int
+    settled_lag_distance_m: Distances
+    settled_apart: int
+    settled_missed: int
+    spraying_accuracy_percent: float | None
+    settled_accuracy_percent: float | None
+    starting_accuracy_percent: float | None
+    misapplied_percent: float | None
+    border_margin_m: Distances
+    off_target_ml: float
+    gap_m2: float
+    overlap_m2: float
+    volume_error_percent: float | None
+    zone_volume_error_percent: dict[str, float]
+    applied_ml: float
+    steps: tuple[Step, ...]
+    settled_steps: tuple[SettledStep, ...]
+    crossings: tuple[BorderCrossing, ...]
+    switches: tuple[Switch, ...]
+
+    def as_json(self, *, limit_ratio: float | None = None) -> dict[str, object]:
+        """Return one entry of the results' `flights`; `limit_ratio` needs a second flight."""
+        settled = asdict(self.settled_lag_distance_m)
+        settled |= {"apart": self.settled_apart, "missed": self.settled_missed}
+        return {
+            **asdict(self.meta),
+            "lag_distance_m": asdict(self.lag_distance_m),
+            "settled_lag_distance_m": settled,
+            "spraying_accuracy_percent": self.spraying_accuracy_percent,
+            "misapplied_percent": self.misapplied_percent,
+            "limit_ratio": limit_ratio,
+            "settled_accuracy_percent": self.settled_accuracy_percent,
+            "starting_accuracy_percent": self.starting_accuracy_percent,
+            "border_margin_m": asdict(self.border_margin_m),
+            "off_target_ml": self.off_target_ml,
+            "missed": self.missed,
+            "apart": self.apart,
+            "gap_m2": self.gap_m2,
+            "overlap_m2": self.overlap_m2,
+            "volume_error_percent": self.volume_error_percent,
+            "zone_volume_error_percent": dict(self.zone_volume_error_percent),
+            "applied_ml": self.applied_ml,
+        }
+
+
+def evaluate(record: FlightRecord) -> Evaluation:
+    """Return every metric of a flight."""
+    strips = strips_of(record)
+    steps = [_steps(strip, record) for strip in strips]
+    switches = [
+        switch
+        for strip, each in zip(strips, steps, strict=True)
+        for switch in switches_of(strip, each)
+    ]
+    crossings = [c for strip in strips for c in border_crossings(strip, record.prescription)]
+    whole = strips_of(whole_boom(record))[0]
+    settled = measure_settled(whole.track, whole.stretches, record.orders)
+    accuracy = flow_accuracy(strips)
+    volume_error, zone_errors = volume_error_percent(strips, record.prescription)
+    all_steps = [step for each in steps for step in each]
+    inside = [step for step in all_steps if not step.change.border]
+    return Evaluation(
+        meta=record.meta,
+        lag_distance_m=Distances.of(step.lag_distance_m for step in inside),
+        apart=sum(step.verdict not in (Verdict.MEASURED, Verdict.MISSED) for step in inside),
+        missed=sum(step.verdict is Verdict.MISSED for step in all_steps),
+        settled_lag_distance_m=Distances.of(step.lag_distance_m for step in settled),
+        settled_apart=sum(step.small for step in settled),
+        settled_missed=sum(not step.small and step.lag_distance_m is None for step in settled),
+        spraying_accuracy_percent=accuracy.all_percent,
+        settled_accuracy_percent=accuracy.settled_percent,
+        starting_accuracy_percent=accuracy.starting_percent,
+        misapplied_percent=misapplied_percent(strips),
+        border_margin_m=Distances.of(crossing.margin_m for crossing in crossings),
+        off_target_ml=off_target_ml(strips, record.prescription),
+        gap_m2=sum(switch.gap_m2 for switch in switches),
+        overlap_m2=sum(switch.overlap_m2 for switch in switches),
+        volume_error_percent=volume_error,
+        zone_volume_error_percent=zone_errors,
+        applied_ml=float((record.volume_ml[-1] - record.volume_ml[0]).sum()),
+        steps=tuple(all_steps),
+        settled_steps=tuple(settled),
+        crossings=tuple(crossings),
+        switches=tuple(switches),
+    )
+
+
+def limit_ratio(flight: Evaluation, perfect: Evaluation) -> float | None:
+    """Return the misapplied volume over that of the same flight with perfect knowledge."""
+    if flight.misapplied_percent is None or not perfect.misapplied_percent:
+        return None
+    return flight.misapplied_percent / perfect.misapplied_percent
+
+
+def _steps(strip: Strip, record: FlightRecord) -> list[Step]:
+    """Return the steps of one strip; what the border held back is no change missed."""
+    steps = measure_steps(strip.track, strip.stretches, strip.orders, record.duty_limits)
+    return held_by_border(strip, record.prescription, steps)

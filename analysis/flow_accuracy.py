@@ -1,0 +1,86 @@
+"""P1's spraying accuracy: the total flow against the flow that the rates under the boom ask for.
+
+SA_k = (1 - |S'_k - S_k| / S_k) 100 %, SA = mean of SA_k (P1 Eqs. 18 and 19). It says nothing where
+nothing is prescribed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.changes import SPEED_MIN_M_S
+from analysis.smoothing import rise_over
+from analysis.transitions import ML_M_PER_L_HA_M
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.strips import Strip
+    from analysis.track import Bools, Floats
+
+SAMPLE_S = 0.01
+SETTLED_AFTER_S = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowAccuracy:
+    """Spraying accuracy of all samples, of those settled and of those after a start [%].
+
+    None where there is no such sample: short zones never settle.
+    """
+
+    all_percent: float | None
+    settled_percent: float | None
+    starting_percent: float | None
+
+
+def flow_accuracy(strips: Sequence[Strip]) -> FlowAccuracy:
+    """Return P1's SA of the total flow, one-period mean, sampled every 10 ms."""
+    track = strips[0].track
+    every = max(round(SAMPLE_S / track.step_s), 1)
+    time_s = track.time_s[::every]
+    given = np.zeros(len(time_s))
+    asked = np.zeros(len(time_s))
+    inside = np.ones(len(time_s), dtype=np.bool_)
+    moving = track.speed_m_s[::every] > SPEED_MIN_M_S
+    for strip in strips:
+        each = strip.track
+        given += rise_over(each.volume_ml, each.period_steps)[::every] / each.period_s
+        metres_s = each.speed_m_s[::every] * each.across_m[::every]
+        asked += strip.rates_at(time_s) * ML_M_PER_L_HA_M * metres_s
+        inside &= strip.inside_at(time_s)
+    counts = inside & moving & (asked > 0.0)
+    accuracy = 100.0 * (1.0 - np.abs(given - asked)[counts] / asked[counts])
+    changed_s, started_s = _since(strips, time_s[counts])
+    return FlowAccuracy(
+        all_percent=_mean(accuracy),
+        settled_percent=_mean(accuracy[changed_s >= SETTLED_AFTER_S]),
+        starting_percent=_mean(accuracy[started_s < SETTLED_AFTER_S]),
+    )
+
+
+def _since(strips: Sequence[Strip], time_s: Floats) -> tuple[Floats, Floats]:
+    """Return the time since any strip's last change of rate, and since the boom's last start."""
+    starts = [run.start_s for strip in strips for run in strip.stretches]
+    edges_s = np.unique(np.array(starts))
+    # Between two edges every rate is constant: any time between them tells.
+    middles_s = np.append(0.5 * (edges_s[1:] + edges_s[:-1]), edges_s[-1] + 1e-6)
+    sprays = np.zeros(len(edges_s), dtype=np.bool_)
+    for strip in strips:
+        sprays |= strip.rates_at(middles_s) > 0.0
+    begins: Bools = sprays & ~np.concatenate(([False], sprays[:-1]))
+    return _last(edges_s, time_s), _last(edges_s[begins], time_s)
+
+
+def _last(events_s: Floats, time_s: Floats) -> Floats:
+    """Return the time since the last event; infinite before the first."""
+    padded = np.concatenate(([-np.inf], events_s))
+    since: Floats = time_s - padded[np.searchsorted(padded, time_s, "right") - 1]
+    return since
+
+
+def _mean(values: Floats) -> float | None:
+    return float(values.mean()) if len(values) else None

@@ -1,0 +1,188 @@
+"""The volume-equivalent step of every change, and how far it lies from its boundary.
+
+With V(s) the volume that a valve has dropped up to the along-track distance s, the flow before a
+change is a line V = V0 + q0 (s - s0), the flow after it another one. A sharp step that delivers
+the same volume stands where the lines meet. Each line goes through one point near the change and
+has the slope of up to twenty periods; both are taken from smoothed volume and distance, so that
+neither the pulses' phase nor the speed matters.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from analysis.changes import Change, changes_of
+from analysis.transitions import (
+    SmoothTrack,
+    Transition,
+    find_transitions,
+    prescribed_dose_ml_m,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.changes import Run
+    from analysis.track import Track
+    from companion.core.types import TimedChange
+
+SMALLEST_STEP = 0.08
+DWELL_MIN_S = 0.5
+PERIODS_MAX = 20
+PERIODS_MIN = 3
+MISSED_BELOW = 0.5
+# Below this part of the prescribed dose a valve is closed.
+DRY_BELOW = 0.02
+# A valve is saturated when its clamped duty leaves the dose this far from what is asked.
+SATURATED_ERROR = 0.05
+
+
+class Verdict(StrEnum):
+    """What became of a change; all but the first and the last count apart.
+
+    `border`: the strip reaches over the border there, which may rightly hold its valve closed.
+    """
+
+    MEASURED = "measured"
+    SMALL = "small"
+    CLOSE = "close"
+    SATURATED = "saturated"
+    BORDER = "border"
+    MISSED = "missed"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """A change and its volume-equivalent step; + is too late. None where it is not measured.
+
+    Borders have one too: the switches' gaps and overlaps come from it. `dry` says that the valve
+    was closed before or after, where something is prescribed.
+    """
+
+    change: Change
+    verdict: Verdict
+    dry: bool
+    lag_distance_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Line:
+    """The volume against the distance, around one point."""
+
+    distance_m: float
+    volume_ml: float
+    slope_ml_m: float
+
+
+def measure_steps(
+    track: Track,
+    stretches: Sequence[Run],
+    orders: Sequence[TimedChange],
+    duty_limits: tuple[float, float],
+) -> list[Step]:
+    """Return the step of every change of one valve; `orders` are that valve's."""
+    changes = changes_of(track, stretches)
+    smooth = SmoothTrack(track)
+    transitions = find_transitions(smooth, stretches, changes)
+    steps: list[Step] = []
+    for i, change in enumerate(changes):
+        if change is None:
+            continue
+        transition, pair = transitions[i], (stretches[i], stretches[i + 1])
+        asked = (
+            prescribed_dose_ml_m(track, change.before_l_ha, change.time_s),
+            prescribed_dose_ml_m(track, change.after_l_ha, change.time_s),
+        )
+        dry = any(
+            given < DRY_BELOW * dose
+            for given, dose in zip(transition.levels_ml_m, asked, strict=True)
+        )
+        verdict = _verdict(change, pair, transition)
+        if (
+            min(asked) > 0.0
+            and verdict in (Verdict.MEASURED, Verdict.MISSED)
+            and any(
+                _is_saturated(orders, duty_limits, stretch, doses)
+                for stretch, *doses in zip(pair, asked, transition.levels_ml_m, strict=True)
+            )
+        ):
+            verdict = Verdict.SATURATED
+        lag_m = None
+        if verdict is Verdict.MEASURED:
+            lag_m = _lag_distance_m(smooth, change, transitions, i)
+            verdict = Verdict.CLOSE if lag_m is None else verdict
+        steps.append(Step(change=change, verdict=verdict, dry=dry, lag_distance_m=lag_m))
+    return steps
+
+
+def _verdict(change: Change, stretches: tuple[Run, Run], transition: Transition) -> Verdict:
+    if not change.relative >= SMALLEST_STEP:
+        return Verdict.SMALL
+    if not all(stretch.dwell_s >= DWELL_MIN_S for stretch in stretches):
+        return Verdict.CLOSE
+    if not transition.progress >= MISSED_BELOW:
+        return Verdict.MISSED
+    return Verdict.MEASURED if transition.found else Verdict.CLOSE
+
+
+def _lag_distance_m(
+    smooth: SmoothTrack, change: Change, transitions: Sequence[Transition], i: int
+) -> float | None:
+    """Return step less boundary; None where a window would reach over a neighbouring change."""
+    track = smooth.track
+    floor_s = transitions[i - 1].settled_s if i > 0 else float(track.time_s[0])
+    last_s = float(track.time_s[-1])
+    ceiling_s = transitions[i + 1].begin_s if i + 1 < len(transitions) else last_s
+    before = _line(smooth, transitions[i].begin_s, floor_s, closed=change.before_l_ha == 0.0)
+    after = _line(smooth, transitions[i].settled_s, ceiling_s, closed=change.after_l_ha == 0.0)
+    if before is None or after is None or before.slope_ml_m == after.slope_ml_m:
+        return None
+    rise_ml = after.volume_ml - before.volume_ml
+    rise_ml += before.slope_ml_m * before.distance_m - after.slope_ml_m * after.distance_m
+    return rise_ml / (before.slope_ml_m - after.slope_ml_m) - change.distance_m
+
+
+def _line(smooth: SmoothTrack, near_s: float, far_s: float, *, closed: bool) -> _Line | None:
+    """Return the line of the flow between a change (`near_s`) and a neighbour (`far_s`)."""
+    track = smooth.track
+    if closed:
+        distance_m = track.value(track.distance_m, near_s)
+        return _Line(
+            distance_m=distance_m,
+            volume_ml=track.value(track.volume_ml, near_s),
+            slope_ml_m=0.0,
+        )
+    away_s = track.period_s if far_s > near_s else -track.period_s
+    # The smoothing reaches one period to each side of both points.
+    periods = min(int((far_s - near_s) / away_s) - 2, PERIODS_MAX)
+    if periods < PERIODS_MIN:
+        return None
+    anchor_s = near_s + away_s
+    distance_m, volume_ml = smooth.at(anchor_s)
+    slope = smooth.dose_between(*sorted((anchor_s, anchor_s + periods * away_s)))
+    return _Line(distance_m=distance_m, volume_ml=volume_ml, slope_ml_m=slope)
+
+
+def _is_saturated(
+    orders: Sequence[TimedChange],
+    duty_limits: tuple[float, float],
+    stretch: Run,
+    doses_ml_m: Sequence[float],
+) -> bool:
+    """Return whether a stretch's duty is at a limit and its dose short of what is asked, or over.
+
+    A valve that gives nothing is not at its limit; it does not work. A switch on or off is placed
+    by the flow's own level and needs no limit.
+    """
+    middle_s = stretch.start_s + 0.5 * stretch.dwell_s
+    number = bisect_right(orders, middle_s, key=lambda order: order.at_s)
+    asked, given = doses_ml_m
+    if not number:
+        return False
+    duty = orders[number - 1].duty
+    short = duty >= duty_limits[1] and DRY_BELOW < given / asked < 1.0 - SATURATED_ERROR
+    over = 0.0 < duty <= duty_limits[0] and given > asked * (1.0 + SATURATED_ERROR)
+    return short or over

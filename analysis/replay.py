@@ -1,0 +1,157 @@
+"""Replay: feed the recorded inputs to the core again and compare every decision.
+
+The core is a function of set-up, inputs and times, and the journal has all three; so the same
+program must decide the same, to the last bit. A difference means that the core has changed, that
+rows are missing, or, with overrides, what would have been decided otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from analysis.overrides import override
+from companion.core.controller import Memory, Setup, step
+from companion.core.estimator import Track, estimate, observe
+from companion.core.types import Decision, Input
+from companion.record.codec import FIELD_NAMES, FieldNames, encode
+from companion.record.reader import Entry, JournalContent, read_journal
+
+
+class Core(Protocol):
+    """What is replayed: it observes inputs and decides at given times."""
+
+    def observe(self, item: Input) -> None:
+        """Take in one input."""
+
+    def decide(self, now_s: float) -> Decision:
+        """Return the decision of `now_s`."""
+
+
+class FlownCore:
+    """The core as `vrspray run` drives it."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self._track = Track()
+        self._memory = Memory()
+
+    def observe(self, item: Input) -> None:
+        """Take in one input."""
+        self._track = observe(self._track, item, self._setup)
+
+    def decide(self, now_s: float) -> Decision:
+        """Return the decision of `now_s`."""
+        state = estimate(self._track, now_s)
+        decision, self._memory = step(self._setup, state, self._memory, now_s)
+        return decision
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayResult:
+    """How many decisions were made again, and how many came out differently."""
+
+    inputs: int
+    decisions: int
+    differences: int
+    first_difference: str | None
+    lost: int
+    is_closed: bool
+    is_what_if: bool
+
+
+def replay(
+    path: Path,
+    *,
+    overrides: Sequence[str] = (),
+    core: Callable[[Setup], Core] = FlownCore,
+) -> ReplayResult:
+    """Return what the core decides today on the inputs of `path`.
+
+    `overrides` ("lag.on_s=0.12") change the set-up first: a what-if, whose differences are its
+    result. JournalError for a file that cannot be used, ConfigError for a wrong override.
+    """
+    content = read_journal(path)
+    flown = core(override(content.setup, overrides))
+    inputs = decisions = differences = 0
+    first: str | None = None
+    for entry in content.entries:
+        if not entry.is_decision:
+            item = content.value(entry)
+            if not isinstance(item, Decision):
+                flown.observe(item)
+            inputs += 1
+            continue
+        decisions += 1
+        difference = _difference(content, entry, flown)
+        if difference is not None:
+            differences += 1
+            first = first or f"decision {decisions}: {difference}"
+    return ReplayResult(
+        inputs=inputs,
+        decisions=decisions,
+        differences=differences,
+        first_difference=first,
+        lost=content.lost,
+        is_closed=content.is_closed,
+        is_what_if=bool(overrides),
+    )
+
+
+def _difference(content: JournalContent, entry: Entry, core: Core) -> str | None:
+    """Return where the decision made now differs from the recorded one; None where it does not."""
+    recorded = content.value(entry)
+    if not isinstance(recorded, Decision):
+        return "is no decision"
+    decided = encode(core.decide(recorded.now_s))
+    if decided == entry.body:
+        return None
+    was = _named(json.loads(entry.body), content.field_names)
+    found = first_difference(was, _named(json.loads(decided), FIELD_NAMES))
+    return None if found is None else f"at {recorded.now_s!r} s, {found}"
+
+
+def _named(plain: Any, names: FieldNames) -> Any:
+    """Return the journal's plain form with the names of the fields in it."""
+    if isinstance(plain, list):
+        return [_named(item, names) for item in plain]
+    if not isinstance(plain, dict):
+        return plain
+    ((kind, content),) = plain.items()
+    if kind in names:
+        return dict(zip(names[kind], (_named(item, names) for item in content), strict=True))
+    return _named(content, names)
+
+
+def first_difference(was: Any, now: Any, path: str = "") -> str | None:
+    """Return the first place where two plain values differ; NaN equals NaN, 0.0 is not -0.0.
+
+    A field that only one of them has is a difference of versions, not of decisions.
+
+    >>> first_difference({"a": [1.0, 2.0]}, {"a": [1.0, 2.5]})
+    'a[1] was 2.0, is 2.5'
+    """
+    if isinstance(was, dict) and isinstance(now, dict):
+        pairs = [(was[key], now[key], f"{path}.{key}".strip(".")) for key in was if key in now]
+    elif isinstance(was, list) and isinstance(now, list) and len(was) == len(now):
+        pairs = [(a, b, f"{path}[{i}]") for i, (a, b) in enumerate(zip(was, now, strict=True))]
+    else:
+        return None if _same(was, now) else f"{path} was {_short(was)}, is {_short(now)}"
+    return next((found for pair in pairs if (found := first_difference(*pair)) is not None), None)
+
+
+def _same(was: Any, now: Any) -> bool:
+    if isinstance(was, float) and isinstance(now, float):
+        if math.isnan(was) or math.isnan(now):
+            return math.isnan(was) and math.isnan(now)
+        return was == now and math.copysign(1.0, was) == math.copysign(1.0, now)
+    return type(was) is type(now) and bool(was == now)
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,95 @@
+"""Everything about one strip that more than one metric needs, computed once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.changes import Run, find_runs, stretches_of
+from analysis.track import Bools, Floats, Track, tracks_of
+from analysis.transitions import ML_M_PER_L_HA_M
+
+if TYPE_CHECKING:
+    from analysis.flight_record import FlightRecord
+    from companion.core.prescription import Prescription
+    from companion.core.types import TimedChange
+
+# Sideways over the border by less than this is no border crossing: aircraft hold a line to some
+# centimetres, and the outer strip of a field often ends on its border. What it drops there is
+# counted all the same, as off target.
+GRAZE_M = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Strip:
+    """A track, its runs by zone and by rate, and where it is wholly in the field.
+
+    `whole` and `grazing` are at the track's marks: the strip lies in the field; it does so but
+    for `GRAZE_M` at either end. `asked_ml` is the cumulative prescribed volume at every sample.
+    """
+
+    track: Track
+    runs: tuple[Run, ...]
+    stretches: tuple[Run, ...]
+    orders: tuple[TimedChange, ...]
+    whole: Bools
+    grazing: Bools
+    asked_ml: Floats
+
+    def rates_at(self, time_s: Floats) -> Floats:
+        """Return the prescribed rate under the strip's centre at any times."""
+        starts_s = np.array([run.start_s for run in self.stretches])
+        rates = np.array([run.rate_l_ha for run in self.stretches])
+        found: Floats = rates[np.clip(np.searchsorted(starts_s, time_s, "right") - 1, 0, None)]
+        return found
+
+    def inside_at(self, time_s: Floats) -> Bools:
+        """Return where the strip lies in the field, but for `GRAZE_M`, at any times."""
+        marks_s = self.track.time_s[self.track.marks]
+        after = np.clip(np.searchsorted(marks_s, time_s), 1, len(marks_s) - 1)
+        return self.grazing[after - 1] & self.grazing[after]
+
+
+def strips_of(record: FlightRecord) -> list[Strip]:
+    """Return the strips of all valves, left to right."""
+    return [_strip(track, record) for track in tracks_of(record)]
+
+
+def _strip(track: Track, record: FlightRecord) -> Strip:
+    runs = find_runs(track, record.prescription)
+    stretches = stretches_of(runs)
+    whole, grazing = _inside(track, record.prescription)
+    return Strip(
+        track=track,
+        runs=tuple(runs),
+        stretches=tuple(stretches),
+        orders=tuple(order for order in record.orders if order.valve == track.valve),
+        whole=whole,
+        grazing=grazing,
+        asked_ml=_asked_ml(track, stretches),
+    )
+
+
+def _inside(track: Track, prescription: Prescription) -> tuple[Bools, Bools]:
+    marks_s = track.time_s[track.marks]
+    whole = track.wholly_inside(prescription, marks_s)
+    grazing = whole.copy()
+    index = np.flatnonzero(~whole)
+    grazing[index] = track.wholly_inside(prescription, marks_s[index], widen_m=-GRAZE_M)
+    return whole, grazing
+
+
+def _asked_ml(track: Track, stretches: list[Run]) -> Floats:
+    """Return the cumulative prescribed volume at every sample; exact across boundaries."""
+    starts_s = np.array([run.start_s for run in stretches])
+    rates = np.array([run.rate_l_ha for run in stretches])
+    knots_s = np.union1d(track.time_s, starts_s)
+    middle_s = 0.5 * (knots_s[1:] + knots_s[:-1])
+    rate = rates[np.clip(np.searchsorted(starts_s, middle_s, "right") - 1, 0, None)]
+    metres = np.diff(track.at(track.distance_m, knots_s))
+    drops = rate * ML_M_PER_L_HA_M * track.at(track.across_m, middle_s) * metres
+    total = np.concatenate(([0.0], np.cumsum(drops)))
+    asked: Floats = total[np.searchsorted(knots_s, track.time_s)]
+    return asked

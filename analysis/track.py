@@ -1,0 +1,136 @@
+"""The true path of one valve's strip over the ground, and what it dropped along it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from analysis.smoothing import rise_over
+
+if TYPE_CHECKING:
+    from analysis.flight_record import FlightRecord
+    from companion.core.prescription import Prescription
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+MARK_SPACING_M = 0.09
+# A strip's ends may touch the border: tiled strips do, and arithmetic is not exact.
+TOUCH_M = 0.001
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """One strip: its centre's path, the along-track distance, its volume.
+
+    `across_m` is the strip's width across the motion. `marks` are samples between which no point
+    of the strip moves by more than about 0.1 m (or one step, where a step is longer).
+    """
+
+    valve: int
+    width_m: float
+    step_s: float
+    period_s: float
+    time_s: Floats
+    east_m: Floats
+    north_m: Floats
+    heading_rad: Floats
+    distance_m: Floats
+    speed_m_s: Floats
+    across_m: Floats
+    volume_ml: Floats
+    marks: Ints
+
+    @property
+    def period_steps(self) -> float:
+        """Return the PWM period in samples."""
+        return self.period_s / self.step_s
+
+    def at(self, values: Floats, time_s: Floats) -> Floats:
+        """Return one of the arrays at any times."""
+        return np.interp(time_s, self.time_s, values)
+
+    def value(self, values: Floats, time_s: float) -> float:
+        """Return one of the arrays at one time."""
+        where = min(max((time_s - self.time_s[0]) / self.step_s, 0.0), len(values) - 1.0)
+        i = min(int(where), len(values) - 2)
+        return float(values[i] + (values[i + 1] - values[i]) * (where - i))
+
+    def sample(self, time_s: float) -> int:
+        """Return the sample at or just before a time."""
+        return int(min(max((time_s - self.time_s[0]) / self.step_s, 0.0), len(self.time_s) - 1.0))
+
+    def points(self, time_s: Floats, right_m: Floats | float = 0.0) -> tuple[Floats, Floats]:
+        """Return east and north of the strip's point `right_m` of its centre."""
+        heading = self.at(self.heading_rad, time_s)
+        east_m = self.at(self.east_m, time_s) + np.cos(heading) * right_m
+        north_m = self.at(self.north_m, time_s) - np.sin(heading) * right_m
+        return east_m, north_m
+
+    def wholly_inside(
+        self, prescription: Prescription, time_s: Floats, *, widen_m: float = -TOUCH_M
+    ) -> Bools:
+        """Return where the whole strip, widened at both ends, lies in the field."""
+        half_m = max(0.5 * self.width_m + widen_m, 0.25 * self.width_m)
+        left, right = self.points(time_s, -half_m), self.points(time_s, half_m)
+        ends = np.stack((np.stack(left, axis=-1), np.stack(right, axis=-1)), axis=1)
+        shapely.prepare(prescription.field)
+        lines = shapely.linestrings(ends)
+        return np.asarray(shapely.contains_properly(prescription.field, lines), dtype=np.bool_)
+
+
+def in_field(prescription: Prescription, east_m: Floats, north_m: Floats) -> Bools:
+    """Return which points lie in the field; fast on very many."""
+    shapely.prepare(prescription.field)
+    return np.asarray(shapely.contains_xy(prescription.field, east_m, north_m), dtype=np.bool_)
+
+
+def tracks_of(record: FlightRecord) -> list[Track]:
+    """Return the tracks of all valves, left to right."""
+    return [_track(record, valve) for valve in range(len(record.boom.valves))]
+
+
+def _track(record: FlightRecord, number: int) -> Track:
+    valve = record.boom.valves[number]
+    heading = np.unwrap(np.radians(record.heading_deg))
+    sin, cos = np.sin(heading), np.cos(heading)
+    east_m = record.east_m + sin * valve.forward_m + cos * valve.right_m
+    north_m = record.north_m + cos * valve.forward_m - sin * valve.right_m
+    move_e, move_n = np.diff(east_m), np.diff(north_m)
+    moved_m = np.hypot(move_e, move_n)
+    distance_m = np.concatenate(([0.0], np.cumsum(moved_m)))
+    steps = record.pwm_period_s / record.step_s
+    run_e, run_n = rise_over(east_m, steps), rise_over(north_m, steps)
+    run_m = np.hypot(run_e, run_n)
+    along = np.divide(
+        np.abs(run_e * sin + run_n * cos), run_m, out=np.ones_like(run_m), where=run_m > 1e-6
+    )
+    turned_m = 0.5 * valve.width_m * np.abs(np.diff(heading))
+    travel_m = np.concatenate(([0.0], np.cumsum(moved_m + turned_m)))
+    return Track(
+        valve=number,
+        width_m=valve.width_m,
+        step_s=record.step_s,
+        period_s=record.pwm_period_s,
+        time_s=record.time_s,
+        east_m=east_m,
+        north_m=north_m,
+        heading_rad=heading,
+        distance_m=distance_m,
+        speed_m_s=rise_over(distance_m, steps) / record.pwm_period_s,
+        across_m=valve.width_m * along,
+        volume_ml=np.ascontiguousarray(record.volume_ml[:, number]),
+        marks=_marks(travel_m),
+    )
+
+
+def _marks(travel_m: Floats) -> Ints:
+    """Return samples at most `MARK_SPACING_M` and one step apart, both ends among them."""
+    wanted = np.arange(0.0, travel_m[-1], MARK_SPACING_M)
+    marks = np.searchsorted(travel_m, wanted)
+    return np.unique(np.concatenate(([0], marks, [len(travel_m) - 1]))).astype(np.int64)

@@ -1,0 +1,158 @@
+"""When the flow of one valve goes from one level to the next, and when it has settled.
+
+The levels are the flow's own, not the prescribed ones: a valve that delivers 2 % too much has not
+missed a change. Everything is volume per metre of track, so that a change of speed is no change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.smoothing import rise_over, smoothed
+from analysis.track import Floats, Track
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.changes import Change, Run
+
+# 1 L/ha on 1 m of width is 0.1 mL per metre of track.
+ML_M_PER_L_HA_M = 0.1
+# Where in the time over a stretch its flow counts as its own: late changes have come, early ones
+# of the next stretch have not.
+LEVEL_FROM = 0.50
+LEVEL_TO = 0.88
+# No change is looked for earlier than this before its boundary.
+SEARCH_BEFORE_S = 2.0
+# A sharp step, smoothed by three means over one period, passes a quarter and three quarters of
+# its height this many periods from each other, and lies in the middle between.
+SHARP_QUARTERS_PERIODS = 0.68
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Transition:
+    """The flow leaves one level after `begin_s` and is at the next one before `settled_s`.
+
+    `levels_ml_m` are the doses before and after. `progress` is how much of the prescribed step
+    they differ by: 1 is all of it.
+    """
+
+    begin_s: float
+    middle_s: float
+    settled_s: float
+    progress: float
+    levels_ml_m: tuple[float, float]
+    found: bool
+
+
+class SmoothTrack:
+    """The track's volume and distance, each smoothed alike: a constant dose stays a line."""
+
+    def __init__(self, track: Track) -> None:
+        self.track = track
+        self.volume_ml = smoothed(track.volume_ml, track.period_steps)
+        self.distance_m = smoothed(track.distance_m, track.period_steps)
+        rise_m = rise_over(self.distance_m, track.period_steps)
+        rise_ml = rise_over(self.volume_ml, track.period_steps)
+        moving = rise_m > 0.1 * track.period_s
+        self.dose_ml_m: Floats = np.divide(rise_ml, rise_m, out=np.zeros_like(rise_m), where=moving)
+
+    def at(self, time_s: float) -> tuple[float, float]:
+        """Return the smoothed distance and volume at a time."""
+        track = self.track
+        return track.value(self.distance_m, time_s), track.value(self.volume_ml, time_s)
+
+    def dose_between(self, start_s: float, end_s: float) -> float:
+        """Return the mean dose between two times; 0 where the strip stands."""
+        (start_m, start_ml), (end_m, end_ml) = self.at(start_s), self.at(end_s)
+        return (end_ml - start_ml) / (end_m - start_m) if end_m - start_m > 0.01 else 0.0
+
+
+def level_of(smooth: SmoothTrack, stretch: Run) -> float:
+    """Return the dose [mL/m] that the flow had in a stretch; outside the field it is 0."""
+    if not stretch.inside:
+        return 0.0
+    return smooth.dose_between(
+        stretch.start_s + LEVEL_FROM * stretch.dwell_s, stretch.start_s + LEVEL_TO * stretch.dwell_s
+    )
+
+
+def prescribed_dose_ml_m(track: Track, rate_l_ha: float, time_s: float) -> float:
+    """Return the volume per metre of track that a rate asks of a strip."""
+    return rate_l_ha * track.value(track.across_m, time_s) * ML_M_PER_L_HA_M
+
+
+def find_transitions(
+    smooth: SmoothTrack, stretches: Sequence[Run], changes: Sequence[Change | None]
+) -> list[Transition]:
+    """Return the transition of each pair of neighbouring stretches."""
+    levels = [level_of(smooth, stretch) for stretch in stretches]
+    found: list[Transition] = []
+    for i, change in enumerate(changes):
+        before, after = stretches[i], stretches[i + 1]
+        early_s = max(before.start_s, after.start_s - SEARCH_BEFORE_S)
+        if found:
+            early_s = max(early_s, found[-1].middle_s)
+        late_s = after.start_s + 0.5 * after.dwell_s if not after.inside else after.end_s
+        pair = (levels[i], levels[i + 1])
+        if change is None:
+            found.append(_nominal(smooth.track, after.start_s, 0.0, pair))
+            continue
+        asked = prescribed_dose_ml_m(smooth.track, after.rate_l_ha, after.start_s)
+        asked -= prescribed_dose_ml_m(smooth.track, before.rate_l_ha, after.start_s)
+        progress = (levels[i + 1] - levels[i]) / asked
+        if progress > 0.0 and late_s - early_s > smooth.track.step_s:
+            found.append(_located(smooth, pair, early_s, late_s, progress=progress))
+        else:
+            found.append(_nominal(smooth.track, after.start_s, progress, pair))
+    return found
+
+
+def _nominal(track: Track, at_s: float, progress: float, levels: tuple[float, float]) -> Transition:
+    """Return a stand-in around the boundary, for neighbours' windows to keep off."""
+    return Transition(
+        begin_s=at_s - track.period_s,
+        middle_s=at_s,
+        settled_s=at_s + 3.0 * track.period_s,
+        progress=progress,
+        levels_ml_m=levels,
+        found=False,
+    )
+
+
+def _located(
+    smooth: SmoothTrack,
+    levels: tuple[float, float],
+    early_s: float,
+    late_s: float,
+    *,
+    progress: float,
+) -> Transition:
+    """Return the transition between two levels in a span of time.
+
+    Its middle is the change point of greatest likelihood for known levels: where the integral of
+    what the flow has done of the step, less one half, is least. Clipped to the two levels, so that
+    a third one, of a neighbour that comes early, does not draw it away.
+    """
+    track = smooth.track
+    first, last = track.sample(early_s), track.sample(late_s) + 1
+    part = (smooth.dose_ml_m[first:last] - levels[0]) / (levels[1] - levels[0])
+    metres = np.diff(smooth.distance_m[first : last + 1], append=smooth.distance_m[-1])
+    excess = np.cumsum((np.clip(part, 0.0, 1.0) - 0.5) * metres[: len(part)])
+    middle = first + int(np.argmin(excess))
+    below = np.flatnonzero(part[: middle - first + 1] <= 0.25)
+    above = np.flatnonzero(part[middle - first :] >= 0.75)
+    low_s = track.time_s[first + below[-1]] if len(below) else early_s
+    high_s = track.time_s[middle + above[0]] if len(above) else late_s
+    slow_s = max(high_s - low_s - SHARP_QUARTERS_PERIODS * track.period_s, 0.0)
+    return Transition(
+        begin_s=float(low_s - 0.35 * track.period_s - slow_s),
+        middle_s=float(track.time_s[middle]),
+        settled_s=float(high_s + 1.35 * track.period_s + 3.0 * slow_s),
+        progress=progress,
+        levels_ml_m=levels,
+        found=True,
+    )

@@ -1,0 +1,219 @@
+"""From a configuration to all that is constant in a flight: map, field, boom, lags, limits.
+
+What cannot be flown is refused here, before the take-off: a map above the product's label, a
+boundary that has nothing in common with the map. What can only be delivered at another speed is
+named by `deliverable`, with that speed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+from shapely import MultiPolygon
+
+from companion.config import Config
+from companion.config.tables import PrescriptionTable
+from companion.config.wording import show_value
+from companion.core.controller import Setup
+from companion.core.frame import LocalFrame
+from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.prescription import Prescription
+from companion.core.rate import flow_for_rate
+from companion.errors import ConfigError, MapError
+from companion.maps.build import build_prescription, frame_for
+from companion.maps.model import MapFile, Problem
+from companion.maps.registry import read_area, read_map
+
+# More rates than these are named by their range: the line must stay readable.
+RATES_NAMED_MAX = 6
+
+
+def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
+    """Return the set-up of a flight; the frame is that of the map unless one is given.
+
+    Raises:
+        ConfigError: where the configuration and its files do not go together.
+        MapError: where a file cannot be used.
+    """
+    table = _prescription_table(config)
+    map_file = read_configured_map(config)
+    label = above_label(config, map_file)
+    if label is not None:
+        raise ConfigError(f"{config.path}: {label.text}; {label.fix}")
+    flight_frame = frame if frame is not None else frame_for(map_file)
+    return Setup(
+        frame=flight_frame,
+        prescription=_prescription(config, table, map_file, flight_frame),
+        boom=config.boom(),
+        nozzle_sets=config.nozzle_sets(),
+        pwm=config.pwm_limits(),
+        lag=config.lag_model(),
+        method=config.method(),
+        look_ahead_s=config.look_ahead_s(),
+        limits=config.limits(),
+        border=table.border,
+        border_buffer_m=table.border_buffer_m,
+        across=table.across,
+        lease_s=config.output.lease_s,
+    )
+
+
+def read_configured_map(config: Config) -> MapFile:
+    """Return the map that the configuration names, read as it says."""
+    table = _prescription_table(config)
+    with _naming(config, "prescription.file", table.file):
+        return read_map(
+            config.resolve(table.file),
+            rate_field=table.rate_field,
+            unit=table.unit,
+            crs=table.crs,
+            layer=table.layer,
+        )
+
+
+@contextmanager
+def _naming(config: Config, key: str, value: str) -> Iterator[None]:
+    """Have an error of a map file say which key of the configuration named it."""
+    try:
+        yield
+    except MapError as error:
+        raise MapError(f"{config.path}: {key} = {show_value(value)}: {error}") from error
+
+
+def _area(config: Config, key: str, name: str) -> MultiPolygon:
+    """Return the ground that a file of the configuration covers."""
+    with _naming(config, key, name):
+        return read_area(config.resolve(name))
+
+
+def _prescription_table(config: Config) -> PrescriptionTable:
+    if config.prescription is None:
+        raise ConfigError(
+            f"{config.path}: prescription.file: missing; write the path of the map under "
+            "[prescription]"
+        )
+    return config.prescription
+
+
+def _prescription(
+    config: Config, table: PrescriptionTable, map_file: MapFile, frame: LocalFrame
+) -> Prescription:
+    """Return the map in the flight's frame, on the ground that may be sprayed."""
+    boundary = None
+    if table.boundary is not None:
+        boundary = _area(config, "prescription.boundary", table.boundary)
+    built = build_prescription(
+        map_file,
+        frame,
+        overlap=table.overlap,
+        boundary=boundary,
+        exclusions=[
+            _area(config, f"prescription.exclusions[{number}]", name)
+            for number, name in enumerate(table.exclusions)
+        ],
+        offset_east_m=table.offset_east_m,
+        offset_north_m=table.offset_north_m,
+    )
+    if table.default_rate_l_ha is not None:
+        built = Prescription(
+            built.zones,
+            boundary=built.field,
+            overlap=built.overlap,
+            default_rate_l_ha=table.default_rate_l_ha,
+            sha256=built.sha256,
+        )
+    if not any(zone.polygon.intersects(built.field) for zone in built.zones):
+        raise ConfigError(
+            f"{config.path}: prescription.boundary and prescription.exclusions leave nothing of "
+            f"{map_file.path} to spray; give files of the same field"
+        )
+    return built
+
+
+def above_label(config: Config, map_file: MapFile) -> Problem | None:
+    """Return what is wrong when a rate of the map is above what the product's label allows."""
+    limit_l_ha = config.product.rate_max_l_ha
+    rates = [zone.rate_l_ha for zone in map_file.zones if zone.rate_l_ha is not None]
+    if config.prescription is not None and config.prescription.default_rate_l_ha is not None:
+        rates.append(config.prescription.default_rate_l_ha)
+    if limit_l_ha is None or not rates or max(rates) <= limit_l_ha:
+        return None
+    return Problem(
+        severity="error",
+        code="above-label",
+        text=f"{map_file.path} asks for up to {max(rates):g} L/ha, above "
+        f"product.rate_max_l_ha = {limit_l_ha:g}",
+        fix="lower the map's rates or correct the limit to what the label says",
+    )
+
+
+def deliverable(setup: Setup, speed_m_s: float) -> list[Problem]:
+    """Return what the nozzle sets cannot deliver at `speed_m_s`, and at which speed they could."""
+    rates = {zone.rate_l_ha for zone in setup.prescription.zones}
+    return undelivered(
+        rates | {setup.prescription.default_rate_l_ha or 0.0},
+        sets=setup.nozzle_sets,
+        pwm=setup.pwm,
+        width_m=setup.boom.width_m,
+        speed_m_s=speed_m_s,
+    )
+
+
+def undelivered(
+    rates_l_ha: Iterable[float],
+    *,
+    sets: tuple[NozzleSet, ...],
+    pwm: PwmLimits,
+    width_m: float,
+    speed_m_s: float,
+) -> list[Problem]:
+    """Return which rates are out of the sets' range at a speed; a rate of 0 never is."""
+    low, high = flow_range(sets, pwm)
+    flow = {
+        rate: flow_for_rate(rate, speed_m_s, width_m) for rate in sorted(rates_l_ha) if rate > 0.0
+    }
+    given = f"the nozzle sets deliver {low:.2f} to {high:.2f} L/min"
+    too_much = [rate for rate, flow_l_min in flow.items() if not flow_l_min <= high]
+    too_little = [rate for rate, flow_l_min in flow.items() if not flow_l_min >= low]
+    problems = []
+    if too_much:
+        # Cut down, so that the speed named is one that does.
+        speed = math.floor(100.0 * speed_m_s * high / flow[too_much[-1]]) / 100.0
+        problems.append(
+            Problem(
+                severity="warning",
+                code="rate-too-high",
+                text=f"{_need(too_much, flow, speed_m_s)}; {given}",
+                fix=f"fly at {speed:g} m/s or slower, or fit larger nozzles",
+            )
+        )
+    if too_little:
+        speed = math.ceil(100.0 * speed_m_s * low / flow[too_little[0]]) / 100.0
+        problems.append(
+            Problem(
+                severity="warning",
+                code="rate-too-low",
+                text=f"{_need(too_little, flow, speed_m_s)}; {given}",
+                fix=f"fly at {speed:g} m/s or faster, or fit smaller nozzles",
+            )
+        )
+    return problems
+
+
+def flow_range(sets: tuple[NozzleSet, ...], pwm: PwmLimits) -> tuple[float, float]:
+    """Return the least and the largest flow [L/min] that the sets deliver evenly."""
+    low = min(max(nozzles.flow_min_l_min, nozzles.curve.flow_for(pwm.duty_min)) for nozzles in sets)
+    return low, max(nozzles.flow_max_l_min for nozzles in sets)
+
+
+def _need(rates: list[float], flow: dict[float, float], speed_m_s: float) -> str:
+    """Return in words which flows some rates need; many rates are named by their range."""
+    if len(rates) > RATES_NAMED_MAX:
+        names = f"{len(rates)} rates from {rates[0]:g} to {rates[-1]:g}"
+    else:
+        names = ", ".join(f"{rate:g}" for rate in rates)
+    least, most = flow[rates[0]], flow[rates[-1]]
+    needs = f"{least:.2f}" if len(rates) == 1 else f"{least:.2f} to {most:.2f}"
+    return f"{names} L/ha at {speed_m_s:g} m/s need {needs} L/min"

@@ -1,0 +1,62 @@
+"""What all commands have in common: the JSON option and how an answer is printed."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from companion.maps.model import Problem
+
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a setting, such as lag.on_s=0.12."),
+]
+
+
+def answer(result: Mapping[str, Any], lines: Iterable[str], *, as_json: bool) -> None:
+    """Print the result on stdout: one JSON object, or lines for a person."""
+    if as_json:
+        typer.echo(json.dumps(_finite(result), allow_nan=False))
+        return
+    for line in lines:
+        typer.echo(line)
+
+
+def note(line: str) -> None:
+    """Print what is not the result, on stderr."""
+    typer.echo(line, err=True)
+
+
+def problem_line(problem: Mapping[str, Any]) -> str:
+    """Return a problem as one line."""
+    where = f" ({problem['where']})" if problem["where"] else ""
+    fix = f"; {problem['fix']}" if problem["fix"] else ""
+    return f"{problem['severity']}: {problem['text']}{where}{fix}"
+
+
+def problem_object(problem: Problem) -> dict[str, str]:
+    """Return a problem as it stands in JSON."""
+    return {
+        "severity": problem.severity,
+        "code": problem.code,
+        "text": problem.text,
+        "where": problem.where,
+        "fix": problem.fix,
+    }
+
+
+def _finite(value: Any) -> Any:
+    """Return a value that JSON has: no NaN, no infinity."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value

@@ -1,0 +1,93 @@
+"""`vrspray config`: is the configuration right, what is in force, what may stand in it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from companion.assembly import build_setup, deliverable
+from companion.cli.answer import AsJson, Overrides, answer, problem_line, problem_object
+from companion.config import Config, load
+from companion.config.rules import mismatches, without_effect
+from companion.config.wording import show_value
+from companion.maps.model import Problem
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    help="Check or show a configuration; print its schema.",
+    epilog="Example: vrspray config check examples/anyang/config.toml",
+)
+File = Annotated[Path, typer.Argument(metavar="FILE", help="Configuration, a TOML file.")]
+
+
+@app.command(epilog="Example: vrspray config check examples/anyang/config.toml")
+def check(file: File, overrides: Overrides = None, as_json: AsJson = False) -> None:
+    """Validate a configuration and the files that it names.
+
+    Exit 0: it can be used; 2: it cannot.
+    """
+    config = load(file, overrides=overrides or ())
+    problems = [problem_object(problem) for problem in problems_of(config)]
+    ok = not any(problem["severity"] == "error" for problem in problems)
+    verdict = f"{file}: ok" if ok else f"{file}: refused"
+    answer(
+        {"ok": ok, "path": str(file), "problems": problems},
+        [*map(problem_line, problems), verdict],
+        as_json=as_json,
+    )
+    raise typer.Exit(0 if ok else 2)
+
+
+def problems_of(config: Config) -> list[Problem]:
+    """Return what is wrong or remarkable beyond what a configuration is refused for."""
+    problems = [
+        Problem(severity="error", code="mismatch", text=found.text, where=found.key)
+        for found in mismatches(config)
+    ]
+    problems += [
+        Problem(severity="warning", code="no-effect", text=found.text, where=found.key)
+        for found in without_effect(config)
+    ]
+    if config.prescription is not None:
+        setup = build_setup(config)
+        if config.mission is not None:
+            problems += deliverable(setup, config.mission.speed_m_s)
+    return problems
+
+
+@app.command(epilog="Example: vrspray config show field.toml --set lag.on_s=0.12")
+def show(file: File, overrides: Overrides = None, as_json: AsJson = False) -> None:
+    """Print every effective setting and where it comes from: file, override or default."""
+    settings = load(file, overrides=overrides or ()).settings()
+    answer(
+        {
+            "path": str(file),
+            "settings": {
+                key: {"value": value, "origin": origin} for key, (value, origin) in settings.items()
+            },
+        },
+        (f"{key} = {_toml(value)}  # {origin}" for key, (value, origin) in settings.items()),
+        as_json=as_json,
+    )
+
+
+def _toml(value: Any) -> str:
+    return "(not set)" if value is None else show_value(value, length_max=1000)
+
+
+@app.command(epilog="Example: vrspray config schema > vrspray.schema.json")
+def schema(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", help="Not read: the schema is the same for all files."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print the JSON Schema of the configuration, for editors."""
+    del file
+    document = Config.model_json_schema(by_alias=True)
+    answer(document, [json.dumps(document, indent=2)], as_json=as_json)

@@ -1,0 +1,198 @@
+"""The configuration as a whole: what its tables say together, in types of the core."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, PrivateAttr, model_validator
+from pydantic_core import PydanticCustomError
+
+from companion.config import tables
+from companion.config.rules import contradictions
+from companion.core.boom import Boom, Valve
+from companion.core.interlock import Limits
+from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.schedule import LagModel
+from companion.core.types import Fix, Method
+
+Origin = Literal["file", "override", "default"]
+
+FIXES = {
+    "3d": Fix.FIX_3D,
+    "dgps": Fix.DGPS,
+    "rtk-float": Fix.RTK_FLOAT,
+    "rtk-fixed": Fix.RTK_FIXED,
+}
+
+
+class Config(tables.Table):
+    """The whole file; the conversions to types of the core happen here and nowhere else."""
+
+    version: int = Field(ge=1, le=1, description="of this format")
+    link: tables.LinkTable = tables.LinkTable()
+    prescription: tables.PrescriptionTable | None = None
+    # The method `boom` returns the core's type, so that the table cannot have the name.
+    boom_table: tables.BoomTable = Field(alias="boom")
+    valve: Annotated[
+        tuple[tables.ValveTable, ...], Field(strict=False, min_length=1, max_length=256)
+    ]
+    pwm: tables.PwmTable = tables.PwmTable()
+    nozzle_set: Annotated[
+        tuple[tables.NozzleSetTable, ...], Field(strict=False, min_length=1, max_length=32)
+    ]
+    lag: tables.LagTable
+    output: tables.OutputTable = tables.OutputTable()
+    safety: tables.SafetyTable = tables.SafetyTable()
+    mission: tables.MissionTable | None = None
+    product: tables.ProductTable = tables.ProductTable()
+    flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
+    journal: tables.JournalTable = tables.JournalTable()
+    web: tables.WebTable = tables.WebTable()
+
+    _path: Path = PrivateAttr(default=Path("config.toml"))
+    _source_text: str = PrivateAttr(default="")
+    _origins: dict[str, Origin] = PrivateAttr(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _agree(self) -> Config:
+        for found in contradictions(self):
+            raise PydanticCustomError(
+                "contradiction", "{text}", {"key": found.key, "text": found.text}
+            )
+        return self
+
+    def came_from(self, path: Path, *, source_text: str, origins: dict[str, Origin]) -> Config:
+        """Note the file that this was read from and which of its keys are whose; return self."""
+        self._path, self._source_text, self._origins = path, source_text, origins
+        return self
+
+    @property
+    def path(self) -> Path:
+        """Return the file that this was read from."""
+        return self._path
+
+    @property
+    def source_text(self) -> str:
+        """Return the text of that file, for the record of a flight."""
+        return self._source_text
+
+    def resolve(self, name: str) -> Path:
+        """Return the path of a file that the configuration names, relative to its own folder."""
+        return self._path.parent / name
+
+    def settings(self) -> dict[str, tuple[Any, Origin]]:
+        """Return every effective setting by its dotted key, and where it came from."""
+        found: dict[str, tuple[Any, Origin]] = {}
+        for key, value in leaves(self.model_dump(mode="json", by_alias=True)):
+            found[key] = (value, self._origins.get(key, "default"))
+        return found
+
+    def boom(self) -> Boom:
+        """Return the geometry; strips share the effective width but for a `width_m` of their own.
+
+        With several sets it is the largest whose valves share it: the smaller sets widen it.
+        """
+        largest = max(len(nozzle_set.valves) for nozzle_set in self.nozzle_set)
+        shared_m = self.boom_table.width_m / largest
+        return Boom(
+            width_m=self.boom_table.width_m,
+            height_m=self.boom_table.height_m,
+            valves=tuple(
+                Valve(
+                    name=valve.name,
+                    right_m=valve.right_m,
+                    forward_m=_or(valve.forward_m, self.boom_table.forward_m),
+                    width_m=_or(valve.width_m, shared_m),
+                    channel=valve.channel or 0,
+                )
+                for valve in self.valve
+            ),
+        )
+
+    def nozzle_sets(self) -> tuple[NozzleSet, ...]:
+        """Return the measured sets, from the smallest to the largest flow."""
+        index = {valve.name: number for number, valve in enumerate(self.valve)}
+        sets = [
+            NozzleSet(
+                valves=tuple(sorted(index[name] for name in table.valves)),
+                curve=FlowCurve(duty=table.duty, flow_l_min=table.flow_l_min),
+            )
+            for table in self.nozzle_set
+        ]
+        return tuple(sorted(sets, key=lambda nozzles: nozzles.flow_max_l_min))
+
+    def pwm_limits(self) -> PwmLimits:
+        """Return what the valves can follow."""
+        return PwmLimits(
+            frequency_hz=self.pwm.frequency_hz,
+            duty_min=self.pwm.duty_min,
+            duty_max=self.pwm.duty_max,
+            min_on_s=self.pwm.min_on_s,
+            min_off_s=self.pwm.min_off_s,
+        )
+
+    def lag_model(self) -> LagModel:
+        """Return the identified lags."""
+        lag = self.lag
+        return LagModel(
+            on_s=lag.on_s,
+            off_s=lag.off_s,
+            up_s=lag.up_s,
+            down_s=lag.down_s,
+            on_start_s=lag.on_start_s,
+            off_end_s=lag.off_end_s,
+            output_s=lag.output_s,
+            position_s=lag.position_s,
+            reference=lag.reference,
+        )
+
+    def method(self) -> Method:
+        """Return how changes of rate are placed."""
+        return Method(self.lag.method)
+
+    def look_ahead_s(self) -> float:
+        """Return T = T1 + T2 + T3 of Wang et al. 2024, for the method `look-ahead`."""
+        return sum(self.lag.look_ahead_s)
+
+    def limits(self) -> Limits:
+        """Return what must hold before a valve may open."""
+        safety = self.safety
+        return Limits(
+            modes=frozenset(mode.upper() for mode in safety.modes),
+            position_age_max_s=safety.position_age_max_s,
+            heartbeat_age_max_s=safety.heartbeat_age_max_s,
+            speed_min_m_s=safety.speed_min_m_s,
+            speed_max_m_s=safety.speed_max_m_s,
+            speed_disagreement_max_m_s=safety.speed_disagreement_max_m_s,
+            height_min_m=safety.height_min_m,
+            height_max_m=safety.height_max_m,
+            fix=FIXES[safety.fix],
+            wind_max_m_s=safety.wind_max_m_s,
+            wind_required=safety.wind_required,
+            enable_by=frozenset(safety.enable_by),
+            rc_channel=safety.rc_channel,
+        )
+
+
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
+
+
+def leaves(node: Any, key: str = "") -> list[tuple[str, Any]]:
+    """Return (dotted key, value) of all settings below `node`; lists of tables get an index.
+
+    >>> leaves({"lag": {"on_s": 0.1}, "valve": [{"name": "1"}]})
+    [('lag.on_s', 0.1), ('valve[0].name', '1')]
+    """
+    if isinstance(node, dict):
+        return [
+            leaf
+            for name, value in node.items()
+            for leaf in leaves(value, f"{key}.{name}" if key else str(name))
+        ]
+    if isinstance(node, list) and any(isinstance(item, dict) for item in node):
+        return [
+            leaf for number, item in enumerate(node) for leaf in leaves(item, f"{key}[{number}]")
+        ]
+    return [(key, node)]

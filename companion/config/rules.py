@@ -1,0 +1,247 @@
+"""What the tables must say together: rules that no single key can break.
+
+The first contradiction refuses the file: a sprayer that is half right is wrong.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from companion.core.nozzle import FlowCurve
+
+if TYPE_CHECKING:
+    from companion.config.model import Config
+
+# MAV_CMD_DO_SET_SERVO: ArduPilot has at most 32 outputs (SERVO1 to SERVO32).
+SERVO_OUTPUTS = 32
+# Less than this between closed and full leaves a servo output too few steps for a duty.
+SPAN_MIN_US = 100
+# Passes spaced by another width than the flow law's leave skips or overlaps in every pass.
+SWATH_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contradiction:
+    """A key, what is wrong with its value, and what to write instead."""
+
+    key: str
+    text: str
+
+
+Rule = Iterator[Contradiction]
+
+
+def contradictions(config: Config) -> Rule:
+    """Yield what makes the configuration unusable."""
+    rules: tuple[Callable[[Config], Rule], ...] = (
+        _link, _valves, _channels, _nozzle_sets, _pwm, _lags, _output, _safety, _mission,
+    )  # fmt: skip
+    for rule in rules:
+        yield from rule(config)
+
+
+def mismatches(config: Config) -> Rule:
+    """Yield what `config check` refuses though the parts would run: widths that do not agree."""
+    width_m = config.boom_table.width_m
+    mission = config.mission
+    if mission is not None and not _near(mission.swath_width_m, width_m):
+        yield Contradiction(
+            key="mission.swath_width_m",
+            text=f"more than 2 % from boom.width_m = {width_m:g}; make the two agree",
+        )
+    strips_m = {valve.name: valve.width_m for valve in config.boom().valves}
+    largest = max(config.nozzle_set, key=lambda table: len(table.valves))
+    sum_m = sum(strips_m[name] for name in largest.valves)
+    if not _near(sum_m, width_m):
+        yield Contradiction(
+            key="boom.width_m",
+            text=f"the strips of the valves add up to {sum_m:g} m; correct valve[...].width_m",
+        )
+
+
+def without_effect(config: Config) -> Rule:
+    """Yield settings that this version accepts and does not act on: silence would deceive."""
+    settings = {
+        "flow_trim.enabled": config.flow_trim.enabled,
+        "web.enabled": config.web.enabled,
+        "output.dither_us": config.output.dither_us > 0,
+        "output.return_channel": config.output.return_channel is not None,
+        "output.kind": config.output.kind == "gpio",
+    }
+    for key, is_set in settings.items():
+        if is_set:
+            yield Contradiction(key=key, text="not part of this version, without effect")
+
+
+def _near(value_m: float, reference_m: float) -> bool:
+    return abs(value_m - reference_m) <= SWATH_TOLERANCE * reference_m + 1e-9
+
+
+def _link(config: Config) -> Rule:
+    kind, _, rest = config.link.url.partition(":")
+    port = int(rest.rpartition(":")[2])
+    least = 0 if kind == "udpin" else 1  # 0 lets the system choose the port to listen on
+    if kind != "serial" and not least <= port <= 65535:
+        yield Contradiction(key="link.url", text="no port; write one from 1 to 65535 at the end")
+
+
+def _valves(config: Config) -> Rule:
+    seen: set[str] = set()
+    for number, valve in enumerate(config.valve):
+        if valve.name in seen:
+            yield Contradiction(
+                key=f"valve[{number}].name",
+                text="another valve has this name; give each its own",
+            )
+        seen.add(valve.name)
+    for number, (left, right) in enumerate(pairwise(config.valve), start=1):
+        if not left.right_m < right.right_m:
+            yield Contradiction(
+                key=f"valve[{number}].right_m",
+                text=f"not to the right of valve[{number - 1}] ({left.right_m:g}); "
+                "order the [[valve]] tables from left to right",
+            )
+
+
+def _channels(config: Config) -> Rule:
+    kind = config.output.kind
+    if kind == "none":
+        return
+    channels = {f"valve[{n}].channel": valve.channel for n, valve in enumerate(config.valve)}
+    first = 1 if kind == "servo" else 0
+    last = SERVO_OUTPUTS if kind == "servo" else 1023
+    what = "servo output" if kind == "servo" else "GPIO line"
+    for key, channel in channels.items():
+        if channel is None:
+            yield Contradiction(key=key, text=f"missing; write the {what}, {first} to {last}")
+    if config.output.return_channel is not None:
+        channels["output.return_channel"] = config.output.return_channel
+    counts = Counter(channels.values())
+    for key, channel in channels.items():
+        if channel is not None and not first <= channel <= last:
+            yield Contradiction(key=key, text=f"no {what}; write one from {first} to {last}")
+        if counts[channel] > 1:
+            yield Contradiction(key=key, text=f"used twice; give each valve its own {what}")
+
+
+def _nozzle_sets(config: Config) -> Rule:
+    names = [valve.name for valve in config.valve]
+    used: set[str] = set()
+    for number, table in enumerate(config.nozzle_set):
+        key = f"nozzle_set[{number}]"
+        unknown = [name for name in table.valves if name not in names]
+        if unknown:
+            yield Contradiction(
+                key=f"{key}.valves",
+                text=f'no valve is named "{unknown[0]}"; the valves are '
+                + ", ".join(f'"{name}"' for name in names),
+            )
+        if len(set(table.valves)) != len(table.valves):
+            yield Contradiction(key=f"{key}.valves", text="a valve stands twice; name it once")
+        used.update(table.valves)
+        yield from _curve(table.duty, table.flow_l_min, key)
+    for number, name in enumerate(names):
+        if name not in used:
+            yield Contradiction(
+                key=f"valve[{number}].name",
+                text="in no nozzle_set.valves, so it would never open; add it or remove the valve",
+            )
+
+
+def _curve(duty: tuple[float, ...], flow_l_min: tuple[float, ...], key: str) -> Rule:
+    if len(duty) != len(flow_l_min):
+        yield Contradiction(
+            key=f"{key}.flow_l_min",
+            text=f"{len(flow_l_min)} flows for {len(duty)} duties; write one flow for each duty",
+        )
+        return
+    try:
+        FlowCurve(duty=duty, flow_l_min=flow_l_min)
+    except ValueError as error:
+        which = "duty" if str(error).startswith("duty") else "flow_l_min"
+        rule = str(error).partition(", got")[0].partition(":")[0]
+        yield Contradiction(
+            key=f"{key}.{which}", text=f"{rule}; write the measured points in order of duty"
+        )
+
+
+def _pwm(config: Config) -> Rule:
+    pwm = config.pwm
+    if not pwm.duty_min < pwm.duty_max:
+        yield Contradiction(
+            key="pwm.duty_min", text=f"not below pwm.duty_max = {pwm.duty_max:g}; write less"
+        )
+    if not pwm.min_on_s + pwm.min_off_s < 1.0 / pwm.frequency_hz:
+        yield Contradiction(
+            key="pwm.min_on_s",
+            text="with pwm.min_off_s as long as a period of "
+            f"{1.0 / pwm.frequency_hz:.4f} s; write less, or a lower pwm.frequency_hz",
+        )
+    if pwm.valve == "normally-open" and not config.safety.pump_cutoff:
+        yield Contradiction(
+            key="pwm.valve",
+            text="such valves spray when the power fails; spraying needs a relay that cuts the "
+            "pump: fit it and write safety.pump_cutoff = true",
+        )
+
+
+def _lags(config: Config) -> Rule:
+    lag = config.lag
+    if not lag.on_start_s <= lag.on_s:
+        yield Contradiction(
+            key="lag.on_start_s",
+            text=f"first flow after lag.on_s = {lag.on_s:g}; write at most that",
+        )
+    if not lag.off_end_s >= lag.off_s:
+        yield Contradiction(
+            key="lag.off_end_s",
+            text=f"last flow before lag.off_s = {lag.off_s:g}; write at least that",
+        )
+
+
+def _output(config: Config) -> Rule:
+    output = config.output
+    if not abs(output.full_us - output.closed_us) >= SPAN_MIN_US:
+        yield Contradiction(
+            key="output.full_us",
+            text=f"within {SPAN_MIN_US} us of output.closed_us = {output.closed_us}; "
+            "write the two ends of the driver's range, such as 1000 and 2000",
+        )
+
+
+def _safety(config: Config) -> Rule:
+    safety = config.safety
+    for what in ("speed", "height"):
+        unit = "m_s" if what == "speed" else "m"
+        low, high = (getattr(safety, f"{what}_{end}_{unit}") for end in ("min", "max"))
+        if not low < high:
+            yield Contradiction(
+                key=f"safety.{what}_min_{unit}",
+                text=f"not below safety.{what}_max_{unit} = {high:g}; write less",
+            )
+    usable = {
+        way
+        for way in safety.enable_by
+        if way == "command"
+        or (way == "rc" and safety.rc_channel is not None)
+        or (way == "web" and config.web.enabled)
+    }
+    if not usable:
+        yield Contradiction(
+            key="safety.enable_by",
+            text='leaves no way to enable; add "command", or for "rc" set safety.rc_channel, '
+            'or for "web" set web.enabled',
+        )
+
+
+def _mission(config: Config) -> Rule:
+    mission = config.mission
+    if mission is not None and not mission.reserve_l < mission.tank_l:
+        yield Contradiction(
+            key="mission.reserve_l",
+            text=f"not below mission.tank_l = {mission.tank_l:g}; write less",
+        )

@@ -1,0 +1,211 @@
+"""Turning what pydantic and tomllib report into one line that an operator can act on."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic_core import ErrorDetails
+
+VALUE_LENGTH_MAX = 60
+BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+LINE = re.compile(r"at line (\d+)")
+
+WRONG = {
+    "float_type": "not a number",
+    "float_parsing": "not a number",
+    "int_type": "not a whole number",
+    "int_from_float": "not a whole number",
+    "bool_type": "neither true nor false",
+    "string_type": "not text in quotes",
+    "string_pattern_mismatch": "not of this form",
+    "string_too_short": "empty",
+    "string_too_long": "too long",
+    "literal_error": "not known",
+    "greater_than": "out of range",
+    "greater_than_equal": "out of range",
+    "less_than": "out of range",
+    "less_than_equal": "out of range",
+    "finite_number": "not finite",
+    "too_short": "too few entries",
+    "too_long": "too many entries",
+    "tuple_type": "not a list",
+    "model_type": "not a table",
+    "missing": "missing",
+}
+
+
+def show_value(value: Any, *, length_max: int = VALUE_LENGTH_MAX) -> str:
+    """Return a value as one short piece of text, whatever it is."""
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= length_max else f"{text[: length_max - 4]} ..."
+
+
+def say_syntax(path: Path, text: str, message: str) -> str:
+    """Return one line on a file that is no TOML: where, what, and the line itself."""
+    match = LINE.search(message)
+    if match is None:
+        return f"{path}: no TOML: {message}; something is not closed at the end of the file"
+    number = int(match[1])
+    lines = text.splitlines()
+    line = show_value(lines[number - 1].strip()) if number <= len(lines) else "the end"
+    return f"{path}: line {number}: {line}: {message}; write key = value, text in quotes"
+
+
+def say(errors: Sequence[ErrorDetails], raw: dict[str, Any], model: type[BaseModel]) -> str:
+    """Return one line on the first error: key, value, what is wrong, what to write instead.
+
+    An unknown key comes before a missing one: the typing error explains the gap.
+    """
+    schema = model.model_json_schema(by_alias=True)
+    first = min(errors, key=lambda error: error["type"] != "extra_forbidden")
+    others = len({dotted(_locate(error["loc"], raw)[0]) for error in errors}) - 1
+    more = "" if others == 0 else f" (and {others} more problem{'s' if others > 1 else ''})"
+    return _say_one(first, raw, schema) + more
+
+
+def _say_one(error: ErrorDetails, raw: dict[str, Any], schema: dict[str, Any]) -> str:
+    if error["type"] == "contradiction":
+        key, text = error["ctx"]["key"], error["ctx"]["text"]
+        value = _lookup(raw, key)
+        return f"{key}: {text}" if value is None else f"{key} = {show_value(value)}: {text}"
+    steps, value = _locate(error["loc"], raw)
+    key = dotted(steps)
+    if error["type"] == "extra_forbidden":
+        return f"{key} = {show_value(value)}: unknown key; {_nearest(steps, schema)}"
+    node = _schema_at(steps, schema)
+    allowed = f"write {allowed_text(node, schema, str(steps[-1]))}"
+    if node.get("description"):
+        allowed += f" ({node['description']})"
+    wrong = WRONG.get(error["type"], error["msg"])
+    if error["type"] == "missing":
+        return f"{key}: missing; {allowed}"
+    return f"{key} = {show_value(value)}: {wrong}; {allowed}"
+
+
+def dotted(steps: Sequence[str | int]) -> str:
+    """Return a key as a person writes it.
+
+    >>> dotted(("valve", 2, "right_m"))
+    'valve[2].right_m'
+    """
+    text = ""
+    for step in steps:
+        if isinstance(step, int):
+            text += f"[{step}]"
+            continue
+        name = step if BARE_KEY.fullmatch(step) else show_value(step)
+        text += f".{name}" if text else name
+    return text
+
+
+def _locate(loc: Sequence[str | int], raw: Any) -> tuple[list[str | int], Any]:
+    """Return the steps of `loc` that are keys of the file, and the value there.
+
+    Behind the key of a union pydantic names the branch; that is no key.
+    """
+    steps: list[str | int] = []
+    node = raw
+    for step in loc:
+        if not isinstance(node, dict | list):
+            break
+        steps.append(step)
+        if isinstance(node, dict):
+            node = node.get(str(step))
+        else:
+            node = node[step] if isinstance(step, int) and step < len(node) else None
+    return steps, node
+
+
+def _lookup(raw: Any, key: str) -> Any:
+    """Return the value of a dotted key in the file; None where it is not in it."""
+    steps = [int(s) if s.isdigit() else s for s in re.findall(r"[^.\[\]]+", key)]
+    return _locate(steps, raw)[1]
+
+
+def _resolved(node: dict[str, Any], schema: dict[str, Any]) -> dict[str, Any]:
+    """Return a node of the schema without references and without its null branch."""
+    if "$ref" in node:
+        target = schema["$defs"][node["$ref"].rpartition("/")[2]]
+        return {**target, **{key: value for key, value in node.items() if key != "$ref"}}
+    branches = [branch for branch in node.get("anyOf", []) if branch.get("type") != "null"]
+    if len(branches) == 1:
+        rest = {key: value for key, value in node.items() if key != "anyOf"}
+        return {**_resolved(branches[0], schema), **rest}
+    return node
+
+
+def _schema_at(steps: Sequence[str | int], schema: dict[str, Any]) -> dict[str, Any]:
+    node = schema
+    for step in steps:
+        child = node.get("items", {}) if isinstance(step, int) else None
+        if child is None:
+            child = node.get("properties", {}).get(step, {})
+        elif "prefixItems" in node and isinstance(step, int) and step < len(node["prefixItems"]):
+            child = node["prefixItems"][step]
+        node = _resolved(child, schema)
+    return node
+
+
+def _nearest(steps: Sequence[str | int], schema: dict[str, Any]) -> str:
+    known = list(_schema_at(steps[:-1], schema).get("properties", {}))
+    near = difflib.get_close_matches(str(steps[-1]), known, n=1, cutoff=0.5)
+    if near:
+        return f"did you mean {dotted([*steps[:-1], near[0]])}?"
+    table = dotted(steps[:-1])
+    return f"{f'[{table}]' if table else 'the file'} knows {', '.join(known)}"
+
+
+def allowed_text(node: dict[str, Any], schema: dict[str, Any], name: str = "key") -> str:
+    """Return in words what a key of the schema may be."""
+    node = _resolved(node, schema)
+    if "anyOf" in node:
+        return " or ".join(allowed_text(branch, schema, name) for branch in node["anyOf"])
+    if "const" in node:
+        return show_value(node["const"])
+    if "enum" in node:
+        return "one of " + ", ".join(show_value(value) for value in node["enum"])
+    kind = str(node.get("type"))
+    if kind == "array":
+        return _list_text(node, schema, name)
+    if kind in ("number", "integer"):
+        return _number_text(node)
+    texts = {"string": "text in quotes", "boolean": "true or false", "object": f"a table [{name}]"}
+    return texts.get(kind, "another value")
+
+
+def _number_text(node: dict[str, Any]) -> str:
+    low = node.get("minimum")
+    if low is not None and low == node.get("maximum"):
+        return show_value(low)
+    return ("a whole number" if node["type"] == "integer" else "a number") + _range(node)
+
+
+def _list_text(node: dict[str, Any], schema: dict[str, Any], name: str) -> str:
+    if "prefixItems" in node:
+        return "[" + ", ".join(allowed_text(i, schema) for i in node["prefixItems"]) + "]"
+    items = _resolved(node.get("items", {}), schema)
+    if items.get("type") == "object":
+        return f"[[{name}]] tables"
+    least = f"at least {node['minItems']} " if node.get("minItems", 0) > 1 else ""
+    text = allowed_text(items, schema).removeprefix("a ").replace("number", "numbers", 1)
+    return f"a list of {least}{text}"
+
+
+def _range(node: dict[str, Any]) -> str:
+    low, high = node.get("minimum"), node.get("maximum")
+    above, below = node.get("exclusiveMinimum"), node.get("exclusiveMaximum")
+    if low is not None and high is not None:
+        return f" from {low:g} to {high:g}"
+    lower = (
+        f" above {above:g}" if above is not None else f" from {low:g}" if low is not None else ""
+    )
+    upper = (
+        f" up to {high:g}" if high is not None else f" below {below:g}" if below is not None else ""
+    )
+    return lower + upper

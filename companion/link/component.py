@@ -1,0 +1,210 @@
+"""A well-behaved MAVLink component: answers, asks for its streams, speaks when it is due.
+
+No I/O: bytes and times come in, bytes go out through `send`, which says whether they left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeGuard, get_args
+
+from companion.core.types import Decision, Input, OperatorCommand, Telemetry
+from companion.link.announcer import Announcer
+from companion.link.clock import ClockOffset
+from companion.link.codec import Codec
+from companion.link.encode import Encoder
+from companion.link.messages import (
+    AckReceived,
+    CommandReceived,
+    Message,
+    PingReceived,
+    ServoOutput,
+    TimesyncReceived,
+)
+from companion.link.streams import StreamRequest, StreamSupervisor, wanted_streams
+
+DO_SET_SERVO = 183
+DO_SPRAYER = 216
+REQUEST_MESSAGE = 512
+_AUTOPILOT_VERSION = 148
+ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3  # MAV_RESULT
+_TIMESYNC_S = 1.0
+_REBOOT_S = 1.0
+_INPUTS = get_args(Input)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComponentOptions:
+    """Who we are on the link and how often we want to know the position."""
+
+    system_id: int = 0
+    component_id: int = 191
+    position_rate_hz: float = 20.0
+    version: tuple[int, int, int] = (0, 1, 0)
+
+
+class Component:
+    """One component on one link to one vehicle."""
+
+    def __init__(self, options: ComponentOptions, send: Callable[[bytes], bool]) -> None:
+        self._options = options
+        self._send = send
+        self._encoder = Encoder(system_id=options.system_id or 1, component_id=options.component_id)
+        self.codec = Codec(system_id=options.system_id)
+        self._announcer = Announcer(self._encoder)
+        self._supervisor: StreamSupervisor | None = None
+        self._boot_s: float | None = None
+        self.clock = ClockOffset()
+        self._timesync_s = float("-inf")
+        self.servo_output: ServoOutput | None = None
+        self.on_order_ack: Callable[[int], None] | None = None
+
+    @property
+    def is_vehicle_known(self) -> bool:
+        """Whether an autopilot has been heard."""
+        return self.codec.vehicle is not None
+
+    def order(self, channel: int, pulse_us: int) -> bool:
+        """Order a servo output; False where nobody is there to take it."""
+        if not self.is_vehicle_known:
+            return False
+        return self._send(self._encoder.set_servo(channel, pulse_us))
+
+    def fault(self, text: str) -> None:
+        """Tell the operator once of something that does not work."""
+        self._announcer.fault(text)
+
+    def receive(self, data: bytes, received_s: float) -> list[Input]:
+        """Return the inputs in `data`, and answer what wants an answer."""
+        inputs: list[Input] = []
+        for message in self.codec.decode(data, received_s):
+            if self._supervisor is None and self.is_vehicle_known:
+                self._meet(received_s)
+            if _is_input(message):
+                self._watch_boot(message)
+                inputs.append(message)
+            elif isinstance(message, CommandReceived):
+                inputs.extend(self._obey(message))
+            else:
+                self._answer(message)
+        return inputs
+
+    def tick(self, decision: Decision | None, now_s: float) -> None:
+        """Send what is due; called at every step of the control loop, at least at 20 Hz."""
+        for frame in self._announcer.due(decision, now_s):
+            self._send(frame)
+        if self._supervisor is None:
+            return
+        for request in self._supervisor.due(self.codec.vehicle_counts, now_s):
+            self._ask(request)
+        if now_s - self._timesync_s >= _TIMESYNC_S:
+            self._timesync_s = now_s
+            self._send(self._encoder.timesync(0, self.clock.ask(now_s)))
+
+    def link_changed(self, now_s: float) -> None:
+        """Ask for the streams anew: whoever answers now may not have heard us before."""
+        if self.is_vehicle_known:
+            self._meet(now_s)
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _meet(self, now_s: float) -> None:
+        """Take the vehicle's system for ours and ask it for its streams."""
+        vehicle = self.codec.vehicle
+        if vehicle is None:
+            return
+        self._encoder.system_id = vehicle.system_id
+        self._supervisor = StreamSupervisor(may_group=vehicle.is_ardupilot)
+        streams = wanted_streams(
+            position_rate_hz=self._options.position_rate_hz, is_px4=vehicle.is_px4
+        )
+        for request in self._supervisor.start(streams, now_s):
+            self._ask(request)
+
+    def _ask(self, request: StreamRequest) -> None:
+        stream = request.stream
+        if request.by_group:
+            self._send(self._encoder.request_data_stream(stream.group, stream.rate_hz))
+        else:
+            self._send(self._encoder.set_message_interval(stream.message_id, stream.rate_hz))
+
+    def _watch_boot(self, item: Input) -> None:
+        """Notice a reboot, after which an autopilot has forgotten what was asked of it."""
+        if not isinstance(item, Telemetry):
+            return
+        if self._boot_s is not None and item.boot_s < self._boot_s - _REBOOT_S:
+            self._meet(item.received_s)
+            self.clock = ClockOffset()
+        self._boot_s = item.boot_s
+        self.clock.position(item.boot_s, item.received_s)
+
+    def _obey(self, command: CommandReceived) -> list[Input]:
+        """Answer a command addressed to us; everything that we do not know is unsupported."""
+        if command.target_component != self._encoder.component_id:
+            return []
+        if command.target_system not in (0, self._encoder.system_id):
+            return []
+        inputs: list[Input] = []
+        result = UNSUPPORTED
+        if command.command == DO_SPRAYER:
+            inputs, result = _spray_command(command)
+        elif command.command == REQUEST_MESSAGE and command.param1 == _AUTOPILOT_VERSION:
+            result = ACCEPTED
+        sender = command.sender
+        self._send(
+            self._encoder.ack(command.command, result, sender.system_id, sender.component_id)
+        )
+        if command.command == REQUEST_MESSAGE and result == ACCEPTED:
+            self._send(self._encoder.autopilot_version(self._options.version))
+        return inputs
+
+    def _answer(self, message: Message) -> None:
+        if isinstance(message, AckReceived):
+            self._take_ack(message)
+        elif isinstance(message, TimesyncReceived):
+            self._take_timesync(message)
+        elif isinstance(message, PingReceived):
+            self._take_ping(message)
+        elif isinstance(message, ServoOutput):
+            self.servo_output = message
+
+    def _take_ack(self, ack: AckReceived) -> None:
+        ours = (self._encoder.system_id, self._encoder.component_id)
+        # 0, 0 is an acknowledgement in the old form, which named nobody.
+        if (ack.target_system, ack.target_component) not in (ours, (0, 0)):
+            return
+        if ack.command == DO_SET_SERVO and self.on_order_ack is not None:
+            self.on_order_ack(ack.result)
+
+    def _take_timesync(self, message: TimesyncReceived) -> None:
+        if message.tc1_ns == 0:
+            now_ns = round(message.received_s * 1e9)
+            self._send(self._encoder.timesync(now_ns, message.ts1_ns))
+            return
+        vehicle = self.codec.vehicle
+        if vehicle is not None and message.sender.system_id == vehicle.system_id:
+            self.clock.answer(message.tc1_ns, message.ts1_ns, message.received_s)
+
+    def _take_ping(self, ping: PingReceived) -> None:
+        if (ping.target_system, ping.target_component) == (0, 0):
+            sender = ping.sender
+            self._send(
+                self._encoder.ping(
+                    ping.time_us, ping.sequence, sender.system_id, sender.component_id
+                )
+            )
+
+
+def _is_input(message: Message) -> TypeGuard[Input]:
+    return isinstance(message, _INPUTS)
+
+
+def _spray_command(command: CommandReceived) -> tuple[list[Input], int]:
+    """Return the operator's wish in DO_SPRAYER: exactly 1 enables, exactly 0 disables."""
+    if command.param1 not in (0.0, 1.0):
+        return [], DENIED
+    wish = OperatorCommand(
+        received_s=command.received_s, enable=command.param1 == 1.0, source="command"
+    )
+    return [wish], ACCEPTED

@@ -1,0 +1,191 @@
+"""One MAVLink message to one of our types: scale factors, sentinels and flags live here only.
+
+Raw units stay in this file. What a message does not know becomes `None`; what it claims is passed
+on even where it is absurd (latitude 0, NaN), for the core to judge and the journal to keep.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from companion.core.types import (
+    EstimatorReport,
+    Fix,
+    GnssReport,
+    HeartbeatReport,
+    LandedReport,
+    RcReport,
+    SpeedReport,
+    Telemetry,
+    WindReport,
+)
+from companion.link.messages import (
+    AckReceived,
+    CommandReceived,
+    Message,
+    PingReceived,
+    Sender,
+    ServoOutput,
+    TimesyncReceived,
+)
+from companion.link.modes import autopilot_name, mode_name
+
+ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+_INT16_LIMIT = 32767
+_UINT16_MAX = 65535
+# EKF_STATUS_FLAGS: what must be set, and what must not. ArduPilot documents that variances below
+# 0.5 are good, 0.5 to 0.8 acceptable and above 1 bad.
+_EKF_NEEDED = 2 | 16  # VELOCITY_HORIZ, POS_HORIZ_ABS
+_EKF_REFUSED = 128 | 1024 | 32768  # CONST_POS_MODE, UNINITIALIZED, GPS_GLITCHING
+_EKF_VARIANCE_MAX = 0.8
+# ESTIMATOR_STATUS_FLAGS (PX4) share the low bits; the ratios are innovations over their limits.
+_ESTIMATOR_NEEDED = 2 | 16
+_ESTIMATOR_REFUSED = 128 | 1024  # CONST_POS_MODE, GPS_GLITCH
+_ESTIMATOR_RATIO_MAX = 1.0
+
+
+def _position(m: Any, received_s: float) -> Telemetry:
+    return Telemetry(
+        received_s=received_s,
+        boot_s=m.time_boot_ms / 1000.0,
+        latitude_deg=m.lat / 1e7,
+        longitude_deg=m.lon / 1e7,
+        relative_altitude_m=m.relative_alt / 1000.0,
+        velocity_north_m_s=_velocity(m.vx),
+        velocity_east_m_s=_velocity(m.vy),
+        velocity_down_m_s=_velocity(m.vz),
+        heading_deg=None if m.hdg == _UINT16_MAX else m.hdg / 100.0,
+    )
+
+
+def _velocity(velocity_cm_s: int) -> float | None:
+    """Return m/s; the ends of the range are no sprayer's speed but saturated or unknown."""
+    return None if abs(velocity_cm_s) >= _INT16_LIMIT else velocity_cm_s / 100.0
+
+
+def _speed(m: Any, received_s: float) -> SpeedReport:
+    return SpeedReport(received_s=received_s, ground_speed_m_s=m.groundspeed)
+
+
+def _gnss(m: Any, received_s: float) -> GnssReport:
+    # 7 (static) and 8 (precise point positioning) are three-dimensional fixes at least.
+    fix = Fix(m.fix_type) if m.fix_type <= Fix.RTK_FIXED else Fix.FIX_3D
+    accuracy_m = m.h_acc / 1000.0 if m.h_acc else None
+    return GnssReport(received_s=received_s, fix=fix, horizontal_accuracy_m=accuracy_m)
+
+
+def _ekf(m: Any, received_s: float) -> EstimatorReport:
+    healthy = (
+        m.flags & _EKF_NEEDED == _EKF_NEEDED
+        and not m.flags & _EKF_REFUSED
+        and m.velocity_variance < _EKF_VARIANCE_MAX
+        and m.pos_horiz_variance < _EKF_VARIANCE_MAX
+    )
+    return EstimatorReport(received_s=received_s, healthy=healthy)
+
+
+def _estimator(m: Any, received_s: float) -> EstimatorReport:
+    healthy = (
+        m.flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED
+        and not m.flags & _ESTIMATOR_REFUSED
+        and m.vel_ratio < _ESTIMATOR_RATIO_MAX
+        and m.pos_horiz_ratio < _ESTIMATOR_RATIO_MAX
+    )
+    return EstimatorReport(received_s=received_s, healthy=healthy)
+
+
+def _heartbeat(m: Any, received_s: float) -> HeartbeatReport:
+    return HeartbeatReport(
+        received_s=received_s,
+        autopilot=autopilot_name(m.autopilot),
+        armed=bool(m.base_mode & ARMED),
+        mode=mode_name(m.autopilot, m.type, m.custom_mode),
+    )
+
+
+def _landed(m: Any, received_s: float) -> LandedReport:
+    # MAV_LANDED_STATE: 0 unknown, 1 on ground, 2 in air, 3 taking off, 4 landing.
+    in_air = None if m.landed_state == 0 else m.landed_state == 2
+    return LandedReport(received_s=received_s, in_air=in_air)
+
+
+def _wind(m: Any, received_s: float) -> WindReport:
+    return WindReport(received_s=received_s, speed_m_s=m.speed)
+
+
+def _wind_cov(m: Any, received_s: float) -> WindReport:
+    return WindReport(received_s=received_s, speed_m_s=math.hypot(m.wind_x, m.wind_y))
+
+
+def _rc(m: Any, received_s: float) -> RcReport:
+    raw = (getattr(m, f"chan{channel}_raw") for channel in range(1, 19))
+    pulses = tuple(0 if pulse == _UINT16_MAX else pulse for pulse in raw)
+    return RcReport(received_s=received_s, pulse_us=pulses)
+
+
+def _servo(m: Any, received_s: float) -> ServoOutput:
+    pulses = tuple(getattr(m, f"servo{channel}_raw") for channel in range(1, 17))
+    return ServoOutput(received_s=received_s, port=m.port, pulse_us=pulses)
+
+
+def _ack(m: Any, received_s: float) -> AckReceived:
+    return AckReceived(
+        received_s=received_s,
+        command=m.command,
+        result=m.result,
+        target_system=m.target_system,
+        target_component=m.target_component,
+    )
+
+
+def _sender(m: Any) -> Sender:
+    return Sender(system_id=m.get_srcSystem(), component_id=m.get_srcComponent())
+
+
+def _command(m: Any, received_s: float) -> CommandReceived:
+    return CommandReceived(
+        received_s=received_s,
+        sender=_sender(m),
+        target_system=m.target_system,
+        target_component=m.target_component,
+        command=m.command,
+        param1=m.param1,
+        param2=m.param2,
+    )
+
+
+def _timesync(m: Any, received_s: float) -> TimesyncReceived:
+    return TimesyncReceived(received_s=received_s, sender=_sender(m), tc1_ns=m.tc1, ts1_ns=m.ts1)
+
+
+def _ping(m: Any, received_s: float) -> PingReceived:
+    return PingReceived(
+        received_s=received_s,
+        sender=_sender(m),
+        time_us=m.time_usec,
+        sequence=m.seq,
+        target_system=m.target_system,
+        target_component=m.target_component,
+    )
+
+
+Decoder = Callable[[Any, float], Message]
+
+# By message id. What describes the vehicle counts only when its autopilot sent it.
+FROM_VEHICLE: dict[int, Decoder] = {
+    0: _heartbeat,
+    24: _gnss,
+    33: _position,
+    36: _servo,
+    65: _rc,
+    74: _speed,
+    77: _ack,
+    168: _wind,
+    193: _ekf,
+    230: _estimator,
+    231: _wind_cov,
+    245: _landed,
+}
+FROM_ANYONE: dict[int, Decoder] = {4: _ping, 75: _command, 76: _command, 111: _timesync}

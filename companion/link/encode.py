@@ -1,0 +1,119 @@
+"""Our messages to bytes, with one running sequence number."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.link.codec import AUTOPILOT_COMPONENT
+
+_ONBOARD_CONTROLLER = 18
+_AUTOPILOT_INVALID = 8
+_TEXT_MAX = 50
+_NAME_MAX = 10
+# MAV_PROTOCOL_CAPABILITY: COMMAND_INT, MAVLINK2.
+_CAPABILITIES = 8 | 8192
+
+STATE_STANDBY = 3  # MAV_STATE
+STATE_ACTIVE = 4
+STATE_CRITICAL = 5
+
+
+class Encoder:
+    """Encodes as one component; `system_id` follows the vehicle's once that is known."""
+
+    def __init__(self, *, system_id: int, component_id: int) -> None:
+        self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+
+    @property
+    def system_id(self) -> int:
+        """Return the system that we speak as."""
+        return int(self._mav.srcSystem)
+
+    @system_id.setter
+    def system_id(self, system_id: int) -> None:
+        self._mav.srcSystem = system_id
+
+    @property
+    def component_id(self) -> int:
+        """Return the component that we speak as."""
+        return int(self._mav.srcComponent)
+
+    def _pack(self, message: Any) -> bytes:
+        frame = bytes(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return frame
+
+    def heartbeat(self, state: int) -> bytes:
+        """Return a HEARTBEAT of an onboard controller that is no autopilot."""
+        return self._pack(
+            self._mav.heartbeat_encode(_ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, 0, state)
+        )
+
+    def command(self, command: int, *params: float) -> bytes:
+        """Return a COMMAND_LONG to the vehicle's autopilot; what is not given is 0.
+
+        0 and not NaN: ArduPilot denies SET_MESSAGE_INTERVAL with a NaN in parameter 3.
+        """
+        filled = (*params, *([0.0] * (7 - len(params))))
+        return self._pack(
+            self._mav.command_long_encode(self.system_id, AUTOPILOT_COMPONENT, command, 0, *filled)
+        )
+
+    def set_servo(self, channel: int, pulse_us: int) -> bytes:
+        """Return MAV_CMD_DO_SET_SERVO."""
+        return self.command(mavlink.MAV_CMD_DO_SET_SERVO, float(channel), float(pulse_us))
+
+    def set_message_interval(self, message_id: int, rate_hz: float) -> bytes:
+        """Return MAV_CMD_SET_MESSAGE_INTERVAL."""
+        interval_us = round(1e6 / rate_hz)
+        return self.command(
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, float(message_id), float(interval_us)
+        )
+
+    def request_data_stream(self, stream: int, rate_hz: float) -> bytes:
+        """Return REQUEST_DATA_STREAM, the older way to ask, which ArduPilot still obeys."""
+        return self._pack(
+            self._mav.request_data_stream_encode(
+                self.system_id, AUTOPILOT_COMPONENT, stream, max(1, round(rate_hz)), 1
+            )
+        )
+
+    def ack(self, command: int, result: int, system_id: int, component_id: int) -> bytes:
+        """Return the COMMAND_ACK for `system_id`, `component_id`."""
+        return self._pack(
+            self._mav.command_ack_encode(command, result, 0, 0, system_id, component_id)
+        )
+
+    def timesync(self, tc1_ns: int, ts1_ns: int) -> bytes:
+        """Return a TIMESYNC."""
+        return self._pack(self._mav.timesync_encode(tc1_ns, ts1_ns))
+
+    def ping(self, time_us: int, sequence: int, system_id: int, component_id: int) -> bytes:
+        """Return the answer to a PING."""
+        return self._pack(self._mav.ping_encode(time_us, sequence, system_id, component_id))
+
+    def text(self, severity: int, text: str) -> bytes:
+        """Return a STATUSTEXT, cut to its 50 bytes."""
+        return self._pack(
+            self._mav.statustext_encode(severity, text.encode("ascii", "replace")[:_TEXT_MAX])
+        )
+
+    def named_value(self, name: str, value: float, now_s: float) -> bytes:
+        """Return a NAMED_VALUE_FLOAT; ArduPilot writes it into its own log."""
+        boot_ms = round(now_s * 1000.0) & 0xFFFFFFFF
+        return self._pack(
+            self._mav.named_value_float_encode(boot_ms, name.encode("ascii")[:_NAME_MAX], value)
+        )
+
+    def autopilot_version(self, version: tuple[int, int, int]) -> bytes:
+        """Return AUTOPILOT_VERSION with the program's version, release type official."""
+        major, minor, patch = version
+        packed = major << 24 | minor << 16 | patch << 8 | 255
+        nothing = [0] * 8
+        return self._pack(
+            self._mav.autopilot_version_encode(
+                _CAPABILITIES, packed, 0, 0, 0, nothing, nothing, nothing, 0, 0, 0
+            )
+        )

@@ -1,0 +1,73 @@
+"""What the link understands besides the inputs of the core."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from companion.core.types import Input
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sender:
+    """System and component that a message came from."""
+
+    system_id: int
+    component_id: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommandReceived:
+    """COMMAND_LONG or COMMAND_INT, whoever it is for; parameters 5 and 6 are not kept."""
+
+    received_s: float
+    sender: Sender
+    target_system: int
+    target_component: int
+    command: int
+    param1: float
+    param2: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AckReceived:
+    """COMMAND_ACK of the vehicle. It names the command, but not which of several alike."""
+
+    received_s: float
+    command: int
+    result: int
+    target_system: int
+    target_component: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimesyncReceived:
+    """TIMESYNC, a question (`tc1_ns` is 0) or an answer."""
+
+    received_s: float
+    sender: Sender
+    tc1_ns: int
+    ts1_ns: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PingReceived:
+    """PING, still asked by some ground stations."""
+
+    received_s: float
+    sender: Sender
+    time_us: int
+    sequence: int
+    target_system: int
+    target_component: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServoOutput:
+    """SERVO_OUTPUT_RAW: what the autopilot's outputs do, channel 1 first; 0 is no pulse."""
+
+    received_s: float
+    port: int
+    pulse_us: tuple[int, ...]
+
+
+Message = Input | CommandReceived | AckReceived | TimesyncReceived | PingReceived | ServoOutput

@@ -1,0 +1,113 @@
+"""Serial: the autopilot's telemetry port, read and written by readiness of its descriptor."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import termios
+
+import serial
+
+from companion.errors import LinkError
+from companion.link.transport import CLOSE_WAIT_S, LinkUrl, OnBytes, OnChange, Reconnecting
+
+# What waits here is behind what the kernel holds (4 kB on Linux): at 57600 baud 1 kB is 0.18 s.
+_PENDING_MAX = 1024
+_READ_MAX = 4096
+
+
+class SerialTransport(Reconnecting):
+    """A serial device, taken exclusively: two programs on one port corrupt each other."""
+
+    def __init__(self, url: LinkUrl, on_bytes: OnBytes, on_change: OnChange) -> None:
+        super().__init__(url, on_change)
+        self._on_bytes = on_bytes
+        self._port: serial.Serial | None = None
+        self._pending = bytearray()
+        self._emptied = asyncio.Event()
+
+    async def _connect(self) -> None:
+        device, baud = self.url.place, self.url.number
+        try:
+            port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
+        except (OSError, ValueError, termios.error) as error:
+            # SerialException is an OSError.
+            raise LinkError(f"link.url = {self.url.text!r}: {_reason(device, error)}") from error
+        self._port = port
+        self._pending.clear()
+        asyncio.get_running_loop().add_reader(port.fileno(), self._readable)
+
+    def _readable(self) -> None:
+        assert self._port is not None
+        try:
+            data = os.read(self._port.fileno(), _READ_MAX)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if data:
+            self._on_bytes(data)
+        else:
+            # Readable without bytes: the device is gone (unplugged, or the other end hung up).
+            self._drop()
+
+    def send(self, data: bytes) -> bool:
+        """Send now, or as soon as the device takes more; False where too much waits already."""
+        if self._port is None or len(self._pending) + len(data) > _PENDING_MAX:
+            return False
+        self._pending += data
+        self._writable()
+        return self._port is not None
+
+    def _writable(self) -> None:
+        """Write what the device takes; the rest waits for its readiness."""
+        if self._port is None:
+            return
+        loop, descriptor = asyncio.get_running_loop(), self._port.fileno()
+        try:
+            written = os.write(descriptor, self._pending)
+        except BlockingIOError:
+            written = 0
+        except OSError:
+            self._drop()
+            return
+        del self._pending[:written]
+        if self._pending:
+            self._emptied.clear()
+            loop.add_writer(descriptor, self._writable)
+        else:
+            self._emptied.set()
+            loop.remove_writer(descriptor)
+
+    def _drop(self) -> None:
+        """Let the device go, which must happen before it can be opened again."""
+        port, self._port = self._port, None
+        if port is None:
+            return
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(port.fileno())
+        loop.remove_writer(port.fileno())
+        self._pending.clear()
+        self._emptied.set()
+        with contextlib.suppress(OSError, termios.error):
+            port.close()
+        self._lost()
+
+    async def _let_go(self) -> None:
+        if self._pending:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CLOSE_WAIT_S):
+                    await self._emptied.wait()
+        self._drop()
+
+
+def _reason(device: str, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    if isinstance(error, FileNotFoundError) or number == 2:
+        return f"there is no device {device}; plug it in, or see /dev/serial/by-id for its name"
+    if number == 13:
+        return f"no permission for {device}; add this user to the group dialout"
+    if number in (11, 16) or "lock" in str(error):
+        return f"{device} is in use by another program; stop that program"
+    return f"{device} cannot be opened as a serial port ({error}); check device and baud rate"

@@ -1,0 +1,146 @@
+"""From a link URL to something that sends bytes and hands over bytes; no threads, no polling.
+
+`send` never waits and never raises: it returns False where the bytes could not leave, and the
+sender decides whether they are still worth sending later. Old orders are not queued up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from abc import abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from companion.errors import LinkError
+
+OnBytes = Callable[[bytes], None]
+OnChange = Callable[[bool], None]
+
+BACK_OFF_MIN_S, BACK_OFF_MAX_S = 0.5, 5.0
+CLOSE_WAIT_S = 0.5
+_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+
+
+class Transport(Protocol):
+    """An open link."""
+
+    is_up: bool
+
+    def send(self, data: bytes) -> bool:
+        """Send now or not at all; return whether it left."""
+
+    async def close(self) -> None:
+        """Let what was sent go out, for half a second at most, and let go."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkUrl:
+    """A link URL in its parts; `number` is the port or the baud rate."""
+
+    kind: str
+    place: str
+    number: int
+    text: str
+
+
+def parse_url(url: str) -> LinkUrl:
+    """Return the parts of `url`, or raise a `LinkError` that says what to write.
+
+    >>> parse_url("udpin:127.0.0.1:14550").number
+    14550
+    """
+    kind, _, rest = url.partition(":")
+    place, _, number = rest.rpartition(":")
+    if kind not in ("udpin", "udpout", "tcp", "serial") or not place:
+        raise LinkError(f"link.url = {url!r}: not a link; write {_FORMS}")
+    if not (number.isascii() and number.isdigit()):
+        what = "baud rate" if kind == "serial" else "port"
+        raise LinkError(f"link.url = {url!r}: {number!r} is no {what}; write {_FORMS}")
+    value = int(number)
+    if kind != "serial" and not (0 if kind == "udpin" else 1) <= value <= 65535:
+        raise LinkError(f"link.url = {url!r}: port {value} does not exist; write 1 to 65535")
+    return LinkUrl(kind=kind, place=place.strip("[]"), number=value, text=url)
+
+
+async def open_transport(url: str, on_bytes: OnBytes, on_change: OnChange) -> Transport:
+    """Open `url`; raises a `LinkError` of one line that says what it sees and what to change.
+
+    `on_change` is told of every loss and return after that; TCP and serial links come back by
+    themselves, UDP has nothing to lose.
+    """
+    # The kinds are imported where they are needed: pyserial is of no use to a UDP link.
+    parts = parse_url(url)
+    if parts.kind in ("udpin", "udpout"):
+        from companion.link.udp import open_udp
+
+        return await open_udp(parts, on_bytes)
+    link: Reconnecting
+    if parts.kind == "tcp":
+        from companion.link.tcp import TcpTransport
+
+        link = TcpTransport(parts, on_bytes, on_change)
+    else:
+        from companion.link.serial_port import SerialTransport
+
+        link = SerialTransport(parts, on_bytes, on_change)
+    await link.open()
+    return link
+
+
+class Reconnecting:
+    """What links that can be lost have in common: they try again with growing pauses."""
+
+    def __init__(self, url: LinkUrl, on_change: OnChange) -> None:
+        self.url = url
+        self.is_up = False
+        self._on_change = on_change
+        self._again: asyncio.Task[None] | None = None
+        self._closed = False
+
+    async def open(self) -> None:
+        """Connect for the first time; raises a `LinkError`."""
+        await self._connect()
+        self.is_up = True
+
+    @abstractmethod
+    async def _connect(self) -> None:
+        """Connect, or raise a `LinkError` of one line."""
+
+    @abstractmethod
+    def send(self, data: bytes) -> bool:
+        """Send now or not at all; return whether it left."""
+
+    async def close(self) -> None:
+        """Stop trying and let go."""
+        self._closed = True
+        self.is_up = False
+        if self._again is not None:
+            self._again.cancel()
+            await asyncio.gather(self._again, return_exceptions=True)
+            self._again = None
+        await self._let_go()
+
+    @abstractmethod
+    async def _let_go(self) -> None:
+        """Let what was sent go out, and close."""
+
+    def _lost(self) -> None:
+        """Tell of the loss and begin to try again."""
+        if self._closed or not self.is_up:
+            return
+        self.is_up = False
+        self._on_change(False)
+        self._again = asyncio.get_running_loop().create_task(self._try_again())
+
+    async def _try_again(self) -> None:
+        pause_s = BACK_OFF_MIN_S
+        while not self.is_up:
+            await asyncio.sleep(pause_s)
+            try:
+                await self._connect()
+            except LinkError:
+                pause_s = min(2.0 * pause_s, BACK_OFF_MAX_S)
+            else:
+                self.is_up = True
+                self._on_change(True)

@@ -1,0 +1,111 @@
+"""From a map file to the core's `Prescription`, in metres of one frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import get_args
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon
+from shapely.errors import ShapelyError
+
+from companion.core.frame import LocalFrame
+from companion.core.prescription import Overlap, Prescription, Zone
+from companion.maps.local import Area, frame_around, make_valid, project, project_all
+from companion.maps.model import MapFile, map_error
+from companion.maps.overlaps import overlaps
+
+__all__ = ["build_prescription", "frame_for", "project"]
+
+
+def frame_for(map_file: MapFile) -> LocalFrame:
+    """Return the frame whose origin is the centre of the map's bounds."""
+    return frame_around(zone.geometry for zone in map_file.zones)
+
+
+def build_prescription(
+    map_file: MapFile,
+    frame: LocalFrame,
+    *,
+    overlap: str = "error",
+    boundary: MultiPolygon | None = None,
+    exclusions: Sequence[MultiPolygon] = (),
+    offset_east_m: float = 0.0,
+    offset_north_m: float = 0.0,
+) -> Prescription:
+    """Return the prescription of a map, moved by the offset between map and receiver.
+
+    Boundary and exclusions, in longitude and latitude, move with it: the offset is between two
+    sets of coordinates, not between two files. Zones without a rate are left out; under `error`
+    zones that share more than a square metre are refused.
+    """
+    policy = _policy(map_file, overlap)
+    offset_m = (offset_east_m, offset_north_m)
+    if not np.isfinite(offset_m).all():
+        raise ValueError(f"offset is no distance: {offset_m}")
+    try:
+        zones = _zones(map_file, frame, offset_m)
+        if policy == "error":
+            _check_overlaps(map_file, zones)
+        return Prescription(
+            zones,
+            boundary=None if boundary is None else _projected(boundary, frame, offset_m),
+            exclusions=[_projected(area, frame, offset_m) for area in exclusions],
+            overlap=policy,
+            sha256=map_file.sha256,
+        )
+    except ShapelyError as error:
+        raise map_error(
+            map_file.path, f"its polygons cannot be used ({error})", fix="export the map again"
+        ) from None
+
+
+def _policy(map_file: MapFile, overlap: str) -> Overlap:
+    for policy in get_args(Overlap):
+        if policy == overlap:
+            return policy  # type: ignore[no-any-return]
+    raise map_error(
+        map_file.path,
+        f"prescription.overlap is {overlap!r}",
+        fix=f"take one of {', '.join(get_args(Overlap))}",
+    )
+
+
+def _zones(map_file: MapFile, frame: LocalFrame, offset_m: tuple[float, float]) -> list[Zone]:
+    """Return all zones that have a rate, in metres."""
+    rated = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
+    if not rated:
+        raise map_error(
+            map_file.path,
+            f"no zone has a rate in {map_file.rate_field}",
+            fix="name another column with --rate-field (prescription.rate_field)",
+        )
+    degrees = np.array([zone.geometry for zone in rated], dtype=object)
+    local = project_all(degrees, frame, offset_m=offset_m)
+    zones = []
+    for area, source, valid in zip(local, rated, shapely.is_valid(local), strict=True):
+        polygon = area if valid else make_valid(area)
+        if polygon is not None and source.rate_l_ha is not None:
+            zones.append(Zone(name=source.name, polygon=polygon, rate_l_ha=source.rate_l_ha))
+    return zones
+
+
+def _projected(area: Area, frame: LocalFrame, offset_m: tuple[float, float]) -> Area:
+    """Return a boundary or exclusion in metres; rounding can make touching rings cross."""
+    local = project(area, frame, offset_m=offset_m)
+    return local if local.is_valid else (make_valid(local) or MultiPolygon())
+
+
+def _check_overlaps(map_file: MapFile, zones: Sequence[Zone]) -> None:
+    found = overlaps([zone.polygon for zone in zones])
+    if not found:
+        return
+    worst = found[0]
+    more = f" (and {len(found) - 1} more pairs)" if len(found) > 1 else ""
+    raise map_error(
+        map_file.path,
+        f"zones {zones[worst.first].name} and {zones[worst.second].name} overlap by "
+        f"{worst.area_m2:.1f} m2{more}",
+        fix="correct the map, or set prescription.overlap to max, min, mean or last",
+    )

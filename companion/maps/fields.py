@@ -1,0 +1,171 @@
+"""Which column is the rate: exactly one clear candidate, or the operator says which.
+
+A wrong column is a wrong dose on the whole field, so nothing is guessed: a column becomes a
+candidate by its name alone, and two candidates that say different things are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.maps.layer import Column, as_number
+from companion.maps.model import Problem, map_error
+from companion.maps.units import unit_in_name
+
+# What rate columns are called; DBF cuts names at ten characters (`TargetRate`, `Tgt_Rate_l`).
+# Seen in maps: rate, rateInt, dose, DOSE, value, Tgt_Rate; the others are the words of farm
+# software in English, French, Spanish, Italian, Portuguese, German and Chinese.
+_WORDS = frozenset(
+    {
+        "rate", "rates", "apprate", "targetrate", "targetrat", "tgtrate", "rxrate", "ratelha",
+        "dose", "doses", "dosis", "dosage", "dosaggio", "dosi", "appdose", "rx",
+        "prescription", "prescrip", "setpoint", "aufwandmenge", "aufwand", "sollwert",
+        "sollmenge", "lha", "施药量", "用量", "亩用量", "剂量", "喷量",
+    }
+)  # fmt: skip
+_WEAK_WORDS = frozenset(
+    {
+        "value", "values", "val", "amount", "quantity", "menge", "target", "application",
+        "volume", "wert", "valor", "valeur", "quantite", "cantidad", "quantita", "quantidade",
+    }
+)  # fmt: skip
+# Numbers that stand beside a rate and are none.
+_DECOYS = frozenset(
+    {
+        "area", "areas", "ha", "acres", "id", "fid", "oid", "gid", "objectid", "zone", "zones",
+        "zoneid", "level", "class", "classid", "cluster", "rank", "perimeter", "length", "len",
+        "width", "lon", "lat", "longitude", "latitude", "x", "y", "z", "elevation", "altitude",
+        "height", "count", "total", "sum", "percent", "pct", "ndvi", "ndre", "yield", "speed",
+        "time", "date", "year", "price", "cost", "color", "colour", "unit", "min", "max",
+        "mean", "avg", "std", "stdev", "shape",
+    }
+)  # fmt: skip
+STRONG, NAMED, WEAK, NONE = 3, 2, 1, 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """The rate column, and what there is to say about the choice."""
+
+    column: Column
+    problems: tuple[Problem, ...] = ()
+
+
+def words(name: str) -> list[str]:
+    """Return the words of a column's name, in lower case.
+
+    >>> words("Tgt_Rate"), words("rateInt"), words("DOSE_UNIT"), words("area_total")
+    (['tgt', 'rate'], ['rate', 'int'], ['dose', 'unit'], ['area', 'total'])
+    """
+    split = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)
+    return [word for word in re.split(r"[\W_\d]+", split.casefold()) if word]
+
+
+def score(column: Column) -> int:
+    """Return how clearly a column's name says that it holds the rate.
+
+    >>> [score(Column(name=name, values=(), numeric=True)) for name in ("rate", "rateInt", "value")]
+    [3, 2, 1]
+    >>> [score(Column(name=name, values=(), numeric=True)) for name in ("area", "zone", "rate_id")]
+    [0, 0, 0]
+    """
+    parts = words(column.name)
+    if not column.numeric:
+        return NONE
+    if "".join(parts) in _WORDS or unit_in_name(column.name) is not None:
+        return STRONG
+    if any(part in _DECOYS for part in parts):
+        return NONE
+    if any(part in _WORDS for part in parts):
+        return NAMED
+    return WEAK if any(part in _WEAK_WORDS for part in parts) else NONE
+
+
+def choose(columns: Sequence[Column], *, asked: str | None, path: Path) -> Choice:
+    """Return the rate column: the one asked for, or the only one that it can be."""
+    if asked is not None:
+        return Choice(column=_asked(columns, asked, path))
+    usable = [column for column in columns if score(column) and _holds_numbers(column)]
+    strong = [column for column in usable if score(column) >= NAMED]
+    candidates = sorted(strong or usable, key=score, reverse=True)
+    if not candidates:
+        raise map_error(
+            path,
+            f"no column looks like a rate; its numeric columns are {_names(columns)}",
+            fix="name the column with --rate-field (prescription.rate_field)",
+        )
+    if len(candidates) == 1:
+        return Choice(column=candidates[0])
+    return _among(candidates, path)
+
+
+def _asked(columns: Sequence[Column], asked: str, path: Path) -> Column:
+    exact = [column for column in columns if column.name == asked]
+    alike = [column for column in columns if column.name.casefold() == asked.casefold()]
+    found = exact or alike
+    if len(found) != 1:
+        raise map_error(
+            path,
+            f"there is no column {asked!r}"
+            if not found
+            else f"the column {asked!r} is there {len(found)} times",
+            fix=f"take one of {', '.join(column.name for column in columns) or 'none'}"
+            " for --rate-field (prescription.rate_field)",
+        )
+    return found[0]
+
+
+def _holds_numbers(column: Column) -> bool:
+    return any(value is not None for value in column.values)
+
+
+def _names(columns: Sequence[Column]) -> str:
+    return ", ".join(column.name for column in columns if column.numeric) or "none"
+
+
+def _among(candidates: Sequence[Column], path: Path) -> Choice:
+    """Return the one whose values the other candidates repeat, if there is such a one."""
+    best = next((one for one in candidates if _repeated_by(one, candidates)), None)
+    if best is None:
+        names = ", ".join(column.name for column in candidates)
+        raise map_error(
+            path,
+            f"several columns can be the rate and differ: {names}",
+            fix="name one with --rate-field (prescription.rate_field)",
+        )
+    others = ", ".join(column.name for column in candidates if column is not best)
+    problem = Problem(
+        severity="warning",
+        code="several-candidates",
+        text=f"the rate is taken from {best.name}; {others} could be it too, but says the same "
+        "(equal, or rounded to whole numbers) in every record",
+        where=best.name,
+        fix="name the column with --rate-field (prescription.rate_field)",
+    )
+    return Choice(column=best, problems=(problem,))
+
+
+def _repeated_by(best: Column, candidates: Sequence[Column]) -> bool:
+    """Tell whether all others hold the same values, or those values rounded."""
+    try:
+        own = [as_number(value) for value in best.values]
+        return all(
+            _same_or_rounded(own, [as_number(value) for value in other.values])
+            for other in candidates
+            if other is not best
+        )
+    except ValueError:
+        return False
+
+
+def _same_or_rounded(own: list[float | None], other: list[float | None]) -> bool:
+    for one, two in zip(own, other, strict=True):
+        if one is None or two is None:
+            if one is not two:
+                return False
+        elif one != two and not (two.is_integer() and abs(one - two) <= 0.5):
+            return False
+    return True

@@ -1,0 +1,111 @@
+"""What every reader hands over: columns and polygons as they stand in the file.
+
+A reader knows its format and nothing of rates, units or zones; `assemble.py` makes sense of the
+columns in the same way for all formats.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pyproj import CRS
+from shapely import MultiPolygon, Polygon
+
+from companion.maps.model import Problem, map_error
+
+# Bounds on what is read from a file that nobody vouches for. Real maps have at most some
+# 25 000 polygons; a million leaves room for gridded ones.
+MAX_FILE_BYTES = 256 * 1024 * 1024
+MAX_RECORDS = 1_000_000
+MAX_VERTICES = 5_000_000
+
+Value = str | float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """One attribute of all records; `numeric` is what the file declares or all values are."""
+
+    name: str
+    values: tuple[Value, ...]
+    numeric: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layer:
+    """The content of one file; None among `geometries` is explained in `skipped`.
+
+    `crs` None: the file does not say. `unit`: what the file as a whole declares.
+    """
+
+    format: str
+    crs: CRS | None
+    columns: tuple[Column, ...]
+    geometries: tuple[Polygon | MultiPolygon | None, ...]
+    sha256: str
+    unit: str | None = None
+    skipped: dict[int, str] = field(default_factory=dict)
+    problems: tuple[Problem, ...] = ()
+
+
+def as_number(value: Value) -> float | None:
+    """Return a cell as a number, None where it is blank or NaN.
+
+    Text counts when it is a plain decimal number. A decimal comma does not: `1,500` is fifteen
+    hundred to one program and one and a half to another.
+
+    >>> as_number(" 12.5 "), as_number(""), as_number(None)
+    (12.5, None, None)
+    """
+    if value is None or (isinstance(value, str) and not value.strip()):
+        return None
+    number = float(value)
+    return None if math.isnan(number) else number
+
+
+def read_bytes(path: Path) -> bytes:
+    """Return the whole file, whose size is checked first."""
+    try:
+        size_bytes = path.stat().st_size
+        if not size_bytes <= MAX_FILE_BYTES:
+            limit_mb = MAX_FILE_BYTES // 1024**2
+            raise map_error(
+                path,
+                f"the file has {size_bytes // 1024**2} MB, more than {limit_mb} MB",
+                fix="cut the map to one field",
+            )
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise map_error(path, "there is no such file", fix="check the path") from None
+    except (OSError, ValueError) as error:
+        raise map_error(path, f"cannot be read ({error})", fix="check path and rights") from None
+
+
+def digest(parts: Iterable[bytes]) -> str:
+    """Return the SHA-256 of the files' bytes one after the other.
+
+    For a single file this is what `sha256sum` prints.
+    """
+    sha256 = hashlib.sha256()
+    for part in parts:
+        sha256.update(part)
+    return sha256.hexdigest()
+
+
+def check_counts(path: Path, *, records: int, vertices: int) -> None:
+    """Refuse a file that would take the vehicle's memory.
+
+    >>> check_counts(Path("a.shp"), records=10, vertices=100)
+    """
+    for name, count, limit in (
+        ("records", records, MAX_RECORDS),
+        ("vertices", vertices, MAX_VERTICES),
+    ):
+        if not 0 <= count <= limit:
+            raise map_error(
+                path, f"{count} {name} are more than {limit}", fix="cut the map to one field"
+            )

@@ -1,0 +1,127 @@
+"""Units of an application rate: what they are called in files, and how many L/ha each is.
+
+Only volume per area is a rate for a sprayer. Mass per area (kg/ha) needs a density that no map
+states, and volume per time needs speed and width, so both are refused rather than converted.
+"""
+
+from __future__ import annotations
+
+import re
+
+# Litres of each volume, by its usual name. US customary: 1 gal = 231 in^3 = 3.785411784 L
+# exactly, 1 gal = 4 qt = 8 pt = 128 fl oz (NIST Handbook 44, appendix C); the imperial gallon is
+# 4.54609 L (UK Weights and Measures Act 1985). A plain "gal" in a prescription is the US one.
+_LITRES: dict[str, tuple[float, str]] = {
+    "L": (1.0, r"l|lt|ltr|lit|lit(?:er|re)s?|升"),
+    "mL": (1e-3, r"ml|cc|millilit(?:er|re)s?|毫升"),
+    "cL": (1e-2, r"cl|centilit(?:er|re)s?"),
+    "dL": (1e-1, r"dl|decilit(?:er|re)s?"),
+    "hL": (1e2, r"hl|hectolit(?:er|re)s?"),
+    "mm3": (1e-6, r"mm3|mm\^3"),
+    "m3": (1e3, r"m3|m\^3|cubicmet(?:er|re)s?"),
+    "gal": (3.785411784, r"gals?|gallons?|us\.?gals?|us\.?gallons?|gals?\(us\)"),
+    "imp gal": (4.54609, r"imp(?:erial)?\.?gal(?:lon)?s?|uk\.?gal(?:lon)?s?"),
+    "qt": (3.785411784 / 4, r"qts?|quarts?"),
+    "pt": (3.785411784 / 8, r"pts?|pints?"),
+    "fl oz": (3.785411784 / 128, r"fl\.?oz|fluidounces?|floz"),
+}
+# Hectares of each area. 1 ac = 4 046.8564224 m2 (international acre); 1 mu is 1/15 ha.
+_HECTARES: dict[str, tuple[float, str]] = {
+    "ha": (1.0, r"ha|hectares?|公顷"),
+    "ac": (0.40468564224, r"ac|acres?|英亩"),
+    "m2": (1e-4, r"m2|m\^2|m-2|m\^-2|sqm|squaremet(?:er|re)s?"),
+    "mu": (1.0 / 15.0, r"mu|亩"),
+}
+_MASS = r"(?:k|m|µ|u)?g|kgs?|kilo(?:gram)?s?|grams?|t|to|tons?|tonnes?|lbs?|pounds?|oz|cwt|dt"
+_SEPARATOR = r"(?:1?(?:/|per|[·.*_-]|)1?)"
+# "l ha^-1", "l.ha⁻¹", and "gal1ac-1", as ADAPT codes it; with the power no separator is needed.
+_POWER = r"\^?\(?-1\)?"
+_WHOLE = {"gpa": ("gal", "ac"), "lha": ("L", "ha"), "lpha": ("L", "ha")}
+_TIDY = str.maketrans({"²": "2", "³": "3", "⁻": "-", "¹": "1", "\N{MICRO SIGN}": "u", "'": ""})
+
+
+def _plain(unit: str) -> str:
+    return re.sub(r"[\s\[\]]+", "", unit.translate(_TIDY).casefold())
+
+
+def _ratio(amounts: str, areas: str) -> str:
+    return f"(?:{amounts})(?:{_SEPARATOR}(?:{areas})(?:{_POWER})?|1?(?:{areas}){_POWER})"
+
+
+def _parts(unit: str) -> tuple[str, str] | None:
+    """Return the names of volume and area, or None."""
+    plain = _plain(unit)
+    if len(plain) > 40:
+        return None
+    if plain in _WHOLE:
+        return _WHOLE[plain]
+    for area, (_, areas) in _HECTARES.items():
+        for volume, (_, volumes) in _LITRES.items():
+            if re.fullmatch(_ratio(volumes, areas), plain):
+                return volume, area
+    return None
+
+
+def unit_name(unit: str) -> str | None:
+    """Return the unit as this project spells it, or None for what is no volume per area.
+
+    >>> unit_name("l/ha"), unit_name("Litres per hectare"), unit_name("gal1ac-1"), unit_name("gpa")
+    ('L/ha', 'L/ha', 'gal/ac', 'gal/ac')
+    >>> unit_name("kg/ha"), unit_name("L/min"), unit_name("")
+    (None, None, None)
+    """
+    parts = _parts(unit)
+    return None if parts is None else "/".join(parts)
+
+
+def l_ha_per_unit(unit: str) -> float | None:
+    """Return how many L/ha one of this unit is, or None for what is no volume per area.
+
+    rate [L/ha] = rate [unit] * litres of its volume / hectares of its area
+
+    >>> l_ha_per_unit("L/ha")
+    1.0
+    >>> round(l_ha_per_unit("gal/ac"), 4)
+    9.354
+    >>> round(l_ha_per_unit("mL/m2"), 9)
+    10.0
+    >>> round(l_ha_per_unit("L/mu"), 9)
+    15.0
+    >>> round(l_ha_per_unit("mm3/m2"), 9), round(l_ha_per_unit("mL/ha"), 9)
+    (0.01, 0.001)
+    >>> round(l_ha_per_unit("L/ac"), 4), round(l_ha_per_unit("fl oz/ac"), 5)
+    (2.4711, 0.07308)
+    >>> l_ha_per_unit("kg/ha") is None
+    True
+    """
+    parts = _parts(unit)
+    if parts is None:
+        return None
+    return _LITRES[parts[0]][0] / _HECTARES[parts[1]][0]
+
+
+def is_mass_per_area(unit: str) -> bool:
+    """Tell whether this is a rate of something weighed, which no sprayer map can be.
+
+    >>> is_mass_per_area("kg/ha"), is_mass_per_area("lbs/ac"), is_mass_per_area("L/ha")
+    (True, True, False)
+    """
+    areas = "|".join(areas for _, areas in _HECTARES.values())
+    return re.fullmatch(_ratio(_MASS, areas), _plain(unit)[:40]) is not None
+
+
+def unit_in_name(column: str) -> str | None:
+    """Return the unit that a column's name ends with, or None.
+
+    Only spelled-out endings count, with a separator before them: `rate_l_ha`, `Dose (L/ha)`.
+
+    >>> unit_in_name("rate_l_ha"), unit_in_name("Dose (L/ha)"), unit_in_name("rate gal/ac")
+    ('L/ha', 'L/ha', 'gal/ac')
+    >>> unit_in_name("rate"), unit_in_name("alpha")
+    (None, None)
+    """
+    for start in (match.end() for match in re.finditer(r"[\s_(\[]+", column)):
+        tail = column[start:].rstrip(")] ")
+        if unit_name(tail) is not None or is_mass_per_area(tail):
+            return unit_name(tail) or tail
+    return None

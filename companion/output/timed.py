@@ -1,0 +1,177 @@
+"""What all executors have in common: which duty a plan has when, and a timer that keeps to it.
+
+The plan itself says when everything closes, so an executor that hears nothing more closes by
+itself at the end of the lease.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from abc import abstractmethod
+from collections import deque
+from dataclasses import dataclass, field
+from itertools import chain
+
+from companion.core.types import SprayPlan
+
+# Clocks that disagree by less than this agree: a timer may wake early by the loop's resolution.
+_EARLY_S = 1e-6
+_KEPT = 4096
+
+
+def duties_at(plan: SprayPlan, now_s: float) -> tuple[float, ...]:
+    """Return the duty of each valve at `now_s`: all zero once the lease has ended.
+
+    >>> plan = SprayPlan(sequence=1, issued_s=0.0, duty=(0.5,), changes=(), lease_until_s=0.3)
+    >>> duties_at(plan, 0.2), duties_at(plan, 0.3)
+    ((0.5,), (0.0,))
+    """
+    if not now_s < plan.lease_until_s:
+        return (0.0,) * len(plan.duty)
+    duty = list(plan.duty)
+    for change in plan.changes:
+        if not change.at_s <= now_s:
+            break
+        duty[change.valve] = change.duty
+    return tuple(duty)
+
+
+def next_event_s(plan: SprayPlan, now_s: float) -> float | None:
+    """Return when the plan next asks for something, the end of its lease included."""
+    if not now_s < plan.lease_until_s:
+        return None
+    ahead = (change.at_s for change in plan.changes if change.at_s > now_s)
+    return min(chain(ahead, (plan.lease_until_s,)))
+
+
+@dataclass(slots=True)
+class Lateness:
+    """How much later than planned orders were given: the last few thousand, and all in sum."""
+
+    count: int = 0
+    worst_s: float = 0.0
+    recent_s: deque[float] = field(default_factory=lambda: deque(maxlen=_KEPT))
+
+    def add(self, late_s: float) -> None:
+        """Take one order's lateness."""
+        self.count += 1
+        self.worst_s = max(self.worst_s, late_s)
+        self.recent_s.append(late_s)
+
+    def quantile_s(self, fraction: float) -> float | None:
+        """Return the lateness that this fraction of the recent orders does not exceed."""
+        if not self.recent_s:
+            return None
+        ranked = sorted(self.recent_s)
+        return ranked[min(len(ranked) - 1, int(fraction * len(ranked)))]
+
+
+class TimedExecutor:
+    """Follows the newest plan by one timer of the event loop; its clock is `time.monotonic`."""
+
+    def __init__(self, valve_count: int) -> None:
+        self._count = valve_count
+        self._plan: SprayPlan | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._is_running = False
+        self.lateness = Lateness()
+        self.lease_end_count = 0
+
+    @property
+    def fault(self) -> str | None:
+        """Why the outputs cannot be trusted; None while all is well."""
+        return None
+
+    async def start(self) -> None:
+        """Take the outputs and order all of them closed."""
+        self._is_running = True
+        self._close_all()
+        self._arm(asyncio.get_running_loop().time())
+
+    def submit(self, plan: SprayPlan) -> None:
+        """Replace what has not happened yet; an older plan changes nothing, a late one closes."""
+        if not self._is_running:
+            return
+        if len(plan.duty) != self._count:
+            raise ValueError(f"plan for {len(plan.duty)} valves, executor has {self._count}")
+        if self._plan is not None and plan.sequence <= self._plan.sequence:
+            return
+        now_s = asyncio.get_running_loop().time()
+        before, self._plan = self._plan, plan
+        self._follow(now_s, replaced=before)
+        self._arm(now_s)
+
+    async def stop(self) -> None:
+        """Order all outputs closed and let go."""
+        self._is_running = False
+        self._plan = None
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._close_all()
+
+    # ------------------------------------------------------------------------------- inside
+
+    @abstractmethod
+    def _apply(self, valve: int, duty: float) -> bool:
+        """Have `valve` take `duty`; return whether that was news to it."""
+
+    def _close_all(self) -> None:
+        for valve in range(self._count):
+            self._apply(valve, 0.0)
+
+    def _next_own_s(self) -> float | None:
+        """Return when the executor wants to be woken for its own ends."""
+        return None
+
+    def _do_own(self, now_s: float) -> None:
+        """Do what the executor wanted to be woken for."""
+
+    def _wanted(self, now_s: float) -> tuple[float, ...]:
+        """Return the duties to have now; without a plan, and with a fault, closed."""
+        if self._plan is None or self.fault is not None:
+            return (0.0,) * self._count
+        return duties_at(self._plan, now_s + _EARLY_S)
+
+    def _follow(self, now_s: float, *, replaced: SprayPlan | None = None) -> None:
+        """Bring every valve to what it should have now."""
+        clock = asyncio.get_running_loop().time
+        given = [
+            (valve, duty, clock())
+            for valve, duty in enumerate(self._wanted(now_s))
+            if self._apply(valve, duty)
+        ]
+        # Measuring waits until all orders have left.
+        for plan in (self._plan, replaced):
+            if plan is not None and given:
+                self._measure(plan, given)
+
+    def _measure(self, plan: SprayPlan, given: list[tuple[int, float, float]]) -> None:
+        """Note how late orders left, where the plan had said when they should."""
+        due = {(change.valve, change.duty): change.at_s for change in plan.changes}
+        for valve, duty, at_s in given:
+            due_s = due.get((valve, duty))
+            if due_s is not None and due_s <= at_s:
+                self.lateness.add(at_s - due_s)
+
+    def _wake(self) -> None:
+        self._timer = None
+        now_s = asyncio.get_running_loop().time()
+        plan = self._plan
+        if plan is not None and not now_s + _EARLY_S < plan.lease_until_s and not plan.is_off:
+            self.lease_end_count += 1
+        self._follow(now_s)
+        self._do_own(now_s)
+        self._arm(now_s)
+
+    def _arm(self, now_s: float) -> None:
+        """Set the one timer to whatever comes first."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if not self._is_running:
+            return
+        plan_s = None if self._plan is None else next_event_s(self._plan, now_s + _EARLY_S)
+        times = [at_s for at_s in (plan_s, self._next_own_s()) if at_s is not None]
+        if times:
+            self._timer = asyncio.get_running_loop().call_at(min(times), self._wake)

@@ -1,0 +1,107 @@
+"""Values of the core as JSON text and back, exact to the last bit.
+
+Floats are written by `repr` (shortest text that reads back the same), NaN and infinities as
+Python's JSON writes them. A tuple is an array; a dataclass is `{"Name": [values]}` in the order of
+its fields, an enumeration `{"Name": value}`, a set `{"frozenset": [values]}`. The names of the
+fields are kept once a file, so that a version with more fields still reads the older ones.
+Nothing but the core's own types can come out: a journal is read, never executed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from types import ModuleType
+
+import numpy as np
+
+from companion.core import boom, controller, frame, interlock, nozzle, schedule, types
+
+_MODULES = (types, boom, nozzle, schedule, interlock, frame, controller)
+_SCALARS = frozenset({float, int, str, bool, type(None)})
+_SET = "frozenset"
+
+FieldNames = Mapping[str, Sequence[str]]
+
+
+def _core_types(modules: Sequence[ModuleType]) -> dict[str, type]:
+    """Return every dataclass and enumeration that the modules of the core can name."""
+    found: dict[str, type] = {}
+    for module in modules:
+        for name, item in vars(module).items():
+            if not (isinstance(item, type) and item.__module__.startswith("companion.core.")):
+                continue
+            if is_dataclass(item) or issubclass(item, Enum):
+                found[name] = item
+    return found
+
+
+_TYPES = _core_types(_MODULES)
+_FIELDS: dict[type, tuple[str, ...]] = {
+    item: tuple(field.name for field in fields(item) if field.init)
+    for item in _TYPES.values()
+    if is_dataclass(item)
+}
+FIELD_NAMES: FieldNames = {item.__name__: names for item, names in _FIELDS.items()}
+
+
+def to_plain(value: object) -> object:
+    """Return `value` as what JSON knows; ValueError for what is no value of the core."""
+    kind = type(value)
+    if kind in _SCALARS:
+        return value
+    if isinstance(value, tuple):
+        return [to_plain(item) for item in value]
+    names = _FIELDS.get(kind)
+    if names is not None:
+        return {kind.__name__: [to_plain(getattr(value, name)) for name in names]}
+    if isinstance(value, frozenset):
+        return {_SET: [to_plain(item) for item in sorted(value)]}
+    if isinstance(value, Enum):
+        return {kind.__name__: value.value}
+    if isinstance(value, np.generic):
+        return to_plain(value.item())
+    raise ValueError(f"no value of the core: {value!r}")
+
+
+def from_plain(plain: object, field_names: FieldNames) -> object:
+    """Return the value that `to_plain` made `plain` of; ValueError for anything else."""
+    if isinstance(plain, list):
+        return tuple(from_plain(item, field_names) for item in plain)
+    if not isinstance(plain, dict):
+        return plain
+    if len(plain) != 1:
+        raise ValueError(f"one type expected, got {sorted(plain)}")
+    ((name, content),) = plain.items()
+    if name == _SET:
+        return frozenset(from_plain(item, field_names) for item in content)
+    kind = _TYPES.get(name)
+    if kind is None:
+        raise ValueError(f"unknown type {name}")
+    if issubclass(kind, Enum):
+        return kind(content)
+    try:
+        values = [from_plain(item, field_names) for item in content]
+        return kind(**dict(zip(field_names[name], values, strict=True)))
+    except (TypeError, KeyError, ValueError) as error:
+        raise ValueError(f"no {name} of this version: {error}") from error
+
+
+def encode(value: object) -> str:
+    """Return `value` as one line of JSON.
+
+    >>> encode(types.SpeedReport(received_s=0.1, ground_speed_m_s=float("nan")))
+    '{"SpeedReport":[0.1,NaN]}'
+    """
+    return json.dumps(to_plain(value), separators=(",", ":"))
+
+
+def decode(text: str, field_names: FieldNames = FIELD_NAMES) -> object:
+    """Return the value that `encode` wrote; ValueError for anything else.
+
+    >>> decode('{"SpeedReport":[0.1,5.0]}')
+    SpeedReport(received_s=0.1, ground_speed_m_s=5.0)
+    """
+    return from_plain(json.loads(text), field_names)

@@ -1,0 +1,119 @@
+"""The GeoPackage around the journal's tables: header, required tables, geometries as bytes.
+
+OGC 12-128r18 (GeoPackage 1.4): application_id and user_version in the file's header, the tables
+`gpkg_spatial_ref_sys`, `gpkg_contents` and `gpkg_geometry_columns`, geometries as a header of
+eight bytes and well-known binary. No R-tree: its triggers call functions that plain SQLite lacks.
+"""
+
+from __future__ import annotations
+
+import struct
+from datetime import UTC, datetime
+
+APPLICATION_ID = 0x47504B47  # "GPKG"
+USER_VERSION = 10400
+WGS84_ID = 4326
+LOCAL_ID = 100_000  # the flight's own frame: metres east and north of its origin
+_LITTLE_ENDIAN = 0x01
+_EMPTY = 0x10
+_HEADER = struct.Struct("<2sBBi")
+_POINT = struct.Struct("<2sBBiBIdd")
+
+WGS84_WKT = (
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563,'
+    'AUTHORITY["EPSG","7030"]],AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0,'
+    'AUTHORITY["EPSG","8901"]],UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],'
+    'AXIS["Latitude",NORTH],AXIS["Longitude",EAST],AUTHORITY["EPSG","4326"]]'
+)
+
+SCHEMA = f"""
+PRAGMA application_id = {APPLICATION_ID};
+PRAGMA user_version = {USER_VERSION};
+CREATE TABLE gpkg_spatial_ref_sys (
+    srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY, organization TEXT NOT NULL,
+    organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT
+);
+CREATE TABLE gpkg_contents (
+    table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE,
+    description TEXT DEFAULT '',
+    last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ', 'now')),
+    min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER,
+    CONSTRAINT fk_gc_r_srs_id FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys (srs_id)
+);
+CREATE TABLE gpkg_geometry_columns (
+    table_name TEXT NOT NULL, column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL,
+    srs_id INTEGER NOT NULL, z TINYINT NOT NULL, m TINYINT NOT NULL,
+    CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name),
+    CONSTRAINT uk_gc_table_name UNIQUE (table_name),
+    CONSTRAINT fk_gc_tn FOREIGN KEY (table_name) REFERENCES gpkg_contents (table_name),
+    CONSTRAINT fk_gc_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys (srs_id)
+);
+INSERT INTO gpkg_spatial_ref_sys VALUES
+    ('Undefined Cartesian', -1, 'NONE', -1, 'undefined', NULL),
+    ('Undefined geographic', 0, 'NONE', 0, 'undefined', NULL),
+    ('WGS 84', {WGS84_ID}, 'EPSG', {WGS84_ID}, '{WGS84_WKT}', 'longitude, latitude');
+CREATE TABLE applied (
+    sequence INTEGER PRIMARY KEY NOT NULL, geom POINT, time DATETIME, time_s DOUBLE,
+    rate_l_ha DOUBLE, target_flow_l_min DOUBLE, flow_l_min DOUBLE, duty DOUBLE,
+    speed_m_s DOUBLE, course_deg DOUBLE, heading_deg DOUBLE, height_m DOUBLE,
+    inhibits TEXT, valve_rates_l_ha TEXT, valve_duties TEXT
+);
+CREATE TABLE zones (
+    id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY, name TEXT, rate_l_ha DOUBLE
+);
+CREATE TABLE field (id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY);
+CREATE TABLE records (
+    sequence INTEGER PRIMARY KEY NOT NULL, time_s DOUBLE, kind TEXT NOT NULL, body TEXT NOT NULL
+);
+CREATE TABLE events (
+    sequence INTEGER PRIMARY KEY NOT NULL, time DATETIME, time_s DOUBLE, kind TEXT, text TEXT
+);
+CREATE TABLE meta (id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT);
+INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES
+    ('records', 'attributes', 'records', 'every input and decision, in order'),
+    ('events', 'attributes', 'events', 'what happened besides'),
+    ('meta', 'attributes', 'meta', 'set-up, versions, state of the file');
+"""
+
+
+def layer_sql(table: str, description: str, *, geometry: str, srs_id: int) -> str:
+    """Return the statements that register `table` as a layer with a geometry."""
+    return (
+        "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, srs_id) "
+        f"VALUES ('{table}', 'features', '{table}', '{description}', {srs_id});"
+        f"INSERT INTO gpkg_geometry_columns VALUES ('{table}', 'geom', '{geometry}', {srs_id}, "
+        "0, 0);"
+    )
+
+
+def point_blob(longitude_deg: float, latitude_deg: float) -> bytes:
+    """Return a point in WGS84 as GeoPackage bytes."""
+    return _POINT.pack(
+        b"GP", 0, _LITTLE_ENDIAN, WGS84_ID, _LITTLE_ENDIAN, 1, longitude_deg, latitude_deg
+    )
+
+
+def geometry_blob(wkb: bytes, *, srs_id: int, is_empty: bool) -> bytes:
+    """Return well-known binary with the GeoPackage's header before it, without an envelope."""
+    flags = _LITTLE_ENDIAN | (_EMPTY if is_empty else 0)
+    return _HEADER.pack(b"GP", 0, flags, srs_id) + wkb
+
+
+def wkb_of(blob: bytes) -> bytes:
+    """Return the well-known binary of a geometry without an envelope; ValueError otherwise."""
+    if len(blob) < _HEADER.size or blob[:2] != b"GP" or blob[3] & 0x0E:
+        raise ValueError("no GeoPackage geometry of this journal")
+    return blob[_HEADER.size :]
+
+
+def time_text(utc_s: float) -> str | None:
+    """Return seconds since 1970 as the GeoPackage writes a time; None for what is no time.
+
+    >>> time_text(0.25)
+    '1970-01-01T00:00:00.250Z'
+    """
+    try:
+        moment = datetime.fromtimestamp(utc_s, UTC)
+    except (ValueError, OverflowError, OSError):
+        return None
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")

@@ -1,0 +1,285 @@
+"""The journal of a flight: one file that is a GeoPackage, and a recorder that never waits.
+
+The control loop only puts what it has into a bounded queue; everything else happens in the
+writer's thread (`writer.py`). Rows that find the queue full are dropped and counted: a slow disk
+may cost the record of a moment, never the moment itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import queue
+import re
+import sqlite3
+import threading
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from companion.core.controller import Setup
+from companion.core.types import Decision, Input
+from companion.errors import JournalError
+from companion.record.geopackage import SCHEMA
+from companion.record.layers import write_layers
+from companion.record.setup_json import setup_to_json
+from companion.record.writer import Event, Writer
+
+_logger = logging.getLogger(__name__)
+
+JOURNAL_VERSION = "1"
+COMMIT_EVERY_S = 1.0
+QUEUE_ROWS = 10_000  # a minute of 50 decisions and 100 inputs a second
+CLOSE_WITHIN_S = 30.0
+_LIBRARIES = ("vrspray", "numpy", "shapely", "pyproj")
+
+_Row = tuple[int, Input | Decision | Event]
+
+
+class Journal:
+    """Takes down a flight; a `ports.Recorder` that begins with `create` and ends with `close`."""
+
+    def __init__(
+        self,
+        path: Path,
+        connection: sqlite3.Connection,
+        *,
+        setup: Setup,
+        utc_offset_s: float,
+        queue_rows: int = QUEUE_ROWS,
+        waits: bool = False,
+    ) -> None:
+        self.path = path
+        self._waits = waits
+        self._sequence = count(1)
+        self._queue_rows = queue_rows
+        self._rows: queue.SimpleQueue[_Row | None] = queue.SimpleQueue()
+        self._dropped = 0
+        self._closing = threading.Event()
+        self._writer = Writer(
+            connection,
+            frame=setup.frame,
+            utc_offset_s=utc_offset_s,
+            next_sequence=self._sequence.__next__,
+        )
+        self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
+        self._thread.start()
+
+    @classmethod
+    def create(
+        cls,
+        folder: Path,
+        *,
+        setup: Setup,
+        setup_text: Mapping[str, str] | None = None,
+        started_s: float | None = None,
+        queue_rows: int = QUEUE_ROWS,
+        waits: bool = False,
+    ) -> Journal:
+        """Begin the next flight's file in `folder`: flight-0001.gpkg, flight-0002.gpkg, ...
+
+        Numbers and not dates: a board without a clock of its own does not know the date.
+
+        Args:
+            folder: made if it is not there.
+            setup: kept whole, with its ground, so that replay needs no other file.
+            setup_text: whatever else belongs to the record, such as `config_toml`.
+            started_s: what the companion's clock shows now; a simulation has its own.
+            queue_rows: how far the disk may fall behind.
+            waits: for simulations, faster than any disk: wait rather than drop.
+        """
+        now_s = time.monotonic() if started_s is None else started_s
+        started = datetime.now(UTC)
+        meta = {**(setup_text or {}), **_about(setup, started, now_s)}
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            path = _new_file(folder, setup, meta)
+            connection = _open(path)
+        except (OSError, sqlite3.Error) as error:
+            raise JournalError(
+                f"journal folder {folder}: cannot be written ({error}); "
+                "set journal.folder to a folder that can"
+            ) from error
+        return cls(
+            path,
+            connection,
+            setup=setup,
+            utc_offset_s=started.timestamp() - now_s,
+            queue_rows=queue_rows,
+            waits=waits,
+        )
+
+    @property
+    def lost(self) -> int:
+        """Return how many rows are not in the file and never will be."""
+        return self._dropped + self._writer.lost
+
+    @property
+    def committed(self) -> int:
+        """Return how many rows are on the disk for good."""
+        return self._writer.committed
+
+    @property
+    def fault(self) -> str | None:
+        """Return why the last second could not be written; None while all is well."""
+        return self._writer.fault
+
+    def record_input(self, item: Input) -> None:
+        """Take down one input as the core saw it."""
+        self._put(item)
+
+    def record_decision(self, decision: Decision) -> None:
+        """Take down one decision."""
+        self._put(decision)
+
+    def record_event(self, at_s: float, kind: str, text: str) -> None:
+        """Take down what happened besides."""
+        self._put(Event(at_s=at_s, kind=kind, text=text))
+
+    def close(self) -> None:
+        """Write what is left and make one closed file of it; may be called twice."""
+        self._closing.set()
+        self._rows.put(None)  # wakes the writer at once
+        self._thread.join(CLOSE_WITHIN_S)
+        if self._thread.is_alive():
+            _logger.warning("journal %s: the disk did not take it in time", self.path)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _put(self, item: Input | Decision | Event) -> None:
+        row = (next(self._sequence), item)
+        if self._closing.is_set() or not self._has_room():
+            self._dropped += 1
+        else:
+            self._rows.put(row)
+
+    def _has_room(self) -> bool:
+        while not self._rows.qsize() < self._queue_rows:
+            if not (self._waits and self._thread.is_alive()):
+                return False
+            time.sleep(0.001)  # in simulations only: the writer has thousands of rows to go
+        return True
+
+    def _run(self) -> None:
+        due_s = time.monotonic() + COMMIT_EVERY_S
+        try:
+            while True:
+                row = self._next(due_s)
+                if row is not None:
+                    self._writer.write(*row)
+                elif self._closing.is_set() and self._rows.empty():
+                    break
+                if time.monotonic() >= due_s:
+                    self._writer.commit(lost_before=self._dropped)
+                    due_s = time.monotonic() + COMMIT_EVERY_S
+        finally:
+            self._writer.finish(lost_before=self._dropped)
+
+    def _next(self, due_s: float) -> _Row | None:
+        """Return the next row; None when the commit is due or the end has come."""
+        try:
+            if self._closing.is_set():
+                return self._rows.get_nowait()
+            return self._rows.get(timeout=max(due_s - time.monotonic(), 0.001))
+        except queue.Empty:
+            return None
+
+
+def _about(setup: Setup, started: datetime, started_s: float) -> dict[str, str]:
+    """Return what the file says of itself."""
+    about = {
+        "journal_version": JOURNAL_VERSION,
+        "closed": "no",
+        "lost": "0",
+        "started_utc": started.isoformat(),
+        "started_s": repr(started_s),
+        "origin_latitude_deg": repr(setup.frame.latitude_deg),
+        "origin_longitude_deg": repr(setup.frame.longitude_deg),
+        "map_sha256": setup.prescription.sha256,
+        "method": str(setup.method),
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "python": platform.python_version(),
+        "setup": setup_to_json(setup),
+    }
+    for name in _LIBRARIES:
+        try:
+            about[f"version_{name}"] = version(name)
+        except PackageNotFoundError:
+            about[f"version_{name}"] = "unknown"
+    return about
+
+
+def _new_file(folder: Path, setup: Setup, meta: Mapping[str, str]) -> Path:
+    """Make a complete, empty journal beside its place and move it there under the next number.
+
+    A link refuses a name that exists, so two processes never share a file, and whoever looks
+    sees a valid GeoPackage or nothing.
+    """
+    draft = folder / f".new-{os.getpid()}-{threading.get_ident()}.gpkg"
+    draft.unlink(missing_ok=True)
+    try:
+        _write_schema(draft, setup, meta)
+        while True:
+            path = folder / f"flight-{_next_number(folder):04d}.gpkg"
+            try:
+                os.link(draft, path)
+            except FileExistsError:
+                continue
+            except OSError:  # a file system without links, such as a FAT card
+                draft.rename(path)
+            return path
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _next_number(folder: Path) -> int:
+    numbers = (re.fullmatch(r"flight-(\d+)\.gpkg.*", entry.name) for entry in folder.iterdir())
+    return max((int(found[1]) for found in numbers if found), default=0) + 1
+
+
+def _write_schema(path: Path, setup: Setup, meta: Mapping[str, str]) -> None:
+    connection = sqlite3.connect(path, isolation_level=None)
+    try:
+        # Nobody knows the draft yet: one sync at its end instead of one a statement.
+        connection.execute("PRAGMA synchronous = OFF")
+        connection.execute("PRAGMA journal_mode = MEMORY").fetchall()
+        connection.executescript(SCHEMA)
+        write_layers(connection, setup.frame, setup.prescription)
+        connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", meta.items())
+    finally:
+        connection.close()
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    """Open for the flight: a log that survives a cut, and nobody else on the file meanwhile.
+
+    EXCLUSIVE before WAL: no second connection can race with a checkpoint (a bug of SQLite before
+    3.51.3 could corrupt the file then), and there is no shared-memory file.
+    """
+    connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+    for pragma in (
+        "locking_mode = EXCLUSIVE",
+        "journal_mode = WAL",
+        "synchronous = FULL",
+        "wal_autocheckpoint = 0",
+    ):
+        connection.execute(f"PRAGMA {pragma}").fetchall()
+    return connection

@@ -1,0 +1,227 @@
+"""The shell around the core: what arrives becomes inputs, what is decided becomes orders.
+
+One task makes all decisions. It is woken by whatever arrives, and by a timer where nothing does,
+so that leases are renewed while all is well and run out when it is not. However it ends (signal,
+duration, exception, cancellation) the valves are ordered closed first; the `finally` in `run` is
+what makes this true. Nothing is remembered from one run to the next: a restart is disabled.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import gc
+import logging
+import selectors
+import signal
+import threading
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from typing import Any
+
+from companion.core.controller import Memory, Setup, step
+from companion.core.estimator import Track, estimate, observe
+from companion.core.types import Decision, Input, OutputReport
+from companion.ports import PlanExecutor, Recorder, VehicleLink
+
+_logger = logging.getLogger(__name__)
+
+# Between messages a step follows at the latest after this: 20 Hz, as the lease and the sign of
+# life to the autopilot's watchdog (10 Hz) need.
+STEP_MAX_S = 0.05
+
+
+class NoRecorder:
+    """Takes nothing down."""
+
+    def record_input(self, item: Input) -> None:
+        """Forget it."""
+
+    def record_decision(self, decision: Decision) -> None:
+        """Forget it."""
+
+    def record_event(self, at_s: float, kind: str, text: str) -> None:
+        """Forget it."""
+
+
+class ControlLoop:
+    """Inputs to track, track to state, state to decision, decision to executor and link."""
+
+    def __init__(
+        self,
+        setup: Setup,
+        *,
+        link: VehicleLink,
+        executor: PlanExecutor,
+        recorder: Recorder,
+        clock: Callable[[], float],
+    ) -> None:
+        self._setup = setup
+        self._link = link
+        self._executor = executor
+        self._recorder = recorder
+        self._clock = clock
+        self._track = Track()
+        self._memory = Memory()
+        self._reported: tuple[str | None] | None = None
+        self._stepped_s = float("-inf")
+
+    @property
+    def next_step_s(self) -> float:
+        """Return when a step is due even if nothing arrives."""
+        return self._stepped_s + STEP_MAX_S
+
+    def turn(self) -> Decision | None:
+        """Take what came in and decide; without news and before its time, do nothing."""
+        inputs = [*self._link.receive(), *self._output_report()]
+        if not inputs and self._clock() < self.next_step_s:
+            return None
+        for item in inputs:
+            self._recorder.record_input(item)
+            self._track = observe(self._track, item, self._setup)
+        now_s = self._stepped_s = self._clock()
+        state = estimate(self._track, now_s)
+        decision, self._memory = step(self._setup, state, self._memory, now_s)
+        self._carry_out(decision)
+        self._recorder.record_decision(decision)
+        return decision
+
+    def _carry_out(self, decision: Decision) -> None:
+        """Close before anything else; open only after the sign of life that allows it.
+
+        A watchdog on the autopilot that has heard no sign of life would undo an order to open.
+        """
+        if decision.plan.is_off:
+            self._executor.submit(decision.plan)
+            self._link.tell(decision, decision.now_s)
+        else:
+            self._link.tell(decision, decision.now_s)
+            self._executor.submit(decision.plan)
+
+    def _output_report(self) -> Iterator[Input]:
+        """Yield what changed in the way to the valves: the link to the vehicle, or the outputs."""
+        fault = self._executor.fault or self._link.fault
+        if self._reported == (fault,):
+            return
+        first, self._reported = self._reported is None, (fault,)
+        now_s = self._clock()
+        if fault is not None:
+            _logger.warning("outputs: %s", fault)
+            self._link.tell_fault(fault)
+        if not first or fault is not None:
+            self._recorder.record_event(now_s, "outputs", fault or "healthy")
+        yield OutputReport(received_s=now_s, healthy=fault is None, text=fault or "")
+
+
+class _Ending:
+    """Why the run ends, and the event that wakes its task."""
+
+    def __init__(self) -> None:
+        self.wake = asyncio.Event()
+        self.reason: str | None = None
+        self.error: BaseException | None = None
+
+    def end(self, reason: str) -> None:
+        """End for `reason`; the first one counts."""
+        self.reason = self.reason or reason
+        self.wake.set()
+
+    def failed(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Take an exception that left a callback: nothing that runs here may fail unnoticed."""
+        error = context.get("exception")
+        if error is None:
+            loop.default_exception_handler(context)
+            return
+        self.error = self.error or error
+        self.end("exception")
+
+
+async def run(
+    setup: Setup,
+    *,
+    link: VehicleLink,
+    executor: PlanExecutor,
+    recorder: Recorder | None = None,
+    duration_s: float | None = None,
+    clock: Callable[[], float] = time.monotonic,
+) -> int:
+    """Spray until a signal comes or `duration_s` is over; return 0 then.
+
+    Raises what went wrong otherwise, a `LinkError` for a link that cannot be opened. A link that
+    is lost later comes back by itself; until then all is closed.
+    """
+    taken = recorder if recorder is not None else NoRecorder()
+    ending = _Ending()
+    with _ends_at_signals(ending):
+        try:
+            await link.open(ending.wake.set)
+            try:
+                await executor.start()
+                taken.record_event(clock(), "start", "")
+                control = ControlLoop(
+                    setup, link=link, executor=executor, recorder=taken, clock=clock
+                )
+                await _turn_until_the_end(control, ending, duration_s)
+            finally:
+                await executor.stop()
+        finally:
+            await link.close()
+            taken.record_event(clock(), "stop", ending.reason or "failure")
+    _logger.info("stopped: %s", ending.reason)
+    return 0
+
+
+async def _turn_until_the_end(
+    control: ControlLoop, ending: _Ending, duration_s: float | None
+) -> None:
+    loop = asyncio.get_running_loop()
+    timers = []
+    if duration_s is not None:
+        timers.append(loop.call_later(duration_s, ending.end, "duration"))
+    step_timer: asyncio.TimerHandle | None = None
+    try:
+        while ending.reason is None:
+            control.turn()
+            step_timer = loop.call_at(control.next_step_s, ending.wake.set)
+            await ending.wake.wait()
+            ending.wake.clear()
+            step_timer.cancel()
+    finally:
+        for timer in [*timers, *([step_timer] if step_timer is not None else [])]:
+            timer.cancel()
+    if ending.error is not None:
+        raise ending.error
+
+
+@contextlib.contextmanager
+def _ends_at_signals(ending: _Ending) -> Iterator[None]:
+    """Have SIGTERM, SIGINT and exceptions in callbacks end the run in its usual way."""
+    loop = asyncio.get_running_loop()
+    before = loop.get_exception_handler()
+    loop.set_exception_handler(ending.failed)
+    signals = (signal.SIGTERM, signal.SIGINT)
+    is_main = threading.current_thread() is threading.main_thread()
+    try:
+        for number in signals if is_main else ():
+            loop.add_signal_handler(number, ending.end, number.name)
+        yield
+    finally:
+        for number in signals if is_main else ():
+            loop.remove_signal_handler(number)
+        loop.set_exception_handler(before)
+
+
+def precise_event_loop() -> asyncio.AbstractEventLoop:
+    """Return an event loop whose timers are not rounded up to whole milliseconds.
+
+    epoll's timeouts are (Python's `selectors.EpollSelector.select`); select's are microseconds.
+    """
+    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+
+
+def execute(start: Callable[[], Coroutine[Any, Any, int]]) -> int:
+    """Run `start()` on a precise event loop, with what exists by now out of the collector's way."""
+    gc.collect()
+    gc.freeze()
+    with asyncio.Runner(loop_factory=precise_event_loop) as runner:
+        return runner.run(start())

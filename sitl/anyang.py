@@ -1,0 +1,118 @@
+"""The flight over the field of Wang et al. 2024: four passes through the centres of the plots.
+
+The field's place and direction come from `examples/anyang/boundary.geojson`; the paper gives
+its size (120 x 24 m, plots of 12 x 6 m), the height of 3.5 m and the four passes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from companion.core.frame import LocalFrame
+from companion.errors import ConfigError
+from sitl.stub.mission_items import MissionItem, waypoint
+from sitl.stub.protocol import dialect
+from sitl.vehicle import Leg, Route
+
+EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "anyang"
+PASS_COUNT = 4
+PASS_SPACING_M = 6.0
+RUN_OUT_M = 15.0  # so that no turn happens over the field
+HEIGHT_M = 3.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pass:
+    """One straight pass, from its start to its end, outside the field on both sides."""
+
+    start_east_m: float
+    start_north_m: float
+    end_east_m: float
+    end_north_m: float
+
+
+def anyang_outline(path: Path = EXAMPLE / "boundary.geojson") -> list[tuple[float, float]]:
+    """Return the (longitude_deg, latitude_deg) of the field's outline."""
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+        geometry = table["features"][0]["geometry"] if "features" in table else table["geometry"]
+        ring = geometry["coordinates"][0]
+        return [(float(point[0]), float(point[1])) for point in ring]
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise ConfigError(f"{path}: no outline of the example field ({error!r})") from error
+
+
+def anyang_passes(frame: LocalFrame, path: Path = EXAMPLE / "boundary.geojson") -> list[Pass]:
+    """Return the passes in `frame`, back and forth, the first one northwards in the west."""
+    corners = [
+        frame.to_local(latitude_deg, longitude_deg)
+        for longitude_deg, latitude_deg in anyang_outline(path)[:-1]
+    ]
+    east_m = sum(corner[0] for corner in corners) / len(corners)
+    north_m = sum(corner[1] for corner in corners) / len(corners)
+    along_e, along_n, half_m = _long_side(corners)
+    reach_m = half_m + RUN_OUT_M
+    passes = []
+    for number in range(PASS_COUNT):
+        right_m = (number - (PASS_COUNT - 1) / 2.0) * PASS_SPACING_M
+        middle_e, middle_n = east_m + along_n * right_m, north_m - along_e * right_m
+        sign = 1.0 if number % 2 == 0 else -1.0
+        passes.append(
+            Pass(
+                start_east_m=middle_e - sign * along_e * reach_m,
+                start_north_m=middle_n - sign * along_n * reach_m,
+                end_east_m=middle_e + sign * along_e * reach_m,
+                end_north_m=middle_n + sign * along_n * reach_m,
+            )
+        )
+    return passes
+
+
+def _long_side(corners: list[tuple[float, float]]) -> tuple[float, float, float]:
+    """Return the unit vector (east, north) of the long side, northwards, and half its length."""
+    sides = zip(corners, corners[1:] + corners[:1], strict=True)
+    side_e, side_n = max(
+        ((b[0] - a[0], b[1] - a[1]) for a, b in sides), key=lambda side: math.hypot(*side)
+    )
+    length_m = math.copysign(math.hypot(side_e, side_n), side_n)
+    return side_e / length_m, side_n / length_m, 0.5 * abs(length_m)
+
+
+def anyang_route(speed_m_s: float, frame: LocalFrame) -> Route:
+    """Return the route of the twin over the field at one speed."""
+    passes = anyang_passes(frame)
+    legs: list[Leg] = []
+    for number, line in enumerate(passes):
+        if number:
+            legs.append(_leg(line.start_east_m, line.start_north_m, speed_m_s, "transit"))
+        legs.append(_leg(line.end_east_m, line.end_north_m, speed_m_s, "spray"))
+    return Route(
+        start_east_m=passes[0].start_east_m,
+        start_north_m=passes[0].start_north_m,
+        legs=tuple(legs),
+        height_m=HEIGHT_M,
+    )
+
+
+def _leg(east_m: float, north_m: float, speed_m_s: float, kind: Literal["spray", "transit"]) -> Leg:
+    return Leg(east_m=east_m, north_m=north_m, speed_m_s=speed_m_s, kind=kind)
+
+
+def anyang_items(speed_m_s: float) -> tuple[MissionItem, ...]:
+    """Return the same flight as a mission: home, take-off, speed, the passes, landing."""
+    longitude_deg, latitude_deg = anyang_outline()[0]
+    frame = LocalFrame(latitude_deg, longitude_deg)
+    route = anyang_route(speed_m_s, frame)
+    start = frame.to_geographic(route.start_east_m, route.start_north_m)
+    ends = [frame.to_geographic(leg.east_m, leg.north_m) for leg in route.legs]
+    return (
+        waypoint(dialect.MAV_CMD_NAV_WAYPOINT, *start, height_m=0.0),
+        waypoint(dialect.MAV_CMD_NAV_TAKEOFF, *start, height_m=HEIGHT_M),
+        MissionItem(command=dialect.MAV_CMD_DO_CHANGE_SPEED, param1=1.0, param2=speed_m_s),
+        *(waypoint(dialect.MAV_CMD_NAV_WAYPOINT, *end, height_m=HEIGHT_M) for end in ends),
+        MissionItem(command=dialect.MAV_CMD_NAV_LAND),
+    )

@@ -1,0 +1,111 @@
+"""The servo path: from an order to the autopilot to the edges at the valves."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from companion.output.pwm import PulseEngine, needs_restart
+
+if TYPE_CHECKING:
+    from companion.core.nozzle import PwmLimits
+    from companion.output.pwm import Edge
+
+# A servo output repeats its pulse at 50 Hz: an order waits for the next frame.
+SERVO_FRAME_S = 0.020
+# Narrower than this is no valid servo pulse. After this long without one the board closes.
+PULSE_MIN_US = 900.0
+PULSE_ABSENT_S = 0.100
+# A width this near to closed is closed: the board must not pulse on a timer's jitter.
+CLOSED_DUTY = 0.01
+
+
+class DriverBoard:
+    """The servo outputs and the board behind them that makes valve pulses of servo pulses.
+
+    `restarting` boards begin a new period when the width moves by 2 % of its span or to or from
+    closed, and carry the debt of the old one; `free-running` boards never do: every change waits
+    for the next period. Before the first order there are no pulses, and all valves are closed.
+    """
+
+    def __init__(
+        self,
+        pwm: PwmLimits,
+        valve_count: int,
+        *,
+        seed: int,
+        start_s: float,
+        kind: Literal["restarting", "free-running"] = "restarting",
+        closed_us: float = 1000.0,
+        full_us: float = 2000.0,
+        frame_s: float = SERVO_FRAME_S,
+    ) -> None:
+        if not closed_us < full_us:
+            raise ValueError(f"closed_us must be below full_us, got {closed_us}, {full_us}")
+        self._engine = PulseEngine(pwm, valve_count, start_s=start_s)
+        self._restarts = kind == "restarting"
+        self._closed_us, self._span_us = closed_us, full_us - closed_us
+        self._frame_s = frame_s
+        self._rng = np.random.default_rng(seed)
+        # (time, order of arrival, valve, width); a width of NaN asks whether pulses came back.
+        self._due: list[tuple[float, int, int, float]] = []
+        self._count = 0
+        self._last_s = [-math.inf] * valve_count
+        self._width_us = [0.0] * valve_count
+        self._absent_since_s = [-math.inf] * valve_count
+
+    @property
+    def width_us(self) -> tuple[float, ...]:
+        """Return the pulse width at each input of the board; 0 is no pulse."""
+        return tuple(self._width_us)
+
+    @property
+    def duty(self) -> tuple[float, ...]:
+        """Return the duty of each valve that is in force or will be with its next period."""
+        return self._engine.duty
+
+    def order(self, at_s: float, valve: int, pulse_us: float) -> None:
+        """Take an order of the autopilot; it shows at the board with the next servo frame."""
+        if not (math.isfinite(at_s) and 0.0 <= pulse_us <= 65535.0):
+            raise ValueError(f"no pulse width and time: {pulse_us} us at {at_s} s")
+        arrives_s = at_s + float(self._rng.uniform(0.0, self._frame_s))
+        self._last_s[valve] = arrives_s = max(arrives_s, self._last_s[valve])
+        self._push(arrives_s, valve, pulse_us)
+
+    def _push(self, at_s: float, valve: int, pulse_us: float) -> None:
+        self._count += 1
+        heapq.heappush(self._due, (at_s, self._count, valve, pulse_us))
+
+    def advance(self, until_s: float) -> list[Edge]:
+        """Return the edges at the valves since the last call up to `until_s`."""
+        while self._due and self._due[0][0] <= until_s:
+            at_s, _, valve, pulse_us = heapq.heappop(self._due)
+            if math.isnan(pulse_us):
+                self._check_absent(at_s, valve)
+            else:
+                self._see(at_s, valve, pulse_us)
+        return self._engine.advance(until_s)
+
+    def _see(self, at_s: float, valve: int, pulse_us: float) -> None:
+        was_valid = self._width_us[valve] >= PULSE_MIN_US
+        self._width_us[valve] = pulse_us
+        if pulse_us >= PULSE_MIN_US:
+            duty = min(max((pulse_us - self._closed_us) / self._span_us, 0.0), 1.0)
+            self._take(at_s, valve, duty if duty >= CLOSED_DUTY else 0.0)
+        elif was_valid:
+            self._absent_since_s[valve] = at_s
+            self._push(at_s + PULSE_ABSENT_S, valve, math.nan)
+
+    def _check_absent(self, at_s: float, valve: int) -> None:
+        absent = self._width_us[valve] < PULSE_MIN_US
+        if absent and at_s - self._absent_since_s[valve] >= PULSE_ABSENT_S - 1e-9:
+            self._take(at_s, valve, 0.0)
+
+    def _take(self, at_s: float, valve: int, duty: float) -> None:
+        old = self._engine.duty[valve]
+        if duty != old:
+            restart = self._restarts and needs_restart(old, duty)
+            self._engine.order(valve, duty, at_s=at_s, restart=restart)

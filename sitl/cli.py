@@ -1,0 +1,125 @@
+"""Command line of the simulation: `vrspray sitl serve`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+
+class Board(StrEnum):
+    """The driver boards that there are."""
+
+    RESTARTING = "restarting"
+    FREE_RUNNING = "free-running"
+
+
+app = typer.Typer(
+    help="The simulated flight: stub autopilot and twin.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.callback()
+def main() -> None:
+    """Keep `serve` a command of its own while it is the only one."""
+
+
+@app.command()
+def serve(
+    link: Annotated[
+        str, typer.Option(help="udpout:, udpin:, tcp: or tcpin:HOST:PORT.")
+    ] = "udpout:127.0.0.1:14550",
+    autopilot: Annotated[str, typer.Option(help="Firmware to behave like: ardupilot.")] = (
+        "ardupilot"
+    ),
+    mission: Annotated[
+        Path | None, typer.Option(help="Mission, .plan or .waypoints; default: the example field.")
+    ] = None,
+    scenario: Annotated[Path | None, typer.Option(help="Faults by the clock (TOML).")] = None,
+    speed: Annotated[float, typer.Option(help="Speed of the flight in m/s.")] = 5.0,
+    field_config: Annotated[
+        Path | None, typer.Option(help="Configuration that says how the valves are wired.")
+    ] = None,
+    profile: Annotated[str, typer.Option(help="Sprayer profile.")] = "wang-2024",
+    board: Annotated[Board, typer.Option(help="restarting or free-running.")] = Board.RESTARTING,
+    gust: Annotated[float, typer.Option(help="Gusts in m/s.")] = 1.0,
+    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for the truth.")] = None,
+    wait_s: Annotated[
+        float | None, typer.Option(help="How long to wait for a companion; default: for ever.")
+    ] = None,
+    no_enable: Annotated[
+        bool, typer.Option("--no-enable", help="Leave the enabling of the spraying out.")
+    ] = False,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+) -> None:
+    """Fly a simulated autopilot that `vrspray run` connects to.
+
+    Example: vrspray sitl serve --speed 5 --out truth
+    """
+    from companion.errors import VrsprayError
+    from sitl.serve import ServeOptions
+
+    options = ServeOptions(
+        link=link,
+        autopilot=autopilot,
+        mission=mission,
+        scenario=scenario,
+        field_config=field_config,
+        profile=profile,
+        board=board.value,
+        speed_m_s=speed,
+        gust_m_s=gust,
+        seed=seed,
+        out=out,
+        enable=not no_enable,
+        wait_s=wait_s,
+    )
+    try:
+        result = _run(options)
+    except VrsprayError as error:
+        _print_error(str(error), as_json=json)
+        raise typer.Exit(2) from None
+    _print_result(result, as_json=json)
+    raise typer.Exit(0 if result["state"] in ("landed", "stopped") else 1)
+
+
+def _run(options: Any) -> dict[str, Any]:
+    """Run to the end; the first Ctrl-C or SIGTERM ends the flight with its truth written."""
+    import asyncio
+    import signal
+
+    from sitl.serve import serve as fly
+
+    async def run() -> dict[str, Any]:
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        assert task is not None
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, task.cancel)
+        return await fly(options, lambda text: typer.echo(text, err=True))
+
+    return asyncio.run(run())
+
+
+def _print_error(text: str, *, as_json: bool) -> None:
+    import json
+
+    typer.echo(text, err=True)
+    if as_json:
+        typer.echo(json.dumps({"error": text}))
+
+
+def _print_result(result: dict[str, Any], *, as_json: bool) -> None:
+    import json
+
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    typer.echo(
+        f"{result['state']}: {result['distance_m']:.0f} m in {result['flight_s']:.0f} s, "
+        f"{result['volume_l']:.3f} L sprayed"
+    )

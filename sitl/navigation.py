@@ -1,0 +1,143 @@
+"""What the autopilot tells of its position: late, noisy, quantised as on the wire."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from companion.core.types import SpeedReport, Telemetry
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from companion.core.frame import LocalFrame
+    from sitl.trajectory import Truth
+
+# RTK: white noise, and a part that wanders; from the accuracy that receivers state (1 cm + 1 ppm).
+WHITE_SD_M = 0.014
+WANDER_SD_M = 0.014
+WANDER_TIME_S = 30.0
+VELOCITY_SD_M_S = 0.03
+SPEED_REPORT_RATE_HZ = 10.0
+_DRAWS = 8
+
+
+class TruthSource(Protocol):
+    """Whoever knows where the vehicle really is."""
+
+    def truth_at(self, time_s: float) -> Truth:
+        """Return the truth at `time_s`."""
+
+
+class Navigation:
+    """Turns the truth into position and speed messages, in the order of their arrival.
+
+    A message of the time t carries the state of `estimator_lag_s` before t and arrives
+    `message_delay_s` and a jitter after t, never before an earlier one of its kind.
+    """
+
+    def __init__(
+        self,
+        source: TruthSource,
+        frame: LocalFrame,
+        *,
+        seed: int,
+        start_s: float = 0.0,
+        position_rate_hz: float = 10.0,
+        estimator_lag_s: float = 0.031,
+        message_delay_s: float = 0.005,
+        jitter_s: float = 0.003,
+        noise: bool = True,
+        boot_s: float = 0.0,
+    ) -> None:
+        if not (0.1 <= position_rate_hz <= 1000.0 and message_delay_s >= 0.0 and jitter_s >= 0.0):
+            raise ValueError("rate, delay and jitter of the position must be sensible")
+        self._source = source
+        self._frame = frame
+        self._period_s = 1.0 / position_rate_hz
+        self._lag_s, self._delay_s, self._jitter_s = estimator_lag_s, message_delay_s, jitter_s
+        self._noise = 1.0 if noise else 0.0
+        self._start_s, self._boot_s = start_s, boot_s
+        decay = math.exp(-self._period_s / WANDER_TIME_S)
+        self._decay, self._kick = decay, WANDER_SD_M * math.sqrt(1.0 - decay**2)
+        position_seed, speed_seed = np.random.SeedSequence(seed).spawn(2)
+        self._position_rng = np.random.default_rng(position_seed)
+        self._speed_rng = np.random.default_rng(speed_seed)
+        self._wander = WANDER_SD_M * self._position_rng.standard_normal(2)
+        self._position_count = self._speed_count = self._order = 0
+        self._position_received_s = self._speed_received_s = -math.inf
+        self._under_way: list[tuple[float, int, Telemetry | SpeedReport]] = []
+
+    def advance(self, until_s: float) -> list[Telemetry | SpeedReport]:
+        """Return what has arrived since the last call up to `until_s`."""
+        self._send_positions(until_s)
+        self._send_speeds(until_s)
+        arrived = []
+        while self._under_way and self._under_way[0][0] <= until_s:
+            arrived.append(heapq.heappop(self._under_way)[2])
+        return arrived
+
+    def _send_positions(self, until_s: float) -> None:
+        times_s = []
+        while (at_s := self._start_s + self._position_count * self._period_s) <= until_s:
+            times_s.append(at_s)
+            self._position_count += 1
+        if not times_s:
+            return
+        draws = self._position_rng.standard_normal((len(times_s), _DRAWS))
+        truths = [self._source.truth_at(at_s - self._lag_s) for at_s in times_s]
+        east_m, north_m = self._positions(truths, draws)
+        latitudes, longitudes = self._frame.to_geographic_all(east_m, north_m)
+        velocity = draws[:, 4:7] * (VELOCITY_SD_M_S * self._noise)
+        for i, truth in enumerate(truths):
+            received_s = self._receive_s(times_s[i], draws[i, 7], self._position_received_s)
+            self._position_received_s = received_s
+            message = Telemetry(
+                received_s=received_s,
+                boot_s=math.floor((times_s[i] - self._boot_s) * 1e3 + 1e-6) / 1e3,
+                latitude_deg=round(latitudes[i] * 1e7) / 1e7,
+                longitude_deg=round(longitudes[i] * 1e7) / 1e7,
+                relative_altitude_m=round(truth.height_m * 1e3) / 1e3,
+                velocity_north_m_s=round((truth.velocity_north_m_s + velocity[i, 0]) * 1e2) / 1e2,
+                velocity_east_m_s=round((truth.velocity_east_m_s + velocity[i, 1]) * 1e2) / 1e2,
+                velocity_down_m_s=round(float(velocity[i, 2]) * 1e2) / 1e2,
+                heading_deg=round(truth.heading_deg * 1e2) % 36_000 / 1e2,
+            )
+            self._put(received_s, message)
+
+    def _positions(
+        self, truths: list[Truth], draws: NDArray[np.float64]
+    ) -> tuple[list[float], list[float]]:
+        east_m, north_m = [], []
+        for truth, draw in zip(truths, draws, strict=True):
+            self._wander = self._decay * self._wander + self._kick * draw[2:4]
+            error = self._noise * (self._wander + WHITE_SD_M * draw[0:2])
+            east_m.append(truth.east_m + float(error[0]))
+            north_m.append(truth.north_m + float(error[1]))
+        return east_m, north_m
+
+    def _send_speeds(self, until_s: float) -> None:
+        # Half a period after the position: the two streams of an autopilot do not coincide.
+        while True:
+            at_s = self._start_s + (self._speed_count + 0.5) / SPEED_REPORT_RATE_HZ
+            if not at_s <= until_s:
+                return
+            self._speed_count += 1
+            error, jitter = self._speed_rng.standard_normal(2)
+            truth = self._source.truth_at(at_s - self._lag_s)
+            speed_m_s = math.hypot(truth.velocity_east_m_s, truth.velocity_north_m_s)
+            speed_m_s = abs(speed_m_s + VELOCITY_SD_M_S * self._noise * float(error))
+            received_s = self._receive_s(at_s, jitter, self._speed_received_s)
+            self._speed_received_s = received_s
+            self._put(received_s, SpeedReport(received_s=received_s, ground_speed_m_s=speed_m_s))
+
+    def _receive_s(self, sent_s: float, jitter: float, after_s: float) -> float:
+        received_s = sent_s + max(self._delay_s + self._jitter_s * float(jitter), 0.0)
+        return max(received_s, after_s)
+
+    def _put(self, received_s: float, message: Telemetry | SpeedReport) -> None:
+        self._order += 1
+        heapq.heappush(self._under_way, (received_s, self._order, message))

@@ -1,0 +1,276 @@
+"""The flow truth: cumulative volume of each valve as an exact function of the recorded orders.
+
+An order becomes a step of a valve's flow after its dead time, spread into a ramp by the hose. The
+sum of ramps is integrated in closed form, so volume is conserved to rounding, whatever the times
+at which it is asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.profile import draw_scatter, flow_table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from companion.core.schedule import LagModel
+    from companion.output.pwm import Edge
+    from sitl.profile import PlantProfile
+
+Floats = NDArray[np.float64]
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Faults:
+    """Valves (by index) that do not follow their orders."""
+
+    stuck_open: frozenset[int] = frozenset()
+    stuck_closed: frozenset[int] = frozenset()
+
+
+class _Ramps:
+    """The flow of one valve: steps, each spread over `ramp_s`, and their integral."""
+
+    def __init__(self, ramp_s: float, start_s: float) -> None:
+        self._ramp_s = ramp_s
+        self._steps: list[tuple[float, float]] = []
+        self._from_s = start_s
+        self._from_ml = 0.0
+        self._from_ml_s = 0.0
+        self._knots: tuple[Floats, Floats, Floats, Floats] | None = None
+
+    def step(self, at_s: float, change_ml_s: float) -> None:
+        """Let the flow begin to change by `change_ml_s` at `at_s`."""
+        self._steps.append((at_s, change_ml_s))
+        self._knots = None
+
+    def volume_ml(self, times_s: Floats) -> Floats:
+        """Return the cumulative volume at times that were not forgotten."""
+        volume_ml = self._from_ml + self._from_ml_s * (times_s - self._from_s)
+        if not self._steps:
+            return volume_ml
+        if self._knots is None:
+            self._knots = self._build()
+        at_s, slope, flow_ml_s, knot_ml = self._knots
+        i = np.searchsorted(at_s, times_s, side="right") - 1
+        since_s = np.where(i >= 0, times_s - at_s[i], 0.0)
+        more_ml = knot_ml[i] + since_s * (flow_ml_s[i] + 0.5 * slope[i] * since_s)
+        result: Floats = volume_ml + np.where(i >= 0, more_ml, 0.0)
+        return result
+
+    def _build(self) -> tuple[Floats, Floats, Floats, Floats]:
+        steps = np.array(self._steps)
+        at_s = np.concatenate((steps[:, 0], steps[:, 0] + self._ramp_s))
+        bend = np.concatenate((steps[:, 1], -steps[:, 1])) / self._ramp_s
+        order = np.argsort(at_s, kind="stable")
+        at_s, slope = at_s[order], np.cumsum(bend[order])
+        slope[np.abs(slope) < ROUNDING] = 0.0
+        gap_s = np.diff(at_s)
+        flow_ml_s = np.concatenate(([0.0], np.cumsum(slope[:-1] * gap_s)))
+        flow_ml_s[np.abs(flow_ml_s) < ROUNDING] = 0.0
+        gap_ml = gap_s * (flow_ml_s[:-1] + 0.5 * slope[:-1] * gap_s)
+        return at_s, slope, flow_ml_s, np.concatenate(([0.0], np.cumsum(gap_ml)))
+
+    def forget(self, before_s: float) -> None:
+        """Fold all steps that are complete before `before_s` into one straight line."""
+        self._from_ml += self._from_ml_s * (before_s - self._from_s)
+        self._from_s = before_s
+        kept = []
+        for at_s, change_ml_s in self._steps:
+            if at_s + self._ramp_s <= before_s:
+                self._from_ml += change_ml_s * (before_s - at_s - 0.5 * self._ramp_s)
+                self._from_ml_s += change_ml_s
+            else:
+                kept.append((at_s, change_ml_s))
+        self._steps = kept
+        self._knots = None
+
+
+class Plant:
+    """What both fidelities share: which valves are in use, scatter, volumes, meter."""
+
+    def __init__(
+        self,
+        profile: PlantProfile,
+        *,
+        seed: int,
+        perfect: bool = False,
+        start_s: float = 0.0,
+        faults: Faults | None = None,
+    ) -> None:
+        self.profile = profile
+        self._perfect = perfect
+        self._faults = faults or Faults()
+        rng = np.random.default_rng(seed)
+        self._scatter = draw_scatter(profile, rng)
+        self._table = flow_table(profile)
+        count = profile.valve_count
+        self._ramps = [_Ramps(profile.ramp_s, start_s) for _ in range(count)]
+        self._level_ml_s = [0.0] * count
+        self._duty = [0.0] * count
+        self._is_open = [False] * count
+        self._active = 0
+        self._start_s = self._forgotten_s = start_s
+        spread = profile.meter.gain_spread
+        self._meter = _MeterState(
+            gain=1.0 + float(rng.uniform(-spread, spread)), noise_rng=rng.spawn(1)[0]
+        )
+        for valve in sorted(self._faults.stuck_open):
+            self._take(start_s, valve, duty=1.0, is_open=True)
+
+    def true_lags(self, valve: int) -> LagModel:
+        """Return this very valve's lags: for the run with perfect knowledge only."""
+        self._check_perfect()
+        return self.profile.lags(self._scatter.shift_s[valve])
+
+    def true_flow_scale(self, valve: int) -> float:
+        """Return this very valve's flow over the nominal one: likewise."""
+        self._check_perfect()
+        return self._scatter.flow_scale[valve]
+
+    def _check_perfect(self) -> None:
+        if not self._perfect:
+            raise ValueError("only a plant made with perfect=True tells what cannot be known")
+
+    def volume_ml(self, times_s: Floats) -> Floats:
+        """Return (n, valves): what each valve has delivered up to each time."""
+        times_s = np.asarray(times_s, dtype=np.float64)
+        if len(times_s) and not times_s.min() >= self._forgotten_s - 1e-9:
+            raise ValueError(f"{times_s.min()} s was forgotten or lies before the start")
+        return np.column_stack([ramps.volume_ml(times_s) for ramps in self._ramps])
+
+    def meter_volume_ml(self, times_s: Floats) -> Floats:
+        """Return what the flow meter has counted up to each time, before rounding to pulses."""
+        state, period_s = self._meter, self.profile.pwm.period_s
+        seen_s = np.maximum(
+            np.asarray(times_s, dtype=np.float64) - self.profile.meter.lag_s, self._meter_from_s()
+        )
+        periods = np.floor((seen_s - self._start_s) / period_s).astype(np.int64)
+        last = int(periods.max(initial=state.index))
+        edges_s: Floats = self._start_s + period_s * np.arange(state.index, last + 2, dtype=float)
+        factors = state.factors(last + 1, self.profile.meter.noise)[state.index :]
+        true_ml = self.volume_ml(edges_s).sum(axis=1)
+        edge_ml = state.volume_ml + np.concatenate(([0.0], np.cumsum(np.diff(true_ml) * factors)))
+        i = periods - state.index
+        result: Floats = edge_ml[i] + factors[i] * (self.volume_ml(seen_s).sum(axis=1) - true_ml[i])
+        return result
+
+    def meter_count(self, times_s: Floats) -> NDArray[np.int64]:
+        """Return the meter's pulses up to each time."""
+        per_ml = self.profile.meter.pulses_per_l / 1000.0
+        return np.floor(self.meter_volume_ml(times_s) * per_ml + ROUNDING).astype(np.int64)
+
+    def meter_flow_l_min(self, times_s: NDArray[np.floating]) -> Floats:
+        """Return the metered flow, mean of the PWM period before each time."""
+        period_s = self.profile.pwm.period_s
+        now_s: Floats = np.asarray(times_s, dtype=np.float64)
+        before_s: Floats = now_s - period_s
+        metered_ml = self.meter_volume_ml(now_s) - self.meter_volume_ml(before_s)
+        flow_l_min: Floats = metered_ml * (60.0 / 1000.0 / period_s)
+        return flow_l_min
+
+    def _meter_from_s(self) -> float:
+        return self._start_s + self._meter.index * self.profile.pwm.period_s
+
+    def forget(self, before_s: float) -> None:
+        """Drop what is only needed for times before `before_s`: for flights in real time."""
+        period_s = self.profile.pwm.period_s
+        index = math.floor((before_s - self._start_s) / period_s)
+        if index <= self._meter.index:
+            return
+        edge_s = self._start_s + index * period_s
+        at_s = np.array([edge_s + self.profile.meter.lag_s])
+        self._meter.volume_ml = float(self.meter_volume_ml(at_s)[0])
+        self._meter.index = index
+        self._forgotten_s = edge_s
+        for ramps in self._ramps:
+            ramps.forget(edge_s)
+
+    def _take(self, at_s: float, valve: int, *, duty: float, is_open: bool) -> None:
+        """Bring one valve to its new state, and all others to the pressure that it leaves."""
+        was_active = self._duty[valve] > 0.0
+        self._duty[valve], self._is_open[valve] = duty, is_open
+        if (duty > 0.0) != was_active:
+            self._active += 1 if duty > 0.0 else -1
+            for other, is_other_open in enumerate(self._is_open):
+                if is_other_open and other != valve:
+                    self._set_level(at_s, other)
+        self._set_level(at_s, valve)
+
+    def _set_level(self, at_s: float, valve: int) -> None:
+        is_open = self._is_open[valve]
+        level_ml_s = 0.0
+        if is_open:
+            level_ml_s = self._flow_ml_s(self._duty[valve]) * self._scatter.flow_scale[valve]
+        change_ml_s = level_ml_s - self._level_ml_s[valve]
+        if change_ml_s != 0.0:
+            self._level_ml_s[valve] = level_ml_s
+            dead_s = self._dead_s(is_open=is_open) + self._scatter.shift_s[valve]
+            self._ramps[valve].step(at_s + max(dead_s, 0.0), change_ml_s)
+
+    def _flow_ml_s(self, duty: float) -> float:
+        raise NotImplementedError
+
+    def _dead_s(self, *, is_open: bool) -> float:
+        raise NotImplementedError
+
+    def _follows(self, valve: int) -> bool:
+        return valve not in self._faults.stuck_open and valve not in self._faults.stuck_closed
+
+
+class PulsedPlant(Plant):
+    """Every pulse as it is: fed with the edges that reach the valves, in order of time."""
+
+    def record(self, edges: Iterable[Edge]) -> None:
+        """Take down edges."""
+        for edge in edges:
+            if self._follows(edge.valve):
+                self._take(edge.at_s, edge.valve, duty=edge.duty, is_open=edge.is_open)
+
+    def _flow_ml_s(self, duty: float) -> float:
+        return self._table.open_ml_s(duty, self._active)
+
+    def _dead_s(self, *, is_open: bool) -> float:
+        return self.profile.dead_open_s if is_open else self.profile.dead_close_s
+
+
+class AveragedPlant(Plant):
+    """The mean of the pulses, with the same volume-equivalent lags: fed with changes of duty."""
+
+    def record_change(self, at_s: float, valve: int, duty: float) -> None:
+        """Take down that `valve` has `duty` from `at_s` on."""
+        if not 0.0 <= duty <= 1.0:
+            raise ValueError(f"duty outside [0, 1]: {duty}")
+        if self._follows(valve) and duty != self._duty[valve]:
+            self._take(at_s, valve, duty=duty, is_open=duty > 0.0)
+
+    def _flow_ml_s(self, duty: float) -> float:
+        return self._table.mean_ml_s(duty, self._active)
+
+    def _dead_s(self, *, is_open: bool) -> float:  # noqa: ARG002 - the middle of a pulse has one lag
+        return self.profile.mean_lag_s - 0.5 * self.profile.ramp_s
+
+
+class _MeterState:
+    """The meter's gain and noise, and what it had counted when the past was forgotten."""
+
+    def __init__(self, *, gain: float, noise_rng: np.random.Generator) -> None:
+        self.gain = gain
+        self.index = 0
+        self.volume_ml = 0.0
+        self._rng = noise_rng
+        self._noise: Floats = np.zeros(0)
+
+    def factors(self, count: int, noise: float) -> Floats:
+        """Return reading over truth of the first `count` PWM periods, the same at every call."""
+        if len(self._noise) < count:
+            more = self._rng.standard_normal(max(count - len(self._noise), 256))
+            self._noise = np.concatenate((self._noise, more))
+        return self.gain * (1.0 + noise * self._noise[:count])

@@ -1,0 +1,227 @@
+"""What a simulated sprayer is made of: measured curves, delays, scatter, meter; read from TOML."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from bisect import bisect_right
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from companion.core.boom import Boom, Valve
+from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.schedule import LagModel
+from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PROFILES = Path(__file__).parent / "profiles"
+ML_S_PER_L_MIN = 1000.0 / 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Meter:
+    """A turbine meter in the supply line of all valves."""
+
+    pulses_per_l: float
+    gain_spread: float
+    noise: float
+    lag_s: float
+
+    def __post_init__(self) -> None:
+        if not self.pulses_per_l > 0.0:
+            raise ValueError(f"pulses_per_l must be positive, got {self.pulses_per_l}")
+        if not all(0.0 <= value < 1.0 for value in (self.gain_spread, self.noise, self.lag_s)):
+            raise ValueError("gain_spread, noise and lag_s must lie in [0, 1)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlantProfile:
+    """One sprayer. Sets are ordered from the smallest; each contains the one before it.
+
+    An edge at the driver becomes flow `dead_open_s` (or `dead_close_s`) later, as a ramp of
+    `ramp_s`. The scatters are 1 sd between valves: of the whole lag, and of the flow.
+    """
+
+    name: str
+    boom_width_m: float
+    valve_count: int
+    normally_open: bool
+    pwm: PwmLimits
+    nozzle_sets: tuple[NozzleSet, ...]
+    dead_open_s: float
+    dead_close_s: float
+    ramp_s: float
+    lag_scatter: float
+    flow_scatter: float
+    meter: Meter
+
+    def __post_init__(self) -> None:
+        if not self.nozzle_sets or not 0.0 < self.boom_width_m < 1000.0:
+            raise ValueError("a sprayer needs a nozzle set and a boom")
+        known: set[int] = set()
+        for nozzle_set in self.nozzle_sets:
+            if not known < set(nozzle_set.valves) <= set(range(self.valve_count)):
+                raise ValueError(f"a set must contain the one before it, got {nozzle_set.valves}")
+            known = set(nozzle_set.valves)
+        if not 0.0 <= self.dead_open_s <= self.dead_close_s <= 10.0:
+            raise ValueError("0 <= dead_open_s <= dead_close_s <= 10 must hold")
+        if not self.overrun_s <= self.pwm.min_off_s:
+            raise ValueError("a valve that closes slower than min_off_s never closes")
+        if not (0.0 < self.ramp_s < 10.0 and 0.0 <= self.lag_scatter < 0.3):
+            raise ValueError("ramp_s must be positive, lag_scatter below 0.3")
+        if not 0.0 <= self.flow_scatter < 0.3:
+            raise ValueError(f"flow_scatter must lie in [0, 0.3), got {self.flow_scatter}")
+
+    @property
+    def overrun_s(self) -> float:
+        """Return how much longer a valve delivers than its pulse lasts."""
+        return self.dead_close_s - self.dead_open_s
+
+    @property
+    def mean_lag_s(self) -> float:
+        """Return the volume-equivalent lag of a train of pulses: that of a pulse's middle."""
+        return 0.5 * (self.dead_open_s + self.dead_close_s + self.ramp_s)
+
+    def lags(self, shift_s: float = 0.0) -> LagModel:
+        """Return the lags of a valve that is `shift_s` later than the nominal one, no output."""
+        lag_s = self.mean_lag_s + shift_s
+        return LagModel(
+            on_s=lag_s,
+            off_s=lag_s,
+            up_s=lag_s,
+            down_s=lag_s,
+            on_start_s=self.dead_open_s + shift_s,
+            off_end_s=self.dead_close_s + self.ramp_s + shift_s,
+            output_s=0.0,
+        )
+
+    def boom(self, *, height_m: float = 3.5, forward_m: float = 0.0) -> Boom:
+        """Return the boom with its strips side by side, valve 0 at the left."""
+        width_m = self.boom_width_m / self.valve_count
+        valves = tuple(
+            Valve(
+                name=str(valve + 1),
+                right_m=(valve + 0.5) * width_m - 0.5 * self.boom_width_m,
+                forward_m=forward_m,
+                width_m=width_m,
+                channel=9 + valve,
+            )
+            for valve in range(self.valve_count)
+        )
+        return Boom(width_m=self.boom_width_m, valves=valves, height_m=height_m)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scatter:
+    """How each valve differs from the nominal one in this sprayer."""
+
+    shift_s: tuple[float, ...]
+    flow_scale: tuple[float, ...]
+
+
+def draw_scatter(profile: PlantProfile, rng: np.random.Generator) -> Scatter:
+    """Draw one sprayer: the flow of every set is kept, for that is what calibration measured."""
+    count = profile.valve_count
+    shift_s = np.clip(rng.standard_normal(count), -3.0, 3.0) * (
+        profile.lag_scatter * profile.mean_lag_s
+    )
+    scale = np.clip(rng.standard_normal(count), -3.0, 3.0) * profile.flow_scatter
+    known: set[int] = set()
+    for nozzle_set in profile.nozzle_sets:
+        new = [valve for valve in nozzle_set.valves if valve not in known]
+        # Taking the mean away takes spread away with it: n / (n - 1) gives it back.
+        scale[new] = (scale[new] - scale[new].mean()) * math.sqrt(len(new) / max(len(new) - 1, 1))
+        known.update(new)
+    return Scatter(shift_s=tuple(shift_s.tolist()), flow_scale=tuple((1.0 + scale).tolist()))
+
+
+@cache
+def flow_table(profile: PlantProfile) -> FlowTable:
+    """Return the table of a profile; it costs more than a flight needs of it."""
+    return FlowTable(profile)
+
+
+class FlowTable:
+    """Mean flow of one nominal valve [mL/s] by duty and by how many valves are in use.
+
+    Fewer valves in use leave more pressure to each: between two measured sets the flow of a valve
+    is interpolated by the number in use, and outside of them held. Tables of 4 001 duties, because
+    a curve's own inverse is too slow for every step of a flight; their error is below 1e-5.
+    """
+
+    STEPS = 4000
+
+    def __init__(self, profile: PlantProfile) -> None:
+        self._pwm = profile.pwm
+        self._overrun = profile.overrun_s * profile.pwm.frequency_hz
+        self._tables = [self._table(profile, active) for active in range(profile.valve_count + 1)]
+
+    def _table(self, profile: PlantProfile, active: int) -> list[float]:
+        sizes = [len(nozzle_set.valves) for nozzle_set in profile.nozzle_sets]
+        right = bisect_right(sizes, active)
+        low, high = max(right - 1, 0), min(right, len(sizes) - 1)
+        span = sizes[high] - sizes[low]
+        share = (active - sizes[low]) / span if span else 0.0
+        flows = (1.0 - share) * self._valve_flows(profile.nozzle_sets[low])
+        flows += share * self._valve_flows(profile.nozzle_sets[high])
+        return [float(flow) for flow in flows]
+
+    def _valve_flows(self, nozzle_set: NozzleSet) -> NDArray[np.float64]:
+        duties = np.linspace(0.0, 1.0, self.STEPS + 1)
+        flows = np.array([nozzle_set.curve.flow_for(duty) for duty in duties.tolist()])
+        return flows * (ML_S_PER_L_MIN / len(nozzle_set.valves))
+
+    def mean_ml_s(self, duty: float, active: int) -> float:
+        """Return the mean flow of one valve at `duty` while `active` valves are in use."""
+        place = duty * self.STEPS
+        i = min(int(place), self.STEPS - 1)
+        table = self._tables[active]
+        return table[i] + (table[i + 1] - table[i]) * (place - i)
+
+    def open_ml_s(self, duty: float, active: int) -> float:
+        """Return the flow of one open valve in a train of pulses: such that the mean is right."""
+        off_s = (1.0 - duty) * self._pwm.period_s
+        if off_s < self._pwm.min_off_s:
+            # The engine lengthens or fills a gap that the valve cannot follow.
+            off_s = self._pwm.min_off_s if off_s >= 0.5 * self._pwm.min_off_s > 0.0 else 0.0
+        share = 1.0 - off_s / self._pwm.period_s + (self._overrun if off_s > 0.0 else 0.0)
+        return self.mean_ml_s(duty, active) / min(max(share, 1e-3), 1.0)
+
+
+def load_profile(name: str | Path) -> PlantProfile:
+    """Read a profile by its name, or from a TOML file."""
+    path = Path(name)
+    if path.suffix != ".toml":
+        path = PROFILES / f"{name}.toml"
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        names = ", ".join(sorted(file.stem for file in PROFILES.glob("*.toml")))
+        raise ConfigError(f"no sprayer profile {str(name)!r}: choose one of {names}") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read as TOML: {error}") from error
+    try:
+        return _profile(table)
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
+        raise ConfigError(f"{path}: {reason}") from error
+
+
+def _profile(table: dict[str, Any]) -> PlantProfile:
+    sets = tuple(
+        NozzleSet(
+            valves=tuple(entry["valves"]),
+            curve=FlowCurve(duty=tuple(entry["duty"]), flow_l_min=tuple(entry["flow_l_min"])),
+        )
+        for entry in table.pop("nozzle_set")
+    )
+    pwm, meter, flow = table.pop("pwm"), table.pop("meter"), table.pop("flow")
+    return PlantProfile(
+        pwm=PwmLimits(**pwm), meter=Meter(**meter), nozzle_sets=sets, **flow, **table
+    )

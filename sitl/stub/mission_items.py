@@ -1,0 +1,127 @@
+"""The items of a mission as they travel and as files hold them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sitl.stub.protocol import Message, dialect
+
+# Commands whose fifth to seventh parameter are a place.
+PLACES = frozenset(
+    {
+        dialect.MAV_CMD_NAV_WAYPOINT,
+        dialect.MAV_CMD_NAV_LAND,
+        dialect.MAV_CMD_NAV_TAKEOFF,
+        dialect.MAV_CMD_DO_SET_HOME,
+    }
+)
+ACTIONS = frozenset(
+    {
+        dialect.MAV_CMD_DO_CHANGE_SPEED,
+        dialect.MAV_CMD_DO_SET_SERVO,
+        dialect.MAV_CMD_DO_SPRAYER,
+        dialect.MAV_CMD_CONDITION_YAW,
+    }
+)
+SUPPORTED = PLACES | ACTIONS | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH}
+
+ACTION_NAMES = {
+    dialect.MAV_CMD_DO_CHANGE_SPEED: "ChangeSpeed",
+    dialect.MAV_CMD_DO_SET_SERVO: "SetServo",
+    dialect.MAV_CMD_DO_SPRAYER: "Sprayer",
+    dialect.MAV_CMD_CONDITION_YAW: "ConditionYaw",
+}
+
+ABSOLUTE_FRAMES = frozenset({dialect.MAV_FRAME_GLOBAL, dialect.MAV_FRAME_GLOBAL_INT})
+FRAMES = ABSOLUTE_FRAMES | {
+    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
+    dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
+    dialect.MAV_FRAME_MISSION,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MissionItem:
+    """One item; `x_e7` and `y_e7` are latitude and longitude in 1e-7 degrees where it has a place.
+
+    Whole numbers are kept, so that what was uploaded reads back the same.
+    """
+
+    command: int
+    frame: int = dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT
+    param1: float = 0.0
+    param2: float = 0.0
+    param3: float = 0.0
+    param4: float = 0.0
+    x_e7: int = 0
+    y_e7: int = 0
+    z_m: float = 0.0
+    autocontinue: int = 1
+
+    @property
+    def has_place(self) -> bool:
+        """Return whether the item names a place on the ground."""
+        return self.command in PLACES and (self.x_e7 != 0 or self.y_e7 != 0)
+
+    @property
+    def latitude_deg(self) -> float:
+        """Return the latitude of the place."""
+        return self.x_e7 * 1e-7
+
+    @property
+    def longitude_deg(self) -> float:
+        """Return the longitude of the place."""
+        return self.y_e7 * 1e-7
+
+
+def waypoint(
+    command: int, latitude_deg: float, longitude_deg: float, *, height_m: float
+) -> MissionItem:
+    """Return an item at a place, with its height above home."""
+    return MissionItem(
+        command=command,
+        x_e7=round(latitude_deg * 1e7),
+        y_e7=round(longitude_deg * 1e7),
+        z_m=height_m,
+    )
+
+
+def item_of(message: Message) -> MissionItem:
+    """Return the item that a MISSION_ITEM_INT or MISSION_ITEM carries."""
+    x, y = message.x, message.y
+    if message.get_type() == "MISSION_ITEM" and message.command in PLACES:
+        x, y = round(x * 1e7), round(y * 1e7)
+    return MissionItem(
+        command=message.command,
+        frame=message.frame,
+        param1=message.param1,
+        param2=message.param2,
+        param3=message.param3,
+        param4=message.param4,
+        x_e7=int(x),
+        y_e7=int(y),
+        z_m=message.z,
+        autocontinue=message.autocontinue,
+    )
+
+
+def item_message(
+    item: MissionItem, sequence: int, *, current: bool, to: tuple[int, int]
+) -> Message:
+    """Return MISSION_ITEM_INT for one item."""
+    return dialect.MAVLink_mission_item_int_message(
+        to[0],
+        to[1],
+        sequence,
+        item.frame,
+        item.command,
+        int(current),
+        item.autocontinue,
+        item.param1,
+        item.param2,
+        item.param3,
+        item.param4,
+        item.x_e7,
+        item.y_e7,
+        item.z_m,
+    )

@@ -1,0 +1,76 @@
+"""The sprayer behind the servo outputs: driver boards and the twin's plant, and its truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.errors import ConfigError
+from sitl.board import DriverBoard
+from sitl.plant import PulsedPlant
+from sitl.profile import load_profile
+from sitl.stub.outputs import ServoOrder
+
+Floats = NDArray[np.float64]
+BoardKind = Literal["restarting", "free-running"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SprayerOptions:
+    """Which sprayer, and how it is wired: one servo channel a valve, left to right."""
+
+    profile: str = "wang-2024"
+    board: BoardKind = "restarting"
+    channels: tuple[int, ...] = (9, 10, 11, 12, 13, 14)
+    closed_us: float = 1000.0
+    full_us: float = 2000.0
+    seed: int = 0
+
+
+class Sprayer:
+    """Takes servo orders and gives cumulative volumes; keeps every order that it took."""
+
+    def __init__(self, options: SprayerOptions, *, start_s: float) -> None:
+        profile = load_profile(options.profile)
+        if len(options.channels) != profile.valve_count:
+            raise ConfigError(
+                f"the configuration wires {len(options.channels)} valves, the sprayer "
+                f"{options.profile} has {profile.valve_count}; choose another with --profile"
+            )
+        if not options.closed_us < options.full_us:
+            raise ConfigError("output.closed_us must be below output.full_us for this board")
+        self.options = options
+        self.orders: list[ServoOrder] = []
+        self._valves = {channel: valve for valve, channel in enumerate(options.channels)}
+        self._plant = PulsedPlant(profile, seed=options.seed, start_s=start_s)
+        self._board = DriverBoard(
+            profile.pwm,
+            profile.valve_count,
+            seed=options.seed,
+            start_s=start_s,
+            kind=options.board,
+            closed_us=options.closed_us,
+            full_us=options.full_us,
+        )
+
+    def take(self, order: ServoOrder) -> None:
+        """Take an order of the autopilot; those of other outputs are none of ours."""
+        valve = self._valves.get(order.channel)
+        if valve is not None:
+            self.orders.append(order)
+            self._board.order(order.at_s, valve, order.pulse_us)
+
+    def advance(self, until_s: float) -> None:
+        """Work the valves out up to a time."""
+        self._plant.record(self._board.advance(until_s))
+
+    def volume_ml(self, times_s: Floats) -> Floats:
+        """Return (n, valves): what each valve has delivered up to each time."""
+        return self._plant.volume_ml(times_s)
+
+    def volume_l(self, now_s: float) -> float:
+        """Return what all valves have delivered."""
+        return float(self.volume_ml(np.array([now_s])).sum()) / 1000.0

@@ -1,0 +1,64 @@
+"""The truth of a simulated flight: at one time, and as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth:
+    """Where the autopilot's position reference really is."""
+
+    time_s: float
+    east_m: float
+    north_m: float
+    height_m: float
+    velocity_east_m_s: float
+    velocity_north_m_s: float
+    heading_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trajectory:
+    """A flight as arrays, evenly spaced; headings are unwrapped, so that they interpolate."""
+
+    time_s: Floats
+    east_m: Floats
+    north_m: Floats
+    velocity_east_m_s: Floats
+    velocity_north_m_s: Floats
+    heading_deg: Floats
+    leg: NDArray[np.int64]
+    height_m: float
+
+    def at(self, time_s: Floats) -> Trajectory:
+        """Return the flight at other times, interpolated; held at its ends."""
+        nearest = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
+        return Trajectory(
+            time_s=time_s,
+            east_m=np.interp(time_s, self.time_s, self.east_m),
+            north_m=np.interp(time_s, self.time_s, self.north_m),
+            velocity_east_m_s=np.interp(time_s, self.time_s, self.velocity_east_m_s),
+            velocity_north_m_s=np.interp(time_s, self.time_s, self.velocity_north_m_s),
+            heading_deg=np.interp(time_s, self.time_s, self.heading_deg),
+            leg=self.leg[nearest],
+            height_m=self.height_m,
+        )
+
+    def truth_at(self, time_s: float) -> Truth:
+        """Return the truth at one time."""
+        at = self.at(np.array([time_s]))
+        return Truth(
+            time_s=time_s,
+            east_m=float(at.east_m[0]),
+            north_m=float(at.north_m[0]),
+            height_m=self.height_m,
+            velocity_east_m_s=float(at.velocity_east_m_s[0]),
+            velocity_north_m_s=float(at.velocity_north_m_s[0]),
+            heading_deg=float(at.heading_deg[0]) % 360.0,
+        )

@@ -1,0 +1,413 @@
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.cli.app import COMMANDS, Place, execute, load_command, main
+from companion.cli.run import build_executor, component_options
+from companion.config import load
+from companion.core.types import SprayPlan
+from companion.errors import ActuatorError, ConfigError, LinkError, VrsprayError
+from companion.link.vehicle_link import VehicleLink
+from companion.output.none import DryRunExecutor
+from companion.output.servo import ServoExecutor
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples" / "anyang"
+CONFIG = str(FOLDER / "config.toml")
+MAP = str(FOLDER / "prescription.shp")
+
+Captured = pytest.CaptureFixture[str]
+
+
+def run_json(capsys: Captured, *arguments: str) -> tuple[int, dict[str, Any]]:
+    """Run with --json and insist on exactly one object on stdout."""
+    code = execute([*arguments, "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert isinstance(found, dict)
+    return code, found
+
+
+# ------------------------------------------------------------------------------- the program itself
+
+
+def test_help_lists_every_command_without_importing_any(capsys: Captured) -> None:
+    script = (
+        "import sys; from companion.cli.app import execute; code = execute(['--help']);"
+        "heavy = {'numpy', 'shapely', 'pyproj', 'companion.config', 'companion.core.types'};"
+        "print(sorted(heavy & set(sys.modules)), code, file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stderr.strip() == "[] 0"
+    for name, place in COMMANDS.items():
+        assert f"  {name} " in done.stdout
+        assert place.help in done.stdout
+
+
+def test_module_runs_as_the_program() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "companion", "--version"],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert done.stdout.startswith("vrspray ")
+
+
+def test_main_leaves_with_the_exit_code(capsys: Captured) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["map", "check", "none.shp"])
+    assert left.value.code == 2
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [[], ["fly"], ["map"], ["map", "rate"], ["config", "check"], ["run"], ["--nope"]],
+    ids=" ".join,
+)
+def test_wrong_usage_is_one_line_and_exit_2(arguments: list[str], capsys: Captured) -> None:
+    assert execute(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+
+
+def test_wrong_usage_with_json_is_one_object(capsys: Captured) -> None:
+    code, found = run_json(capsys, "map", "check", "--unknown-option", MAP)
+    assert code == 2
+    assert "--unknown-option" in found["error"]
+
+
+def raise_interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+def raise_refusal() -> None:
+    raise LinkError("port 14550 is in use;\nstop the other program")
+
+
+def raise_failure() -> None:
+    raise ActuatorError("no answer")
+
+
+def return_one() -> int:
+    return 1
+
+
+@pytest.mark.parametrize(
+    ("function", "code", "text"),
+    [
+        ("raise_interrupt", 130, "interrupted"),
+        ("raise_refusal", 2, "port 14550 is in use; stop the other program"),
+        ("raise_failure", 1, "no answer"),
+    ],
+)
+def test_every_end_has_its_exit_code_and_one_line(
+    function: str, code: int, text: str, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "own_commands", sys.modules[__name__])
+    monkeypatch.setitem(COMMANDS, "trial", Place(f"own_commands:{function}", "A trial."))
+    assert execute(["trial"]) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.removeprefix("error: ") == text + "\n"
+
+
+def test_number_that_a_command_returns_is_its_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "own_commands", sys.modules[__name__])
+    monkeypatch.setitem(COMMANDS, "trial", Place("own_commands:return_one", "A trial."))
+    assert execute(["trial"]) == 1
+
+
+def test_command_that_is_not_installed_says_so() -> None:
+    with pytest.raises(VrsprayError, match="no_such_package is not part of this installation"):
+        load_command("fly", Place("no_such_package:fly", "Fly."))
+
+
+@pytest.mark.parametrize("name", ["run", "config", "map", "replay"])
+def test_command_has_help_with_an_example(name: str, capsys: Captured) -> None:
+    assert execute([name, "--help"]) == 0
+    assert f"vrspray {name}" in capsys.readouterr().out.partition("Example:")[2]
+
+
+@pytest.mark.parametrize("name", ["config check", "config show", "config schema"])
+@pytest.mark.parametrize("option", ["--json", "Example: vrspray"])
+def test_command_of_config_has_json_and_an_example(
+    name: str, option: str, capsys: Captured
+) -> None:
+    assert execute([*name.split(), "--help"]) == 0
+    assert option in capsys.readouterr().out
+
+
+# ------------------------------------------------------------------------------------------ config
+
+
+def test_config_check_accepts_the_example(capsys: Captured) -> None:
+    assert run_json(capsys, "config", "check", CONFIG) == (
+        0,
+        {"ok": True, "path": CONFIG, "problems": []},
+    )
+
+
+def test_config_check_refuses_a_swath_that_is_not_the_boom(capsys: Captured) -> None:
+    code, found = run_json(capsys, "config", "check", CONFIG, "--set", "mission.swath_width_m=5.8")
+    assert code == 2
+    assert not found["ok"]
+    (problem,) = found["problems"]
+    assert (problem["severity"], problem["where"]) == ("error", "mission.swath_width_m")
+
+
+def test_config_check_warns_of_what_it_cannot_deliver_or_do(capsys: Captured) -> None:
+    overrides = ["--set", "mission.speed_m_s=8", "--set", "web.enabled=true"]
+    code, found = run_json(capsys, "config", "check", CONFIG, *overrides)
+    assert code == 0
+    assert [problem["code"] for problem in found["problems"]] == ["no-effect", "rate-too-high"]
+
+
+def test_config_check_refuses_a_wrong_file_in_one_line(capsys: Captured) -> None:
+    code, found = run_json(capsys, "config", "check", CONFIG, "--set", "lag.onn_s=1")
+    assert code == 2
+    assert "did you mean lag.on_s?" in found["error"]
+
+
+def test_config_show_says_where_each_setting_comes_from(capsys: Captured) -> None:
+    assert execute(["config", "show", CONFIG, "--set", "lag.on_s=0.12"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "lag.on_s = 0.12  # override" in lines
+    assert "lag.off_s = 0.08  # file" in lines
+    assert "prescription.unit = (not set)  # default" in lines
+    code, found = run_json(capsys, "config", "show", CONFIG)
+    assert code == 0
+    assert found["settings"]["lag.on_s"] == {"value": 0.1, "origin": "file"}
+
+
+def test_config_schema_knows_the_tables(capsys: Captured) -> None:
+    code, found = run_json(capsys, "config", "schema")
+    assert code == 0
+    assert {"boom", "valve", "nozzle_set", "lag"} <= set(found["required"])
+
+
+# --------------------------------------------------------------------------------------------- map
+
+
+def test_map_check_has_the_promised_keys(capsys: Captured) -> None:
+    code, found = run_json(capsys, "map", "check", MAP)
+    assert code == 0
+    promised = "ok format crs unit rate_field zones area_ha rates_l_ha sha256 problems"
+    assert set(promised.split()) <= set(found)
+    assert (found["ok"], found["zones"], found["unit"]) == (True, 40, "L/ha")
+    assert found["area_ha"] == pytest.approx(0.288, abs=1e-4)
+
+
+def test_map_check_with_a_sprayer_says_what_it_cannot_deliver(
+    capsys: Captured, tmp_path: Path
+) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(Path(CONFIG).read_text().replace("speed_m_s = 5.0", "speed_m_s = 8.0"))
+    code, found = run_json(capsys, "map", "check", MAP, "--config", str(path))
+    assert code == 0
+    assert [problem["code"] for problem in found["problems"]] == ["rate-too-high"]
+    path.write_text(path.read_text() + "[product]\nrate_max_l_ha = 20.0\n")
+    code, found = run_json(capsys, "map", "check", MAP, "--config", str(path))
+    assert (code, found["ok"]) == (1, False)
+    assert "above-label" in [problem["code"] for problem in found["problems"]]
+
+
+def write_map(path: Path, *, overlapping: bool = False, unit: str | None = "L/ha") -> str:
+    shift = 0.0005 if overlapping else 0.001
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"rate": 10.0 * (number + 1)} | ({"unit": unit} if unit else {}),
+            "geometry": {
+                "type": "Polygon",
+                "coordinates": [
+                    [
+                        [10.0 + number * shift + x, -35.0 + y]
+                        for x, y in ((0, 0), (0.001, 0), (0.001, 0.001), (0, 0.001), (0, 0))
+                    ]
+                ],
+            },
+        }
+        for number in range(2)
+    ]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return str(path)
+
+
+def test_map_check_tells_errors_from_unreadable_files(capsys: Captured, tmp_path: Path) -> None:
+    code, found = run_json(
+        capsys, "map", "check", write_map(tmp_path / "overlap.geojson", overlapping=True)
+    )
+    assert (code, found["ok"]) == (1, False)
+    code, found = run_json(capsys, "map", "check", str(tmp_path / "none.shp"))
+    assert code == 2
+    assert "none.shp" in found["error"]
+
+
+def test_map_options_answer_what_the_file_leaves_open(capsys: Captured, tmp_path: Path) -> None:
+    path = write_map(tmp_path / "unitless.geojson", unit=None)
+    assert run_json(capsys, "map", "check", path)[0] == 2
+    code, found = run_json(capsys, "map", "check", path, "--unit", "gal/ac")
+    assert code == 0
+    assert found["rates_l_ha"] == pytest.approx([93.54, 187.08], abs=0.01)
+
+
+def test_map_options_come_from_the_configuration_where_not_given(
+    capsys: Captured, tmp_path: Path
+) -> None:
+    path = write_map(tmp_path / "unitless.geojson", unit=None)
+    config = tmp_path / "config.toml"
+    config.write_text(
+        Path(CONFIG).read_text().replace("[prescription]", '[prescription]\nunit = "mL/m2"')
+    )
+    _, found = run_json(capsys, "map", "check", path, "--config", str(config))
+    assert found["rates_l_ha"] == [100.0, 200.0]
+    _, found = run_json(capsys, "map", "check", path, "--config", str(config), "--unit", "L/ha")
+    assert found["rates_l_ha"] == [10.0, 20.0]
+
+
+def test_map_rate_is_that_of_the_zone_even_south_of_the_equator(
+    capsys: Captured, tmp_path: Path
+) -> None:
+    path = write_map(tmp_path / "south.geojson")
+    code, found = run_json(capsys, "map", "rate", path, "-34.9995", "10.0015")
+    assert code == 0
+    assert found["rate_l_ha"] == 20.0
+    assert found["zone"] is not None
+    _, outside = run_json(capsys, "map", "rate", path, "-34.9", "10.0015")
+    assert (outside["rate_l_ha"], outside["zone"]) == (None, None)
+    assert run_json(capsys, "map", "rate", path, "0", "0")[1]["rate_l_ha"] is None
+
+
+def test_map_rate_answers_a_file_of_points_in_its_order(capsys: Captured, tmp_path: Path) -> None:
+    path = write_map(tmp_path / "map.geojson")
+    points = tmp_path / "points.csv"
+    points.write_text("name,lon,lat\na,10.0015,-34.9995\nb,0,0\nc,10.0005,-34.9995\n")
+    code, found = run_json(capsys, "map", "rate", path, "--points", str(points))
+    assert code == 0
+    assert [row["rate_l_ha"] for row in found["points"]] == [20.0, None, 10.0]
+    assert (found["points"][0]["lat"], found["points"][0]["lon"]) == (-34.9995, 10.0015)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"latitude,longitude\n1,2\n", "no columns lat and lon"),
+        (b"", "no columns lat and lon"),
+        (b"lat,lon\n1,2\n3\n", "line 3"),
+        (b"lat,lon\n91,2\n", "line 2"),
+        (b"lat,lon\nnan,2\n", "line 2"),
+        (b"\xff\xfel\x00", "save it as that"),
+        (b'lat,lon\n"1,2\n' + b"x" * 200_000, "no CSV text"),
+    ],
+    ids=["names", "empty", "short", "range", "nan", "utf-16", "quotes"],
+)
+def test_broken_file_of_points_is_refused_in_one_line(
+    content: bytes, expected: str, capsys: Captured, tmp_path: Path
+) -> None:
+    points = tmp_path / "points.csv"
+    points.write_bytes(content)
+    code, found = run_json(capsys, "map", "rate", MAP, "--points", str(points))
+    assert code == 2
+    assert expected in found["error"]
+
+
+@pytest.mark.parametrize(
+    "places", [[], ["36"], ["36", "x"], ["91", "0"], ["36", "114", "--points", "x.csv"]], ids=str
+)
+def test_map_rate_without_a_place_is_refused(places: list[str], capsys: Captured) -> None:
+    code, found = run_json(capsys, "map", "rate", MAP, *places)
+    assert code == 2
+    assert found["error"]
+
+
+# --------------------------------------------------------------------------------------------- run
+
+
+def test_link_gets_what_the_configuration_says() -> None:
+    overrides = ["link.system_id=7", "link.component_id=192", "link.position_rate_hz=12"]
+    options = component_options(load(Path(CONFIG), overrides=overrides))
+    assert (options.system_id, options.component_id, options.position_rate_hz) == (7, 192, 12)
+
+
+def test_outputs_are_those_of_the_configuration() -> None:
+    orders: list[tuple[int, int]] = []
+
+    class Link(VehicleLink):
+        def order(self, channel: int, pulse_us: int) -> bool:
+            orders.append((channel, pulse_us))
+            return True
+
+    overrides = ["output.closed_us=1100", "output.full_us=1900", "valve[0].channel=21"]
+    config = load(Path(CONFIG), overrides=overrides)
+    link = Link(config.link.url, component_options(config))
+    executor = build_executor(config, link)
+    assert isinstance(executor, ServoExecutor)
+
+    async def open_all() -> None:
+        await executor.start()
+        now_s = asyncio.get_running_loop().time()
+        executor.submit(
+            SprayPlan(
+                sequence=1, issued_s=now_s, duty=(1.0,) * 6, changes=(), lease_until_s=now_s + 1.0
+            )
+        )
+        await executor.stop()
+
+    asyncio.run(open_all())
+    channels = (21, 10, 11, 12, 13, 14)
+    assert orders[:6] == [(channel, 1100) for channel in channels]
+    assert orders[6:12] == [(channel, 1900) for channel in channels]
+    assert orders[12:18] == [(channel, 1100) for channel in channels]
+
+
+def test_refusal_of_an_order_reaches_the_executor() -> None:
+    config = load(Path(CONFIG))
+    link = VehicleLink(config.link.url, component_options(config))
+    executor = build_executor(config, link)
+    assert link.component.on_order_ack is not None
+    link.component.on_order_ack(4)
+    assert executor.fault is not None
+
+
+def test_dry_run_has_no_outputs_and_gpio_is_refused() -> None:
+    dry = load(Path(CONFIG), overrides=["output.kind=none"])
+    link = VehicleLink(dry.link.url, component_options(dry))
+    assert isinstance(build_executor(dry, link), DryRunExecutor)
+    with pytest.raises(ConfigError, match="not part of this version"):
+        build_executor(load(Path(CONFIG), overrides=["output.kind=gpio"]), link)
+
+
+def run_arguments(folder: Path, port: int) -> list[str]:
+    settings = [f"journal.folder={folder}", f"link.url=udpin:127.0.0.1:{port}"]
+    return ["run", "--config", CONFIG, *(part for one in settings for part in ("--set", one))]
+
+
+def test_run_ends_after_its_duration_and_leaves_a_journal(capsys: Captured, tmp_path: Path) -> None:
+    code, found = run_json(capsys, *run_arguments(tmp_path, 0), "--duration-s", "0.2")
+    assert code == 0
+    assert Path(found["journal"]) == tmp_path / "flight-0001.gpkg"
+    code, replayed = run_json(capsys, "replay", found["journal"])
+    assert code == 0
+    assert replayed["decisions"] > 0
+    assert replayed["differences"] == 0
+
+
+def test_port_in_use_is_one_line_and_exit_2(capsys: Captured, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        code, found = run_json(capsys, *run_arguments(tmp_path, port), "--duration-s", "0.2")
+    assert code == 2
+    assert f"port {port} is in use" in found["error"]

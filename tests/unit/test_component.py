@@ -1,0 +1,447 @@
+"""A well-behaved component: heartbeat, answers, streams, texts, sign of life."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from companion.core.controller import Memory, step
+from companion.core.types import Decision, Inhibit, OperatorCommand, SprayPlan, Telemetry
+from companion.link.component import Component, ComponentOptions
+from companion.link.vehicle_link import VehicleLink
+from tests import builders
+
+VEHICLE = 7
+SETUP = builders.setup()
+OPEN, _ = step(SETUP, builders.SPRAYING, Memory(), 10.0)
+CLOSED, _ = step(SETUP, None, Memory(), 10.0)
+
+
+class Peer:
+    """Encodes for an autopilot and a ground station, and reads what the component sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+        self.is_up = True
+        self._parser = mavlink.MAVLink(None)
+        self._autopilot = mavlink.MAVLink(None, srcSystem=VEHICLE, srcComponent=1)
+        self._ground = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+
+    def take(self, frame: bytes) -> bool:
+        if self.is_up:
+            self.sent.extend(self._parser.parse_buffer(frame) or [])
+        return self.is_up
+
+    def autopilot(self, name: str, *fields: Any, **more: Any) -> bytes:
+        message = getattr(self._autopilot, f"{name}_encode")(*fields, **more)
+        return bytes(message.pack(self._autopilot))
+
+    def ground(self, name: str, *fields: Any) -> bytes:
+        message = getattr(self._ground, f"{name}_encode")(*fields)
+        return bytes(message.pack(self._ground))
+
+    def heartbeat(self, autopilot: int = 3) -> bytes:
+        return self.autopilot("heartbeat", 2, autopilot, 128, 3, 4)
+
+    def position(self, boot_s: float) -> bytes:
+        boot_ms = round(boot_s * 1000)
+        return self.autopilot("global_position_int", boot_ms, 0, 0, 0, 0, 0, 0, 0, 0)
+
+    def command(self, command: int, *params: float, system: int = VEHICLE, to: int = 191) -> bytes:
+        filled = (*params, *([0.0] * (7 - len(params))))
+        return self.ground("command_long", system, to, command, 0, *filled)
+
+    def of(self, kind: str) -> list[Any]:
+        return [message for message in self.sent if message.get_type() == kind]
+
+    def texts(self) -> list[str]:
+        return [message.text for message in self.of("STATUSTEXT")]
+
+    def named(self, name: str) -> list[float]:
+        return [m.value for m in self.of("NAMED_VALUE_FLOAT") if m.name == name]
+
+    def asked(self) -> dict[int, float]:
+        """Return the rate asked for, by message, of every SET_MESSAGE_INTERVAL so far."""
+        commands = [m for m in self.of("COMMAND_LONG") if m.command == 511]
+        return {int(m.param1): round(1e6 / m.param2, 3) for m in commands}
+
+
+@pytest.fixture
+def peer() -> Peer:
+    return Peer()
+
+
+@pytest.fixture
+def component(peer: Peer) -> Component:
+    return Component(ComponentOptions(), peer.take)
+
+
+@pytest.fixture
+def met(peer: Peer, component: Component) -> Component:
+    """Return a component that knows its vehicle; what it sent so far is forgotten."""
+    component.receive(peer.heartbeat(), 0.0)
+    peer.sent.clear()
+    return component
+
+
+def test_the_heartbeat_is_there_from_the_first_step(peer: Peer, component: Component) -> None:
+    component.tick(None, 100.0)
+    (heartbeat,) = peer.of("HEARTBEAT")
+    assert (heartbeat.type, heartbeat.autopilot) == (18, 8)
+    assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 191)
+
+
+def test_the_heartbeat_goes_on_once_a_second_however_often_the_loop_turns(
+    peer: Peer, component: Component
+) -> None:
+    for turn in range(301):
+        component.tick(CLOSED, 100.0 + turn * 0.033)
+    assert len(peer.of("HEARTBEAT")) == 10
+
+
+def test_without_the_loop_there_is_no_heartbeat(peer: Peer, component: Component) -> None:
+    component.tick(CLOSED, 0.0)
+    peer.sent.clear()
+    component.receive(peer.heartbeat(), 5.0)
+    assert not peer.of("HEARTBEAT")
+
+
+def test_we_speak_as_the_vehicles_system_once_it_is_known(peer: Peer, met: Component) -> None:
+    met.tick(None, 0.0)
+    assert peer.of("HEARTBEAT")[0].get_srcSystem() == VEHICLE
+
+
+def test_a_configured_system_is_kept(peer: Peer) -> None:
+    component = Component(ComponentOptions(system_id=3), peer.take)
+    component.receive(peer.heartbeat(), 0.0)
+    component.tick(None, 0.0)
+    assert peer.of("HEARTBEAT")[0].get_srcSystem() == 3
+    assert not component.is_vehicle_known
+
+
+def test_an_unknown_command_is_unsupported(peer: Peer, met: Component) -> None:
+    assert met.receive(peer.command(400, 1.0), 1.0) == []
+    (ack,) = peer.of("COMMAND_ACK")
+    assert (ack.command, ack.result) == (400, 3)
+    assert (ack.target_system, ack.target_component) == (255, 190)
+
+
+@pytest.mark.parametrize("value", [1.0, 0.0])
+def test_do_sprayer_is_the_operators_wish(peer: Peer, met: Component, value: float) -> None:
+    inputs = met.receive(peer.command(216, value), 1.0)
+    assert inputs == [OperatorCommand(received_s=1.0, enable=value == 1.0, source="command")]
+    assert peer.of("COMMAND_ACK")[0].result == 0
+
+
+@pytest.mark.parametrize("value", [0.5, 2.0, -1.0, float("nan"), float("inf")])
+def test_do_sprayer_with_anything_else_is_denied(peer: Peer, met: Component, value: float) -> None:
+    assert met.receive(peer.command(216, value), 1.0) == []
+    assert peer.of("COMMAND_ACK")[0].result == 2
+
+
+@pytest.mark.parametrize("target", [{"to": 1}, {"to": 0}, {"to": 190}, {"system": 8}])
+def test_what_is_not_addressed_to_us_is_neither_obeyed_nor_answered(
+    peer: Peer, met: Component, target: dict[str, int]
+) -> None:
+    assert met.receive(peer.command(216, 1.0, **target), 1.0) == []
+    assert not peer.sent
+
+
+def test_every_command_is_answered_even_when_repeated(peer: Peer, met: Component) -> None:
+    for _ in range(3):
+        met.receive(peer.command(216, 1.0), 1.0)
+    assert len(peer.of("COMMAND_ACK")) == 3
+
+
+def test_commands_in_integers_are_answered_too(peer: Peer, met: Component) -> None:
+    command = peer.ground("command_int", VEHICLE, 191, 0, 216, 0, 0, 1.0, 0, 0, 0, 0, 0, 0.0)
+    assert len(met.receive(command, 1.0)) == 1
+    assert peer.of("COMMAND_ACK")[0].result == 0
+
+
+def test_our_version_can_be_asked_for(peer: Peer, met: Component) -> None:
+    met.receive(peer.command(512, 148.0), 1.0)
+    assert peer.of("COMMAND_ACK")[0].result == 0
+    (version,) = peer.of("AUTOPILOT_VERSION")
+    assert version.flight_sw_version >> 8 == 0x000100
+    met.receive(peer.command(512, 33.0), 1.0)
+    assert peer.of("COMMAND_ACK")[1].result == 3
+
+
+def test_time_questions_are_answered_with_our_time(peer: Peer, met: Component) -> None:
+    met.receive(peer.autopilot("timesync", 0, 123_456), 2.0)
+    (answer,) = peer.of("TIMESYNC")
+    assert (answer.tc1, answer.ts1) == (2_000_000_000, 123_456)
+
+
+def test_pings_to_all_are_echoed_to_their_sender(peer: Peer, met: Component) -> None:
+    met.receive(peer.ground("ping", 99, 5, 0, 0), 1.0)
+    met.receive(peer.ground("ping", 99, 6, VEHICLE, 191), 1.0)
+    (echo,) = peer.of("PING")
+    assert (echo.time_usec, echo.seq) == (99, 5)
+    assert (echo.target_system, echo.target_component) == (255, 190)
+
+
+def test_the_clocks_are_compared_and_the_quickest_answer_counts(peer: Peer, met: Component) -> None:
+    for now_s, round_trip_s in [(10.0, 0.2), (11.0, 0.004), (12.0, 0.3)]:
+        peer.sent.clear()
+        met.tick(None, now_s)
+        (question,) = peer.of("TIMESYNC")
+        there_ns = round((now_s + 0.002 - 5.0) * 1e9)  # 5 s between the clocks
+        met.receive(peer.autopilot("timesync", there_ns, question.ts1), now_s + round_trip_s)
+    assert met.clock.round_trip_s == pytest.approx(0.004)
+    assert met.clock.offset_s == pytest.approx(5.0)
+    met.receive(peer.position(8.0), 13.03)
+    assert met.clock.position_delay_s == pytest.approx(0.03, abs=1e-6)
+
+
+def test_answers_to_other_peoples_questions_are_ignored(peer: Peer, met: Component) -> None:
+    met.tick(None, 10.0)
+    met.receive(peer.autopilot("timesync", 77, 88), 10.1)
+    assert met.clock.offset_s is None
+
+
+# ------------------------------------------------------------------------------------- streams
+
+
+WANTED = {33: 20.0, 74: 10.0, 24: 5.0, 193: 2.0, 245: 2.0, 65: 5.0, 36: 10.0}
+
+
+def test_streams_are_asked_for_when_the_vehicle_is_first_heard(
+    peer: Peer, component: Component
+) -> None:
+    component.tick(None, 0.0)
+    assert not peer.of("COMMAND_LONG")
+    component.receive(peer.heartbeat(), 0.5)
+    assert WANTED.items() <= peer.asked().items()
+    commands = peer.of("COMMAND_LONG")
+    assert all((m.target_system, m.target_component) == (VEHICLE, 1) for m in commands)
+    assert all(m.param3 == 0.0 for m in commands)
+
+
+def test_px4_is_asked_for_its_own_estimator(peer: Peer, component: Component) -> None:
+    component.receive(peer.heartbeat(autopilot=12), 0.0)
+    assert 230 in peer.asked()
+    assert 193 not in peer.asked()
+
+
+def fly(
+    component: Component, peer: Peer, *, from_s: float, to_s: float, rate_hz: float = 20.0
+) -> None:
+    """Feed every wanted stream at its rate, the positions at `rate_hz`, and turn the loop."""
+    steps = round((to_s - from_s) * 20)
+    empty = {
+        74: peer.autopilot("vfr_hud", 0.0, 0.0, 0, 0, 0.0, 0.0),
+        24: peer.autopilot("gps_raw_int", 0, 6, 0, 0, 0, 0, 0, 0, 0, 0),
+        193: peer.autopilot("ekf_status_report", 0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        245: peer.autopilot("extended_sys_state", 0, 0),
+        65: peer.autopilot("rc_channels", 0, 0, *([0] * 18), 0),
+        36: peer.autopilot("servo_output_raw", 0, 0, *([0] * 8)),
+    }
+    for number in range(steps):
+        now_s = from_s + number / 20
+        if int(number * rate_hz / 20) != int((number - 1) * rate_hz / 20):
+            component.receive(peer.position(now_s), now_s)
+        for message_id, frame in empty.items():
+            if number % round(20 / WANTED[message_id]) == 0:
+                component.receive(frame, now_s)
+        component.tick(CLOSED, now_s)
+
+
+def test_streams_that_come_are_left_alone(peer: Peer, met: Component) -> None:
+    fly(met, peer, from_s=0.0, to_s=20.0)
+    assert not peer.asked()
+
+
+def test_a_slow_stream_is_asked_for_again_but_not_more_often_than_every_five_seconds(
+    peer: Peer, met: Component
+) -> None:
+    fly(met, peer, from_s=0.0, to_s=20.0, rate_hz=10.0)
+    assert set(peer.asked()) == {33}
+    assert len(peer.of("COMMAND_LONG")) == 2
+
+
+def test_after_two_failures_the_older_way_is_tried(peer: Peer, met: Component) -> None:
+    fly(met, peer, from_s=0.0, to_s=18.0, rate_hz=10.0)
+    (request,) = peer.of("REQUEST_DATA_STREAM")
+    assert (request.req_stream_id, request.req_message_rate, request.start_stop) == (6, 20, 1)
+
+
+def test_px4_is_never_asked_the_older_way(peer: Peer, component: Component) -> None:
+    component.receive(peer.heartbeat(autopilot=12), 0.0)
+    fly(component, peer, from_s=0.0, to_s=40.0, rate_hz=5.0)
+    assert not peer.of("REQUEST_DATA_STREAM")
+
+
+def test_after_a_reboot_every_stream_is_asked_for_anew(peer: Peer, met: Component) -> None:
+    met.receive(peer.position(500.0), 1.0)
+    met.receive(peer.position(499.5), 1.1)  # a message that was overtaken
+    assert not peer.asked()
+    met.receive(peer.position(3.0), 2.0)
+    assert WANTED.items() <= peer.asked().items()
+
+
+def test_after_the_link_was_away_every_stream_is_asked_for_anew(peer: Peer, met: Component) -> None:
+    met.link_changed(3.0)
+    assert WANTED.items() <= peer.asked().items()
+
+
+# -------------------------------------------------------------------------------- announcements
+
+
+def inhibited(*inhibits: Inhibit) -> Decision:
+    return replace(CLOSED, inhibits=frozenset(inhibits))
+
+
+def test_reasons_are_told_when_they_change_and_not_otherwise(peer: Peer, met: Component) -> None:
+    for turn in range(60):
+        met.tick(inhibited(Inhibit.NOT_ENABLED, Inhibit.NOT_ARMED), turn * 0.05)
+    for turn in range(60, 90):
+        met.tick(OPEN, turn * 0.05)
+    assert peer.texts() == ["Spray: closed: not-enabled, not-armed", "Spray: ready"]
+
+
+def test_reasons_that_flicker_are_told_once_a_second(peer: Peer, met: Component) -> None:
+    for turn in range(100):
+        flicker = Inhibit.SPEED_BELOW_MIN if turn % 2 else Inhibit.STALE_POSITION
+        met.tick(inhibited(flicker), turn * 0.05)
+    assert 4 <= len(peer.texts()) <= 6
+
+
+def test_all_reasons_at_once_fit_into_a_text(peer: Peer, met: Component) -> None:
+    met.tick(inhibited(*Inhibit), 0.0)
+    (text,) = peer.texts()
+    assert len(text) == 50
+
+
+def test_a_fault_is_told_once_as_an_error(peer: Peer, met: Component) -> None:
+    met.fault("servo order failed")
+    for turn in range(50):
+        met.tick(OPEN, turn * 0.05)
+    errors = [m.text for m in peer.of("STATUSTEXT") if m.severity == 3]
+    assert errors == ["Spray: servo order failed"]
+
+
+def test_values_are_told_once_a_second(peer: Peer, met: Component) -> None:
+    for turn in range(60):
+        met.tick(OPEN, turn * 0.05)
+    assert len(peer.named("SPR_FLOW")) == 3
+    assert peer.named("SPR_STATE") == [2.0] * 3
+    assert peer.named("SPR_RATE")[0] == pytest.approx(20.0)
+
+
+def test_the_sign_of_life_comes_ten_times_a_second_while_valves_may_be_open(
+    peer: Peer, met: Component
+) -> None:
+    assert not OPEN.plan.is_off
+    for turn in range(60):
+        met.tick(OPEN, turn * 0.033)
+    assert 19 <= len(peer.named("SPR_LIVE")) <= 21
+
+
+def test_there_is_no_sign_of_life_while_everything_stays_closed(peer: Peer, met: Component) -> None:
+    for turn in range(60):
+        met.tick(CLOSED, turn * 0.05)
+    assert not peer.named("SPR_LIVE")
+
+
+def test_the_sign_of_life_comes_before_a_valve_opens(peer: Peer, met: Component) -> None:
+    later = SprayPlan(
+        sequence=1,
+        issued_s=0.0,
+        duty=(0.0,) * 6,
+        changes=tuple(OPEN.plan.changes)[:1],
+        lease_until_s=0.3,
+    )
+    met.tick(replace(OPEN, plan=later), 0.0)
+    assert len(peer.named("SPR_LIVE")) == 1
+
+
+# ------------------------------------------------------------------------------ link that returns
+
+
+class UpAndDown:
+    """A transport whose state the test sets."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.is_up = True
+        self._peer = peer
+
+    def send(self, data: bytes) -> bool:
+        return self.is_up and self._peer.take(data)
+
+    async def close(self) -> None:
+        self.is_up = False
+
+
+@pytest.mark.parametrize("heard_first", [True, False])
+def test_a_link_that_returns_counts_once_a_step_was_taken_and_the_vehicle_was_heard(
+    peer: Peer, heard_first: bool
+) -> None:
+    link = VehicleLink("udpin:127.0.0.1:14550", ComponentOptions())
+    transport = link._transport = UpAndDown(peer)
+    link._on_bytes(peer.heartbeat())
+    link.receive()
+    assert fault_of(link) is None
+    transport.is_up = False
+    link._on_change(False)
+    assert fault_of(link) == "link is down"
+    transport.is_up = True
+    link._on_change(True)
+    if heard_first:
+        link._on_bytes(peer.position(1.0))
+        link.receive()
+        assert fault_of(link) is not None
+        link.tell(CLOSED, 1.0)
+    else:
+        link.receive()
+        link.tell(CLOSED, 1.0)
+        assert fault_of(link) is not None
+        link._on_bytes(peer.position(1.0))
+        link.receive()
+    assert fault_of(link) is None
+
+
+def fault_of(link: VehicleLink) -> str | None:
+    return link.fault
+
+
+# --------------------------------------------------------------------------------------- orders
+
+
+def test_no_order_leaves_before_the_vehicle_is_known(peer: Peer, component: Component) -> None:
+    assert not component.order(9, 1000)
+    component.receive(peer.heartbeat(), 0.0)
+    peer.sent.clear()
+    assert component.order(9, 1000)
+    (order,) = peer.of("COMMAND_LONG")
+    assert (order.target_system, order.target_component) == (VEHICLE, 1)
+
+
+def test_an_order_that_cannot_leave_is_said_not_to_have_left(peer: Peer, met: Component) -> None:
+    peer.is_up = False
+    assert not met.order(9, 1000)
+
+
+def test_answers_to_our_orders_reach_the_executor_and_no_others(peer: Peer, met: Component) -> None:
+    results: list[int] = []
+    met.on_order_ack = results.append
+    met.receive(peer.autopilot("command_ack", 183, 4, 0, 0, VEHICLE, 191), 1.0)
+    met.receive(peer.autopilot("command_ack", 183, 0, 0, 0, 0, 0), 1.0)
+    met.receive(peer.autopilot("command_ack", 183, 4, 0, 0, 255, 190), 1.0)
+    met.receive(peer.autopilot("command_ack", 511, 4, 0, 0, VEHICLE, 191), 1.0)
+    assert results == [4, 0]
+
+
+def test_positions_pass_through_as_inputs(peer: Peer, met: Component) -> None:
+    (item,) = met.receive(peer.position(1.5), 3.0)
+    assert isinstance(item, Telemetry)
+    assert item.received_s == 3.0
+
+
+async def test_the_component_needs_no_event_loop_of_its_own() -> None:
+    assert len(asyncio.all_tasks()) == 1

@@ -1,0 +1,342 @@
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.config import Config, load
+from companion.config.rules import mismatches, without_effect
+from companion.config.wording import allowed_text
+from companion.core.types import Fix, Method
+from companion.errors import ConfigError
+
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLE = ROOT / "examples" / "anyang" / "config.toml"
+
+# What no file may leave out: it has to be measured on the sprayer.
+MEASURED = """
+version = 1
+[boom]
+width_m = 4.0
+[[valve]]
+name = "left"
+right_m = -1.0
+channel = 9
+[[valve]]
+name = "right"
+right_m = 1.0
+channel = 10
+[[nozzle_set]]
+valves = ["left", "right"]
+duty = [0.2, 1.0]
+flow_l_min = [1.0, 4.0]
+[lag]
+on_s = 0.1
+off_s = 0.1
+up_s = 0.1
+down_s = 0.1
+on_start_s = 0.05
+off_end_s = 0.2
+output_s = 0.02
+"""
+
+
+def refusal(path: Path, *overrides: str) -> str:
+    with pytest.raises(ConfigError) as refused:
+        load(path, overrides=overrides)
+    text = str(refused.value)
+    assert "\n" not in text
+    return text
+
+
+def test_example_becomes_types_of_the_core() -> None:
+    config = load(EXAMPLE)
+    boom = config.boom()
+    assert [valve.right_m for valve in boom.valves] == [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
+    assert [valve.width_m for valve in boom.valves] == [1.0] * 6
+    assert [valve.channel for valve in boom.valves] == [9, 10, 11, 12, 13, 14]
+    (nozzles,) = config.nozzle_sets()
+    assert nozzles.valves == (0, 1, 2, 3, 4, 5)
+    assert (nozzles.flow_min_l_min, nozzles.flow_max_l_min) == (1.476, 6.096)
+    assert config.pwm_limits().frequency_hz == 11.0
+    assert config.method() is Method.SCHEDULED
+    assert config.look_ahead_s() == pytest.approx(0.97)
+    assert config.limits().fix is Fix.RTK_FLOAT
+    assert config.limits().modes == {"AUTO"}
+
+
+def test_every_lag_reaches_the_core_under_its_own_name(tmp_path: Path) -> None:
+    names = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s", "output_s", "position_s")
+    values = dict(zip(names, (0.21, 0.22, 0.23, 0.24, 0.05, 0.26, 0.27, 0.28), strict=True))
+    lag = load(EXAMPLE, overrides=[f"lag.{name}={value}" for name, value in values.items()])
+    assert {name: getattr(lag.lag_model(), name) for name in names} == values
+    settled = load(EXAMPLE, overrides=["lag.reference=settled"]).lag_model()
+    assert settled.reference == "settled"
+
+
+def test_every_limit_reaches_the_core_under_its_own_name() -> None:
+    values: dict[str, Any] = {
+        "position_age_max_s": 0.71,
+        "heartbeat_age_max_s": 2.2,
+        "speed_min_m_s": 1.3,
+        "speed_max_m_s": 9.4,
+        "speed_disagreement_max_m_s": 0.6,
+        "height_min_m": 1.7,
+        "height_max_m": 8.8,
+        "wind_max_m_s": 5.9,
+        "wind_required": True,
+        "rc_channel": 8,
+    }
+    overrides = [f"safety.{key}={json.dumps(value)}" for key, value in values.items()]
+    overrides += ['safety.modes=["guided"]', 'safety.enable_by=["rc"]', "safety.fix=rtk-fixed"]
+    limits = load(EXAMPLE, overrides=overrides).limits()
+    assert {key: getattr(limits, key) for key in values} == values
+    assert limits.modes == {"GUIDED"}
+    assert limits.enable_by == {"rc"}
+    assert limits.fix is Fix.RTK_FIXED
+
+
+def test_strips_share_the_width_by_the_largest_set_unless_a_valve_has_its_own(
+    tmp_path: Path,
+) -> None:
+    small = '[[nozzle_set]]\nvalves = ["left"]\nduty = [0.2, 1.0]\nflow_l_min = [0.5, 2.0]\n'
+    path = tmp_path / "config.toml"
+    path.write_text(MEASURED + small)
+    config = load(path, overrides=["valve[1].width_m=1.5", "valve[1].forward_m=-0.3"])
+    left, right = config.boom().valves
+    assert (left.width_m, right.width_m) == (2.0, 1.5)
+    assert (left.forward_m, right.forward_m) == (0.0, -0.3)
+    assert [nozzles.valves for nozzles in config.nozzle_sets()] == [(0,), (0, 1)]
+
+
+def test_smallest_file_is_accepted_and_shows_the_origin_of_each_setting(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(MEASURED)
+    settings = load(path, overrides=["lag.on_s = 0.12"]).settings()
+    assert settings["lag.on_s"] == (0.12, "override")
+    assert settings["lag.off_s"] == (0.1, "file")
+    assert settings["valve[1].right_m"] == (1.0, "file")
+    assert settings["link.url"] == ("udpin:127.0.0.1:14550", "default")
+
+
+MEASURED_KEYS = [
+    "boom.width_m",
+    "valve",
+    "nozzle_set",
+    "valve[0].right_m",
+    "nozzle_set[0].duty",
+    "nozzle_set[0].flow_l_min",
+    *(f"lag.{kind}_s" for kind in ("on", "off", "up", "down", "on_start", "off_end", "output")),
+]
+
+
+@pytest.mark.parametrize("key", MEASURED_KEYS)
+def test_what_must_be_measured_has_no_default(key: str) -> None:
+    raw = tomllib.loads(MEASURED)
+    node: Any = raw
+    *steps, last = key.replace("[0]", ".0").split(".")
+    for step in steps:
+        node = node[int(step)] if step.isdigit() else node[step]
+    del node[last]
+    with pytest.raises(ValueError, match="required"):
+        Config.model_validate(raw)
+
+
+REFUSED = [
+    ("lag.onn_s=0.1", "lag.onn_s = 0.1: unknown key; did you mean lag.on_s?"),
+    ("prescripton.file=x", "unknown key; did you mean prescription?"),
+    ("valve[2].rihgt_m=1", "did you mean valve[2].right_m?"),
+    ("lag.on_s=fast", 'lag.on_s = "fast": not a number; write a number from 0 to 30'),
+    ('boom.width_m="6.0"', 'boom.width_m = "6.0": not a number'),
+    ("lag.on_s=true", "lag.on_s = true: not a number"),
+    ("lag.on_s=nan", "lag.on_s = NaN: not finite"),
+    ("boom.height_m=inf", "boom.height_m = Infinity: not finite"),
+    ("lag.on_s=99", "lag.on_s = 99: out of range; write a number from 0 to 30"),
+    ("lag.on_s=-0.1", "lag.on_s = -0.1: out of range"),
+    ("boom.width_m=0", "boom.width_m = 0: out of range; write a number above 0 up to 100"),
+    ("link.system_id=1.5", "link.system_id = 1.5: not a whole number"),
+    ("link.url=com3", "udpin:HOST:PORT"),
+    ("link.url=tcp:host:70000", "write one from 1 to 65535"),
+    ("version=2", "version = 2: out of range; write 1"),
+    ("version=true", "version = true: not a whole number; write 1"),
+    ("output.kind=usb", 'output.kind = "usb": not known; write one of "servo", "gpio", "none"'),
+    ("safety.modes=AUTO", 'safety.modes = "AUTO": not a list'),
+    ("safety.modes=[]", "safety.modes = []: too few entries"),
+    ("mission.angle_deg=north", 'write a number from -360 to 360 or "auto"'),
+    ("mission.depots=[[36.0, 114.0], [99.0, 3.0]]", "mission.depots[1][0] = 99.0: out of range"),
+    ("boom=3", "boom = 3: not a table; write a table [boom]"),
+    ("valve=[]", "valve = []: too few entries; write [[valve]] tables"),
+    ("valve[2].right_m=-4", "valve[2].right_m = -4: not to the right of valve[1] (-1.5)"),
+    ("valve[2].name='1'", 'valve[2].name = "1": another valve has this name'),
+    ("valve[1].channel=9", "valve[0].channel = 9: used twice"),
+    ("valve[1].channel=33", "valve[1].channel = 33: no servo output; write one from 1 to 32"),
+    ("output.return_channel=9", "used twice"),
+    ("nozzle_set[0].valves=['7']", 'no valve is named "7"'),
+    ("nozzle_set[0].valves=['1', '1']", "a valve stands twice"),
+    ("nozzle_set[0].valves=['1']", 'valve[1].name = "2": in no nozzle_set.valves'),
+    ("nozzle_set[0].flow_l_min[3]=3.0", "nozzle_set[0].flow_l_min = [1.476, 3.024, 3.276, 3.0"),
+    ("nozzle_set[0].flow_l_min[3]=3.276", "flow_l_min must be strictly increasing"),
+    ("nozzle_set[0].duty[0]=0.45", "nozzle_set[0].duty = [0.45, 0.4"),
+    ("nozzle_set[0].duty=[0.2, 1.0]", "7 flows for 2 duties"),
+    ("nozzle_set[0].duty[6]=1.5", "nozzle_set[0].duty[6] = 1.5: out of range"),
+    ("pwm.valve=normally-open", "safety.pump_cutoff = true"),
+    ("pwm.duty_min=0.95", "not below pwm.duty_max = 0.9"),
+    ("pwm.min_on_s=0.09", "write less, or a lower pwm.frequency_hz"),
+    ("lag.on_start_s=0.2", "lag.on_start_s = 0.2: first flow after lag.on_s = 0.1"),
+    ("lag.off_end_s=0.01", "lag.off_end_s = 0.01: last flow before lag.off_s = 0.08"),
+    ("output.full_us=1010", "output.full_us = 1010"),
+    ("safety.speed_min_m_s=20", "not below safety.speed_max_m_s = 12"),
+    ("safety.height_min_m=20", "not below safety.height_max_m = 10"),
+    ("safety.enable_by=['rc']", "safety.rc_channel"),
+    ("safety.enable_by=['web']", "web.enabled"),
+    ("mission.reserve_l=40", "not below mission.tank_l = 40"),
+]
+
+
+@pytest.mark.parametrize(("override", "expected"), REFUSED, ids=[case[0] for case in REFUSED])
+def test_wrong_setting_is_refused_in_one_line_with_file_key_value_and_fix(
+    override: str, expected: str
+) -> None:
+    text = refusal(EXAMPLE, override)
+    assert text.startswith(f"{EXAMPLE}: ")
+    assert expected in text
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("lag", "write KEY=VALUE"),
+        ("lag..on_s=1", "write KEY=VALUE"),
+        ("valve[9].right_m=1", "no entry [9]"),
+        ("link.url.host=x", "host stands in no table"),
+    ],
+)
+def test_override_that_names_no_setting_is_refused(override: str, expected: str) -> None:
+    text = refusal(EXAMPLE, override)
+    assert text.startswith("override")
+    assert expected in text
+
+
+def test_missing_key_is_named_with_what_to_write(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(MEASURED.replace("up_s = 0.1\n", ""))
+    text = refusal(path)
+    assert text == (
+        f"{path}: lag.up_s: missing; write a number from 0 to 30 "
+        "(measured: the same, to a larger flow)"
+    )
+
+
+def test_typing_error_is_reported_before_the_gap_that_it_leaves(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text(MEASURED.replace("up_s", "upp_s"))
+    text = refusal(path)
+    assert "lag.upp_s = 0.1: unknown key; did you mean lag.up_s? (and 1 more problem)" in text
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (b"version = 1\nlag.on_s = 0,1\n", 'line 2: "lag.on_s = 0,1"'),
+        (b"version = 1\nversion = 1\n", "line 2"),
+        (b"x = [", "not closed at the end of the file"),
+        (b"\xff\xfe1\x00", "save the file as UTF-8"),
+        (b"x = " + b"[" * 9000, "nested too deep"),
+        (b"# " + b"x" * 1_000_001, "too large"),
+        (b"", "version: missing"),
+    ],
+    ids=["syntax", "twice", "open", "utf-16", "deep", "large", "empty"],
+)
+def test_broken_file_is_refused_in_one_line(tmp_path: Path, content: bytes, expected: str) -> None:
+    path = tmp_path / "config.toml"
+    path.write_bytes(content)
+    text = refusal(path)
+    assert text.startswith(f"{path}: ")
+    assert expected in text
+
+
+def test_path_that_is_no_file_is_refused(tmp_path: Path) -> None:
+    assert "no such file" in refusal(tmp_path / "none.toml")
+    assert "is a directory" in refusal(tmp_path)
+
+
+def test_normally_open_valves_are_accepted_with_a_pump_cutoff() -> None:
+    config = load(EXAMPLE, overrides=["pwm.valve=normally-open", "safety.pump_cutoff=true"])
+    assert config.pwm.valve == "normally-open"
+
+
+def test_dry_run_needs_no_channels(tmp_path: Path) -> None:
+    path = tmp_path / "config.toml"
+    path.write_text("\n".join(line for line in MEASURED.splitlines() if "channel" not in line))
+    assert "valve[0].channel: missing; write the servo output" in refusal(path)
+    assert load(path, overrides=["output.kind=none"]).output.kind == "none"
+
+
+@pytest.mark.parametrize(("swath_m", "found"), [(6.11, 0), (5.89, 0), (6.13, 1), (5.87, 1)])
+def test_swath_may_differ_from_the_boom_by_two_percent(swath_m: float, found: int) -> None:
+    config = load(EXAMPLE, overrides=[f"mission.swath_width_m={swath_m}"])
+    keys = [mismatch.key for mismatch in mismatches(config)]
+    assert keys == ["mission.swath_width_m"] * found
+
+
+def test_strips_that_do_not_add_up_to_the_boom_are_a_mismatch() -> None:
+    config = load(EXAMPLE, overrides=["valve[0].width_m=1.5"])
+    assert [mismatch.key for mismatch in mismatches(config)] == ["boom.width_m"]
+
+
+def test_accepted_settings_without_effect_are_named() -> None:
+    overrides = ["web.enabled=true", "output.dither_us=5", "flow_trim.enabled=true"]
+    config = load(EXAMPLE, overrides=overrides)
+    found = {contradiction.key for contradiction in without_effect(config)}
+    assert found == {"web.enabled", "output.dither_us", "flow_trim.enabled"}
+    assert not list(without_effect(load(EXAMPLE)))
+
+
+def test_text_of_the_file_is_kept_for_the_record() -> None:
+    config = load(EXAMPLE)
+    assert config.source_text == EXAMPLE.read_text()
+    assert config.resolve("flights") == EXAMPLE.parent / "flights"
+
+
+def test_number_is_bounded_on_both_sides() -> None:
+    schema = Config.model_json_schema()
+    unbounded = [
+        f"{name}.{key}"
+        for name, table in schema["$defs"].items()
+        for key, node in table["properties"].items()
+        for branch in node.get("anyOf", [node])
+        if branch.get("type") in ("number", "integer")
+        and not (
+            {"minimum", "exclusiveMinimum"} & set(branch)
+            and {"maximum", "exclusiveMaximum"} & set(branch)
+        )
+    ]
+    assert not unbounded
+
+
+def documented_rows() -> list[str]:
+    """One row a key for docs/configuration.md."""
+    schema = Config.model_json_schema(by_alias=True)
+    rows = []
+    for table, node in schema["properties"].items():
+        branch = next((b for b in node.get("anyOf", [node]) if b.get("type") != "null"), node)
+        reference = branch.get("$ref") or branch.get("items", {}).get("$ref")
+        if reference is None:
+            continue
+        definition = schema["$defs"][reference.rpartition("/")[2]]
+        for key, leaf in definition["properties"].items():
+            if key in definition.get("required", []):
+                default = "**required**"
+            else:
+                default = "-" if leaf["default"] is None else f"`{json.dumps(leaf['default'])}`"
+            allowed = allowed_text(leaf, schema, key)
+            rows.append(f"| `{table}.{key}` | {allowed} | {default} | {leaf['description']} |")
+    return rows
+
+
+@pytest.mark.parametrize("row", documented_rows())
+def test_every_key_is_documented_as_it_is(row: str) -> None:
+    assert row in (ROOT / "docs" / "configuration.md").read_text()
