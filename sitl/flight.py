@@ -86,6 +86,7 @@ def fly(
     wang: WangController | None = None,
     method: str | None = None,
     observer: Callable[[Decision], None] | None = None,
+    on_input: Callable[[Input], None] | None = None,
 ) -> FlightResult:
     """Fly `trajectory` with our controller, or with P1's where `wang` is given."""
     if not options.scatter:
@@ -96,7 +97,7 @@ def fly(
     if wang is not None:
         said = _fly_wang(wang, inputs, output, start_s)
     else:
-        said = _fly_ours(setup, inputs, output, start_s, observer)
+        said = _fly_ours(setup, inputs, output, start_s, observer, on_input)
     output.finish(end_s + TAIL_S / 2)
     sample_s = SAMPLE_S[options.fidelity]
     times = start_s + sample_s * np.arange(math.floor((end_s + TAIL_S - start_s) / sample_s) + 1)
@@ -110,6 +111,7 @@ def fly(
         boom=setup.boom,
         prescription=setup.prescription,
         pwm_period_s=profile.pwm.period_s,
+        duty_limits=(profile.pwm.duty_min, profile.pwm.duty_max),
         orders=tuple(output.orders),
         meta=FlightMeta(
             speed_m_s=speed_m_s,
@@ -195,6 +197,7 @@ def _fly_ours(
     output: Output,
     start_s: float,
     observer: Callable[[Decision], None] | None,
+    on_input: Callable[[Input], None] | None,
 ) -> _Said:
     """Run the core as the runtime does: at every position, and 20 times a second at least."""
     track, memory, said = Track(), Memory(), _Said(set())
@@ -215,6 +218,8 @@ def _fly_ours(
     for item in inputs:
         while next_s <= item.received_s:
             decide(next_s)
+        if on_input is not None:
+            on_input(item)
         track = observe(track, item, setup)
         if isinstance(item, Telemetry):
             decide(item.received_s)
