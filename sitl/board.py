@@ -42,10 +42,11 @@ class DriverBoard:
         closed_us: float = 1000.0,
         full_us: float = 2000.0,
         frame_s: float = SERVO_FRAME_S,
+        overrun_s: float = 0.0,
     ) -> None:
         if not closed_us < full_us:
             raise ValueError(f"closed_us must be below full_us, got {closed_us}, {full_us}")
-        self._engine = PulseEngine(pwm, valve_count, start_s=start_s)
+        self._engine = PulseEngine(pwm, valve_count, start_s=start_s, overrun_s=overrun_s)
         self._restarts = kind == "restarting"
         self._closed_us, self._span_us = closed_us, full_us - closed_us
         self._frame_s = frame_s

@@ -91,6 +91,7 @@ def serve(
 def _run(options: Any) -> dict[str, Any]:
     """Run to the end; the first Ctrl-C or SIGTERM ends the flight with its truth written."""
     import asyncio
+    import gc
     import signal
 
     from sitl.serve import serve as fly
@@ -100,6 +101,8 @@ def _run(options: Any) -> dict[str, Any]:
         assert task is not None
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, task.cancel)
+        # What was loaded so far stays: the collector need not look at it during the flight.
+        gc.freeze()
         return await fly(options, lambda text: typer.echo(text, err=True))
 
     return asyncio.run(run())

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from analysis.flight_record import Fidelity, FlightMeta, FlightRecord
+from analysis.flight_record import Fidelity, FlightMeta, FlightRecord, Floats
 from companion.core.controller import Memory, Setup, step
 from companion.core.estimator import Track, estimate, observe
 from companion.core.types import (
@@ -100,7 +100,8 @@ def fly(
         said = _fly_ours(setup, inputs, output, start_s, observer, on_input)
     output.finish(end_s + TAIL_S / 2)
     sample_s = SAMPLE_S[options.fidelity]
-    times = start_s + sample_s * np.arange(math.floor((end_s + TAIL_S - start_s) / sample_s) + 1)
+    samples = math.floor((end_s + TAIL_S - start_s) / sample_s) + 1
+    times: Floats = start_s + sample_s * np.arange(samples, dtype=np.float64)
     path = trajectory.at(times)
     record = FlightRecord(
         time_s=times,
@@ -146,6 +147,7 @@ def _sprayer(
         seed=options.seed,
         start_s=start_s,
         kind=options.board,
+        overrun_s=profile.overrun_s if options.board == "restarting" else 0.0,
     )
     return pulsed, ServoOutput(pulsed, board)
 

@@ -223,3 +223,15 @@ def test_a_thousand_layers_on_the_same_ground_do_not_take_all_pairs() -> None:
     found = a_map(*((ground, 1.0) for ground in layers))
     with pytest.raises(MapError, match=r"overlap by .* \(and [1-9]\d{3} more pairs\)"):
         build_prescription(found, frame_for(found))
+
+
+@pytest.mark.parametrize("rates", [(10.0, 20.0), (20.0, 10.0), (None, 10.0), (10.0, None)])
+def test_a_point_on_a_common_corner_takes_the_smaller_rate(
+    rates: tuple[float | None, float | None],
+) -> None:
+    middle = WEST + CELL
+    left = box(WEST, SOUTH, middle, SOUTH + CELL)
+    right = box(middle, SOUTH, middle + CELL, SOUTH + CELL)
+    (row,) = point_rates(a_map((left, rates[0]), (right, rates[1])), [(SOUTH, middle)])
+    assert row["rate_l_ha"] == 10.0
+    assert row["zone"] == f"zone{rates.index(10.0)}"

@@ -192,3 +192,35 @@ def test_an_obstacle_drawn_as_a_point_is_refused(tmp_path: Path) -> None:
     point = {"type": "Feature", "geometry": {"type": "Point", "coordinates": [WEST, SOUTH]}}
     with pytest.raises(MapError, match="not-a-polygon:Point"):
         read_area(saved(tmp_path, collection(feature(), point)))
+
+
+def test_ground_that_two_rings_of_a_zone_share_stays_ground(tmp_path: Path) -> None:
+    inner = [[x + (x - WEST) / -2, y + (y - SOUTH) / -2] for x, y in SQUARE]
+    zone = feature(1)
+    zone["geometry"] = {"type": "MultiPolygon", "coordinates": [[SQUARE], [inner]]}
+    found = read_map(saved(tmp_path, collection(zone)))
+    assert found.zones[0].geometry.area == pytest.approx(shapely.Polygon(SQUARE).area)
+    assert [problem.code for problem in found.problems] == ["invalid-ring"]
+
+
+def test_a_rate_of_nan_is_no_rate(tmp_path: Path) -> None:
+    rates = [float("nan"), "NaN", " ", "7.5"]
+    found = read_map(saved(tmp_path, collection(*map(feature, rates))), rate_field="dose")
+    assert [zone.rate_l_ha for zone in found.zones] == [None, None, None, 7.5]
+
+
+def test_a_decimal_comma_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="dose of zone 1 is '7,5', which is no rate"):
+        read_map(saved(tmp_path, collection(feature("7,5"))), rate_field="dose")
+
+
+def test_a_coordinate_that_is_no_number_is_called_so(tmp_path: Path) -> None:
+    ring = [SQUARE[0], [float("nan"), SOUTH], *SQUARE[2:]]
+    with pytest.raises(MapError, match="a coordinate is no finite number"):
+        read_map(saved(tmp_path, collection(feature(1, ring))))
+
+
+def test_a_line_break_in_the_path_stays_out_of_the_message(tmp_path: Path) -> None:
+    with pytest.raises(MapError) as caught:
+        read_map(tmp_path / "a\nb.geojson")
+    assert "\n" not in str(caught.value)
