@@ -1,4 +1,4 @@
-"""Command line of the simulation: `vrspray sitl serve`."""
+"""Command line of the simulation: `vrspray sitl serve` and `vrspray sitl fly`."""
 
 from __future__ import annotations
 
@@ -16,16 +16,25 @@ class Board(StrEnum):
     FREE_RUNNING = "free-running"
 
 
+class Fidelity(StrEnum):
+    """How closely the valves are simulated."""
+
+    AVERAGED = "averaged"
+    PULSED = "pulsed"
+
+
+class OutputPath(StrEnum):
+    """By which way the orders reach the valves."""
+
+    GPIO = "gpio"
+    SERVO = "servo"
+
+
 app = typer.Typer(
     help="The simulated flight: stub autopilot and twin.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-
-
-@app.callback()
-def main() -> None:
-    """Keep `serve` a command of its own while it is the only one."""
 
 
 @app.command()
@@ -86,6 +95,55 @@ def serve(
         raise typer.Exit(2) from None
     _print_result(result, as_json=json)
     raise typer.Exit(0 if result["state"] in ("landed", "stopped") else 1)
+
+
+@app.command()
+def fly(
+    config: Annotated[Path, typer.Option(help="Configuration of the companion.")],
+    mission: Annotated[Path, typer.Option(help="Mission, .plan or .waypoints.")],
+    scenario: Annotated[Path | None, typer.Option(help="Faults by the clock (TOML).")] = None,
+    plant: Annotated[
+        str | None,
+        typer.Option(help="Sprayer profile, a name or a .toml; default: that of the nearest flow."),
+    ] = None,
+    fidelity: Annotated[
+        Fidelity | None, typer.Option(help="averaged, or pulsed; default: what --output needs.")
+    ] = None,
+    output: Annotated[OutputPath, typer.Option(help="gpio or servo.")] = OutputPath.GPIO,
+    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 1,
+    speed: Annotated[
+        float | None, typer.Option(help="m/s on every leg; default: the mission's.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for truth, result, picture and journal.")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
+) -> None:
+    """Fly a mission in the closed loop, faster than real time, and evaluate it.
+
+    Example: vrspray sitl fly --config examples/anyang/config.toml --mission
+    examples/anyang/mission.waypoints
+    """
+    from companion.cli.answer import answer, note
+    from sitl.fly import FlyOptions, fly_mission
+    from sitl.fly_files import fly_lines, write_files
+
+    options = FlyOptions(
+        config=config,
+        mission=mission,
+        scenario=scenario,
+        plant=plant,
+        fidelity=None if fidelity is None else fidelity.value,
+        output=output.value,
+        seed=seed,
+        speed_m_s=speed,
+        out=out,
+    )
+    flown = fly_mission(options, note)
+    result = flown.as_json()
+    if out is not None:
+        result["out"] = [str(path) for path in write_files(flown, out, note)]
+    answer(result, fly_lines(result), as_json=json)
 
 
 def _run(options: Any) -> dict[str, Any]:

@@ -87,6 +87,7 @@ def fly(
     method: str | None = None,
     observer: Callable[[Decision], None] | None = None,
     on_input: Callable[[Input], None] | None = None,
+    disturb: Callable[[Iterator[Input]], Iterator[Input]] | None = None,
 ) -> FlightResult:
     """Fly `trajectory` with our controller, or with P1's where `wang` is given."""
     if not options.scatter:
@@ -94,6 +95,8 @@ def fly(
     start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     plant, output = _sprayer(profile, options, start_s)
     inputs = _inputs(setup, trajectory, options)
+    if disturb is not None:
+        inputs = disturb(inputs)
     if wang is not None:
         said = _fly_wang(wang, inputs, output, start_s)
     else:

@@ -22,6 +22,9 @@ Reference = Literal["volume", "settled"]
 DUTY_STEP = 0.0001
 # Beyond this share a change of duty at once is a late change of zone and not a trim for speed.
 TRIM_MAX_SHARE = 0.08
+# A trim moves by at most this at once: below the 2 % of the span at which a driver board takes a
+# change for a new zone and restarts its period; 20 such steps a second follow any braking.
+TRIM_STEP_MAX = 0.018
 # How far ahead of its time a change that was already ordered is left alone when the prediction
 # moves it back: without this, noise would revert it for a moment and order it again.
 STICKY_S = 0.1
@@ -229,6 +232,8 @@ def schedule(
     if abs(duty - in_force) >= DUTY_STEP or (duty == 0.0) != (in_force == 0.0):
         restart = not 0.0 < abs(duty - in_force) <= TRIM_MAX_SHARE * in_force or duty == 0.0
         late = restart and due > 0
+        if not restart:
+            duty = min(max(duty, in_force - TRIM_STEP_MAX), in_force + TRIM_STEP_MAX)
         changes.append(TimedChange(at_s=now_s, valve=valve, duty=duty, restart=restart))
     changes.extend(
         TimedChange(at_s=order.at_s, valve=valve, duty=order.duty)

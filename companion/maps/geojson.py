@@ -13,7 +13,15 @@ from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
 from companion.maps.crs import WGS84, crs_name, parse_crs
-from companion.maps.layer import Column, Layer, Value, check_counts, digest, read_bytes
+from companion.maps.layer import (
+    Column,
+    Layer,
+    Value,
+    check_coordinates,
+    check_counts,
+    digest,
+    read_bytes,
+)
 from companion.maps.local import as_area
 from companion.maps.model import Problem, map_error
 
@@ -155,7 +163,9 @@ def _ring(ring: list[list[float]]) -> np.ndarray[tuple[int, int], np.dtype[np.fl
     points = np.array([(x, y) for x, y, *_ in ring])
     if points.dtype.kind not in "if" or len(points) < 4:
         raise ValueError("a ring needs four positions of numbers")
-    return points.astype(np.float64)
+    coordinates = points.astype(np.float64)
+    check_coordinates(coordinates)
+    return coordinates
 
 
 def _columns(features: list[dict[str, object]], path: Path) -> tuple[Column, ...]:

@@ -12,6 +12,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon
 
@@ -22,6 +24,7 @@ from companion.maps.model import Problem, map_error
 MAX_FILE_BYTES = 256 * 1024 * 1024
 MAX_RECORDS = 1_000_000
 MAX_VERTICES = 5_000_000
+COORDINATE_MAX = 1e9
 
 Value = str | float | None
 
@@ -94,6 +97,15 @@ def digest(parts: Iterable[bytes]) -> str:
     for part in parts:
         sha256.update(part)
     return sha256.hexdigest()
+
+
+def check_coordinates(points: NDArray[np.float64]) -> None:
+    """Raise a `ValueError` where a coordinate is nowhere on earth, in any unit.
+
+    Before any sum or product of coordinates, which could overflow.
+    """
+    if not (np.abs(points) <= COORDINATE_MAX).all():
+        raise ValueError("a coordinate is no finite number, or beyond a billion")
 
 
 def check_counts(path: Path, *, records: int, vertices: int) -> None:

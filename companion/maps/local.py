@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import TypeVar
 
@@ -41,6 +41,12 @@ def project_all(
     cut = densified(geometries, SEGMENT_M / METRES_PER_DEGREE)
     result: Objects = shapely.transform(cut, transform)
     return result
+
+
+def places(points: Sequence[tuple[float, float]], frame: LocalFrame) -> Floats:
+    """Return (latitude, longitude) points as rows of east and north, infinite beyond the earth."""
+    degrees = np.array(points, dtype=np.float64).reshape(-1, 2)
+    return np.column_stack(_transformer(frame).transform(degrees[:, 1], degrees[:, 0]))
 
 
 def project(

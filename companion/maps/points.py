@@ -9,6 +9,7 @@ import shapely
 from shapely import STRtree
 
 from companion.maps.build import build_prescription, frame_for
+from companion.maps.local import places
 from companion.maps.model import MapFile, MapZone
 
 Point = tuple[float, float]
@@ -25,8 +26,7 @@ def point_rates(
     """
     frame = frame_for(map_file)
     prescription = build_prescription(map_file, frame, overlap=overlap)
-    places = np.array([frame.to_local(*point) for point in points], dtype=np.float64)
-    east_m, north_m = places.reshape(-1, 2).T
+    east_m, north_m = places(points, frame).T
     real = np.isfinite(east_m) & np.isfinite(north_m)
     found = prescription.zones_at(np.where(real, east_m, np.inf), np.where(real, north_m, np.inf))
     answers: dict[int, Answer] = {
@@ -57,9 +57,9 @@ def _touched(map_file: MapFile, points: Sequence[Point], which: list[int]) -> di
     parts, owner = shapely.get_parts(
         np.array([zone.geometry for zone in zones], dtype=object), return_index=True
     )
-    places = shapely.points([(points[index][1], points[index][0]) for index in which])
+    spots = shapely.points([(points[index][1], points[index][0]) for index in which])
     around: dict[int, list[MapZone]] = {index: [] for index in which}
-    for place, part in STRtree(parts).query(places, predicate="intersects").T.tolist():
+    for place, part in STRtree(parts).query(spots, predicate="intersects").T.tolist():
         around[which[place]].append(zones[owner[part]])
     return {index: _smallest(met) for index, met in around.items()}
 

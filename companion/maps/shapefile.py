@@ -22,7 +22,14 @@ from shapely.errors import ShapelyError
 
 from companion.maps.crs import parse_crs
 from companion.maps.dbf import BROKEN, read_columns
-from companion.maps.layer import MAX_RECORDS, Layer, check_counts, digest, read_bytes
+from companion.maps.layer import (
+    MAX_RECORDS,
+    Layer,
+    check_coordinates,
+    check_counts,
+    digest,
+    read_bytes,
+)
 from companion.maps.model import Problem, map_error
 from companion.maps.rings import area_of_rings
 
@@ -132,6 +139,7 @@ def _area(shape: shapefile.Shape) -> tuple[Polygon | MultiPolygon | None, str]:
         return None, f"not-a-polygon:{shape.shapeTypeName}"
     # Points carry heights and measures behind x and y in some files.
     points = np.array([point[:2] for point in shape.points], dtype=np.float64).reshape(-1, 2)
+    check_coordinates(points)
     starts = list(shape.parts)
     if starts and (starts[0] != 0 or starts != sorted(starts) or starts[-1] > len(points)):
         raise ValueError("its parts are out of order")

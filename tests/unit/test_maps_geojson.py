@@ -214,8 +214,12 @@ def test_a_decimal_comma_is_refused(tmp_path: Path) -> None:
         read_map(saved(tmp_path, collection(feature("7,5"))), rate_field="dose")
 
 
-def test_a_coordinate_that_is_no_number_is_called_so(tmp_path: Path) -> None:
-    ring = [SQUARE[0], [float("nan"), SOUTH], *SQUARE[2:]]
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e300])
+@pytest.mark.parametrize("vertex", [0, 1])
+def test_a_coordinate_that_is_no_number_is_called_so(
+    tmp_path: Path, value: float, vertex: int
+) -> None:
+    ring = [[value, SOUTH] if index == vertex else xy for index, xy in enumerate(SQUARE)]
     with pytest.raises(MapError, match="a coordinate is no finite number"):
         read_map(saved(tmp_path, collection(feature(1, ring))))
 

@@ -484,3 +484,17 @@ def test_a_file_too_large_to_read_is_refused_unread(
     monkeypatch.setattr(layer, "MAX_FILE_BYTES", 100)
     with pytest.raises(MapError, match="more than 0 MB"):
         read_map(path)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1e308])
+@pytest.mark.parametrize("vertex", [0, 1, 4])
+def test_a_coordinate_that_is_no_place_is_refused(
+    tmp_path: Path, value: float, vertex: int
+) -> None:
+    path = simple(tmp_path)
+    content = bytearray(path.read_bytes())
+    at = 100 + 8 + 44 + 4 + 16 * vertex
+    content[at : at + 8] = struct.pack("<d", value)
+    path.write_bytes(content)
+    with pytest.raises(MapError, match="coordinate"):
+        read_map(path)

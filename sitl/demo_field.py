@@ -1,0 +1,106 @@
+"""What the demo's flights have in common: the field, the rates of a speed, the path, the lags."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+from companion.assembly import build_setup
+from companion.config import Config, load
+from companion.core.controller import Setup
+from companion.core.prescription import Prescription
+from companion.core.schedule import LagModel
+from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_route
+from sitl.board import SERVO_FRAME_S
+from sitl.flight import MESSAGE_DELAY_S, FlightOptions
+from sitl.profile import PlantProfile
+from sitl.route import Route
+from sitl.trajectory import Trajectory
+from sitl.vehicle import Vehicle
+
+# P1 flew its rates at 5 m/s; the example's map is for this speed.
+MAP_SPEED_M_S = 5.0
+START_S = 100.0
+ACCELERATION_M_S2 = 2.5
+# On the run-out, beyond what accelerating takes: the speed is steady where the field begins.
+STEADY_M = 5.0
+# The autopilot's wire, and the mean wait for the next servo frame.
+SERVO_DELAY_S = 0.002 + 0.5 * SERVO_FRAME_S
+
+
+@cache
+def example() -> Config:
+    """Return the configuration of the example field."""
+    return load(EXAMPLE / "config.toml")
+
+
+@cache
+def demo_setup(speed_m_s: float) -> Setup:
+    """Return the example's set-up with its rates for one speed, and limits that allow the speed."""
+    setup = build_setup(example())
+    limits = replace(
+        setup.limits,
+        speed_min_m_s=min(setup.limits.speed_min_m_s, 0.5 * speed_m_s),
+        speed_max_m_s=max(setup.limits.speed_max_m_s, 1.5 * speed_m_s),
+    )
+    prescription = scaled(setup.prescription, MAP_SPEED_M_S / speed_m_s)
+    return replace(setup, limits=limits, prescription=prescription)
+
+
+def scaled(prescription: Prescription, factor: float) -> Prescription:
+    """Return the same map with every rate times `factor`."""
+    default = prescription.default_rate_l_ha
+    return Prescription(
+        [replace(zone, rate_l_ha=zone.rate_l_ha * factor) for zone in prescription.zones],
+        boundary=prescription.field,
+        overlap=prescription.overlap,
+        default_rate_l_ha=None if default is None else default * factor,
+        sha256=prescription.sha256,
+    )
+
+
+def demo_lags(profile: PlantProfile, output: str, *, perfect: bool = False) -> LagModel:
+    """Return the lags of the nominal valve, of the output path and of the position.
+
+    They are what a calibration measures in the mean; the single valve, the single message and the
+    single servo frame scatter around them. With perfect knowledge the position is not late.
+    """
+    late_s = FlightOptions().estimator_lag_s + MESSAGE_DELAY_S
+    return replace(
+        profile.lags(),
+        output_s=SERVO_DELAY_S if output == "servo" else 0.0,
+        position_s=0.0 if perfect else late_s,
+    )
+
+
+@cache
+def demo_trajectory(speed_m_s: float, seed: int) -> Trajectory:
+    """Return the path of a speed and a seed, the same for all methods."""
+    route = demo_route(speed_m_s)
+    vehicle = Vehicle(route, start_s=START_S, seed=seed, acceleration_m_s2=ACCELERATION_M_S2)
+    return vehicle.fly_to_end()
+
+
+def demo_route(speed_m_s: float) -> Route:
+    """Return the passes over the field, longer where the speed needs more room to be reached."""
+    route = anyang_route(speed_m_s, demo_setup(speed_m_s).frame)
+    more_m = speed_m_s**2 / (2.0 * ACCELERATION_M_S2) + STEADY_M - RUN_OUT_M
+    if not more_m > 0.0:
+        return route
+    first = route.legs[0]
+    east_m, north_m = first.east_m - route.start_east_m, first.north_m - route.start_north_m
+    stretch = more_m / (east_m**2 + north_m**2) ** 0.5
+    east_m, north_m = east_m * stretch, north_m * stretch
+    # Two ends in the north, two in the south: where a pass ends, and where the next one begins.
+    legs = []
+    for number, leg in enumerate(route.legs):
+        sign = 1.0 if number % 4 < 2 else -1.0
+        legs.append(
+            replace(leg, east_m=leg.east_m + sign * east_m, north_m=leg.north_m + sign * north_m)
+        )
+    return replace(
+        route,
+        start_east_m=route.start_east_m - east_m,
+        start_north_m=route.start_north_m - north_m,
+        legs=tuple(legs),
+    )

@@ -1,0 +1,331 @@
+"""`vrspray sitl fly`: one mission over one map in the closed loop, evaluated, without a socket.
+
+The controller is the configured one with its configured lags; the plant is a profile with its own
+true ones. A second flight of the same path with perfect knowledge says how far from the best
+possible the first one was.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import shapely
+
+from analysis.border import off_target_ml
+from analysis.evaluation import Evaluation, evaluate, limit_ratio
+from analysis.strips import strips_of
+from companion.assembly import build_setup, deliverable
+from companion.config import Config, load
+from companion.core.controller import Setup
+from companion.core.nozzle import NozzleSet, allowed_duty
+from companion.core.prescription import Prescription
+from companion.core.rate import flow_for_rate
+from companion.errors import ConfigError
+from sitl.board import SERVO_FRAME_S
+from sitl.flight import FlightOptions, FlightResult, fly
+from sitl.input_faults import check_on_inputs, with_faults
+from sitl.profile import PROFILES, PlantProfile, load_profile
+from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
+from sitl.stub.faults import Fault, read_scenario
+from sitl.vehicle import Route, Trajectory, Vehicle
+
+if TYPE_CHECKING:
+    from shapely import LineString
+
+    from analysis.flight_record import Fidelity, FlightRecord
+    from companion.core.types import Decision, Input
+    from companion.maps.model import Problem
+    from sitl.vehicle import Leg
+
+DEFAULT_SPEED_M_S = 5.0
+DEFAULT_ACCELERATION_M_S2 = 2.5
+WIRE_S = 0.002  # of `ServoOutput`
+SAY_EVERY_S = 300.0  # of the flight
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlyOptions:
+    """What the command line says; None leaves it to the files."""
+
+    config: Path
+    mission: Path
+    scenario: Path | None = None
+    plant: str | None = None
+    fidelity: Fidelity | None = None
+    output: Literal["gpio", "servo"] = "gpio"
+    seed: int = 1
+    speed_m_s: float | None = None
+    out: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """Everything that is known before the take-off."""
+
+    config: Config
+    setup: Setup
+    profile: PlantProfile
+    route: Route
+    speed_m_s: float
+    warnings: tuple[Problem, ...]
+    faults: tuple[Fault, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flown:
+    """A flight with its path, its perfect twin's figures, and the time that it took."""
+
+    task: Task
+    result: FlightResult
+    evaluation: Evaluation
+    perfect: Evaluation
+    trajectory: Trajectory
+    zero_rate_ml: float
+    trace: tuple[Input | Decision, ...]
+    wall_s: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the results in the shape of the contract."""
+        ratio = limit_ratio(self.evaluation, self.perfect)
+        warnings = [asdict(problem) for problem in self.task.warnings]
+        flight = self.evaluation.as_json(limit_ratio=ratio) | {
+            "zero_rate_ml": self.zero_rate_ml,
+            "plant": self.task.profile.name,
+            "steps": self.result.steps,
+            "late": self.result.late,
+            "unresolved": self.result.unresolved,
+            "inhibits": sorted(self.result.inhibits),
+        }
+        return {
+            "flights": [flight],
+            "warnings": warnings,
+            "wall_s": self.wall_s,
+            "simulated_s": self.result.simulated_s,
+            "times_real_time": self.result.simulated_s / self.wall_s,
+        }
+
+
+def fly_mission(options: FlyOptions, say: Say) -> Flown:
+    """Fly one mission as `options` say, and return what came of it."""
+    task = prepare(options)
+    say(f"plant {task.profile.name}, {len(task.route.legs)} legs, {task.speed_m_s:g} m/s")
+    for problem in task.warnings:
+        say(f"warning: {problem.text}; {problem.fix}")
+    trajectory = _trajectory(task, options.seed)
+    trace: list[Input | Decision] = []
+    began_s = time.perf_counter()
+    result = _flight(task, trajectory, options, say, trace if options.out is not None else None)
+    wall_s = time.perf_counter() - began_s
+    say(f"flown {result.simulated_s:.0f} s in {wall_s:.2f} s; evaluating")
+    evaluation = evaluate(result.record)
+    perfect = evaluate(_perfect_flight(task, trajectory, options).record)
+    return Flown(
+        task=task,
+        result=result,
+        evaluation=evaluation,
+        perfect=perfect,
+        trajectory=trajectory,
+        zero_rate_ml=zero_rate_ml(result.record, evaluation.off_target_ml),
+        trace=tuple(trace),
+        wall_s=wall_s,
+    )
+
+
+def prepare(options: FlyOptions) -> Task:
+    """Read all files and check that they go together."""
+    speed = options.speed_m_s
+    if speed is not None and not SPEED_MIN_M_S <= speed <= SPEED_MAX_M_S:
+        raise ConfigError(f"--speed {speed:g}: give {SPEED_MIN_M_S:g} to {SPEED_MAX_M_S:g} m/s")
+    if not options.seed >= 0:
+        raise ConfigError(f"--seed {options.seed}: give 0 or more")
+    if options.output == "servo" and options.fidelity == "averaged":
+        raise ConfigError("--output servo makes pulses: leave --fidelity averaged out")
+    config = load(options.config)
+    setup = build_setup(config)
+    profile = _plant(options.plant, setup)
+    faults = () if options.scenario is None else read_scenario(options.scenario)
+    if options.scenario is not None:
+        check_on_inputs(faults, options.scenario)
+    default_m_s = DEFAULT_SPEED_M_S if config.mission is None else config.mission.speed_m_s
+    route = read_route(
+        options.mission, setup.frame, speed_m_s=speed, default_speed_m_s=default_m_s
+    )
+    over = legs_over(route, setup.prescription.field, reach_m=setup.boom.reach_m)
+    if not over:
+        raise ConfigError(
+            f"{options.mission}: the mission does not come over the map of {options.config}; "
+            "give files of the same field"
+        )
+    speeds = sorted({leg.speed_m_s for leg, _ in over})
+    if not any(delivers(setup, speed_m_s) for speed_m_s in speeds):
+        raise ConfigError(f"{options.config}: {_nothing(setup, speeds[-1])}")
+    return Task(
+        config=config,
+        setup=setup,
+        profile=profile,
+        route=route,
+        speed_m_s=_main_speed_m_s(over),
+        warnings=tuple(p for speed_m_s in speeds for p in deliverable(setup, speed_m_s)),
+        faults=faults,
+    )
+
+
+def delivers(setup: Setup, speed_m_s: float) -> bool:
+    """Return whether any rate of the map opens any valve at `speed_m_s`."""
+    flows = [flow_for_rate(rate, speed_m_s, setup.boom.width_m) for rate in _rates(setup)]
+    return any(
+        allowed_duty(nozzles.curve.duty_for(flow), setup.pwm) > 0.0
+        for nozzles in setup.nozzle_sets
+        for flow in flows
+    )
+
+
+def _rates(setup: Setup) -> set[float]:
+    rates = {zone.rate_l_ha for zone in setup.prescription.zones}
+    rates.add(setup.prescription.default_rate_l_ha or 0.0)
+    return {rate for rate in rates if rate > 0.0}
+
+
+def _nothing(setup: Setup, speed_m_s: float) -> str:
+    """Return why nothing at all would be sprayed."""
+    problems = deliverable(setup, speed_m_s)
+    if not problems:
+        return "the map has no rate above 0 L/ha; there is nothing to spray"
+    return f"nothing of the map can be delivered: {problems[0].text}; {problems[0].fix}"
+
+
+def _main_speed_m_s(over: Iterable[tuple[Leg, LineString]]) -> float:
+    """Return the speed of most of the way over the field."""
+    length_m: dict[float, float] = {}
+    for leg, line in over:
+        length_m[leg.speed_m_s] = length_m.get(leg.speed_m_s, 0.0) + line.length
+    return max(length_m, key=lambda speed_m_s: length_m[speed_m_s])
+
+
+def _plant(name: str | None, setup: Setup) -> PlantProfile:
+    """Return the sprayer that is asked for, or the one whose full flow is nearest."""
+    count = len(setup.boom.valves)
+    if name is not None:
+        profile = load_profile(name)
+        if profile.valve_count != count:
+            raise ConfigError(
+                f"--plant {name}: it has {profile.valve_count} valves, the configuration {count}"
+            )
+        return profile
+    shipped = [load_profile(path) for path in sorted(PROFILES.glob("*.toml"))]
+    fitting = [profile for profile in shipped if profile.valve_count == count]
+    if not fitting:
+        raise ConfigError(
+            f"no sprayer profile has {count} valves; give one: --plant FILE.toml, written as "
+            "those in sitl/profiles"
+        )
+    full = math.log(setup.nozzle_sets[-1].flow_max_l_min)
+    return min(fitting, key=lambda p: abs(math.log(p.nozzle_sets[-1].flow_max_l_min) - full))
+
+
+def _trajectory(task: Task, seed: int) -> Trajectory:
+    mission = task.config.mission
+    acceleration = DEFAULT_ACCELERATION_M_S2 if mission is None else mission.acceleration_m_s2
+    vehicle = Vehicle(task.route, start_s=0.0, seed=seed, acceleration_m_s2=acceleration)
+    return vehicle.fly_to_end()
+
+
+def _flight(
+    task: Task,
+    trajectory: Trajectory,
+    options: FlyOptions,
+    say: Say,
+    trace: list[Input | Decision] | None,
+) -> FlightResult:
+    """Fly with what the configuration knows, and say how far it is."""
+    end_s = float(trajectory.time_s[-1])
+    said_s = SAY_EVERY_S
+
+    def observe(decision: Decision) -> None:
+        nonlocal said_s
+        if decision.now_s >= said_s:
+            say(f"{decision.now_s:.0f} of {end_s:.0f} s")
+            said_s += SAY_EVERY_S
+        if trace is not None:
+            trace.append(decision)
+
+    def disturb(items: Iterator[Input]) -> Iterator[Input]:
+        return with_faults(items, task.faults, start_s=float(trajectory.time_s[0]))
+
+    return fly(
+        task.setup,
+        trajectory,
+        task.profile,
+        _flight_options(task, options),
+        speed_m_s=task.speed_m_s,
+        observer=observe if trace is not None or end_s > SAY_EVERY_S else None,
+        on_input=None if trace is None else trace.append,
+        disturb=disturb if task.faults else None,
+    )
+
+
+def _flight_options(task: Task, options: FlyOptions) -> FlightOptions:
+    return FlightOptions(
+        fidelity=options.fidelity or ("pulsed" if options.output == "servo" else "averaged"),
+        output=options.output,
+        seed=options.seed,
+        position_rate_hz=float(task.config.link.position_rate_hz),
+    )
+
+
+def _perfect_flight(task: Task, trajectory: Trajectory, options: FlyOptions) -> FlightResult:
+    """Fly the same path with the true position, the plant's true curves and lags, no scatter."""
+    output_s = WIRE_S + 0.5 * SERVO_FRAME_S if options.output == "servo" else 0.0
+    profile = task.profile
+    setup = replace(
+        task.setup,
+        lag=replace(profile.lags(), output_s=output_s),
+        nozzle_sets=tuple(_true_set(nozzles, profile) for nozzles in task.setup.nozzle_sets),
+        pwm=profile.pwm,
+    )
+    perfect = replace(_flight_options(task, options), noise=False, scatter=False)
+    return fly(setup, trajectory, profile, perfect, speed_m_s=task.speed_m_s)
+
+
+def _true_set(nozzles: NozzleSet, profile: PlantProfile) -> NozzleSet:
+    """Return the same set with the plant's own curve, where the plant has that set."""
+    same = (each for each in profile.nozzle_sets if set(each.valves) == set(nozzles.valves))
+    return next(same, nozzles)
+
+
+def zero_rate_ml(record: FlightRecord, outside_ml: float) -> float:
+    """Return what fell on ground whose rate is 0, given what fell outside the field."""
+    prescription = record.prescription
+    bounds = shapely.total_bounds(shapely.points(record.east_m, record.north_m))
+    near = shapely.box(*bounds).buffer(record.boom.reach_m + 1.0)
+    dry, wet = (
+        shapely.union_all(
+            [
+                zone.polygon
+                for zone in prescription.zones
+                if (zone.rate_l_ha > 0.0) == is_wet and zone.polygon.intersects(near)
+            ]
+        )
+        for is_wet in (False, True)
+    )
+    dry = dry.intersection(prescription.field).difference(wet)
+    if dry.is_empty:
+        return 0.0
+    ground = prescription.field.difference(dry)
+    open_ground = Prescription(
+        prescription.zones,
+        boundary=shapely.MultiPolygon(
+            [part for part in shapely.get_parts(ground) if isinstance(part, shapely.Polygon)]
+        ),
+        overlap=prescription.overlap,
+        default_rate_l_ha=prescription.default_rate_l_ha,
+    )
+    sure = replace(record, prescription=open_ground)
+    return max(off_target_ml(strips_of(sure), open_ground) - outside_ml, 0.0)

@@ -1,0 +1,209 @@
+"""What `vrspray sitl fly` leaves behind: truth, result, journal, a picture; and its few lines."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from companion.core.types import Decision
+from companion.errors import ConfigError
+from companion.record.journal import Journal
+from sitl.deposit import Deposit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from sitl.fly import Flown
+
+RASTER_CELLS_MAX = 4_000_000
+MARGIN_M = 5.0
+
+
+def write_files(flown: Flown, folder: Path, say: Callable[[str], None]) -> list[Path]:
+    """Write everything into `folder` and return the files; without matplotlib no picture."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        truth, result = folder / "truth.npz", folder / "result.json"
+        np.savez_compressed(truth, **truth_arrays(flown))
+        text = json.dumps(flown.as_json(), indent=1, allow_nan=False)
+        result.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ConfigError(f"--out {folder}: cannot be written ({reason})") from error
+    files = [truth, result, write_journal(flown, folder)]
+    picture = folder / "flight.png"
+    try:
+        _draw(flown, picture)
+        files.append(picture)
+    except ImportError:
+        say("no picture: matplotlib is not installed (pip install vrspray[plot])")
+    return files
+
+
+def truth_arrays(flown: Flown) -> dict[str, Any]:
+    """Return the true flight as arrays; metres are in the frame that the journal names."""
+    record, orders = flown.result.record, flown.result.record.orders
+    path = flown.trajectory.at(record.time_s)
+    return {
+        "time_s": record.time_s,
+        "east_m": record.east_m,
+        "north_m": record.north_m,
+        "height_m": np.full(len(record.time_s), path.height_m),
+        "heading_deg": record.heading_deg,
+        "velocity_east_m_s": path.velocity_east_m_s,
+        "velocity_north_m_s": path.velocity_north_m_s,
+        "volume_ml": record.volume_ml,
+        "order_time_s": np.array([order.at_s for order in orders], dtype=np.float64),
+        "order_valve": np.array([order.valve for order in orders], dtype=np.int64),
+        "order_duty": np.array([order.duty for order in orders], dtype=np.float64),
+    }
+
+
+def write_journal(flown: Flown, folder: Path) -> Path:
+    """Write all inputs and decisions as the companion's own journal has them."""
+    with Journal.create(
+        folder,
+        setup=flown.task.setup,
+        setup_text={"config_toml": flown.task.config.source_text},
+        started_s=float(flown.trajectory.time_s[0]),
+        waits=True,
+    ) as journal:
+        for item in flown.trace:
+            if isinstance(item, Decision):
+                journal.record_decision(item)
+            else:
+                journal.record_input(item)
+        path = journal.path
+    return path
+
+
+def fly_lines(result: dict[str, Any]) -> Iterator[str]:
+    """Yield the result for a person."""
+    flight = result["flights"][0]
+    lag = flight["lag_distance_m"]
+    yield (
+        f"{flight['method']} at {flight['speed_m_s']:g} m/s, {flight['plant']}, "
+        f"{flight['fidelity']}, {flight['output']}, seed {flight['seed']}"
+    )
+    yield (
+        f"lag distance: {_number(lag['mean_abs'])} m mean, {_number(lag['max_abs'])} m worst of "
+        f"{lag['count']} changes; {flight['apart']} apart, {flight['missed']} missed"
+    )
+    yield (
+        f"misapplied {_number(flight['misapplied_percent'], 2)} %, "
+        f"{_number(flight['limit_ratio'], 2)} times the least possible; "
+        f"spraying accuracy {_number(flight['spraying_accuracy_percent'], 2)} %"
+    )
+    yield (
+        f"applied {flight['applied_ml'] / 1000.0:.3f} L, off target {flight['off_target_ml']:.1f} "
+        f"mL, on ground of rate 0 {flight['zero_rate_ml']:.1f} mL"
+    )
+    yield (
+        f"{result['simulated_s']:.0f} s in {result['wall_s']:.2f} s: "
+        f"{result['times_real_time']:.0f} times real time"
+    )
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _draw(flown: Flown, path: Path) -> None:
+    """Draw the prescription, what was applied, and the flow over the time."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplot_mosaic([["asked", "applied"], ["flow", "flow"]], height_ratios=[3, 1])
+    rates = [zone.rate_l_ha for zone in flown.task.setup.prescription.zones]
+    most = max(rates) or 1.0
+    _draw_asked(flown, axes["asked"], most)
+    image = _draw_applied(flown, axes["applied"], most)
+    figure.colorbar(image, ax=axes["applied"], label="L/ha")
+    _draw_flow(flown, axes["flow"])
+    figure.savefig(path, dpi=110)
+
+
+def _window(flown: Flown) -> tuple[float, float, float, float]:
+    """Return west, south, east, north of the flight and what its boom reaches."""
+    record = flown.result.record
+    reach_m = record.boom.reach_m + MARGIN_M
+    return (
+        float(record.east_m.min()) - reach_m,
+        float(record.north_m.min()) - reach_m,
+        float(record.east_m.max()) + reach_m,
+        float(record.north_m.max()) + reach_m,
+    )
+
+
+def _draw_asked(flown: Flown, axes: Axes, most_l_ha: float) -> None:
+    import shapely
+    from matplotlib import colormaps
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    window = shapely.box(*_window(flown))
+    for zone in flown.task.setup.prescription.zones:
+        for part in shapely.get_parts(zone.polygon.intersection(window)):
+            if not isinstance(part, shapely.Polygon):
+                continue
+            rings = [part.exterior, *part.interiors]
+            outline = Outline.make_compound_path(
+                *(Outline(shapely.get_coordinates(ring), closed=True) for ring in rings)
+            )
+            colour = colormaps["viridis"](zone.rate_l_ha / most_l_ha)
+            axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="white", linewidth=0.3))
+    record = flown.result.record
+    axes.plot(record.east_m, record.north_m, color="tab:red", linewidth=0.7)
+    _frame(axes, flown, "prescribed, and the way flown")
+
+
+def _draw_applied(flown: Flown, axes: Axes, most_l_ha: float) -> Any:
+    west_m, south_m, east_m, north_m = _window(flown)
+    area_m2 = (east_m - west_m) * (north_m - south_m)
+    cell_m = max(0.25, float(np.sqrt(area_m2 / RASTER_CELLS_MAX)))
+    record = flown.result.record
+    deposit = Deposit((west_m, south_m, east_m, north_m), cell_m=cell_m)
+    deposit.add(
+        east_m=record.east_m,
+        north_m=record.north_m,
+        heading_deg=record.heading_deg,
+        volume_ml=record.volume_ml,
+        boom=record.boom,
+    )
+    applied = np.where(deposit.cells_ml > 0.0, deposit.applied_l_ha, np.nan)
+    extent = (
+        west_m,
+        west_m + deposit.columns * cell_m,
+        south_m,
+        south_m + deposit.rows * cell_m,
+    )
+    image = axes.imshow(applied, origin="lower", extent=extent, vmin=0.0, vmax=most_l_ha)
+    _frame(axes, flown, "applied")
+    return image
+
+
+def _draw_flow(flown: Flown, axes: Axes) -> None:
+    record = flown.result.record
+    period = max(round(record.pwm_period_s / record.step_s), 1)
+    volume_ml = record.volume_ml.sum(axis=1)[::period]
+    time_s = record.time_s[::period]
+    flow_l_min = np.diff(volume_ml) / np.diff(time_s) * 0.06
+    axes.plot(0.5 * (time_s[1:] + time_s[:-1]), flow_l_min, linewidth=0.7)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("flow [L/min]")
+
+
+def _frame(axes: Axes, flown: Flown, title: str) -> None:
+    west_m, south_m, east_m, north_m = _window(flown)
+    axes.set_xlim(west_m, east_m)
+    axes.set_ylim(south_m, north_m)
+    axes.set_aspect("equal")
+    axes.set_title(title)
+    axes.set_xlabel("east [m]")
+    axes.set_ylabel("north [m]")

@@ -1,0 +1,1 @@
+"""The figures that README gives, measured: `python -m tests.bench [SEED] [--quick]`."""
