@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 # 1 L/ha on 1 m of width is 0.1 mL per metre of track.
 ML_M_PER_L_HA_M = 0.1
+# On-time that a truncated period owes is paid in the next one, which draws a sharp step out by up
+# to this many periods more; only what is longer than that is a slow plant.
+DEBT_PERIODS = 1.0
 # Where in the time over a stretch its flow counts as its own: late changes have come, early ones
 # of the next stretch have not.
 LEVEL_FROM = 0.50
@@ -147,7 +150,7 @@ def _located(
     above = np.flatnonzero(part[middle - first :] >= 0.75)
     low_s = track.time_s[first + below[-1]] if len(below) else early_s
     high_s = track.time_s[middle + above[0]] if len(above) else late_s
-    slow_s = max(high_s - low_s - SHARP_QUARTERS_PERIODS * track.period_s, 0.0)
+    slow_s = max(high_s - low_s - (SHARP_QUARTERS_PERIODS + DEBT_PERIODS) * track.period_s, 0.0)
     return Transition(
         begin_s=float(low_s - 0.35 * track.period_s - slow_s),
         middle_s=float(track.time_s[middle]),

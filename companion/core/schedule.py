@@ -25,6 +25,9 @@ TRIM_MAX_SHARE = 0.08
 # A trim moves by at most this at once: below the 2 % of the span at which a driver board takes a
 # change for a new zone and restarts its period; 20 such steps a second follow any braking.
 TRIM_STEP_MAX = 0.018
+# No trim this shortly before a change of zone: on a servo output it would hold the change up by a
+# frame, and it would act for a fraction of a period only.
+TRIM_HOLD_S = 0.03
 # How far ahead of its time a change that was already ordered is left alone when the prediction
 # moves it back: without this, noise would revert it for a moment and order it again.
 STICKY_S = 0.1
@@ -232,9 +235,12 @@ def schedule(
     if abs(duty - in_force) >= DUTY_STEP or (duty == 0.0) != (in_force == 0.0):
         restart = not 0.0 < abs(duty - in_force) <= TRIM_MAX_SHARE * in_force or duty == 0.0
         late = restart and due > 0
-        if not restart:
+        if not restart and due + 1 < len(made) and made[due + 1].at_s - now_s < TRIM_HOLD_S:
+            duty = in_force
+        elif not restart:
             duty = min(max(duty, in_force - TRIM_STEP_MAX), in_force + TRIM_STEP_MAX)
-        changes.append(TimedChange(at_s=now_s, valve=valve, duty=duty, restart=restart))
+        if duty != in_force:
+            changes.append(TimedChange(at_s=now_s, valve=valve, duty=duty, restart=restart))
     changes.extend(
         TimedChange(at_s=order.at_s, valve=valve, duty=order.duty)
         for order in made[due + 1 :]
