@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from companion.core.frame import LocalFrame
+from companion.core.schedule import LagModel
 from companion.errors import ConfigError
 from sitl.stub.mission_items import MissionItem, waypoint
 from sitl.stub.protocol import dialect
@@ -116,3 +118,16 @@ def anyang_items(speed_m_s: float) -> tuple[MissionItem, ...]:
         *(waypoint(dialect.MAV_CMD_NAV_WAYPOINT, *end, height_m=HEIGHT_M) for end in ends),
         MissionItem(command=dialect.MAV_CMD_NAV_LAND),
     )
+
+
+def anyang_lag(output: str, folder: Path = EXAMPLE / "lags") -> LagModel:
+    """Return the lags measured beforehand for an output path: `gpio` or `servo`.
+
+    Made by `sitl/measure_lags.py`, on other sprayers of the make than any flight's.
+    """
+    path = folder / f"{output}.toml"
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))["lag"]
+        return LagModel(**table)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path}: no lags of the example's sprayer ({error!r})") from error

@@ -93,7 +93,7 @@ def fly(
     if not options.scatter:
         profile = replace(profile, lag_scatter=0.0, flow_scatter=0.0)
     start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
-    plant, output = _sprayer(profile, options, start_s)
+    plant, output = sprayer(profile, options, start_s)
     inputs = _inputs(setup, trajectory, options)
     if disturb is not None:
         inputs = disturb(inputs)
@@ -135,9 +135,10 @@ def fly(
     )
 
 
-def _sprayer(
+def sprayer(
     profile: PlantProfile, options: FlightOptions, start_s: float
 ) -> tuple[AveragedPlant | PulsedPlant, Output]:
+    """Return a plant and the output path that drives it."""
     if options.fidelity == "averaged":
         averaged = AveragedPlant(profile, seed=options.seed, start_s=start_s)
         return averaged, AveragedOutput(averaged)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from companion.core.types import SpeedReport, Telemetry
+from sitl.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,7 +67,8 @@ class Navigation:
         position_seed, speed_seed = np.random.SeedSequence(seed).spawn(2)
         self._position_rng = np.random.default_rng(position_seed)
         self._speed_rng = np.random.default_rng(speed_seed)
-        self._wander = WANDER_SD_M * self._position_rng.standard_normal(2)
+        east, north = self._position_rng.standard_normal(2).tolist()
+        self._wander = (WANDER_SD_M * east, WANDER_SD_M * north)
         self._position_count = self._speed_count = self._order = 0
         self._position_received_s = self._speed_received_s = -math.inf
         self._under_way: list[tuple[float, int, Telemetry | SpeedReport]] = []
@@ -88,12 +90,13 @@ class Navigation:
         if not times_s:
             return
         draws = self._position_rng.standard_normal((len(times_s), _DRAWS))
-        truths = [self._source.truth_at(at_s - self._lag_s) for at_s in times_s]
+        truths = self._truths(times_s)
         east_m, north_m = self._positions(truths, draws)
         latitudes, longitudes = self._frame.to_geographic_all(east_m, north_m)
-        velocity = draws[:, 4:7] * (VELOCITY_SD_M_S * self._noise)
+        velocity = (draws[:, 4:7] * (VELOCITY_SD_M_S * self._noise)).tolist()
+        jitter = draws[:, 7].tolist()
         for i, truth in enumerate(truths):
-            received_s = self._receive_s(times_s[i], draws[i, 7], self._position_received_s)
+            received_s = self._receive_s(times_s[i], jitter[i], self._position_received_s)
             self._position_received_s = received_s
             message = Telemetry(
                 received_s=received_s,
@@ -101,9 +104,9 @@ class Navigation:
                 latitude_deg=round(latitudes[i] * 1e7) / 1e7,
                 longitude_deg=round(longitudes[i] * 1e7) / 1e7,
                 relative_altitude_m=round(truth.height_m * 1e3) / 1e3,
-                velocity_north_m_s=round((truth.velocity_north_m_s + velocity[i, 0]) * 1e2) / 1e2,
-                velocity_east_m_s=round((truth.velocity_east_m_s + velocity[i, 1]) * 1e2) / 1e2,
-                velocity_down_m_s=round(float(velocity[i, 2]) * 1e2) / 1e2,
+                velocity_north_m_s=round((truth.velocity_north_m_s + velocity[i][0]) * 1e2) / 1e2,
+                velocity_east_m_s=round((truth.velocity_east_m_s + velocity[i][1]) * 1e2) / 1e2,
+                velocity_down_m_s=round(velocity[i][2] * 1e2) / 1e2,
                 heading_deg=round(truth.heading_deg * 1e2) % 36_000 / 1e2,
             )
             self._put(received_s, message)
@@ -112,30 +115,41 @@ class Navigation:
         self, truths: list[Truth], draws: NDArray[np.float64]
     ) -> tuple[list[float], list[float]]:
         east_m, north_m = [], []
-        for truth, draw in zip(truths, draws, strict=True):
-            self._wander = self._decay * self._wander + self._kick * draw[2:4]
-            error = self._noise * (self._wander + WHITE_SD_M * draw[0:2])
-            east_m.append(truth.east_m + float(error[0]))
-            north_m.append(truth.north_m + float(error[1]))
+        (east, north), decay, kick, noise = self._wander, self._decay, self._kick, self._noise
+        for truth, draw in zip(truths, draws[:, :4].tolist(), strict=True):
+            east, north = decay * east + kick * draw[2], decay * north + kick * draw[3]
+            east_m.append(truth.east_m + noise * (east + WHITE_SD_M * draw[0]))
+            north_m.append(truth.north_m + noise * (north + WHITE_SD_M * draw[1]))
+        self._wander = (east, north)
         return east_m, north_m
+
+    def _truths(self, sent_s: list[float]) -> list[Truth]:
+        """Return what the messages sent at these times tell of."""
+        times_s = [at_s - self._lag_s for at_s in sent_s]
+        if isinstance(self._source, Trajectory):
+            return self._source.truths_at(times_s)
+        return [self._source.truth_at(time_s) for time_s in times_s]
 
     def _send_speeds(self, until_s: float) -> None:
         # Half a period after the position: the two streams of an autopilot do not coincide.
+        times_s = []
         while True:
             at_s = self._start_s + (self._speed_count + 0.5) / SPEED_REPORT_RATE_HZ
             if not at_s <= until_s:
-                return
+                break
+            times_s.append(at_s)
             self._speed_count += 1
-            error, jitter = self._speed_rng.standard_normal(2)
-            truth = self._source.truth_at(at_s - self._lag_s)
+        draws = self._speed_rng.standard_normal((len(times_s), 2)).tolist()
+        truths = self._truths(times_s)
+        for at_s, truth, (error, jitter) in zip(times_s, truths, draws, strict=True):
             speed_m_s = math.hypot(truth.velocity_east_m_s, truth.velocity_north_m_s)
-            speed_m_s = abs(speed_m_s + VELOCITY_SD_M_S * self._noise * float(error))
+            speed_m_s = abs(speed_m_s + VELOCITY_SD_M_S * self._noise * error)
             received_s = self._receive_s(at_s, jitter, self._speed_received_s)
             self._speed_received_s = received_s
             self._put(received_s, SpeedReport(received_s=received_s, ground_speed_m_s=speed_m_s))
 
     def _receive_s(self, sent_s: float, jitter: float, after_s: float) -> float:
-        received_s = sent_s + max(self._delay_s + self._jitter_s * float(jitter), 0.0)
+        received_s = sent_s + max(self._delay_s + self._jitter_s * jitter, 0.0)
         return max(received_s, after_s)
 
     def _put(self, received_s: float, message: Telemetry | SpeedReport) -> None:

@@ -7,13 +7,15 @@ is. All of them keep the changes that were carried out.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import TimedChange
 from companion.output.pwm import PulseEngine
 
 if TYPE_CHECKING:
+    from companion.core.types import SprayPlan
     from sitl.board import DriverBoard
     from sitl.plant import AveragedPlant, PulsedPlant
 
@@ -39,7 +41,9 @@ class PlanFollower:
     valve_count: int
     orders: list[TimedChange] = field(default_factory=list)
     duty: list[float] = field(init=False)
-    _plan: SprayPlan | None = None
+    _changes: tuple[TimedChange, ...] = ()
+    _done: int = 0
+    _lease_until_s: float = math.inf
 
     def __post_init__(self) -> None:
         self.duty = [0.0] * self.valve_count
@@ -50,28 +54,25 @@ class PlanFollower:
         for valve, duty in enumerate(plan.duty):
             if duty != self.duty[valve]:
                 done.append(self._take(TimedChange(at_s=now_s, valve=valve, duty=duty)))
-        self._plan = plan
+        self._changes, self._done, self._lease_until_s = plan.changes, 0, plan.lease_until_s
         return done + self.advance(now_s)
 
     def advance(self, until_s: float) -> list[TimedChange]:
         """Return the changes up to `until_s` that were not returned yet."""
-        plan = self._plan
-        if plan is None:
-            return []
+        changes, lease_until_s, i = self._changes, self._lease_until_s, self._done
         done = []
-        due = 0
-        for change in plan.changes:
-            if change.at_s > until_s or change.at_s >= plan.lease_until_s:
+        while i < len(changes):
+            change = changes[i]
+            if change.at_s > until_s or change.at_s >= lease_until_s:
                 break
-            due += 1
+            i += 1
             if change.duty != self.duty[change.valve]:
                 done.append(self._take(change))
-        rest = plan.changes[due:]
-        self._plan = replace(plan, duty=tuple(self.duty), changes=rest) if due else plan
-        if plan.lease_until_s <= until_s:
-            self._plan = None
+        self._done = i
+        if lease_until_s <= until_s:
+            self._changes, self._done, self._lease_until_s = (), 0, math.inf
             done += [
-                self._take(TimedChange(at_s=plan.lease_until_s, valve=valve, duty=0.0))
+                self._take(TimedChange(at_s=lease_until_s, valve=valve, duty=0.0))
                 for valve, duty in enumerate(self.duty)
                 if duty != 0.0
             ]

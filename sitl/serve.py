@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from companion.assembly import build_setup
 from companion.config import Config, load
 from companion.core.frame import LocalFrame, course_deg
 from companion.errors import ConfigError
@@ -27,6 +28,7 @@ from sitl.stub.operator import Operator, Step
 from sitl.stub.server import StubServer
 from sitl.stub.sprayer import BoardKind, Sprayer, SprayerOptions
 from sitl.stub.truth import TruthLog
+from sitl.wire_truth import judge
 
 DEFAULT_LINK = "udpout:127.0.0.1:14550"
 _SAY_EVERY_S = 5.0
@@ -77,7 +79,7 @@ class _Run:
             raise ConfigError(f"--autopilot {options.autopilot}: this version knows ardupilot only")
         if not 0.5 <= options.speed_m_s <= 20.0:
             raise ConfigError(f"--speed {options.speed_m_s}: give 0.5 to 20 m/s")
-        config = load(options.field_config or EXAMPLE / "config.toml")
+        config = self._config = load(options.field_config or EXAMPLE / "config.toml")
         items = _items(options)
         start_s = time.monotonic()
         home = LocalFrame(items[0].latitude_deg, items[0].longitude_deg)
@@ -147,8 +149,20 @@ class _Run:
         }
         if self._options.out is not None:
             self.truth.write(self._options.out, summary)
+            if summary["state"] == Step.DONE.value:
+                summary["metrics"] = self._judge(self._options.out)
             summary["out"] = str(self._options.out)
         return summary
+
+    def _judge(self, folder: Path) -> dict[str, object]:
+        """Return how well the map of the configuration was put on the ground."""
+        output = self._config.output
+        return judge(
+            folder,
+            build_setup(self._config),
+            closed_us=output.closed_us,
+            full_us=output.full_us,
+        )
 
     def _tell(self, now_s: float) -> None:
         """Say each step, each text of the companion, and the state every few seconds."""

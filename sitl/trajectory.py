@@ -52,13 +52,28 @@ class Trajectory:
 
     def truth_at(self, time_s: float) -> Truth:
         """Return the truth at one time."""
-        at = self.at(np.array([time_s]))
-        return Truth(
-            time_s=time_s,
-            east_m=float(at.east_m[0]),
-            north_m=float(at.north_m[0]),
-            height_m=self.height_m,
-            velocity_east_m_s=float(at.velocity_east_m_s[0]),
-            velocity_north_m_s=float(at.velocity_north_m_s[0]),
-            heading_deg=float(at.heading_deg[0]) % 360.0,
+        return self.truths_at([time_s])[0]
+
+    def truths_at(self, times_s: list[float]) -> list[Truth]:
+        """Return the truth at each of some times."""
+        at = self.at(np.array(times_s, dtype=np.float64))
+        columns = (
+            at.east_m,
+            at.north_m,
+            at.velocity_east_m_s,
+            at.velocity_north_m_s,
+            at.heading_deg % 360.0,
         )
+        rows = zip(times_s, *(column.tolist() for column in columns), strict=True)
+        return [
+            Truth(
+                time_s=time_s,
+                east_m=east_m,
+                north_m=north_m,
+                height_m=self.height_m,
+                velocity_east_m_s=velocity_east,
+                velocity_north_m_s=velocity_north,
+                heading_deg=heading_deg,
+            )
+            for time_s, east_m, north_m, velocity_east, velocity_north, heading_deg in rows
+        ]

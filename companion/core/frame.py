@@ -10,10 +10,13 @@ import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
 from pyproj import CRS, Geod, Transformer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
+    from numpy.typing import NDArray
 
 WGS84 = Geod(ellps="WGS84")
 
@@ -50,6 +53,15 @@ class LocalFrame:
         """Return (east_m, north_m); infinite where the projection has no answer."""
         east_m, north_m = self._forward.transform(longitude_deg, latitude_deg)
         return float(east_m), float(north_m)
+
+    def to_local_all(
+        self, latitude_deg: Sequence[float], longitude_deg: Sequence[float]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (east_m, north_m) of many points at once."""
+        east_m, north_m = self._forward.transform(
+            np.asarray(longitude_deg, dtype=np.float64), np.asarray(latitude_deg, dtype=np.float64)
+        )
+        return east_m, north_m
 
     def to_geographic(self, east_m: float, north_m: float) -> tuple[float, float]:
         """Return (latitude_deg, longitude_deg)."""

@@ -13,6 +13,7 @@ import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import shapefile
 import shapely
@@ -34,7 +35,7 @@ STRIP_ACROSS_M = (-9.0, -2.0)  # the strip of rate 0 lies between these, along -
 STRIP_ALONG_M = (-10.0, 60.0)
 SPACING_M, RUN_OUT_M, SPEED_M_S, HEIGHT_M = 6.0, 15.0, 4.0, 3.5
 
-Ground = shapely.Geometry
+Ground = Any  # a polygon or several
 
 
 def outline() -> Ground:
@@ -63,9 +64,7 @@ def level(along_m: float, across_m: float) -> int:
 def bare() -> Ground:
     """Return the ground of rate 0."""
     along, across, radius = BARE
-    strip = shapely.box(
-        STRIP_ALONG_M[0], STRIP_ACROSS_M[0], STRIP_ALONG_M[1], STRIP_ACROSS_M[1]
-    )
+    strip = shapely.box(STRIP_ALONG_M[0], STRIP_ACROSS_M[0], STRIP_ALONG_M[1], STRIP_ACROSS_M[1])
     return strip.union(shapely.Point(along, across).buffer(radius, quad_segs=3))
 
 

@@ -16,6 +16,8 @@ from sitl.stub.outputs import ServoOrder
 
 Floats = NDArray[np.float64]
 _MEMORY_S = 1.0
+# A command of 44 bytes over a telemetry port, less what the loopback takes itself.
+_WIRE_S = 0.001
 BoardKind = Literal["restarting", "free-running"]
 
 
@@ -67,7 +69,7 @@ class Sprayer:
         valve = self._valves.get(order.channel)
         if valve is not None:
             self.orders.append(order)
-            self._board.order(order.at_s, valve, order.pulse_us)
+            self._board.order(order.at_s + _WIRE_S, valve, order.pulse_us)
 
     def advance(self, until_s: float) -> None:
         """Work the valves out up to a time."""

@@ -186,7 +186,7 @@ REFUSED = [
     ("pwm.duty_min=0.95", "not below pwm.duty_max = 0.9"),
     ("pwm.min_on_s=0.09", "write less, or a lower pwm.frequency_hz"),
     ("lag.on_start_s=0.2", "lag.on_start_s = 0.2: first flow after lag.on_s = 0.1"),
-    ("lag.off_end_s=0.01", "lag.off_end_s = 0.01: last flow before lag.off_s = 0.08"),
+    ("lag.off_end_s=0.01", "lag.off_end_s = 0.01: last flow before lag.off_s = 0.1"),
     ("output.full_us=1010", "output.full_us = 1010"),
     ("safety.speed_min_m_s=20", "not below safety.speed_max_m_s = 12"),
     ("safety.height_min_m=20", "not below safety.height_max_m = 10"),
