@@ -10,9 +10,7 @@ from companion.config import Config, load
 from companion.core.controller import Setup
 from companion.core.prescription import Prescription
 from companion.core.schedule import LagModel
-from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_route
-from sitl.board import SERVO_FRAME_S
-from sitl.flight import MESSAGE_DELAY_S, FlightOptions
+from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_lag, anyang_route
 from sitl.profile import PlantProfile
 from sitl.route import Route
 from sitl.trajectory import Trajectory
@@ -24,8 +22,6 @@ START_S = 100.0
 ACCELERATION_M_S2 = 2.5
 # On the run-out, beyond what accelerating takes: the speed is steady where the field begins.
 STEADY_M = 5.0
-# The autopilot's wire, and the mean wait for the next servo frame.
-SERVO_DELAY_S = 0.002 + 0.5 * SERVO_FRAME_S
 
 
 @cache
@@ -60,17 +56,12 @@ def scaled(prescription: Prescription, factor: float) -> Prescription:
 
 
 def demo_lags(profile: PlantProfile, output: str, *, perfect: bool = False) -> LagModel:
-    """Return the lags of the nominal valve, of the output path and of the position.
+    """Return the lags measured beforehand; with perfect knowledge those of the nominal valve.
 
-    They are what a calibration measures in the mean; the single valve, the single message and the
-    single servo frame scatter around them. With perfect knowledge the position is not late.
+    The single valve, message and servo frame scatter around either.
     """
-    late_s = FlightOptions().estimator_lag_s + MESSAGE_DELAY_S
-    return replace(
-        profile.lags(),
-        output_s=SERVO_DELAY_S if output == "servo" else 0.0,
-        position_s=0.0 if perfect else late_s,
-    )
+    measured = anyang_lag(output)
+    return replace(profile.lags(), output_s=measured.output_s) if perfect else measured
 
 
 @cache

@@ -1,6 +1,6 @@
 """The demo's pictures: the field, the lag of every boundary, the flow along one pass.
 
-The only file of the demo that needs matplotlib (the extra `plot`).
+With `demo_map` and `demo_style` the only files of the demo that need matplotlib (extra `plot`).
 """
 
 from __future__ import annotations
@@ -8,83 +8,37 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import shapely
 from matplotlib import rc_context
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
-from matplotlib.colors import Colormap, Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from numpy.typing import NDArray
 
 from analysis.published import p1_lag_distance_m
-from sitl.demo import METHODS, SCHEDULED, DemoResult, Flown, demo_setup
-from sitl.demo_traces import CELL_M, MARGIN_M, FieldAxes, field_axes
+from sitl.demo import METHODS, SCHEDULED, DemoResult, Flown
+from sitl.demo_field import demo_setup
+from sitl.demo_map import map_figure
+from sitl.demo_style import COLOURS, DPI, FAINT, INK, STYLE, TITLES, new_figure, shown
+from sitl.demo_traces import field_axes
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
-    from companion.core.prescription import Prescription
+Floats = NDArray[np.float64]
 
-# Okabe and Ito's colours, told apart by all kinds of eyes.
-COLOURS = {
-    "none": "#D55E00",
-    "look-ahead": "#E69F00",
-    "look-ahead-stated": "#CC79A7",
-    "scheduled": "#0072B2",
-}
-TITLES = {
-    "none": "none",
-    "look-ahead": "look-ahead 0.71 s",
-    "look-ahead-stated": "look-ahead 0.97 s",
-    "scheduled": "scheduled",
-}
-INK, FAINT, BARE = "#222222", "#8A8A8A", "#F1F1EE"
-STYLE = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-}
-DPI = 150
-# Less than this share of the least rate on the map is not worth a colour.
-WET_SHARE = 0.1
+# The enlarged picture reaches at least this far.
+REACH_CM = 25.0
+PLOT_M = 12.0
 
 
-def draw_pictures(result: DemoResult, folder: Path) -> list[Path]:
-    """Draw all pictures into `folder` and return where they are."""
+def draw_pictures(result: DemoResult, folder: Path) -> list[str]:
+    """Draw all pictures into `folder` and return their names."""
+    drawings = {"map.png": map_figure, "lags.png": lags_figure, "flow.png": flow_figure}
     with rc_context(STYLE):
-        figures = {
-            "map.png": map_figure(result),
-            "lags.png": lags_figure(result),
-            "flow.png": flow_figure(result),
-        }
-        for name, figure in figures.items():
-            figure.savefig(folder / name, dpi=DPI, facecolor="white")
-    return [folder / name for name in figures]
-
-
-def _figure(width_in: float, height_in: float, title: str, subtitle: str) -> Figure:
-    figure = Figure(figsize=(width_in, height_in))
-    FigureCanvasAgg(figure)
-    figure.text(0.03, 1.0 - 0.17 / height_in, title, size=13.5, weight="bold", va="top")
-    figure.text(0.03, 1.0 - 0.46 / height_in, subtitle, size=9.5, color="#555555", va="top")
-    return figure
-
-
-def _shown(result: DemoResult) -> dict[str, Flown]:
-    """Return the flights that have traces, by method."""
-    return {flown.job.method: flown for flown in result.flights if flown.traces is not None}
+        for name, drawing in drawings.items():
+            drawing(result).savefig(folder / name, dpi=DPI, facecolor="white")
+    return list(drawings)
 
 
 # ---------------------------------------------------------------------------------------- the lags
@@ -93,74 +47,75 @@ def _shown(result: DemoResult) -> dict[str, Flown]:
 def lags_figure(result: DemoResult) -> Figure:
     """Draw the lag distance of every boundary and valve: all methods, and ours enlarged."""
     speeds = result.options.speeds_m_s
-    figure = _figure(
-        10.0,
-        4.9,
+    figure = new_figure(
+        (10.0, 4.9),
         "Where the changes of rate fell",
-        "Distance from the boundary to the volume-equivalent step of the true flow; "
-        "one point for each boundary and valve",
+        "Distance along the track from the boundary to the volume-equivalent step of the true "
+        "flow, a point for every boundary and valve",
     )
     left, right = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
-    figure.subplots_adjust(left=0.07, right=0.985, top=0.77, bottom=0.11, wspace=0.17)
-    rng = np.random.default_rng(0)
+    figure.subplots_adjust(left=0.06, right=0.985, top=0.755, bottom=0.075, wspace=0.17)
+    jitter = np.random.default_rng(0)
     for flown in result.flights:
-        place, method = speeds.index(flown.job.speed_m_s), flown.job.method
-        offset = 0.2 * (METHODS.index(method) - 1.5)
+        place, method = float(speeds.index(flown.job.speed_m_s)), flown.job.method
         lags_m = _lags_m(flown)
-        spread = rng.uniform(-0.07, 0.07, len(lags_m))
-        _points(left, place + offset + spread, lags_m, method)
+        spread = jitter.uniform(-0.07, 0.07, len(lags_m))
+        _points(left, place + _beside(method) + spread, lags_m, method)
         if method == SCHEDULED:
             _points(right, place + 3.0 * spread, 100.0 * lags_m, method)
-            _mean(right, place, flown, 100.0, "cm", 0.3)
+            _figures(right, place, flown, size=min(8.5, 26.0 / len(speeds)))
     _published(left, speeds)
     left.set_title("All methods")
-    left.set_ylabel("lag distance [m]: above 0 too late")
-    right.set_title("scheduled alone, enlarged")
-    right.set_ylabel("lag distance [cm]")
+    left.set_ylabel("lag distance [m], above 0 too late")
+    right.set_title("scheduled alone; figures: absolute values")
+    right.set_ylabel("lag distance [cm], above 0 too late")
+    reach_cm = max(REACH_CM, 1.3 * float(np.abs(right.get_ylim()).max()))
+    right.set_ylim(-reach_cm, reach_cm)
     for panel in (left, right):
-        panel.axhline(0.0, color=INK, lw=1.0, zorder=1)
-        panel.set_xticks(range(len(speeds)), [f"{speed:g} m/s" for speed in speeds])
-        panel.set_xlim(-0.55, len(speeds) - 0.45)
-        panel.tick_params(length=0)
-        panel.grid(axis="y", color="#E4E4E4", lw=0.7)
-        panel.set_axisbelow(True)
-    reach = max(25.0, 1.15 * float(np.abs(right.get_ylim()).max()))
-    right.set_ylim(-reach, reach)
+        _dress(panel, speeds)
     _legend(figure)
     return figure
 
 
-def _lags_m(flown: Flown) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def _beside(method: str) -> float:
+    return 0.2 * (METHODS.index(method) - 0.5 * (len(METHODS) - 1))
+
+
+def _lags_m(flown: Flown) -> Floats:
+    """Return the lag of every change inside the field that has one."""
     lags = (s.lag_distance_m for s in flown.evaluation.steps if not s.change.border)
     return np.array([lag for lag in lags if lag is not None], dtype=np.float64)
 
 
-def _points(panel: Axes, x: object, y: object, method: str) -> None:
-    panel.scatter(x, y, s=7, color=COLOURS[method], alpha=0.4, linewidths=0, zorder=2)  # type: ignore[arg-type]
+def _points(panel: Axes, x: Floats, y: Floats, method: str) -> None:
+    panel.scatter(x, y, s=8, color=COLOURS[method], alpha=0.4, linewidths=0, zorder=2)
 
 
-def _mean(panel: Axes, place: float, flown: Flown, scale: float, unit: str, half: float) -> None:
+def _figures(panel: Axes, place: float, flown: Flown, *, size: float) -> None:
     lag = flown.evaluation.lag_distance_m
     if lag.mean_abs is None or lag.max_abs is None:
         return
-    panel.text(
-        place,
-        0.99,
-        f"mean {scale * lag.mean_abs:.1f} {unit}\nworst {scale * lag.max_abs:.0f} {unit}",
-        transform=panel.get_xaxis_transform(),
-        ha="center",
-        va="top",
-        size=8.5,
-    )
+    text = f"mean {100.0 * lag.mean_abs:.1f} cm\nworst {100.0 * lag.max_abs:.1f} cm"
+    where = panel.get_xaxis_transform()
+    panel.text(place, 0.99, text, transform=where, ha="center", va="top", size=size)
 
 
 def _published(panel: Axes, speeds: tuple[float, ...]) -> None:
     for place, speed_m_s in enumerate(speeds):
-        for number, method in enumerate(METHODS):
+        for method in METHODS:
             row = p1_lag_distance_m(method, speed_m_s)
             if row is not None:
-                x = place + 0.2 * (number - 1.5)
+                x = place + _beside(method)
                 panel.scatter(x, row.mean, s=46, marker="D", color="none", ec=INK, lw=1.2, zorder=4)
+
+
+def _dress(panel: Axes, speeds: tuple[float, ...]) -> None:
+    panel.axhline(0.0, color=INK, lw=1.0, zorder=1)
+    panel.set_xticks(range(len(speeds)), [f"{speed:g} m/s" for speed in speeds])
+    panel.set_xlim(-0.55, len(speeds) - 0.45)
+    panel.tick_params(length=0)
+    panel.grid(axis="y", color="#E4E4E4", lw=0.7)
+    panel.set_axisbelow(True)
 
 
 def _legend(figure: Figure) -> None:
@@ -168,11 +123,15 @@ def _legend(figure: Figure) -> None:
         Line2D([], [], ls="", marker="o", ms=6, color=COLOURS[method], label=TITLES[method])
         for method in METHODS
     ]
-    marks.append(
-        Line2D([], [], ls="", marker="D", ms=6, mfc="none", mec=INK, label="P1, published mean")
-    )
+    published = "Wang et al. 2024, mean (settled)"
+    marks.append(Line2D([], [], ls="", marker="D", ms=6, mfc="none", mec=INK, label=published))
     figure.legend(
-        handles=marks, loc="upper left", bbox_to_anchor=(0.02, 0.89), ncols=5, columnspacing=1.4
+        handles=marks,
+        loc="upper left",
+        bbox_to_anchor=(0.01, 0.87),
+        ncols=len(marks),
+        columnspacing=1.6,
+        handletextpad=0.2,
     )
 
 
@@ -181,32 +140,36 @@ def _legend(figure: Figure) -> None:
 
 def flow_figure(result: DemoResult) -> Figure:
     """Draw the prescribed, ordered and applied flow along the first pass, a panel a method."""
-    speed_m_s, shown = result.options.shown_m_s, _shown(result)
+    speed_m_s, flown = result.options.shown_m_s, shown(result)
     length_m = field_axes(demo_setup(speed_m_s)).length_m
-    figure = _figure(
-        10.0,
-        7.2,
+    figure = new_figure(
+        (10.0, 7.0),
         "The flow along one pass",
-        f"Total flow at {speed_m_s:g} m/s against the distance along the field; "
-        "applied: mean over one PWM period",
+        f"Total flow of the boom at {speed_m_s:g} m/s against the distance along the field; "
+        "prescribed follows the true speed, applied is the mean over one PWM period",
     )
     panels = figure.subplots(len(METHODS), 1, sharex=True, sharey=True)
-    figure.subplots_adjust(left=0.07, right=0.98, top=0.85, bottom=0.075, hspace=0.32)
+    figure.subplots_adjust(left=0.055, right=0.985, top=0.86, bottom=0.07, hspace=0.27)
     for panel, method in zip(panels, METHODS, strict=True):
-        traces = shown[method].traces
-        assert traces is not None
-        along_m, asked = traces.along_m, traces.prescribed_l_min
-        panel.fill_between(along_m, asked, color="#E2E2DE", lw=0, label="prescribed")
-        panel.plot(along_m, asked, color=FAINT, lw=0.8)
-        panel.plot(
-            along_m, traces.ordered_l_min, color=INK, lw=1.0, ls=(0, (3, 1.5)), label="ordered"
-        )
-        panel.plot(along_m, traces.applied_l_min, color=COLOURS[method], lw=1.7, label="applied")
+        _flows(panel, flown[method])
         panel.set_title(TITLES[method], color=COLOURS[method], weight="bold", pad=4)
         panel.set_ylabel("L/min")
-        panel.legend(loc="upper right", bbox_to_anchor=(1.0, 1.3), ncols=3, fontsize=8.5)
-        panel.set_xlim(-4.0, length_m + 4.0)
-        panel.set_xticks(np.arange(0.0, length_m + 1.0, 12.0))
-        panel.set_ylim(0.0, 1.08 * float(traces.prescribed_l_min.max()))
-    panels[-1].set_xlabel("distance along the field [m]; ticks at the boundaries of the plots")
+    panels[0].legend(
+        loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3, fontsize=9, borderaxespad=0.0
+    )
+    panels[0].set_xlim(-4.0, length_m + 4.0)
+    panels[0].set_xticks(np.arange(0.0, length_m + 1.0, PLOT_M))
+    panels[0].set_ylim(bottom=0.0)
+    panels[-1].set_xlabel("distance along the field [m], with ticks where plots meet")
     return figure
+
+
+def _flows(panel: Axes, flown: Flown) -> None:
+    traces, colour = flown.traces, COLOURS[flown.job.method]
+    assert traces is not None
+    along_m, asked = traces.along_m, traces.prescribed_l_min
+    panel.fill_between(along_m, asked, color="#E0E0DC", lw=0, label="prescribed")
+    panel.plot(along_m, asked, color=FAINT, lw=0.8)
+    ordered = traces.ordered_l_min
+    panel.plot(along_m, ordered, color=INK, lw=1.0, ls=(0, (3, 1.5)), label="ordered")
+    panel.plot(along_m, traces.applied_l_min, color=colour, lw=1.7, label="applied")

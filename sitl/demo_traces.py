@@ -31,7 +31,7 @@ L_MIN_PER_ML_S = 0.06
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldAxes:
-    """The field laid on its side: x along the first pass from its edge, y to the left of it."""
+    """The plots laid on their side: x along the first pass from the edge, y to the left of it."""
 
     east_m: float
     north_m: float
@@ -53,9 +53,9 @@ class FieldAxes:
 
 
 def field_axes(setup: Setup) -> FieldAxes:
-    """Return the axes whose origin is the field's corner: x and y begin at 0 there."""
+    """Return the axes whose origin is a corner of the plots: x and y begin at 0 there."""
     along_east, along_north = _along(setup.frame)
-    corners = shapely.get_coordinates(setup.prescription.field)
+    corners = shapely.get_coordinates([zone.polygon for zone in setup.prescription.zones])
     raw = FieldAxes(
         east_m=0.0,
         north_m=0.0,
@@ -88,7 +88,7 @@ class Traces:
     """Flows [L/min] of the whole boom along the first pass, and the rate on a raster [L/ha].
 
     `applied` is the mean over one PWM period. The raster's cells are `CELL_M` wide, its corner
-    lies `MARGIN_X_M` and `MARGIN_Y_M` outside the field's; rows along y, columns along x.
+    lies `MARGIN_X_M` and `MARGIN_Y_M` outside the plots'; rows along y, columns along x.
     """
 
     along_m: Floats

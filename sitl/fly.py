@@ -14,16 +14,11 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import shapely
-
-from analysis.border import off_target_ml
 from analysis.evaluation import Evaluation, evaluate, limit_ratio
-from analysis.strips import strips_of
 from companion.assembly import build_setup, deliverable
 from companion.config import Config, load
 from companion.core.controller import Setup
 from companion.core.nozzle import NozzleSet, allowed_duty
-from companion.core.prescription import Prescription
 from companion.core.rate import flow_for_rate
 from companion.errors import ConfigError
 from sitl.board import SERVO_FRAME_S
@@ -33,11 +28,12 @@ from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
 from sitl.stub.faults import Fault, read_scenario
 from sitl.vehicle import Route, Trajectory, Vehicle
+from sitl.zero_rate import zero_rate_ml
 
 if TYPE_CHECKING:
     from shapely import LineString
 
-    from analysis.flight_record import Fidelity, FlightRecord
+    from analysis.flight_record import Fidelity
     from companion.core.types import Decision, Input
     from companion.maps.model import Problem
     from sitl.vehicle import Leg
@@ -154,9 +150,7 @@ def prepare(options: FlyOptions) -> Task:
     if options.scenario is not None:
         check_on_inputs(faults, options.scenario)
     default_m_s = DEFAULT_SPEED_M_S if config.mission is None else config.mission.speed_m_s
-    route = read_route(
-        options.mission, setup.frame, speed_m_s=speed, default_speed_m_s=default_m_s
-    )
+    route = read_route(options.mission, setup.frame, speed_m_s=speed, default_speed_m_s=default_m_s)
     over = legs_over(route, setup.prescription.field, reach_m=setup.boom.reach_m)
     if not over:
         raise ConfigError(
@@ -298,34 +292,3 @@ def _true_set(nozzles: NozzleSet, profile: PlantProfile) -> NozzleSet:
     """Return the same set with the plant's own curve, where the plant has that set."""
     same = (each for each in profile.nozzle_sets if set(each.valves) == set(nozzles.valves))
     return next(same, nozzles)
-
-
-def zero_rate_ml(record: FlightRecord, outside_ml: float) -> float:
-    """Return what fell on ground whose rate is 0, given what fell outside the field."""
-    prescription = record.prescription
-    bounds = shapely.total_bounds(shapely.points(record.east_m, record.north_m))
-    near = shapely.box(*bounds).buffer(record.boom.reach_m + 1.0)
-    dry, wet = (
-        shapely.union_all(
-            [
-                zone.polygon
-                for zone in prescription.zones
-                if (zone.rate_l_ha > 0.0) == is_wet and zone.polygon.intersects(near)
-            ]
-        )
-        for is_wet in (False, True)
-    )
-    dry = dry.intersection(prescription.field).difference(wet)
-    if dry.is_empty:
-        return 0.0
-    ground = prescription.field.difference(dry)
-    open_ground = Prescription(
-        prescription.zones,
-        boundary=shapely.MultiPolygon(
-            [part for part in shapely.get_parts(ground) if isinstance(part, shapely.Polygon)]
-        ),
-        overlap=prescription.overlap,
-        default_rate_l_ha=prescription.default_rate_l_ha,
-    )
-    sure = replace(record, prescription=open_ground)
-    return max(off_target_ml(strips_of(sure), open_ground) - outside_ml, 0.0)

@@ -77,8 +77,7 @@ def write_journal(flown: Flown, folder: Path) -> Path:
                 journal.record_decision(item)
             else:
                 journal.record_input(item)
-        path = journal.path
-    return path
+        return journal.path
 
 
 def fly_lines(result: dict[str, Any]) -> Iterator[str]:

@@ -77,18 +77,22 @@ class _State:
             return None
         if isinstance(item, Telemetry):
             return self._position(item)
+        return self._report(item)
+
+    def _report(self, item: Input) -> Input:
+        """Return what is no position, as the fault has it."""
+        now_s = item.received_s
         stale = self.clock.active(FaultKind.STALE_POSITION, now_s) is not None
-        if isinstance(item, SpeedReport) and stale:
+        drop = self.clock.active(FaultKind.GPS_DROP, now_s)
+        mode = self.clock.active(FaultKind.MODE, now_s)
+        if stale and isinstance(item, SpeedReport):
             return replace(item, ground_speed_m_s=0.0)
-        if isinstance(item, EstimatorReport) and stale:
+        if stale and isinstance(item, EstimatorReport):
             return replace(item, healthy=False)
-        if isinstance(item, GnssReport):
-            drop = self.clock.active(FaultKind.GPS_DROP, now_s)
-            return item if drop is None else replace(item, fix=Fix(min(max(drop.fix, 0), 6)))
-        if isinstance(item, HeartbeatReport):
-            mode = self.clock.active(FaultKind.MODE, now_s)
-            name = None if mode is None else MODE_NAMES.get(mode.mode, f"MODE_{mode.mode}")
-            return item if name is None else replace(item, mode=name)
+        if drop is not None and isinstance(item, GnssReport):
+            return replace(item, fix=Fix(min(max(drop.fix, 0), 6)))
+        if mode is not None and isinstance(item, HeartbeatReport):
+            return replace(item, mode=MODE_NAMES.get(mode.mode, f"MODE_{mode.mode}"))
         return item
 
     def _position(self, item: Telemetry) -> Telemetry | None:

@@ -1,4 +1,4 @@
-"""Mission files for simulated flights: QGC WPL 110 and QGroundControl's plan, the same flight twice.
+"""Mission files for simulated flights: QGC WPL 110 and QGroundControl's plan.
 
 What `stub/mission_file.py` reads; home comes first, as ArduPilot numbers it.
 """

@@ -8,6 +8,7 @@ import os
 import platform
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
@@ -18,37 +19,59 @@ from tests.bench.flights import fly_all, tasks
 from tests.bench.loading import loading
 from tests.bench.lookup import lookups
 from tests.bench.realtime import times_real_time
+from tests.bench.report import page
 from tests.bench.steps import growth, large_field, small_field
 
 SEEDS, QUICK_SEEDS = 20, 3
 PROCESSES = 2
+OURS_MIN = 0.9
 
 Say = Callable[[str], None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the results; 0 even where a target is missed: the figures are the result."""
-    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
-    parser.add_argument("seed", nargs="?", type=int, default=1, help="the first of the seeds")
-    parser.add_argument("--quick", action="store_true", help="3 seeds, 5 m/s, smaller samples")
-    given = parser.parse_args(arguments)
-    begin = perf_counter()
-    figures = [
-        *timings(given.seed, is_quick=given.quick, say=say),
-        *flights(given.seed, is_quick=given.quick, say=say),
-    ]
-    print_results(figures, seed=given.seed, is_quick=given.quick, wall_s=perf_counter() - begin)
+    given = _parser().parse_args(arguments)
+    begin, load = perf_counter(), os.getloadavg()[0]
+    count = given.seeds or (QUICK_SEEDS if given.quick else SEEDS)
+    seeds = range(given.seed, given.seed + count)
+    timed, share = timings(given.seed, is_quick=given.quick, say=say)
+    figures = [*timed, *flights(seeds, is_quick=given.quick, say=say)]
+    wall_s = perf_counter() - begin
+    print_results(figures, seed=given.seed, is_quick=given.quick, wall_s=wall_s)
+    if given.page is not None:
+        busy = f"{share:.0%} of one core was ours while timing, load average before {load:.1f}"
+        about = {
+            "machine": f"{os.cpu_count()} {platform.machine()} cores",
+            "python": platform.python_version(),
+            "busy": busy,
+        }
+        quick = " --quick" if given.quick else ""
+        text = f"{given.seed} --seeds {count}{quick} --page docs/performance.md"
+        given.page.write_text(page(figures, arguments=text, seeds=seeds, about=about), "utf-8")
     return 0
 
 
-def timings(seed: int, *, is_quick: bool, say: Say) -> list[Figure]:
-    """Measure what is measured in time, one after the other, before anything runs beside it."""
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    parser.add_argument("seed", nargs="?", type=int, default=1, help="the first of the seeds")
+    parser.add_argument("--quick", action="store_true", help="3 seeds, 5 m/s, smaller samples")
+    parser.add_argument("--seeds", type=int, help=f"how many seeds; {SEEDS} unless told")
+    parser.add_argument("--page", type=Path, help="also write a page of Markdown here")
+    return parser
+
+
+def timings(seed: int, *, is_quick: bool, say: Say) -> tuple[list[Figure], float]:
+    """Measure what is measured in time, before anything runs beside it.
+
+    Returns also which share of the time this program had a core to itself.
+    """
     wall, cpu = perf_counter(), process_time()
     zones = (100, 10_000) if is_quick else (100, 1_000, 10_000, 100_000)
     say("core steps")
     figures = [
         small_field(seed=seed, repeats=1 if is_quick else 3),
-        large_field(seed=seed),
+        large_field(seed=seed, length_m=300.0 if is_quick else 900.0),
         growth(seed=seed, zones=zones),
     ]
     say("look-ups, simulation, maps")
@@ -57,15 +80,15 @@ def timings(seed: int, *, is_quick: bool, say: Say) -> list[Figure]:
     figures.append(loading(seed=seed, repeats=1 if is_quick else 3))
     # What other programs took away shows here: 1.0 is a machine of our own.
     share = (process_time() - cpu) / (perf_counter() - wall)
-    if share < 0.9:
+    if share < OURS_MIN:
         say(f"the machine is busy: {share:.0%} of the time was ours; timings are too long")
     say("message to orders")
-    return figures + arrivals(seed=seed, count=100 if is_quick else 400)
+    return figures + arrivals(seed=seed, count=100 if is_quick else 400), share
 
 
-def flights(seed: int, *, is_quick: bool, say: Say) -> list[Figure]:
+def flights(seeds: range, *, is_quick: bool, say: Say) -> list[Figure]:
     """Measure the accuracy of many flights, in two processes."""
-    todo = tasks(range(seed, seed + (QUICK_SEEDS if is_quick else SEEDS)), is_quick=is_quick)
+    todo = tasks(seeds, is_quick=is_quick)
 
     def progress(done: int) -> None:
         if done % 10 == 0 or done == len(todo):

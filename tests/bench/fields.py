@@ -27,18 +27,12 @@ from companion.core.types import (
     VehicleState,
 )
 from sitl.anyang import HEIGHT_M
-from sitl.demo import (
-    ACCELERATION_M_S2,
-    MAP_SPEED_M_S,
-    PROFILE,
-    START_S,
-    demo_lags,
-    demo_setup,
-)
+from sitl.demo_field import MAP_SPEED_M_S, START_S, demo_lags, demo_setup
 from sitl.navigation import Navigation
 from sitl.profile import load_profile
 from sitl.vehicle import Leg, Route, Vehicle
 
+PROFILE = "wang-2024"
 RATES_L_HA = (14.5, 15.4, 16.6, 17.7, 19.4, 20.5, 22.7, 23.8, 25.5, 27.8)  # P1
 PLOT_LENGTH_M, PLOT_WIDTH_M = 12.0, 6.0
 
@@ -113,7 +107,7 @@ class Moment:
 
 def moments(setup: Setup, route: Route, *, seed: int, rate_hz: float = 20.0) -> list[Moment]:
     """Return the states, one at each position message, that a noisy flight leads to."""
-    vehicle = Vehicle(route, start_s=START_S, seed=seed, acceleration_m_s2=ACCELERATION_M_S2)
+    vehicle = Vehicle(route, start_s=START_S, seed=seed)
     trajectory = vehicle.fly_to_end()
     navigation = Navigation(
         trajectory, setup.frame, seed=seed, start_s=START_S, position_rate_hz=rate_hz

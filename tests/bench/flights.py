@@ -15,19 +15,19 @@ from itertools import product
 from typing import Literal
 
 from analysis.evaluation import Evaluation, evaluate, limit_ratio
-from sitl.demo import P1_LOOK_AHEAD_S, PROFILE, demo_lags, demo_trajectory
+from sitl.demo_field import demo_lags, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.profile import PlantProfile, load_profile
 from sitl.trajectory import Trajectory
-from sitl.wang import WangController
-from tests.bench.fields import example
+from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController
+from tests.bench.fields import PROFILE, example
 
 Output = Literal["gpio", "servo", "free-running"]
 OUTPUTS: tuple[Output, ...] = ("gpio", "servo", "free-running")
 SLOW_M_S = (2.0, 3.0, 4.0, 5.0, 6.0)
 FAST_M_S = (8.0, 10.0, 12.0, 15.0)
 PAPER_M_S = 5.0
-PAPER_METHODS = tuple(P1_LOOK_AHEAD_S)
+PAPER_METHODS = {"none": 0.0, "look-ahead": LOOK_AHEAD_S, "look-ahead-stated": LOOK_AHEAD_STATED_S}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +109,7 @@ def fly_task(task: Task) -> list[Flown]:
         mine = example(speed_m_s, "gpio" if output == "gpio" else "servo")
         ours = fly(mine, path, profile, options_of(output, seed), speed_m_s=speed_m_s)
         results.append(keep(evaluate(ours.record), output=output))
-    for method, look_ahead_s in P1_LOOK_AHEAD_S.items() if task.with_paper else ():
+    for method, look_ahead_s in PAPER_METHODS.items() if task.with_paper else ():
         theirs = fly(
             setup,
             path,

@@ -55,7 +55,7 @@ def _write(path: Path, side: int, seed: int) -> None:
     with shapefile.Writer(path, shapeType=shapefile.POLYGON) as writer:
         writer.field("rate", "N", 10, 2)
         for zone in zones:
-            east, north = np.array(zone.polygon.exterior.coords).T
+            east, north = shapely.get_coordinates(zone.polygon).T
             latitudes, longitudes = ORIGIN.to_geographic_all(east.tolist(), north.tolist())
             ring = [list(corner) for corner in zip(longitudes, latitudes, strict=True)]
             writer.poly([ring[::-1]])

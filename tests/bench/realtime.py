@@ -5,11 +5,11 @@ from __future__ import annotations
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from sitl.demo import ACCELERATION_M_S2, PROFILE, START_S, demo_route
+from sitl.demo_field import START_S, demo_route
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.vehicle import Vehicle
-from tests.bench.fields import example
+from tests.bench.fields import PROFILE, example
 from tests.bench.figures import Figure, collector_as_in_flight
 
 if TYPE_CHECKING:
@@ -46,9 +46,7 @@ def _flight(fidelity: Fidelity, seed: int) -> tuple[float, float, int]:
     setup, profile = example(SPEED_M_S), load_profile(PROFILE)
     route = demo_route(SPEED_M_S)
     begin = perf_counter()
-    path = Vehicle(
-        route, start_s=START_S, seed=seed, acceleration_m_s2=ACCELERATION_M_S2
-    ).fly_to_end()
+    path = Vehicle(route, start_s=START_S, seed=seed).fly_to_end()
     options = FlightOptions(seed=seed, fidelity=fidelity)
     result = fly(setup, path, profile, options, speed_m_s=SPEED_M_S)
     return result.simulated_s, perf_counter() - begin, result.steps

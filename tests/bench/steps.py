@@ -10,7 +10,7 @@ import shapely
 from shapely import STRtree
 
 from companion.core.controller import Memory, Setup, step
-from sitl.demo import demo_route
+from sitl.demo_field import demo_route
 from tests.bench.fields import (
     PLOT_LENGTH_M,
     Moment,
@@ -144,7 +144,7 @@ def _intersections_us(setup: Setup, flown: list[Moment]) -> dict[str, float]:
         more_e = state.velocity_east_m_s * setup.ahead_s
         more_n = state.velocity_north_m_s * setup.ahead_s
         ends = np.stack([east, north, east + more_e, north + more_n], axis=1)
-        paths = shapely.linestrings(ends.reshape(-1, 2, 2))
+        paths = np.asarray(shapely.linestrings(ends.reshape(-1, 2, 2)))
         lines, hits = tree.query(paths)
         shapely.intersection(paths[lines], polygons[hits])
         times.append((perf_counter() - begin) * 1e6)

@@ -184,7 +184,7 @@ def test_config_show_says_where_each_setting_comes_from(capsys: Captured) -> Non
     assert execute(["config", "show", CONFIG, "--set", "lag.on_s=0.12"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "lag.on_s = 0.12  # override" in lines
-    assert "lag.off_s = 0.08  # file" in lines
+    assert "boom.height_m = 3.5  # file" in lines
     assert "prescription.unit = (not set)  # default" in lines
     code, found = run_json(capsys, "config", "show", CONFIG)
     assert code == 0

@@ -49,8 +49,6 @@ def route_of(lines: Sequence[Line], speed_m_s: float = SPEED_M_S) -> Route:
     legs: list[Leg] = []
     for number, ((east_0, north_0), (east_1, north_1)) in enumerate(lines):
         if number:
-            legs.append(
-                Leg(east_m=east_0, north_m=north_0, speed_m_s=speed_m_s, kind="transit")
-            )
+            legs.append(Leg(east_m=east_0, north_m=north_0, speed_m_s=speed_m_s, kind="transit"))
         legs.append(Leg(east_m=east_1, north_m=north_1, speed_m_s=speed_m_s))
     return Route(start_east_m=lines[0][0][0], start_north_m=lines[0][0][1], legs=tuple(legs))

@@ -1,0 +1,222 @@
+"""Command line of the demo: `vrspray demo`."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from companion.cli.answer import AsJson, answer, note
+from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sitl.demo import DemoOptions, DemoResult
+
+JOURNAL = "flight-0001.gpkg"
+PICTURES = ("map.png", "lags.png", "flow.png")
+FILES = ("demo.json", "report.html", JOURNAL, *PICTURES)
+# The table where the output is no terminal.
+WIDTH = 110
+# From here on there is room between the columns.
+WIDE = 96
+
+
+class Fidelity(StrEnum):
+    """How the twin simulates the flow."""
+
+    PULSED = "pulsed"
+    AVERAGED = "averaged"
+
+
+class Output(StrEnum):
+    """Which way the orders take to the valves."""
+
+    GPIO = "gpio"
+    SERVO = "servo"
+
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(epilog="Example: vrspray demo --out demo-out --speed 5 --seed 2")
+def demo_flights(
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for what is made.")] = Path(
+        "demo-out"
+    ),
+    speed: Annotated[
+        list[float] | None,
+        typer.Option(metavar="V", help="Speed [m/s], 1 to 15; may be repeated. Default: 4, 5, 6."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 1,
+    fidelity: Annotated[Fidelity, typer.Option(help="Pulses, or their mean.")] = Fidelity.PULSED,
+    output: Annotated[
+        Output, typer.Option(help="Lines of this computer, or servo outputs of the autopilot.")
+    ] = Output.GPIO,
+    as_json: AsJson = False,
+) -> None:
+    """Fly the field of the first paper with all methods and compare them.
+
+    Simulated: no hardware, no network. Exit 0: flown; 2: an option or the folder is wrong.
+    """
+    began_s = time.perf_counter()
+    from sitl.demo import DemoOptions, check
+
+    options = DemoOptions(
+        speeds_m_s=tuple(dict.fromkeys(speed or DemoOptions().speeds_m_s)),
+        seed=seed,
+        fidelity=fidelity.value,
+        output=output.value,
+    )
+    check(options)
+    with _termination_as_interrupt(), _staging(out) as stage:
+        result = _flown(options, stage, quiet=as_json)
+        found = {**result.as_json(), "wall_s": time.perf_counter() - began_s}
+        names = _write(result, found, stage)
+        _move(names, stage, out)
+    answer(found, (), as_json=as_json)
+    if not as_json:
+        _print(result, [out / name for name in names])
+
+
+def _flown(options: DemoOptions, stage: Path, *, quiet: bool) -> DemoResult:
+    from sitl.demo import fly_demo, jobs_of
+
+    with _progress(len(jobs_of(options, None)), quiet=quiet) as advance:
+        return fly_demo(options, journal_folder=stage, on_flown=advance)
+
+
+@contextmanager
+def _progress(total: int, *, quiet: bool) -> Iterator[Callable[[], None]]:
+    """Yield what moves a bar on stderr; without a terminal there is none."""
+    console = Console(stderr=True)
+    if quiet or not console.is_terminal:
+        yield lambda: None
+        return
+    bar = Progress(
+        TextColumn("flights"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task("flights", total=total)
+        yield lambda: bar.advance(task)
+
+
+# ---------------------------------------------------------------------------------------- the files
+
+
+@contextmanager
+def _staging(out: Path) -> Iterator[Path]:
+    """Yield a folder inside `out` that is gone afterwards: there is all of a demo or nothing."""
+    is_new = not out.exists()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        stage = Path(tempfile.mkdtemp(prefix=".demo-", dir=out))
+    except OSError as error:
+        raise ConfigError(
+            f"--out {out}: cannot be written ({error.strerror}); give a folder that can"
+        ) from error
+    try:
+        yield stage
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        if is_new and not any(out.iterdir()):
+            out.rmdir()
+
+
+def _write(result: DemoResult, found: dict[str, Any], stage: Path) -> list[str]:
+    """Write what belongs to a demo and return the names of the files."""
+    from sitl.demo_page import page
+
+    pictures: Sequence[str] = ()
+    if importlib.util.find_spec("matplotlib") is None:
+        note("no pictures: matplotlib is missing; pip install vrspray[plot]")
+    else:
+        from sitl.demo_pictures import draw_pictures
+
+        pictures = draw_pictures(result, stage)
+    text = json.dumps(found, indent=1, allow_nan=False)
+    (stage / "demo.json").write_text(text + "\n", encoding="utf-8")
+    document = page(result, [stage / name for name in pictures])
+    (stage / "report.html").write_text(document, encoding="utf-8")
+    return [name for name in FILES if (stage / name).exists()]
+
+
+def _move(names: Sequence[str], stage: Path, out: Path) -> None:
+    """Put the files in their place, and take away those of an earlier demo that have no new one."""
+    try:
+        for name in FILES:
+            if name in names:
+                (stage / name).replace(out / name)
+            else:
+                (out / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise ConfigError(
+            f"--out {out}: cannot be written ({error.strerror}); give a folder that can"
+        ) from error
+
+
+@contextmanager
+def _termination_as_interrupt() -> Iterator[None]:
+    """Have SIGTERM end the demo as Ctrl-C does, with nothing left behind."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+# ---------------------------------------------------------------------------------------- the table
+
+
+def _print(result: DemoResult, paths: Sequence[Path]) -> None:
+    from sitl.demo_page import legend_lines, sentence
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=WIDTH)
+    console.print(_table(result, padding=1 if console.width >= WIDE else 0))
+    for line in (*legend_lines(), ""):
+        console.print(line, style="dim")
+    console.print(sentence(result))
+    console.print(f"Files in {paths[0].parent}{os.sep}: {', '.join(path.name for path in paths)}")
+
+
+def _table(result: DemoResult, *, padding: int) -> Table:
+    from sitl.demo_page import COLUMNS, rows_of
+
+    table = Table(box=SIMPLE_HEAD, padding=(0, padding), pad_edge=False)
+    for number, name in enumerate(COLUMNS):
+        table.add_column(name, justify="left" if number == 1 else "right", no_wrap=True)
+    for group in rows_of(result):
+        for number, row in enumerate(group):
+            last = number == len(group) - 1
+            style = "dim italic" if row.published else "bold" if row.ours else None
+            table.add_row(*row.cells, style=style, end_section=last)
+    return table
+
+
+# What the program's own command line takes in: one command of the kind that Typer makes.
+demo = typer.main.get_command(app)

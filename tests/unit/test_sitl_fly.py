@@ -1,0 +1,202 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from analysis.replay import replay
+from companion.cli.app import execute
+from companion.core.frame import LocalFrame
+from companion.errors import ConfigError
+from sitl.anyang import anyang_items, anyang_route
+from sitl.fly import FlyOptions, fly_mission, prepare
+from sitl.mission_writing import write_mission
+from sitl.routes import read_route
+from sitl.stub.mission_file import read_mission
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+ANYANG = EXAMPLES / "anyang"
+ORCHARD = EXAMPLES / "orchard"
+KEYS = {
+    "speed_m_s", "method", "lag_distance_m", "settled_lag_distance_m", "misapplied_percent",
+    "spraying_accuracy_percent", "limit_ratio", "settled_accuracy_percent", "border_margin_m",
+    "off_target_ml", "missed", "apart", "fidelity", "output", "seed",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def short_mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One pass over the example field."""
+    folder = tmp_path_factory.mktemp("mission")
+    items = anyang_items(5.0)
+    write_mission((*items[:4], items[-1]), folder)
+    return folder / "mission.waypoints"
+
+
+@pytest.fixture
+def options(short_mission: Path) -> FlyOptions:
+    return FlyOptions(config=ANYANG / "config.toml", mission=short_mission)
+
+
+def silent(_: str) -> None:
+    pass
+
+
+def command(mission: Path, *more: str, config: Path = ANYANG / "config.toml") -> list[str]:
+    return ["sitl", "fly", "--config", str(config), "--mission", str(mission), *more]
+
+
+def test_one_flight_comes_out_as_one_json_object(
+    short_mission: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert execute(command(short_mission, "--json")) == 0
+    said = capsys.readouterr()
+    result: dict[str, Any] = json.loads(said.out)
+    (flight,) = result["flights"]
+    assert set(flight) >= KEYS
+    assert flight["missed"] == 0
+    assert flight["off_target_ml"] == 0.0
+    assert flight["limit_ratio"] >= 1.0
+    assert result["warnings"] == []
+    assert result["times_real_time"] == result["simulated_s"] / result["wall_s"]
+    assert "plant wang-2024" in said.err
+
+
+def test_out_keeps_truth_result_picture_and_a_journal_that_replays(
+    short_mission: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert execute(command(short_mission, "--out", str(out))) == 0
+    assert "times real time" in capsys.readouterr().out
+    with np.load(out / "truth.npz") as truth:
+        assert truth["volume_ml"].shape == (len(truth["time_s"]), 6)
+        applied_ml = float(truth["volume_ml"][-1].sum())
+    kept = json.loads((out / "result.json").read_text(encoding="utf-8"))
+    assert kept["flights"][0]["applied_ml"] == pytest.approx(applied_ml)
+    found = replay(out / "flight-0001.gpkg")
+    assert found.decisions == kept["flights"][0]["steps"]
+    assert found.differences == 0
+    assert (out / "flight.png").stat().st_size > 10_000
+
+
+def test_the_same_seed_gives_the_same_flight(options: FlyOptions) -> None:
+    first, second = (fly_mission(options, silent).result.record for _ in range(2))
+    assert np.array_equal(first.volume_ml, second.volume_ml)
+
+
+def test_the_missions_of_the_example_are_the_flight_of_the_demo() -> None:
+    items = anyang_items(5.0)
+    for name in ("mission.waypoints", "mission.plan"):
+        assert read_mission(ANYANG / name)[1:] == items[1:]
+
+
+def test_a_mission_file_gives_the_route_in_the_frame_of_the_map() -> None:
+    frame = LocalFrame(35.9966, 114.5439)
+    route = read_route(ANYANG / "mission.waypoints", frame, speed_m_s=None, default_speed_m_s=9.0)
+    wanted = anyang_route(5.0, frame)
+    assert route.height_m == wanted.height_m
+    assert [leg.speed_m_s for leg in route.legs] == [5.0] * 7
+    for leg, other in zip(route.legs, wanted.legs, strict=True):
+        assert leg.east_m == pytest.approx(other.east_m, abs=0.02)
+        assert leg.north_m == pytest.approx(other.north_m, abs=0.02)
+
+
+def test_a_speed_on_the_command_line_goes_before_that_of_the_mission(options: FlyOptions) -> None:
+    task = prepare(replace(options, speed_m_s=4.0))
+    assert {leg.speed_m_s for leg in task.route.legs} == {4.0}
+    assert task.speed_m_s == 4.0
+
+
+def test_the_plant_is_the_one_that_delivers_as_much_as_the_configured_sets() -> None:
+    options = FlyOptions(config=ORCHARD / "config.toml", mission=ORCHARD / "mission.plan")
+    task = prepare(options)
+    assert task.profile.name == "orchard-180"
+    assert not task.warnings
+
+
+def test_rates_above_what_the_sets_deliver_are_a_warning(
+    options: FlyOptions, tmp_path: Path
+) -> None:
+    config = with_map(tmp_path, rate_l_ha=150.0)
+    (warning,) = prepare(replace(options, config=config)).warnings
+    assert warning.code == "rate-too-high"
+    assert "150 L/ha at 5 m/s need 27.00 L/min" in warning.text
+
+
+def test_a_map_of_which_nothing_can_be_delivered_is_refused(
+    short_mission: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = with_map(tmp_path, rate_l_ha=1.0)
+    assert execute(command(short_mission, config=config)) == 2
+    assert "nothing of the map can be delivered: 1 L/ha at 5 m/s" in capsys.readouterr().err
+
+
+def with_map(folder: Path, *, rate_l_ha: float) -> Path:
+    """Write the example's configuration with the same field at one rate."""
+    outline = json.loads((ANYANG / "boundary.geojson").read_text(encoding="utf-8"))
+    outline["features"][0]["properties"] = {"rate": rate_l_ha, "unit": "L/ha"}
+    (folder / "map.geojson").write_text(json.dumps(outline), encoding="utf-8")
+    text = (ANYANG / "config.toml").read_text(encoding="utf-8")
+    text = text.replace("prescription.shp", "map.geojson")
+    text = text.replace('boundary = "boundary.geojson"\n', "")
+    (folder / "config.toml").write_text(text, encoding="utf-8")
+    return folder / "config.toml"
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"config": ORCHARD / "config.toml"}, "does not come over the map"),
+        ({"speed_m_s": 40.0}, "--speed 40: give 0.5 to 20 m/s"),
+        ({"seed": -1}, "--seed -1"),
+        ({"plant": "no-such"}, "no sprayer profile 'no-such'"),
+        ({"mission": Path("missing.plan")}, "missing.plan"),
+        ({"output": "servo", "fidelity": "averaged"}, "--output servo"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    options: FlyOptions, change: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(ConfigError, match=text):
+        prepare(replace(options, **change))
+
+
+def scenario(folder: Path, kind: str) -> Path:
+    path = folder / "scenario.toml"
+    path.write_text(
+        f'[[fault]]\nkind = "{kind}"\nat_s = 10.0\nduration_s = 5.0\n', encoding="utf-8"
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "inhibit"),
+    [
+        ("no-position", "stale-position"),
+        ("stale-position", "estimator-unhealthy"),
+        ("zero-position", "invalid-position"),
+        ("heading-unknown", "heading-unknown"),
+        ("gps-drop", "fix-too-low"),
+        ("mode", "wrong-mode"),
+        ("silence", "stale-heartbeat"),
+    ],
+)
+def test_a_fault_of_the_scenario_closes_the_valves(
+    options: FlyOptions, tmp_path: Path, kind: str, inhibit: str
+) -> None:
+    flown = fly_mission(replace(options, scenario=scenario(tmp_path, kind)), silent)
+    assert inhibit in flown.result.inhibits
+    record = flown.result.record
+    volume_ml = record.volume_ml.sum(axis=1)
+    under_fault = (record.time_s > 13.0) & (record.time_s < 14.9)
+    assert np.ptp(volume_ml[under_fault]) == 0.0
+    assert volume_ml[-1] > 0.0
+
+
+def test_a_fault_of_the_wire_is_refused(options: FlyOptions, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'ack-lost' needs a wire"):
+        prepare(replace(options, scenario=scenario(tmp_path, "ack-lost")))
