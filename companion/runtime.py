@@ -26,9 +26,9 @@ from companion.ports import PlanExecutor, Recorder, VehicleLink
 
 _logger = logging.getLogger(__name__)
 
-# Between messages a step follows at the latest after this: 20 Hz, as the lease and the sign of
-# life to the autopilot's watchdog (10 Hz) need.
-STEP_MAX_S = 0.05
+# Between messages a step follows at the latest after this: often enough for the lease and for the
+# sign of life to the autopilot's watchdog (10 Hz), and not just before a position at 20 Hz.
+STEP_MAX_S = 0.06
 
 
 class NoRecorder:

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from sitl.profile import PlantProfile
     from sitl.trajectory import Trajectory
 
-# Steps between positions, as the runtime has them.
-STEP_S = 0.05
+# Without a position a step follows after this, as in the runtime.
+STEP_S = 0.06
 SAMPLE_S: dict[Fidelity, float] = {"pulsed": 0.002, "averaged": 0.010}
 TAIL_S = 1.0
 # A position message is on its way this long: autopilot, wire, reader.

@@ -10,7 +10,13 @@ import math
 from dataclasses import dataclass, field
 
 from companion.core.boom import Boom
-from companion.core.crossings import Across, Border, Route, find_routes
+from companion.core.crossings import (
+    STRAIGHT_YAW_RATE_DEG_S,
+    Across,
+    Border,
+    Route,
+    find_routes,
+)
 from companion.core.frame import LocalFrame
 from companion.core.interlock import Limits, closed_plan, guard, inhibits
 from companion.core.nozzle import NozzleSet, PwmLimits, allowed_duty, choose_set
@@ -24,8 +30,12 @@ __all__ = ["Across", "Border", "Memory", "Setup", "step"]
 # Below this share of its width across the motion, a boom that flies askew is dosed as at it: the
 # flow that the law asks for would fall towards nothing while the strip is a blur.
 SKEW_MIN = 0.3
-# How long the crossings found after one position are carried on while no other comes.
-ROUTES_KEPT_S = 0.11
+# Crossings found in one step are carried on for this long, if the path does not leave its
+# prediction by more than these and none of them is to be ordered within this time.
+ROUTES_KEPT_S = 0.21
+ROUTES_ASIDE_M = 0.03
+ROUTES_ALONG_M = 0.2
+ROUTES_EXACT_S = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,8 +83,8 @@ class Setup:
     def ahead_s(self) -> float:
         """Return how far ahead a path must reach: the lease, the longest lead and a short stay."""
         timing = self.timing
-        lead_s = max(timing.on_s, timing.off_s, timing.up_s, timing.down_s, timing.border_off_s)
-        return self.lease_s + lead_s + 2.0 * timing.dwell_min_s + ROUTES_KEPT_S + 0.05
+        longest_s = timing.longest_s + 2.0 * timing.dwell_min_s
+        return self.lease_s + longest_s + ROUTES_KEPT_S + 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,8 +95,7 @@ class Memory:
     set_index: int = 0
     set_rate_l_ha: float | None = None
     routes: tuple[Route, ...] = ()
-    routes_at_s: float = -math.inf
-    position_received_s: float = -math.inf
+    routes_from: VehicleState | None = None
 
 
 def step(
@@ -98,7 +107,7 @@ def step(
     if reasons or state is None:
         return _closed(setup, state, reasons, sequence, now_s)
     in_force = duty_in_force(memory.plan, now_s, len(setup.boom.valves))
-    routes, routes_at_s = _routes(setup, state, memory, now_s)
+    routes, routes_from = _routes(setup, state, memory, now_s)
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
     index, set_rate = _nozzle_set(setup, routes, memory, speed_m_s)
     until_s = now_s + setup.lease_s
@@ -134,24 +143,26 @@ def step(
         set_index=index,
         set_rate_l_ha=set_rate,
         routes=routes,
-        routes_at_s=routes_at_s,
-        position_received_s=state.position_received_s,
+        routes_from=routes_from,
     )
 
 
 def _routes(
     setup: Setup, state: VehicleState, memory: Memory, now_s: float
-) -> tuple[tuple[Route, ...], float]:
-    """Return the valves' routes and when they were found.
+) -> tuple[tuple[Route, ...], VehicleState]:
+    """Return the valves' routes, and the state that they were found from.
 
-    Without a new position the prediction is the old one carried on, and so are its crossings.
+    On a straight pass the same edges are crossed at every step: as long as the prediction holds
+    and no crossing is due soon, the last ones are carried on and only their times are shifted.
     """
-    if (
-        state.position_received_s == memory.position_received_s
-        and 0.0 <= now_s - memory.routes_at_s <= ROUTES_KEPT_S
-        and memory.routes
-    ):
-        return memory.routes, memory.routes_at_s
+    found_from = memory.routes_from
+    if found_from is not None:
+        shift = _carried(setup, found_from, state, now_s)
+        if shift is not None:
+            routes = _shifted(memory.routes, shift, now_s)
+            soon_s = now_s + setup.timing.longest_s + ROUTES_EXACT_S
+            if all(len(route) == 1 or route[1].at_s > soon_s for route in routes):
+                return routes, found_from
     routes = find_routes(
         setup.prescription,
         state,
@@ -162,7 +173,56 @@ def _routes(
         border_buffer_m=setup.border_buffer_m,
         across=setup.across,
     )
-    return routes, now_s
+    return routes, state
+
+
+def _carried(
+    setup: Setup, before: VehicleState, state: VehicleState, now_s: float
+) -> tuple[float, float, float] | None:
+    """Return how far along, how fast then and how fast now; None where the prediction fails."""
+    age_s = now_s - before.time_s
+    turning = max(abs(before.yaw_rate_deg_s), abs(state.yaw_rate_deg_s))
+    if not (0.0 <= age_s <= ROUTES_KEPT_S and turning < STRAIGHT_YAW_RATE_DEG_S):
+        return None
+    then_east = before.velocity_east_m_s + before.acceleration_east_m_s2 * age_s
+    then_north = before.velocity_north_m_s + before.acceleration_north_m_s2 * age_s
+    east, north = state.velocity_east_m_s, state.velocity_north_m_s
+    speed, then = math.hypot(east, north), math.hypot(then_east, then_north)
+    if not (speed > 0.5 and then > 0.5):
+        return None
+    half = 0.5 * age_s * age_s
+    off_east = state.east_m - before.east_m - before.velocity_east_m_s * age_s
+    off_east -= before.acceleration_east_m_s2 * half
+    off_north = state.north_m - before.north_m - before.velocity_north_m_s * age_s
+    off_north -= before.acceleration_north_m_s2 * half
+    aside = abs(off_north * east - off_east * north) / speed
+    bend = abs(then_east * north - then_north * east) / (speed * then)
+    turned_deg = ((state.heading_deg or 0.0) - (before.heading_deg or 0.0) + 180.0) % 360.0 - 180.0
+    aside += bend * speed * setup.ahead_s + math.radians(abs(turned_deg)) * setup.boom.reach_m
+    along = (off_east * east + off_north * north) / speed
+    if not (aside <= ROUTES_ASIDE_M and abs(along) <= ROUTES_ALONG_M):
+        return None
+    return along, then, speed
+
+
+def _shifted(
+    routes: tuple[Route, ...], shift: tuple[float, float, float], now_s: float
+) -> tuple[Route, ...]:
+    """Return the routes with their crossings at the times that the new position gives."""
+    along_m, then, speed = shift
+    moved: list[Route] = []
+    for route in routes:
+        if len(route) == 1:
+            moved.append(route)
+            continue
+        moved.append(
+            route[:1]
+            + tuple(
+                crossing._replace(at_s=now_s + ((crossing.at_s - now_s) * then - along_m) / speed)
+                for crossing in route[1:]
+            )
+        )
+    return tuple(moved)
 
 
 def duty_in_force(plan: SprayPlan | None, now_s: float, valve_count: int) -> tuple[float, ...]:

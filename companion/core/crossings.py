@@ -49,6 +49,9 @@ class Paths:
     speed_m_s: Floats
     middle: tuple[tuple[float, float], ...]
     right: tuple[tuple[float, float], ...]
+    step_east_m: Floats
+    step_north_m: Floats
+    length_m: Floats
 
     def box(self, reach_m: float) -> tuple[float, float, float, float]:
         """Return west, south, east, north of all within `reach_m` of the middle's path."""
@@ -99,64 +102,89 @@ def predict(
     )
     chords = CURVE_CHORDS if turning else 1
     knots = [-back_s + (back_s + ahead_s) * i / chords for i in range(chords + 1)]
-    shape = (len(right_m), chords + 1)
-    east, north, pace = np.empty(shape), np.empty(shape), np.empty(shape)
-    middle = [
-        _knot(state, dt_s, heading_deg, turning, right_m, forward_m, (east, north, pace), i)
-        for i, dt_s in enumerate(knots)
-    ]
+    if turning:
+        shape = (len(right_m), chords + 1)
+        east, north, pace = np.empty(shape), np.empty(shape), np.empty(shape)
+        middle = [
+            _knot(state, dt_s, heading_deg, right_m, forward_m, (east, north, pace), i)
+            for i, dt_s in enumerate(knots)
+        ]
+    else:
+        east, north, pace, middle = _straight(state, knots, heading_deg, right_m, forward_m)
     rights = []
     for a, b in pairwise(knots):
         turned_deg = state.yaw_rate_deg_s * (a + b) / 2 if turning else 0.0
         angle = math.radians(heading_deg + turned_deg)
         rights.append((math.cos(angle), -math.sin(angle)))
+    dx = east[:, 1:] - east[:, :-1]
+    dy = north[:, 1:] - north[:, :-1]
     return Paths(
-        time_s=tuple(state.time_s + dt_s for dt_s in knots),
+        time_s=tuple([state.time_s + dt_s for dt_s in knots]),
         east_m=east,
         north_m=north,
         speed_m_s=pace,
         middle=tuple(middle),
         right=tuple(rights),
+        step_east_m=dx,
+        step_north_m=dy,
+        length_m=np.hypot(dx, dy),
     )
+
+
+def _carried(state: VehicleState, dt_s: float) -> tuple[float, float, float, float]:
+    """Return velocity (east, north) and place (east, north) of the reference at `dt_s` from now."""
+    ahead_s = max(dt_s, 0.0)
+    gained = ACCELERATION_TIME_S * (1.0 - math.exp(-ahead_s / ACCELERATION_TIME_S))
+    carried = ACCELERATION_TIME_S * (ahead_s - gained)
+    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
+    return (
+        state.velocity_east_m_s + ae * gained,
+        state.velocity_north_m_s + an * gained,
+        state.east_m + state.velocity_east_m_s * dt_s + ae * carried,
+        state.north_m + state.velocity_north_m_s * dt_s + an * carried,
+    )
+
+
+def _straight(
+    state: VehicleState, knots: list[float], heading_deg: float, right_m: Floats, forward_m: Floats
+) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
+    """Return east, north and speed of all points at all knots, and the reference's places."""
+    angle = math.radians(heading_deg)
+    sin, cos = math.sin(angle), math.cos(angle)
+    motions = [_carried(state, dt_s) for dt_s in knots]
+    middle_east, middle_north = [m[2] for m in motions], [m[3] for m in motions]
+    east = (right_m * cos + forward_m * sin)[:, None] + np.array(middle_east)
+    north = (forward_m * cos - right_m * sin)[:, None] + np.array(middle_north)
+    pace = np.empty(east.shape)
+    pace[:] = [math.hypot(m[0], m[1]) for m in motions]
+    return east, north, pace, list(zip(middle_east, middle_north, strict=True))
 
 
 def _knot(
     state: VehicleState,
     dt_s: float,
     heading_deg: float,
-    turning: bool,
     right_m: Floats,
     forward_m: Floats,
     into: tuple[Floats, Floats, Floats],
     column: int,
 ) -> tuple[float, float]:
-    """Write east, north and speed of all points at `dt_s` from now into a column.
+    """Write east, north and speed of all points at `dt_s` from now into a column, in a turn.
 
     Returns the position reference itself.
     """
-    ahead_s = max(dt_s, 0.0)
-    gained = ACCELERATION_TIME_S * (1.0 - math.exp(-ahead_s / ACCELERATION_TIME_S))
-    carried = ACCELERATION_TIME_S * (ahead_s - gained)
-    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
-    velocity_east = state.velocity_east_m_s + ae * gained
-    velocity_north = state.velocity_north_m_s + an * gained
-    turned_deg = state.yaw_rate_deg_s * dt_s if turning else 0.0
-    angle = math.radians(heading_deg + turned_deg)
+    velocity_east, velocity_north, middle_east, middle_north = _carried(state, dt_s)
+    angle = math.radians(heading_deg + state.yaw_rate_deg_s * dt_s)
     sin, cos = math.sin(angle), math.cos(angle)
     offset_east = right_m * cos + forward_m * sin
     offset_north = forward_m * cos - right_m * sin
     east, north, pace = into
-    middle_east = state.east_m + state.velocity_east_m_s * dt_s + ae * carried
-    middle_north = state.north_m + state.velocity_north_m_s * dt_s + an * carried
     east[:, column] = middle_east + offset_east
     north[:, column] = middle_north + offset_north
-    if turning:
-        yaw_rate = math.radians(state.yaw_rate_deg_s)
-        pace[:, column] = np.hypot(
-            velocity_east + yaw_rate * offset_north, velocity_north - yaw_rate * offset_east
-        )
-    else:
-        pace[:, column] = math.hypot(velocity_east, velocity_north)
+    yaw_rate = math.radians(state.yaw_rate_deg_s)
+    pace[:, column] = np.hypot(
+        velocity_east + yaw_rate * offset_north, velocity_north - yaw_rate * offset_east
+    )
     return middle_east, middle_north
 
 
@@ -171,56 +199,52 @@ class _Cut(NamedTuple):
 
 
 def _cuts(paths: Paths, ends: Floats, owner: NDArray[np.int64]) -> list[list[_Cut]]:
-    """Return, for each point, where its path cuts the edges, in order of time."""
-    found: list[list[_Cut]] = [[] for _ in range(len(paths.east_m))]
+    """Return, for each point, where its path cuts the edges, in order of time.
+
+    All chords of all points at once: row = chord * points + point.
+    """
+    count, chords = paths.length_m.shape
+    found: list[list[_Cut]] = [[] for _ in range(count)]
     if not len(ends):
         return found
-    along = np.zeros(len(found))
-    for chord in range(len(paths.time_s) - 1):
-        along = along + _chord_cuts(paths, chord, ends, owner, along, found)
-    return found
-
-
-def _chord_cuts(
-    paths: Paths,
-    chord: int,
-    ends: Floats,
-    owner: NDArray[np.int64],
-    along: Floats,
-    found: list[list[_Cut]],
-) -> Floats:
-    """Add the cuts of one chord to `found`; return the lengths of the chords."""
-    px, py = paths.east_m[:, chord], paths.north_m[:, chord]
-    dx, dy = paths.east_m[:, chord + 1] - px, paths.north_m[:, chord + 1] - py
-    length = np.hypot(dx, dy)
+    px, py = paths.east_m[:, :-1].T.ravel(), paths.north_m[:, :-1].T.ravel()
+    dx, dy = paths.step_east_m.T.ravel(), paths.step_north_m.T.ravel()
     corners = ends.reshape(-1, 2)
     left = dx[:, None] * corners[:, 1] - dy[:, None] * corners[:, 0]
-    is_left = left >= (dx * py - dy * px)[:, None]
-    points, hits = np.nonzero(is_left[:, 0::2] != is_left[:, 1::2])
-    if not len(points):
-        return length
-    l0, l1 = left[points, 2 * hits], left[points, 2 * hits + 1]
-    share = (l0 - (dx * py - dy * px)[points]) / (l0 - l1)
-    x0, y0, x1, y1 = ends[hits].T
-    reach = length[points]
-    s = (x0 + share * (x1 - x0) - px[points]) * dx[points]
-    s += (y0 + share * (y1 - y0) - py[points]) * dy[points]
-    s /= np.maximum(reach, 1e-12)
-    first = START_NUDGE_M if chord == 0 else 0.0
-    rows = np.nonzero((s > first) & (s <= reach))[0]
-    # In order of the path; leaving before entering, where both are at one place.
-    enters = l0 > l1
-    rows = rows[np.lexsort((enters[rows], np.round(s[rows], 6)))]
-    points, s = points[rows], s[rows]
-    share = s / reach[rows]
-    v0, v1 = paths.speed_m_s[points, chord], paths.speed_m_s[points, chord + 1]
-    speed = np.sqrt(v0 * v0 + (v1 * v1 - v0 * v0) * share)
-    t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
-    at_s = t0 + share * (v0 + v1) / np.maximum(v0 + speed, 1e-9) * (t1 - t0)
-    columns = (points, at_s, along[points] + s, speed, owner[hits[rows]], enters[rows])
-    for point, *cut in zip(*(column.tolist() for column in columns), strict=True):
-        found[point].append(_Cut(*cut))
-    return length
+    own = dx * py - dy * px
+    is_left = left >= own[:, None]
+    rows, hits = (is_left[:, 0::2] != is_left[:, 1::2]).nonzero()
+    if not len(rows):
+        return found
+    l0, l1 = left[rows, 2 * hits].tolist(), left[rows, 2 * hits + 1].tolist()
+    own_, reach_ = own.tolist(), paths.length_m.T.ravel().tolist()
+    px_, py_, dx_, dy_ = px.tolist(), py.tolist(), dx.tolist(), dy.tolist()
+    pace = paths.speed_m_s.tolist()
+    kept = []
+    for row, a, b, (x0, y0, x1, y1), who in zip(
+        rows.tolist(), l0, l1, ends[hits].tolist(), owner[hits].tolist(), strict=True
+    ):
+        share = (a - own_[row]) / (a - b)
+        reach = reach_[row]
+        s = (x0 + share * (x1 - x0) - px_[row]) * dx_[row]
+        s += (y0 + share * (y1 - y0) - py_[row]) * dy_[row]
+        s /= max(reach, 1e-12)
+        if (START_NUDGE_M if row < count else 0.0) < s <= reach:
+            # In order of the path; leaving before entering, where both are at one place.
+            kept.append((row // count, round(s * 1e6), a > b, row, s, reach, who))
+    kept.sort()
+    along = np.cumsum(paths.length_m, axis=1).tolist() if chords > 1 else []
+    for chord, _, enters, row, s, reach, who in kept:
+        point = row - chord * count
+        share = s / reach
+        v0, v1 = pace[point][chord : chord + 2]
+        v0_2 = v0 * v0
+        speed = math.sqrt(v0_2 + (v1 * v1 - v0_2) * share)
+        t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
+        at_s = t0 + share * (v0 + v1) / max(v0 + speed, 1e-9) * (t1 - t0)
+        gone = along[point][chord - 1] if chord else 0.0
+        found[point].append(_Cut(at_s, gone + s, speed, who, enters))
+    return found
 
 
 def _time_on_chord(
@@ -310,9 +334,8 @@ def _rates(
 
 def _starts(paths: Paths) -> tuple[Floats, Floats]:
     """Return the starts of the paths, a hair ahead, so that none lies on an edge it just cut."""
-    dx = paths.east_m[:, 1] - paths.east_m[:, 0]
-    dy = paths.north_m[:, 1] - paths.north_m[:, 0]
-    scale = START_NUDGE_M / np.maximum(np.hypot(dx, dy), START_NUDGE_M)
+    dx, dy = paths.step_east_m[:, 0], paths.step_north_m[:, 0]
+    scale = START_NUDGE_M / np.maximum(paths.length_m[:, 0], START_NUDGE_M)
     return paths.east_m[:, 0] + dx * scale, paths.north_m[:, 0] + dy * scale
 
 
@@ -396,23 +419,26 @@ def _add_chord_contacts(
 ) -> None:
     """Add the contacts of one chord, in the skewed frame of path and boom."""
     px, py = paths.east_m[:, chord], paths.north_m[:, chord]
-    dx, dy = paths.east_m[:, chord + 1] - px, paths.north_m[:, chord + 1] - py
-    length = np.hypot(dx, dy)
+    dx, dy = paths.step_east_m[:, chord], paths.step_north_m[:, chord]
+    length = paths.length_m[:, chord]
     rx, ry = paths.right[chord]
     safe = np.maximum(length, 1e-12)
     turn = (dx * ry - dy * rx) / safe  # sine of the angle from path to boom
-    if not bool(np.all(np.abs(turn) >= ACROSS_MIN)):
+    if not np.abs(turn).min() >= ACROSS_MIN:
         for intervals in closed:
             intervals.append((paths.time_s[chord], paths.time_s[chord + 1]))
         return
     ux, uy, t2 = (dx / safe)[:, None], (dy / safe)[:, None], turn[:, None]
-    ax, ay = ends[:, 0] - px[:, None], ends[:, 1] - py[:, None]
-    bx, by = ends[:, 2] - px[:, None], ends[:, 3] - py[:, None]
-    across_0, across_1 = (ux * ay - uy * ax) / t2, (ux * by - uy * bx) / t2
-    along_0, along_1 = (ax * ry - ay * rx) / t2, (bx * ry - by * rx) / t2
+    x, y = ends[:, 0::2].ravel() - px[:, None], ends[:, 1::2].ravel() - py[:, None]
+    across = (ux * y - uy * x) / t2
+    across_0, across_1 = across[:, 0::2], across[:, 1::2]
     half = (boom.half_width_m + buffer_m)[:, None]
     touching = (np.minimum(across_0, across_1) <= half) & (np.maximum(across_0, across_1) >= -half)
-    valves, hits = np.nonzero(touching)
+    valves, hits = touching.nonzero()
+    if not len(valves):
+        return
+    along = (x * ry - y * rx) / t2
+    along_0, along_1 = along[:, 0::2], along[:, 1::2]
     for valve, hit in zip(valves.tolist(), hits.tolist(), strict=True):
         limits = _clip(
             (float(across_0[valve, hit]), float(along_0[valve, hit])),

@@ -126,7 +126,9 @@ class Prescription:
     def owners_at(self, east_m: Floats, north_m: Floats) -> list[set[int]]:
         """Return, for each point, the zones that it lies in, and `FIELD` if it is inside."""
         found: list[set[int]] = [set() for _ in range(len(east_m))]
-        points, parts = self._tree.query(shapely.points(east_m, north_m))
+        places = np.empty((len(east_m), 2))
+        places[:, 0], places[:, 1] = east_m, north_m
+        points, parts = self._tree.query(shapely.points(places))
         within = shapely.contains_xy(self._parts[parts], east_m[points], north_m[points])
         owners = self._owner[parts[within]]
         for point, owner in zip(points[within].tolist(), owners.tolist(), strict=True):

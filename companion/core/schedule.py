@@ -65,11 +65,6 @@ class LagModel:
         if not self.off_end_s >= self.off_s:
             raise ValueError("off_end_s (last flow) cannot be earlier than off_s")
 
-    @property
-    def longest_s(self) -> float:
-        """Return the farthest that an order may lie ahead of its crossing."""
-        return max(self.on_s, self.off_end_s, self.up_s, self.down_s) * 2.0 + self.output_s
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
@@ -109,6 +104,11 @@ class Timing:
             border_off_s=lag.off_end_s + lag.output_s,
             dwell_min_s=dwell_s,
         )
+
+    @property
+    def longest_s(self) -> float:
+        """Return the longest lead of all."""
+        return max(self.on_s, self.off_s, self.up_s, self.down_s, self.border_off_s)
 
     def lead_s(self, before: float, after: float, *, border: bool) -> float:
         """Return the lead of a change from one duty to another."""
