@@ -13,7 +13,7 @@ import numpy as np
 from analysis.changes import SPEED_MIN_M_S, Run, bisect
 from analysis.lag import DWELL_MIN_S, Step, Verdict
 from analysis.strips import GRAZE_M, Strip
-from analysis.track import Ints, Track, in_field
+from analysis.track import Bools, Floats, Ints, Track, in_field
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -28,6 +28,9 @@ ELEMENT_M = 0.1
 # How long before and after a change the strip must keep in the field.
 AROUND_S = 1.0
 BESIDE_S = 0.5
+# What the lines of a change are laid through reaches this far to both sides at 11 Hz (20 periods
+# and the change itself); whether a change was missed is judged by the whole of both stretches.
+WINDOWS_S = 2.3
 # A controller may keep a strip closed whose end comes this near to the border.
 CLEAR_M = 0.2
 
@@ -193,6 +196,16 @@ def _doubtful(strip: Strip) -> Ints:
     return np.flatnonzero(doubtful).astype(np.int64)
 
 
+def _in_two_stretches(strip: Strip, change_s: float, marks_s: Floats) -> Bools:
+    """Return which marks lie in the stretch that a change ends or in the one that it begins."""
+    starts_s = np.array([stretch.start_s for stretch in strip.stretches])
+    after = int(np.argmin(np.abs(starts_s - change_s)))
+    first_s = starts_s[max(after - 1, 0)]
+    last_s = starts_s[after + 1] if after + 1 < len(starts_s) else np.inf
+    inside: Bools = (marks_s >= first_s) & (marks_s < last_s)
+    return inside
+
+
 def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Step]) -> list[Step]:
     """Return the steps with those apart where the strip reaches over the border.
 
@@ -207,8 +220,11 @@ def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Ste
         if not (missed or (step.verdict is Verdict.MEASURED and not change.border)):
             found.append(step)
             continue
-        index = np.flatnonzero(np.abs(marks_s - change.time_s) <= AROUND_S)
-        if change.border:
+        around_s = AROUND_S if change.border else np.inf if missed else WINDOWS_S
+        index = np.flatnonzero(np.abs(marks_s - change.time_s) <= around_s)
+        if not change.border:
+            index = index[_in_two_stretches(strip, change.time_s, marks_s[index])]
+        else:
             index = index[strip.rates_at(marks_s[index]) > 0.0]
         clear = strip.grazing[index].all()
         if clear and missed and step.dry:

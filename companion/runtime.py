@@ -14,6 +14,7 @@ import gc
 import logging
 import selectors
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator
@@ -25,6 +26,8 @@ from companion.core.types import Decision, Input, OutputReport
 from companion.ports import PlanExecutor, Recorder, VehicleLink
 
 _logger = logging.getLogger(__name__)
+
+SWITCH_S = 0.0002
 
 # Between messages a step follows at the latest after this: often enough for the lease and for the
 # sign of life to the autopilot's watchdog (10 Hz), and not just before a position at 20 Hz.
@@ -223,5 +226,8 @@ def execute(start: Callable[[], Coroutine[Any, Any, int]]) -> int:
     """Run `start()` on a precise event loop, with what exists by now out of the collector's way."""
     gc.collect()
     gc.freeze()
+    # The journal's thread gives the interpreter back within this, not within 5 ms: an order that
+    # is due does not wait for it.
+    sys.setswitchinterval(SWITCH_S)
     with asyncio.Runner(loop_factory=precise_event_loop) as runner:
         return runner.run(start())
