@@ -14,7 +14,7 @@ COMPILE = $(BIN)/uv pip compile --universal --python-version 3.11 --generate-has
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format-check ruff mypy imports bench faults test-gpio docs lock clean
+.PHONY: help setup demo test lint format-check ruff mypy imports bench mutants faults test-gpio docs lock clean
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -43,6 +43,9 @@ imports: $(INSTALLED)
 
 bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 	$(BIN)/python -m tests.bench $(SEED)
+
+mutants: $(INSTALLED) ## each known way to break the code makes a test fail (ARGS="lease" for some)
+	$(BIN)/python -m tests.mutations $(ARGS)
 
 faults: ## faults injected over many flights
 	@echo "make faults: not part of this version; it needs the fault campaign." >&2; exit 1

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from companion.core.boom import Boom, Valve
 
 if TYPE_CHECKING:
+    from companion.core.nozzle import NozzleSet
     from companion.core.prescription import Prescription
     from companion.core.types import TimedChange
 
@@ -41,6 +42,8 @@ class FlightRecord:
     offsets. `volume_ml` is cumulative, one column a valve. `orders` are the changes of duty as
     executed at the output, in order of time; they may be empty. `duty_limits` are the lowest and
     the highest duty of the PWM: a valve held there and still beside its dose is saturated.
+    `nozzle_sets` are those that the controller took its duties from: they tell what flow an order
+    asked for; none where that is not known.
     """
 
     time_s: Floats
@@ -54,6 +57,7 @@ class FlightRecord:
     orders: tuple[TimedChange, ...]
     meta: FlightMeta
     duty_limits: tuple[float, float] = (0.0, 1.0)
+    nozzle_sets: tuple[NozzleSet, ...] = ()
 
     def __post_init__(self) -> None:
         samples = len(self.time_s)

@@ -116,6 +116,7 @@ def fly(
         prescription=setup.prescription,
         pwm_period_s=profile.pwm.period_s,
         duty_limits=(profile.pwm.duty_min, profile.pwm.duty_max),
+        nozzle_sets=setup.nozzle_sets,
         orders=tuple(output.orders),
         meta=FlightMeta(
             speed_m_s=speed_m_s,

@@ -34,6 +34,7 @@ def evaluate_truth(folder: Path, setup: Setup, *, closed_us: float, full_us: flo
             prescription=setup.prescription,
             pwm_period_s=profile.pwm.period_s,
             duty_limits=(profile.pwm.duty_min, profile.pwm.duty_max),
+            nozzle_sets=setup.nozzle_sets,
             orders=_orders(arrays, closed_us, full_us),
             meta=FlightMeta(
                 speed_m_s=summary["speed_m_s"],

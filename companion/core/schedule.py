@@ -18,8 +18,9 @@ from companion.core.types import Method, TimedChange
 
 Reference = Literal["volume", "settled"]
 
-# Duties nearer than this are the same order: a fiftieth of a percent of the flow.
-DUTY_STEP = 0.0001
+# Duties nearer than this are the same order: 2 us of a servo pulse, a fifth of a percent of flow;
+# finer trims only follow the noise of the speed (measured: they change no figure of a flight).
+DUTY_STEP = 0.002
 # Beyond this share a change of duty at once is a late change of zone and not a trim for speed.
 TRIM_MAX_SHARE = 0.08
 # A trim moves by at most this at once: below the 2 % of the span at which a driver board takes a
