@@ -10,6 +10,7 @@ import shapely
 
 from analysis.evaluation import evaluate
 from companion.core.types import Decision, Fix, Method, SprayPlan, TimedChange
+from sitl.anyang import anyang_lag
 from sitl.deposit import Deposit
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.outputs import PlanFollower
@@ -65,9 +66,7 @@ def test_every_change_falls_on_its_boundary_and_nothing_outside(
     output: str, mean_m: float, worst_m: float
 ) -> None:
     # Guards of a short field with small steps; the targets are measured by the benchmarks.
-    given = SETUP
-    if output == "servo":
-        given = replace(SETUP, lag=replace(SETUP.lag, output_s=0.012))
+    given = replace(SETUP, lag=anyang_lag(output))
     lags: list[float] = []
     for seed in range(1, 6):
         options = FlightOptions(output=output, seed=seed)  # type: ignore[arg-type]
