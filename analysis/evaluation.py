@@ -128,7 +128,7 @@ def evaluate(record: FlightRecord) -> Evaluation:
     ]
     crossings = [c for strip in strips for c in border_crossings(strip, record.prescription)]
     whole = strips_of(whole_boom(record))[0]
-    settled = measure_settled(whole.track, whole.stretches, record.orders)
+    settled = measure_settled(whole.track, whole.stretches, record.orders, record.nozzle_sets)
     accuracy = flow_accuracy(strips)
     volume_error, zone_errors = volume_error_percent(strips, record.prescription)
     all_steps = [step for each in steps for step in each]

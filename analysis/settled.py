@@ -123,7 +123,7 @@ class _TotalFlow:
     def came(self, pair: _Pair) -> bool:
         """Return whether the flow went from one stretch to the next by half of the step or more."""
         rates = [
-            _ratio(self.ml_s[level].sum(), self.per_rate[level].sum(), 0.0)
+            _usual_ratio(self.ml_s[level], self.per_rate[level])
             for level in (self.level(pair.before), self.level(pair.after))
         ]
         return (rates[1] - rates[0]) / pair.rise_l_ha >= HALF_OF_STEP
@@ -158,7 +158,7 @@ class _ByRate:
         begin_s = self._first_s(pair.change, begin_s, pair.after.end_s)
         where = slice(boom.sample(begin_s), boom.sample(pair.after.end_s) + 1)
         level, asked = flow.level(pair.after), pair.after.rate_l_ha * flow.per_rate
-        target = asked[where] * _ratio(flow.ml_s[level].sum(), asked[level].sum(), 1.0)
+        target = asked[where] * _ratio(flow.ml_s[level], asked[level])
         step = abs(pair.rise_l_ha) * flow.per_rate[where]
         return flow.stays_s(np.abs(flow.ml_s[where] - target) <= BAND_OF_STEP * step, where.start)
 
@@ -190,7 +190,6 @@ class _ByOrders:
 
         `orders_are` is what the orders ask for over what the rate asks for, `flow_is` the flow over
         the orders, both where the stretch has settled: neither curve nor sum needs to be exact.
-        Medians, as the orders of a next change that comes early are the last of these samples.
         """
         flow, boom = self.flow, self.flow.boom
         level, rate = flow.level(pair.after), pair.after.rate_l_ha
@@ -251,10 +250,20 @@ def highest(values: Floats, count: int) -> Floats:
 
 
 def _usual_ratio(parts: Floats, wholes: Floats) -> float:
-    """Return the median of the ratios; 1 where there is nothing to compare with."""
+    """Return the ratio of the sums where it is usual: a smallest step or more off is another rate.
+
+    The orders for a next change that comes early are among the last samples of a stretch.
+    """
     there = wholes > 0.0
-    return float(np.median(parts[there] / wholes[there])) if there.any() else 1.0
+    if not there.any():
+        return 1.0
+    ratios = parts[there] / wholes[there]
+    median = float(np.median(ratios))
+    usual = np.abs(ratios - median) <= SMALLEST_STEP * median
+    return _ratio(parts[there][usual], wholes[there][usual]) if usual.any() else median
 
 
-def _ratio(part: float, whole: float, otherwise: float) -> float:
-    return float(part / whole) if whole > 0.0 else otherwise
+def _ratio(parts: Floats, wholes: Floats) -> float:
+    """Return the ratio of the sums; 1 where there is nothing to compare with."""
+    whole = float(wholes.sum())
+    return float(parts.sum()) / whole if whole > 0.0 else 1.0

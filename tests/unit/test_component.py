@@ -406,6 +406,20 @@ def test_a_link_that_returns_counts_once_a_step_was_taken_and_the_vehicle_was_he
     assert fault_of(link) is None
 
 
+def test_what_came_before_the_loss_is_neither_used_nor_taken_for_the_vehicle_s_return(
+    peer: Peer,
+) -> None:
+    link = VehicleLink("udpin:127.0.0.1:14550", ComponentOptions())
+    link._transport = UpAndDown(peer)
+    link._on_bytes(peer.heartbeat())
+    link._on_bytes(peer.position(1.0))
+    link._on_change(False)
+    link._on_change(True)
+    assert link.receive() == []
+    link.tell(CLOSED, 1.0)
+    assert fault_of(link) is not None
+
+
 def fault_of(link: VehicleLink) -> str | None:
     return link.fault
 

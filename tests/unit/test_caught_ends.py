@@ -1,0 +1,303 @@
+"""However a part ends, what it took is given back: each test fails for a `finally` of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sqlite3
+import threading
+from collections.abc import Callable
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.core.types import Decision, HeartbeatReport, Input, Method, SprayPlan
+from companion.errors import JournalError
+from companion.record.journal import Journal
+from companion.record.writer import Writer
+from companion.runtime import run
+from sitl.demo_cli import _termination_as_interrupt
+from sitl.demo_pool import _interrupt_held_back, _pool
+from sitl.serve import ServeOptions, _Run
+from sitl.stub.transport import _TcpServer
+from tests.builders import setup
+
+
+class BrokenPartError(RuntimeError):
+    """What no part is expected to raise."""
+
+
+@dataclass
+class Scribe:
+    """Link and executor in one; `fail_on` names the call that fails."""
+
+    fail_on: str = ""
+    fault: str | None = None
+    calls: list[str] = field(default_factory=list)
+    inputs: list[Input] = field(default_factory=list)
+    submitted: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def _note(self, call: str) -> None:
+        self.calls.append(call)
+        if call == self.fail_on:
+            raise BrokenPartError(call)
+
+    async def open(self, wake: Callable[[], None]) -> None:
+        self._note("open")
+
+    def receive(self) -> list[Input]:
+        self._note("receive")
+        return [self.inputs.pop(0)] if self.inputs else []
+
+    def tell(self, decision: Decision | None, now_s: float) -> None:
+        self._note("tell")
+
+    def tell_fault(self, text: str) -> None:
+        self._note("tell_fault")
+
+    async def close(self) -> None:
+        self._note("close")
+
+    async def start(self) -> None:
+        self._note("start")
+
+    def submit(self, plan: SprayPlan) -> None:
+        self.submitted.set()
+        self._note("submit")
+
+    async def stop(self) -> None:
+        self._note("stop")
+
+
+@pytest.mark.parametrize("fail_on", ["", "open", "start", "receive", "submit", "stop", "close"])
+async def test_signals_and_handler_are_given_back_whatever_fails(fail_on: str) -> None:
+    loop = asyncio.get_running_loop()
+    handler = loop.get_exception_handler()
+    scribe = Scribe(fail_on=fail_on)
+    given = run(setup(), link=scribe, executor=scribe, duration_s=0.0)
+    results = await asyncio.gather(given, return_exceptions=True)
+    assert [type(result) for result in results] == [BrokenPartError if fail_on else int]
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert loop.get_exception_handler() is handler
+    # Valves first, while the link can still carry the order; then the link.
+    assert scribe.calls[-2:] == (["open", "close"] if fail_on == "open" else ["stop", "close"])
+
+
+@pytest.mark.parametrize("fail_on", ["", "submit"])
+async def test_no_timer_is_left_behind_whatever_fails(fail_on: str) -> None:
+    scribe = Scribe(fail_on=fail_on)
+    task = asyncio.create_task(run(setup(), link=scribe, executor=scribe, duration_s=3600.0))
+    async with asyncio.timeout(5.0):
+        await scribe.submitted.wait()
+    await asyncio.sleep(0)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    left = [timer.when() for timer in asyncio.get_running_loop()._scheduled  # type: ignore[attr-defined]
+            if not timer.cancelled()]  # fmt: skip
+    assert left == []
+    assert scribe.calls[-2:] == ["stop", "close"]
+
+
+def test_a_demo_that_fails_gives_the_signal_back() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(BrokenPartError), _termination_as_interrupt():
+        raise BrokenPartError
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+async def test_an_order_to_close_leaves_before_anything_is_told() -> None:
+    scribe = Scribe()
+    await run(setup(), link=scribe, executor=scribe, duration_s=0.0)
+    assert scribe.calls[:5] == ["open", "start", "receive", "submit", "tell"]
+
+
+@dataclass
+class Notes:
+    """Keeps what it is given to take down."""
+
+    rows: list[Input | Decision] = field(default_factory=list)
+
+    def record_input(self, item: Input) -> None:
+        self.rows.append(item)
+
+    def record_decision(self, decision: Decision) -> None:
+        self.rows.append(decision)
+
+    def record_event(self, at_s: float, kind: str, text: str) -> None:
+        pass
+
+
+async def test_every_input_is_taken_down_before_the_decision_that_it_led_to() -> None:
+    beat = HeartbeatReport(received_s=1.0, autopilot="ardupilot", armed=False, mode="AUTO")
+    scribe, notes = Scribe(inputs=[beat]), Notes()
+    await run(setup(), link=scribe, executor=scribe, recorder=notes, duration_s=0.0)
+    assert notes.rows[0] is beat
+    assert isinstance(notes.rows[-1], Decision)
+
+
+@pytest.mark.parametrize("method", list(Method))
+def test_a_journal_tells_the_method_that_was_flown(method: Method, tmp_path: Path) -> None:
+    with Journal.create(tmp_path, setup=setup(method=method)) as journal:
+        pass
+    with closing(sqlite3.connect(journal.path)) as connection:
+        found = connection.execute("SELECT value FROM meta WHERE key = 'method'").fetchall()
+    assert found == [(str(method),)]
+
+
+def open_files(folder: Path) -> list[str]:
+    links = [link for link in Path("/proc/self/fd").iterdir() if link.is_symlink()]
+    return [name for name in map(str, map(Path.resolve, links)) if str(folder) in name]
+
+
+def test_a_journal_that_cannot_be_begun_leaves_no_file_and_none_open(tmp_path: Path) -> None:
+    text = {"config_toml": object()}
+    with pytest.raises(JournalError) as raised:
+        Journal.create(tmp_path, setup=setup(), setup_text=text)  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+    assert open_files(tmp_path) == []
+    assert raised.value.__cause__ is not None
+
+
+def test_a_writer_that_fails_at_the_end_closes_its_file(tmp_path: Path) -> None:
+    class Failing(sqlite3.Connection):
+        def execute(self, *arguments: Any) -> sqlite3.Cursor:
+            raise BrokenPartError
+
+    connection = sqlite3.connect(tmp_path / "a.gpkg", factory=Failing)
+    writer = Writer(connection, frame=setup().frame, utc_offset_s=0.0, next_sequence=lambda: 1)
+    with pytest.raises(BrokenPartError):
+        writer.finish(lost_before=0)
+    with pytest.raises(sqlite3.ProgrammingError, match="closed"):
+        connection.cursor()
+
+
+def test_a_journal_whose_writer_fails_is_a_closed_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[object] = []
+    monkeypatch.setattr(threading, "excepthook", lambda given: seen.append(given.exc_type))
+
+    class Poison:
+        @property
+        def received_s(self) -> float:
+            raise BrokenPartError
+
+    with Journal.create(tmp_path, setup=setup()) as journal:
+        journal.record_input(Poison())  # type: ignore[arg-type]
+    assert seen == [BrokenPartError]
+    assert [path.name for path in tmp_path.iterdir()] == [journal.path.name]
+    with closing(sqlite3.connect(journal.path)) as connection:
+        found = connection.execute("SELECT value FROM meta WHERE key = 'closed'").fetchall()
+    assert found == [("yes",)]
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_pool_takes_no_work_after_its_block_however_it_ended(fails: bool) -> None:
+    with suppress(BrokenPartError), _pool(1) as pool:
+        if fails:
+            raise BrokenPartError
+    with pytest.raises(RuntimeError, match="after shutdown"):
+        pool.submit(abs, -1)
+
+
+def test_an_interrupt_is_let_through_again_whatever_fails() -> None:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    with pytest.raises(BrokenPartError), _interrupt_held_back():
+        raise BrokenPartError
+    after = signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    assert after == before
+
+
+# ------------------------------------------------------------------- the stub's TCP clients
+
+
+@dataclass
+class Hub:
+    """Counts its peers; may fail on what it receives."""
+
+    peers: int = 0
+    fails: bool = False
+
+    def attach(self, name: str, send: Callable[[bytes], None]) -> Any:
+        self.peers += 1
+
+    def detach(self, channel: Any) -> None:
+        self.peers -= 1
+
+    def received(self, channel: Any, received: bytes) -> None:
+        if self.fails:
+            raise BrokenPartError
+
+
+@dataclass
+class Line:
+    """The writing half of a connection."""
+
+    is_closed: bool = False
+
+    def get_extra_info(self, name: str) -> tuple[str, int]:
+        return ("127.0.0.1", 1)
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+def by_hanging_up(reader: asyncio.StreamReader, task: asyncio.Task[None]) -> None:
+    reader.feed_eof()
+
+
+def by_a_broken_line(reader: asyncio.StreamReader, task: asyncio.Task[None]) -> None:
+    reader.set_exception(ConnectionResetError())
+
+
+def by_a_fault_of_ours(reader: asyncio.StreamReader, task: asyncio.Task[None]) -> None:
+    reader.feed_data(b"x")
+
+
+def by_the_end_of_the_server(reader: asyncio.StreamReader, task: asyncio.Task[None]) -> None:
+    task.cancel()
+
+
+@pytest.mark.parametrize(
+    "end", [by_hanging_up, by_a_broken_line, by_a_fault_of_ours, by_the_end_of_the_server]
+)
+async def test_a_client_that_is_gone_is_forgotten_however_it_went(
+    end: Callable[[asyncio.StreamReader, asyncio.Task[None]], None],
+) -> None:
+    hub, line, reader = Hub(fails=end is by_a_fault_of_ours), Line(), asyncio.StreamReader()
+    server = _TcpServer(hub)
+    task = asyncio.create_task(server._accept(reader, line))  # type: ignore[arg-type]
+    await asyncio.sleep(0)
+    assert hub.peers == 1
+    end(reader, task)
+    await asyncio.gather(task, return_exceptions=True)
+    assert (hub.peers, line.is_closed, server._tasks) == (0, True, set())
+
+
+# --------------------------------------------------------------------- the flight of the stub
+
+
+class Server:
+    """A server of which nothing is heard."""
+
+    async def wait(self) -> None:
+        await asyncio.Event().wait()
+
+
+@pytest.mark.parametrize("cancelled", [False, True])
+async def test_waiting_for_the_landing_leaves_nothing_waiting(cancelled: bool) -> None:
+    flight = _Run(ServeOptions(), lambda text: None)
+    before = asyncio.all_tasks()
+    task = asyncio.create_task(flight.finished(Server()))  # type: ignore[arg-type]
+    await asyncio.sleep(0)
+    if cancelled:
+        task.cancel()
+    else:
+        flight._done.set()
+    await asyncio.gather(task, return_exceptions=True)
+    await asyncio.sleep(0)
+    assert asyncio.all_tasks() == before
