@@ -104,7 +104,7 @@ async def test_each_change_falls_on_its_boundary_over_a_real_socket(tmp_path: Pa
     assert lag["count"] == (len(RATES) - 1) * 6
     assert (metrics["missed"], metrics["off_target_ml"]) == (0, 0.0)
     # The whole example field is measured against 0.05 m and 0.20 m (docs/performance.md). The
-    # thirty changes of this one pass share one error of the position, 2 cm (1 sd): a guard is wider.
+    # thirty changes of this one pass share one error of the position, 2 cm (1 sd).
     assert abs(lag["mean"]) <= 0.06
     assert lag["mean_abs"] <= 0.08
     assert lag["max_abs"] <= 0.30
