@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: vrspray replay flights/flight-0001.gpkg --set lag.on_s=0.12")
+@app.command(epilog="Example: vrspray replay flights/flight-0001.gpkg --set lag.up_s=0.12")
 def replay_journal(
     journal: Annotated[Path, typer.Argument(help="File of a flight, such as flight-0001.gpkg.")],
     changes: Annotated[

@@ -333,10 +333,18 @@ def _rates(
 
 
 def _starts(paths: Paths) -> tuple[Floats, Floats]:
-    """Return the starts of the paths, a hair ahead, so that none lies on an edge it just cut."""
+    """Return the starts of the paths, a hair ahead and to the right.
+
+    Ahead, so that none lies on an edge it just cut; to the right, as the side test has an edge
+    that is flown along on the left: on the edge itself a point is in neither of its zones.
+    """
     dx, dy = paths.step_east_m[:, 0], paths.step_north_m[:, 0]
-    scale = START_NUDGE_M / np.maximum(paths.length_m[:, 0], START_NUDGE_M)
-    return paths.east_m[:, 0] + dx * scale, paths.north_m[:, 0] + dy * scale
+    ahead = START_NUDGE_M / np.maximum(paths.length_m[:, 0], START_NUDGE_M)
+    aside = 0.1 * ahead
+    return (
+        paths.east_m[:, 0] + dx * ahead + dy * aside,
+        paths.north_m[:, 0] + dy * ahead - dx * aside,
+    )
 
 
 def _rates_across(

@@ -200,16 +200,16 @@ def test_a_pool_takes_no_work_after_its_block_however_it_ended(fails: bool) -> N
     with suppress(BrokenPartError), _pool(1) as pool:
         if fails:
             raise BrokenPartError
-    with pytest.raises(RuntimeError, match="after shutdown"):
+    # Let go of by `shutdown` only; work is refused by a pool whose processes died as well.
+    assert getattr(pool, "_executor_manager_thread", "renamed") is None
+    with pytest.raises(RuntimeError):
         pool.submit(abs, -1)
 
 
 def test_an_interrupt_is_let_through_again_whatever_fails() -> None:
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    with pytest.raises(BrokenPartError), _interrupt_held_back():
+    with suppress(BrokenPartError), _interrupt_held_back():
         raise BrokenPartError
-    after = signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    assert after == before
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 # ------------------------------------------------------------------- the stub's TCP clients

@@ -188,7 +188,7 @@ def test_config_show_says_where_each_setting_comes_from(capsys: Captured) -> Non
     assert "prescription.unit = (not set)  # default" in lines
     code, found = run_json(capsys, "config", "show", CONFIG)
     assert code == 0
-    assert found["settings"]["lag.on_s"] == {"value": 0.1, "origin": "file"}
+    assert found["settings"]["boom.height_m"] == {"value": 3.5, "origin": "file"}
 
 
 def test_config_schema_knows_the_tables(capsys: Captured) -> None:

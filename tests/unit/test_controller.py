@@ -267,3 +267,20 @@ def test_the_course_may_point_anywhere() -> None:
         state = flying(10.0, 24.0, **along(course))  # type: ignore[arg-type]
         decision, _ = step(setup(), state, Memory(), 10.0)
         assert not decision.inhibits
+
+
+def test_a_valve_that_flies_along_the_edge_of_two_zones_sprays_one_of_them() -> None:
+    zones = [
+        Zone(name="left", polygon=shapely.box(0, 3, 40, 9), rate_l_ha=20.0),
+        Zone(name="right", polygon=shapely.box(0, -3, 40, 3), rate_l_ha=25.0),
+    ]
+    field = Prescription(zones, boundary=shapely.box(-5, -10, 45, 16))
+    given = setup(
+        prescription=field,
+        boom=boom(count=1, width_m=1.0),
+        nozzle_sets=(NozzleSet(valves=(0,), curve=CURVE),),
+    )
+    for course, rate in ((90.0, 25.0), (270.0, 20.0)):
+        state = flying(10.0, 20.0, north_m=3.0, **along(course))  # type: ignore[arg-type]
+        decision, _ = step(given, state, Memory(), 10.0)
+        assert decision.rate_l_ha == (rate,)
