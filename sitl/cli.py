@@ -107,9 +107,12 @@ def fly(
         typer.Option(help="Sprayer profile, a name or a .toml; default: that of the nearest flow."),
     ] = None,
     fidelity: Annotated[
-        Fidelity | None, typer.Option(help="averaged, or pulsed; default: what --output needs.")
+        Fidelity | None,
+        typer.Option(help="averaged, or pulsed; default: pulsed with --output servo."),
     ] = None,
-    output: Annotated[OutputPath, typer.Option(help="gpio or servo.")] = OutputPath.GPIO,
+    output: Annotated[
+        OutputPath | None, typer.Option(help="gpio or servo; default: as the configuration says.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 1,
     speed: Annotated[
         float | None, typer.Option(help="m/s on every leg; default: the mission's.")
@@ -134,7 +137,7 @@ def fly(
         scenario=scenario,
         plant=plant,
         fidelity=None if fidelity is None else fidelity.value,
-        output=output.value,
+        output=None if output is None else output.value,
         seed=seed,
         speed_m_s=speed,
         out=out,
@@ -184,3 +187,10 @@ def _print_result(result: dict[str, Any], *, as_json: bool) -> None:
         f"{result['state']}: {result['distance_m']:.0f} m in {result['flight_s']:.0f} s, "
         f"{result['volume_l']:.3f} L sprayed"
     )
+    lag = result.get("metrics", {}).get("lag_distance_m", {})
+    if lag.get("count"):
+        typer.echo(
+            f"lag distance of {lag['count']} changes: mean {lag['mean_abs']:.3f} m, "
+            f"worst {lag['max_abs']:.3f} m; off target "
+            f"{result['metrics']['off_target_ml']:.1f} mL"
+        )

@@ -29,9 +29,9 @@ from companion.core.types import (
     OperatorCommand,
     Telemetry,
 )
-from sitl.board import DriverBoard
+from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.navigation import Navigation
-from sitl.outputs import AveragedOutput, GpioOutput, Output, ServoOutput
+from sitl.outputs import WIRE_S, AveragedOutput, GpioOutput, Output, ServoOutput
 from sitl.plant import AveragedPlant, PulsedPlant
 from sitl.wang import POLL_S, WangController
 
@@ -142,7 +142,8 @@ def sprayer(
     """Return a plant and the output path that drives it."""
     if options.fidelity == "averaged":
         averaged = AveragedPlant(profile, seed=options.seed, start_s=start_s)
-        return averaged, AveragedOutput(averaged)
+        delay_s = WIRE_S + 0.5 * SERVO_FRAME_S if options.output == "servo" else 0.0
+        return averaged, AveragedOutput(averaged, delay_s=delay_s)
     pulsed = PulsedPlant(profile, seed=options.seed, start_s=start_s)
     if options.output == "gpio":
         return pulsed, GpioOutput(pulsed, start_s=start_s)

@@ -24,6 +24,7 @@ from companion.errors import ConfigError
 from sitl.board import SERVO_FRAME_S
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.input_faults import check_on_inputs, with_faults
+from sitl.outputs import WIRE_S
 from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
 from sitl.stub.faults import Fault, read_scenario
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
 
 DEFAULT_SPEED_M_S = 5.0
 DEFAULT_ACCELERATION_M_S2 = 2.5
-WIRE_S = 0.002  # of `ServoOutput`
 SAY_EVERY_S = 300.0  # of the flight
 
 Say = Callable[[str], None]
@@ -55,7 +55,7 @@ class FlyOptions:
     scenario: Path | None = None
     plant: str | None = None
     fidelity: Fidelity | None = None
-    output: Literal["gpio", "servo"] = "gpio"
+    output: Literal["gpio", "servo"] | None = None
     seed: int = 1
     speed_m_s: float | None = None
     out: Path | None = None
@@ -141,8 +141,6 @@ def prepare(options: FlyOptions) -> Task:
         raise ConfigError(f"--speed {speed:g}: give {SPEED_MIN_M_S:g} to {SPEED_MAX_M_S:g} m/s")
     if not options.seed >= 0:
         raise ConfigError(f"--seed {options.seed}: give 0 or more")
-    if options.output == "servo" and options.fidelity == "averaged":
-        raise ConfigError("--output servo makes pulses: leave --fidelity averaged out")
     config = load(options.config)
     setup = build_setup(config)
     profile = _plant(options.plant, setup)
@@ -268,15 +266,22 @@ def _flight(
 def _flight_options(task: Task, options: FlyOptions) -> FlightOptions:
     return FlightOptions(
         fidelity=options.fidelity or ("pulsed" if options.output == "servo" else "averaged"),
-        output=options.output,
+        output=_output(task, options),
         seed=options.seed,
         position_rate_hz=float(task.config.link.position_rate_hz),
     )
 
 
+def _output(task: Task, options: FlyOptions) -> Literal["gpio", "servo"]:
+    """Return the way to the valves: as told, or the configuration's own, whose lags are flown."""
+    if options.output is not None:
+        return options.output
+    return "servo" if task.config.output.kind == "servo" else "gpio"
+
+
 def _perfect_flight(task: Task, trajectory: Trajectory, options: FlyOptions) -> FlightResult:
     """Fly the same path with the true position, the plant's true curves and lags, no scatter."""
-    output_s = WIRE_S + 0.5 * SERVO_FRAME_S if options.output == "servo" else 0.0
+    output_s = WIRE_S + 0.5 * SERVO_FRAME_S if _output(task, options) == "servo" else 0.0
     profile = task.profile
     setup = replace(
         task.setup,

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from sitl.board import DriverBoard
     from sitl.plant import AveragedPlant, PulsedPlant
 
+# An order is on its way to the autopilot this long: 44 bytes over a telemetry port.
+WIRE_S = 0.002
+
 
 class Output(Protocol):
     """Takes plans, drives the plant, keeps what was carried out."""
@@ -85,10 +88,11 @@ class PlanFollower:
 
 
 class AveragedOutput:
-    """Duties act as they are."""
+    """Duties act as they are, after the mean delay of the output path."""
 
-    def __init__(self, plant: AveragedPlant) -> None:
+    def __init__(self, plant: AveragedPlant, *, delay_s: float = 0.0) -> None:
         self._plant = plant
+        self._delay_s = delay_s
         self._follower = PlanFollower(plant.profile.valve_count)
 
     @property
@@ -106,7 +110,7 @@ class AveragedOutput:
 
     def _act(self, changes: list[TimedChange]) -> None:
         for change in changes:
-            self._plant.record_change(change.at_s, change.valve, change.duty)
+            self._plant.record_change(change.at_s + self._delay_s, change.valve, change.duty)
 
 
 class GpioOutput:
@@ -145,7 +149,7 @@ class ServoOutput:
         plant: PulsedPlant,
         board: DriverBoard,
         *,
-        wire_s: float = 0.002,
+        wire_s: float = WIRE_S,
         closed_us: float = 1000.0,
         full_us: float = 2000.0,
     ) -> None:

@@ -77,6 +77,10 @@ class _Run:
     def __init__(self, options: ServeOptions, say: Say) -> None:
         if options.autopilot != "ardupilot":
             raise ConfigError(f"--autopilot {options.autopilot}: this version knows ardupilot only")
+        if not 0.0 <= options.gust_m_s <= 10.0:
+            raise ConfigError(f"--gust {options.gust_m_s:g}: give 0 to 10 m/s")
+        if options.wait_s is not None and not options.wait_s >= 0.0:
+            raise ConfigError(f"--wait-s {options.wait_s:g}: give 0 or more seconds")
         if not 0.5 <= options.speed_m_s <= 20.0:
             raise ConfigError(f"--speed {options.speed_m_s}: give 0.5 to 20 m/s")
         config = self._config = load(options.field_config or EXAMPLE / "config.toml")

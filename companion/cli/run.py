@@ -17,13 +17,14 @@ from companion.assembly import build_setup, deliverable
 from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.config import Config, load
 from companion.config.rules import without_effect
-from companion.errors import ConfigError
+from companion.errors import ConfigError, LinkError
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
 from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
+from companion.record.reader import read_journal
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -55,12 +56,19 @@ def run_companion(
         for problem in deliverable(setup, config.mission.speed_m_s):
             note(f"{problem.severity}: {problem.text}; {problem.fix}")
     folder = config.resolve(config.journal.folder)
-    with Journal.create(folder, setup=setup, setup_text=_about(config, overrides or ())) as journal:
-        runtime.execute(
-            lambda: runtime.run(
-                setup, link=link, executor=executor, recorder=journal, duration_s=duration_s
+    journal = Journal.create(folder, setup=setup, setup_text=_about(config, overrides or ()))
+    try:
+        with journal:
+            runtime.execute(
+                lambda: runtime.run(
+                    setup, link=link, executor=executor, recorder=journal, duration_s=duration_s
+                )
             )
-        )
+    except LinkError:
+        # A link that cannot be opened ends the run before its first step: no flight to keep.
+        if not read_journal(journal.path).entries:
+            journal.path.unlink()
+        raise
     answer(
         {"journal": str(journal.path), "lost_rows": journal.lost},
         [f"journal: {journal.path}"],

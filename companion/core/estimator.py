@@ -162,8 +162,10 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         return replace(track, position_valid=False, position_received_s=item.received_s)
     before = track.motion
     if before is not None and item.boot_s <= before.boot_s:
-        if item.boot_s == before.boot_s or item.boot_s > before.boot_s - 0.5:
-            return track  # repeated or overtaken: nothing new
+        if item.boot_s == before.boot_s:
+            return track  # repeated: nothing new
+        if item.boot_s > before.boot_s - 0.5:
+            return replace(track, position_valid=False)  # time went back: until the next is newer
         before = None  # the autopilot's clock went back: it was restarted
         track = replace(track, clock=None)
     clock = _tick(track.clock, item)

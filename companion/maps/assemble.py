@@ -66,6 +66,12 @@ def map_of(
 ) -> MapFile:
     """Return the map that a layer holds, or refuse what is ambiguous in it."""
     used_crs, crs_problems = crs_of(layer, path, crs)
+    if not layer.columns:
+        raise map_error(
+            path,
+            "the map has no attributes and so no rates",
+            fix="copy all of its files (.shp, .shx, .dbf and .prj), or export it again",
+        )
     choice = choose(layer.columns, asked=rate_field, path=path)
     used_unit, unit_problems = unit_of(layer, choice.column, asked=unit, path=path)
     names = zone_names(layer)

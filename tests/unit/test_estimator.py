@@ -196,11 +196,21 @@ def test_an_autopilot_that_was_restarted_is_confirmed_anew() -> None:
     assert state.east_m == pytest.approx(15.0, abs=0.01)
 
 
-def test_repeated_and_overtaken_messages_change_nothing() -> None:
+def test_repeated_messages_change_nothing() -> None:
     track = eastwards()
     repeated = position(12.9, 14.5)
     assert heard(replace(repeated, received_s=13.3), track=track) == track
-    assert heard(replace(position(12.8, 14.0), received_s=13.3), track=track) == track
+
+
+def test_time_that_goes_backwards_makes_the_position_invalid_until_the_next() -> None:
+    track = heard(replace(position(12.8, 14.0), received_s=13.0), track=eastwards())
+    state = estimate(track, 13.0)
+    assert state is not None
+    assert not state.position_valid
+    assert state.east_m == pytest.approx(15.0, abs=0.01)
+    again = estimate(heard(position(13.1, 15.5), track=track), 13.1)
+    assert again is not None
+    assert again.position_valid
 
 
 def test_the_reported_ground_speed_stands_in_for_an_unknown_velocity() -> None:

@@ -155,7 +155,6 @@ def with_map(folder: Path, *, rate_l_ha: float) -> Path:
         ({"seed": -1}, "--seed -1"),
         ({"plant": "no-such"}, "no sprayer profile 'no-such'"),
         ({"mission": Path("missing.plan")}, "missing.plan"),
-        ({"output": "servo", "fidelity": "averaged"}, "--output servo"),
     ],
 )
 def test_what_does_not_go_together_is_refused(
