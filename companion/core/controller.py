@@ -33,7 +33,7 @@ SKEW_MIN = 0.3
 # Crossings found in one step are carried on for this long, if the path does not leave its
 # prediction by more than these and none of them is to be ordered within this time.
 ROUTES_KEPT_S = 0.21
-ROUTES_ASIDE_M = 0.03
+ROUTES_ASIDE_M = 0.05
 ROUTES_ALONG_M = 0.2
 ROUTES_EXACT_S = 0.15
 
@@ -198,7 +198,8 @@ def _carried(
     aside = abs(off_north * east - off_east * north) / speed
     bend = abs(then_east * north - then_north * east) / (speed * then)
     turned_deg = ((state.heading_deg or 0.0) - (before.heading_deg or 0.0) + 180.0) % 360.0 - 180.0
-    aside += bend * speed * setup.ahead_s + math.radians(abs(turned_deg)) * setup.boom.reach_m
+    aside += bend * speed * (setup.timing.longest_s + ROUTES_EXACT_S)
+    aside += math.radians(abs(turned_deg)) * setup.boom.reach_m
     along = (off_east * east + off_north * north) / speed
     if not (aside <= ROUTES_ASIDE_M and abs(along) <= ROUTES_ALONG_M):
         return None

@@ -212,9 +212,11 @@ def test_crossings_are_those_of_an_independent_intersection(
         start = np.array([east, north]) + right * valve.right_m - forward * 5.0 * 0.3
         line = shapely.LineString([start, start + forward * 5.0 * 2.3])
         expected = []
+        shortest = 1.0
         for zone in zones:
             for part in shapely.get_parts(shapely.intersection(line, zone.polygon)):
                 if part.length > 0.0:
+                    shortest = min(shortest, part.length)
                     begins = line.project(shapely.Point(part.coords[0]))
                     expected.append((begins, zone.rate_l_ha))
         expected.sort()
@@ -222,7 +224,7 @@ def test_crossings_are_those_of_an_independent_intersection(
         found = [((c.at_s - 9.7) * 5.0, c.rate_l_ha) for c in route[1:]]
         inside = [pair for pair in found if pair[1] is not None]
         short = any(b - a < 0.05 for (a, _), (b, _) in itertools.pairwise(merged))
-        if short:
+        if short or shortest < 0.05:
             continue  # slivers are merged on purpose
         assert len(inside) == len(merged)
         for (s, rate), (want_s, want) in zip(inside, merged, strict=True):
