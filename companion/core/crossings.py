@@ -28,10 +28,10 @@ Across = Literal["centre", "mean", "max"]
 Border = Literal["inside", "volume"]
 Floats = NDArray[np.float64]
 
-# Below these, a second of flight deviates from a straight line by less than a decimetre and the
-# tenth of a second that an order looks ahead by less than a centimetre.
+# Below these, the tenth of a second that an order looks ahead deviates from a straight line by
+# less than a centimetre, and the estimate of an acceleration is mostly noise.
 STRAIGHT_YAW_RATE_DEG_S = 3.0
-STRAIGHT_LATERAL_M_S2 = 0.4
+STRAIGHT_LATERAL_M_S2 = 1.0
 CURVE_CHORDS = 6
 # A boom that lies nearly along its own motion covers no strip that could be judged.
 ACROSS_MIN = 0.2
@@ -131,12 +131,13 @@ def predict(
     )
 
 
-def _carried(state: VehicleState, dt_s: float) -> tuple[float, float, float, float]:
+def _carried(
+    state: VehicleState, dt_s: float, ae: float, an: float
+) -> tuple[float, float, float, float]:
     """Return velocity (east, north) and place (east, north) of the reference at `dt_s` from now."""
     ahead_s = max(dt_s, 0.0)
     gained = ACCELERATION_TIME_S * (1.0 - math.exp(-ahead_s / ACCELERATION_TIME_S))
     carried = ACCELERATION_TIME_S * (ahead_s - gained)
-    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
     return (
         state.velocity_east_m_s + ae * gained,
         state.velocity_north_m_s + an * gained,
@@ -148,10 +149,17 @@ def _carried(state: VehicleState, dt_s: float) -> tuple[float, float, float, flo
 def _straight(
     state: VehicleState, knots: list[float], heading_deg: float, right_m: Floats, forward_m: Floats
 ) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
-    """Return east, north and speed of all points at all knots, and the reference's places."""
+    """Return east, north and speed of all points at all knots, and the reference's places.
+
+    Only the acceleration along the course counts: one chord to where the other leads would miss
+    the near end of the path by more than leaving it out.
+    """
+    ve, vn = state.velocity_east_m_s, state.velocity_north_m_s
+    gain = ve * state.acceleration_east_m_s2 + vn * state.acceleration_north_m_s2
+    gain /= max(ve * ve + vn * vn, 1e-9)
     angle = math.radians(heading_deg)
     sin, cos = math.sin(angle), math.cos(angle)
-    motions = [_carried(state, dt_s) for dt_s in knots]
+    motions = [_carried(state, dt_s, gain * ve, gain * vn) for dt_s in knots]
     middle_east, middle_north = [m[2] for m in motions], [m[3] for m in motions]
     east = (right_m * cos + forward_m * sin)[:, None] + np.array(middle_east)
     north = (forward_m * cos - right_m * sin)[:, None] + np.array(middle_north)
@@ -173,7 +181,8 @@ def _knot(
 
     Returns the position reference itself.
     """
-    velocity_east, velocity_north, middle_east, middle_north = _carried(state, dt_s)
+    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
+    velocity_east, velocity_north, middle_east, middle_north = _carried(state, dt_s, ae, an)
     angle = math.radians(heading_deg + state.yaw_rate_deg_s * dt_s)
     sin, cos = math.sin(angle), math.cos(angle)
     offset_east = right_m * cos + forward_m * sin

@@ -219,6 +219,8 @@ def schedule(
     `in_force` is the duty that the last plan has brought about by now, `speed_soon_m_s` the
     footprint's speed when a trim ordered now would act.
     """
+    if len(route) == 1 and _holds(route[0], dosing, speed_soon_m_s, in_force):
+        return ValveSchedule((), False, 0, route[0].rate_l_ha)  # in the middle of a zone
     unresolved, due = 0, 0
     made: list[Order] = []
     rate = route[0].rate_l_ha
@@ -248,6 +250,12 @@ def schedule(
         if order.at_s < until_s
     )
     return ValveSchedule(tuple(changes), late, unresolved, _rate_at(route, now_s))
+
+
+def _holds(zone: Crossing, dosing: Dosing, speed_m_s: float, in_force: float) -> bool:
+    """Whether the duty in force is the zone's, to the step below which nothing is ordered."""
+    duty = 0.0 if zone.rate_l_ha is None else dosing(zone.rate_l_ha, speed_m_s)
+    return abs(duty - in_force) < DUTY_STEP and (duty == 0.0) == (in_force == 0.0)
 
 
 def _already_ordered(now: Order, following: Order, in_force: float, now_s: float) -> bool:
