@@ -214,7 +214,8 @@ def test_every_target_that_was_promised_exists() -> None:
 def test_ci_runs_lint_and_tests() -> None:
     script = ROOT / ".ci/run"
     assert os.access(script, os.X_OK)
-    assert "make --keep-going lint test" in script.read_text()
+    text = script.read_text()
+    assert "\nmake --keep-going lint || status=$?\nmake test || status=$?\nexit" in text
 
 
 def test_image_copies_only_what_exists_and_is_not_ignored() -> None:
