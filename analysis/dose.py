@@ -56,7 +56,7 @@ def volume_error_percent(
             for run, volume_ml in zip(inside, volumes.tolist(), strict=True):
                 totals[run.zones] += volume_ml
     by_zone = {
-        "+".join(prescription.zones[zone].name for zone in sorted(zones)): _error_percent(
+        "+".join(prescription.zone_name(zone) for zone in sorted(zones)): _error_percent(
             given_ml[zones], asked
         )
         for zones, asked in asked_ml.items()

@@ -70,6 +70,9 @@ def read_configured_map(config: Config) -> MapFile:
             unit=table.unit,
             crs=table.crs,
             layer=table.layer,
+            density_kg_l=table.density_kg_l,
+            flow_width_m=table.flow_width_m,
+            flow_speed_m_s=table.flow_speed_m_s,
         )
 
 
@@ -114,17 +117,10 @@ def _prescription(
             for number, name in enumerate(table.exclusions)
         ],
         offset_east_m=table.offset_east_m,
+        default_rate_l_ha=table.default_rate_l_ha,
         offset_north_m=table.offset_north_m,
     )
-    if table.default_rate_l_ha is not None:
-        built = Prescription(
-            built.zones,
-            boundary=built.field,
-            overlap=built.overlap,
-            default_rate_l_ha=table.default_rate_l_ha,
-            sha256=built.sha256,
-        )
-    if not any(zone.polygon.intersects(built.field) for zone in built.zones):
+    if not _meets(built):
         raise ConfigError(
             f"{config.path}: prescription.boundary and prescription.exclusions leave nothing of "
             f"{map_file.path} to spray; give files of the same field"
@@ -132,12 +128,21 @@ def _prescription(
     return built
 
 
+def _meets(built: Prescription) -> bool:
+    """Tell whether anything of the map lies on ground that may be sprayed."""
+    if built.cells is not None:
+        return bool(built.cells.outline.intersects(built.field))
+    return any(zone.polygon.intersects(built.field) for zone in built.zones)
+
+
 def above_label(config: Config, map_file: MapFile) -> Problem | None:
     """Return what is wrong when a rate of the map is above what the product's label allows."""
     limit_l_ha = config.product.rate_max_l_ha
-    rates = [zone.rate_l_ha for zone in map_file.zones if zone.rate_l_ha is not None]
+    rates = [*map_file.rates_l_ha]
     if config.prescription is not None and config.prescription.default_rate_l_ha is not None:
         rates.append(config.prescription.default_rate_l_ha)
+    elif map_file.default_rate_l_ha is not None:
+        rates.append(map_file.default_rate_l_ha)
     if limit_l_ha is None or not rates or max(rates) <= limit_l_ha:
         return None
     return Problem(
@@ -151,9 +156,8 @@ def above_label(config: Config, map_file: MapFile) -> Problem | None:
 
 def deliverable(setup: Setup, speed_m_s: float) -> list[Problem]:
     """Return what the nozzle sets cannot deliver at `speed_m_s`, and at which speed they could."""
-    rates = {zone.rate_l_ha for zone in setup.prescription.zones}
     return undelivered(
-        rates | {setup.prescription.default_rate_l_ha or 0.0},
+        setup.prescription.rates_l_ha,
         sets=setup.nozzle_sets,
         pwm=setup.pwm,
         width_m=setup.boom.width_m,

@@ -22,7 +22,15 @@ class ConfigError(VrsprayError):
 
 
 class MapError(VrsprayError):
-    """A prescription, boundary or exclusion file cannot be used."""
+    """A prescription, boundary or exclusion file cannot be used.
+
+    `code` is the linter's name of the reason (docs/maps.md), `fix` what the operator can do.
+    """
+
+    def __init__(self, text: str, *, code: str = "unusable", fix: str = "") -> None:
+        super().__init__(text)
+        self.code = code
+        self.fix = fix
 
 
 class LinkError(VrsprayError):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import matplotlib
@@ -37,7 +38,7 @@ def map_figure(result: DemoResult) -> Figure:
     speed_m_s = result.options.shown_m_s
     setup, flown = demo_setup(speed_m_s), shown(result)
     axes = field_axes(setup)
-    rates = sorted({zone.rate_l_ha for zone in setup.prescription.zones})
+    rates = setup.prescription.rates_l_ha
     norm = Normalize(rates[0] - BEYOND_L_HA, rates[-1] + BEYOND_L_HA)
     colours = matplotlib.colormaps["viridis"].with_extremes(bad=BARE)
     figure = new_figure(
@@ -49,7 +50,7 @@ def map_figure(result: DemoResult) -> Figure:
     )
     panels = figure.subplots(3, 1)
     figure.subplots_adjust(left=0.02, right=0.9, top=0.865, bottom=0.065, hspace=0.16)
-    plots = len(setup.prescription.zones)
+    plots = setup.prescription.zone_count
     panels[0].set_title(f"Prescribed: {plots} plots, {len(rates)} rates", weight="bold")
     _fill(panels[0], setup.prescription, axes, colours=colours, norm=norm)
     _arrows(panels[0], axes)
@@ -170,7 +171,7 @@ def _scale_and_north(panel: Axes, axes: FieldAxes) -> None:
     panel.text(axes.length_m, y_m, note, ha="right", va="center", size=9, color=QUIET)
 
 
-def _rate_bar(figure: Figure, rates: list[float], norm: Normalize, colours: Colormap) -> None:
+def _rate_bar(figure: Figure, rates: Sequence[float], norm: Normalize, colours: Colormap) -> None:
     place = figure.add_axes((0.925, 0.1, 0.016, 0.72))
     bar = figure.colorbar(ScalarMappable(norm=norm, cmap=colours), cax=place)
     bar.set_ticks(rates, labels=[f"{rate:.1f}" for rate in rates])

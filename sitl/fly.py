@@ -180,9 +180,7 @@ def delivers(setup: Setup, speed_m_s: float) -> bool:
 
 
 def _rates(setup: Setup) -> set[float]:
-    rates = {zone.rate_l_ha for zone in setup.prescription.zones}
-    rates.add(setup.prescription.default_rate_l_ha or 0.0)
-    return {rate for rate in rates if rate > 0.0}
+    return {rate for rate in setup.prescription.rates_l_ha if rate > 0.0}
 
 
 def _nothing(setup: Setup, speed_m_s: float) -> str:

@@ -119,7 +119,7 @@ def _draw(flown: Flown, path: Path) -> None:
     figure = Figure(figsize=(12, 9), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplot_mosaic([["asked", "applied"], ["flow", "flow"]], height_ratios=[3, 1])
-    rates = [zone.rate_l_ha for zone in flown.task.setup.prescription.zones]
+    rates = flown.task.setup.prescription.rates_l_ha
     most = max(rates) or 1.0
     _draw_asked(flown, axes["asked"], most)
     image = _draw_applied(flown, axes["applied"], most)

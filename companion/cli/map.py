@@ -10,11 +10,11 @@ import typer
 
 from companion.assembly import above_label, undelivered
 from companion.cli.answer import AsJson, answer, problem_line, problem_object
-from companion.config import Config, load
+from companion.cli.map_options import File, Reading, reading_options
+from companion.config import Config
 from companion.errors import MapError
 from companion.maps.lint import point_rates, summary
 from companion.maps.model import MapFile
-from companion.maps.registry import read_map
 
 POINTS_MAX = 1_000_000
 RATES_SHOWN_MAX = 12
@@ -25,33 +25,13 @@ app = typer.Typer(
     help="Check a prescription map; look up rates in it.",
     epilog="Example: vrspray map check examples/anyang/prescription.shp",
 )
-File = Annotated[Path, typer.Argument(metavar="FILE", help="Prescription map.")]
-RateField = Annotated[
-    str | None, typer.Option(metavar="F", help="Column of the rate, where there are several.")
-]
-Unit = Annotated[
-    str | None, typer.Option(metavar="U", help="Unit of the rate, where the file does not say.")
-]
-Crs = Annotated[
-    str | None, typer.Option(metavar="C", help="Such as EPSG:4326, where the file does not say.")
-]
-LayerName = Annotated[
-    str | None, typer.Option("--layer", metavar="L", help="Layer, where there are several.")
-]
-ConfigFile = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="FILE", help="What is not given here comes from its map."),
-]
 
 
 @app.command(epilog="Example: vrspray map check field.shp --rate-field dose --unit L/ha")
+@reading_options
 def check(
     file: File,
-    rate_field: RateField = None,
-    unit: Unit = None,
-    crs: Crs = None,
-    layer: LayerName = None,
-    config_file: ConfigFile = None,
+    reading: Reading,
     as_json: AsJson = False,
 ) -> None:
     """Say what is in a map and what is wrong with it.
@@ -59,9 +39,9 @@ def check(
     With --config also whether its sprayer can deliver the rates. Exit 0: usable; 1: readable,
     with errors; 2: unreadable.
     """
-    config = None if config_file is None else load(config_file)
-    map_file = _read(file, config, rate_field=rate_field, unit=unit, crs=crs, layer=layer)
-    result: dict[str, Any] = dict(summary(map_file, overlap=_overlap(config)))
+    config = reading.config
+    map_file = reading.read(file)
+    result: dict[str, Any] = dict(summary(map_file, overlap=reading.overlap))
     if config is not None:
         result["problems"] = [*result["problems"], *_sprayer_problems(config, map_file)]
     result["ok"] = not any(problem["severity"] == "error" for problem in result["problems"])
@@ -73,31 +53,26 @@ def check(
     epilog="Example: vrspray map rate examples/anyang/prescription.shp 35.9962 114.5436",
     context_settings={"ignore_unknown_options": True},  # a latitude may be negative
 )
+@reading_options
 def rate(
     file: File,
+    reading: Reading,
     latitude: Annotated[float | None, typer.Argument(metavar="LAT", help="Degrees.")] = None,
     longitude: Annotated[float | None, typer.Argument(metavar="LON", help="Degrees.")] = None,
     points: Annotated[
         Path | None,
         typer.Option("--points", metavar="CSV", help="File with columns lat and lon instead."),
     ] = None,
-    rate_field: RateField = None,
-    unit: Unit = None,
-    crs: Crs = None,
-    layer: LayerName = None,
-    config_file: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:
     """Say the rate at a place, or at all places of a file."""
     if (points is None) == (latitude is None or longitude is None):
         raise typer.BadParameter("give LAT and LON, or --points CSV")
-    config = None if config_file is None else load(config_file)
     if points is not None:
         places = _read_points(points)
     else:
         places = [_place(latitude, longitude, "LAT LON")]
-    map_file = _read(file, config, rate_field=rate_field, unit=unit, crs=crs, layer=layer)
-    found = point_rates(map_file, places, overlap=_overlap(config))
+    found = point_rates(reading.read(file), places, overlap=reading.overlap)
     lines = (
         f"{item['lat']},{item['lon']}: "
         + ("no rate" if item["rate_l_ha"] is None else f"{item['rate_l_ha']:g} L/ha")
@@ -105,20 +80,6 @@ def rate(
         for item in found
     )
     answer(found[0] if points is None else {"points": found}, lines, as_json=as_json)
-
-
-def _read(file: Path, config: Config | None, **given: str | None) -> MapFile:
-    """Return the map, read as the options say and otherwise as the configuration does."""
-    table = None if config is None else config.prescription
-    options = {
-        name: value if value is not None or table is None else getattr(table, name)
-        for name, value in given.items()
-    }
-    return read_map(file, **options)
-
-
-def _overlap(config: Config | None) -> str:
-    return "error" if config is None or config.prescription is None else config.prescription.overlap
 
 
 def _sprayer_problems(config: Config, map_file: MapFile) -> list[dict[str, str]]:

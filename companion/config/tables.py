@@ -58,7 +58,21 @@ class PrescriptionTable(Table):
     crs: Text | None = Field(
         default=None, description="where the map does not say, such as EPSG:4326"
     )
-    layer: Text | None = Field(default=None, description="where the map has several layers")
+    layer: Text | None = Field(
+        default=None, description="where the map has several layers or tasks"
+    )
+    density_kg_l: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=30.0,
+        description="of the product, where the map's rates are weights",
+    )
+    flow_width_m: Width | None = Field(
+        default=None, description="working width for which a map in L/min was made"
+    )
+    flow_speed_m_s: float | None = Field(
+        default=None, gt=0.0, le=100.0, description="speed for which a map in L/min was made"
+    )
     overlap: Literal["error", "max", "min", "mean", "last"] = Field(
         default="error", description="which rate holds where zones overlap; error refuses the map"
     )

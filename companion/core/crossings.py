@@ -289,8 +289,7 @@ def find_routes(
     """Return what each valve is prescribed along its predicted path, left to right."""
     paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
     reach_m = boom.reach_m + border_buffer_m + SLIVER_M
-    near = prescription.edges.near(*paths.box(reach_m))
-    ends, owner = prescription.edges.ends[near], prescription.edges.owner[near]
+    ends, owner = prescription.edges_near(*paths.box(reach_m))
     bases = prescription.owners_at(*_starts(paths))
     cuts = _cuts(paths, ends, owner)
     if across == "centre":

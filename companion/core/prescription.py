@@ -3,19 +3,22 @@
 Built once, immutable. A zone is one polygon with one rate; the field is where spraying is
 allowed: the boundary, or the outline of all zones, less the exclusions. Look-ups go through one
 STRtree of polygons, crossings through one STRtree of edges, so their cost does not grow with the
-number of zones.
+number of zones. A map in rows and columns has its cells instead of zones (`cells.py`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 from shapely import Geometry, MultiPolygon, Polygon, STRtree
+
+from companion.core.cells import NO_RATE, CellGrid
 
 Overlap = Literal["error", "max", "min", "mean", "last"]
 Floats = NDArray[np.float64]
@@ -71,7 +74,10 @@ class Prescription:
         overlap: what holds where zones overlap. Whoever loads a map refuses overlaps under
             `error`; slivers that remain take the smaller rate.
         default_rate_l_ha: the rate inside the field where there is no zone; None closes.
+        cells: rows and columns of rates instead of zones.
         sha256: of the file that the zones came from.
+
+    Wherever zones are numbered, those of `cells` are its classes: all ground of one rate.
     """
 
     def __init__(
@@ -82,16 +88,26 @@ class Prescription:
         exclusions: Sequence[Polygon | MultiPolygon] = (),
         overlap: Overlap = "error",
         default_rate_l_ha: float | None = None,
+        cells: CellGrid | None = None,
         sha256: str = "",
     ) -> None:
-        self.zones = tuple(zones)
+        if cells is not None and zones:
+            raise ValueError("a prescription has zones or cells, not both")
+        self._zones = tuple(zones)
+        self.cells = cells
         self.overlap: Overlap = overlap
         self.default_rate_l_ha = default_rate_l_ha
         self.sha256 = sha256
-        self._zone_rates = tuple(zone.rate_l_ha for zone in zones)
+        self._zone_rates: Sequence[float] | Floats = (
+            tuple(zone.rate_l_ha for zone in zones) if cells is None else cells.rates_l_ha
+        )
         zone_parts, owner = _parts([zone.polygon for zone in zones])
-        self.area_m2 = float(shapely.area(zone_parts).sum())
-        self.field = _field(zone_parts, boundary, exclusions)
+        ground: Geometry | None = boundary
+        if ground is None:
+            ground = _outline(zone_parts) if cells is None else cells.outline
+        self.field = _field(ground, exclusions)
+        # Without a boundary or an exclusion, inside is where a cell has a rate: no need to ask.
+        self._is_all_cells = cells is not None and boundary is None and not exclusions
         field_parts, _ = _parts([self.field])
         self._parts = np.concatenate([zone_parts, field_parts])
         self._owner = np.concatenate([owner, np.full(len(field_parts), FIELD, dtype=np.int64)])
@@ -103,6 +119,52 @@ class Prescription:
         )
         self._rate_of: dict[frozenset[int], float | None] = {}
 
+    @cached_property
+    def zones(self) -> tuple[Zone, ...]:
+        """Return the zones; of cells, the ground of each class, joined when it is asked for."""
+        if self.cells is None:
+            return self._zones
+        return tuple(
+            Zone(name=self.zone_name(index), polygon=area, rate_l_ha=self.zone_rate(index))
+            for index, area in enumerate(self.cells.areas)
+        )
+
+    @property
+    def zone_count(self) -> int:
+        """Return the number of zones, or of classes of cells."""
+        return len(self._zone_rates)
+
+    def zone_name(self, zone: int) -> str:
+        """Return what a zone is called; a class of cells by its rate."""
+        return self._zones[zone].name if self.cells is None else f"{self.zone_rate(zone):g} L/ha"
+
+    def zone_rate(self, zone: int) -> float:
+        """Return the rate of one zone [L/ha]."""
+        return float(self._zone_rates[zone])
+
+    @cached_property
+    def rates_l_ha(self) -> tuple[float, ...]:
+        """Return all different rates, the default among them, the least first."""
+        default = () if self.default_rate_l_ha is None else (self.default_rate_l_ha,)
+        rates = np.concatenate([np.asarray(self._zone_rates, dtype=np.float64), default])
+        return tuple(np.unique(rates).tolist())
+
+    @cached_property
+    def area_m2(self) -> float:
+        """Return the ground of all zones; where they overlap it counts for each."""
+        return float(shapely.area([zone.polygon for zone in self.zones]).sum())
+
+    def edges_near(
+        self, west_m: float, south_m: float, east_m: float, north_m: float
+    ) -> tuple[Floats, Ints]:
+        """Return the edges whose boxes meet a box, as in `Edges`, and whose each is."""
+        near = self.edges.near(west_m, south_m, east_m, north_m)
+        ends, owner = self.edges.ends[near], self.edges.owner[near]
+        if self.cells is None:
+            return ends, owner
+        cell_ends, cell_owner = self.cells.edges_in(west_m, south_m, east_m, north_m)
+        return np.concatenate([ends, cell_ends]), np.concatenate([owner, cell_owner])
+
     def rate_of(self, zones: frozenset[int]) -> float | None:
         """Return the rate where exactly these zones lie, by the overlap policy."""
         try:
@@ -112,7 +174,7 @@ class Prescription:
             return rate
 
     def _combine(self, zones: frozenset[int]) -> float | None:
-        rates = [self._zone_rates[zone] for zone in zones]
+        rates = [self.zone_rate(zone) for zone in zones]
         if not rates:
             return self.default_rate_l_ha
         if self.overlap == "max":
@@ -120,12 +182,18 @@ class Prescription:
         if self.overlap == "mean":
             return sum(rates) / len(rates)
         if self.overlap == "last":
-            return self._zone_rates[max(zones)]
+            return self.zone_rate(max(zones))
         return min(rates)
 
     def owners_at(self, east_m: Floats, north_m: Floats) -> list[set[int]]:
         """Return, for each point, the zones that it lies in, and `FIELD` if it is inside."""
         found: list[set[int]] = [set() for _ in range(len(east_m))]
+        if self.cells is not None:
+            for point, kind in enumerate(self.cells.classes_at(east_m, north_m).tolist()):
+                if kind != NO_RATE:
+                    found[point].update((kind, FIELD) if self._is_all_cells else (kind,))
+        if self._is_all_cells:
+            return found
         places = np.empty((len(east_m), 2))
         places[:, 0], places[:, 1] = east_m, north_m
         points, parts = self._tree.query(shapely.points(places))
@@ -155,6 +223,9 @@ class Prescription:
 
     def rate_at(self, east_m: float, north_m: float) -> float | None:
         """Return the rate at one point [L/ha]; None outside the field or without a rate."""
+        if self.cells is not None and self._is_all_cells:
+            kind = self.cells.class_at(east_m, north_m)
+            return None if kind == NO_RATE else self.zone_rate(kind)
         rate = float(self.rates_at(np.array([east_m]), np.array([north_m]))[0])
         return None if np.isnan(rate) else rate
 
@@ -180,18 +251,17 @@ def _edges(parts: NDArray[np.object_], owner: Ints) -> Edges:
     return Edges(ends=ends, owner=owners.astype(np.int64), tree=STRtree(lines))
 
 
+def _outline(parts: NDArray[np.object_]) -> Geometry:
+    """Return the ground of all zones, with the slivers between them closed."""
+    grown = shapely.buffer(parts, SLIVER_M / 2, join_style="mitre")
+    return shapely.buffer(shapely.union_all(grown), -SLIVER_M / 2, join_style="mitre")
+
+
 def _field(
-    parts: NDArray[np.object_],
-    boundary: Polygon | MultiPolygon | None,
-    exclusions: Sequence[Polygon | MultiPolygon],
+    ground: Geometry, exclusions: Sequence[Polygon | MultiPolygon]
 ) -> Polygon | MultiPolygon:
     """Return the ground that may be sprayed."""
-    field: Geometry
-    if boundary is None:
-        grown = shapely.buffer(parts, SLIVER_M / 2, join_style="mitre")
-        field = shapely.buffer(shapely.union_all(grown), -SLIVER_M / 2, join_style="mitre")
-    else:
-        field = boundary
+    field = ground
     if exclusions:
         field = shapely.difference(field, shapely.union_all(list(exclusions)))
     if isinstance(field, Polygon | MultiPolygon):

@@ -15,13 +15,13 @@ import shapely
 from pyproj import CRS
 from shapely.errors import ShapelyError
 
+from companion.maps.cells import check_place, corner
 from companion.maps.crs import Objects, crs_name, datum_problem, parse_crs, to_longitude_latitude
-from companion.maps.declared import unit_of
+from companion.maps.declared import Given, Unit, unit_of
 from companion.maps.fields import choose
-from companion.maps.layer import Column, Layer, as_number
+from companion.maps.layer import Band, Column, Grid, Layer, as_number
 from companion.maps.local import Area, frame_around, make_valid, project
-from companion.maps.model import RATE_MAX_L_HA, MapFile, MapZone, Problem, map_error
-from companion.maps.units import l_ha_per_unit
+from companion.maps.model import RATE_MAX_L_HA, MapCells, MapFile, MapZone, Problem, map_error
 
 # Names of zones, the best first: the first of these columns that tells all records apart.
 _NAME_COLUMNS = ("name", "zonename", "zone", "zoneid", "zone_id", "label", "id", "fid", "level")
@@ -62,21 +62,26 @@ class Repair:
 
 
 def map_of(
-    layer: Layer, path: Path, *, rate_field: str | None, unit: str | None, crs: str | None
+    found: Layer | Grid, path: Path, *, rate_field: str | None, crs: str | None, given: Given
 ) -> MapFile:
-    """Return the map that a layer holds, or refuse what is ambiguous in it."""
-    used_crs, crs_problems = crs_of(layer, path, crs)
-    if not layer.columns:
+    """Return the map that a file holds, or refuse what is ambiguous in it."""
+    if isinstance(found, Grid):
+        return _map_of_grid(found, path, rate_field=rate_field, crs=crs, given=given)
+    used_crs, crs_problems = crs_of(found, path, crs)
+    if not found.columns:
         raise map_error(
             path,
             "the map has no attributes and so no rates",
-            fix="copy all of its files (.shp, .shx, .dbf and .prj), or export it again",
+            fix="copy all of its files (.shp, .shx, .dbf and .prj), or export it again"
+            if found.format == "shapefile"
+            else "export it again with the rate as an attribute",
+            code="no-rate-column",
         )
-    choice = choose(layer.columns, asked=rate_field, path=path)
-    used_unit, unit_problems = unit_of(layer, choice.column, asked=unit, path=path)
-    names = zone_names(layer)
-    rates = _rates(choice.column, used_unit, names, path)
-    ground, repairs = ground_of(layer, used_crs, names, path)
+    choice = choose(found.columns, asked=rate_field, path=path)
+    unit = unit_of(found, choice.column, given=given, path=path)
+    names = zone_names(found)
+    rates = _rates(choice.column, unit, names, path)
+    ground, repairs = ground_of(found, used_crs, names, path)
     zones = tuple(
         MapZone(name=name, geometry=area, rate_l_ha=rate)
         for name, area, rate in zip(names, ground, rates, strict=True)
@@ -84,24 +89,67 @@ def map_of(
     )
     return MapFile(
         path=path,
-        format=layer.format,
+        format=found.format,
         crs=crs_name(used_crs),
-        unit=used_unit,
+        unit=unit.name,
         rate_field=choice.column.name,
         zones=zones,
-        sha256=layer.sha256,
+        sha256=found.sha256,
+        boundary=found.boundary,
+        default_rate_l_ha=_default(choice.column, unit, path),
         problems=(
-            *layer.problems,
+            *found.problems,
             *crs_problems,
             *choice.problems,
-            *unit_problems,
-            *skip_problems(layer, names),
+            *unit.problems,
+            *skip_problems(found, names),
             *(repair.problem for repair in repairs),
         ),
     )
 
 
-def crs_of(layer: Layer, path: Path, asked: str | None) -> tuple[CRS, list[Problem]]:
+def _map_of_grid(
+    found: Grid, path: Path, *, rate_field: str | None, crs: str | None, given: Given
+) -> MapFile:
+    """Return the map that rows and columns of cells hold."""
+    used_crs, crs_problems = crs_of(found, path, crs)
+    choice = choose(found.bands, asked=rate_field, path=path)
+    unit = unit_of(found, choice.column, given=given, path=path)
+    rates = choice.column.values * unit.l_ha
+    with np.errstate(invalid="ignore"):
+        wrong = ~np.isnan(rates) & ~((rates >= 0.0) & (rates < RATE_MAX_L_HA))
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0].tolist()
+        where = f"row {row + 1}, column {column + 1}"
+        raise _bad_rate(path, choice.column, where, float(choice.column.values[row, column]))
+    cells = MapCells(rates_l_ha=rates, transform=found.transform, crs=used_crs)
+    check_place(cells, path)
+    return MapFile(
+        path=path,
+        format=found.format,
+        crs=crs_name(used_crs),
+        unit=unit.name,
+        rate_field=choice.column.name,
+        zones=(),
+        sha256=found.sha256,
+        cells=cells,
+        boundary=found.boundary,
+        default_rate_l_ha=_default(choice.column, unit, path),
+        problems=(*found.problems, *crs_problems, *choice.problems, *unit.problems),
+    )
+
+
+def _default(column: Column | Band, unit: Unit, path: Path) -> float | None:
+    """Return what the file prescribes inside the field where there is no zone [L/ha]."""
+    if column.default is None:
+        return None
+    rate = column.default * unit.l_ha
+    if not 0.0 <= rate < RATE_MAX_L_HA:
+        raise _bad_rate(path, column, "the default", column.default)
+    return rate
+
+
+def crs_of(layer: Layer | Grid, path: Path, asked: str | None) -> tuple[CRS, list[Problem]]:
     """Return the CRS of the coordinates: what the operator says, else what the file says."""
     problems: list[Problem] = []
     if asked is not None:
@@ -122,11 +170,30 @@ def crs_of(layer: Layer, path: Path, asked: str | None) -> tuple[CRS, list[Probl
         raise map_error(
             path,
             "the file does not say its coordinate reference system"
-            + (" (no .prj beside it)" if layer.format == "shapefile" else ""),
+            + (" (no .prj beside it)" if layer.format == "shapefile" else "")
+            + _looks_like(layer),
             fix="give it with --crs, for example --crs EPSG:4326, or copy the missing file",
+            code="no-crs",
         )
     datum = datum_problem(crs)
     return crs, [*problems, *([datum] if datum is not None else [])]
+
+
+def _looks_like(layer: Layer | Grid) -> str:
+    """Return what the coordinates look like; a hint, on which nothing rests."""
+    if isinstance(layer, Grid):
+        rows, columns = layer.bands[0].values.shape
+        x, y = corner(layer.transform, np.array([0.0, columns]), np.array([0.0, rows]))
+        points = np.column_stack([x, y])
+    else:
+        areas = [area for area in layer.geometries if area is not None]
+        points = shapely.get_coordinates(areas)
+    if not len(points):
+        return ""
+    (west, south), (east, north) = points.min(axis=0), points.max(axis=0)
+    span = f"x {west:.7g} to {east:.7g}, y {south:.7g} to {north:.7g}"
+    degrees = max(abs(west), abs(east)) <= 180.0 and max(abs(south), abs(north)) <= 90.0
+    return f"; its numbers ({span}) look like {'degrees' if degrees else 'metres'}"
 
 
 def zone_names(layer: Layer) -> list[str]:
@@ -149,31 +216,29 @@ def _label(value: str | float | None) -> str:
     return " ".join((value or "").split())[:60]
 
 
-def _rates(column: Column, unit: str, names: Sequence[str], path: Path) -> list[float | None]:
+def _rates(column: Column, unit: Unit, names: Sequence[str], path: Path) -> list[float | None]:
     """Return every record's rate in L/ha; a record without one stays without."""
-    factor = l_ha_per_unit(unit)
-    if factor is None:
-        raise ValueError(f"no unit of volume per area: {unit}")
     rates: list[float | None] = []
     for name, value in zip(names, column.values, strict=True):
         try:
             number = as_number(value)
         except ValueError:
-            raise _bad_rate(path, column, name, value) from None
-        rate = None if number is None else number * factor
+            raise _bad_rate(path, column, f"zone {name}", value) from None
+        rate = None if number is None else number * unit.l_ha
         if rate is not None and not 0.0 <= rate < RATE_MAX_L_HA:
-            raise _bad_rate(path, column, name, value)
+            raise _bad_rate(path, column, f"zone {name}", value)
         rates.append(rate)
     return rates
 
 
-def _bad_rate(path: Path, column: Column, name: str, value: object) -> Exception:
+def _bad_rate(path: Path, column: Column | Band, where: str, value: object) -> Exception:
     shown = repr(value)[:40]
     return map_error(
         path,
-        f"{column.name} of zone {name} is {shown}, which is no rate",
+        f"{column.name} of {where} is {shown}, which is no rate",
         fix="correct the value (leave it blank where nothing is prescribed), or name another "
         "column with --rate-field (prescription.rate_field)",
+        code="bad-rate",
     )
 
 
@@ -189,6 +254,7 @@ def ground_of(
             path,
             f"there is no polygon in the file ({found or 'it is empty'})",
             fix="export the zones as polygons",
+            code="no-polygon",
         )
     try:
         native: Objects = np.array([layer.geometries[index] for index in here], dtype=object)
@@ -196,13 +262,21 @@ def ground_of(
         repaired, repairs = _repaired(areas, [names[index] for index in here])
     except ShapelyError as error:
         raise map_error(
-            path, f"its polygons cannot be used ({str(error)[:120]})", fix="export the map again"
+            path,
+            f"its polygons cannot be used ({str(error)[:120]})",
+            fix="export the map again",
+            code="broken-geometry",
         ) from None
     ground: list[Area | None] = [None] * len(layer.geometries)
     for index, area in zip(here, repaired, strict=True):
         ground[index] = area
     if all(area is None for area in ground):
-        raise map_error(path, "no polygon in the file has an area", fix="export the map again")
+        raise map_error(
+            path,
+            "no polygon in the file has an area",
+            fix="export the map again",
+            code="no-polygon",
+        )
     return ground, repairs
 
 

@@ -12,6 +12,7 @@ from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Overlap, Prescription, Zone
+from companion.maps.cells import bounds_deg, grid_of
 from companion.maps.local import Area, frame_around, make_valid, project, project_all
 from companion.maps.model import MapFile, map_error
 from companion.maps.overlaps import overlaps
@@ -21,7 +22,10 @@ __all__ = ["build_prescription", "frame_for", "project"]
 
 def frame_for(map_file: MapFile) -> LocalFrame:
     """Return the frame whose origin is the centre of the map's bounds."""
-    return frame_around(zone.geometry for zone in map_file.zones)
+    if map_file.cells is None:
+        return frame_around(zone.geometry for zone in map_file.zones)
+    west, south, east, north = bounds_deg(map_file.cells)
+    return LocalFrame(latitude_deg=(south + north) / 2, longitude_deg=(west + east) / 2)
 
 
 def build_prescription(
@@ -31,33 +35,55 @@ def build_prescription(
     overlap: str = "error",
     boundary: MultiPolygon | None = None,
     exclusions: Sequence[MultiPolygon] = (),
+    default_rate_l_ha: float | None = None,
     offset_east_m: float = 0.0,
     offset_north_m: float = 0.0,
 ) -> Prescription:
     """Return the prescription of a map, moved by the offset between map and receiver.
 
     Boundary and exclusions, in longitude and latitude, move with it: the offset is between two
-    sets of coordinates, not between two files. Zones without a rate are left out; under `error`
-    zones that share more than a square metre are refused.
+    sets of coordinates, not between two files. Without `boundary` and `default_rate_l_ha` those
+    of the map itself hold, where it has any; the map's default only inside the map's boundary.
+    Zones without a rate are left out; under `error` zones that share more than a square metre are
+    refused.
     """
     policy = _policy(map_file, overlap)
     offset_m = (offset_east_m, offset_north_m)
     if not np.isfinite(offset_m).all():
         raise ValueError(f"offset is no distance: {offset_m}")
+    if boundary is None:
+        boundary = map_file.boundary
+    if default_rate_l_ha is None and map_file.boundary is not None:
+        default_rate_l_ha = map_file.default_rate_l_ha
+    if not map_file.rates_l_ha:
+        raise map_error(
+            map_file.path,
+            f"nothing has a rate in {map_file.rate_field}",
+            fix="name another column with --rate-field (prescription.rate_field)",
+            code="null-rate",
+        )
     try:
         zones = _zones(map_file, frame, offset_m)
         if policy == "error":
             _check_overlaps(map_file, zones)
+        cells = map_file.cells
         return Prescription(
             zones,
             boundary=None if boundary is None else _projected(boundary, frame, offset_m),
             exclusions=[_projected(area, frame, offset_m) for area in exclusions],
             overlap=policy,
+            default_rate_l_ha=default_rate_l_ha,
+            cells=None
+            if cells is None
+            else grid_of(cells, frame, map_file.path, offset_m=offset_m),
             sha256=map_file.sha256,
         )
     except ShapelyError as error:
         raise map_error(
-            map_file.path, f"its polygons cannot be used ({error})", fix="export the map again"
+            map_file.path,
+            f"its polygons cannot be used ({error})",
+            fix="export the map again",
+            code="broken-geometry",
         ) from None
 
 
@@ -69,6 +95,7 @@ def _policy(map_file: MapFile, overlap: str) -> Overlap:
         map_file.path,
         f"prescription.overlap is {overlap!r}",
         fix=f"take one of {', '.join(get_args(Overlap))}",
+        code="overlap-policy",
     )
 
 
@@ -76,11 +103,7 @@ def _zones(map_file: MapFile, frame: LocalFrame, offset_m: tuple[float, float]) 
     """Return all zones that have a rate, in metres."""
     rated = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
     if not rated:
-        raise map_error(
-            map_file.path,
-            f"no zone has a rate in {map_file.rate_field}",
-            fix="name another column with --rate-field (prescription.rate_field)",
-        )
+        return []
     degrees = np.array([zone.geometry for zone in rated], dtype=object)
     local = project_all(degrees, frame, offset_m=offset_m)
     zones = []
@@ -108,4 +131,5 @@ def _check_overlaps(map_file: MapFile, zones: Sequence[Zone]) -> None:
         f"zones {zones[worst.first].name} and {zones[worst.second].name} overlap by "
         f"{worst.area_m2:.1f} m2{more}",
         fix="correct the map, or set prescription.overlap to max, min, mean or last",
+        code="overlap",
     )

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from companion.errors import ConfigError
 from companion.maps.fields import words
-from companion.maps.layer import Column, Layer
+from companion.maps.layer import Band, Column, Grid, Layer
 from companion.maps.model import Problem, map_error
-from companion.maps.units import is_mass_per_area, unit_in_name, unit_name
+from companion.maps.units import (
+    RateUnit,
+    is_mass_per_area,
+    l_ha_per_unit,
+    rate_unit,
+    unit_in_name,
+)
 
 _UNIT_WORDS = frozenset(
     {
@@ -26,45 +34,124 @@ _BLANK = frozenset(("", "-", "n/a", "na", "none", "null", "unknown"))
 _FIX = "give the unit with --unit (prescription.unit): L/ha, gal/ac, mL/m2 or L/mu"
 
 
-def unit_of(
-    layer: Layer, rate: Column, *, asked: str | None, path: Path
-) -> tuple[str, list[Problem]]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Given:
+    """What the operator states about the rates of a map."""
+
+    unit: str | None = None
+    density_kg_l: float | None = None
+    flow_width_m: float | None = None
+    flow_speed_m_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("density_kg_l", "flow_width_m", "flow_speed_m_s"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < 1e6:
+                raise ConfigError(f"{name} is {value}; give a number above 0")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unit:
+    """The unit of a map's rates, and how many L/ha one of it is."""
+
+    name: str
+    l_ha: float
+    problems: tuple[Problem, ...] = ()
+
+
+def unit_of(layer: Layer | Grid, rate: Column | Band, *, given: Given, path: Path) -> Unit:
     """Return the unit of the rates, or refuse: never a guess.
 
     What the operator says holds where the file says nothing that can be read. Where both speak
     and differ, one of them is wrong, and which is not for a program to decide.
     """
-    wanted = None if asked is None else _wanted(asked, path)
+    wanted = None if given.unit is None else _wanted(given.unit, path)
     declared = _declared(layer, rate)
-    known = {unit_name(text) for text in declared} - {None}
-    unknown = [text for text in declared if unit_name(text) is None]
-    mass = next((text for text in unknown if is_mass_per_area(text)), None)
-    if mass is not None or (unknown and wanted is None):
-        said = (mass or unknown[0])[:40]
-        raise map_error(path, f"its unit {said!r} is no volume per area", fix=_FIX)
-    if len(known) > 1:
-        names = ", ".join(sorted(str(name) for name in known))
-        raise map_error(path, f"it declares several units: {names}", fix="convert it to one")
-    said_unit = next(iter(known), None)
-    if wanted is None and said_unit is None:
-        raise map_error(path, f"no unit is given for the rates in {rate.name}", fix=_FIX)
-    if wanted is not None and said_unit is not None and wanted != said_unit:
+    known = {found.name: found for found in map(rate_unit, declared) if found is not None}
+    unknown = [text for text in declared if rate_unit(text) is None]
+    if unknown and (wanted is None or any(map(is_mass_per_area, unknown))):
         raise map_error(
             path,
-            f"its unit is {said_unit}, but {wanted} is asked for",
-            fix="leave out --unit (prescription.unit), or correct the file",
+            f"its unit {unknown[0][:40]!r} is no volume per area",
+            fix=_FIX,
+            code="not-a-volume",
         )
-    return str(wanted or said_unit), _overridden(unknown, wanted, rate)
+    if len(known) > 1:
+        names = ", ".join(sorted(known))
+        raise map_error(
+            path, f"it declares several units: {names}", fix="convert it to one",
+            code="unit-conflict",
+        )  # fmt: skip
+    said = next(iter(known.values()), None)
+    if wanted is not None and said is not None and wanted.name != said.name:
+        raise map_error(
+            path,
+            f"its unit is {said.name}, but {wanted.name} is asked for",
+            fix="leave out --unit (prescription.unit), or correct the file",
+            code="unit-conflict",
+        )
+    found = wanted or said
+    if found is None:
+        raise map_error(
+            path, f"no unit is given for the rates in {rate.name}", fix=_FIX, code="no-unit"
+        )
+    return _in_litres(found, given, path, tuple(_overridden(unknown, found.name, rate)))
 
 
-def _wanted(asked: str, path: Path) -> str:
-    name = unit_name(asked)
-    if name is None:
-        raise map_error(path, f"the unit {asked!r} is no volume per area", fix=_FIX)
-    return name
+def _in_litres(found: RateUnit, given: Given, path: Path, problems: tuple[Problem, ...]) -> Unit:
+    """Return the unit with its L/ha; a weight needs a density, a flow a width and a speed."""
+    l_ha = l_ha_per_unit(
+        found.name,
+        density_kg_l=given.density_kg_l,
+        flow_width_m=given.flow_width_m,
+        flow_speed_m_s=given.flow_speed_m_s,
+    )
+    if l_ha is None and found.kind == "mass":
+        raise map_error(
+            path,
+            f"its unit {found.name!r} is a weight, and no volume per area",
+            fix="give the density of what is sprayed with --density-kg-l "
+            "(prescription.density_kg_l), or make the map in L/ha",
+            code="not-a-volume",
+        )
+    if l_ha is None:
+        raise map_error(
+            path,
+            f"its unit {found.name!r} is a flow, and no volume per area",
+            fix="give the width and the speed that the map was made for with --flow-width-m and "
+            "--flow-speed-m-s (prescription.flow_width_m, flow_speed_m_s)",
+            code="not-a-volume",
+        )
+    if found.kind != "volume":
+        basis = (
+            f"a density of {given.density_kg_l:g} kg/L"
+            if found.kind == "mass"
+            else f"{given.flow_width_m:g} m of width at {given.flow_speed_m_s:g} m/s"
+        )
+        problem = Problem(
+            severity="warning",
+            code="converted-unit",
+            text=f"the rates are in {found.name}; with {basis}, 1 {found.name} is {l_ha:.6g} L/ha",
+            where=str(path),
+            fix="check the figure, or make the map in L/ha",
+        )
+        problems = (*problems, problem)
+    return Unit(name=found.name, l_ha=l_ha, problems=problems)
 
 
-def _overridden(unknown: Sequence[str], wanted: str | None, rate: Column) -> list[Problem]:
+def _wanted(asked: str, path: Path) -> RateUnit:
+    found = rate_unit(asked)
+    if found is None:
+        raise map_error(
+            path,
+            f"the unit {asked!r} is no volume per area",
+            fix=_FIX,
+            code="not-a-volume",
+        )
+    return found
+
+
+def _overridden(unknown: Sequence[str], wanted: str, rate: Column | Band) -> list[Problem]:
     if not unknown:
         return []
     return [
@@ -78,9 +165,12 @@ def _overridden(unknown: Sequence[str], wanted: str | None, rate: Column) -> lis
     ]
 
 
-def _declared(layer: Layer, rate: Column) -> list[str]:
-    """Return every unit that the file states for its rates."""
-    columns = [column for column in layer.columns if _is_unit_column(column, rate)]
+def _declared(layer: Layer | Grid, rate: Column | Band) -> list[str]:
+    """Return every unit that the file states for its rates; that of the column itself first."""
+    if rate.unit is not None and rate.unit.strip().casefold() not in _BLANK:
+        return [rate.unit.strip()]
+    every = layer.columns if isinstance(layer, Layer) else ()
+    columns = [column for column in every if _is_unit_column(column, rate)]
     own = [column for column in columns if set(words(column.name)) & set(words(rate.name))]
     stated = [value for column in own or columns for value in column.values]
     texts = dict.fromkeys(
@@ -91,7 +181,7 @@ def _declared(layer: Layer, rate: Column) -> list[str]:
     return [text for text in texts if text.casefold() not in _BLANK]
 
 
-def _is_unit_column(column: Column, rate: Column) -> bool:
+def _is_unit_column(column: Column, rate: Column | Band) -> bool:
     """Tell whether a column holds the unit of the rate, and not of something else."""
     parts = words(column.name)
     others = set(parts) - _UNIT_WORDS

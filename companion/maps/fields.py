@@ -10,8 +10,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
-from companion.maps.layer import Column, as_number
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.maps.layer import Band, Column, as_number
 from companion.maps.model import Problem, map_error
 from companion.maps.units import unit_in_name
 
@@ -46,11 +50,14 @@ _DECOYS = frozenset(
 STRONG, NAMED, WEAK, NONE = 3, 2, 1, 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Choice:
-    """The rate column, and what there is to say about the choice."""
+Source = TypeVar("Source", Column, Band)
 
-    column: Column
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice(Generic[Source]):
+    """The rate column or band, and what there is to say about the choice."""
+
+    column: Source
     problems: tuple[Problem, ...] = ()
 
 
@@ -64,7 +71,7 @@ def words(name: str) -> list[str]:
     return [word for word in re.split(r"[\W_\d]+", split.casefold()) if word]
 
 
-def score(column: Column) -> int:
+def score(column: Column | Band) -> int:
     """Return how clearly a column's name says that it holds the rate.
 
     >>> [score(Column(name=name, values=(), numeric=True)) for name in ("rate", "rateInt", "value")]
@@ -73,7 +80,7 @@ def score(column: Column) -> int:
     [0, 0, 0]
     """
     parts = words(column.name)
-    if not column.numeric:
+    if isinstance(column, Column) and not column.numeric:
         return NONE
     if "".join(parts) in _WORDS or unit_in_name(column.name) is not None:
         return STRONG
@@ -84,25 +91,46 @@ def score(column: Column) -> int:
     return WEAK if any(part in _WEAK_WORDS for part in parts) else NONE
 
 
-def choose(columns: Sequence[Column], *, asked: str | None, path: Path) -> Choice:
-    """Return the rate column: the one asked for, or the only one that it can be."""
+def choose(columns: Sequence[Source], *, asked: str | None, path: Path) -> Choice[Source]:
+    """Return the rate column: the one asked for, or the only one that it can be.
+
+    A format that marks its rates has one for each product; one product is flown at a time.
+    """
     if asked is not None:
         return Choice(column=_asked(columns, asked, path))
+    marked = [column for column in columns if column.is_rate]
+    if len(marked) > 1:
+        raise map_error(
+            path,
+            f"the map holds {len(marked)} products: {', '.join(one.name for one in marked)}",
+            fix="name the one to spray with --rate-field (prescription.rate_field)",
+            code="several-products",
+        )
+    if marked:
+        return Choice(column=marked[0])
     usable = [column for column in columns if score(column) and _holds_numbers(column)]
     strong = [column for column in usable if score(column) >= NAMED]
     candidates = sorted(strong or usable, key=score, reverse=True)
+    if not candidates and len(columns) == 1 and isinstance(columns[0], Band):
+        candidates = list(columns)  # a raster of one band is a map of that
     if not candidates:
+        several_bands = len(columns) > 1 and isinstance(columns[0], Band)
         raise map_error(
             path,
-            f"no column looks like a rate; its numeric columns are {_names(columns)}",
-            fix="name the column with --rate-field (prescription.rate_field)",
+            f"no band looks like a rate; there are {_names(columns)}"
+            if several_bands
+            else f"no column looks like a rate; its numeric columns are {_names(columns)}",
+            fix="name it with --rate-field (prescription.rate_field)"
+            if several_bands
+            else "name the column with --rate-field (prescription.rate_field)",
+            code="several-products" if several_bands else "no-rate-column",
         )
     if len(candidates) == 1:
         return Choice(column=candidates[0])
     return _among(candidates, path)
 
 
-def _asked(columns: Sequence[Column], asked: str, path: Path) -> Column:
+def _asked(columns: Sequence[Source], asked: str, path: Path) -> Source:
     exact = [column for column in columns if column.name == asked]
     alike = [column for column in columns if column.name.casefold() == asked.casefold()]
     found = exact or alike
@@ -114,19 +142,23 @@ def _asked(columns: Sequence[Column], asked: str, path: Path) -> Column:
             else f"the column {asked!r} is there {len(found)} times",
             fix=f"take one of {', '.join(column.name for column in columns) or 'none'}"
             " for --rate-field (prescription.rate_field)",
+            code="no-rate-column",
         )
     return found[0]
 
 
-def _holds_numbers(column: Column) -> bool:
+def _holds_numbers(column: Column | Band) -> bool:
+    if isinstance(column, Band):
+        return not bool(np.isnan(column.values).all())
     return any(value is not None for value in column.values)
 
 
-def _names(columns: Sequence[Column]) -> str:
-    return ", ".join(column.name for column in columns if column.numeric) or "none"
+def _names(columns: Sequence[Column] | Sequence[Band]) -> str:
+    numeric = [one for one in columns if isinstance(one, Band) or one.numeric]
+    return ", ".join(column.name for column in numeric) or "none"
 
 
-def _among(candidates: Sequence[Column], path: Path) -> Choice:
+def _among(candidates: Sequence[Source], path: Path) -> Choice[Source]:
     """Return the one whose values the other candidates repeat, if there is such a one."""
     best = next((one for one in candidates if _repeated_by(one, candidates)), None)
     if best is None:
@@ -135,6 +167,7 @@ def _among(candidates: Sequence[Column], path: Path) -> Choice:
             path,
             f"several columns can be the rate and differ: {names}",
             fix="name one with --rate-field (prescription.rate_field)",
+            code="several-columns",
         )
     others = ", ".join(column.name for column in candidates if column is not best)
     problem = Problem(
@@ -148,24 +181,24 @@ def _among(candidates: Sequence[Column], path: Path) -> Choice:
     return Choice(column=best, problems=(problem,))
 
 
-def _repeated_by(best: Column, candidates: Sequence[Column]) -> bool:
+def _repeated_by(best: Source, candidates: Sequence[Source]) -> bool:
     """Tell whether all others hold the same values, or those values rounded."""
     try:
-        own = [as_number(value) for value in best.values]
-        return all(
-            _same_or_rounded(own, [as_number(value) for value in other.values])
-            for other in candidates
-            if other is not best
-        )
+        own = _numbers(best)
+        return all(_same_or_rounded(own, _numbers(one)) for one in candidates if one is not best)
     except ValueError:
         return False
 
 
-def _same_or_rounded(own: list[float | None], other: list[float | None]) -> bool:
-    for one, two in zip(own, other, strict=True):
-        if one is None or two is None:
-            if one is not two:
-                return False
-        elif one != two and not (two.is_integer() and abs(one - two) <= 0.5):
-            return False
-    return True
+def _numbers(column: Column | Band) -> NDArray[np.float64]:
+    if isinstance(column, Band):
+        return column.values.ravel()
+    values = [as_number(value) for value in column.values]
+    return np.array([np.nan if value is None else value for value in values])
+
+
+def _same_or_rounded(own: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    both_blank = np.isnan(own) & np.isnan(other)
+    with np.errstate(invalid="ignore"):
+        rounded = (other == np.rint(other)) & (np.abs(own - other) <= 0.5)
+    return bool((both_blank | (own == other) | rounded).all())

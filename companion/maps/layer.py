@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon
 
-from companion.maps.model import Problem, map_error
+from companion.maps.model import Affine, Problem, map_error
 
 # Bounds on what is read from a file that nobody vouches for. Real maps have at most some
 # 25 000 polygons; a million leaves room for gridded ones.
@@ -31,18 +31,27 @@ Value = str | float | None
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Column:
-    """One attribute of all records; `numeric` is what the file declares or all values are."""
+    """One attribute of all records; `numeric` is what the file declares or all values are.
+
+    A format that says which attribute is a rate (ISOXML, ADAPT) sets `is_rate`; with several such
+    columns, each is a product. `unit` is what the file says of this column, `default` what it
+    prescribes inside the field where there is no record, in that unit.
+    """
 
     name: str
     values: tuple[Value, ...]
     numeric: bool
+    unit: str | None = None
+    is_rate: bool = False
+    default: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layer:
     """The content of one file; None among `geometries` is explained in `skipped`.
 
-    `crs` None: the file does not say. `unit`: what the file as a whole declares.
+    `crs` None: the file does not say. `unit`: what the file as a whole declares. `boundary`: the
+    outline of the field, in longitude and latitude, where the file has one.
     """
 
     format: str
@@ -51,7 +60,33 @@ class Layer:
     geometries: tuple[Polygon | MultiPolygon | None, ...]
     sha256: str
     unit: str | None = None
+    boundary: MultiPolygon | None = None
     skipped: dict[int, str] = field(default_factory=dict)
+    problems: tuple[Problem, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Band:
+    """One value for every cell: (rows, columns), NaN for no data; the rest as for a `Column`."""
+
+    name: str
+    values: NDArray[np.float64]
+    unit: str | None = None
+    is_rate: bool = False
+    default: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grid:
+    """The content of one file of cells; `transform` as in `MapCells`, all bands of one shape."""
+
+    format: str
+    crs: CRS | None
+    transform: Affine
+    bands: tuple[Band, ...]
+    sha256: str
+    unit: str | None = None
+    boundary: MultiPolygon | None = None
     problems: tuple[Problem, ...] = ()
 
 

@@ -11,21 +11,24 @@ from shapely import MultiPolygon
 from shapely.errors import ShapelyError
 
 from companion.maps.assemble import crs_of, ground_of, map_of, zone_names
+from companion.maps.bundle import open_bundle
+from companion.maps.declared import Given
 from companion.maps.geojson import read_geojson
-from companion.maps.layer import Layer
+from companion.maps.layer import Grid, Layer
 from companion.maps.local import polygons_of
 from companion.maps.model import MapFile, map_error
 from companion.maps.shapefile import read_shapefile
 
-Reader = Callable[[Path, str | None], Layer]
+Reader = Callable[[Path, str | None], Layer | Grid]
 
-# The suffix, in lower case, and who reads it; "" is a folder.
+# The suffix, in lower case, and who reads it.
 READERS: dict[str, Reader] = {
     ".shp": read_shapefile,
-    "": read_shapefile,
     ".geojson": read_geojson,
     ".json": read_geojson,
 }
+# Folders and archives, by a file in them: its name or its suffix; the first that is there.
+PACKAGES: tuple[tuple[str, Reader], ...] = ((".shp", read_shapefile),)
 # A repair of a boundary or an exclusion may move the limit of spraying by this much unasked.
 REPAIR_MAX_M2 = 1.0
 
@@ -37,62 +40,108 @@ def read_map(
     unit: str | None = None,
     crs: str | None = None,
     layer: str | None = None,
+    density_kg_l: float | None = None,
+    flow_width_m: float | None = None,
+    flow_speed_m_s: float | None = None,
 ) -> MapFile:
     """Return the prescription in a file, or raise a `MapError` that names file, reason and fix.
 
-    The arguments answer what the file leaves open: which column is the rate, in which unit, and
-    in which coordinate reference system.
+    The arguments answer what the file leaves open: which column, band or product is the rate, in
+    which unit, in which coordinate reference system, in which layer or task; the density for
+    rates by weight, width and speed for rates by time.
     """
     path = Path(path)
-    found = _read(path, layer)
-    return map_of(found, path, rate_field=rate_field, unit=unit, crs=crs)
+    given = Given(
+        unit=unit,
+        density_kg_l=density_kg_l,
+        flow_width_m=flow_width_m,
+        flow_speed_m_s=flow_speed_m_s,
+    )
+    return map_of(_read(path, layer), path, rate_field=rate_field, crs=crs, given=given)
 
 
 def read_area(path: Path, *, crs: str | None = None) -> MultiPolygon:
     """Return the ground that a boundary or exclusion file covers, in longitude and latitude.
 
-    Stricter than a prescription: a record that has to be left out, or a ring whose repair moves
-    more than a square metre, could be the ground that must not be sprayed.
+    Of a file that has an outline of the field beside its zones (ISOXML, a DJI package), that
+    outline. Stricter than a prescription: a record that has to be left out, or a ring whose
+    repair moves more than a square metre, could be the ground that must not be sprayed.
     """
     path = Path(path)
     layer = _read(path, None)
+    if layer.boundary is not None:
+        return layer.boundary
+    if isinstance(layer, Grid):
+        raise map_error(
+            path,
+            "rows and columns of cells are no outline",
+            fix="give the boundary or the exclusion as polygons",
+            code="no-polygon",
+        )
     used_crs, _ = crs_of(layer, path, crs)
     names = zone_names(layer)
     ground, repairs = ground_of(layer, used_crs, names, path)
     if layer.skipped:
         index, reason = next(iter(layer.skipped.items()))
         raise map_error(
-            path, f"record {names[index]} is no area: {reason}", fix="draw it as a polygon"
+            path,
+            f"record {names[index]} is no area: {reason}",
+            fix="draw it as a polygon",
+            code="no-polygon",
         )
     large = [repair for repair in repairs if not repair.change_m2 <= REPAIR_MAX_M2]
     if large:
         raise map_error(
-            path, f"record {large[0].zone}: {large[0].text}", fix="repair it where it is made"
+            path,
+            f"record {large[0].zone}: {large[0].text}",
+            fix="repair it where it is made",
+            code="invalid-ring",
         )
     try:
         united = shapely.union_all(np.array(ground, dtype=object))
     except ShapelyError as error:
-        raise map_error(path, f"its polygons do not unite ({error})", fix="repair them") from None
+        raise map_error(
+            path, f"its polygons do not unite ({error})", fix="repair them", code="broken-geometry"
+        ) from None
     return MultiPolygon(polygons_of(united))
 
 
-def _read(path: Path, layer: str | None) -> Layer:
-    suffix = path.suffix.casefold()
+def _read(path: Path, layer: str | None) -> Layer | Grid:
     try:
         folder = path.is_dir()
         there = path.exists()
     except (OSError, ValueError) as error:
-        raise map_error(path, f"is no path ({error})", fix="check the path") from None
+        raise map_error(
+            path, f"is no path ({error})", fix="check the path", code="no-file"
+        ) from None
     if not there:
-        raise map_error(path, "there is no such file", fix="check the path")
-    reader = READERS.get("" if folder else suffix) if folder or suffix else None
+        raise map_error(path, "there is no such file", fix="check the path", code="no-file")
+    suffix = path.suffix.casefold()
+    reader = _of_package(path) if folder or suffix == ".zip" else READERS.get(suffix)
     if reader is None:
-        known = ", ".join(name for name in READERS if name)
+        known = ", ".join(READERS)
         raise map_error(
             path,
             f"the format {suffix or 'without a suffix'} is not known",
             fix="name the .shp of the shapefile"
             if suffix in (".dbf", ".prj", ".shx", ".cpg")
-            else f"take one of {known}",
+            else f"take one of {known}, or a folder or .zip with such files",
+            code="unknown-format",
         )
     return reader(path, layer)
+
+
+def _of_package(path: Path) -> Reader:
+    """Return who reads a folder or an archive, by what lies in it."""
+    bundle = open_bundle(path)
+    for sign, reader in PACKAGES:
+        found = bundle.with_suffix(sign) if sign.startswith(".") else bundle.called(sign)
+        if found:
+            return reader
+    signs = ", ".join(sign for sign, _ in PACKAGES)
+    raise map_error(
+        path,
+        f"it holds none of {signs}",
+        fix="name the file of the map itself",
+        code="unknown-format",
+    )

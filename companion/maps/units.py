@@ -1,12 +1,19 @@
 """Units of an application rate: what they are called in files, and how many L/ha each is.
 
 Only volume per area is a rate for a sprayer. Mass per area (kg/ha) needs a density that no map
-states, and volume per time needs speed and width, so both are refused rather than converted.
+states, and volume per time (L/min) needs a speed and a width: whoever asks for the conversion has
+to state them.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
+from typing import Literal
+
+from companion.core.rate import rate_for_flow
+
+Kind = Literal["volume", "mass", "flow"]
 
 # Litres of each volume, by its usual name. US customary: 1 gal = 231 in^3 = 3.785411784 L
 # exactly, 1 gal = 4 qt = 8 pt = 128 fl oz (NIST Handbook 44, appendix C); the imperial gallon is
@@ -32,6 +39,22 @@ _HECTARES: dict[str, tuple[float, str]] = {
     "m2": (1e-4, r"m2|m\^2|m-2|m\^-2|sqm|squaremet(?:er|re)s?"),
     "mu": (1.0 / 15.0, r"mu|亩"),
 }
+# Kilograms of each weight; 1 lb = 0.45359237 kg exactly (NIST Handbook 44), 1 oz = 1/16 lb; the
+# short ton of 2 000 lb goes by the name of ton in the United States, so a plain ton is refused.
+_KILOGRAMS: dict[str, tuple[float, str]] = {
+    "kg": (1.0, r"kgs?|kilo(?:gram)?(?:me)?s?|公斤|千克"),
+    "g": (1e-3, r"g|grams?|gr|克"),
+    "mg": (1e-6, r"mg|milligrams?"),
+    "t": (1e3, r"t|tonnes?"),
+    "lb": (0.45359237, r"lbs?|pounds?"),
+    "oz": (0.45359237 / 16, r"oz|ounces?"),
+}
+# Minutes of each time.
+_MINUTES: dict[str, tuple[float, str]] = {
+    "min": (1.0, r"min(?:ute)?s?|分钟?"),
+    "s": (1.0 / 60.0, r"s|sec(?:ond)?s?|秒"),
+    "h": (60.0, r"h|hrs?|hours?"),
+}
 _MASS = r"(?:k|m|µ|u)?g|kgs?|kilo(?:gram)?s?|grams?|t|to|tons?|tonnes?|lbs?|pounds?|oz|cwt|dt"
 _SEPARATOR = r"(?:1?(?:/|per|[·.*_-]|)1?)"
 # "l ha^-1", "l.ha⁻¹", and "gal1ac-1", as ADAPT codes it; with the power no separator is needed.
@@ -48,17 +71,43 @@ def _ratio(amounts: str, areas: str) -> str:
     return f"(?:{amounts})(?:{_SEPARATOR}(?:{areas})(?:{_POWER})?|1?(?:{areas}){_POWER})"
 
 
-def _parts(unit: str) -> tuple[str, str] | None:
-    """Return the names of volume and area, or None."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RateUnit:
+    """A unit of a rate: what kind, how this project spells it, and what one of it is.
+
+    `factor` is in L/ha for a volume, in kg/ha for a mass, in L/min for a flow.
+    """
+
+    kind: Kind
+    name: str
+    factor: float
+
+
+_KINDS: tuple[tuple[Kind, dict[str, tuple[float, str]], dict[str, tuple[float, str]]], ...] = (
+    ("volume", _LITRES, _HECTARES),
+    ("mass", _KILOGRAMS, _HECTARES),
+    ("flow", _LITRES, _MINUTES),
+)
+
+
+def rate_unit(unit: str) -> RateUnit | None:
+    """Return what a unit means, or None for what is no rate of anything.
+
+    >>> [(found.kind, found.name) for found in (rate_unit("kg/ha"), rate_unit("l per min"))]
+    [('mass', 'kg/ha'), ('flow', 'L/min')]
+    >>> rate_unit("g/m2").factor, rate_unit("seeds/ha") is None
+    (10.0, True)
+    """
     plain = _plain(unit)
     if len(plain) > 40:
         return None
-    if plain in _WHOLE:
-        return _WHOLE[plain]
-    for area, (_, areas) in _HECTARES.items():
-        for volume, (_, volumes) in _LITRES.items():
-            if re.fullmatch(_ratio(volumes, areas), plain):
-                return volume, area
+    for kind, amounts, bases in _KINDS:
+        for base, (size, bases_called) in bases.items():
+            for amount, (content, called) in amounts.items():
+                if _WHOLE.get(plain) == (amount, base) or re.fullmatch(
+                    _ratio(called, bases_called), plain
+                ):
+                    return RateUnit(kind=kind, name=f"{amount}/{base}", factor=content / size)
     return None
 
 
@@ -70,14 +119,21 @@ def unit_name(unit: str) -> str | None:
     >>> unit_name("kg/ha"), unit_name("L/min"), unit_name("")
     (None, None, None)
     """
-    parts = _parts(unit)
-    return None if parts is None else "/".join(parts)
+    found = rate_unit(unit)
+    return found.name if found is not None and found.kind == "volume" else None
 
 
-def l_ha_per_unit(unit: str) -> float | None:
-    """Return how many L/ha one of this unit is, or None for what is no volume per area.
+def l_ha_per_unit(
+    unit: str,
+    *,
+    density_kg_l: float | None = None,
+    flow_width_m: float | None = None,
+    flow_speed_m_s: float | None = None,
+) -> float | None:
+    """Return how many L/ha one of this unit is, or None where that cannot be known.
 
-    rate [L/ha] = rate [unit] * litres of its volume / hectares of its area
+    rate [L/ha] = rate [unit] * litres of its volume / hectares of its area; a mass is divided by
+    the density, a flow spread over the width and the way of its time (P1 Eq. 1).
 
     >>> l_ha_per_unit("L/ha")
     1.0
@@ -91,13 +147,21 @@ def l_ha_per_unit(unit: str) -> float | None:
     (0.01, 0.001)
     >>> round(l_ha_per_unit("L/ac"), 4), round(l_ha_per_unit("fl oz/ac"), 5)
     (2.4711, 0.07308)
-    >>> l_ha_per_unit("kg/ha") is None
-    True
+    >>> l_ha_per_unit("kg/ha") is None, l_ha_per_unit("kg/ha", density_kg_l=1.25)
+    (True, 0.8)
+    >>> round(l_ha_per_unit("L/min", flow_width_m=5.0, flow_speed_m_s=6.0), 4)
+    5.5556
     """
-    parts = _parts(unit)
-    if parts is None:
+    found = rate_unit(unit)
+    if found is None:
         return None
-    return _LITRES[parts[0]][0] / _HECTARES[parts[1]][0]
+    if found.kind == "mass":
+        return None if density_kg_l is None else found.factor / density_kg_l
+    if found.kind == "flow":
+        if flow_width_m is None or flow_speed_m_s is None:
+            return None
+        return rate_for_flow(found.factor, flow_speed_m_s, flow_width_m)
+    return found.factor
 
 
 def is_mass_per_area(unit: str) -> bool:
@@ -122,6 +186,7 @@ def unit_in_name(column: str) -> str | None:
     """
     for start in (match.end() for match in re.finditer(r"[\s_(\[]+", column)):
         tail = column[start:].rstrip(")] ")
-        if unit_name(tail) is not None or is_mass_per_area(tail):
-            return unit_name(tail) or tail
+        found = rate_unit(tail)
+        if found is not None or is_mass_per_area(tail):
+            return tail if found is None else found.name
     return None

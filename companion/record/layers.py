@@ -13,18 +13,23 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
+from companion.core.cells import CellGrid
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
+from companion.record.cell_table import read_cells, write_cells
 from companion.record.geopackage import LOCAL_ID, WGS84_ID, geometry_blob, layer_sql, wkb_of
 
 Area = Polygon | MultiPolygon
+# Cells of no more rates than these are drawn as zones too, for whoever looks at the file.
+CLASSES_DRAWN_MAX = 32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ground:
-    """Zones as (name, rate [L/ha], polygon), in their order, and where spraying is allowed."""
+    """Zones as (name, rate [L/ha], polygon) in their order, or cells; where spraying is allowed."""
 
     zones: tuple[tuple[str, float, Area], ...]
+    cells: CellGrid | None
     field: Area
 
 
@@ -43,7 +48,11 @@ def write_layers(
         layer_sql("field", "where spraying is allowed", geometry="GEOMETRY", srs_id=LOCAL_ID),
     ):
         connection.executescript(sql)
-    zones = prescription.zones
+    cells = prescription.cells
+    drawn = cells is None or prescription.zone_count <= CLASSES_DRAWN_MAX
+    zones = prescription.zones if drawn else ()
+    if cells is not None:
+        write_cells(connection, cells)
     blobs = _blobs([zone.polygon for zone in zones])
     connection.execute("BEGIN")
     connection.executemany(
@@ -73,7 +82,9 @@ def set_box(
 
 def read_ground(connection: sqlite3.Connection) -> Ground:
     """Return the ground as it was flown; ValueError where the layers are damaged."""
-    rows = connection.execute("SELECT name, rate_l_ha, geom FROM zones ORDER BY id").fetchall()
+    cells = read_cells(connection)
+    sql = "SELECT name, rate_l_ha, geom FROM zones ORDER BY id"
+    rows = connection.execute(sql).fetchall() if cells is None else []
     fields = connection.execute("SELECT geom FROM field").fetchall()
     if len(fields) != 1:
         raise ValueError(f"one field expected, got {len(fields)}")
@@ -81,7 +92,7 @@ def read_ground(connection: sqlite3.Connection) -> Ground:
     zones = tuple(
         (name, rate, area) for (name, rate, _), area in zip(rows, areas[:-1], strict=True)
     )
-    return Ground(zones=zones, field=areas[-1])
+    return Ground(zones=zones, cells=cells, field=areas[-1])
 
 
 def _blobs(areas: list[Area]) -> list[bytes]:

@@ -61,6 +61,7 @@ def setup_from_json(text: str, ground: Ground) -> Setup:
                 for name, rate_l_ha, polygon in ground.zones
             ],
             boundary=ground.field,
+            cells=ground.cells,
             overlap=overlap,
             default_rate_l_ha=about["default_rate_l_ha"],
             sha256=about["sha256"],

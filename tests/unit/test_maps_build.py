@@ -69,7 +69,7 @@ def test_a_zone_without_a_rate_is_left_out_and_zero_is_not() -> None:
 
 def test_a_map_without_any_rate_is_refused() -> None:
     found = a_map((cell(0), None))
-    with pytest.raises(MapError, match="no zone has a rate"):
+    with pytest.raises(MapError, match="nothing has a rate"):
         build_prescription(found, frame_for(found))
     assert summary(found)["ok"] is False
 

@@ -8,7 +8,7 @@ import pytest
 from pyproj import CRS
 
 from companion.errors import MapError
-from companion.maps.declared import unit_of
+from companion.maps.declared import Given, unit_of
 from companion.maps.fields import Choice, choose
 from companion.maps.layer import Column, Layer, Value
 from companion.maps.units import is_mass_per_area, l_ha_per_unit, unit_name
@@ -89,7 +89,7 @@ def unit(*columns: Column, asked: str | None = None, rate: str = "rate") -> str:
         geometries=(None, None),
         sha256="",
     )
-    return unit_of(layer, value, asked=asked, path=PATH)[0]
+    return unit_of(layer, value, given=Given(unit=asked), path=PATH).name
 
 
 @pytest.mark.parametrize("name", ["unit", "Units", "UOM", "DOSE_UNIT", "rate_unit", "rateUnits"])

@@ -1,0 +1,111 @@
+"""What every command on a map asks: the file, and what the file itself may leave open."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from companion.config import Config, load
+from companion.maps.model import MapFile
+from companion.maps.registry import read_map
+
+File = Annotated[Path, typer.Argument(metavar="FILE", help="Prescription map.")]
+_RateField = Annotated[
+    str | None,
+    typer.Option(metavar="F", help="Column, band or product, where there are several."),
+]
+_Unit = Annotated[
+    str | None, typer.Option(metavar="U", help="Unit of the rate, where the file does not say.")
+]
+_Crs = Annotated[
+    str | None, typer.Option(metavar="C", help="Such as EPSG:4326, where the file does not say.")
+]
+_Layer = Annotated[
+    str | None, typer.Option(metavar="L", help="Layer or task, where there are several.")
+]
+_Density = Annotated[
+    float | None, typer.Option(metavar="KG_PER_L", help="Of the product, for rates by weight.")
+]
+_FlowWidth = Annotated[
+    float | None, typer.Option(metavar="M", help="Width for which a map in L/min was made.")
+]
+_FlowSpeed = Annotated[
+    float | None, typer.Option(metavar="M_S", help="Speed for which a map in L/min was made.")
+]
+_ConfigFile = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="What is not given here comes from its map."),
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """The answers to what a map file leaves open, and the configuration they may come from."""
+
+    rate_field: str | None = None
+    unit: str | None = None
+    crs: str | None = None
+    layer: str | None = None
+    density_kg_l: float | None = None
+    flow_width_m: float | None = None
+    flow_speed_m_s: float | None = None
+    config: Config | None = None
+
+    @property
+    def overlap(self) -> str:
+        """Return the policy where zones overlap."""
+        table = None if self.config is None else self.config.prescription
+        return "error" if table is None else table.overlap
+
+    def read(self, file: Path) -> MapFile:
+        """Return the map, read as the options say and otherwise as the configuration does."""
+        table = None if self.config is None else self.config.prescription
+        answers = {
+            field.name: getattr(self, field.name)
+            if getattr(self, field.name) is not None or table is None
+            else getattr(table, field.name)
+            for field in fields(self)
+            if field.name != "config"
+        }
+        return read_map(file, **answers)
+
+
+_OPTIONS: dict[str, Any] = {
+    "rate_field": _RateField,
+    "unit": _Unit,
+    "crs": _Crs,
+    "layer": _Layer,
+    "density_kg_l": _Density,
+    "flow_width_m": _FlowWidth,
+    "flow_speed_m_s": _FlowSpeed,
+    "config_file": _ConfigFile,
+}
+
+
+def reading_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command that takes `reading: Reading` one option for each answer instead."""
+    signature = inspect.signature(command, eval_str=True)
+    own = [item for item in signature.parameters.values() if item.name != "reading"]
+    added = [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+        for name, kind in _OPTIONS.items()
+    ]
+
+    @wraps(command)
+    def expanded(**given: Any) -> None:
+        answers = {name: given.pop(name) for name in _OPTIONS}
+        file = answers.pop("config_file")
+        config = None if file is None else load(file)
+        command(reading=Reading(config=config, **answers), **given)
+
+    expanded.__signature__ = signature.replace(  # type: ignore[attr-defined]
+        parameters=[item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in own] + added
+    )
+    expanded.__annotations__ = {item.name: item.annotation for item in [*own, *added]}
+    return expanded

@@ -1,0 +1,209 @@
+"""Rows and columns of a map, from the coordinates of its file to metres of the flight's frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.exceptions import ProjError
+
+from companion.core.cells import DEGREE_MAX, NO_RATE, CellGrid, Warp, monomials
+from companion.core.frame import LocalFrame
+from companion.maps.crs import EXTENT_MAX_M, METRES_PER_DEGREE, WGS84
+from companion.maps.model import Affine, MapCells, map_error
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# Lattice on which the polynomials are fitted, and what they may leave between its points.
+FIT_SIDE = 14
+FIT_MAX_M = 1e-7
+USABLE_MAX_M = 1e-3
+# Cells smaller than this are below what any receiver can tell apart.
+CELL_MIN_M = 0.05
+
+
+def corner(transform: Affine, column: Floats, row: Floats) -> tuple[Floats, Floats]:
+    """Return x and y of corners of cells.
+
+    >>> [float(v[0]) for v in corner((2.0, 0.0, 10.0, 0.0, -2.0, 50.0), np.ones(1), np.ones(1))]
+    [12.0, 48.0]
+    """
+    a, b, c, d, e, f = transform
+    return a * column + b * row + c, d * column + e * row + f
+
+
+def to_degrees(cells: MapCells, column: Floats, row: Floats) -> tuple[Floats, Floats]:
+    """Return longitude and latitude of corners of cells; infinite where there are none."""
+    x, y = corner(cells.transform, column, row)
+    if cells.crs.to_epsg() == 4326:
+        return x, y
+    return _transformer(cells.crs, WGS84).transform(x, y)
+
+
+def bounds_deg(cells: MapCells) -> tuple[float, float, float, float]:
+    """Return west, south, east, north of the corners all round [deg]."""
+    rows, columns = cells.rates_l_ha.shape
+    across, up = np.linspace(0.0, columns, 33), np.linspace(0.0, rows, 33)
+    column = np.concatenate([across, across, np.zeros(33), np.full(33, float(columns))])
+    row = np.concatenate([np.zeros(33), np.full(33, float(rows)), up, up])
+    longitude, latitude = to_degrees(cells, column, row)
+    return (
+        float(longitude.min()),
+        float(latitude.min()),
+        float(longitude.max()),
+        float(latitude.max()),
+    )
+
+
+def check_place(cells: MapCells, path: Path) -> None:
+    """Refuse cells that are no place on earth, or reach too far."""
+    try:
+        west, south, east, north = bounds_deg(cells)
+    except ProjError as error:
+        raise map_error(
+            path, f"its CRS cannot be used ({str(error)[:120]})", fix="give it with --crs",
+            code="wrong-crs",
+        ) from None  # fmt: skip
+    if not (west >= -180.0 and east <= 180.0 and south >= -90.0 and north <= 90.0):
+        exchanged = cells.crs.is_geographic and max(abs(south), abs(north)) <= 180.0
+        raise map_error(
+            path,
+            f"its cells (x {west:.6g} to {east:.6g}, y {south:.6g} to {north:.6g}) are no place "
+            "on earth",
+            fix="longitude and latitude look exchanged: export the map with longitude first"
+            if exchanged
+            else "give the right CRS with --crs",
+            code="swapped-axes" if exchanged else "out-of-range",
+        )
+    narrow = np.cos(np.radians(min(abs(south), abs(north)) if south * north > 0 else 0.0))
+    extent_m = METRES_PER_DEGREE * max((east - west) * float(narrow), north - south)
+    if not extent_m <= EXTENT_MAX_M:
+        raise map_error(
+            path,
+            f"the map reaches over {extent_m / 1000:.0f} km",
+            fix="cut it to one field, or correct the CRS with --crs",
+            code="too-large",
+        )
+
+
+def grid_of(
+    cells: MapCells, frame: LocalFrame, path: Path, *, offset_m: tuple[float, float] = (0.0, 0.0)
+) -> CellGrid:
+    """Return the cells in the flight's frame, moved by an offset (east, north)."""
+    rates, kinds = _classes(cells)
+    flipped = turns_clockwise(cells)
+    if flipped:
+        kinds = kinds[::-1]
+    to_frame, to_cells = _fitted(cells, frame, path, offset_m, flipped=flipped)
+    return CellGrid(kinds, rates, to_frame, to_cells)
+
+
+def cell_areas_m2(cells: MapCells, frame: LocalFrame) -> Floats:
+    """Return the area of every cell (rows, columns), by its four corners in the frame."""
+    rows, columns = cells.rates_l_ha.shape
+    to_frame, _ = _fitted(cells, frame, Path("cells"), (0.0, 0.0), flipped=False)
+    areas = np.empty((rows, columns))
+    column = np.arange(columns + 1, dtype=np.float64)
+    east, north = to_frame(column, np.zeros(columns + 1))
+    for row in range(rows):
+        next_east, next_north = to_frame(column, np.full(columns + 1, row + 1.0))
+        # Half the cross product of the diagonals.
+        first = (next_east[1:] - east[:-1]) * (next_north[:-1] - north[1:])
+        second = (next_east[:-1] - east[1:]) * (next_north[1:] - north[:-1])
+        areas[row] = np.abs(first - second) / 2.0
+        east, north = next_east, next_north
+    return areas
+
+
+def cell_size_m(cells: MapCells, frame: LocalFrame) -> tuple[float, float]:
+    """Return the length of a cell along its row and along its column, in the middle of the map."""
+    rows, columns = cells.rates_l_ha.shape
+    column = np.array([0.0, 1.0, 0.0]) + columns // 2
+    row = np.array([0.0, 0.0, 1.0]) + rows // 2
+    longitude, latitude = to_degrees(cells, column, row)
+    east, north = frame.to_local_all(latitude.tolist(), longitude.tolist())
+    along = np.hypot(east[1:] - east[0], north[1:] - north[0])
+    return float(along[0]), float(along[1])
+
+
+def _transformer(source: CRS, target: CRS) -> Transformer:
+    return Transformer.from_crs(source, target, always_xy=True)
+
+
+def _classes(cells: MapCells) -> tuple[Floats, NDArray[np.int32]]:
+    """Return the different rates, and for every cell the index of its own."""
+    rated = ~np.isnan(cells.rates_l_ha)
+    rates, index = np.unique(cells.rates_l_ha[rated], return_inverse=True)
+    kinds = np.full(rated.shape, NO_RATE, dtype=np.int32)
+    kinds[rated] = index
+    return rates, kinds
+
+
+def turns_clockwise(cells: MapCells) -> bool:
+    """Tell whether the first row lies north of the second, as in most rasters."""
+    a, b, _, d, e, _ = cells.transform
+    return a * e - b * d < 0.0
+
+
+def _fitted(
+    cells: MapCells,
+    frame: LocalFrame,
+    path: Path,
+    offset_m: tuple[float, float],
+    *,
+    flipped: bool,
+) -> tuple[Warp, Warp]:
+    """Return the polynomials from cell numbers to the frame and back, of the least degree."""
+    rows, columns = cells.rates_l_ha.shape
+
+    def places(side: int) -> tuple[Floats, Floats, Floats, Floats]:
+        column, row = np.meshgrid(np.linspace(0.0, columns, side), np.linspace(0.0, rows, side))
+        longitude, latitude = to_degrees(
+            cells, column.ravel(), (rows - row if flipped else row).ravel()
+        )
+        east, north = frame.to_local_all(latitude.tolist(), longitude.tolist())
+        return column.ravel(), row.ravel(), east + offset_m[0], north + offset_m[1]
+
+    known, checked = places(FIT_SIDE), places(2 * FIT_SIDE + 1)
+    size_m = float(np.hypot(np.ptp(known[2]), np.ptp(known[3])) / np.hypot(rows, columns))
+    if not size_m >= CELL_MIN_M:
+        raise map_error(
+            path,
+            f"its cells are {100 * size_m:.2g} cm wide",
+            fix=f"make the map with cells of {CELL_MIN_M * 100:.0f} cm or more",
+            code="too-fine",
+        )
+    for degree in range(1, DEGREE_MAX + 1):
+        to_frame = _fit(known[:2], known[2:], degree)
+        to_cells = _fit(known[2:], known[:2], degree)
+        error_m = max(
+            _largest(to_frame, checked[:2], checked[2:]),
+            size_m * _largest(to_cells, checked[2:], checked[:2]),
+        )
+        if error_m <= FIT_MAX_M:
+            break
+    if not error_m <= USABLE_MAX_M:
+        raise map_error(
+            path,
+            f"its rows and columns are bent: {error_m:.2g} m are left unexplained",
+            fix="cut the map to one field",
+            code="too-large",
+        )
+    return to_frame, to_cells
+
+
+def _fit(known: tuple[Floats, ...], wanted: tuple[Floats, ...], degree: int) -> Warp:
+    (x, y), (u, v) = known, wanted
+    x0, y0 = float(x.min() + np.ptp(x) / 2), float(y.min() + np.ptp(y) / 2)
+    scale = float(max(np.ptp(x), np.ptp(y)) / 2)
+    matrix = monomials((x - x0) / scale, (y - y0) / scale, degree).T
+    terms = np.linalg.lstsq(matrix, np.column_stack([u, v]), rcond=None)[0]
+    return Warp(x0=x0, y0=y0, scale=scale, terms=tuple((float(a), float(b)) for a, b in terms))
+
+
+def _largest(warp: Warp, known: tuple[Floats, ...], wanted: tuple[Floats, ...]) -> float:
+    found = warp(known[0], known[1])
+    return float(max(np.abs(found[0] - wanted[0]).max(), np.abs(found[1] - wanted[1]).max()))
