@@ -24,6 +24,7 @@ from companion.core.rate import flow_for_rate
 from companion.errors import ConfigError, MapError
 from companion.maps.build import build_prescription, frame_for
 from companion.maps.model import MapFile, Problem
+from companion.maps.offset import offset_between
 from companion.maps.registry import read_area, read_map
 
 # More rates than these are named by their range: the line must stay readable.
@@ -73,6 +74,8 @@ def read_configured_map(config: Config) -> MapFile:
             density_kg_l=table.density_kg_l,
             flow_width_m=table.flow_width_m,
             flow_speed_m_s=table.flow_speed_m_s,
+            merge=table.merge,
+            origin=table.origin,
         )
 
 
@@ -104,6 +107,7 @@ def _prescription(
     config: Config, table: PrescriptionTable, map_file: MapFile, frame: LocalFrame
 ) -> Prescription:
     """Return the map in the flight's frame, on the ground that may be sprayed."""
+    _check_mark(config, table)
     boundary = None
     if table.boundary is not None:
         boundary = _area(config, "prescription.boundary", table.boundary)
@@ -126,6 +130,20 @@ def _prescription(
             f"{map_file.path} to spray; give files of the same field"
         )
     return built
+
+
+def _check_mark(config: Config, table: PrescriptionTable) -> None:
+    """Refuse an offset that does not bring a mark of the map to where the receiver finds it."""
+    if table.check_map is None or table.check_surveyed is None:
+        return
+    east_m, north_m = offset_between(table.check_map, table.check_surveyed)
+    error_m = math.hypot(east_m - table.offset_east_m, north_m - table.offset_north_m)
+    if not error_m <= table.check_tolerance_m:
+        raise ConfigError(
+            f"{config.path}: prescription.check_surveyed lies {error_m:.2f} m from where the map "
+            f"and its offset put the mark; set prescription.offset_east_m = {east_m:.3f} and "
+            f"offset_north_m = {north_m:.3f}, or correct the mark"
+        )
 
 
 def _meets(built: Prescription) -> bool:

@@ -1,21 +1,22 @@
 """The program's entry: which command is where, and how everything ends.
 
 Exit codes: 0 done, 1 a problem was found or the work failed, 2 wrong usage, configuration or
-input, 130 interrupted. An error is one line on stderr, and with `--json` one object on stdout.
+input, 130 interrupted. An error is one line on stderr, and with `--json` one object on stdout; of
+a map that is refused, with the list of problems that `map check` prints.
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 from typer.core import TyperGroup
 
-from companion.errors import ActuatorError, VrsprayError
+from companion.errors import ActuatorError, MapError, VrsprayError
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
@@ -128,7 +129,8 @@ def execute(arguments: Sequence[str]) -> int:
         return _fail(f"{error.format_message()} (see --help)", error.exit_code, as_json=as_json)
     except VrsprayError as error:
         code = FAILED if isinstance(error, ActuatorError) else REFUSED
-        return _fail(str(error), code, as_json=as_json)
+        more = {"ok": False, "problems": [refusal(error)]} if isinstance(error, MapError) else {}
+        return _fail(str(error), code, as_json=as_json, more=more)
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted", INTERRUPTED, as_json=as_json)
     if result == INTERRUPTED:  # Typer makes an exit of an interrupt
@@ -136,10 +138,22 @@ def execute(arguments: Sequence[str]) -> int:
     return result if isinstance(result, int) else 0
 
 
-def _fail(text: str, code: int, *, as_json: bool) -> int:
+def refusal(error: MapError) -> dict[str, str]:
+    """Return a map that cannot be used as the problem that it is, as `map check` lists them.
+
+    A `MapError` says file: what is wrong; what to do.
+    """
+    line = " ".join(str(error).split()).removesuffix(f"; {error.fix}")
+    where, colon, text = line.partition(": ")
+    if not colon:
+        where, text = "", line
+    return {"severity": "error", "code": error.code, "text": text, "where": where, "fix": error.fix}
+
+
+def _fail(text: str, code: int, *, as_json: bool, more: Mapping[str, object] | None = None) -> int:
     """Say why on stderr, in one line, and with `--json` on stdout too; return `code`."""
     line = " ".join(text.split())
     if as_json:
-        typer.echo(json.dumps({"error": line}))
+        typer.echo(json.dumps({"error": line, **(more or {})}))
     typer.echo(line if code == INTERRUPTED else f"error: {line}", err=True)
     return code

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from companion.cli.map_grid import parse_place
 from companion.config import Config, load
 from companion.maps.model import MapFile
 from companion.maps.registry import read_map
@@ -38,6 +39,14 @@ _FlowWidth = Annotated[
 _FlowSpeed = Annotated[
     float | None, typer.Option(metavar="M_S", help="Speed for which a map in L/min was made.")
 ]
+_Merge = Annotated[
+    str | None,
+    typer.Option(metavar="HOW", help="P2's text map: max, average or mean of points in a cell."),
+]
+_Origin = Annotated[
+    str | None,
+    typer.Option(metavar="LAT,LON,ALT", help="P2's text map: origin of its plane; else point 1."),
+]
 _ConfigFile = Annotated[
     Path | None,
     typer.Option("--config", metavar="FILE", help="What is not given here comes from its map."),
@@ -55,6 +64,8 @@ class Reading:
     density_kg_l: float | None = None
     flow_width_m: float | None = None
     flow_speed_m_s: float | None = None
+    merge: str | None = None
+    origin: tuple[float, float, float] | None = None
     config: Config | None = None
 
     @property
@@ -84,6 +95,8 @@ _OPTIONS: dict[str, Any] = {
     "density_kg_l": _Density,
     "flow_width_m": _FlowWidth,
     "flow_speed_m_s": _FlowSpeed,
+    "merge": _Merge,
+    "origin": _Origin,
     "config_file": _ConfigFile,
 }
 
@@ -102,6 +115,8 @@ def reading_options(command: Callable[..., None]) -> Callable[..., None]:
         answers = {name: given.pop(name) for name in _OPTIONS}
         file = answers.pop("config_file")
         config = None if file is None else load(file)
+        if answers["origin"] is not None:
+            answers["origin"] = parse_place(answers["origin"], "--origin")
         command(reading=Reading(config=config, **answers), **given)
 
     expanded.__signature__ = signature.replace(  # type: ignore[attr-defined]

@@ -38,10 +38,23 @@ Rule = Iterator[Contradiction]
 def contradictions(config: Config) -> Rule:
     """Yield what makes the configuration unusable."""
     rules: tuple[Callable[[Config], Rule], ...] = (
-        _link, _valves, _channels, _nozzle_sets, _pwm, _lags, _output, _safety, _mission,
+        _link, _prescription, _valves, _channels, _nozzle_sets, _pwm, _lags, _output, _safety,
+        _mission,
     )  # fmt: skip
     for rule in rules:
         yield from rule(config)
+
+
+def _prescription(config: Config) -> Rule:
+    table = config.prescription
+    if table is not None and (table.check_map is None) != (table.check_surveyed is None):
+        here, missing = ("check_map", "check_surveyed")
+        if table.check_map is None:
+            here, missing = missing, here
+        yield Contradiction(
+            key=f"prescription.{here}",
+            text=f"without prescription.{missing}; give the mark in the map and as surveyed",
+        )
 
 
 def mismatches(config: Config) -> Rule:

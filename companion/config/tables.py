@@ -21,6 +21,9 @@ Duty = Annotated[FiniteFloat, Field(ge=0.0, le=1.0)]
 Latitude = Annotated[FiniteFloat, Field(ge=-90.0, le=90.0)]
 Longitude = Annotated[FiniteFloat, Field(ge=-180.0, le=180.0)]
 
+Altitude = Annotated[FiniteFloat, Field(ge=-1000.0, le=10_000.0)]
+Place = Annotated[tuple[Latitude, Longitude], Field(strict=False)]
+
 
 class Table(BaseModel):
     """A table of the file: frozen, strict, nothing unknown."""
@@ -73,6 +76,13 @@ class PrescriptionTable(Table):
     flow_speed_m_s: float | None = Field(
         default=None, gt=0.0, le=100.0, description="speed for which a map in L/min was made"
     )
+    merge: Literal["max", "average", "mean"] | None = Field(
+        default=None, description="text map: of several points in a cell; max unless set"
+    )
+    origin: Annotated[tuple[Latitude, Longitude, Altitude], Field(strict=False)] | None = Field(
+        default=None,
+        description="text map: [latitude, longitude, altitude] of its plane; else its first point",
+    )
     overlap: Literal["error", "max", "min", "mean", "last"] = Field(
         default="error", description="which rate holds where zones overlap; error refuses the map"
     )
@@ -97,6 +107,15 @@ class PrescriptionTable(Table):
     )
     offset_north_m: float = Field(
         default=0.0, ge=-1000, le=1000, description="added to the map's north"
+    )
+    check_map: Place | None = Field(
+        default=None, description="[latitude, longitude] of a mark, as the map has it"
+    )
+    check_surveyed: Place | None = Field(
+        default=None, description="[latitude, longitude] of the same mark by this receiver"
+    )
+    check_tolerance_m: float = Field(
+        default=0.1, gt=0, le=100, description="how far the two may lie apart after the offset"
     )
     boundary: Text | None = Field(
         default=None, description="file with the outline of the field; without it that of all zones"

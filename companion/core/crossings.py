@@ -35,7 +35,9 @@ STRAIGHT_LATERAL_M_S2 = 1.0
 CURVE_CHORDS = 6
 # A boom that lies nearly along its own motion covers no strip that could be judged.
 ACROSS_MIN = 0.2
-SAMPLES_ACROSS = 5
+# A strip over several zones is judged at points no farther apart than this, its ends included.
+SAMPLE_ACROSS_M = 0.1
+SAMPLES_ACROSS = (5, 40)
 START_NUDGE_M = 1e-6
 
 
@@ -365,31 +367,51 @@ def _rates_across(
     ahead_s: float,
 ) -> list[_Steps]:
     """Return the mean or the maximum over each strip, from points across it."""
-    shares = (np.arange(SAMPLES_ACROSS) + 0.5) / SAMPLES_ACROSS * 2.0 - 1.0
+    shares, weights = _across(2.0 * float(boom.half_width_m.max()))
+    count = len(shares)
     right = (boom.right_m[:, None] + boom.half_width_m[:, None] * shares).ravel()
-    forward = np.repeat(boom.forward_m, SAMPLES_ACROSS)
+    forward = np.repeat(boom.forward_m, count)
     paths = predict(state, right, forward, back_s=back_s, ahead_s=ahead_s)
     every = _rates(
         prescription, paths, prescription.owners_at(*_starts(paths)), _cuts(paths, *edges)
     )
     timelines = []
     for valve in range(len(boom.valves)):
-        parts = every[valve * SAMPLES_ACROSS : (valve + 1) * SAMPLES_ACROSS]
+        parts = every[valve * count : (valve + 1) * count]
         events = sorted({(at_s, speed) for part in parts for at_s, _, speed in part})
         steps: _Steps = []
-        for at_s, speed in events:
+        for i, (at_s, speed) in enumerate(events):
+            next_s = events[i + 1][0] if steps and i + 1 < len(events) else math.inf
+            if (next_s - at_s) * speed < SLIVER_M:
+                continue  # the points of a strip reach one boundary at one time
             now = [_value_at(part, at_s) for part in parts]
-            rates = [rate for rate in now if rate is not None]
-            if not rates:
+            given = [
+                (rate, weight)
+                for rate, weight in zip(now, weights, strict=True)
+                if rate is not None
+            ]
+            if not given:
                 value = None
             elif across == "max":
-                value = max(rates)
+                value = max(rate for rate, _ in given)
             else:
-                value = sum(rates) / len(parts)
+                value = sum(rate * weight for rate, weight in given)
             if not steps or steps[-1][1] != value:
                 steps.append((at_s, value, speed))
         timelines.append(steps)
     return timelines
+
+
+def _across(width_m: float) -> tuple[Floats, list[float]]:
+    """Return places across a strip, -1 at its left end to 1 at its right, and their weights.
+
+    The weights are those of the trapezoidal rule, so that a mean is over the width.
+    """
+    least, most = SAMPLES_ACROSS
+    spans = min(max(math.ceil(width_m / SAMPLE_ACROSS_M), least), most)
+    weights = np.full(spans + 1, 1.0 / spans)
+    weights[[0, -1]] /= 2.0
+    return np.linspace(-1.0, 1.0, spans + 1), weights.tolist()
 
 
 def _value_at(steps: _Steps, at_s: float) -> float | None:

@@ -115,12 +115,17 @@ def read_bytes(path: Path) -> bytes:
                 path,
                 f"the file has {size_bytes // 1024**2} MB, more than {limit_mb} MB",
                 fix="cut the map to one field",
+                code="too-large",
             )
         return path.read_bytes()
     except FileNotFoundError:
-        raise map_error(path, "there is no such file", fix="check the path") from None
+        raise map_error(
+            path, "there is no such file", fix="check the path", code="no-file"
+        ) from None
     except (OSError, ValueError) as error:
-        raise map_error(path, f"cannot be read ({error})", fix="check path and rights") from None
+        raise map_error(
+            path, f"cannot be read ({error})", fix="check path and rights", code="no-file"
+        ) from None
 
 
 def digest(parts: Iterable[bytes]) -> str:
@@ -154,5 +159,8 @@ def check_counts(path: Path, *, records: int, vertices: int) -> None:
     ):
         if not 0 <= count <= limit:
             raise map_error(
-                path, f"{count} {name} are more than {limit}", fix="cut the map to one field"
+                path,
+                f"{count} {name} are more than {limit}",
+                fix="cut the map to one field",
+                code="too-large",
             )

@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import STRtree
 
+from companion.errors import MapError
 from companion.maps.local import Area
 
 Objects = NDArray[np.object_]
@@ -20,10 +21,23 @@ Ints = NDArray[np.int64]
 OVERLAP_MAX_M2 = 1.0
 # Boxes that share less cannot hide an overlap worth adding up.
 _BOX_MIN_M2 = 1e-3
-_CHUNK = 64
 _BITE = 5000
+# How many pairs one question to the tree should bring, and for how many parts it may ask.
+_HITS_WANTED = 50_000
+_CHUNK_MAX = 256
 # Enough to tell the operator; a map with more is drawn in layers.
 PAIRS_MAX = 1000
+# Parts with fewer vertices are compared faster than they are prepared for it.
+_PREPARED_MIN = 100
+# What one look may cost: pairs of boxes (some 20 s), vertices of the pairs that touch (50 s), and
+# crossings of edges beyond what neighbours have along a common border. A sound map of 22 500
+# polygons with a border of 20 000 vertices around them needs a tenth at most.
+CANDIDATES_MAX = 5_000_000
+VERTICES_MAX = 300_000_000
+CROSSINGS_MAX = 400_000
+_CROSSINGS_PER_VERTEX = 4
+# Pairs that cannot have many crossings are not asked: one side is short, or both are.
+_SHORT, _PRODUCT_MIN = 100, 300_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,13 +53,22 @@ def overlaps(zones: Sequence[Area], *, above_m2: float = OVERLAP_MAX_M2) -> list
     """Return the pairs of zones that share more than `above_m2`, the largest first.
 
     The zones are in metres. The work is done in bites and ends after many pairs, because a file
-    with every zone on the same ground has billions of them.
+    with every zone on the same ground has billions of them. A file that would take longer than
+    anyone waits before it comes to that is refused.
     """
     if not zones:
         return []
     parts, owner = shapely.get_parts(np.array(zones, dtype=object), return_index=True)
+    vertices = shapely.get_num_coordinates(parts).astype(np.int64)
+    shapely.prepare(parts[vertices >= _PREPARED_MIN])
     shared: dict[tuple[int, int], float] = defaultdict(float)
+    visited = crossings = 0
     for one, two in _candidates(parts, owner):
+        one, two = _meeting(parts, vertices, one, two)
+        visited += int(vertices[one].sum() + vertices[two].sum())
+        if not visited <= VERTICES_MAX:
+            raise _too_complicated()
+        crossings += _crossings(parts, vertices, one, two, CROSSINGS_MAX - crossings)
         area_m2 = shapely.area(shapely.intersection(parts[one], parts[two]))
         pairs = np.sort(np.column_stack([owner[one], owner[two]]), axis=1).tolist()
         for (first, second), pair_m2 in zip(pairs, area_m2.tolist(), strict=True):
@@ -64,9 +87,13 @@ def _candidates(parts: Objects, owner: Ints) -> Iterator[tuple[Ints, Ints]]:
     """Yield, in bites, each pair of parts of different zones whose boxes share ground, once."""
     tree = STRtree(parts)
     boxes = shapely.bounds(parts)
-    for start in range(0, len(parts), _CHUNK):
-        one, two = tree.query(parts[start : start + _CHUNK])
+    start, chunk, looked_at = 0, 4, 0
+    while start < len(parts):
+        one, two = tree.query(parts[start : start + chunk])
         one = one + start
+        start += chunk
+        wanted = int(chunk * _HITS_WANTED / max(len(one), 1))
+        chunk = max(1, min(2 * chunk, wanted, _CHUNK_MAX))
         once = (one < two) & (owner[one] != owner[two])
         one, two = one[once], two[once]
         low = np.maximum(boxes[one, :2], boxes[two, :2])
@@ -74,5 +101,58 @@ def _candidates(parts: Objects, owner: Ints) -> Iterator[tuple[Ints, Ints]]:
         size = np.clip(high - low, 0.0, None)
         large = size[:, 0] * size[:, 1] > _BOX_MIN_M2
         one, two = one[large], two[large]
+        looked_at += len(one)
+        if not looked_at <= CANDIDATES_MAX:
+            raise _too_complicated()
         for bite in range(0, len(one), _BITE):
             yield one[bite : bite + _BITE], two[bite : bite + _BITE]
+
+
+def _meeting(parts: Objects, vertices: Ints, one: Ints, two: Ints) -> tuple[Ints, Ints]:
+    """Return the pairs that touch at all: a border's box holds every zone inside its ring."""
+    swap = vertices[one] < vertices[two]
+    large, small = np.where(swap, two, one), np.where(swap, one, two)
+    meets = shapely.intersects(parts[large], parts[small])
+    return one[meets], two[meets]
+
+
+def _crossings(parts: Objects, vertices: Ints, one: Ints, two: Ints, left: int) -> int:
+    """Return how many more edges cross than along a common border; refuse more than `left`.
+
+    Two combs laid across each other share millions of little squares.
+    """
+    few, many = np.minimum(vertices[one], vertices[two]), np.maximum(vertices[one], vertices[two])
+    found = 0
+    for pair in np.flatnonzero((few > _SHORT) | (few * many > _PRODUCT_MIN)).tolist():
+        first, second = _edge_boxes(parts[one[pair]]), _edge_boxes(parts[two[pair]])
+        tree = STRtree(first)
+        expected = _CROSSINGS_PER_VERTEX * int(few[pair] + many[pair])
+        hits, start, chunk = 0, 0, 1
+        while start < len(second):
+            more = len(tree.query(second[start : start + chunk])[0])
+            start += chunk
+            chunk = max(1, min(2 * chunk, int(chunk * _HITS_WANTED / max(more, 1))))
+            hits += more
+            if not found + hits - expected <= left:
+                raise _too_complicated()
+        found += max(0, hits - expected)
+    return found
+
+
+def _edge_boxes(part: Area) -> Objects:
+    """Return the box of every edge."""
+    points, ring = shapely.get_coordinates(shapely.get_rings(part), return_index=True)
+    same = ring[1:] == ring[:-1]
+    ends = np.hstack([points[:-1], points[1:]])[same]
+    low, high = np.minimum(ends[:, :2], ends[:, 2:]), np.maximum(ends[:, :2], ends[:, 2:])
+    boxes: Objects = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
+    return boxes
+
+
+def _too_complicated() -> MapError:
+    return MapError(
+        "the zones of the map touch each other in too many places to be compared; "
+        "simplify the map, or cut it to one field",
+        code="too-complicated",
+        fix="simplify the map, or cut it to one field",
+    )

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import shapely
 from shapely import MultiPolygon
 from shapely.errors import ShapelyError
 
+from companion.maps.adapt import read_adapt
 from companion.maps.assemble import crs_of, ground_of, map_of, zone_names
 from companion.maps.bundle import open_bundle
+from companion.maps.csv_map import read_csv
 from companion.maps.declared import Given
+from companion.maps.dji import read_dji
 from companion.maps.geojson import read_geojson
+from companion.maps.geopackage import read_geopackage
+from companion.maps.geoparquet import read_geoparquet
+from companion.maps.geotiff import read_geotiff
+from companion.maps.isoxml import read_isoxml
+from companion.maps.kml import read_kml
 from companion.maps.layer import Grid, Layer
 from companion.maps.local import polygons_of
 from companion.maps.model import MapFile, map_error
 from companion.maps.shapefile import read_shapefile
+from companion.maps.text_map import read_text_map
 
 Reader = Callable[[Path, str | None], Layer | Grid]
 
@@ -26,9 +35,28 @@ READERS: dict[str, Reader] = {
     ".shp": read_shapefile,
     ".geojson": read_geojson,
     ".json": read_geojson,
+    ".gpkg": read_geopackage,
+    ".kml": read_kml,
+    ".kmz": read_kml,
+    ".xml": read_isoxml,
+    ".tif": read_geotiff,
+    ".tiff": read_geotiff,
+    ".parquet": read_geoparquet,
+    ".geoparquet": read_geoparquet,
+    ".csv": read_csv,
+    ".txt": read_text_map,
 }
-# Folders and archives, by a file in them: its name or its suffix; the first that is there.
-PACKAGES: tuple[tuple[str, Reader], ...] = ((".shp", read_shapefile),)
+# Folders and archives, by a file in them: its name, or its suffix in a folder of some name. The
+# first that is there; a shapefile comes last, as other formats carry boundaries in shapefiles.
+PACKAGES: tuple[tuple[str, Reader], ...] = (
+    ("taskdata.xml", read_isoxml),
+    ("adapt.json", read_adapt),
+    ("rx/*.tif", read_dji),
+    ("rx/*.tiff", read_dji),
+    ("*.gpkg", read_geopackage),
+    ("*.kml", read_kml),
+    ("*.shp", read_shapefile),
+)
 # A repair of a boundary or an exclusion may move the limit of spraying by this much unasked.
 REPAIR_MAX_M2 = 1.0
 
@@ -43,12 +71,14 @@ def read_map(
     density_kg_l: float | None = None,
     flow_width_m: float | None = None,
     flow_speed_m_s: float | None = None,
+    merge: str | None = None,
+    origin: tuple[float, float, float] | None = None,
 ) -> MapFile:
     """Return the prescription in a file, or raise a `MapError` that names file, reason and fix.
 
     The arguments answer what the file leaves open: which column, band or product is the rate, in
     which unit, in which coordinate reference system, in which layer or task; the density for
-    rates by weight, width and speed for rates by time.
+    rates by weight, width and speed for rates by time; how P2's text map makes its cells.
     """
     path = Path(path)
     given = Given(
@@ -57,7 +87,8 @@ def read_map(
         flow_width_m=flow_width_m,
         flow_speed_m_s=flow_speed_m_s,
     )
-    return map_of(_read(path, layer), path, rate_field=rate_field, crs=crs, given=given)
+    found = _read(path, layer, merge=merge, origin=origin)
+    return map_of(found, path, rate_field=rate_field, crs=crs, given=given)
 
 
 def read_area(path: Path, *, crs: str | None = None) -> MultiPolygon:
@@ -106,7 +137,13 @@ def read_area(path: Path, *, crs: str | None = None) -> MultiPolygon:
     return MultiPolygon(polygons_of(united))
 
 
-def _read(path: Path, layer: str | None) -> Layer | Grid:
+def _read(
+    path: Path,
+    layer: str | None,
+    *,
+    merge: str | None = None,
+    origin: tuple[float, float, float] | None = None,
+) -> Layer | Grid:
     try:
         folder = path.is_dir()
         there = path.exists()
@@ -128,6 +165,15 @@ def _read(path: Path, layer: str | None) -> Layer | Grid:
             else f"take one of {known}, or a folder or .zip with such files",
             code="unknown-format",
         )
+    if reader is read_text_map:
+        return read_text_map(path, layer, merge=merge or "max", origin=origin)
+    if merge is not None or origin is not None:
+        raise map_error(
+            path,
+            "it is not P2's text map, which alone has points to merge and an origin",
+            fix="leave out --merge and --origin (prescription.merge, prescription.origin)",
+            code="not-a-text-map",
+        )
     return reader(path, layer)
 
 
@@ -135,8 +181,7 @@ def _of_package(path: Path) -> Reader:
     """Return who reads a folder or an archive, by what lies in it."""
     bundle = open_bundle(path)
     for sign, reader in PACKAGES:
-        found = bundle.with_suffix(sign) if sign.startswith(".") else bundle.called(sign)
-        if found:
+        if any(PurePosixPath(name.casefold()).match(sign) for name in bundle.names):
             return reader
     signs = ", ".join(sign for sign, _ in PACKAGES)
     raise map_error(

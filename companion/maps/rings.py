@@ -13,15 +13,37 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely import MultiPolygon, Polygon, STRtree
+from shapely import Polygon, STRtree
 
-from companion.maps.local import as_area
+from companion.maps.local import Area, as_area
 
 Floats = NDArray[np.float64]
 Objects = NDArray[np.object_]
 
 
-def area_of_rings(rings: Sequence[Floats]) -> Polygon | MultiPolygon | None:
+def areas_of_records(records: Sequence[Sequence[Floats]]) -> list[Area | None]:
+    """Return `area_of_rings` of every record.
+
+    Records of a single ring, which most are, are made at once: there is nothing to sort out.
+    """
+    single = [index for index, rings in enumerate(records) if _is_plain(rings)]
+    made = _polygons([records[index][0] for index in single])
+    quick = {
+        index: polygon
+        for index, polygon, area in zip(single, made, shapely.area(made), strict=True)
+        if area > 0.0
+    }
+    return [
+        quick[index] if index in quick else area_of_rings(rings)
+        for index, rings in enumerate(records)
+    ]
+
+
+def _is_plain(rings: Sequence[Floats]) -> bool:
+    return len(rings) == 1 and len(rings[0]) >= 4 and bool((rings[0][0] == rings[0][-1]).all())
+
+
+def area_of_rings(rings: Sequence[Floats]) -> Area | None:
     """Return the polygon or multipolygon of one record, or None where no ring has an area."""
     shells, holes = [], []
     for ring in map(_closed, rings):
@@ -55,8 +77,12 @@ def _closed(ring: Floats) -> Floats:
     return ring
 
 
-def _polygons(rings: list[Floats]) -> Objects:
-    return np.array([Polygon(ring) for ring in rings], dtype=object)
+def _polygons(rings: Sequence[Floats]) -> Objects:
+    """Return a polygon without holes for every closed ring."""
+    if not rings:
+        return np.empty(0, dtype=object)
+    owner = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    return np.array(shapely.polygons(shapely.linearrings(np.vstack(rings), indices=owner)))
 
 
 def _owners(inner: Objects, outer: Objects) -> dict[int, list[int]]:

@@ -16,8 +16,8 @@ from tests.bench.accuracy import accuracy
 from tests.bench.arrival import arrivals
 from tests.bench.figures import Figure, rounded, table
 from tests.bench.flights import fly_all, tasks
-from tests.bench.loading import loading
-from tests.bench.lookup import lookups
+from tests.bench.loading import loading, raster
+from tests.bench.lookup import cell_lookup, lookup_growth, lookups
 from tests.bench.realtime import times_real_time
 from tests.bench.report import page
 from tests.bench.steps import growth, large_field, small_field
@@ -76,8 +76,11 @@ def timings(seed: int, *, is_quick: bool, say: Say) -> tuple[list[Figure], float
     ]
     say("look-ups, simulation, maps")
     figures += lookups(seed=seed)
+    figures.append(lookup_growth(seed=seed, zones=(100, 10_000 if is_quick else 100_000)))
+    figures.append(cell_lookup(seed=seed))
     figures.append(times_real_time(seed=seed, repeats=2 if is_quick else 4))
     figures.append(loading(seed=seed, repeats=1 if is_quick else 3))
+    figures += raster(seed=seed, repeats=1 if is_quick else 3)
     # What other programs took away shows here: 1.0 is a machine of our own.
     share = (process_time() - cpu) / (perf_counter() - wall)
     if share < OURS_MIN:

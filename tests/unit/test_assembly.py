@@ -77,6 +77,25 @@ def test_offset_moves_the_map_and_its_boundary() -> None:
     )
 
 
+MARK = "prescription.check_map=[36.0, 114.5]"
+# 5e-6 degrees north and east: 0.555 m and 0.451 m there.
+SURVEYED = "prescription.check_surveyed=[36.000005, 114.500005]"
+
+
+def test_a_surveyed_mark_has_to_lie_where_the_offset_puts_it() -> None:
+    with pytest.raises(ConfigError, match=r"0\.71 m .*offset_east_m = 0\.451 .* = 0\.555"):
+        setup_with(MARK, SURVEYED)
+    offset = ("prescription.offset_east_m=0.45", "prescription.offset_north_m=0.5")
+    assert setup_with(MARK, SURVEYED, *offset)
+    with pytest.raises(ConfigError, match="check_surveyed lies"):
+        setup_with(MARK, SURVEYED, *offset, "prescription.check_tolerance_m=0.05")
+
+
+def test_half_a_mark_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"check_map.*without prescription\.check_surveyed"):
+        setup_with(MARK)
+
+
 def test_frame_that_is_given_is_used() -> None:
     frame = LocalFrame(latitude_deg=36.0, longitude_deg=114.5)
     assert build_setup(load(EXAMPLE), frame=frame).frame is frame

@@ -1,0 +1,154 @@
+"""All checks of a map, one after the other, and what `map check` prints of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import shapely
+from shapely.errors import ShapelyError
+
+from companion.maps.lint.place import place_problems
+from companion.maps.lint.plan import Plan
+from companion.maps.lint.rates import ground_problems, rate_problems
+from companion.maps.lint.shapes import overlap_problems, shape_problems
+from companion.maps.lint.short import short_problems
+from companion.maps.lint.survey import Survey
+from companion.maps.model import MapFile, Problem, map_error
+
+
+def check_map(
+    map_file: MapFile, *, overlap: str = "error", plan: Plan | None = None
+) -> tuple[Problem, ...]:
+    """Return everything that reading found, and what a look at the whole map adds; errors first.
+
+    Overlaps are an error only where the overlap policy refuses them.
+    """
+    plan = plan or Plan()
+    return _checked(_surveyed(map_file, plan), overlap, plan)
+
+
+def summary(
+    map_file: MapFile,
+    *,
+    overlap: str = "error",
+    plan: Plan | None = None,
+    more: Sequence[Problem] = (),
+) -> dict[str, object]:
+    """Return what `map check --json` prints; `more` are problems that others found.
+
+    `area_ha` is of the zones or cells that have a rate, each counted once, in the map's local
+    frame; `litres` is area times rate, likewise.
+    """
+    plan = plan or Plan()
+    survey = _surveyed(map_file, plan)
+    problems = _worst_first([*_checked(survey, overlap, plan), *_placed(survey, more)])
+    rates, area_m2 = survey.rates[survey.rated], survey.area_m2[survey.rated]
+    parts = shapely.get_parts(np.array([zone.geometry for zone in map_file.zones], dtype=object))
+    litres = float((rates * area_m2).sum()) / 10_000.0
+    total_m2 = float(area_m2.sum())
+    return {
+        "ok": not any(problem.severity == "error" for problem in problems),
+        "path": str(map_file.path),
+        "format": map_file.format,
+        "crs": map_file.crs,
+        "unit": map_file.unit,
+        "rate_field": map_file.rate_field,
+        "zones": len(map_file.zones) if map_file.cells is None else int(survey.rated.sum()),
+        "parts": len(parts),
+        "holes": int(shapely.get_num_interior_rings(parts).sum()),
+        **_shape(survey),
+        "area_ha": total_m2 / 10_000.0,
+        "zero_ha": survey.hectares(survey.rates == 0.0),
+        "no_rate_ha": survey.hectares(~survey.rated) if map_file.cells is None else None,
+        "boundary_ha": None if survey.boundary is None else survey.boundary.area / 10_000.0,
+        "boundary_from": _boundary_from(map_file, plan),
+        "default_rate_l_ha": map_file.default_rate_l_ha
+        if plan.default_rate_l_ha is None
+        else plan.default_rate_l_ha,
+        "litres": litres,
+        "mean_rate_l_ha": 10_000.0 * litres / total_m2 if total_m2 > 0.0 else None,
+        "rates_l_ha": list(map_file.rates_l_ha),
+        "bounds": list(survey.bounds_deg),
+        "sha256": map_file.sha256,
+        "problems": [
+            {
+                "severity": problem.severity,
+                "code": problem.code,
+                "text": problem.text,
+                "where": problem.where,
+                "fix": problem.fix,
+            }
+            for problem in problems
+        ],
+    }
+
+
+def _surveyed(map_file: MapFile, plan: Plan) -> Survey:
+    try:
+        return Survey(map_file, boundary=plan.boundary)
+    except ShapelyError as error:
+        raise _unusable(map_file, error) from None
+
+
+def _checked(survey: Survey, overlap: str, plan: Plan) -> tuple[Problem, ...]:
+    """Return all problems; overlaps are looked for first, they refuse what none could join."""
+    try:
+        overlapping = overlap_problems(survey, overlap)
+        return _worst_first(
+            [
+                *_placed(survey, survey.map_file.problems),
+                *place_problems(survey, plan.homes),
+                *rate_problems(survey, plan.default_rate_l_ha),
+                *ground_problems(survey, plan.default_rate_l_ha),
+                *overlapping,
+                *shape_problems(survey),
+                *short_problems(survey, plan.sprayer),
+            ]
+        )
+    except ShapelyError as error:
+        raise _unusable(survey.map_file, error) from None
+
+
+def _worst_first(problems: Sequence[Problem]) -> tuple[Problem, ...]:
+    return tuple(sorted(problems, key=lambda problem: problem.severity != "error"))
+
+
+def _placed(survey: Survey, problems: Sequence[Problem]) -> list[Problem]:
+    """Return problems that name a zone, or a rate's problem that names none, with a place."""
+    if survey.cells is not None or not problems:
+        return list(problems)
+    by_name = {zone.name: index for index, zone in enumerate(survey.zones)}
+    return [
+        replace(problem, where=survey.zone_spots([by_name[problem.where]]))
+        if problem.where in by_name
+        else problem
+        for problem in problems
+    ]
+
+
+def _shape(survey: Survey) -> dict[str, object]:
+    """Return rows, columns and the size of a cell; none for a map of zones."""
+    size = survey.cell_size_m
+    rows, columns = survey.rates.shape if size is not None else (None, None)
+    return {
+        "rows": rows,
+        "columns": columns,
+        "cell_m": None if size is None else [float(np.round(side, 4)) for side in size],
+    }
+
+
+def _boundary_from(map_file: MapFile, plan: Plan) -> str | None:
+    if plan.boundary is not None:
+        return "configuration"
+    return None if map_file.boundary is None else "map"
+
+
+def _unusable(map_file: MapFile, error: ShapelyError) -> Exception:
+    return map_error(
+        map_file.path,
+        f"its polygons cannot be used ({str(error)[:120]})",
+        fix="export the map again",
+        code="broken-geometry",
+    )

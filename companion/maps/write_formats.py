@@ -1,0 +1,147 @@
+"""The formats in which maps are written; a new one is a function and an entry here.
+
+Each writer gets what its format can hold: zones or cells, the outline of the field and the
+default rate where there is room for them, and otherwise zones and cells that say the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from companion.maps.model import MapCells, MapFile, map_error
+from companion.maps.plain_zones import plain_zones
+from companion.maps.rasterise import cells_of, north_up
+
+# Where the operator does not say: narrower than any section of a boom.
+CELL_M = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wish:
+    """What the operator says about a file to be written, where its format leaves a choice."""
+
+    cell_m: float | None = None
+    flow_width_m: float | None = None
+    flow_speed_m_s: float | None = None
+    overlap: str = "error"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Writer:
+    """One format: its name, the suffixes of its files ("" is a folder), and how it is written."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    write: Callable[[MapFile, Path, Wish], None]
+
+
+def keeps_cells(map_file: MapFile, wish: Wish) -> bool:
+    """Tell whether a format of cells along meridians and parallels takes those of the map."""
+    if map_file.cells is None or wish.cell_m is not None:
+        return False
+    a, b, _, d, _, _ = map_file.cells.transform
+    return map_file.cells.crs.to_epsg() == 4326 and a > 0.0 and b == d == 0.0
+
+
+def _shapefile(map_file: MapFile, path: Path, _: Wish) -> None:
+    from companion.maps.write_shapefile import write_shapefile
+
+    bare = path.suffix.casefold() == ".shp"
+    zones = plain_zones(map_file, clip=bare)
+    write_shapefile(zones, path, boundary=None if bare else map_file.boundary)
+
+
+def _geojson(map_file: MapFile, path: Path, _: Wish) -> None:
+    from companion.maps.write_geojson import write_geojson
+
+    write_geojson(plain_zones(map_file, clip=False), path, boundary=map_file.boundary)
+
+
+def _geopackage(map_file: MapFile, path: Path, _: Wish) -> None:
+    from companion.maps.write_geopackage import write_geopackage
+
+    write_geopackage(plain_zones(map_file, clip=False), path, boundary=map_file.boundary)
+
+
+def _kml(map_file: MapFile, path: Path, _: Wish) -> None:
+    from companion.maps.write_kml import write_kml
+
+    write_kml(plain_zones(map_file, clip=False), path, boundary=map_file.boundary)
+
+
+def _isoxml(map_file: MapFile, path: Path, wish: Wish) -> None:
+    from companion.maps.write_isoxml import write_isoxml
+
+    if wish.cell_m is not None:
+        cells = _cells(map_file, wish, clip=False)
+        map_file = replace(map_file, zones=(), cells=cells)
+    elif map_file.cells is not None and not keeps_cells(map_file, wish):
+        # The field and its default stay what they are, so zones need not stand for them.
+        plain = replace(map_file, boundary=None)
+        map_file = replace(map_file, zones=tuple(plain_zones(plain, clip=False)), cells=None)
+    write_isoxml(map_file, path)
+
+
+def _geotiff(map_file: MapFile, path: Path, wish: Wish) -> None:
+    from companion.maps.write_geotiff import write_geotiff
+
+    write_geotiff(_cells(map_file, wish, clip=True), path)
+
+
+def _dji(map_file: MapFile, path: Path, wish: Wish) -> None:
+    from companion.maps.write_geotiff import write_dji
+
+    write_dji(_cells(map_file, wish, clip=False), path, map_file.boundary)
+
+
+def _cells(map_file: MapFile, wish: Wish, *, clip: bool) -> MapCells:
+    if map_file.cells is not None:
+        return north_up(map_file, wish.cell_m, clip=clip)
+    return cells_of(map_file, wish.cell_m or CELL_M, overlap=wish.overlap, clip=clip)
+
+
+def _text_map(map_file: MapFile, path: Path, wish: Wish) -> None:
+    from companion.maps.text_lattice import text_map_of
+    from companion.maps.text_points import write_text_map
+
+    width_m, speed_m_s = wish.flow_width_m, wish.flow_speed_m_s
+    if width_m is None or speed_m_s is None or not (width_m > 0.0 and speed_m_s > 0.0):
+        raise map_error(
+            path,
+            "rates in this format are L/min, for one width and speed",
+            fix="give both with --flow-width-m and --flow-speed-m-s",
+            code="no-flow-basis",
+        )
+    spacing_m = wish.cell_m
+    if spacing_m is not None and not (spacing_m >= 1.0 and spacing_m == int(spacing_m)):
+        raise map_error(
+            path,
+            f"cells of {spacing_m:g} m are not whole metres, as this format has them",
+            fix="take --cell-m 1, 2, 3, …",
+            code="cell-size",
+        )
+    points = text_map_of(
+        map_file,
+        width_m=width_m,
+        speed_m_s=speed_m_s,
+        spacing_m=None if spacing_m is None else int(spacing_m),
+        overlap=wish.overlap,
+    )
+    write_text_map(points, path)
+
+
+WRITERS = {
+    writer.name: writer
+    for writer in (
+        Writer(name="shapefile", suffixes=(".shp", ".zip"), write=_shapefile),
+        Writer(name="geojson", suffixes=(".geojson", ".json"), write=_geojson),
+        Writer(name="geopackage", suffixes=(".gpkg",), write=_geopackage),
+        Writer(name="kml", suffixes=(".kml", ".kmz"), write=_kml),
+        Writer(name="isoxml", suffixes=(".xml", ".zip", ""), write=_isoxml),
+        Writer(name="geotiff", suffixes=(".tif", ".tiff"), write=_geotiff),
+        Writer(name="dji", suffixes=(".zip", ""), write=_dji),
+        Writer(name="text-map", suffixes=(".txt",), write=_text_map),
+    )
+}

@@ -1,0 +1,608 @@
+"""KML and KMZ as programs and people write them, and ours as GDAL reads them."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pyogrio
+import pytest
+import shapely
+from shapely import LinearRing, MultiPolygon, Polygon, box
+
+from companion.errors import MapError
+from companion.maps.assemble import map_of
+from companion.maps.declared import Given
+from companion.maps.kml import read_kml
+from companion.maps.layer import Layer
+from companion.maps.model import MapFile, MapZone
+from companion.maps.write_kml import write_kml
+
+WEST, SOUTH, CELL = 15.14, 48.12, 0.001
+SQUARE = box(WEST, SOUTH, WEST + CELL, SOUTH + CELL)
+RING = SQUARE.difference(SQUARE.buffer(-CELL / 4, join_style="mitre"))
+NEXT = box(WEST + CELL, SOUTH, WEST + 2 * CELL, SOUTH + CELL)
+TWO = MultiPolygon([NEXT, box(WEST + 3 * CELL, SOUTH, WEST + 4 * CELL, SOUTH + CELL)])
+NAMESPACE = "http://www.opengis.net/kml/2.2"
+CORNERS = "15.1,48.1,200 15.2,48.1,200 15.2,48.2,200 15.1,48.1,200"
+TRIANGLE = Polygon([(15.1, 48.1), (15.2, 48.1), (15.2, 48.2)])
+
+
+def polygon(corners: str = CORNERS, *holes: str) -> str:
+    def side(name: str, text: str) -> str:
+        ring = f"<LinearRing><coordinates>{text}</coordinates></LinearRing>"
+        return f"<{name}>{ring}</{name}>"
+
+    inner = "".join(side("innerBoundaryIs", hole) for hole in holes)
+    return f"<Polygon><extrude>0</extrude>{side('outerBoundaryIs', corners)}{inner}</Polygon>"
+
+
+def data(**values: object) -> str:
+    pairs = (f"<Data name='{name}'><value>{v}</value></Data>" for name, v in values.items())
+    return f"<ExtendedData>{''.join(pairs)}</ExtendedData>"
+
+
+def placemark(*content: str, name: str = "a zone") -> str:
+    return f"<Placemark><name>{name}</name>{''.join(content)}</Placemark>"
+
+
+def folder(name: str, *content: str) -> str:
+    return f"<Folder><name>{name}</name>{''.join(content)}</Folder>"
+
+
+def kml(*content: str, namespace: str = NAMESPACE) -> str:
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="{namespace}">'
+        f"<Document><name>field</name>{''.join(content)}</Document></kml>"
+    )
+
+
+def saved(tmp_path: Path, text: str, name: str = "rx.kml") -> Path:
+    path = tmp_path / name
+    path.write_text(text, "utf-8")
+    return path
+
+
+def read(tmp_path: Path, *content: str, layer: str | None = None) -> Layer:
+    return read_kml(saved(tmp_path, kml(*content)), layer)
+
+
+def understood(path: Path) -> MapFile:
+    return map_of(read_kml(path), path, rate_field=None, crs=None, given=Given())
+
+
+def refused(path: Path, layer: str | None = None) -> MapError:
+    with pytest.raises(MapError) as caught:
+        read_kml(path, layer)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    assert caught.value.fix
+    return caught.value
+
+
+def columns(layer: Layer) -> dict[str, tuple[tuple[object, ...], bool]]:
+    return {column.name: (column.values, column.numeric) for column in layer.columns}
+
+
+@pytest.mark.parametrize(
+    ("driver", "suffix"), [("KML", ".kml"), ("LIBKML", ".kml"), ("LIBKML", ".kmz")]
+)
+def test_what_gdal_writes_is_read(tmp_path: Path, driver: str, suffix: str) -> None:
+    path = tmp_path / f"rx{suffix}"
+    pyogrio.raw.write(
+        str(path),
+        shapely.to_wkb(np.array([RING, TWO, SQUARE], dtype=object)),
+        [np.array([12.5, np.nan, 0.0]), np.array(["gal/ac"] * 3, dtype=object)],
+        ["rate", "unit"],
+        geometry_type="Unknown",
+        crs="EPSG:4326",
+        driver=driver,
+    )
+    found = understood(path)
+    assert (found.format, found.crs, found.unit) == ("kml", "EPSG:4326", "gal/ac")
+    assert [zone.rate_l_ha for zone in found.zones] == [pytest.approx(116.925, abs=1e-3), None, 0.0]
+    for zone, ground in zip(found.zones, (RING, TWO, SQUARE), strict=True):
+        assert zone.geometry.symmetric_difference(ground).area < 1e-9 * ground.area
+
+
+@pytest.mark.parametrize(
+    "namespace",
+    [NAMESPACE, "http://www.opengis.net/kml/2.3", "http://earth.google.com/kml/2.1", ""],
+)
+def test_every_version_of_the_namespace(tmp_path: Path, namespace: str) -> None:
+    path = saved(tmp_path, kml(placemark(data(rate=5), polygon()), namespace=namespace))
+    layer = read_kml(path)
+    assert layer.geometries == (TRIANGLE,)
+    assert columns(layer) == {"rate": (("5",), True), "name": (("a zone",), True)} | {
+        "name": (("a zone",), False)
+    }
+    assert layer.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_a_placemark_or_a_folder_may_be_all_there_is(tmp_path: Path) -> None:
+    assert read_kml(saved(tmp_path, placemark(polygon()))).geometries == (TRIANGLE,)
+    assert read_kml(saved(tmp_path, folder("x", placemark(polygon())))).geometries == (TRIANGLE,)
+
+
+SCHEMA = """<Schema name="rx" id="rx"><SimpleField type="double" name="rate"/>
+<SimpleField type="xsd:float" name="other"/><SimpleField type="string" name="dose"/>
+<SimpleField type="bool" name="wet"/><SimpleField type="int" name="broken"/></Schema>"""
+
+
+def schema_data(**values: str) -> str:
+    pairs = (f'<SimpleData name="{name}">{v}</SimpleData>' for name, v in values.items())
+    return f'<ExtendedData><SchemaData schemaUrl="#rx">{"".join(pairs)}</SchemaData></ExtendedData>'
+
+
+def test_types_of_a_schema(tmp_path: Path) -> None:
+    one = schema_data(rate=" 12.5\n", other="", dose="7", wet="1", broken="1,5")
+    two = schema_data(dose=" ", wet="0", broken="")
+    layer = read(tmp_path, SCHEMA, placemark(one, polygon()), placemark(two, polygon()))
+    assert columns(layer) == {
+        "rate": (("12.5", None), True),
+        "other": ((None, None), True),
+        "dose": (("7", None), True),
+        "wet": (("true", "false"), False),
+        "broken": (("1,5", None), True),
+        "name": (("a zone", "a zone"), False),
+    }
+
+
+def test_a_decimal_comma_is_no_number(tmp_path: Path) -> None:
+    path = saved(tmp_path, kml(placemark(data(rate="12,5", unit="L/ha"), polygon())))
+    assert not columns(read_kml(path))["rate"][1]
+    with pytest.raises(MapError):
+        understood(path)
+    path = saved(tmp_path, kml(SCHEMA, placemark(schema_data(rate="12,5"), polygon())))
+    with pytest.raises(MapError, match="12,5"):
+        map_of(read_kml(path), path, rate_field=None, crs=None, given=Given(unit="L/ha"))
+
+
+def test_elements_of_another_namespace_are_attributes(tmp_path: Path) -> None:
+    extended = (
+        '<ExtendedData xmlns:farm="http://farm.example/x"><farm:rate>4.5</farm:rate>'
+        "<farm:more><farm:deep>1</farm:deep></farm:more></ExtendedData>"
+    )
+    layer = read(tmp_path, placemark(extended, polygon()))
+    assert columns(layer) == {"rate": (("4.5",), True), "name": (("a zone",), False)}
+
+
+def test_no_rate_is_read_out_of_text_for_people(tmp_path: Path) -> None:
+    content = "<description>rate: 12.5 L/ha, &lt;b&gt;dose 3&lt;/b&gt;</description>"
+    layer = read(tmp_path, placemark(content, polygon(), name="12.5 L/ha"))
+    assert columns(layer) == {"name": (("12.5 L/ha",), False)}
+
+
+@pytest.mark.parametrize("form", ["Data", "Schema"])
+def test_units_in_titles(tmp_path: Path, form: str) -> None:
+    title = "<displayName>Dose (gal/ac)</displayName>"
+    if form == "Data":
+        extended = f"<ExtendedData><Data name='dose'>{title}<value>3</value></Data></ExtendedData>"
+        layer = read(tmp_path, placemark(extended, polygon()))
+    else:
+        field = f"<SimpleField type='double' name='dose'>{title}</SimpleField>"
+        schema = f"<Schema id='rx'>{field}</Schema>"
+        layer = read(tmp_path, schema, placemark(schema_data(dose="3"), polygon()))
+    assert {column.name: column.unit for column in layer.columns} == {
+        "dose": "gal/ac",
+        "name": None,
+    }
+
+
+def test_titles_that_state_two_units_are_refused(tmp_path: Path) -> None:
+    extended = [
+        f"<ExtendedData><Data name='dose'><displayName>{unit}</displayName><value>3</value></Data>"
+        "</ExtendedData>"
+        for unit in ("L/ha", "gal/ac")
+    ]
+    path = saved(tmp_path, kml(*(placemark(one, polygon()) for one in extended)))
+    assert refused(path).code == "unit-conflict"
+
+
+def test_one_name_with_two_values_is_refused(tmp_path: Path) -> None:
+    both = (
+        '<ExtendedData><Data name="rate"><value>1</value></Data>'
+        '<SchemaData><SimpleData name="rate">{}</SimpleData></SchemaData></ExtendedData>'
+    )
+    assert columns(read(tmp_path, placemark(both.format("1"), polygon())))["rate"][0] == ("1",)
+    assert columns(read(tmp_path, placemark(both.format(""), polygon())))["rate"][0] == ("1",)
+    path = saved(tmp_path, kml(placemark(both.format("2"), polygon())))
+    assert refused(path).code == "several-columns"
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        "15.1,48.1 15.2,48.1 15.2,48.2 15.1,48.1",
+        "\n\t 15.1,48.1,0\r\n15.2,48.1,1e3\n\n15.2,48.2,-5   15.1,48.1,0 \n",
+        "15.1, 48.1, 0 15.2 ,48.1 , 0  15.2,\n48.2, 0 15.1 , 48.1,0",
+        "15.1,48.1 15.2,48.1,7 15.2,48.2",
+        "15.1,48.1, 15.2,48.1, 15.2,48.2,".replace(", ", ",0 ") + "0",
+    ],
+)
+def test_coordinates_in_every_layout(tmp_path: Path, corners: str) -> None:
+    assert read(tmp_path, placemark(polygon(corners))).geometries == (TRIANGLE,)
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        "15.1,48.1,0,15.2,48.1,0,15.2,48.2,0",
+        "15.1 48.1 15.2 48.1 15.2 48.2",
+        "15.1,48.1 15.2,48.1",
+        "15.1,48.1 15.2,48.1 15.1,48.1",
+        "15.1,48.1 15.2,abc 15.2,48.2",
+        "15.1,48.1 15.2, 15.2,48.2",
+        "15.1,48.1, 15.2,48.1, 15.2,48.2,",
+        "15.1,48.1,high 15.2,48.1,0 15.2,48.2,0",
+        "15.1,48.1 1_5.2,48.1 15.2,48.2",
+        "nan,48.1 15.2,48.1 15.2,48.2",
+        "inf,48.1 15.2,48.1 15.2,48.2",
+        "1e300,48.1 15.2,48.1 15.2,48.2",
+    ],
+)
+def test_coordinates_that_are_none_are_refused(tmp_path: Path, corners: str) -> None:
+    path = saved(tmp_path, kml(placemark(polygon()), placemark(polygon(corners), name="west")))
+    error = refused(path)
+    assert error.code == "broken-geometry"
+    assert "placemark 2 (west)" in str(error)
+
+
+def test_longitude_and_latitude_exchanged_are_refused(tmp_path: Path) -> None:
+    corners = "48.1,115.1 48.1,115.2 48.2,115.2"
+    path = saved(tmp_path, kml(placemark(data(rate=1, unit="L/ha"), polygon(corners))))
+    with pytest.raises(MapError, match="exchanged"):
+        understood(path)
+
+
+def test_holes_and_parts(tmp_path: Path) -> None:
+    def text(ring: LinearRing) -> str:
+        return " ".join(f"{x!r},{y!r},0" for x, y in ring.coords)
+
+    holed = polygon(text(RING.exterior), *(text(hole) for hole in RING.interiors))
+    nested = f"<MultiGeometry>{holed}<MultiGeometry>{polygon()}</MultiGeometry></MultiGeometry>"
+    layer = read(tmp_path, placemark(nested))
+    assert layer.geometries == (MultiPolygon([RING, TRIANGLE]),)
+    rings = "".join(
+        f"<LinearRing><coordinates>{text(LinearRing(one))}</coordinates></LinearRing>"
+        for one in ([(1, 1), (2, 1), (2, 2)], [(3, 3), (4, 3), (4, 4)])
+    )
+    big = "0,0 9,0 9,9 0,9 0,0"
+    both = polygon(big).replace(
+        "</Polygon>", f"<innerBoundaryIs>{rings}</innerBoundaryIs></Polygon>"
+    )
+    found = read(tmp_path, placemark(both)).geometries[0]
+    assert isinstance(found, Polygon)
+    assert len(found.interiors) == 2
+
+
+@pytest.mark.parametrize(
+    ("geometry", "reason"),
+    [
+        ("", "null-geometry"),
+        ("<Point><coordinates>15,48</coordinates></Point>", "not-a-polygon:Point"),
+        ("<LineString><coordinates>15,48 16,48</coordinates></LineString>",
+         "not-a-polygon:LineString"),
+        (polygon(" "), "no-area"),
+        ("<Polygon/>", "no-area"),
+        ("<MultiGeometry><Point/></MultiGeometry>", "not-a-polygon:Point"),
+    ],
+)  # fmt: skip
+def test_placemarks_without_ground_are_told(tmp_path: Path, geometry: str, reason: str) -> None:
+    layer = read(tmp_path, placemark(polygon()), placemark(geometry))
+    assert layer.geometries == (TRIANGLE, None)
+    assert layer.skipped == {1: reason}
+
+
+@pytest.mark.parametrize("broken", ["innerBoundaryIs", "two outsides"])
+def test_polygons_without_one_outside_are_refused(tmp_path: Path, broken: str) -> None:
+    good = polygon()
+    bad = (
+        good.replace("outerBoundaryIs", broken)
+        if broken == "innerBoundaryIs"
+        else good.replace("</Polygon>", good.removeprefix("<Polygon>"))
+    )
+    assert refused(saved(tmp_path, kml(placemark(bad)))).code == "broken-geometry"
+
+
+FOLDERS = (
+    folder("May", folder("north", placemark(data(rate=1), polygon()))),
+    folder("June", placemark(data(rate=2), polygon()), placemark(data(rate=3), polygon())),
+)
+
+
+def test_folders_are_one_map_unless_one_is_asked_for(tmp_path: Path) -> None:
+    assert columns(read(tmp_path, *FOLDERS))["rate"][0] == ("1", "2", "3")
+    assert columns(read(tmp_path, *FOLDERS, layer="June"))["rate"][0] == ("2", "3")
+    assert columns(read(tmp_path, *FOLDERS, layer="May"))["rate"][0] == ("1",)
+    assert columns(read(tmp_path, *FOLDERS, layer="north"))["rate"][0] == ("1",)
+    error = refused(tmp_path / "rx.kml", "July")
+    assert error.code == "no-layer"
+    assert "May, north, June" in str(error)
+
+
+def test_a_folder_called_boundary_is_the_outline(tmp_path: Path) -> None:
+    zones = folder("zones", placemark(data(rate=1), polygon()))
+    corner = "<Point><coordinates>15,48</coordinates></Point>"
+    outline = folder("Boundary", placemark(polygon()), placemark(corner))
+    layer = read(tmp_path, outline, zones)
+    assert layer.geometries == (TRIANGLE,)
+    assert layer.boundary is not None
+    assert layer.boundary.equals(TRIANGLE)
+    assert layer.skipped == {}
+    with_rate = folder("boundary", placemark(data(rate=9), polygon()))
+    layer = read(tmp_path, with_rate, zones)
+    assert columns(layer)["rate"][0] == ("9", "1")
+    assert layer.boundary is None
+    alone = read(tmp_path, outline)
+    assert alone.geometries == (TRIANGLE, None)
+    assert alone.boundary is None
+
+
+def test_a_boundary_that_crosses_itself_is_refused(tmp_path: Path) -> None:
+    bow = "15.1,48.1 15.2,48.2 15.2,48.1 15.1,48.2 15.1,48.1"
+    zones = placemark(data(rate=1), polygon())
+    path = saved(tmp_path, kml(zones, folder("boundary", placemark(polygon(bow)))))
+    assert refused(path).code == "broken-geometry"
+
+
+def test_links_are_told_and_not_followed(tmp_path: Path) -> None:
+    link = "<NetworkLink><Link><href>http://127.0.0.1:9/x.kml</href></Link></NetworkLink>"
+    layer = read(tmp_path, link, folder("x", link), placemark(data(rate=1), polygon()))
+    assert [problem.code for problem in layer.problems] == ["network-link"]
+    assert layer.problems[0].text.startswith("2 links")
+    assert read(tmp_path, placemark(polygon())).problems == ()
+
+
+def test_a_file_of_links_alone_is_refused(tmp_path: Path) -> None:
+    link = "<NetworkLink><Link><href>http://127.0.0.1:9/x.kml</href></Link></NetworkLink>"
+    assert refused(saved(tmp_path, kml(link))).code == "network-link"
+    assert refused(saved(tmp_path, kml(folder("empty")))).code == "no-polygon"
+
+
+def zipped(tmp_path: Path, files: dict[str, str], name: str = "rx.kmz") -> Path:
+    path = tmp_path / name
+    with zipfile.ZipFile(path, "w") as archive:
+        for member, text in files.items():
+            archive.writestr(member, text)
+    return path
+
+
+MAY, JUNE = (kml(placemark(data(rate=rate), polygon())) for rate in (5, 6))
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"files/june.kml": JUNE, "doc.kml": MAY},
+        {"a.kml": JUNE, "Doc.KML": MAY},
+        {"Files/MAY.KML": MAY, "icon.png": ""},
+    ],
+)
+def test_the_main_file_of_an_archive(tmp_path: Path, files: dict[str, str]) -> None:
+    layer = read_kml(zipped(tmp_path, files))
+    assert columns(layer)["rate"][0] == ("5",)
+    assert layer.sha256 == hashlib.sha256(MAY.encode()).hexdigest()
+
+
+def test_an_archive_with_several_maps_asks_which(tmp_path: Path) -> None:
+    path = zipped(tmp_path, {"may.kml": MAY, "june.kml": JUNE}, "rx.zip")
+    assert refused(path).code == "several-layers"
+    assert columns(read_kml(path, "june"))["rate"][0] == ("6",)
+    assert columns(read_kml(path, "may.kml"))["rate"][0] == ("5",)
+    assert refused(path, "july").code == "several-layers"
+    assert refused(zipped(tmp_path, {"a.txt": ""})).code == "no-file"
+
+
+def links(*targets: str) -> str:
+    return "".join(
+        f"<NetworkLink><Link><href> {one} </href></Link></NetworkLink>" for one in targets
+    )
+
+
+def test_links_inside_an_archive_are_followed_once(tmp_path: Path) -> None:
+    files = {
+        "doc.kml": kml(folder("x", links("layers/may%201.kml", "layers/may%201.kml"))),
+        "layers/may 1.kml": kml(folder("May", placemark(data(rate=5), polygon())), links("b.kml")),
+        "layers/b.kml": JUNE,
+    }
+    path = zipped(tmp_path, files)
+    layer = read_kml(path)
+    assert columns(layer)["rate"][0] == ("5",)
+    assert [problem.code for problem in layer.problems] == ["network-link"]
+    assert columns(read_kml(path, "May"))["rate"][0] == ("5",)
+    parts = (files["doc.kml"] + files["layers/may 1.kml"]).encode()
+    assert layer.sha256 == hashlib.sha256(parts).hexdigest()
+
+
+def test_links_in_a_circle_or_out_of_the_archive_end(tmp_path: Path) -> None:
+    (tmp_path / "june.kml").write_text(JUNE, "utf-8")
+    outside = links("doc.kml", "../june.kml", str(tmp_path / "june.kml"), "http://127.0.0.1:9/a")
+    zones = placemark(data(rate=5), polygon())
+    layer = read_kml(zipped(tmp_path, {"doc.kml": kml(zones, outside)}))
+    assert columns(layer)["rate"][0] == ("5",)
+    assert layer.problems[0].text.startswith("3 links")
+
+
+def test_linked_files_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = zipped(tmp_path, {"doc.kml": kml(links("a.kml")), "a.kml": MAY})
+    assert len(read_kml(path).geometries) == 1
+    monkeypatch.setattr("companion.maps.kml_files.MAX_ELEMENTS", 15)
+    assert refused(path).code == "too-large"
+
+
+def test_a_folder_of_files(tmp_path: Path) -> None:
+    saved(tmp_path, MAY)
+    assert columns(read_kml(tmp_path))["rate"][0] == ("5",)
+
+
+def test_archives_that_lead_astray_are_refused(tmp_path: Path) -> None:
+    assert refused(zipped(tmp_path, {"../doc.kml": MAY})).code == "archive-unsafe"
+    path = tmp_path / "rx.kmz"
+    path.write_bytes(path.read_bytes()[:60])
+    assert refused(path).code == "truncated"
+
+
+def test_other_xml_is_refused(tmp_path: Path) -> None:
+    assert refused(saved(tmp_path, "<gpx/>")).code == "unknown-format"
+    assert refused(saved(tmp_path, MAY[:-9])).code == "truncated"
+    bomb = '<!DOCTYPE x [<!ENTITY a "aa">]>' + placemark(polygon())
+    assert refused(saved(tmp_path, bomb)).code == "xml-unsafe"
+    deep = "<Folder>" * 5000 + "</Folder>" * 5000
+    assert refused(saved(tmp_path, deep)).code == "xml-unsafe"
+
+
+@pytest.mark.parametrize(
+    ("limit", "value"),
+    [
+        ("layer.MAX_RECORDS", 1),
+        ("layer.MAX_VERTICES", 7),
+        ("kml_attributes._CELLS_MAX", 1),
+        ("kml_attributes._COLUMNS_MAX", 0),
+        ("kml_geometry.MAX_VERTICES", 2),
+    ],
+)
+def test_what_is_too_large_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int
+) -> None:
+    path = saved(tmp_path, kml(*[placemark(data(rate=1), polygon())] * 2))
+    assert len(read_kml(path).geometries) == 2
+    monkeypatch.setattr(f"companion.maps.{limit}", value)
+    with pytest.raises(MapError, match=r"more than|too many"):
+        read_kml(path)
+
+
+ZONES = (
+    MapZone(name="Süd <\"&'> 地块", geometry=RING, rate_l_ha=12.345678901),
+    MapZone(name="two", geometry=TWO, rate_l_ha=None),
+    MapZone(name="zero", geometry=NEXT, rate_l_ha=0.0),
+    MapZone(name="little", geometry=SQUARE, rate_l_ha=0.01),
+)
+FIELD = MultiPolygon([box(WEST, SOUTH, WEST + 9 * CELL, SOUTH + CELL).difference(SQUARE)])
+
+
+def assert_same(found: Sequence[MapZone], wanted: Sequence[MapZone]) -> None:
+    for one, two in zip(found, wanted, strict=True):
+        assert one.name == two.name
+        assert (one.part_count, one.hole_count) == (two.part_count, two.hole_count)
+        assert shapely.hausdorff_distance(one.geometry.boundary, two.geometry.boundary) < 1e-9
+        assert one.rate_l_ha == (None if two.rate_l_ha is None else pytest.approx(two.rate_l_ha))
+
+
+@pytest.mark.parametrize("suffix", [".kml", ".kmz"])
+@pytest.mark.parametrize("boundary", [None, FIELD])
+def test_our_own_file_is_read_back(
+    tmp_path: Path, suffix: str, boundary: MultiPolygon | None
+) -> None:
+    path = tmp_path / f"out{suffix}"
+    write_kml(ZONES, path, boundary=boundary)
+    found = understood(path)
+    assert (found.unit, found.crs, found.problems) == ("L/ha", "EPSG:4326", ())
+    assert_same(found.zones, ZONES)
+    outline = read_kml(path).boundary
+    assert (outline is None) == (boundary is None)
+    if outline is not None:
+        assert outline.symmetric_difference(FIELD).area < 1e-9 * FIELD.area
+
+
+@pytest.mark.parametrize("suffix", [".kml", ".kmz"])
+def test_gdal_reads_our_file(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"out{suffix}"
+    write_kml(ZONES, path, boundary=FIELD)
+    assert pyogrio.list_layers(path)[:, 0].tolist() == ["prescription", "boundary"]
+    meta, _, blobs, values = pyogrio.raw.read(str(path), layer="prescription")
+    fields = dict(zip(meta["fields"].tolist(), values, strict=True))
+    assert fields["Name"].tolist() == [zone.name for zone in ZONES]
+    assert fields["rate"].dtype == np.float64
+    rates = [zone.rate_l_ha if zone.rate_l_ha is not None else np.nan for zone in ZONES]
+    assert fields["rate"].tolist() == pytest.approx(rates, nan_ok=True, abs=1e-6)
+    assert fields["unit"].tolist() == ["L/ha"] * 4
+    for ground, zone in zip(shapely.from_wkb(blobs), ZONES, strict=True):
+        assert shapely.hausdorff_distance(ground.boundary, zone.geometry.boundary) < 1e-9
+    outline = shapely.from_wkb(pyogrio.raw.read(str(path), layer="boundary")[2])[0]
+    assert outline.symmetric_difference(FIELD).area < 1e-9 * FIELD.area
+
+
+def tags(path: Path, name: str) -> list[ElementTree.Element]:
+    return list(ElementTree.parse(path).getroot().iter(f"{{{NAMESPACE}}}{name}"))
+
+
+def test_every_zone_has_a_colour_that_is_there(tmp_path: Path) -> None:
+    path = tmp_path / "out.kml"
+    write_kml(ZONES, path, boundary=FIELD)
+    used = [element.text for element in tags(path, "styleUrl")]
+    assert used == ["#rate6", "#none", "#rate0", "#rate0", "#boundary"]
+    defined = {f"#{style.get('id')}" for style in tags(path, "Style")}
+    assert set(used) <= defined
+    write_kml(ZONES[:1], path)
+    assert [element.text for element in tags(path, "styleUrl")] == ["#rate3"]
+
+
+def test_colours_get_darker_with_the_rate(tmp_path: Path) -> None:
+    path = tmp_path / "out.kml"
+    write_kml(ZONES, path)
+    fills = [element.findtext(f"{{{NAMESPACE}}}color") or "" for element in tags(path, "PolyStyle")]
+    lightness = [
+        0.2126 * int(one[6:8], 16) + 0.7152 * int(one[4:6], 16) + 0.0722 * int(one[2:4], 16)
+        for one in fills[:7]
+    ]
+    assert len(set(lightness)) == 7
+    assert lightness == sorted(lightness, reverse=True)
+
+
+def test_outsides_turn_left_and_holes_right(tmp_path: Path) -> None:
+    path = tmp_path / "out.kml"
+    for ground in (RING, shapely.orient_polygons(RING, exterior_cw=True)):
+        write_kml([MapZone(name="a", geometry=ground, rate_l_ha=1.0)], path)
+        sides = {
+            side: LinearRing(
+                [
+                    tuple(map(float, one.split(",")))
+                    for element in tags(path, side)
+                    for one in "".join(element.itertext()).split()
+                ]
+            ).is_ccw
+            for side in ("outerBoundaryIs", "innerBoundaryIs")
+        }
+        assert sides == {"outerBoundaryIs": True, "innerBoundaryIs": False}
+
+
+def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
+    for suffix in (".kml", ".kmz"):
+        for name in ("a", "b"):
+            write_kml(ZONES, tmp_path / f"{name}{suffix}", boundary=FIELD)
+        assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_names_that_xml_cannot_hold(tmp_path: Path) -> None:
+    path = tmp_path / "out.kml"
+    write_kml([MapZone(name="a\x00b\x1b\ud800\uffffc", geometry=SQUARE, rate_l_ha=1.0)], path)
+    assert understood(path).zones[0].name == "a b c"
+
+
+def test_tiny_coordinates_have_no_exponent(tmp_path: Path) -> None:
+    path = tmp_path / "out.kml"
+    ground = box(-1e-5, -1e-5, 1e-5, 1e-5)
+    write_kml([MapZone(name="a", geometry=ground, rate_l_ha=1e-5)], path)
+    assert "e-" not in "".join(element.text or "" for element in tags(path, "coordinates"))
+    assert_same(understood(path).zones, [MapZone(name="a", geometry=ground, rate_l_ha=1e-5)])
+
+
+def test_a_real_map_keeps_its_facts(samples: Path, tmp_path: Path) -> None:
+    source = samples / "01_shp_lha_multipolygon" / "Rx.shp"
+    meta, _, blobs, fields = pyogrio.raw.read(str(source))
+    path = tmp_path / "rx.kml"
+    pyogrio.raw.write(
+        str(path), blobs, fields, meta["fields"].tolist(), geometry_type="MultiPolygon",
+        crs=meta["crs"], driver="LIBKML",
+    )  # fmt: skip
+    found = understood(path)
+    assert (found.unit, found.rate_field) == ("L/ha", "rate")
+    assert found.rates_l_ha == (0.0, 120.0, 140.0, 160.0, 170.0, 180.0)
+    assert sum(zone.part_count for zone in found.zones) == 527
+    assert sum(zone.hole_count for zone in found.zones) == 68
