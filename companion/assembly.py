@@ -85,7 +85,8 @@ def _naming(config: Config, key: str, value: str) -> Iterator[None]:
     try:
         yield
     except MapError as error:
-        raise MapError(f"{config.path}: {key} = {show_value(value)}: {error}") from error
+        text = f"{config.path}: {key} = {show_value(value)}: {error}"
+        raise MapError(text, code=error.code, fix=error.fix) from error
 
 
 def _area(config: Config, key: str, name: str) -> MultiPolygon:
@@ -180,6 +181,7 @@ def deliverable(setup: Setup, speed_m_s: float) -> list[Problem]:
         pwm=setup.pwm,
         width_m=setup.boom.width_m,
         speed_m_s=speed_m_s,
+        speeds_m_s=(setup.limits.speed_min_m_s, setup.limits.speed_max_m_s),
     )
 
 
@@ -190,8 +192,12 @@ def undelivered(
     pwm: PwmLimits,
     width_m: float,
     speed_m_s: float,
+    speeds_m_s: tuple[float, float] = (0.0, math.inf),
 ) -> list[Problem]:
-    """Return which rates are out of the sets' range at a speed; a rate of 0 never is."""
+    """Return which rates are out of the sets' range at a speed; a rate of 0 never is.
+
+    `speeds_m_s` are the least and the highest that may be sprayed at; none beyond is advised.
+    """
     low, high = flow_range(sets, pwm)
     flow = {
         rate: flow_for_rate(rate, speed_m_s, width_m) for rate in sorted(rates_l_ha) if rate > 0.0
@@ -208,7 +214,10 @@ def undelivered(
                 severity="warning",
                 code="rate-too-high",
                 text=f"{_need(too_much, flow, speed_m_s)}; {given}",
-                fix=f"fly at {speed:g} m/s or slower, or fit larger nozzles",
+                fix=f"fly at {speed:g} m/s or slower, or fit larger nozzles"
+                if speed >= speeds_m_s[0]
+                else f"fit larger nozzles: only below {speeds_m_s[0]:g} m/s, which the "
+                f"configuration refuses, would these do ({speed:g} m/s)",
             )
         )
     if too_little:
@@ -218,7 +227,10 @@ def undelivered(
                 severity="warning",
                 code="rate-too-low",
                 text=f"{_need(too_little, flow, speed_m_s)}; {given}",
-                fix=f"fly at {speed:g} m/s or faster, or fit smaller nozzles",
+                fix=f"fly at {speed:g} m/s or faster, or fit smaller nozzles"
+                if speed <= speeds_m_s[1]
+                else f"fit smaller nozzles: only above {speeds_m_s[1]:g} m/s, which the "
+                f"configuration refuses, would these do ({speed:g} m/s)",
             )
         )
     return problems

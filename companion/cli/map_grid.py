@@ -11,7 +11,7 @@ import typer
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
 from companion.maps.layer import read_bytes
 from companion.maps.model import map_error
-from companion.maps.point_grid import MERGES
+from companion.maps.point_grid import M2_PER_HA, MERGES
 from companion.maps.text_map import PointGrid, grid_of_points, grid_problems
 from companion.maps.text_points import parse_text_map
 from companion.maps.whole_file import write_whole
@@ -67,8 +67,9 @@ def grid_result(found: PointGrid) -> dict[str, Any]:
         "cell_m": layout.cell_m,
         "rows": layout.rows,
         "columns": layout.columns,
-        "area_ha": layout.area_ha,
-        "points_per_ha": layout.points_per_ha,
+        "area_ha": layout.table_area_ha,
+        "points_per_ha": layout.table_points_per_ha,
+        "area_m2": layout.area_ha * M2_PER_HA,
         "east_min_m": layout.east_min_m,
         "east_max_m": layout.east_max_m,
         "north_min_m": layout.north_min_m,
@@ -84,13 +85,15 @@ def grid_result(found: PointGrid) -> dict[str, Any]:
 def _grid_lines(result: dict[str, Any]) -> list[str]:
     latitude, longitude, altitude = result["origin"]
     least, most = result["rates_l_min"]
+    per_ha = result["points_per_ha"]
+    density = "" if per_ha is None else f", {per_ha} points/ha"
     cells = result["rows"] * result["columns"]
     return [
-        f"points        {result['points']}, {result['points_per_ha']:.0f} points/ha",
+        f"points        {result['points']}{density}",
         f"origin        {latitude:.9f}, {longitude:.9f}, {altitude:g} m",
         f"east          {result['east_min_m']:.1f} to {result['east_max_m']:.1f} m",
         f"north         {result['north_min_m']:.1f} to {result['north_max_m']:.1f} m",
-        f"area          {result['area_ha']:.2f} ha",
+        f"area          {result['area_ha']:g} ha",
         f"cell          {result['cell_m']} m",
         f"columns (H)   {result['columns']}",
         f"rows (V)      {result['rows']}",

@@ -13,6 +13,7 @@ import typer
 
 from companion.cli.map_grid import parse_place
 from companion.config import Config, load
+from companion.config.tables import PrescriptionTable
 from companion.maps.model import MapFile
 from companion.maps.registry import read_map
 
@@ -49,7 +50,11 @@ _Origin = Annotated[
 ]
 _ConfigFile = Annotated[
     Path | None,
-    typer.Option("--config", metavar="FILE", help="What is not given here comes from its map."),
+    typer.Option(
+        "--config",
+        metavar="FILE",
+        help="Of the flight; for its own map also what is not given here.",
+    ),
 ]
 
 
@@ -75,8 +80,11 @@ class Reading:
         return "error" if table is None else table.overlap
 
     def read(self, file: Path) -> MapFile:
-        """Return the map, read as the options say and otherwise as the configuration does."""
-        table = None if self.config is None else self.config.prescription
+        """Return the map, read as the options say and otherwise as the configuration does.
+
+        The configuration's answers are about its own map; they say nothing of any other.
+        """
+        table = self._table(file)
         answers = {
             field.name: getattr(self, field.name)
             if getattr(self, field.name) is not None or table is None
@@ -85,6 +93,13 @@ class Reading:
             if field.name != "config"
         }
         return read_map(file, **answers)
+
+    def _table(self, file: Path) -> PrescriptionTable | None:
+        table = None if self.config is None else self.config.prescription
+        if self.config is None or table is None:
+            return None
+        configured = self.config.resolve(table.file)
+        return table if file.resolve() == configured.resolve() else None
 
 
 _OPTIONS: dict[str, Any] = {

@@ -84,6 +84,7 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
             pwm=config.pwm_limits(),
             width_m=config.boom_table.width_m,
             speed_m_s=config.mission.speed_m_s,
+            speeds_m_s=(config.safety.speed_min_m_s, config.safety.speed_max_m_s),
         )
     if not found:
         return []

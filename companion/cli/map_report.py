@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.cli.answer import problem_line
+from companion.maps.lint.survey import counted
 
 RATES_SHOWN_MAX = 12
 # Problems of one kind, and kinds, that are written out; all of them are in --json.
@@ -36,9 +37,10 @@ def _extent(result: Mapping[str, Any]) -> str:
             f"{result['rows']} rows x {result['columns']} columns of cells, {along:.2f} m x "
             f"{across:.2f} m; {result['zones']} have a rate, {result['area_ha']:.4f} ha"
         )
-    parts = f" in {result['parts']} parts" if result["parts"] != result["zones"] else ""
-    holes = f" with {result['holes']} holes" if result["holes"] else ""
-    return f"{result['zones']} zones{parts}{holes}, {result['area_ha']:.4f} ha"
+    zones, parts, holes = (counted(result[f"{name}s"], name) for name in ("zone", "part", "hole"))
+    in_parts = f" in {parts}" if result["parts"] != result["zones"] else ""
+    with_holes = f" with {holes}" if result["holes"] else ""
+    return f"{zones}{in_parts}{with_holes}, {result['area_ha']:.4f} ha"
 
 
 def _rates(result: Mapping[str, Any]) -> str:
@@ -94,12 +96,8 @@ def _problems(problems: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def _verdict(result: Mapping[str, Any]) -> str:
-    count = {"error": 0, "warning": 0}
-    for problem in result["problems"]:
-        count[problem["severity"]] += 1
-    if not any(count.values()):
-        return "ok"
-    counted = ", ".join(
-        f"{number} {name}{'' if number == 1 else 's'}" for name, number in count.items() if number
-    )
-    return f"{'ok' if result['ok'] else 'not usable'}: {counted}"
+    severities = [problem["severity"] for problem in result["problems"]]
+    found = [
+        counted(severities.count(name), name) for name in ("error", "warning") if name in severities
+    ]
+    return ("ok" if result["ok"] else "not usable") + (f": {', '.join(found)}" if found else "")

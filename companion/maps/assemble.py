@@ -296,6 +296,7 @@ def _repaired(areas: Objects, names: Sequence[str]) -> tuple[list[Area | None], 
                 after_m2=0.0 if area is None else project(area, frame).area,
             )
         )
+    repairs.sort(key=lambda repair: repair.change_m2, reverse=True)
     return result, repairs
 
 

@@ -6,7 +6,6 @@ Axis order is never guessed: shapefile and GeoJSON both store x before y, whatev
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +13,7 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
-from shapely import Geometry
 
-from companion.errors import MapError
 from companion.maps.crs_place import (
     EXTENT_MAX_M,
     METRES_PER_DEGREE,
@@ -24,13 +21,12 @@ from companion.maps.crs_place import (
     check_place,
     crs_name,
     looks_like_metres,
-    span,
 )
 from companion.maps.model import Problem, map_error
 
 __all__ = [
     "EXTENT_MAX_M", "METRES_PER_DEGREE", "SEGMENT_M", "WGS84", "Floats", "Objects", "crs_name",
-    "datum_problem", "densified", "no_crs", "parse_crs", "to_longitude_latitude",
+    "datum_problem", "densified", "parse_crs", "to_longitude_latitude",
 ]  # fmt: skip
 
 Objects = NDArray[np.object_]
@@ -62,27 +58,6 @@ def parse_crs(text: str, *, path: Path, source: str) -> CRS:
             code="wrong-crs",
         ) from None
     return crs
-
-
-def no_crs(path: Path, geometries: Iterable[Geometry | None], *, missing: str = "") -> MapError:
-    """Return the refusal of coordinates without a CRS, with what the numbers look like.
-
-    `missing` says which file or member would have told: `no .prj beside it`.
-    """
-    there = np.array([one for one in geometries if one is not None], dtype=object)
-    points = shapely.get_coordinates(there)
-    text = "the file does not say its coordinate reference system"
-    text += f" ({missing})" if missing else ""
-    fix = "give it with --crs, for example --crs EPSG:4326, or copy the missing file"
-    if len(points) and looks_like_metres(points):
-        text += f"; its numbers look like metres ({span(points)})"
-        fix = (
-            "copy the missing file, or give the CRS in which the map was made with --crs: "
-            "EPSG:326 and the zone for UTM north (EPSG:32650), EPSG:327 and the zone for south"
-        )
-    elif len(points):
-        text += f"; its numbers could be degrees ({span(points)})"
-    return map_error(path, text, fix=fix, code="no-crs")
 
 
 def datum_problem(crs: CRS) -> Problem | None:

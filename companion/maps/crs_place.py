@@ -80,22 +80,20 @@ def _check_degrees_in_metres(raw: Floats, crs: CRS, path: Path) -> None:
 
 
 def _check_area_of_use(points: Floats, raw: Floats, crs: CRS, path: Path) -> None:
-    """Refuse a map far from where its CRS is used, or outside when exchanging x and y mends it."""
+    """Refuse a map far from where its CRS is used, the more so if exchanging x and y mends it."""
     area = _area_of_use(crs)
-    if area is None:
+    if area is None or _degrees_outside(points, area) <= _AREA_MARGIN_DEG:
         return
-    off_deg = _degrees_outside(points, area)
-    if off_deg > 0.0 and _fits_exchanged(raw, crs, area):
+    if _fits_exchanged(raw, crs, area):
         raise _swapped(raw, crs, path)
-    if not off_deg <= _AREA_MARGIN_DEG:
-        west, south, east, north = area
-        raise map_error(
-            path,
-            f"the map lies at {span(points)} by its CRS {crs_name(crs)}, which is meant for "
-            f"x {west:.4g} to {east:.4g}, y {south:.4g} to {north:.4g}",
-            fix="give the right CRS with --crs",
-            code="wrong-crs",
-        )
+    west, south, east, north = area
+    raise map_error(
+        path,
+        f"the map lies at {span(points)} by its CRS {crs_name(crs)}, which is meant for "
+        f"x {west:.4g} to {east:.4g}, y {south:.4g} to {north:.4g}",
+        fix="give the right CRS with --crs",
+        code="wrong-crs",
+    )
 
 
 def _check_extent(points: Floats, path: Path) -> None:
@@ -154,13 +152,20 @@ def _area_of_use(crs: CRS) -> _Box | None:
 
     A `.prj` does not say it, EPSG does; nothing is known of areas across the date line.
     """
-    area = _own(crs).area_of_use
-    code = _epsg(crs)
+    own = _own(crs)
+    area = own.area_of_use
+    # Of degrees PROJ is never sure, for the axes that a .prj does not have; their datum tells.
+    code = _epsg(crs, confidence=20 if own.is_geographic else 70)
     if area is None and code is not None:
-        area = CRS.from_epsg(code).area_of_use
+        known = CRS.from_epsg(code)
+        area = known.area_of_use if _datum(known) == _datum(own) else None
     if area is None or not area.west < area.east:
         return None
     return area.west, area.south, area.east, area.north
+
+
+def _datum(crs: CRS) -> str | None:
+    return crs.datum.name.removesuffix(" ensemble") if crs.datum is not None else None
 
 
 def _degrees_outside(points: Floats, area: _Box) -> float:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 DELIMITERS = (",", ";", "\t")
 MAX_COLUMNS = 255
 MAX_FIELDS = 10_000_000
+_TURNED_ROWS = 10_000
 _BLANK = frozenset(("", "na", "n/a", "nan", "null", "none"))
 _PLAIN = re.compile(r"[0-9eE+.\s-]*", re.ASCII)
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?", re.ASCII)
@@ -157,6 +158,7 @@ def _table(text: str, path: Path, delimiter: str) -> Table:
     names = tidy_names(next(reader))
     names = [name or f"column {number}" for number, name in enumerate(names, 1)]
     _check_names(names, path)
+    columns: list[list[str]] = [[] for _ in names]
     rows: list[list[str]] = []
     lines: list[int] = []
     for row in reader:
@@ -169,7 +171,7 @@ def _table(text: str, path: Path, delimiter: str) -> Table:
                 fix=_AS_CSV,
                 code="bad-line",
             )
-        if not (len(rows) < MAX_RECORDS and len(rows) * len(names) < MAX_FIELDS):
+        if not (len(lines) < MAX_RECORDS and len(lines) * len(names) < MAX_FIELDS):
             raise map_error(
                 path,
                 f"more than {min(MAX_RECORDS, MAX_FIELDS // len(names))} rows",
@@ -178,10 +180,21 @@ def _table(text: str, path: Path, delimiter: str) -> Table:
             )
         rows.append(row)
         lines.append(reader.line_num)
-    if not rows:
+        if len(rows) == _TURNED_ROWS:
+            _turn(rows, columns)
+    if not lines:
         raise map_error(path, "there are no rows", fix="export the map again", code="truncated")
-    columns = dict(zip(names, zip(*rows, strict=True), strict=True))
-    return Table(path=path, columns=columns, lines=tuple(lines))
+    _turn(rows, columns)
+    return Table(
+        path=path, columns=dict(zip(names, map(tuple, columns), strict=True)), lines=tuple(lines)
+    )
+
+
+def _turn(rows: list[list[str]], columns: list[list[str]]) -> None:
+    """Move rows to the columns; a million lists at once would keep the collector busy."""
+    for column, values in zip(columns, zip(*rows, strict=True), strict=False):
+        column.extend(values)
+    rows.clear()
 
 
 def _check_names(names: Sequence[str], path: Path) -> None:

@@ -54,6 +54,12 @@ class ReadBand:
 
 def read_band(raw: RawBand, path: Path) -> ReadBand:
     """Return a band with NaN for no data."""
+    # What a damaged file makes of numbers may overflow, and its NaN may "signal".
+    with np.errstate(all="ignore"):
+        return _read_band(raw, path)
+
+
+def _read_band(raw: RawBand, path: Path) -> ReadBand:
     values = raw.values.astype(np.float64)
     missing = np.isnan(values)
     if raw.hidden is not None:
@@ -114,8 +120,7 @@ def _as_stored(nodata: float, dtype: np.dtype[Any]) -> float:
     """Return the declared value as the cells' type holds it: -3.4e38 is cut to 32 bits."""
     if dtype.kind != "f":
         return nodata
-    with np.errstate(over="ignore"):
-        return float(dtype.type(nodata))
+    return float(dtype.type(nodata))
 
 
 def _nodata_zero(name: str, count: int) -> Problem:
@@ -137,8 +142,7 @@ def _filled(raw: RawBand, missing: Bools) -> float | None:
         found = bool(((raw.values == largest) & ~missing).any())
         return float(largest) if found else None
     if dtype.kind == "f":
-        with np.errstate(invalid="ignore"):
-            found_cells = (raw.values >= _FILL_MIN) & ~missing & np.isfinite(raw.values)
+        found_cells = (raw.values >= _FILL_MIN) & ~missing & np.isfinite(raw.values)
         return float(raw.values[found_cells][0]) if found_cells.any() else None
     return None
 
@@ -156,8 +160,7 @@ def filled_fault(raw: RawBand, value: float, path: Path) -> MapError:
 
 def _fault(raw: RawBand, values: NDArray[np.float64], path: Path) -> MapError | None:
     """Return why a band can be no rate: infinite or negative numbers."""
-    with np.errstate(invalid="ignore"):
-        wrong = np.isinf(values) | (values < 0.0)
+    wrong = np.isinf(values) | (values < 0.0)
     if not wrong.any():
         return None
     found = values[wrong]

@@ -20,6 +20,7 @@ from companion.errors import MapError
 from companion.maps.crs import parse_crs
 from companion.maps.geotiff_bands import RawBand, ReadBand, read_band
 from companion.maps.model import Affine, map_error
+from companion.maps.tiff_tags import check_tags
 
 MAX_CELLS = 16_000_000
 MAX_BANDS = 64
@@ -101,6 +102,7 @@ def _opened(content: bytes, path: Path, layer: str | None) -> Iterator[Any]:
          MemoryError, KeyError, AttributeError,
     )  # fmt: skip
     try:
+        check_tags(content)
         with warnings.catch_warnings(), rasterio.Env(**_OPTIONS):
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
             with rasterio.io.MemoryFile(content) as memory, memory.open(driver="GTiff") as source:

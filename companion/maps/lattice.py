@@ -118,20 +118,24 @@ def _grown(around: Floats, steps: Floats) -> tuple[Ints, Floats, Floats, float] 
     The rough steps are good for a few cells. What they give there is fitted, which is good for
     twice as far, and so on: numbers never slip, however many columns there are.
     """
-    start = around[int(np.argmin(np.hypot(around[:, 0], around[:, 1])))]
-    origin, radius = start, float(_START_RADIUS)
+    away = np.hypot(around[:, 0], around[:, 1])
+    origin = around[int(np.argmin(away))]
+    away = np.hypot(*(around - origin).T)
+    order = np.argsort(away)
+    away, outwards = away[order], around[order]
+    radius = float(_START_RADIUS)
     for _ in range(_ROUNDS_MAX):
-        place = (around - origin) @ np.linalg.inv(steps)
-        number = np.rint(place)
-        near = np.abs(place).max(axis=1) <= radius
-        left = around[near] - origin - number[near] @ steps
-        matrix = np.column_stack([number[near], np.ones(int(near.sum()))])
+        reach = radius * float(np.hypot(steps[:, 0], steps[:, 1]).min())
+        near = outwards[: int(np.searchsorted(away, reach, side="right"))]
+        number = np.rint((near - origin) @ np.linalg.inv(steps))
+        left = near - origin - number @ steps
+        matrix = np.column_stack([number, np.ones(len(near))])
         # The least correction: where all points near stand in one row, the other step stays.
         correction = np.linalg.lstsq(matrix, left, rcond=None)[0]
         steps, origin = steps + correction[:2], origin + correction[2]
         if not _sound(steps):
             return None
-        if near.all():
+        if len(near) == len(around):
             return _checked(around, steps, origin)
         radius *= 2.0
     return None
@@ -169,7 +173,7 @@ def _numbered(
     lonely = min(rows, columns) < 2
     if lonely or not rows * columns * FILLED_MIN <= count:
         return None
-    if len(np.unique(row * columns + column)) != count:
+    if np.bincount(row * columns + column).max() > 1:
         return None
     corner = origin + middle + (first - 0.5) @ steps
     (a, d), (b, e) = steps.tolist()

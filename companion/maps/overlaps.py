@@ -62,7 +62,7 @@ def overlaps(zones: Sequence[Area], *, above_m2: float = OVERLAP_MAX_M2) -> list
     vertices = shapely.get_num_coordinates(parts).astype(np.int64)
     shapely.prepare(parts[vertices >= _PREPARED_MIN])
     shared: dict[tuple[int, int], float] = defaultdict(float)
-    visited = crossings = 0
+    visited = crossings = large = 0
     for one, two in _candidates(parts, owner):
         one, two = _meeting(parts, vertices, one, two)
         visited += int(vertices[one].sum() + vertices[two].sum())
@@ -72,8 +72,10 @@ def overlaps(zones: Sequence[Area], *, above_m2: float = OVERLAP_MAX_M2) -> list
         area_m2 = shapely.area(shapely.intersection(parts[one], parts[two]))
         pairs = np.sort(np.column_stack([owner[one], owner[two]]), axis=1).tolist()
         for (first, second), pair_m2 in zip(pairs, area_m2.tolist(), strict=True):
-            shared[first, second] += pair_m2
-        if sum(not area_m2 <= above_m2 for area_m2 in shared.values()) > PAIRS_MAX:
+            before_m2 = shared[first, second]
+            shared[first, second] = before_m2 + pair_m2
+            large += before_m2 <= above_m2 < before_m2 + pair_m2
+        if large > PAIRS_MAX:
             break
     found = [
         Overlap(first=first, second=second, area_m2=area_m2)

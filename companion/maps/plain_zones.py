@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import shapely
 from shapely import MultiPolygon
@@ -31,6 +33,17 @@ def plain_zones(map_file: MapFile, *, clip: bool) -> list[MapZone]:
     if clip:
         zones = _clipped(map_file, map_file.boundary, zones)
     return zones if default is None else [default, *zones]
+
+
+def outline_of_rates(map_file: MapFile) -> MultiPolygon:
+    """Return the ground of all that has a rate, for a format that wants an outline of the field."""
+    cells = map_file.cells
+    if cells is None:
+        grounds = [zone.geometry for zone in map_file.zones if zone.rate_l_ha is not None]
+    else:
+        rated = np.where(np.isnan(cells.rates_l_ha), np.nan, 0.0)
+        grounds = [zone.geometry for zone in zones_of(replace(cells, rates_l_ha=rated))]
+    return MultiPolygon(polygons_of(shapely.union_all(np.array(grounds, dtype=object))))
 
 
 def _default_zone(

@@ -39,7 +39,7 @@ class GridLayout:
 
     @property
     def area_ha(self) -> float:
-        """Return the area as P2's tables have it: range east times range north of the points."""
+        """Return range east times range north of the points, which is P2's map area."""
         return (
             (self.east_max_m - self.east_min_m) * (self.north_max_m - self.north_min_m) / M2_PER_HA
         )
@@ -48,6 +48,16 @@ class GridLayout:
     def points_per_ha(self) -> float:
         """Return the density of the map; infinite for points on one line."""
         return self.points / self.area_ha if self.area_ha > 0.0 else math.inf
+
+    @property
+    def table_area_ha(self) -> float:
+        """Return the area as P2 prints it: 9.206 ha are 9.2 in Table 1, so the rest is cut off."""
+        return math.floor(100.0 * self.area_ha) / 100.0
+
+    @property
+    def table_points_per_ha(self) -> int | None:
+        """Return the density as P2 prints it: 80.5 points/ha are 80 in Table 2."""
+        return math.floor(self.points_per_ha) if math.isfinite(self.points_per_ha) else None
 
 
 def cell_size(east_range_m: float, north_range_m: float, points: int) -> int:
@@ -77,7 +87,7 @@ def layout_for(
     >>> vineyard = layout_for(11243, east_m=(-167.0, 147.2), north_m=(-181.1, 111.9))
     >>> vineyard.cell_m, vineyard.columns, vineyard.rows
     (3, 105, 98)
-    >>> round(vineyard.area_ha, 1), round(vineyard.points_per_ha)
+    >>> vineyard.table_area_ha, vineyard.table_points_per_ha
     (9.2, 1221)
     """
     ranges = (east_m[1] - east_m[0], north_m[1] - north_m[0])

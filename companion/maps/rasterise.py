@@ -65,7 +65,7 @@ def cells_of(
     else:
         rates = _of_cells(map_file.cells, shape, transform)
     made = MapCells(rates_l_ha=rates, transform=transform, crs=WGS84)
-    return _in_field(made, map_file, clip=clip)
+    return in_field(made, map_file, clip=clip)
 
 
 def north_up(map_file: MapFile, cell_m: float | None = None, *, clip: bool = True) -> MapCells:
@@ -87,14 +87,16 @@ def north_up(map_file: MapFile, cell_m: float | None = None, *, clip: bool = Tru
             transform=(a, b, c, d, -e, f + rows * e),
             crs=cells.crs,
         )
-    return _in_field(cells, map_file, clip=clip)
+    return in_field(cells, map_file, clip=clip)
 
 
-def _in_field(cells: MapCells, map_file: MapFile, *, clip: bool) -> MapCells:
+def in_field(cells: MapCells, map_file: MapFile, *, clip: bool) -> MapCells:
     """Return the cells with the map's default inside its boundary, and no rate beyond it."""
     default = map_file.default_rate_l_ha
     if map_file.boundary is None or not (clip or default is not None):
         return cells
+    if default is not None:
+        cells = _reaching(cells, map_file.boundary, map_file.path)
     rows, columns = cells.rates_l_ha.shape
     spans = spans_of(_numbered([map_file.boundary], cells), (rows, columns), path=map_file.path)
     flat = np.zeros(rows * columns, dtype=np.bool_)
@@ -105,6 +107,34 @@ def _in_field(cells: MapCells, map_file: MapFile, *, clip: bool) -> MapCells:
     if default is not None:
         rates[inside & np.isnan(rates)] = default
     return replace(cells, rates_l_ha=rates)
+
+
+def _reaching(cells: MapCells, boundary: MultiPolygon, path: Path) -> MapCells:
+    """Return the cells with more of them around, without a rate, as far as the boundary reaches."""
+    rows, columns = cells.rates_l_ha.shape
+    west, south, east, north = shapely.total_bounds(_numbered([boundary], cells))
+    before = max(math.ceil(-south - 0.5), 0), max(math.ceil(-west - 0.5), 0)
+    after = max(math.ceil(north - rows - 0.5), 0), max(math.ceil(east - columns - 0.5), 0)
+    if not (rows + before[0] + after[0]) * (columns + before[1] + after[1]) <= MAX_CELLS:
+        raise map_error(
+            path,
+            "its boundary reaches far beyond its cells, and the default rate with it",
+            fix="convert it to zones, such as .gpkg",
+            code="too-large",
+        )
+    if before == after == (0, 0):
+        return cells
+    a, b, c, d, e, f = cells.transform
+    row, column = before
+    return MapCells(
+        rates_l_ha=np.pad(
+            cells.rates_l_ha,
+            ((before[0], after[0]), (before[1], after[1])),
+            constant_values=np.nan,
+        ),
+        transform=(a, b, c - a * column - b * row, d, e, f - d * column - e * row),
+        crs=cells.crs,
+    )
 
 
 def _bounds(map_file: MapFile) -> Box:

@@ -3,8 +3,8 @@
 P2 (Rovira-Más et al. 2024) goes from latitude, longitude and altitude through earth-centred,
 earth-fixed X, Y, Z to a plane that touches the earth at the origin, on the WGS 84 ellipsoid.
 The core's `LocalFrame` is a map projection instead. From the same origin, on the ellipsoid, the
-two differ by d^3 / (6 R^2): 4 micrometres at 1 km, half a millimetre at 5 km. But the tangent
-plane stretches with altitude, by h / R (0.1 m per km at 640 m), and leans with the distance of
+two differ by up to d^3 / (3 R^2): 8 micrometres at 1 km, 1 mm at 5 km. But the tangent plane
+stretches with altitude, by h / R (0.1 m per km at 640 m), and leans with the distance of
 its origin; so its cells are tied to the ground by their corners (`text_map.py`).
 """
 

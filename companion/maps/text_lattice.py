@@ -194,15 +194,17 @@ def _laid(rates: Floats, cell_m: int) -> tuple[Floats, Floats, Floats] | None:
     which = np.concatenate([np.arange(len(rows)), [west, south]])
     across = np.concatenate([columns + 0.5, [columns[west], columns[south] + 0.5]])
     up = np.concatenate([rows + 0.5, [rows[west] + 0.5, rows[south]]])
-    wide, high = float(np.ptp(across)), float(np.ptp(up))
-    # A thousandth more than equation 1 asks for, against the rounding of degrees.
-    missing = np.arange(max(0, math.ceil(1.001 * wide * high) - len(which)))
+    # Further points reach a quarter of a cell beyond the middles, and equation 1 asks for more of
+    # them then; a thousandth more is against the rounding of degrees.
+    wanted = 1.001 * (np.ptp(across) + 0.25) * (np.ptp(up) + 0.25)
+    missing = np.arange(max(0, math.ceil(wanted) - len(which)))
     again = missing % len(rows)
     shift = _QUARTERS[missing // len(rows) % len(_QUARTERS)]
     which = np.concatenate([which, again])
     across = np.concatenate([across, columns[again] + 0.5 + shift[:, 0]])
     up = np.concatenate([up, rows[again] + 0.5 + shift[:, 1]])
-    if cell_size(wide * cell_m, high * cell_m, len(which)) != cell_m:
+    wide_m, high_m = cell_m * float(np.ptp(across)), cell_m * float(np.ptp(up))
+    if cell_size(wide_m, high_m, len(which)) != cell_m:
         return None
     return across, up, rates[rows, columns][which]
 

@@ -216,10 +216,11 @@ def grid_problems(grid: PointGrid, content: bytes, path: Path) -> list[Problem]:
         )
     decimals = _decimals(content)
     if decimals < DECIMALS_MIN:
+        step_m = float(f"{111_320.0 / 10**decimals:.2g}")
         found.append(
             (
                 "coarse-position",
-                f"its degrees have {decimals} decimals, steps of {111_320.0 / 10**decimals:.2g} m",
+                f"its degrees have {decimals} decimals, steps of {step_m:g} m",
                 f"write latitude and longitude with {DECIMALS_MIN} decimals or more",
             )
         )

@@ -10,12 +10,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import shapely
+from shapely import MultiPolygon
+
+from companion.maps.local import polygons_of
 from companion.maps.model import MapCells, MapFile, map_error
-from companion.maps.plain_zones import plain_zones
+from companion.maps.plain_zones import outline_of_rates, plain_zones
 from companion.maps.rasterise import cells_of, north_up
 
 # Where the operator does not say: narrower than any section of a boom.
 CELL_M = 1.0
+# To which all formats round at most: a tenth of a millimetre on the ground.
+DEGREE_STEP = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,40 +54,51 @@ def keeps_cells(map_file: MapFile, wish: Wish) -> bool:
 def _shapefile(map_file: MapFile, path: Path, _: Wish) -> None:
     from companion.maps.write_shapefile import write_shapefile
 
-    bare = path.suffix.casefold() == ".shp"
-    zones = plain_zones(map_file, clip=bare)
-    write_shapefile(zones, path, boundary=None if bare else map_file.boundary)
+    # Beside the zones a zip has the boundary too, but few programs heed it.
+    write_shapefile(plain_zones(map_file, clip=True), path, boundary=_boundary(map_file))
 
 
 def _geojson(map_file: MapFile, path: Path, _: Wish) -> None:
     from companion.maps.write_geojson import write_geojson
 
-    write_geojson(plain_zones(map_file, clip=False), path, boundary=map_file.boundary)
+    write_geojson(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
 
 
 def _geopackage(map_file: MapFile, path: Path, _: Wish) -> None:
     from companion.maps.write_geopackage import write_geopackage
 
-    write_geopackage(plain_zones(map_file, clip=False), path, boundary=map_file.boundary)
+    write_geopackage(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
 
 
 def _kml(map_file: MapFile, path: Path, _: Wish) -> None:
     from companion.maps.write_kml import write_kml
 
-    write_kml(plain_zones(map_file, clip=False), path, boundary=map_file.boundary)
+    write_kml(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
 
 
 def _isoxml(map_file: MapFile, path: Path, wish: Wish) -> None:
     from companion.maps.write_isoxml import write_isoxml
 
+    written = map_file
     if wish.cell_m is not None:
-        cells = _cells(map_file, wish, clip=False)
-        map_file = replace(map_file, zones=(), cells=cells)
+        written = replace(map_file, zones=(), cells=_cells(map_file, wish, clip=False))
     elif map_file.cells is not None and not keeps_cells(map_file, wish):
-        # The field and its default stay what they are, so zones need not stand for them.
-        plain = replace(map_file, boundary=None)
-        map_file = replace(map_file, zones=tuple(plain_zones(plain, clip=False)), cells=None)
-    write_isoxml(map_file, path)
+        # The field and its default stay what they are, so no zone need stand for them.
+        bare = replace(map_file, boundary=None)
+        written = replace(map_file, zones=tuple(plain_zones(bare, clip=False)), cells=None)
+    # A task wants a field: without one, the ground of all zones.
+    boundary = map_file.boundary or outline_of_rates(map_file)
+    write_isoxml(replace(written, boundary=_sound(boundary)), path)
+
+
+def _boundary(map_file: MapFile) -> MultiPolygon | None:
+    return None if map_file.boundary is None else _sound(map_file.boundary)
+
+
+def _sound(boundary: MultiPolygon) -> MultiPolygon:
+    """Return a boundary whose rings still do not cross when its degrees are rounded in a file."""
+    snapped = shapely.set_precision(boundary, DEGREE_STEP)
+    return MultiPolygon(polygons_of(snapped)) if polygons_of(snapped) else boundary
 
 
 def _geotiff(map_file: MapFile, path: Path, wish: Wish) -> None:
@@ -93,7 +110,8 @@ def _geotiff(map_file: MapFile, path: Path, wish: Wish) -> None:
 def _dji(map_file: MapFile, path: Path, wish: Wish) -> None:
     from companion.maps.write_geotiff import write_dji
 
-    write_dji(_cells(map_file, wish, clip=False), path, map_file.boundary)
+    cells = _cells(map_file, wish, clip=False)
+    write_dji(cells, path, map_file.boundary or outline_of_rates(map_file))
 
 
 def _cells(map_file: MapFile, wish: Wish, *, clip: bool) -> MapCells:

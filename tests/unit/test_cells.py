@@ -222,6 +222,25 @@ def test_an_offset_moves_the_cells() -> None:
     )
 
 
+def test_the_boundary_and_the_default_of_the_map_itself_hold() -> None:
+    rates = np.array([[10.0, np.nan, 30.0]])
+    plain = map_of(rates, (1e-4, 0.0, 114.5, 0.0, -1e-4, 36.0))
+    left_two = shapely.MultiPolygon([shapely.box(114.5, 35.9999, 114.5002, 36.0)])
+    own = replace(plain, boundary=left_two, default_rate_l_ha=5.0)
+    frame = frame_for(plain)
+    places = frame.to_local_all([35.99995] * 3, [114.50005, 114.50015, 114.50025])
+
+    def found(map_file: MapFile) -> list[float]:
+        return build_prescription(map_file, frame).rates_at(*places).tolist()
+
+    assert found(plain) == pytest.approx([10.0, math.nan, 30.0], nan_ok=True)
+    assert found(own) == pytest.approx([10.0, 5.0, math.nan], nan_ok=True)
+    without_boundary = replace(plain, default_rate_l_ha=5.0)
+    assert found(without_boundary) == pytest.approx([10.0, math.nan, 30.0], nan_ok=True)
+    given = build_prescription(own, frame, default_rate_l_ha=7.0).rates_at(*places).tolist()
+    assert given == pytest.approx([10.0, 7.0, math.nan], nan_ok=True)
+
+
 def test_cells_too_fine_or_nowhere_are_refused() -> None:
     fine = map_of(np.array([[1.0]]), (1e-9, 0.0, 114.5, 0.0, -1e-9, 36.0))
     with pytest.raises(MapError) as caught:

@@ -13,6 +13,8 @@ import shapely
 from shapely import box
 
 from companion.errors import MapError
+from companion.maps import geojson, layer
+from companion.maps.geojson import read_geojson
 from companion.maps.registry import read_area, read_map
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001
@@ -86,28 +88,38 @@ def test_the_old_crs_member_may_be_projected(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("crs", [7, {}, old_crs("EPSG:0"), {"type": "link", "properties": {}}])
 def test_a_crs_member_that_names_nothing_is_refused(tmp_path: Path, crs: object) -> None:
-    with pytest.raises(MapError, match="crs member"):
+    with pytest.raises(MapError, match="crs member") as caught:
         read_map(saved(tmp_path, collection(feature(), crs=crs)))
+    assert caught.value.code == "wrong-crs"
+
+
+def test_a_crs_member_of_null_says_that_the_crs_is_unknown(tmp_path: Path) -> None:
+    path = saved(tmp_path, collection(feature(), crs=None))
+    assert read_geojson(path).crs is None
+    assert read_map(path, crs="EPSG:4326").crs == "EPSG:4326"
 
 
 def test_latitude_first_is_refused_where_it_shows(tmp_path: Path) -> None:
     ring = [[36.0, 114.5], [36.0, 114.6], [36.1, 114.6], [36.0, 114.5]]
-    with pytest.raises(MapError, match="look exchanged"):
+    with pytest.raises(MapError, match="look exchanged") as caught:
         read_map(saved(tmp_path, collection(feature(1, ring))))
+    assert caught.value.code == "swapped-axes"
 
 
 def test_metres_without_a_crs_are_refused(tmp_path: Path) -> None:
     ring = [[500000, 5330000], [500100, 5330000], [500100, 5330100], [500000, 5330000]]
     path = saved(tmp_path, collection(feature(1, ring)))
-    with pytest.raises(MapError, match="look like metres: give their CRS with --crs"):
+    with pytest.raises(MapError, match="look like metres: give their CRS with --crs") as caught:
         read_map(path)
+    assert caught.value.code == "wrong-crs"
     assert read_map(path, crs="EPSG:32633").crs == "EPSG:32633"
 
 
 def test_a_map_over_half_a_country_is_refused(tmp_path: Path) -> None:
     far = [[x + 5.0, y] for x, y in SQUARE]
-    with pytest.raises(MapError, match="reaches over"):
+    with pytest.raises(MapError, match="reaches over") as caught:
         read_map(saved(tmp_path, collection(feature(), feature(1, far))))
+    assert caught.value.code == "out-of-range"
 
 
 def test_zones_are_named_by_the_column_that_tells_them_apart(tmp_path: Path) -> None:
@@ -172,8 +184,9 @@ def test_nonsense_is_refused_in_one_line(tmp_path: Path, document: object) -> No
 
 
 def test_a_layer_of_geojson_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match="no layers"):
+    with pytest.raises(MapError, match="no layers") as caught:
         read_map(saved(tmp_path, collection(feature())), layer="x")
+    assert caught.value.code == "no-layer"
 
 
 def test_a_bare_geometry_is_a_boundary(tmp_path: Path) -> None:
@@ -228,3 +241,93 @@ def test_a_line_break_in_the_path_stays_out_of_the_message(tmp_path: Path) -> No
     with pytest.raises(MapError) as caught:
         read_map(tmp_path / "a\nb.geojson")
     assert "\n" not in str(caught.value)
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(MapError) as caught:
+        read_geojson(path)
+    assert "\n" not in str(caught.value)
+    return caught.value.code
+
+
+@pytest.mark.parametrize(
+    ("document", "code"),
+    [
+        ('{"type": "FeatureCollection", "features": [', "truncated"),
+        ("", "truncated"),
+        ("[]", "unknown-format"),
+        ({"type": "Topology"}, "unknown-format"),
+        (collection(feature(1, SQUARE[:2])), "broken-geometry"),
+        (collection(feature(1, [[1, 2, 3], [1, "2"], [1, 2], [1, 2]])), "broken-geometry"),
+        (collection(feature(1, [[1], [2], [3], [4]])), "broken-geometry"),
+        (collection(feature(1, [[[1, 2]] * 4])), "broken-geometry"),
+        (collection(feature(1, [[1e300, 2]] * 4)), "broken-geometry"),
+    ],
+)
+def test_every_refusal_has_its_code(tmp_path: Path, document: object, code: str) -> None:
+    assert refused(saved(tmp_path, document)) == code
+
+
+def test_positions_of_which_only_some_have_a_height_are_read(tmp_path: Path) -> None:
+    ring = [[*SQUARE[0], 3.0], *SQUARE[1:]]
+    plain = read_geojson(saved(tmp_path, collection(feature(1)))).geometries
+    assert read_geojson(saved(tmp_path, collection(feature(1, ring)))).geometries == plain
+
+
+def test_a_member_that_is_there_twice_is_refused(tmp_path: Path) -> None:
+    text = json.dumps(collection(feature(10))).replace('"dose": 10', '"dose": 10, "dose": 20')
+    assert refused(saved(tmp_path, text)) == "duplicate-member"
+
+
+def test_text_that_is_not_in_utf_8_is_refused(tmp_path: Path) -> None:
+    path = saved(tmp_path, collection(feature()))
+    path.write_bytes(path.read_bytes().replace(b"L/ha", b"L/h\xe4"))
+    assert refused(path) == "encoding"
+
+
+def test_half_a_letter_becomes_a_mark_that_can_be_written(tmp_path: Path) -> None:
+    (column, *_) = read_geojson(
+        saved(tmp_path, '{"type": "Feature", "properties": {"a\\ud800": "b\\udfff"}}')
+    ).columns
+    assert (column.name, column.values) == ("a?", ("b?",))
+
+
+@pytest.mark.parametrize(
+    ("name", "most", "text"),
+    [("MAX_VERTICES", 12, "vertices"), ("MAX_RECORDS", 1, "records")],
+)
+def test_a_file_of_too_many_things_is_refused_before_it_is_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, most: int, text: str
+) -> None:
+    path = saved(tmp_path, collection(feature(), feature()))
+    monkeypatch.setattr(layer, name, most + 1)
+    assert read_geojson(path)
+    monkeypatch.setattr(layer, name, most)
+    monkeypatch.setattr(geojson.json, "loads", lambda *_, **__: pytest.fail("it was parsed"))
+    with pytest.raises(MapError, match=f"{text} are more than {most}"):
+        read_geojson(path)
+
+
+def test_more_properties_than_any_map_has_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    many = {f"p{index}": index for index in range(254)}
+    assert len(read_geojson(saved(tmp_path, collection(feature(1, SQUARE)))).columns) == 2
+    assert refused(saved(tmp_path, collection(feature(1, SQUARE, **many)))) == "too-large"
+    monkeypatch.setattr(geojson, "_CELLS_MAX", 3)
+    assert refused(saved(tmp_path, collection(feature(), feature()))) == "too-large"
+
+
+def test_the_outline_beside_the_features_is_the_boundary(tmp_path: Path) -> None:
+    outline = {"type": "Polygon", "coordinates": [SQUARE]}
+    found = read_geojson(saved(tmp_path, collection(feature(), boundary=outline)))
+    assert found.boundary is not None
+    assert found.boundary.equals(shapely.Polygon(SQUARE))
+    assert len(found.geometries) == 1
+    for other in (7, {}, {"type": "Point", "coordinates": [1, 2]}, None):
+        assert read_geojson(saved(tmp_path, collection(feature(), boundary=other))).boundary is None
+    broken = {"type": "Polygon", "coordinates": [SQUARE[:2]]}
+    assert refused(saved(tmp_path, collection(feature(), boundary=broken))) == "broken-geometry"
+    bow = [SQUARE[0], SQUARE[2], SQUARE[1], [WEST, SOUTH + CELL], SQUARE[0]]
+    crossed = {"type": "Polygon", "coordinates": [bow]}
+    assert refused(saved(tmp_path, collection(feature(), boundary=crossed))) == "broken-geometry"

@@ -26,7 +26,7 @@ def check_map(
     Overlaps are an error only where the overlap policy refuses them.
     """
     plan = plan or Plan()
-    return _checked(_surveyed(map_file, plan), overlap, plan)
+    return _checked(Survey(map_file, boundary=plan.boundary), overlap, plan)
 
 
 def summary(
@@ -42,7 +42,7 @@ def summary(
     frame; `litres` is area times rate, likewise.
     """
     plan = plan or Plan()
-    survey = _surveyed(map_file, plan)
+    survey = Survey(map_file, boundary=plan.boundary)
     problems = _worst_first([*_checked(survey, overlap, plan), *_placed(survey, more)])
     rates, area_m2 = survey.rates[survey.rated], survey.area_m2[survey.rated]
     parts = shapely.get_parts(np.array([zone.geometry for zone in map_file.zones], dtype=object))
@@ -64,9 +64,7 @@ def summary(
         "no_rate_ha": survey.hectares(~survey.rated) if map_file.cells is None else None,
         "boundary_ha": None if survey.boundary is None else survey.boundary.area / 10_000.0,
         "boundary_from": _boundary_from(map_file, plan),
-        "default_rate_l_ha": map_file.default_rate_l_ha
-        if plan.default_rate_l_ha is None
-        else plan.default_rate_l_ha,
+        "default_rate_l_ha": _default(survey, plan),
         "litres": litres,
         "mean_rate_l_ha": 10_000.0 * litres / total_m2 if total_m2 > 0.0 else None,
         "rates_l_ha": list(map_file.rates_l_ha),
@@ -85,30 +83,33 @@ def summary(
     }
 
 
-def _surveyed(map_file: MapFile, plan: Plan) -> Survey:
-    try:
-        return Survey(map_file, boundary=plan.boundary)
-    except ShapelyError as error:
-        raise _unusable(map_file, error) from None
-
-
 def _checked(survey: Survey, overlap: str, plan: Plan) -> tuple[Problem, ...]:
     """Return all problems; overlaps are looked for first, they refuse what none could join."""
     try:
         overlapping = overlap_problems(survey, overlap)
-        return _worst_first(
-            [
-                *_placed(survey, survey.map_file.problems),
-                *place_problems(survey, plan.homes),
-                *rate_problems(survey, plan.default_rate_l_ha),
-                *ground_problems(survey, plan.default_rate_l_ha),
-                *overlapping,
-                *shape_problems(survey),
-                *short_problems(survey, plan.sprayer),
-            ]
-        )
+        default = _default(survey, plan)
+        found = [
+            *place_problems(survey, plan.homes),
+            *rate_problems(survey, default),
+            *ground_problems(survey, default),
+            *overlapping,
+            *shape_problems(survey),
+            *short_problems(survey, plan.sprayer),
+        ]
     except ShapelyError as error:
         raise _unusable(survey.map_file, error) from None
+    read = survey.map_file.problems
+    if plan.boundary is None and any(problem.code == "grid-outside-field" for problem in read):
+        said = ("far-from-field", "outside-boundary")
+        found = [problem for problem in found if problem.code not in said]
+    return _worst_first([*_placed(survey, read), *found])
+
+
+def _default(survey: Survey, plan: Plan) -> float | None:
+    """Return the rate inside the boundary where there is no zone, as the flight takes it."""
+    if plan.default_rate_l_ha is not None or survey.map_file.boundary is None:
+        return plan.default_rate_l_ha
+    return survey.map_file.default_rate_l_ha
 
 
 def _worst_first(problems: Sequence[Problem]) -> tuple[Problem, ...]:

@@ -105,6 +105,7 @@ def ground_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Pro
     problems = []
     if empty_m2 >= least_m2:
         then = "the valves close there"
+        nowhere = "in no zone" if survey.cells is None else "in no cell with a rate"
         if default_rate_l_ha is not None:
             litres = default_rate_l_ha * empty_m2 / 10_000.0
             then = f"the default rate of {default_rate_l_ha:g} L/ha falls there, {litres:.1f} L"
@@ -113,9 +114,9 @@ def ground_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Pro
                 severity="warning",
                 code="uncovered",
                 text=f"{area_text(empty_m2)} inside the field's boundary "
-                f"({boundary.area / 10_000:.3f} ha) in no zone; {then}",
+                f"({boundary.area / 10_000:.3f} ha) {nowhere}; {then}",
                 where=empty_where,
-                fix="draw the zones up to the boundary, or check that it is of the same field",
+                fix="draw the map up to the boundary, or check that both are of the same field",
             )
         )
     if outside_m2 >= least_m2:

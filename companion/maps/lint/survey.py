@@ -40,17 +40,13 @@ class Survey:
         self.map_file = map_file
         self.frame = frame_for(map_file)
         self.boundary_deg = map_file.boundary if boundary is None else boundary
-        self.local: Objects = np.empty(0, dtype=object)
         if map_file.cells is None:
-            self.local = _valid(project_all(_geometries(map_file.zones), self.frame))
             self.rates: Floats = np.array(
                 [np.nan if zone.rate_l_ha is None else zone.rate_l_ha for zone in map_file.zones],
                 dtype=np.float64,
             )
-            self.area_m2: Floats = shapely.area(self.local)
         else:
             self.rates = map_file.cells.rates_l_ha
-            self.area_m2 = cell_areas_m2(map_file.cells, self.frame)
 
     @property
     def zones(self) -> tuple[MapZone, ...]:
@@ -61,6 +57,19 @@ class Survey:
     def cells(self) -> MapCells | None:
         """Return the cells of the map, if it is made of them."""
         return self.map_file.cells
+
+    @cached_property
+    def local(self) -> Objects:
+        """Return the ground of every zone in metres; none for a map of cells."""
+        return _valid(project_all(_geometries(self.zones), self.frame))
+
+    @cached_property
+    def area_m2(self) -> Floats:
+        """Return the area of every zone or cell."""
+        if self.cells is not None:
+            return cell_areas_m2(self.cells, self.frame)
+        found: Floats = shapely.area(self.local)
+        return found
 
     @cached_property
     def rated(self) -> Bools:
@@ -156,10 +165,10 @@ class Survey:
     def zone_spots(self, which: Iterable[int]) -> str:
         """Return the names of the first few of these zones, each with a place in it."""
         indices = list(which)
-        named = [
-            f"{self.zone_name(index)} at {self.spot(self.local[index])}"
-            for index in indices[:PLACES_MAX]
-        ]
+        named = []
+        for index in indices[:PLACES_MAX]:
+            point = shapely.point_on_surface(self.zones[index].geometry)
+            named.append(f"{self.zone_name(index)} at {latitude_longitude(point.y, point.x)}")
         return some(named, len(indices))
 
     def cell_spots(self, which: Bools) -> str:

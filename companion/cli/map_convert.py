@@ -1,0 +1,244 @@
+"""`vrspray map convert` and `vrspray map show`: a map in another format, and as a picture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
+from companion.cli.map_options import File, Reading, reading_options
+from companion.errors import MapError
+from companion.maps.compare import Comparison, compare
+from companion.maps.model import MapFile, MapZone, map_error
+from companion.maps.registry import read_map
+from companion.maps.totals import as_sprayed, totals
+from companion.maps.write_formats import Wish, keeps_cells
+from companion.maps.writers import write_map, writer_for
+
+# What a conversion may change of a rate; files hold three decimals or more.
+CHANGE_MAX_L_HA = 0.01
+NOT_PRESERVED = "not-preserved"
+_OVERLAPS = ("max", "min", "mean", "last")
+
+_Out = Annotated[Path, typer.Argument(metavar="OUT", help="File to write; its suffix counts.")]
+_Format = Annotated[
+    str | None,
+    typer.Option("--format", metavar="F", help="Where the suffix leaves it open, as for .zip."),
+]
+_CellM = Annotated[
+    float | None, typer.Option("--cell-m", metavar="M", help="Width of cells, 1 unless given.")
+]
+_Overlap = Annotated[
+    str | None,
+    typer.Option("--overlap", metavar="P", help="For cells: max, min, mean or last zone holds."),
+]
+_Round = Annotated[
+    float | None, typer.Option("--round", metavar="L_HA", help="Round rates to multiples of it.")
+]
+_Force = Annotated[bool, typer.Option("--force", help="Replace files that are there.")]
+_Picture = Annotated[Path, typer.Option("--out", metavar="PNG", help="Or .svg or .pdf.")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Checked:
+    """The written file, read back, and how it compares with its source."""
+
+    written: MapFile
+    comparison: Comparison
+
+
+@reading_options
+def convert(
+    file: File,
+    out: _Out,
+    reading: Reading,
+    format_name: _Format = None,
+    cell_m: _CellM = None,
+    overlap: _Overlap = None,
+    round_l_ha: _Round = None,
+    force: _Force = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a map in another format, read it back and compare both at 1000 places.
+
+    Exit 1, and nothing written, where a rate would change by more than 0.01 L/ha. A text map in
+    L/min is for the width and speed of --flow-width-m and --flow-speed-m-s.
+    """
+    if overlap is not None and overlap not in _OVERLAPS:
+        raise typer.BadParameter(f"--overlap is one of {', '.join(_OVERLAPS)}, not {overlap!r}")
+    writer = writer_for(out, format_name)
+    source = reading.read(file)
+    if round_l_ha is not None:
+        source = _rounded(source, round_l_ha)
+    wish = Wish(
+        cell_m=cell_m,
+        flow_width_m=_flow(reading, "flow_width_m"),
+        flow_speed_m_s=_flow(reading, "flow_speed_m_s"),
+        overlap=overlap or reading.overlap,
+    )
+    checked: list[_Checked] = []
+    try:
+        files = write_map(
+            source,
+            out,
+            format=writer.name,
+            cell_m=cell_m,
+            flow_width_m=wish.flow_width_m,
+            flow_speed_m_s=wish.flow_speed_m_s,
+            overlap=wish.overlap,
+            force=force,
+            check=lambda made: checked.append(_check(source, made, writer.name, wish)),
+        )
+    except MapError as error:
+        if error.code != NOT_PRESERVED:
+            raise
+        answer({"ok": False, "error": str(error), "code": error.code}, [], as_json=as_json)
+        note(f"error: {error}")
+        raise typer.Exit(1) from None
+    result = _result(file, out, files, writer.name, source, checked[0])
+    for problem in result["problems"]:
+        note(problem_line(problem))
+    answer(result, _lines(result), as_json=as_json)
+
+
+def _flow(reading: Reading, name: str) -> float | None:
+    """Return width or speed for rates in L/min: of the command line, else of the configuration."""
+    given: float | None = getattr(reading, name)
+    if given is None and reading.config is not None and reading.config.prescription is not None:
+        given = getattr(reading.config.prescription, name, None)
+    return given
+
+
+def _rounded(map_file: MapFile, step_l_ha: float) -> MapFile:
+    """Return the map with rates that are multiples of the step."""
+    if not 1e-6 <= step_l_ha <= 1000.0:
+        raise typer.BadParameter(f"--round takes 0.000001 to 1000 L/ha, not {step_l_ha:g}")
+    if map_file.cells is not None:
+        rates = np.round(np.rint(map_file.cells.rates_l_ha / step_l_ha) * step_l_ha, 9)
+        return replace(map_file, cells=replace(map_file.cells, rates_l_ha=rates))
+
+    def rounded(zone: MapZone) -> MapZone:
+        if zone.rate_l_ha is None:
+            return zone
+        return replace(zone, rate_l_ha=round(round(zone.rate_l_ha / step_l_ha) * step_l_ha, 9))
+
+    return replace(map_file, zones=tuple(rounded(zone) for zone in map_file.zones))
+
+
+def _check(source: MapFile, made: Path, format_name: str, wish: Wish) -> _Checked:
+    """Return what was written, read back, or refuse it."""
+    try:
+        written = read_map(
+            made,
+            unit="L/ha" if format_name == "dji" else None,
+            flow_width_m=wish.flow_width_m if format_name == "text-map" else None,
+            flow_speed_m_s=wish.flow_speed_m_s if format_name == "text-map" else None,
+        )
+    except MapError as error:
+        raise map_error(
+            made,
+            f"what was written does not read back ({str(error)[:200]})",
+            fix="nothing is kept; take another format",
+            code=NOT_PRESERVED,
+        ) from None
+    cells = written.cells is not None
+    clipped = format_name == "geotiff" and source.boundary is not None
+    found = compare(
+        source,
+        written,
+        overlaps=(wish.overlap,) if cells else ("min", "max", "last"),
+        same_cells=format_name != "text-map" and keeps_cells(source, wish) and not clipped,
+        zero_is_none=format_name == "isoxml" and cells,
+    )
+    if found.lost or not found.change_l_ha <= CHANGE_MAX_L_HA:
+        what = (
+            f"{found.lost} of {found.points} places have a rate in one file and none in the other"
+            if found.lost
+            else f"a rate would change by {found.change_l_ha:.3g} L/ha"
+        )
+        latitude, longitude = found.worst or (0.0, 0.0)
+        raise map_error(
+            made,
+            f"{what} (at {latitude:.7f}, {longitude:.7f})",
+            fix="nothing is kept; take smaller cells or another format",
+            code=NOT_PRESERVED,
+        )
+    return _Checked(written=written, comparison=found)
+
+
+def _result(
+    file: Path, out: Path, files: list[Path], format_name: str, source: MapFile, checked: _Checked
+) -> dict[str, Any]:
+    written = checked.written
+    after, before = totals(as_sprayed(written)), totals(as_sprayed(source))
+    shape = None if written.cells is None else written.cells.rates_l_ha.shape
+    return {
+        "ok": True,
+        "in": str(file),
+        "out": str(out),
+        "files": [str(one) for one in files],
+        "format": format_name,
+        "zones": len(written.zones),
+        "rows": None if shape is None else shape[0],
+        "columns": None if shape is None else shape[1],
+        "area_ha": after.area_ha,
+        "litres": after.all_litres,
+        "source_area_ha": before.area_ha,
+        "source_litres": before.all_litres,
+        "boundary": written.boundary is not None,
+        "points_compared": checked.comparison.points,
+        "max_rate_change_l_ha": checked.comparison.change_l_ha,
+        "problems": [problem_object(problem) for problem in source.problems],
+    }
+
+
+def _lines(result: dict[str, Any]) -> list[str]:
+    ground = (
+        f"{result['zones']} zones"
+        if result["rows"] is None
+        else f"{result['rows']} x {result['columns']} cells"
+    )
+    compared = (
+        f"largest difference at {result['points_compared']} places: "
+        f"{result['max_rate_change_l_ha']:.3g} L/ha"
+        if result["points_compared"]
+        else "no place is far enough from an edge to compare"
+    )
+    return [
+        f"{result['out']}: {result['format']}, {ground}, {result['area_ha']:.4f} ha, "
+        f"{result['litres']:.1f} L",
+        f"source: {result['source_area_ha']:.4f} ha, {result['source_litres']:.1f} L",
+        compared,
+        *(f"also written: {name}" for name in result["files"] if name != result["out"]),
+    ]
+
+
+@reading_options
+def show(file: File, reading: Reading, out: _Picture, as_json: AsJson = False) -> None:
+    """Draw a map: its rates with a legend, north and a scale."""
+    from companion.maps.picture import draw
+
+    source = reading.read(file)
+    drawn = draw(source, out, title=file.name)
+    result: dict[str, Any] = {
+        "in": str(file),
+        "out": str(out),
+        "rates_l_ha": drawn.rates_l_ha.tolist(),
+        "area_ha": drawn.area_ha,
+        "litres": drawn.all_litres,
+        "problems": [problem_object(problem) for problem in source.problems],
+    }
+    for problem in result["problems"]:
+        note(problem_line(problem))
+    answer(
+        result,
+        [
+            f"{out}: {len(drawn.rates_l_ha)} rates on {drawn.area_ha:.4f} ha, "
+            f"{drawn.all_litres:.1f} L"
+        ],
+        as_json=as_json,
+    )

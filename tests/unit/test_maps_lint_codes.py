@@ -1,0 +1,65 @@
+"""Every code that a problem of a map can have is explained in docs/map-check.md."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = [
+    *sorted((ROOT / "companion" / "maps").rglob("*.py")),
+    *sorted((ROOT / "companion" / "cli").glob("map*.py")),
+    ROOT / "companion" / "assembly.py",
+    ROOT / "companion" / "errors.py",
+]
+CODE = re.compile(r"[a-z]+(-[a-z0-9]+)*")
+# `not-a-polygon:Point` is the code and what was found instead.
+WITH_HYPHEN = re.compile(r"([a-z]+(?:-[a-z0-9]+)+)(?::.*)?")
+# Words with a hyphen that are no codes: encodings of text and names of formats.
+NO_CODES = re.compile(r"(utf|euc|windows|latin|iso|cp|shift)-.*|text-map|normally-.*|look-ahead")
+
+
+def codes_in(source: str) -> set[str]:
+    """Return what is given as `code`, and every other string that looks like one."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.keyword) and node.arg == "code":
+            texts = [one.value for one in ast.walk(node.value) if isinstance(one, ast.Constant)]
+            found |= {text for text in texts if isinstance(text, str) and CODE.fullmatch(text)}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            match = WITH_HYPHEN.fullmatch(node.value)
+            if match and not NO_CODES.fullmatch(match[1]):
+                found.add(match[1])
+    return found
+
+
+def documented() -> dict[str, list[str]]:
+    """Return the cells of the row of every code."""
+    rows: dict[str, list[str]] = {}
+    for line in (ROOT / "docs" / "map-check.md").read_text(encoding="utf-8").splitlines():
+        columns = [column.strip() for column in line.strip("| ").split(" | ")]
+        if line.startswith("| `") and len(columns) == 5:
+            for code in re.findall(r"`([a-z0-9-]+)`", columns[0]):
+                assert code not in rows, f"{code} is explained twice"
+                rows[code] = columns
+    return rows
+
+
+def test_codes_are_found_however_they_are_given() -> None:
+    source = (
+        'f(code="a-b"); g("c-d" if x else "e"); h[1] = "not-it:Point"; k(code="gap" if y else z)'
+    )
+    assert codes_in(source) == {"a-b", "c-d", "not-it", "gap"}
+
+
+def test_every_code_is_explained_with_meaning_example_and_fix() -> None:
+    used = {code: path.name for path in SOURCES for code in codes_in(path.read_text("utf-8"))}
+    assert len(used) > 50
+    assert {code: name for code, name in used.items() if code not in documented()} == {}
+
+
+def test_nothing_is_explained_that_no_longer_exists() -> None:
+    text = "".join(path.read_text(encoding="utf-8") for path in SOURCES)
+    assert [code for code in documented() if f'"{code}' not in text] == []
+    assert all(all(columns[:1] + columns[2:3]) for columns in documented().values())
