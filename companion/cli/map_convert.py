@@ -13,7 +13,7 @@ from companion.cli.answer import AsJson, answer, note, problem_line, problem_obj
 from companion.cli.map_options import File, Reading, reading_options
 from companion.errors import MapError
 from companion.maps.compare import Comparison, compare
-from companion.maps.model import MapFile, MapZone, map_error
+from companion.maps.model import MapFile, map_error
 from companion.maps.registry import read_map
 from companion.maps.totals import as_sprayed, totals
 from companion.maps.write_formats import Wish, keeps_cells
@@ -117,16 +117,20 @@ def _rounded(map_file: MapFile, step_l_ha: float) -> MapFile:
     """Return the map with rates that are multiples of the step."""
     if not 1e-6 <= step_l_ha <= 1000.0:
         raise typer.BadParameter(f"--round takes 0.000001 to 1000 L/ha, not {step_l_ha:g}")
-    if map_file.cells is not None:
-        rates = np.round(np.rint(map_file.cells.rates_l_ha / step_l_ha) * step_l_ha, 9)
-        return replace(map_file, cells=replace(map_file.cells, rates_l_ha=rates))
 
-    def rounded(zone: MapZone) -> MapZone:
-        if zone.rate_l_ha is None:
-            return zone
-        return replace(zone, rate_l_ha=round(round(zone.rate_l_ha / step_l_ha) * step_l_ha, 9))
+    def rounded(rate_l_ha: float | None) -> float | None:
+        return None if rate_l_ha is None else round(round(rate_l_ha / step_l_ha) * step_l_ha, 9)
 
-    return replace(map_file, zones=tuple(rounded(zone) for zone in map_file.zones))
+    cells = map_file.cells
+    if cells is not None:
+        rates = np.round(np.rint(cells.rates_l_ha / step_l_ha) * step_l_ha, 9)
+        cells = replace(cells, rates_l_ha=rates)
+    return replace(
+        map_file,
+        cells=cells,
+        zones=tuple(replace(zone, rate_l_ha=rounded(zone.rate_l_ha)) for zone in map_file.zones),
+        default_rate_l_ha=rounded(map_file.default_rate_l_ha),
+    )
 
 
 def _check(source: MapFile, made: Path, format_name: str, wish: Wish) -> _Checked:

@@ -21,6 +21,7 @@ from companion.maps.crs import parse_crs
 from companion.maps.geotiff_bands import RawBand, ReadBand, read_band
 from companion.maps.model import Affine, map_error
 from companion.maps.tiff_tags import check_tags
+from companion.maps.xmltree import parse_xml
 
 MAX_CELLS = 16_000_000
 MAX_BANDS = 64
@@ -102,7 +103,9 @@ def _opened(content: bytes, path: Path, layer: str | None) -> Iterator[Any]:
          MemoryError, KeyError, AttributeError,
     )  # fmt: skip
     try:
-        check_tags(content)
+        for description in check_tags(content):
+            # GDAL does without one that it cannot read, and so without the scale of the rates.
+            parse_xml(description, path, name="its description of the bands")
         with warnings.catch_warnings(), rasterio.Env(**_OPTIONS):
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
             with rasterio.io.MemoryFile(content) as memory, memory.open(driver="GTiff") as source:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
+from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
 from companion.maps.build import frame_for
@@ -75,6 +76,21 @@ def draw(map_file: MapFile, out: Path, *, title: str) -> Totals:
         raise map_error(
             map_file.path, "there is nothing to draw", fix="name another file", code="no-polygon"
         )
+    try:
+        content, found = _drawn(map_file, title, suffix)
+    except ShapelyError as error:
+        raise map_error(
+            map_file.path,
+            f"its polygons cannot be used ({str(error)[:120]})",
+            fix="repair the map where it is made",
+            code="broken-geometry",
+        ) from None
+    write_whole(out, content)
+    return found
+
+
+def _drawn(map_file: MapFile, title: str, suffix: str) -> tuple[bytes, Totals]:
+    """Return the picture's bytes, and the ground of each rate."""
     from matplotlib import rc_context
 
     sprayed = as_sprayed(map_file)
@@ -84,8 +100,7 @@ def draw(map_file: MapFile, out: Path, *, title: str) -> Totals:
         figure = _figure(sprayed, frame, found, title)
         content = BytesIO()
         figure.savefig(content, format=suffix[1:], dpi=DPI, metadata=_METADATA[suffix])
-    write_whole(out, content.getvalue())
-    return found
+    return content.getvalue(), found
 
 
 def _figure(map_file: MapFile, frame: LocalFrame, found: Totals, title: str) -> Figure:

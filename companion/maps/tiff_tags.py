@@ -14,26 +14,35 @@ _SIZES = {
     17: 8, 18: 8,
 }  # fmt: skip
 _ASCII = 2
+# Scale, offset, unit and name of each band (GDAL, GTiff driver).
+_GDAL_METADATA = 42112
 _MAX_DIRECTORIES = 10_000
 
 
-def check_tags(content: bytes) -> None:
-    """Raise `ValueError` for a directory or a tag that does not lie inside the file."""
+def check_tags(content: bytes) -> list[bytes]:
+    """Return GDAL's own descriptions (XML) in the file.
+
+    Raises `ValueError` for a directory or a tag that does not lie inside the file.
+    """
     order = "<" if content[:2] == b"II" else ">"
     big = content[2:4] in (b"+\0", b"\0+")
     seen: set[int] = set()
+    descriptions: list[bytes] = []
     try:
         at = struct.unpack_from(f"{order}Q" if big else f"{order}I", content, 8 if big else 4)[0]
         while at:
             if at in seen or len(seen) >= _MAX_DIRECTORIES:
                 raise ValueError("its directories follow each other without end")
             seen.add(at)
-            at = _check_directory(content, at, order, big=big)
+            at = _check_directory(content, at, order, descriptions, big=big)
     except struct.error:
         raise ValueError("a directory lies beyond its end") from None
+    return descriptions
 
 
-def _check_directory(content: bytes, at: int, order: str, *, big: bool) -> int:
+def _check_directory(
+    content: bytes, at: int, order: str, descriptions: list[bytes], *, big: bool
+) -> int:
     """Return where the next directory is, 0 for none."""
     count_form, entry_form, offset_form = ("Q", "HHQ", "Q") if big else ("H", "HHI", "I")
     count = struct.unpack_from(order + count_form, content, at)[0]
@@ -50,7 +59,10 @@ def _check_directory(content: bytes, at: int, order: str, *, big: bool) -> int:
         start = at if size <= inline else struct.unpack_from(order + offset_form, content, at)[0]
         if start + size > len(content):
             raise ValueError(f"its tag {tag} lies beyond its end")
-        if kind == _ASCII and b"\0" in content[start : start + size].rstrip(b"\0"):
+        text = content[start : start + size].rstrip(b"\0") if kind == _ASCII else b""
+        if b"\0" in text:
             raise ValueError(f"the text of its tag {tag} is damaged")
+        if tag == _GDAL_METADATA:
+            descriptions.append(text)
         at += inline
     return int(struct.unpack_from(order + offset_form, content, at)[0])

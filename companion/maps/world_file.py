@@ -118,7 +118,8 @@ def _shifts_cells(
     x, y = corner(world, at_column, at_row)
     own_x, own_y = corner(own, at_column, at_row)
     a, b, _, d, e, _ = own
-    shift = np.linalg.solve(np.array([[a, b], [d, e]]), np.array([x - own_x, y - own_y]))
+    with np.errstate(all="ignore"):  # cells next to nothing wide: the shift is infinite
+        shift = np.linalg.solve(np.array([[a, b], [d, e]]), np.array([x - own_x, y - own_y]))
     return shift.T
 
 

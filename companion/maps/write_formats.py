@@ -13,6 +13,7 @@ from pathlib import Path
 import shapely
 from shapely import MultiPolygon
 
+from companion.errors import MapError
 from companion.maps.local import polygons_of
 from companion.maps.model import MapCells, MapFile, map_error
 from companion.maps.plain_zones import outline_of_rates, plain_zones
@@ -86,13 +87,21 @@ def _isoxml(map_file: MapFile, path: Path, wish: Wish) -> None:
         # The field and its default stay what they are, so no zone need stand for them.
         bare = replace(map_file, boundary=None)
         written = replace(map_file, zones=tuple(plain_zones(bare, clip=False)), cells=None)
-    # A task wants a field: without one, the ground of all zones.
-    boundary = map_file.boundary or outline_of_rates(map_file)
-    write_isoxml(replace(written, boundary=_sound(boundary)), path)
+    write_isoxml(replace(written, boundary=_field(map_file)), path)
 
 
 def _boundary(map_file: MapFile) -> MultiPolygon | None:
     return None if map_file.boundary is None else _sound(map_file.boundary)
+
+
+def _field(map_file: MapFile) -> MultiPolygon | None:
+    """Return the outline of the field, or where the map has none, of all that has a rate."""
+    if map_file.boundary is not None:
+        return _sound(map_file.boundary)
+    try:
+        return _sound(outline_of_rates(map_file))
+    except MapError:  # cells too speckled for an outline; the format does without
+        return None
 
 
 def _sound(boundary: MultiPolygon) -> MultiPolygon:
@@ -111,7 +120,7 @@ def _dji(map_file: MapFile, path: Path, wish: Wish) -> None:
     from companion.maps.write_geotiff import write_dji
 
     cells = _cells(map_file, wish, clip=False)
-    write_dji(cells, path, map_file.boundary or outline_of_rates(map_file))
+    write_dji(cells, path, _field(map_file))
 
 
 def _cells(map_file: MapFile, wish: Wish, *, clip: bool) -> MapCells:

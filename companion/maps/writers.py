@@ -6,6 +6,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+from shapely.errors import ShapelyError
+
 from companion.errors import MapError
 from companion.maps.model import MapFile, map_error
 from companion.maps.write_formats import WRITERS, Wish, Writer
@@ -49,6 +51,13 @@ def write_map(
                 text = str(error).replace(str(made), str(path))
                 raise MapError(text, code=error.code, fix=error.fix) from None
             return _moved(Path(folder), path, force=force)
+    except ShapelyError as error:
+        raise map_error(
+            map_file.path,
+            f"its polygons cannot be used ({str(error)[:120]})",
+            fix="repair the map where it is made",
+            code="broken-geometry",
+        ) from None
     except OSError as error:
         raise map_error(
             path,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -235,8 +236,10 @@ def test_the_boundary_and_the_default_of_the_map_itself_hold() -> None:
 
     assert found(plain) == pytest.approx([10.0, math.nan, 30.0], nan_ok=True)
     assert found(own) == pytest.approx([10.0, 5.0, math.nan], nan_ok=True)
-    without_boundary = replace(plain, default_rate_l_ha=5.0)
-    assert found(without_boundary) == pytest.approx([10.0, math.nan, 30.0], nan_ok=True)
+    # A default means the field that the map knows, not one that somebody else drew.
+    unbounded = replace(plain, default_rate_l_ha=5.0)
+    drawn = build_prescription(unbounded, frame, boundary=left_two).rates_at(*places).tolist()
+    assert drawn == pytest.approx([10.0, math.nan, math.nan], nan_ok=True)
     given = build_prescription(own, frame, default_rate_l_ha=7.0).rates_at(*places).tolist()
     assert given == pytest.approx([10.0, 7.0, math.nan], nan_ok=True)
 

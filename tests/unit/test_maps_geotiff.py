@@ -488,6 +488,44 @@ def test_a_file_cut_short_is_refused(tmp_path: Path, options: dict[str, Any], ke
     refused("truncated", path)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "code"),
+    [
+        (b"<Item", b"<\xb3tem", "encoding"),
+        (b"</GDALMetadata>", b"</GDALMetadat\0>", "truncated"),
+        (b"</GDALMetadata>", b"</GDALMetadata ", "truncated"),
+    ],
+)
+def test_a_damaged_description_of_the_bands_is_refused(
+    tmp_path: Path, old: bytes, new: bytes, code: str
+) -> None:
+    """GDAL would go on without the scale."""
+    path = write(tmp_path / "rx.tif", scales=((0.5,), (1.0,)))
+    content = path.read_bytes()
+    assert content.count(old) >= 1
+    path.write_bytes(content.replace(old, new))
+    refused(code, path)
+
+
+def test_a_tag_beyond_the_end_is_refused(tmp_path: Path) -> None:
+    """GDAL would go on without the value for no data."""
+    path = write(tmp_path / "rx.tif", nodata=-9999)
+    content = path.read_bytes()
+    at = content.index(struct.pack("<HHI", 42113, 2, 6)) + 8
+    path.write_bytes(content[:at] + struct.pack("<I", len(content)) + content[at + 4 :])
+    assert "42113" in refused("truncated", path)
+
+
+def test_directories_without_end_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "rx.tif"
+    content = bytearray(by_hand([RATES]))
+    first = struct.unpack_from("<I", content, 4)[0]
+    link = first + 2 + 12 * struct.unpack_from("<H", content, first)[0]
+    struct.pack_into("<I", content, link, first)
+    path.write_bytes(content)
+    assert "without end" in refused("truncated", path)
+
+
 def test_several_pictures_in_a_file_need_a_choice(tmp_path: Path) -> None:
     path = tmp_path / "rx.tif"
     path.write_bytes(by_hand([RATES, RATES + 1]))
