@@ -58,7 +58,7 @@ def compare(
         middle_m = max(EDGE_M, 0.05 * min(size_m))
         places.append(centres(source, written.cells, count=count, margin_m=middle_m))
         margin_m = 1.1 * float(np.hypot(*size_m))
-    places.append(sample_places(source, count=count, margin_m=margin_m))
+    places.append(sample_places(source, count=count, margin_m=margin_m, around=written))
     longitude, latitude = (np.concatenate(values) for values in zip(*places, strict=True))
     gap = np.zeros(len(longitude))
     for overlap in overlaps:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -25,12 +27,17 @@ _ROUND = np.outer((0.5, 1.0), np.exp(2j * np.pi * np.arange(8) / 8)).ravel()
 
 
 def sample_places(
-    map_file: MapFile, *, count: int, margin_m: float, seed: int = 1
+    map_file: MapFile,
+    *,
+    count: int,
+    margin_m: float,
+    around: MapFile | None = None,
+    seed: int = 1,
 ) -> tuple[Floats, Floats]:
     """Return longitude and latitude of places away from edges, most of them on ground with a rate.
 
     The same map gives the same places. There are fewer than `count` where little ground is away
-    from edges; every sixth lies anywhere in and around the map, where there may be no rate.
+    from edges; every sixth lies anywhere in this map or in `around`, where there may be no rate.
     """
     random = np.random.default_rng(seed)
     frame = frame_for(map_file)
@@ -41,9 +48,9 @@ def sample_places(
         if map_file.cells is None
         else _on_cells(map_file.cells, frame, drawn, random)
     )
-    around = _box_m(map_file, frame)
+    west, south, right, top = _box_m((map_file, around or map_file), frame)
     every = slice(None, None, _DRAWN_PER_POINT)
-    for values, low, high in ((east, around[0], around[2]), (north, around[1], around[3])):
+    for values, low, high in ((east, west, right), (north, south, top)):
         anywhere = values[every]
         anywhere[:] = random.uniform(low - 2 * margin_m, high + 2 * margin_m, len(anywhere))
     longitude, latitude = to_degrees.transform(east, north)
@@ -110,15 +117,13 @@ def _on_cells(
     return np.asarray(east), np.asarray(north)
 
 
-def _box_m(map_file: MapFile, frame: LocalFrame) -> tuple[float, float, float, float]:
-    if map_file.cells is not None:
-        ground = shapely.box(*bounds_deg(map_file.cells))
-    else:
-        ground = shapely.box(
-            *shapely.total_bounds(np.array([zone.geometry for zone in map_file.zones], object))
-        )
-    west, south, east, north = project_all(np.array([ground], dtype=object), frame)[0].bounds
-    return float(west), float(south), float(east), float(north)
+def _box_m(maps: Sequence[MapFile], frame: LocalFrame) -> tuple[float, float, float, float]:
+    """Return the bounds of all zones and cells."""
+    grounds = [zone.geometry for one in maps for zone in one.zones]
+    boxes = [shapely.box(*bounds_deg(one.cells)) for one in maps if one.cells is not None]
+    local = project_all(np.array([*grounds, *boxes], dtype=object), frame)
+    west, south, east, north = shapely.total_bounds(local).tolist()
+    return west, south, east, north
 
 
 def _away_from_rings(
