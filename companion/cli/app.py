@@ -38,7 +38,7 @@ COMMANDS = {
     ),
     "run": Place("companion.cli.run:run", "Spray: the companion beside the flight controller."),
     "config": Place("companion.cli.config:app", "Check or show a configuration; print its schema."),
-    "map": Place("companion.cli.map:app", "Check a prescription map; look up rates in it."),
+    "map": Place("companion.cli.map:app", "Check, show, convert and make prescription maps."),
     "sitl": Place("sitl.cli:app", "Simulated flight controller and sprayer."),
     "replay": Place("analysis.cli:replay", "Feed a journal to the core and compare decisions."),
 }

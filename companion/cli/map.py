@@ -1,4 +1,7 @@
-"""`vrspray map`: what is in a prescription file, what is wrong with it, the rate at a place."""
+"""`vrspray map`: what is in a prescription file, what is wrong with it, the rate at a place.
+
+The other commands stand in files of their own and are gathered at the end.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,10 @@ from typing import Annotated, Any
 import typer
 
 from companion.cli.answer import AsJson, answer
+from companion.cli.map_convert import convert, show
+from companion.cli.map_grid import GRID_EXAMPLE, grid
+from companion.cli.map_new import NEW_EXAMPLE, new
+from companion.cli.map_offset import OFFSET_EXAMPLE, offset
 from companion.cli.map_options import File, Reading, reading_options
 from companion.cli.map_plan import plan_of, sprayer_problems
 from companion.cli.map_report import report_lines
@@ -21,7 +28,7 @@ POINTS_MAX = 1_000_000
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
-    help="Check a prescription map; look up rates in it.",
+    help="Check, show, convert and make prescription maps; look up rates in them.",
     epilog="Example: vrspray map check examples/anyang/prescription.shp",
 )
 
@@ -139,3 +146,10 @@ def _place(
 
 def _bad_points(text: str, fix: str) -> MapError:
     return MapError(f"{text}; {fix}", code="bad-points", fix=fix)
+
+
+app.command(epilog="Example: vrspray map show examples/anyang/prescription.shp --out map.png")(show)
+app.command(epilog="Example: vrspray map convert field.shp field.gpkg")(convert)
+app.command(epilog=GRID_EXAMPLE)(grid)
+app.command(epilog=NEW_EXAMPLE)(new)
+app.command(epilog=OFFSET_EXAMPLE)(offset)

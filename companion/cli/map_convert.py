@@ -158,20 +158,31 @@ def _check(source: MapFile, made: Path, format_name: str, wish: Wish) -> _Checke
         same_cells=format_name != "text-map" and keeps_cells(source, wish) and not clipped,
         zero_is_none=format_name == "isoxml" and cells,
     )
-    if found.lost or not found.change_l_ha <= CHANGE_MAX_L_HA:
-        what = (
-            f"{found.lost} of {found.points} places have a rate in one file and none in the other"
-            if found.lost
-            else f"a rate would change by {found.change_l_ha:.3g} L/ha"
-        )
-        latitude, longitude = found.worst or (0.0, 0.0)
+    what = _objection(found)
+    if what is not None:
         raise map_error(
             made,
-            f"{what} (at {latitude:.7f}, {longitude:.7f})",
+            what,
             fix="nothing is kept; take smaller cells or another format",
             code=NOT_PRESERVED,
         )
     return _Checked(written=written, comparison=found)
+
+
+def _objection(found: Comparison) -> str | None:
+    """Return why a written file is not to be kept, or None."""
+    if not found.rated:
+        return "no place with a rate is far enough from an edge to be compared with the source"
+    latitude, longitude = found.worst or (0.0, 0.0)
+    where = f"(at {latitude:.7f}, {longitude:.7f})"
+    if found.lost:
+        return (
+            f"{found.lost} of {found.points} places have a rate in one file and none in the other "
+            f"{where}"
+        )
+    if not found.change_l_ha <= CHANGE_MAX_L_HA:
+        return f"a rate would change by {found.change_l_ha:.3g} L/ha {where}"
+    return None
 
 
 def _result(
@@ -206,17 +217,12 @@ def _lines(result: dict[str, Any]) -> list[str]:
         if result["rows"] is None
         else f"{result['rows']} x {result['columns']} cells"
     )
-    compared = (
-        f"largest difference at {result['points_compared']} places: "
-        f"{result['max_rate_change_l_ha']:.3g} L/ha"
-        if result["points_compared"]
-        else "no place is far enough from an edge to compare"
-    )
     return [
         f"{result['out']}: {result['format']}, {ground}, {result['area_ha']:.4f} ha, "
         f"{result['litres']:.1f} L",
         f"source: {result['source_area_ha']:.4f} ha, {result['source_litres']:.1f} L",
-        compared,
+        f"largest difference at {result['points_compared']} places: "
+        f"{result['max_rate_change_l_ha']:.3g} L/ha",
         *(f"also written: {name}" for name in result["files"] if name != result["out"]),
     ]
 

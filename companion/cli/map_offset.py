@@ -11,6 +11,9 @@ from companion.cli.answer import AsJson, answer
 from companion.errors import MapError
 from companion.maps.offset import offset_between
 
+OFFSET_EXAMPLE = (
+    "Example: vrspray map offset --map 35.996089,114.543487 --surveyed 35.996094,114.543481"
+)
 # Datums and bases differ by metres; a mark farther off is another mark.
 PLAUSIBLE_M = 10.0
 

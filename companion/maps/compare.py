@@ -25,11 +25,12 @@ EDGE_M = 0.02
 class Comparison:
     """What two maps say at the same places.
 
-    `change_l_ha` is the largest difference where both have a rate; `lost` counts the places where
+    `rated` of the points have a rate in the source. `change_l_ha` is the largest difference where both have a rate; `lost` counts the places where
     only one has, `worst` (latitude, longitude) is a place of the largest difference or loss.
     """
 
     points: int
+    rated: int
     change_l_ha: float
     lost: int
     worst: tuple[float, float] | None
@@ -61,9 +62,11 @@ def compare(
     places.append(sample_places(source, count=count, margin_m=margin_m, around=written))
     longitude, latitude = (np.concatenate(values) for values in zip(*places, strict=True))
     gap = np.zeros(len(longitude))
+    rated = np.zeros(len(longitude), dtype=np.bool_)
     for overlap in overlaps:
         one = rates_at(source, longitude, latitude, overlap)
         two = rates_at(written, longitude, latitude, overlap)
+        rated |= ~np.isnan(one)
         if zero_is_none:
             one, two = np.nan_to_num(one), np.nan_to_num(two)
         lost = np.isnan(one) != np.isnan(two)
@@ -72,6 +75,7 @@ def compare(
     worst = int(np.argmax(gap)) if len(gap) else 0
     return Comparison(
         points=len(gap),
+        rated=int(rated.sum()),
         change_l_ha=float(both.max(initial=0.0)),
         lost=int(np.isinf(gap).sum()),
         worst=(float(latitude[worst]), float(longitude[worst])) if gap.any() else None,

@@ -46,15 +46,16 @@ READERS: dict[str, Reader] = {
     ".csv": read_csv,
     ".txt": read_text_map,
 }
-# Folders and archives, by a file in them: its name, or its suffix in a folder of some name. The
-# first that is there; a shapefile comes last, as other formats carry boundaries in shapefiles.
+# Folders and archives, by a file in them: the first pattern that any name matches. A shapefile
+# comes last, as other formats carry boundaries in shapefiles.
 PACKAGES: tuple[tuple[str, Reader], ...] = (
     ("taskdata.xml", read_isoxml),
     ("adapt.json", read_adapt),
-    ("rx/*.tif", read_dji),
-    ("rx/*.tiff", read_dji),
     ("*.gpkg", read_geopackage),
     ("*.kml", read_kml),
+    ("*.tif", read_dji),
+    ("*.tiff", read_dji),
+    ("*.parquet", read_geoparquet),
     ("*.shp", read_shapefile),
 )
 # A repair of a boundary or an exclusion may move the limit of spraying by this much unasked.
@@ -154,7 +155,11 @@ def _read(
     if not there:
         raise map_error(path, "there is no such file", fix="check the path", code="no-file")
     suffix = path.suffix.casefold()
-    reader = _of_package(path) if folder or suffix == ".zip" else READERS.get(suffix)
+    reader = READERS.get(suffix)
+    if folder or suffix == ".zip":
+        reader = _of_package(path)
+    elif path.name.casefold() == "adapt.json":
+        reader = read_adapt
     if reader is None:
         known = ", ".join(READERS)
         raise map_error(
