@@ -21,6 +21,7 @@ from companion.core.types import (
     Decision,
     EstimatorReport,
     Fix,
+    FlowReport,
     GnssReport,
     HeartbeatReport,
     Inhibit,
@@ -32,7 +33,7 @@ from companion.core.types import (
 from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.navigation import Navigation
 from sitl.outputs import WIRE_S, AveragedOutput, GpioOutput, Output, ServoOutput
-from sitl.plant import AveragedPlant, PulsedPlant
+from sitl.plant import AveragedPlant, Plant, PulsedPlant
 from sitl.wang import POLL_S, WangController
 
 if TYPE_CHECKING:
@@ -49,7 +50,10 @@ MESSAGE_DELAY_S = 0.005
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightOptions:
-    """How a flight is simulated; `noise` and `scatter` off is perfect knowledge."""
+    """How a flight is simulated; `noise` and `scatter` off is perfect knowledge.
+
+    `meter_rate_hz` above 0 has the flow meter report that often.
+    """
 
     fidelity: Fidelity = "pulsed"
     output: Literal["gpio", "servo"] = "gpio"
@@ -59,6 +63,7 @@ class FlightOptions:
     estimator_lag_s: float = 0.031
     noise: bool = True
     scatter: bool = True
+    meter_rate_hz: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +105,8 @@ def fly(
     if wang is not None:
         said = _fly_wang(wang, inputs, output, start_s)
     else:
-        said = _fly_ours(setup, inputs, output, start_s, observer, on_input)
+        meter = _Meter(plant, options.meter_rate_hz, start_s)
+        said = _fly_ours(setup, inputs, output, meter, start_s, observer, on_input)
     output.finish(end_s + TAIL_S / 2)
     sample_s = SAMPLE_S[options.fidelity]
     samples = math.floor((end_s + TAIL_S - start_s) / sample_s) + 1
@@ -199,10 +205,38 @@ class _Said:
     unresolved: int = 0
 
 
+@dataclass(slots=True)
+class _Meter:
+    """Reads the plant's flow meter at its own rate, up to where the plant is known."""
+
+    plant: Plant
+    rate_hz: float
+    start_s: float
+    _read: int = 0
+
+    def read(self, now_s: float) -> list[FlowReport]:
+        """Return what was counted since the last call, in order of time."""
+        if not self.rate_hz > 0.0:
+            return []
+        last = math.floor((now_s - self.start_s) * self.rate_hz)
+        times = self.start_s + np.arange(self._read + 1, last + 1) / self.rate_hz
+        self._read = max(last, self._read)
+        if not len(times):
+            return []
+        per_ml = self.plant.profile.meter.pulses_per_l / 1000.0
+        return [
+            FlowReport(received_s=at_s, volume_ml=count / per_ml)
+            for at_s, count in zip(
+                times.tolist(), self.plant.meter_count(times).tolist(), strict=True
+            )
+        ]
+
+
 def _fly_ours(
     setup: Setup,
     inputs: Iterator[Input],
     output: Output,
+    meter: _Meter,
     start_s: float,
     observer: Callable[[Decision], None] | None,
     on_input: Callable[[Input], None] | None,
@@ -222,13 +256,19 @@ def _fly_ours(
         said.inhibits |= decision.inhibits
         if observer is not None:
             observer(decision)
+        for report in meter.read(now_s):
+            hear(report)
+
+    def hear(item: Input) -> None:
+        nonlocal track
+        if on_input is not None:
+            on_input(item)
+        track = observe(track, item, setup)
 
     for item in inputs:
         while next_s <= item.received_s:
             decide(next_s)
-        if on_input is not None:
-            on_input(item)
-        track = observe(track, item, setup)
+        hear(item)
         if isinstance(item, Telemetry):
             decide(item.received_s)
     return said

@@ -18,6 +18,7 @@ import numpy as np
 
 from companion.core.types import (
     EstimatorReport,
+    FlowReport,
     GnssReport,
     HeartbeatReport,
     Input,
@@ -101,6 +102,7 @@ class Track:
     wind: WindReport | None = None
     rc: RcReport | None = None
     output: OutputReport | None = None
+    flow: FlowReport | None = None
     enabled: bool = False
 
 
@@ -125,6 +127,7 @@ _KEEP: dict[type, Callable[[Track, Any], Track]] = {
     LandedReport: lambda track, item: replace(track, landed=item),
     WindReport: lambda track, item: replace(track, wind=item),
     OutputReport: lambda track, item: replace(track, output=item),
+    FlowReport: lambda track, item: replace(track, flow=item),
 }
 
 

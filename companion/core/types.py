@@ -156,6 +156,17 @@ class OutputReport:
     text: str = ""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowReport:
+    """What the flow meter has counted since it was started: all valves, as its calibration has it.
+
+    A count and not a flow, so that a mean over any time can be formed from two of them.
+    """
+
+    received_s: float
+    volume_ml: float
+
+
 Input = (
     Telemetry
     | SpeedReport
@@ -167,6 +178,7 @@ Input = (
     | RcReport
     | OperatorCommand
     | OutputReport
+    | FlowReport
 )
 
 
