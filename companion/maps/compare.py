@@ -25,8 +25,9 @@ EDGE_M = 0.02
 class Comparison:
     """What two maps say at the same places.
 
-    `rated` of the points have a rate in the source. `change_l_ha` is the largest difference where both have a rate; `lost` counts the places where
-    only one has, `worst` (latitude, longitude) is a place of the largest difference or loss.
+    At `rated` of the `points` the source has a rate. `change_l_ha` is the largest difference where
+    both have one; `lost` counts the places where only one has; `worst` (latitude, longitude) is a
+    place of the largest difference or loss.
     """
 
     points: int

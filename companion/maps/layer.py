@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,19 +91,26 @@ class Grid:
     problems: tuple[Problem, ...] = ()
 
 
+_DECIMAL = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+
+
 def as_number(value: Value) -> float | None:
-    """Return a cell as a number, None where it is blank or NaN.
+    """Return a cell as a number, None where it is blank or NaN; ValueError for other text.
 
     Text counts when it is a plain decimal number. A decimal comma does not: `1,500` is fifteen
     hundred to one program and one and a half to another.
 
-    >>> as_number(" 12.5 "), as_number(""), as_number(None)
-    (12.5, None, None)
+    >>> as_number(" 12.5 "), as_number(""), as_number(None), as_number("nan")
+    (12.5, None, None, None)
     """
-    if value is None or (isinstance(value, str) and not value.strip()):
-        return None
-    number = float(value)
-    return None if math.isnan(number) else number
+    if isinstance(value, str):
+        text = value.strip()
+        if not text or text.casefold() == "nan":
+            return None
+        if _DECIMAL.fullmatch(text) is None:
+            raise ValueError(f"{text[:40]!r} is no number")
+        return float(text)
+    return None if value is None or math.isnan(value) else float(value)
 
 
 def read_bytes(path: Path) -> bytes:

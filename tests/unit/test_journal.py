@@ -27,6 +27,7 @@ from companion.core.types import (
     Decision,
     EstimatorReport,
     Fix,
+    FlowReport,
     GnssReport,
     HeartbeatReport,
     Input,
@@ -69,6 +70,7 @@ INPUTS: list[Input] = [
     RcReport(received_s=1.6, pulse_us=(1500, 0, 65535)),
     OperatorCommand(received_s=NAN, enable=True, source="web"),
     OutputReport(received_s=1.8, healthy=False, text="änderung"),
+    FlowReport(received_s=1.9, volume_ml=0.1 + 0.2),
 ]
 
 

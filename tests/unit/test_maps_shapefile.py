@@ -929,6 +929,26 @@ def test_a_record_that_contradicts_itself_is_refused(
     assert caught.value.code == code
 
 
+@pytest.mark.parametrize("words", [0, -100, 49, 10**6, 2**31 - 1])
+def test_an_index_that_leads_nowhere_is_refused(tmp_path: Path, words: int) -> None:
+    path = simple(tmp_path)
+    shx = path.with_suffix(".shx")
+    content = bytearray(shx.read_bytes())
+    struct.pack_into(">i", content, 108, words)
+    shx.write_bytes(content)
+    with pytest.raises(MapError, match="record 2 of its shapes is broken") as caught:
+        read_shapefile(path)
+    assert caught.value.code == "truncated"
+
+
+def test_a_ring_without_an_area_is_left_out(tmp_path: Path) -> None:
+    flat = Polygon([(WEST, SOUTH), (WEST + CELL, SOUTH), (WEST + 2 * CELL, SOUTH), (WEST, SOUTH)])
+    path = write(tmp_path / "rx.shp", [flat, cell(0)], geometry_type="Polygon", rate=[1.0, 2.0])
+    found = read_shapefile(path)
+    assert found.skipped == {0: "no-area"}
+    assert found.geometries[0] is None
+
+
 def test_one_shape_named_many_times_counts_each_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -989,7 +1009,7 @@ def test_degrees_of_wgs84_need_no_word(tmp_path: Path, prj: str, crs: str) -> No
 
 
 @pytest.mark.parametrize(
-    "prj", ["+init=epsg:4326", "+init=/etc/passwd:1", "EPSG:4978", "x" * 10**6]
+    "prj", ["+init=epsg:4326", "+init=/etc/passwd:1", "EPSG:4978", "EPSG:4326" + " " * 10**5]
 )
 def test_a_prj_that_is_of_no_map_is_refused(tmp_path: Path, prj: str) -> None:
     path = simple(tmp_path)
