@@ -163,7 +163,8 @@ def raster(tmp_path: Path) -> Path:
     path = tmp_path / "rates.tif"
     with rasterio.open(
         path, "w", driver="GTiff", width=40, height=30, count=1, dtype="float32",
-        crs="EPSG:4326", transform=rasterio.Affine(2e-5, 0.0, 10.0, 0.0, -1e-5, 50.0), nodata=-9999.0,
+        crs="EPSG:4326", transform=rasterio.Affine(2e-5, 0.0, 10.0, 0.0, -1e-5, 50.0),
+        nodata=-9999.0,
     ) as target:  # fmt: skip
         target.write(rates, 1)
         target.units = ("L/ha",)
