@@ -61,13 +61,15 @@ def amount(value: float) -> str:
 
 def _lines_of(found: Totals, shown: NDArray[np.bool_]) -> list[str]:
     """Return rate, ground and litres as columns; a figure space is as wide as a digit."""
+    most = float(found.litres.max(initial=0.0))
+    decimals = 0 if most >= 100.0 else 1 if most >= 10.0 else 2
     columns = [
         [f"{rate:.6g}" for rate in found.rates_l_ha[shown].tolist()],
         [
             f"{area:.2f}" if area >= 1.0 else f"{area:.4f}"
             for area in found.areas_ha[shown].tolist()
         ],
-        [amount(litres) for litres in found.litres[shown].tolist()],
+        [f"{litres:,.{decimals}f}" for litres in found.litres[shown].tolist()],
     ]
     widths = [max(map(len, column), default=0) for column in columns]
     rows = zip(*columns, strict=True)
