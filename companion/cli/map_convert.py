@@ -12,12 +12,12 @@ import typer
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
 from companion.cli.map_options import File, Reading, reading_options
 from companion.errors import MapError
-from companion.maps.compare import Comparison, compare
+from companion.maps.convert.compare import Comparison, compare
+from companion.maps.convert.formats import Wish, keeps_cells
+from companion.maps.convert.writers import write_map, writer_for
 from companion.maps.model import MapFile, map_error
 from companion.maps.registry import read_map
 from companion.maps.totals import as_sprayed, totals
-from companion.maps.write_formats import Wish, keeps_cells
-from companion.maps.writers import write_map, writer_for
 
 # What a conversion may change of a rate; files hold three decimals or more.
 CHANGE_MAX_L_HA = 0.01
@@ -230,7 +230,7 @@ def _lines(result: dict[str, Any]) -> list[str]:
 @reading_options
 def show(file: File, reading: Reading, out: _Picture, as_json: AsJson = False) -> None:
     """Draw a map: its rates with a legend, north and a scale."""
-    from companion.maps.picture import draw
+    from companion.maps.picture.draw import draw
 
     source = reading.read(file)
     drawn = draw(source, out, title=file.name)

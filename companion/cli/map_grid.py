@@ -11,9 +11,9 @@ import typer
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
 from companion.maps.layer import read_bytes
 from companion.maps.model import map_error
-from companion.maps.point_grid import M2_PER_HA, MERGES
-from companion.maps.text_map import PointGrid, grid_of_points, grid_problems
-from companion.maps.text_points import parse_text_map
+from companion.maps.text.point_grid import M2_PER_HA, MERGES
+from companion.maps.text.reader import PointGrid, grid_of_points, grid_problems
+from companion.maps.text.text_points import parse_text_map
 from companion.maps.whole_file import write_whole
 
 GRID_EXAMPLE = "Example: vrspray map grid field.txt --origin 39.5,-0.4,50 --merge mean --json"

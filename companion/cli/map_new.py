@@ -10,9 +10,9 @@ import typer
 
 from companion.cli.answer import AsJson, answer
 from companion.cli.map_grid import Force, check_new, grid, parse_numbers, parse_place
+from companion.maps.convert.make_map import Plots, Points, make_plots, make_points
 from companion.maps.layer import digest, read_bytes
-from companion.maps.make_map import Plots, Points, make_plots, make_points
-from companion.maps.text_points import write_text_map
+from companion.maps.text.text_points import write_text_map
 
 __all__ = ["NEW_EXAMPLE", "grid", "new"]
 
@@ -168,7 +168,7 @@ def _new_points(
 
 
 def _new_plots(out: Path, wanted: Plots, *, force: bool) -> dict[str, Any]:
-    from companion.maps.writers import write_map
+    from companion.maps.convert.writers import write_map
 
     made = make_plots(wanted, out, map_format=out.suffix.lstrip("."))
     write_map(made, out, force=force)

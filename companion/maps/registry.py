@@ -10,23 +10,23 @@ import shapely
 from shapely import MultiPolygon
 from shapely.errors import ShapelyError
 
-from companion.maps.adapt import read_adapt
+from companion.maps.adapt.geoparquet import read_geoparquet
+from companion.maps.adapt.reader import read_adapt
 from companion.maps.assemble import crs_of, ground_of, map_of, zone_names
 from companion.maps.bundle import open_bundle
-from companion.maps.csv_map import read_csv
+from companion.maps.csvfile.reader import read_csv
 from companion.maps.declared import Given
-from companion.maps.dji import read_dji
-from companion.maps.geojson import read_geojson
-from companion.maps.geopackage import read_geopackage
-from companion.maps.geoparquet import read_geoparquet
-from companion.maps.geotiff import read_geotiff
-from companion.maps.isoxml import read_isoxml
-from companion.maps.kml import read_kml
+from companion.maps.geojson.reader import read_geojson
+from companion.maps.geopackage.reader import read_geopackage
+from companion.maps.geotiff.dji import read_dji
+from companion.maps.geotiff.reader import read_geotiff
+from companion.maps.isoxml.reader import read_isoxml
+from companion.maps.kml.reader import read_kml
 from companion.maps.layer import Grid, Layer
 from companion.maps.local import polygons_of
 from companion.maps.model import MapFile, map_error
-from companion.maps.shapefile import read_shapefile
-from companion.maps.text_map import read_text_map
+from companion.maps.shapefile.reader import read_shapefile
+from companion.maps.text.reader import read_text_map
 
 Reader = Callable[[Path, str | None], Layer | Grid]
 

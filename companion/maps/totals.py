@@ -10,10 +10,10 @@ import shapely
 from companion.core.frame import LocalFrame
 from companion.maps.build import frame_for
 from companion.maps.cells import cell_areas_m2
+from companion.maps.convert.plain_zones import plain_zones
+from companion.maps.convert.rasterise import in_field
 from companion.maps.local import project_all
 from companion.maps.model import Floats, MapFile
-from companion.maps.plain_zones import plain_zones
-from companion.maps.rasterise import in_field
 
 M2_PER_HA = 10_000.0
 

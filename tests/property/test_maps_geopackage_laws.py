@@ -18,13 +18,13 @@ from shapely import MultiPolygon, Polygon, box
 from companion.errors import MapError
 from companion.maps.assemble import map_of
 from companion.maps.declared import Given
-from companion.maps.geopackage import read_geopackage
-from companion.maps.kml import read_kml
+from companion.maps.geopackage.reader import read_geopackage
+from companion.maps.geopackage.wkb import CurvedError, areas_of, polygons_in
+from companion.maps.geopackage.writer import write_geopackage
+from companion.maps.kml.reader import read_kml
+from companion.maps.kml.writer import write_kml
 from companion.maps.layer import Layer
 from companion.maps.model import MapFile, MapZone
-from companion.maps.wkb import CurvedError, areas_of, polygons_in
-from companion.maps.write_geopackage import write_geopackage
-from companion.maps.write_kml import write_kml
 
 WEST, SOUTH, CELL = 114.543, 35.996, 0.0005
 READERS: dict[str, Callable[[Path], Layer]] = {

@@ -17,10 +17,10 @@ from shapely import MultiPolygon, box
 
 from companion.errors import MapError
 from companion.maps.crs import WGS84
-from companion.maps.isoxml import read_isoxml
+from companion.maps.isoxml.reader import read_isoxml
+from companion.maps.isoxml.writer import write_isoxml
 from companion.maps.layer import Grid, Layer
 from companion.maps.model import MapCells, MapFile, MapZone
-from companion.maps.write_isoxml import write_isoxml
 
 WEST, SOUTH, STEP = 15.0, 48.0, 0.0005
 FIELD = MultiPolygon([box(WEST, SOUTH, WEST + 4 * STEP, SOUTH + 3 * STEP)])

@@ -14,8 +14,8 @@ import typer
 
 from companion.cli import map_convert
 from companion.errors import MapError
+from companion.maps.convert.formats import WRITERS, Writer
 from companion.maps.registry import read_map
-from companion.maps.write_formats import WRITERS, Writer
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 PLOTS = EXAMPLES / "anyang" / "prescription.shp"

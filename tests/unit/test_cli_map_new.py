@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 from companion.cli.map_grid import GRID_EXAMPLE
 from companion.cli.map_new import NEW_EXAMPLE, grid, new
 from companion.errors import MapError
-from companion.maps.csv_map import read_csv
+from companion.maps.csvfile.reader import read_csv
 from companion.maps.layer import Grid
-from companion.maps.text_map import read_text_map
+from companion.maps.text.reader import read_text_map
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 app.command(epilog=NEW_EXAMPLE)(new)

@@ -21,13 +21,13 @@ from pyproj import CRS
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.compare import compare, rates_at
+from companion.maps.convert.compare import compare, rates_at
+from companion.maps.convert.formats import WRITERS
+from companion.maps.convert.rasterise import metres_per_degree
+from companion.maps.convert.sample_places import centres, sample_places
+from companion.maps.convert.writers import write_map, writer_for
 from companion.maps.model import MapCells, MapFile, MapZone
-from companion.maps.rasterise import metres_per_degree
 from companion.maps.registry import read_map
-from companion.maps.sample_places import centres, sample_places
-from companion.maps.write_formats import WRITERS
-from companion.maps.writers import write_map, writer_for
 
 Floats = NDArray[np.float64]
 Lookup = Callable[[Floats, Floats], Floats]

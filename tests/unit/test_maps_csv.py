@@ -16,9 +16,9 @@ from shapely import box
 
 from companion.errors import MapError
 from companion.maps.assemble import map_of
-from companion.maps.csv_map import read_csv
+from companion.maps.csvfile.lattice import find_lattice
+from companion.maps.csvfile.reader import read_csv
 from companion.maps.declared import Given
-from companion.maps.lattice import find_lattice
 from companion.maps.layer import Grid, Layer
 
 WEST, SOUTH = 114.543, 35.996

@@ -13,8 +13,9 @@ import shapely
 from shapely import box
 
 from companion.errors import MapError
-from companion.maps import geojson, layer
-from companion.maps.geojson import read_geojson
+from companion.maps import layer
+from companion.maps.geojson import reader as geojson
+from companion.maps.geojson.reader import read_geojson
 from companion.maps.registry import read_area, read_map
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001

@@ -20,10 +20,10 @@ from shapely import MultiPolygon, Polygon, box
 from companion.errors import MapError
 from companion.maps.assemble import map_of
 from companion.maps.declared import Given
-from companion.maps.geopackage import read_geopackage
+from companion.maps.geopackage.reader import read_geopackage
+from companion.maps.geopackage.writer import write_geopackage
 from companion.maps.layer import Layer
 from companion.maps.model import MapFile, MapZone
-from companion.maps.write_geopackage import write_geopackage
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001
 SQUARE = box(WEST, SOUTH, WEST + CELL, SOUTH + CELL)
@@ -408,8 +408,8 @@ def test_a_virtual_table_is_no_layer(tmp_path: Path) -> None:
 def test_work_without_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = by_gdal(tmp_path / "rx.gpkg", grounds=[SQUARE] * 2000, rates=[1.0] * 2000)
     assert len(read_geopackage(path).geometries) == 2000
-    monkeypatch.setattr("companion.maps.sqlite._STEPS_MAX", 1000)
-    monkeypatch.setattr("companion.maps.sqlite._STEPS_PER_CALL", 500)
+    monkeypatch.setattr("companion.maps.geopackage.sqlite._STEPS_MAX", 1000)
+    monkeypatch.setattr("companion.maps.geopackage.sqlite._STEPS_PER_CALL", 500)
     assert refused(path).code == "too-large"
 
 
@@ -418,9 +418,9 @@ def test_work_without_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyP
     [
         ("layer.MAX_RECORDS", 1),
         ("layer.MAX_VERTICES", 14),
-        ("geopackage_layers._CELLS_MAX", 7),
-        ("geopackage_layers._COLUMNS_MAX", 3),
-        ("geopackage_layers._LAYERS_MAX", 0),
+        ("geopackage.layers._CELLS_MAX", 7),
+        ("geopackage.layers._COLUMNS_MAX", 3),
+        ("geopackage.layers._LAYERS_MAX", 0),
         ("layer.MAX_FILE_BYTES", 10_000),
     ],
 )

@@ -22,14 +22,14 @@ from rasterio.transform import Affine
 from shapely import MultiPolygon, box
 
 from companion.errors import MapError
-from companion.maps.adapt import read_adapt
+from companion.maps.adapt.reader import read_adapt
 from companion.maps.assemble import map_of
 from companion.maps.cells import bounds_deg
 from companion.maps.declared import Given
-from companion.maps.dji import read_dji
-from companion.maps.geotiff import read_geotiff
+from companion.maps.geotiff.dji import read_dji
+from companion.maps.geotiff.reader import read_geotiff
+from companion.maps.geotiff.world_file import parse_world_file
 from companion.maps.layer import Grid
-from companion.maps.world_file import parse_world_file
 
 WEST, NORTH, CELL = 114.5, 36.0, 1e-4
 PLACE = Affine(CELL, 0.0, WEST, 0.0, -CELL, NORTH)

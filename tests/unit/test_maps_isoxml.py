@@ -15,7 +15,7 @@ import shapely
 from shapely import Polygon, box
 
 from companion.errors import MapError
-from companion.maps.isoxml import read_isoxml
+from companion.maps.isoxml.reader import read_isoxml
 from companion.maps.layer import Grid, Layer
 
 WEST, SOUTH = 15.0, 48.0
@@ -342,7 +342,7 @@ def test_dictionary_says_unit_and_resolution(
 def test_dictionary_agrees_with_an_independent_one() -> None:
     from isoxml.models.ddi_entities import DDEntity
 
-    from companion.maps.isoxml_ddi import FAMILIES
+    from companion.maps.isoxml.ddi import FAMILIES
     from companion.maps.units import rate_unit
 
     roles = ("setpoint", "actual", "default", "minimum", "maximum")

@@ -17,10 +17,10 @@ from shapely import LinearRing, MultiPolygon, Polygon, box
 from companion.errors import MapError
 from companion.maps.assemble import map_of
 from companion.maps.declared import Given
-from companion.maps.kml import read_kml
+from companion.maps.kml.reader import read_kml
+from companion.maps.kml.writer import write_kml
 from companion.maps.layer import Layer
 from companion.maps.model import MapFile, MapZone
-from companion.maps.write_kml import write_kml
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001
 SQUARE = box(WEST, SOUTH, WEST + CELL, SOUTH + CELL)
@@ -431,7 +431,7 @@ def test_links_in_a_circle_or_out_of_the_archive_end(tmp_path: Path) -> None:
 def test_linked_files_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = zipped(tmp_path, {"doc.kml": kml(links("a.kml")), "a.kml": MAY})
     assert len(read_kml(path).geometries) == 1
-    monkeypatch.setattr("companion.maps.kml_files.MAX_ELEMENTS", 15)
+    monkeypatch.setattr("companion.maps.kml.files.MAX_ELEMENTS", 15)
     assert refused(path).code == "too-large"
 
 
@@ -461,9 +461,9 @@ def test_other_xml_is_refused(tmp_path: Path) -> None:
     [
         ("layer.MAX_RECORDS", 1),
         ("layer.MAX_VERTICES", 7),
-        ("kml_attributes._CELLS_MAX", 1),
-        ("kml_attributes._COLUMNS_MAX", 0),
-        ("kml_geometry.MAX_VERTICES", 2),
+        ("kml.kml_attributes._CELLS_MAX", 1),
+        ("kml.kml_attributes._COLUMNS_MAX", 0),
+        ("kml.geometry.MAX_VERTICES", 2),
     ],
 )
 def test_what_is_too_large_is_refused(

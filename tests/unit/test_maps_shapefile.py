@@ -18,10 +18,11 @@ from pyproj import CRS, Geod
 from shapely import Geometry, MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps import dbf, layer
+from companion.maps import layer
 from companion.maps.model import MapFile
 from companion.maps.registry import read_area, read_map
-from companion.maps.shapefile import read_shapefile
+from companion.maps.shapefile import dbf
+from companion.maps.shapefile.reader import read_shapefile
 
 # A degree of latitude is 111.0 km here, a degree of longitude 90.2 km.
 WEST, SOUTH = 114.543, 35.996

@@ -17,11 +17,11 @@ from shapely import MultiPolygon, Polygon, box
 from companion.errors import MapError
 from companion.maps.assemble import map_of
 from companion.maps.declared import Given
-from companion.maps.dji import read_dji
-from companion.maps.geotiff import read_geotiff
+from companion.maps.geotiff.dji import read_dji
+from companion.maps.geotiff.reader import read_geotiff
+from companion.maps.geotiff.writer import write_dji, write_geotiff
 from companion.maps.layer import Grid
 from companion.maps.model import Affine, MapCells
-from companion.maps.write_geotiff import write_dji, write_geotiff
 
 WEST, NORTH, WIDTH, HEIGHT = 114.5, 36.0, 1.1e-5, 0.9e-5
 NORTH_UP: Affine = (WIDTH, 0.0, WEST, 0.0, -HEIGHT, NORTH)

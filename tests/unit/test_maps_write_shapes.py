@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps import write_shapefile as module
+from companion.maps.geojson.writer import write_geojson
 from companion.maps.model import MapZone
 from companion.maps.registry import read_map
-from companion.maps.shapefile import read_shapefile
-from companion.maps.write_geojson import write_geojson
-from companion.maps.write_shapefile import write_shapefile
+from companion.maps.shapefile import writer as module
+from companion.maps.shapefile.reader import read_shapefile
+from companion.maps.shapefile.writer import write_shapefile
 
 WEST, SOUTH, CELL = 114.543_123_456_789, 35.996_987_654_321, 0.001
 Writer = Callable[..., None]

@@ -1,0 +1,1 @@
+"""ADAPT Standard: GeoTIFF or GeoParquet with a catalogue."""

@@ -1,0 +1,154 @@
+"""Writing a map in any format that can be written: chosen by suffix, made beside, then moved."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from shapely.errors import ShapelyError
+
+from companion.errors import MapError
+from companion.maps.convert.formats import WRITERS, Wish, Writer
+from companion.maps.model import MapFile, map_error
+
+# What other programs keep beside a shapefile about its old content.
+_STALE = (".sbn", ".sbx", ".qix", ".cpg")
+
+
+def write_map(
+    map_file: MapFile,
+    path: Path,
+    *,
+    format: str | None = None,
+    cell_m: float | None = None,
+    flow_width_m: float | None = None,
+    flow_speed_m_s: float | None = None,
+    overlap: str = "error",
+    force: bool = False,
+    check: Callable[[Path], None] | None = None,
+) -> list[Path]:
+    """Write a map in the format of the suffix, or in the one named, and return all files.
+
+    They are made in a folder beside `path`, looked at by `check`, and only then moved to where
+    they belong; without `force` nothing is replaced.
+    """
+    path = Path(path)
+    writer = writer_for(path, format)
+    wish = Wish(
+        cell_m=cell_m, flow_width_m=flow_width_m, flow_speed_m_s=flow_speed_m_s, overlap=overlap
+    )
+    _check_target(path, force=force)
+    try:
+        with tempfile.TemporaryDirectory(prefix=".vrspray-", dir=path.parent) as folder:
+            made = Path(folder) / path.name
+            try:
+                writer.write(map_file, made, wish)
+                if check is not None:
+                    check(made)
+            except MapError as error:
+                # The operator knows nothing of the folder.
+                text = str(error).replace(str(made), str(path))
+                raise MapError(text, code=error.code, fix=error.fix) from None
+            return _moved(Path(folder), path, force=force)
+    except ShapelyError as error:
+        raise map_error(
+            map_file.path,
+            f"its polygons cannot be used ({str(error)[:120]})",
+            fix="repair the map where it is made",
+            code="broken-geometry",
+        ) from None
+    except OSError as error:
+        raise map_error(
+            path,
+            f"cannot be written ({error.strerror or error})",
+            fix="check folder, rights and free space",
+            code="not-written",
+        ) from None
+
+
+def writer_for(path: Path, name: str | None = None) -> Writer:
+    """Return the format that the operator names, else the one of the suffix."""
+    suffix = path.suffix.casefold()
+    if name is not None:
+        writer = WRITERS.get(name.casefold())
+        if writer is None:
+            raise map_error(
+                path,
+                f"the format {name!r} cannot be written",
+                fix=f"take one of {', '.join(WRITERS)}",
+                code="unknown-format",
+            )
+        if suffix not in writer.suffixes:
+            names = " or ".join(one or "a folder (no suffix)" for one in writer.suffixes)
+            raise map_error(
+                path,
+                f"{writer.name} is not written as {suffix or 'a folder'}",
+                fix=f"name {names}",
+                code="unknown-format",
+            )
+        return writer
+    found = [writer for writer in WRITERS.values() if suffix in writer.suffixes]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise map_error(
+            path,
+            f"{suffix or 'a folder'} can hold several formats",
+            fix=f"say which with --format: {', '.join(writer.name for writer in found)}",
+            code="several-formats",
+        )
+    known = sorted({one for writer in WRITERS.values() for one in writer.suffixes if one})
+    raise map_error(
+        path,
+        f"maps are not written as {suffix}",
+        fix=f"take one of {', '.join(known)}",
+        code="unknown-format",
+    )
+
+
+def _check_target(path: Path, *, force: bool) -> None:
+    try:
+        there, folder = path.exists(), path.is_dir()
+        parent = path.parent.is_dir()
+        full = folder and any(path.iterdir())
+    except (OSError, ValueError) as error:
+        raise map_error(path, f"is no path ({error})", fix="check it", code="no-file") from None
+    if not parent:
+        raise map_error(
+            path, "its folder is not there", fix="make the folder first", code="no-file"
+        )
+    if full:
+        raise map_error(
+            path, "is a folder with files in it", fix="name a new folder", code="file-exists"
+        )
+    if there and not folder and not force:
+        raise _exists(path, path)
+
+
+def _exists(path: Path, there: Path) -> Exception:
+    return map_error(
+        path,
+        f"{there.name} is there already",
+        fix="name another file, or replace it with --force",
+        code="file-exists",
+    )
+
+
+def _moved(folder: Path, path: Path, *, force: bool) -> list[Path]:
+    """Move all files from the folder to beside `path`, and return them, `path` first."""
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
+    # The file that the operator named comes last, when all that it needs is there.
+    files.sort(key=lambda file: file.name == path.name)
+    targets = [path.parent / file.relative_to(folder) for file in files]
+    if not force:
+        for target in targets:
+            if target.exists():
+                raise _exists(path, target)
+    if path.suffix.casefold() == ".shp":
+        for suffix in _STALE:
+            path.with_suffix(suffix).unlink(missing_ok=True)
+    for file, target in zip(files, targets, strict=True):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        file.replace(target)
+    return sorted(targets, key=lambda target: target != path)

@@ -1,0 +1,1 @@
+"""CSV of points or of polygons."""

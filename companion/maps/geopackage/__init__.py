@@ -1,0 +1,1 @@
+"""GeoPackage, an SQLite database of layers."""

@@ -1,0 +1,1 @@
+"""GeoTIFF, and DJI's package of it."""

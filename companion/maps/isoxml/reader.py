@@ -1,0 +1,37 @@
+"""ISOXML task data, version 3 and 4 (ISO 11783-10): grids of type 1 and 2, and polygons."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from companion.maps.isoxml.field import field_of
+from companion.maps.isoxml.files import TaskFiles
+from companion.maps.isoxml.grid import grid_of_task
+from companion.maps.isoxml.references import References
+from companion.maps.isoxml.task import chosen_task
+from companion.maps.isoxml.zones import zones_layer
+from companion.maps.layer import Grid, Layer
+from companion.maps.model import Problem
+
+
+def read_isoxml(path: Path, layer: str | None = None) -> Layer | Grid:
+    """Return what a task prescribes, from a TASKDATA.XML, its folder, or a zip of it.
+
+    `layer` is the id or the designator of one of several tasks.
+    """
+    files = TaskFiles(path)
+    task = chosen_task(files.root, path, layer)
+    references = References(files.root, path)
+    boundary, problems = field_of(files.root, task, path)
+    found: Layer | Grid
+    if task.grid is not None:
+        found = grid_of_task(files, task.grid, task, references, boundary)
+    else:
+        found = zones_layer(files, task, references, boundary)
+    return _with(found, [*files.problems, *problems])
+
+
+def _with(found: Layer | Grid, problems: list[Problem]) -> Layer | Grid:
+    """Return a layer or grid with problems of the whole file put before its own."""
+    return replace(found, problems=(*problems, *found.problems))

@@ -1,0 +1,1 @@
+"""P2's open text map and its grid."""
