@@ -53,9 +53,13 @@ _ConfigFile = Annotated[
     typer.Option(
         "--config",
         metavar="FILE",
-        help="Of the flight; for its own map also what is not given here.",
+        help="Of the flight; what is not given here comes from it.",
     ),
 ]
+
+
+# What a configuration says of the map that it names, and of no other.
+_OF_ONE_FILE = frozenset({"rate_field", "layer", "merge", "origin"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,24 +86,22 @@ class Reading:
     def read(self, file: Path) -> MapFile:
         """Return the map, read as the options say and otherwise as the configuration does.
 
-        The configuration's answers are about its own map; they say nothing of any other.
+        Which column and which layer the configuration names, it says of its own map alone.
         """
-        table = self._table(file)
-        answers = {
-            field.name: getattr(self, field.name)
-            if getattr(self, field.name) is not None or table is None
-            else getattr(table, field.name)
-            for field in fields(self)
-            if field.name != "config"
-        }
+        table = None if self.config is None else self.config.prescription
+        own = table is not None and self._is_own(file, table)
+        answers = {}
+        for name in (field.name for field in fields(self) if field.name != "config"):
+            given = getattr(self, name)
+            if given is None and table is not None and (own or name not in _OF_ONE_FILE):
+                given = getattr(table, name)
+            answers[name] = given
         return read_map(file, **answers)
 
-    def _table(self, file: Path) -> PrescriptionTable | None:
-        table = None if self.config is None else self.config.prescription
-        if self.config is None or table is None:
-            return None
-        configured = self.config.resolve(table.file)
-        return table if file.resolve() == configured.resolve() else None
+    def _is_own(self, file: Path, table: PrescriptionTable) -> bool:
+        if self.config is None:
+            return False
+        return file.resolve() == self.config.resolve(table.file).resolve()
 
 
 _OPTIONS: dict[str, Any] = {
