@@ -8,7 +8,7 @@ named by `deliverable`, with that speed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from shapely import MultiPolygon
@@ -19,7 +19,7 @@ from companion.config.wording import show_value
 from companion.core.controller import Setup
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import NozzleSet, PwmLimits
-from companion.core.prescription import Prescription
+from companion.core.prescription import FIELD, Prescription
 from companion.core.rate import flow_for_rate
 from companion.errors import ConfigError, MapError
 from companion.maps.build import build_prescription, frame_for
@@ -145,6 +145,38 @@ def _check_mark(config: Config, table: PrescriptionTable) -> None:
             f"and its offset put the mark; set prescription.offset_east_m = {east_m:.3f} and "
             f"offset_north_m = {north_m:.3f}, or correct the mark"
         )
+
+
+def flown_at(
+    config: Config, map_file: MapFile, points: Sequence[tuple[float, float]]
+) -> list[dict[str, object]]:
+    """Return rate and zone at each (latitude, longitude) as a flight with this configuration has.
+
+    Boundary, exclusions, default rate and offset are applied; `inside` says whether the place may
+    be sprayed at all.
+    """
+    table = _prescription_table(config)
+    frame = frame_for(map_file)
+    flown = _prescription(config, table, map_file, frame)
+    latitudes, longitudes = zip(*points, strict=True)
+    east_m, north_m = frame.to_local_all(latitudes, longitudes)
+    rows: list[dict[str, object]] = []
+    for point, owners in zip(points, flown.owners_at(east_m, north_m), strict=True):
+        inside, zones = FIELD in owners, sorted(owners - {FIELD})
+        rate_l_ha = flown.rate_of(frozenset(zones)) if inside else None
+        names = [flown.zone_name(zone) for zone in zones]
+        if not names and rate_l_ha is not None:
+            names = ["default"]
+        rows.append(
+            {
+                "lat": point[0],
+                "lon": point[1],
+                "rate_l_ha": rate_l_ha,
+                "zone": ", ".join(names) or None,
+                "inside": inside,
+            }
+        )
+    return rows
 
 
 def _meets(built: Prescription) -> bool:

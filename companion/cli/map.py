@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from companion.assembly import flown_at
 from companion.cli.answer import AsJson, answer
 from companion.cli.map_convert import convert, show
 from companion.cli.map_grid import GRID_EXAMPLE, grid
@@ -75,14 +76,22 @@ def rate(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say the rate at a place, or at all places of a file."""
+    """Say the rate at a place, or at all places of a file.
+
+    As the map has it; with --config as it will be flown: boundary, exclusions, default rate and
+    offset applied.
+    """
     if (points is None) == (latitude is None or longitude is None):
         raise typer.BadParameter("give LAT and LON, or --points CSV")
     if points is not None:
         places = _read_points(points)
     else:
         places = [_place(latitude, longitude, "LAT LON")]
-    found = point_rates(reading.read(file), places, overlap=reading.overlap)
+    map_file = reading.read(file)
+    if reading.config is not None and reading.config.prescription is not None and places:
+        found = flown_at(reading.config, map_file, places)
+    else:
+        found = point_rates(map_file, places, overlap=reading.overlap)
     answer(
         found[0] if points is None else {"points": found}, map(_rate_line, found), as_json=as_json
     )

@@ -26,6 +26,9 @@ from companion.maps.model import RATE_MAX_L_HA, MapCells, MapFile, MapZone, Prob
 # Names of zones, the best first: the first of these columns that tells all records apart.
 _NAME_COLUMNS = ("name", "zonename", "zone", "zoneid", "zone_id", "label", "id", "fid", "level")
 
+_CRS_FIX = "give it with --crs (--crs EPSG:4326 for GPS coordinates), or copy the missing file"
+_PROJECTION_FIX = "give with --crs the projection that it was made in, or copy the missing file"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Repair:
@@ -67,6 +70,10 @@ def map_of(
     """Return the map that a file holds, or refuse what is ambiguous in it."""
     if isinstance(found, Grid):
         return _map_of_grid(found, path, rate_field=rate_field, crs=crs, given=given)
+    if not found.geometries:
+        raise map_error(
+            path, "there is no record in it", fix="export the zones again", code="no-polygon"
+        )
     used_crs, crs_problems = crs_of(found, path, crs)
     if not found.columns:
         raise map_error(
@@ -172,7 +179,7 @@ def crs_of(layer: Layer | Grid, path: Path, asked: str | None) -> tuple[CRS, lis
             "the file does not say its coordinate reference system"
             + (" (no .prj beside it)" if layer.format == "shapefile" else "")
             + _looks_like(layer),
-            fix="give it with --crs, for example --crs EPSG:4326, or copy the missing file",
+            fix=_CRS_FIX if "degrees" in _looks_like(layer) else _PROJECTION_FIX,
             code="no-crs",
         )
     datum = datum_problem(crs)

@@ -12,7 +12,9 @@ from pyproj.exceptions import ProjError
 
 from companion.core.cells import DEGREE_MAX, NO_RATE, CellGrid, Warp, monomials
 from companion.core.frame import LocalFrame
-from companion.maps.crs import EXTENT_MAX_M, METRES_PER_DEGREE, WGS84
+from companion.errors import MapError
+from companion.maps.crs import WGS84
+from companion.maps.crs_place import check_extent
 from companion.maps.model import Affine, MapCells, map_error
 
 Floats = NDArray[np.float64]
@@ -76,25 +78,28 @@ def check_place(cells: MapCells, path: Path) -> None:
             code="wrong-crs",
         ) from None  # fmt: skip
     if not (west >= -180.0 and east <= 180.0 and south >= -90.0 and north <= 90.0):
-        exchanged = cells.crs.is_geographic and max(abs(south), abs(north)) <= 180.0
-        raise map_error(
-            path,
-            f"its cells (x {west:.6g} to {east:.6g}, y {south:.6g} to {north:.6g}) are no place "
-            "on earth",
-            fix="longitude and latitude look exchanged: export the map with longitude first"
-            if exchanged
-            else "give the right CRS with --crs",
-            code="swapped-axes" if exchanged else "out-of-range",
-        )
-    narrow = np.cos(np.radians(min(abs(south), abs(north)) if south * north > 0 else 0.0))
-    extent_m = METRES_PER_DEGREE * max((east - west) * float(narrow), north - south)
-    if not extent_m <= EXTENT_MAX_M:
-        raise map_error(
-            path,
-            f"the map reaches over {extent_m / 1000:.0f} km",
-            fix="cut it to one field, or correct the CRS with --crs",
-            code="too-large",
-        )
+        raise _nowhere(cells, path, (west, south, east, north))
+    check_extent((west, south, east, north), path)
+
+
+def _nowhere(cells: MapCells, path: Path, box: tuple[float, float, float, float]) -> MapError:
+    """Return the refusal of cells that are no place on earth, with the likely reason."""
+    west, south, east, north = box
+    fix, code = "give the right CRS with --crs", "out-of-range"
+    if cells.crs.is_geographic and max(abs(south), abs(north)) <= 90.0:
+        fix = "split the map where it crosses the 180th meridian"
+    elif cells.crs.is_geographic and max(abs(south), abs(north)) <= 180.0:
+        fix = "longitude and latitude look exchanged: export the map with longitude first"
+        code = "swapped-axes"
+    elif cells.crs.is_geographic:
+        fix, code = "give with --crs the projection that it was made in", "wrong-crs"
+    return map_error(
+        path,
+        f"its cells (x {west:.6g} to {east:.6g}, y {south:.6g} to {north:.6g}) are no place on "
+        "earth",
+        fix=fix,
+        code=code,
+    )
 
 
 def grid_of(

@@ -24,6 +24,10 @@ METRES_PER_DEGREE = 111_320.0
 # A prescription is one field or a few. Beyond this the local frame is off by more than 4 cm
 # (its scale error is x^2 / (2 R^2)), and a stray vertex is likelier than a field of that size.
 EXTENT_MAX_M = 100_000.0
+# The northernmost grain ripens at 70 degrees; beyond 85 a degree of longitude is a few paces.
+LATITUDE_MAX_DEG = 85.0
+# 100 km at that latitude.
+LONGITUDES_MAX_DEG = 11.0
 # Degrees beyond its area of use at which a CRS is a mistake. Maps are drawn in the next UTM zone
 # on purpose, 6 degrees wide; more than one zone away nobody does.
 _AREA_MARGIN_DEG = 6.0
@@ -60,7 +64,7 @@ def check_place(points: Floats, raw: Floats, crs: CRS, path: Path) -> None:
         raise _out_of_range(raw, crs, path)
     _check_degrees_in_metres(raw, crs, path)
     _check_area_of_use(points, raw, crs, path)
-    _check_extent(points, path)
+    check_extent(_box(points), path)
 
 
 def _check_degrees_in_metres(raw: Floats, crs: CRS, path: Path) -> None:
@@ -96,14 +100,30 @@ def _check_area_of_use(points: Floats, raw: Floats, crs: CRS, path: Path) -> Non
     )
 
 
-def _check_extent(points: Floats, path: Path) -> None:
-    west, south, east, north = _box(points)
-    narrow = np.cos(np.radians(min(abs(south), abs(north)) if south * north > 0 else 0.0))
-    extent_m = METRES_PER_DEGREE * max((east - west) * narrow, north - south)
-    if not extent_m <= EXTENT_MAX_M:
+def check_extent(box: _Box, path: Path) -> None:
+    """Refuse a map (west, south, east, north in degrees) that is no field's, by size or place."""
+    west, south, east, north = box
+    if not max(abs(south), abs(north)) <= LATITUDE_MAX_DEG:
         raise map_error(
             path,
-            f"the map reaches over {extent_m / 1000:.0f} km ({span(points)})",
+            f"the map reaches to latitude {max(south, north, key=abs):.4g}, where no field lies",
+            fix="remove the stray zone, or correct the CRS with --crs",
+            code="out-of-range",
+        )
+    if not east - west <= LONGITUDES_MAX_DEG:
+        raise map_error(
+            path,
+            f"the map reaches over {east - west:.4g} degrees of longitude",
+            fix="split it where it crosses the 180th meridian; otherwise remove the stray zone",
+            code="out-of-range",
+        )
+    narrow = np.cos(np.radians(min(abs(south), abs(north)) if south * north > 0 else 0.0))
+    extent_m = METRES_PER_DEGREE * max((east - west) * float(narrow), north - south)
+    if not extent_m <= EXTENT_MAX_M:
+        text = f"x {west:.6g} to {east:.6g}, y {south:.6g} to {north:.6g}"
+        raise map_error(
+            path,
+            f"the map reaches over {extent_m / 1000:.0f} km ({text})",
             fix="remove the stray zone, or correct the CRS with --crs",
             code="out-of-range",
         )
@@ -119,7 +139,7 @@ def _out_of_range(raw: Floats, crs: CRS, path: Path) -> MapError:
         return _swapped(raw, crs, path)
     fix, code = "give the right CRS with --crs", "out-of-range"
     if crs.is_geographic and looks_like_metres(raw):
-        fix = "they look like metres: give their CRS with --crs, for example --crs EPSG:32650"
+        fix = "they look like metres: give with --crs the projection that they were made in"
         code = "wrong-crs"
     text = f"coordinates ({span(raw)}) are outside what {crs_name(crs)} can hold"
     return map_error(path, text, fix=fix, code=code)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -108,7 +108,17 @@ def choose(columns: Sequence[Source], *, asked: str | None, path: Path) -> Choic
         )
     if marked:
         return Choice(column=marked[0])
+    columns = [_with_numbers(column) for column in columns]
     usable = [column for column in columns if score(column) and _holds_numbers(column)]
+    blank = [column for column in columns if score(column) >= NAMED and column not in usable]
+    if not usable and len(blank) == 1:
+        raise map_error(
+            path,
+            f"{blank[0].name} holds no rate at all",
+            fix="give the zones a rate, 0 for none, or name another column with --rate-field "
+            "(prescription.rate_field)",
+            code="null-rate",
+        )
     strong = [column for column in usable if score(column) >= NAMED]
     candidates = sorted(strong or usable, key=score, reverse=True)
     if not candidates and len(columns) == 1 and isinstance(columns[0], Band):
@@ -128,6 +138,17 @@ def choose(columns: Sequence[Source], *, asked: str | None, path: Path) -> Choic
     if len(candidates) == 1:
         return Choice(column=candidates[0])
     return _among(candidates, path)
+
+
+def _with_numbers(column: Source) -> Source:
+    """Return a column of texts that are plain numbers as numeric: some programs write it so."""
+    if isinstance(column, Band) or column.numeric:
+        return column
+    try:
+        numbers = [as_number(value) for value in column.values]
+    except ValueError:
+        return column
+    return column if all(one is None for one in numbers) else replace(column, numeric=True)
 
 
 def _asked(columns: Sequence[Source], asked: str, path: Path) -> Source:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+import stat
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -116,7 +117,12 @@ def as_number(value: Value) -> float | None:
 def read_bytes(path: Path) -> bytes:
     """Return the whole file, whose size is checked first."""
     try:
-        size_bytes = path.stat().st_size
+        about = path.stat()
+        if not stat.S_ISREG(about.st_mode):
+            raise map_error(
+                path, "this is no regular file", fix="name the map's file", code="no-file"
+            )
+        size_bytes = about.st_size
         if not size_bytes <= MAX_FILE_BYTES:
             limit_mb = MAX_FILE_BYTES // 1024**2
             raise map_error(

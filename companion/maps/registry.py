@@ -148,12 +148,15 @@ def _read(
     try:
         folder = path.is_dir()
         there = path.exists()
+        usable = folder or path.is_file()
     except (OSError, ValueError) as error:
         raise map_error(
             path, f"is no path ({error})", fix="check the path", code="no-file"
         ) from None
     if not there:
         raise map_error(path, "there is no such file", fix="check the path", code="no-file")
+    if not usable:
+        raise map_error(path, "this is no regular file", fix="name the map's file", code="no-file")
     suffix = path.suffix.casefold()
     reader = READERS.get(suffix)
     if folder or suffix == ".zip":

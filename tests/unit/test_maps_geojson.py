@@ -110,7 +110,7 @@ def test_latitude_first_is_refused_where_it_shows(tmp_path: Path) -> None:
 def test_metres_without_a_crs_are_refused(tmp_path: Path) -> None:
     ring = [[500000, 5330000], [500100, 5330000], [500100, 5330100], [500000, 5330000]]
     path = saved(tmp_path, collection(feature(1, ring)))
-    with pytest.raises(MapError, match="look like metres: give their CRS with --crs") as caught:
+    with pytest.raises(MapError, match="look like metres: give with --crs the projection") as caught:
         read_map(path)
     assert caught.value.code == "wrong-crs"
     assert read_map(path, crs="EPSG:32633").crs == "EPSG:32633"
