@@ -17,6 +17,7 @@ from companion.config import Config
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
 from companion.core.controller import Setup
+from companion.core.flow_trim import FlowTrim
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.prescription import FIELD, Prescription
@@ -58,6 +59,20 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
         border_buffer_m=table.border_buffer_m,
         across=table.across,
         lease_s=config.output.lease_s,
+        flow_trim=_flow_trim(config),
+    )
+
+
+def _flow_trim(config: Config) -> FlowTrim | None:
+    """Return the slow correction of the flow, if there is to be one."""
+    table = config.flow_trim
+    if not table.enabled:
+        return None
+    return FlowTrim(
+        tau_s=table.tau_s,
+        limit=table.limit,
+        meter_minimum_l_min=table.meter_minimum_l_min,
+        settle_s=table.settle_s,
     )
 
 

@@ -117,6 +117,9 @@ def fly(
     speed: Annotated[
         float | None, typer.Option(help="m/s on every leg; default: the mission's.")
     ] = None,
+    meter_rate_hz: Annotated[
+        float, typer.Option(help="How often the flow meter reports; 0: there is none.")
+    ] = 50.0,
     out: Annotated[
         Path | None, typer.Option(help="Folder for truth, result, picture and journal.")
     ] = None,
@@ -140,6 +143,7 @@ def fly(
         output=None if output is None else output.value,
         seed=seed,
         speed_m_s=speed,
+        meter_rate_hz=meter_rate_hz,
         out=out,
     )
     flown = fly_mission(options, note)

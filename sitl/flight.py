@@ -34,6 +34,7 @@ from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.navigation import Navigation
 from sitl.outputs import WIRE_S, AveragedOutput, GpioOutput, Output, ServoOutput
 from sitl.plant import AveragedPlant, Plant, PulsedPlant
+from sitl.pump_plant import PumpPlant
 from sitl.wang import POLL_S, WangController
 
 if TYPE_CHECKING:
@@ -144,10 +145,14 @@ def fly(
 
 def sprayer(
     profile: PlantProfile, options: FlightOptions, start_s: float
-) -> tuple[AveragedPlant | PulsedPlant, Output]:
-    """Return a plant and the output path that drives it."""
-    if options.fidelity == "averaged":
-        averaged = AveragedPlant(profile, seed=options.seed, start_s=start_s)
+) -> tuple[AveragedPlant | PulsedPlant | PumpPlant, Output]:
+    """Return a plant and the output path that drives it; a pump has no pulses."""
+    if options.fidelity == "averaged" or profile.pump is not None:
+        averaged: AveragedPlant | PumpPlant
+        if profile.pump is not None:
+            averaged = PumpPlant(profile, seed=options.seed, start_s=start_s)
+        else:
+            averaged = AveragedPlant(profile, seed=options.seed, start_s=start_s)
         delay_s = WIRE_S + 0.5 * SERVO_FRAME_S if options.output == "servo" else 0.0
         return averaged, AveragedOutput(averaged, delay_s=delay_s)
     pulsed = PulsedPlant(profile, seed=options.seed, start_s=start_s)
@@ -205,30 +210,24 @@ class _Said:
     unresolved: int = 0
 
 
-@dataclass(slots=True)
 class _Meter:
     """Reads the plant's flow meter at its own rate, up to where the plant is known."""
 
-    plant: Plant
-    rate_hz: float
-    start_s: float
-    _read: int = 0
+    def __init__(self, plant: Plant, rate_hz: float, start_s: float) -> None:
+        self._rate_hz, self._start_s, self._read = rate_hz, start_s, 0
+        self._per_ml = plant.profile.meter.pulses_per_l / 1000.0
+        self._count = plant.meter_counter() if rate_hz > 0.0 else None
 
     def read(self, now_s: float) -> list[FlowReport]:
         """Return what was counted since the last call, in order of time."""
-        if not self.rate_hz > 0.0:
+        if self._count is None:
             return []
-        last = math.floor((now_s - self.start_s) * self.rate_hz)
-        times = self.start_s + np.arange(self._read + 1, last + 1) / self.rate_hz
+        first, last = self._read + 1, math.floor((now_s - self._start_s) * self._rate_hz)
         self._read = max(last, self._read)
-        if not len(times):
-            return []
-        per_ml = self.plant.profile.meter.pulses_per_l / 1000.0
+        times = (self._start_s + number / self._rate_hz for number in range(first, last + 1))
         return [
-            FlowReport(received_s=at_s, volume_ml=count / per_ml)
-            for at_s, count in zip(
-                times.tolist(), self.plant.meter_count(times).tolist(), strict=True
-            )
+            FlowReport(received_s=at_s, volume_ml=self._count(at_s) / self._per_ml)
+            for at_s in times
         ]
 
 

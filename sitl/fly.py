@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SPEED_M_S = 5.0
 DEFAULT_ACCELERATION_M_S2 = 2.5
+METER_RATE_MAX_HZ = 1000.0
 SAY_EVERY_S = 300.0  # of the flight
 
 Say = Callable[[str], None]
@@ -58,6 +59,7 @@ class FlyOptions:
     output: Literal["gpio", "servo"] | None = None
     seed: int = 1
     speed_m_s: float | None = None
+    meter_rate_hz: float = 50.0
     out: Path | None = None
 
 
@@ -141,6 +143,10 @@ def prepare(options: FlyOptions) -> Task:
         raise ConfigError(f"--speed {speed:g}: give {SPEED_MIN_M_S:g} to {SPEED_MAX_M_S:g} m/s")
     if not options.seed >= 0:
         raise ConfigError(f"--seed {options.seed}: give 0 or more")
+    if not 0.0 <= options.meter_rate_hz <= METER_RATE_MAX_HZ:
+        raise ConfigError(
+            f"--meter-rate-hz {options.meter_rate_hz:g}: give 0 (no meter) to {METER_RATE_MAX_HZ:g}"
+        )
     config = load(options.config)
     setup = build_setup(config)
     profile = _plant(options.plant, setup)
@@ -267,6 +273,7 @@ def _flight_options(task: Task, options: FlyOptions) -> FlightOptions:
         output=_output(task, options),
         seed=options.seed,
         position_rate_hz=float(task.config.link.position_rate_hz),
+        meter_rate_hz=options.meter_rate_hz,
     )
 
 
@@ -287,7 +294,7 @@ def _perfect_flight(task: Task, trajectory: Trajectory, options: FlyOptions) -> 
         nozzle_sets=tuple(_true_set(nozzles, profile) for nozzles in task.setup.nozzle_sets),
         pwm=profile.pwm,
     )
-    perfect = replace(_flight_options(task, options), noise=False, scatter=False)
+    perfect = replace(_flight_options(task, options), noise=False, scatter=False, meter_rate_hz=0.0)
     return fly(setup, trajectory, profile, perfect, speed_m_s=task.speed_m_s)
 
 

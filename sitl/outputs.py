@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from companion.core.types import SprayPlan
     from sitl.board import DriverBoard
     from sitl.plant import AveragedPlant, PulsedPlant
+    from sitl.pump_plant import PumpPlant
 
 # An order is on its way to the autopilot this long: 44 bytes over a telemetry port.
 WIRE_S = 0.002
@@ -90,7 +91,7 @@ class PlanFollower:
 class AveragedOutput:
     """Duties act as they are, after the mean delay of the output path."""
 
-    def __init__(self, plant: AveragedPlant, *, delay_s: float = 0.0) -> None:
+    def __init__(self, plant: AveragedPlant | PumpPlant, *, delay_s: float = 0.0) -> None:
         self._plant = plant
         self._delay_s = delay_s
         self._follower = PlanFollower(plant.profile.valve_count)

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.errors import ConfigError
+from sitl.meter import MeterStream
 from sitl.profile import draw_scatter, flow_table
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from companion.core.schedule import LagModel
     from companion.output.pwm import Edge
@@ -35,21 +37,36 @@ class Faults:
     stuck_closed: frozenset[int] = frozenset()
 
 
-class _Ramps:
-    """The flow of one valve: steps, each spread over `ramp_s`, and their integral."""
+class Flow(Protocol):
+    """The flow of one outlet, integrated."""
 
-    def __init__(self, ramp_s: float, start_s: float) -> None:
-        self._ramp_s = ramp_s
-        self._steps: list[tuple[float, float]] = []
+    def volume_ml(self, times_s: Floats) -> Floats:
+        """Return the cumulative volume at times that were not forgotten."""
+
+    def forget(self, before_s: float) -> None:
+        """Drop what is only needed for times before `before_s`."""
+
+
+class _Ramps:
+    """The flow of one valve: steps, each spread over a ramp, and their integral."""
+
+    def __init__(self, start_s: float) -> None:
+        # Each step: when it begins, the change of flow, the length of its ramp.
+        self._steps: list[tuple[float, float, float]] = []
         self._from_s = start_s
         self._from_ml = 0.0
         self._from_ml_s = 0.0
         self._knots: tuple[Floats, Floats, Floats, Floats] | None = None
 
-    def step(self, at_s: float, change_ml_s: float) -> None:
-        """Let the flow begin to change by `change_ml_s` at `at_s`."""
-        self._steps.append((at_s, change_ml_s))
+    def step(self, at_s: float, change_ml_s: float, ramp_s: float) -> None:
+        """Let the flow begin to change by `change_ml_s` at `at_s`, within `ramp_s`."""
+        self._steps.append((at_s, change_ml_s, ramp_s))
         self._knots = None
+
+    @property
+    def steps(self) -> tuple[tuple[float, float, float], ...]:
+        """Return the steps that were not forgotten."""
+        return tuple(self._steps)
 
     def volume_ml(self, times_s: Floats) -> Floats:
         """Return the cumulative volume at times that were not forgotten."""
@@ -67,8 +84,9 @@ class _Ramps:
 
     def _build(self) -> tuple[Floats, Floats, Floats, Floats]:
         steps = np.array(self._steps)
-        at_s = np.concatenate((steps[:, 0], steps[:, 0] + self._ramp_s))
-        bend = np.concatenate((steps[:, 1], -steps[:, 1])) / self._ramp_s
+        at_s = np.concatenate((steps[:, 0], steps[:, 0] + steps[:, 2]))
+        slopes = steps[:, 1] / steps[:, 2]
+        bend = np.concatenate((slopes, -slopes))
         order = np.argsort(at_s, kind="stable")
         at_s, slope = at_s[order], np.cumsum(bend[order])
         slope[np.abs(slope) < ROUNDING] = 0.0
@@ -83,12 +101,12 @@ class _Ramps:
         self._from_ml += self._from_ml_s * (before_s - self._from_s)
         self._from_s = before_s
         kept = []
-        for at_s, change_ml_s in self._steps:
-            if at_s + self._ramp_s <= before_s:
-                self._from_ml += change_ml_s * (before_s - at_s - 0.5 * self._ramp_s)
+        for at_s, change_ml_s, ramp_s in self._steps:
+            if at_s + ramp_s <= before_s:
+                self._from_ml += change_ml_s * (before_s - at_s - 0.5 * ramp_s)
                 self._from_ml_s += change_ml_s
             else:
-                kept.append((at_s, change_ml_s))
+                kept.append((at_s, change_ml_s, ramp_s))
         self._steps = kept
         self._knots = None
 
@@ -106,24 +124,36 @@ class Plant:
         faults: Faults | None = None,
     ) -> None:
         self.profile = profile
+        self._check_kind()
         self._perfect = perfect
         self._faults = faults or Faults()
         rng = np.random.default_rng(seed)
         self._scatter = draw_scatter(profile, rng)
         self._table = flow_table(profile)
         count = profile.valve_count
-        self._ramps = [_Ramps(profile.ramp_s, start_s) for _ in range(count)]
+        self._ramps = [_Ramps(start_s) for _ in range(count)]
+        self._flows: Sequence[Flow] = self._ramps
         self._level_ml_s = [0.0] * count
         self._duty = [0.0] * count
         self._is_open = [False] * count
+        self._opened_s = [-math.inf] * count
         self._active = 0
         self._start_s = self._forgotten_s = start_s
         spread = profile.meter.gain_spread
         self._meter = _MeterState(
             gain=1.0 + float(rng.uniform(-spread, spread)), noise_rng=rng.spawn(1)[0]
         )
+        self._stream: MeterStream | None = None
         for valve in sorted(self._faults.stuck_open):
             self._take(start_s, valve, duty=1.0, is_open=True)
+
+    def _check_kind(self) -> None:
+        """Refuse a sprayer whose flow is not made by its valves."""
+        if self.profile.pump is not None:
+            raise ConfigError(
+                f"the sprayer {self.profile.name} has a pump that makes the flow and no PWM "
+                "valves; fly it with `vrspray sitl fly`"
+            )
 
     def true_lags(self, valve: int) -> LagModel:
         """Return this very valve's lags: for the run with perfect knowledge only."""
@@ -144,7 +174,7 @@ class Plant:
         times_s = np.asarray(times_s, dtype=np.float64)
         if len(times_s) and not times_s.min() >= self._forgotten_s - 1e-9:
             raise ValueError(f"{times_s.min()} s was forgotten or lies before the start")
-        return np.column_stack([ramps.volume_ml(times_s) for ramps in self._ramps])
+        return np.column_stack([flow.volume_ml(times_s) for flow in self._flows])
 
     def meter_volume_ml(self, times_s: Floats) -> Floats:
         """Return what the flow meter has counted up to each time, before rounding to pulses."""
@@ -166,6 +196,23 @@ class Plant:
         """Return the meter's pulses up to each time."""
         per_ml = self.profile.meter.pulses_per_l / 1000.0
         return np.floor(self.meter_volume_ml(times_s) * per_ml + ROUNDING).astype(np.int64)
+
+    def meter_counter(self) -> Callable[[float], int]:
+        """Return the meter to be read in passing: the same counts, in order of time only."""
+        if self._flows is not self._ramps:
+            return lambda time_s: int(self.meter_count(np.array([time_s]))[0])
+        meter, state = self.profile.meter, self._meter
+        stream = self._stream = MeterStream(
+            start_s=self._start_s,
+            period_s=self.profile.pwm.period_s,
+            lag_s=meter.lag_s,
+            per_ml=meter.pulses_per_l / 1000.0,
+            factors=lambda count: state.factors(count, meter.noise).tolist(),
+        )
+        for ramps in self._ramps:
+            for step in ramps.steps:
+                stream.step(*step)
+        return stream.count
 
     def meter_flow_l_min(self, times_s: NDArray[np.floating]) -> Floats:
         """Return the metered flow, mean of the PWM period before each time."""
@@ -190,8 +237,8 @@ class Plant:
         self._meter.volume_ml = float(self.meter_volume_ml(at_s)[0])
         self._meter.index = index
         self._forgotten_s = edge_s
-        for ramps in self._ramps:
-            ramps.forget(edge_s)
+        for flow in self._flows:
+            flow.forget(edge_s)
 
     def _take(self, at_s: float, valve: int, *, duty: float, is_open: bool) -> None:
         """Bring one valve to its new state, and all others to the pressure that it leaves."""
@@ -213,9 +260,21 @@ class Plant:
         if change_ml_s != 0.0:
             self._level_ml_s[valve] = level_ml_s
             dead_s = self._dead_s(is_open=is_open) + self._scatter.shift_s[valve]
-            self._ramps[valve].step(at_s + max(dead_s, 0.0), change_ml_s)
+            begin_s, ramp_s = at_s + max(dead_s, 0.0), self._ramp_s(is_open=is_open)
+            if is_open:
+                self._opened_s[valve] = begin_s + ramp_s
+            else:
+                # A pulse cut short goes back from where it has come to: no flow falls below zero.
+                ramp_s = max(ramp_s, self._opened_s[valve] - begin_s)
+            step = (begin_s, change_ml_s, ramp_s)
+            self._ramps[valve].step(*step)
+            if self._stream is not None:
+                self._stream.step(*step)
 
     def _flow_ml_s(self, duty: float) -> float:
+        raise NotImplementedError
+
+    def _ramp_s(self, *, is_open: bool) -> float:
         raise NotImplementedError
 
     def _dead_s(self, *, is_open: bool) -> float:
@@ -240,6 +299,9 @@ class PulsedPlant(Plant):
     def _dead_s(self, *, is_open: bool) -> float:
         return self.profile.dead_open_s if is_open else self.profile.dead_close_s
 
+    def _ramp_s(self, *, is_open: bool) -> float:
+        return self.profile.ramp_s if is_open else self.profile.closing_s
+
 
 class AveragedPlant(Plant):
     """The mean of the pulses, with the same volume-equivalent lags: fed with changes of duty."""
@@ -255,7 +317,10 @@ class AveragedPlant(Plant):
         return self._table.mean_ml_s(duty, self._active)
 
     def _dead_s(self, *, is_open: bool) -> float:  # noqa: ARG002 - the middle of a pulse has one lag
-        return self.profile.mean_lag_s - 0.5 * self.profile.ramp_s
+        return self.profile.mean_lag_s - 0.5 * self.profile.closing_s
+
+    def _ramp_s(self, *, is_open: bool) -> float:  # noqa: ARG002 - likewise; the shorter of the two
+        return self.profile.closing_s
 
 
 class _MeterState:

@@ -41,11 +41,32 @@ class Meter:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Pump:
+    """A pump whose speed makes the flow: dead time, then an exponential, slower up than down.
+
+    With `shut_off` a valve behind it opens and shuts the boom; the pump holds its speed meanwhile.
+    """
+
+    dead_s: float
+    up_s: float
+    down_s: float
+    shut_off: bool
+
+    def __post_init__(self) -> None:
+        if not all(0.0 <= value <= 10.0 for value in (self.dead_s, self.up_s, self.down_s)):
+            raise ValueError("dead_s, up_s and down_s of a pump must lie in [0, 10] s")
+        if not (self.up_s > 0.0 and self.down_s > 0.0):
+            raise ValueError("up_s and down_s of a pump must be positive")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlantProfile:
     """One sprayer. Sets are ordered from the smallest; each contains the one before it.
 
     An edge at the driver becomes flow `dead_open_s` (or `dead_close_s`) later, as a ramp of
-    `ramp_s`. The scatters are 1 sd between valves: of the whole lag, and of the flow.
+    `ramp_s` (`ramp_close_s` where closing takes another time). The scatters are 1 sd between
+    valves: of the whole lag, and of the flow. With a `pump` it is the pump's speed that makes the
+    flow, and the edges are those of its shut-off valve.
     """
 
     name: str
@@ -60,6 +81,8 @@ class PlantProfile:
     lag_scatter: float
     flow_scatter: float
     meter: Meter
+    ramp_close_s: float | None = None
+    pump: Pump | None = None
 
     def __post_init__(self) -> None:
         if not self.nozzle_sets or not 0.0 < self.boom_width_m < 1000.0:
@@ -77,19 +100,40 @@ class PlantProfile:
             raise ValueError("ramp_s must be positive, lag_scatter below 0.3")
         if not 0.0 <= self.flow_scatter < 0.3:
             raise ValueError(f"flow_scatter must lie in [0, 0.3), got {self.flow_scatter}")
+        if not 0.0 < self.closing_s <= self.ramp_s:
+            raise ValueError("0 < ramp_close_s <= ramp_s must hold")
+        if self.pump is not None and not (
+            self.valve_count == 1
+            and self.dead_open_s == self.dead_close_s
+            and self.closing_s == self.ramp_s
+        ):
+            raise ValueError("a pump has one valve_count, with equal edges to open and to shut")
+
+    @property
+    def closing_s(self) -> float:
+        """Return the length of a closing valve's ramp."""
+        return self.ramp_s if self.ramp_close_s is None else self.ramp_close_s
+
+    @property
+    def surplus_s(self) -> float:
+        """Return how much longer a valve delivers than its pulse lasts; negative: less long."""
+        return self.dead_close_s - self.dead_open_s + 0.5 * (self.closing_s - self.ramp_s)
 
     @property
     def overrun_s(self) -> float:
-        """Return how much longer a valve delivers than its pulse lasts."""
-        return self.dead_close_s - self.dead_open_s
+        """Return the surplus that pulse engine and driver board reckon with: never below 0."""
+        return max(self.surplus_s, 0.0)
 
     @property
     def mean_lag_s(self) -> float:
         """Return the volume-equivalent lag of a train of pulses: that of a pulse's middle."""
-        return 0.5 * (self.dead_open_s + self.dead_close_s + self.ramp_s)
+        ramps_s = 0.5 * (self.ramp_s + self.closing_s)
+        return 0.5 * (self.dead_open_s + self.dead_close_s + ramps_s)
 
     def lags(self, shift_s: float = 0.0) -> LagModel:
         """Return the lags of a valve that is `shift_s` later than the nominal one, no output."""
+        if self.pump is not None:
+            return self._pump_lags(self.pump)
         lag_s = self.mean_lag_s + shift_s
         return LagModel(
             on_s=lag_s,
@@ -97,7 +141,33 @@ class PlantProfile:
             up_s=lag_s,
             down_s=lag_s,
             on_start_s=self.dead_open_s + shift_s,
-            off_end_s=self.dead_close_s + self.ramp_s + shift_s,
+            off_end_s=self.dead_close_s + self.closing_s + shift_s,
+            output_s=0.0,
+        )
+
+    def _pump_lags(self, pump: Pump) -> LagModel:
+        """Return the lags of a pump: dead time and time constant, for steps of any size.
+
+        An exponential is below 2 % after ln(50) time constants.
+        """
+        up_s, down_s = pump.dead_s + pump.up_s, pump.dead_s + pump.down_s
+        if not pump.shut_off:
+            return LagModel(
+                on_s=up_s,
+                off_s=down_s,
+                up_s=up_s,
+                down_s=down_s,
+                on_start_s=pump.dead_s,
+                off_end_s=pump.dead_s + math.log(50.0) * pump.down_s,
+                output_s=0.0,
+            )
+        return LagModel(
+            on_s=self.dead_open_s + 0.5 * self.ramp_s,
+            off_s=self.dead_close_s + 0.5 * self.closing_s,
+            up_s=up_s,
+            down_s=down_s,
+            on_start_s=self.dead_open_s,
+            off_end_s=self.dead_close_s + self.closing_s,
             output_s=0.0,
         )
 
@@ -159,7 +229,7 @@ class FlowTable:
 
     def __init__(self, profile: PlantProfile) -> None:
         self._pwm = profile.pwm
-        self._overrun = profile.overrun_s * profile.pwm.frequency_hz
+        self._surplus = profile.surplus_s * profile.pwm.frequency_hz
         self._tables = [self._table(profile, active) for active in range(profile.valve_count + 1)]
 
     def _table(self, profile: PlantProfile, active: int) -> list[float]:
@@ -190,7 +260,7 @@ class FlowTable:
         if off_s < self._pwm.min_off_s:
             # The engine lengthens or fills a gap that the valve cannot follow.
             off_s = self._pwm.min_off_s if off_s >= 0.5 * self._pwm.min_off_s > 0.0 else 0.0
-        share = 1.0 - off_s / self._pwm.period_s + (self._overrun if off_s > 0.0 else 0.0)
+        share = 1.0 - off_s / self._pwm.period_s + (self._surplus if off_s > 0.0 else 0.0)
         return self.mean_ml_s(duty, active) / min(max(share, 1e-3), 1.0)
 
 
@@ -222,6 +292,12 @@ def _profile(table: dict[str, Any]) -> PlantProfile:
         for entry in table.pop("nozzle_set")
     )
     pwm, meter, flow = table.pop("pwm"), table.pop("meter"), table.pop("flow")
+    pump = table.pop("pump", None)
     return PlantProfile(
-        pwm=PwmLimits(**pwm), meter=Meter(**meter), nozzle_sets=sets, **flow, **table
+        pwm=PwmLimits(**pwm),
+        meter=Meter(**meter),
+        nozzle_sets=sets,
+        pump=None if pump is None else Pump(**pump),
+        **flow,
+        **table,
     )

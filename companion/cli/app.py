@@ -34,12 +34,15 @@ class Place(NamedTuple):
 
 COMMANDS = {
     "demo": Place(
-        "sitl.demo_cli:demo", "Fly the field of the first paper with all methods and compare them."
+        "sitl.demo_cli:demo", "Fly the field of the first paper by all methods; compare them."
     ),
     "run": Place("companion.cli.run:run", "Spray: the companion beside the flight controller."),
     "config": Place("companion.cli.config:app", "Check or show a configuration; print its schema."),
     "map": Place("companion.cli.map:app", "Check, show, convert and make prescription maps."),
     "sitl": Place("sitl.cli:app", "Simulated flight controller and sprayer."),
+    "calibrate": Place(
+        "analysis.calibrate_cli:app", "Measure lags and flow curves; plan the flight for it."
+    ),
     "replay": Place("analysis.cli:replay", "Feed a journal to the core and compare decisions."),
 }
 

@@ -15,13 +15,16 @@ from companion.errors import MapError
 from companion.maps.convert.compare import Comparison, compare
 from companion.maps.convert.formats import Wish, keeps_cells
 from companion.maps.convert.writers import write_map, writer_for
-from companion.maps.model import MapFile, map_error
+from companion.maps.model import MapFile, Problem, map_error
 from companion.maps.registry import read_map
 from companion.maps.totals import as_sprayed, totals
 
 # What a conversion may change of a rate; files hold three decimals or more.
 CHANGE_MAX_L_HA = 0.01
 NOT_PRESERVED = "not-preserved"
+# What cells may change of the ground in all before somebody should know.
+AREA_CHANGE_MAX = 0.001
+_OF_CELLS = ("geotiff", "dji", "text-map")
 _OVERLAPS = ("max", "min", "mean", "last")
 
 _Out = Annotated[Path, typer.Argument(metavar="OUT", help="File to write; its suffix counts.")]
@@ -190,6 +193,9 @@ def _result(
 ) -> dict[str, Any]:
     written = checked.written
     after, before = totals(as_sprayed(written)), totals(as_sprayed(source))
+    problems = list(source.problems)
+    if format_name in _OF_CELLS:
+        problems += _area_problems(out, after.area_ha, before.area_ha)
     shape = None if written.cells is None else written.cells.rates_l_ha.shape
     return {
         "ok": True,
@@ -207,8 +213,23 @@ def _result(
         "boundary": written.boundary is not None,
         "points_compared": checked.comparison.points,
         "max_rate_change_l_ha": checked.comparison.change_l_ha,
-        "problems": [problem_object(problem) for problem in source.problems],
+        "problems": [problem_object(problem) for problem in problems],
     }
+
+
+def _area_problems(out: Path, after_ha: float, before_ha: float) -> list[Problem]:
+    """Return what to say where cells, which follow no border, hold another area than the map."""
+    if abs(after_ha - before_ha) <= AREA_CHANGE_MAX * before_ha:
+        return []
+    return [
+        Problem(
+            severity="warning",
+            code="area-changed",
+            text=f"its cells cover {after_ha:.4f} ha, the source {before_ha:.4f} ha",
+            where=str(out),
+            fix="take smaller cells with --cell-m",
+        )
+    ]
 
 
 def _lines(result: dict[str, Any]) -> list[str]:

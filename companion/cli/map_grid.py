@@ -16,7 +16,7 @@ from companion.maps.text.reader import PointGrid, grid_of_points, grid_problems
 from companion.maps.text.text_points import parse_text_map
 from companion.maps.whole_file import write_whole
 
-GRID_EXAMPLE = "Example: vrspray map grid field.txt --origin 39.5,-0.4,50 --merge mean --json"
+GRID_EXAMPLE = "Example: vrspray map grid field.txt --origin 37.85,-4.8,120 --merge mean --json"
 
 Force = Annotated[bool, typer.Option("--force", help="Overwrite the file.")]
 

@@ -78,8 +78,12 @@ def mismatches(config: Config) -> Rule:
 
 def without_effect(config: Config) -> Rule:
     """Yield settings that this version accepts and does not act on: silence would deceive."""
+    if config.flow_trim.enabled:
+        yield Contradiction(
+            key="flow_trim.enabled",
+            text="`run` reads no flow meter in this version: its trim stays 1",
+        )
     settings = {
-        "flow_trim.enabled": config.flow_trim.enabled,
         "web.enabled": config.web.enabled,
         "output.dither_us": config.output.dither_us > 0,
         "output.return_channel": config.output.return_channel is not None,

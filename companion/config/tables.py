@@ -307,9 +307,21 @@ class ProductTable(Table):
 
 
 class FlowTrimTable(Table):
-    """Slow correction by a flow meter."""
+    """Slow correction by a flow meter; see flow-trim.md."""
 
-    enabled: bool = Field(default=False, description="not part of this version")
+    enabled: bool = Field(
+        default=False, description="true: flows are divided by metered over expected flow"
+    )
+    tau_s: float = Field(default=5.0, ge=1, le=600, description="time constant of the correction")
+    limit: float = Field(
+        default=0.15, ge=0.01, le=0.25, description="largest correction, as a share of the flow"
+    )
+    meter_minimum_l_min: float = Field(
+        default=0.5, ge=0, le=10_000, description="the meter's smallest flow; none is taken below"
+    )
+    settle_s: float = Field(
+        default=2.0, ge=0, le=60, description="no correction for this long after a change of rate"
+    )
 
 
 class JournalTable(Table):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
+from companion.core import flow_trim
 from companion.core.boom import Boom
 from companion.core.crossings import (
     STRAIGHT_YAW_RATE_DEG_S,
@@ -17,6 +18,7 @@ from companion.core.crossings import (
     Route,
     find_routes,
 )
+from companion.core.flow_trim import FlowTrim, TrimMemory, Trimming
 from companion.core.frame import LocalFrame
 from companion.core.interlock import Limits, closed_plan, guard, inhibits
 from companion.core.nozzle import NozzleSet, PwmLimits, allowed_duty, choose_set
@@ -55,7 +57,9 @@ class Setup:
     border_buffer_m: float = 0.1
     across: Across = "centre"
     lease_s: float = 0.3
+    flow_trim: FlowTrim | None = None
     timing: Timing = field(init=False, repr=False, compare=False)
+    trimming: Trimming | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.lease_s <= 5.0:
@@ -73,6 +77,9 @@ class Setup:
             self.method, self.lag, look_ahead_s=self.look_ahead_s, period_s=self.pwm.period_s
         )
         object.__setattr__(self, "timing", timing)
+        law = self.flow_trim
+        trimming = None if law is None else Trimming.of(law, self.lag, self.pwm)
+        object.__setattr__(self, "trimming", trimming)
 
     @property
     def back_s(self) -> float:
@@ -96,6 +103,7 @@ class Memory:
     set_rate_l_ha: float | None = None
     routes: tuple[Route, ...] = ()
     routes_from: VehicleState | None = None
+    trim: TrimMemory | None = None
 
 
 def step(
@@ -105,13 +113,15 @@ def step(
     reasons = inhibits(state, setup.limits, field_bounds_m=setup.prescription.bounds_m, now_s=now_s)
     sequence = 1 if memory.plan is None else memory.plan.sequence + 1
     if reasons or state is None:
-        return _closed(setup, state, reasons, sequence, now_s)
+        return _closed(setup, state, reasons, sequence, memory, now_s)
     in_force = duty_in_force(memory.plan, now_s, len(setup.boom.valves))
     routes, routes_from = _routes(setup, state, memory, now_s)
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
     index, set_rate = _nozzle_set(setup, routes, memory, speed_m_s)
     until_s = now_s + setup.lease_s
-    dosing = _dosing(setup, index, _skew(state, speed_m_s))
+    trim = _trim(setup, state, memory, in_force, now_s)
+    gain = 1.0 if trim is None else trim.sets[index].trim
+    dosing = _dosing(setup, index, _skew(state, speed_m_s) / gain)
     soon_m_s = _speed_soon(setup, state, speed_m_s)
     valves = []
     for valve, route in enumerate(routes):
@@ -137,13 +147,50 @@ def step(
         lease_until_s=until_s,
     )
     plan = guard(plan, reasons, lease_s=setup.lease_s)
-    decision = _decision(setup, state, plan, valves, index, speed_m_s)
+    flow_l_min = _flow(setup, plan, index)
+    if setup.trimming is not None and trim is not None:
+        trim = flow_trim.ordered(
+            setup.trimming, trim, flow_l_min=flow_l_min, index=index, now_s=now_s
+        )
+    decision = _decision(
+        setup, state, plan, valves,
+        index=index, speed_m_s=speed_m_s, flow_l_min=flow_l_min * gain, trim=trim,
+    )  # fmt: skip
     return decision, Memory(
         plan=plan,
         set_index=index,
         set_rate_l_ha=set_rate,
         routes=routes,
         routes_from=routes_from,
+        trim=trim,
+    )
+
+
+def _trim(
+    setup: Setup,
+    state: VehicleState,
+    memory: Memory,
+    in_force: tuple[float, ...],
+    now_s: float,
+) -> TrimMemory | None:
+    """Return the trims after the meter's newest count; None where no trim is configured."""
+    if setup.trimming is None:
+        return None
+    before = memory.trim or flow_trim.begin(len(setup.nozzle_sets))
+    is_steady, plan = memory.plan is not None, memory.plan
+    for change in plan.changes if plan is not None else ():
+        if change.at_s > now_s:
+            break
+        is_steady = is_steady and not change.restart
+    duties = [in_force[valve] for valve in setup.nozzle_sets[memory.set_index].valves]
+    low, high = min(duties), max(duties)
+    return flow_trim.follow(
+        setup.trimming,
+        before,
+        state.flow,
+        is_steady=is_steady and low > 0.0,
+        is_saturated=not setup.pwm.duty_min < low <= high < setup.pwm.duty_max,
+        now_s=now_s,
     )
 
 
@@ -243,10 +290,15 @@ def _closed(
     state: VehicleState | None,
     reasons: frozenset[Inhibit],
     sequence: int,
+    memory: Memory,
     now_s: float,
 ) -> tuple[Decision, Memory]:
     count = len(setup.boom.valves)
     plan = closed_plan(sequence=sequence, valve_count=count, now_s=now_s, lease_s=setup.lease_s)
+    trim = None
+    if setup.trimming is not None:
+        trim = memory.trim or flow_trim.begin(len(setup.nozzle_sets))
+        trim = flow_trim.pause(trim, None if state is None else state.flow, now_s=now_s)
     decision = Decision(
         now_s=now_s,
         state=state,
@@ -255,8 +307,10 @@ def _closed(
         rate_l_ha=(None,) * count,
         target_flow_l_min=0.0,
         flow_l_min=0.0,
+        flow_trim=None if trim is None else trim.sets[trim.set_index].trim,
+        flow_trim_state=None if trim is None else trim.state,
     )
-    return decision, Memory(plan=plan)
+    return decision, Memory(plan=plan, trim=trim)
 
 
 def _skew(state: VehicleState, speed_m_s: float) -> float:
@@ -314,12 +368,17 @@ def _shut(rate_l_ha: float, speed_m_s: float) -> float:  # noqa: ARG001
 
 
 def _speed_soon(setup: Setup, state: VehicleState, speed_m_s: float) -> float:
-    """Return the speed when an order given now takes effect."""
+    """Return the speed when an order given now takes effect.
+
+    On a straight line, however long the lag: a flow that follows as an exponential keeps up with
+    the speed if its order leads by dead time plus time constant, each direction by its own.
+    """
     along = (
         state.velocity_east_m_s * state.acceleration_east_m_s2
         + state.velocity_north_m_s * state.acceleration_north_m_s2
     )
-    return max(speed_m_s + along / speed_m_s * (setup.timing.up_s + 0.5 * setup.pwm.period_s), 0.0)
+    lag_s = setup.timing.up_s if along > 0.0 else setup.timing.down_s
+    return max(speed_m_s + along / speed_m_s * (lag_s + 0.5 * setup.pwm.period_s), 0.0)
 
 
 def _in_order(valves: list[ValveSchedule]) -> tuple[TimedChange, ...]:
@@ -333,8 +392,11 @@ def _decision(
     state: VehicleState,
     plan: SprayPlan,
     valves: list[ValveSchedule],
+    *,
     index: int,
     speed_m_s: float,
+    flow_l_min: float,
+    trim: TrimMemory | None,
 ) -> Decision:
     nozzles = setup.nozzle_sets[index]
     share = setup.boom.width_m / len(nozzles.valves)
@@ -342,9 +404,6 @@ def _decision(
         flow_for_rate(valves[valve].rate_now_l_ha or 0.0, speed_m_s, share)
         for valve in nozzles.valves
     )
-    now = duty_in_force(plan, plan.issued_s, len(valves))
-    flows = {duty: nozzles.curve.flow_for(duty) for duty in set(now)}
-    flow = sum(flows[now[valve]] for valve in nozzles.valves)
     return Decision(
         now_s=plan.issued_s,
         state=state,
@@ -352,7 +411,17 @@ def _decision(
         plan=plan,
         rate_l_ha=tuple(valve.rate_now_l_ha for valve in valves),
         target_flow_l_min=target,
-        flow_l_min=flow / len(nozzles.valves),
+        flow_l_min=flow_l_min,
         late_count=sum(valve.late for valve in valves),
         unresolved_count=sum(valve.unresolved_count for valve in valves),
+        flow_trim=None if trim is None else trim.sets[index].trim,
+        flow_trim_state=None if trim is None else trim.state,
     )
+
+
+def _flow(setup: Setup, plan: SprayPlan, index: int) -> float:
+    """Return the flow [L/min] that the table says of the duties in force from now on."""
+    nozzles = setup.nozzle_sets[index]
+    now = duty_in_force(plan, plan.issued_s, len(setup.boom.valves))
+    flows = {duty: nozzles.curve.flow_for(duty) for duty in set(now)}
+    return sum(flows[now[valve]] for valve in nozzles.valves) / len(nozzles.valves)

@@ -396,6 +396,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         wind_m_s=track.wind.speed_m_s if track.wind else None,
         output_healthy=track.output is None or track.output.healthy,
         enabled=track.enabled,
+        flow=track.flow,
     )
 
 

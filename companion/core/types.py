@@ -57,6 +57,17 @@ class Inhibit(StrEnum):
     OUTPUT_FAULT = "output-fault"
 
 
+class FlowTrimState(StrEnum):
+    """What the slow trim of the flow does, and what has to be said of it; see `flow_trim.py`."""
+
+    TRACKING = "tracking"
+    FROZEN = "frozen"  # as it has to be: closed, a change, an end of the range, too little flow
+    NO_METER = "no-meter"  # no count, or none that is young and sound
+    AT_LIMIT = "at-limit"  # for too long: it cannot correct what is wrong
+    SUDDEN_CHANGE = "sudden-change"  # held: a clog or a leak, not a drift
+    IMPLAUSIBLE = "implausible"  # the meter is too far from the table
+
+
 # --------------------------------------------------------------------------------------- inputs
 
 
@@ -216,6 +227,7 @@ class VehicleState:
     wind_m_s: float | None
     output_healthy: bool
     enabled: bool
+    flow: FlowReport | None = None
 
 
 # ---------------------------------------------------------------------------------------- plans
@@ -279,7 +291,9 @@ class Decision:
     """One step of the core: one row of the journal. Replay must give the same again.
 
     `rate_l_ha` is what each valve's footprint is prescribed now (`None`: nothing, closed).
-    `flow_l_min` is the flow that the duties now in force stand for, all valves together.
+    `flow_l_min` is the flow that the duties now in force stand for, all valves together; with a
+    trim its best estimate, the table's flow times the trim. `flow_trim` is that of the nozzle set
+    in use, `None` where none is configured.
     """
 
     now_s: float
@@ -291,3 +305,5 @@ class Decision:
     flow_l_min: float
     late_count: int = 0
     unresolved_count: int = 0
+    flow_trim: float | None = None
+    flow_trim_state: FlowTrimState | None = None

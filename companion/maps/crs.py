@@ -51,6 +51,8 @@ def parse_crs(text: str, *, path: Path, source: str) -> CRS:
         Transformer.from_crs(crs, WGS84, always_xy=True)
     except (CRSError, ProjError, ValueError) as error:
         reason = str(error).split("(Internal")[0].strip(" :")
+        if isinstance(error, UnicodeError) or reason.startswith("Invalid projection"):
+            reason = "it is unknown or damaged"
         raise map_error(
             path,
             f"{source} is no usable coordinate reference system ({reason[:120]})",

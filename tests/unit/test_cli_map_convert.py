@@ -65,6 +65,32 @@ def test_cells_hold_nearly_the_same_ground(tmp_path: Path, capsys: Captured, fil
     assert found["litres"] == pytest.approx(found["source_litres"], rel=0.005)
 
 
+@pytest.mark.parametrize(
+    ("file", "more"),
+    [("a.tif", ()), ("a.zip", ("--format", "dji")), ("a.txt", (*FLOW,))],
+)
+def test_cells_that_change_the_area_are_told(
+    tmp_path: Path, capsys: Captured, file: str, more: tuple[str, ...]
+) -> None:
+    out = tmp_path / file
+    code, found = run_json(capsys, "convert", PLOTS, out, *more, "--cell-m", "2", "--force")
+    assert code == 0
+    assert abs(found["area_ha"] / found["source_area_ha"] - 1.0) > 0.001
+    (problem,) = (one for one in found["problems"] if one["code"] == "area-changed")
+    assert problem["severity"] == "warning"
+    for name in ("area_ha", "source_area_ha"):
+        assert f"{found[name]:.4f} ha" in problem["text"]
+    assert "--cell-m" in problem["fix"]
+
+
+def test_cells_and_zones_of_the_same_area_say_nothing(
+    tmp_path: Path, capsys: Captured, raster: Path
+) -> None:
+    for source, file in ((raster, "a.tif"), (PLOTS, "a.shp"), (raster, "TASKDATA.XML")):
+        code, found = run_json(capsys, "convert", source, tmp_path / file)
+        assert (code, found["problems"]) == (0, [])
+
+
 def test_a_person_reads_what_was_written_and_compared(tmp_path: Path, capsys: Captured) -> None:
     assert run("convert", PLOTS, tmp_path / "a.shp") == 0
     lines = capsys.readouterr().out.splitlines()

@@ -202,6 +202,25 @@ def test_wrong_usage_says_what_is_wanted(
     assert not list(tmp_path.iterdir())
 
 
+def test_the_examples_run_as_they_are_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    lines = f"{NEW_EXAMPLE.removeprefix('Examples: ')} | {GRID_EXAMPLE.removeprefix('Example: ')}"
+    commands = [line.split() for line in lines.split(" | ")]
+    assert [words[:3] for words in commands] == [
+        ["vrspray", "map", command] for command in ("new", "new", "grid")
+    ]
+    printed = [run(*words[2:]) for words in commands]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["field.txt", "plots.geojson"]
+    found = json.loads(printed[-1])
+    assert (found["points"], found["merge"]) == (2302, "mean")
+    # Both have the same origin, the south-west corner.
+    assert found["origin"] == [37.85, -4.8, 120.0]
+    edges = [found[name] for name in ("east_min_m", "north_min_m", "east_max_m", "north_max_m")]
+    assert edges == pytest.approx([0.0, 0.0, 480.3, 595.3], abs=0.1)
+
+
 def test_unreadable_map_is_a_map_error(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="no such file"):
         run("grid", tmp_path / "none.txt")

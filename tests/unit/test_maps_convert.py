@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import math
+import os
 import struct
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -342,6 +344,38 @@ def test_a_folder_that_is_not_there_is_not_made_up(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="make the folder") as caught:
         write_map(FIELD, tmp_path / "none" / "map.shp")
     assert caught.value.code == "no-file"
+
+
+@pytest.mark.parametrize("after", ["mkdir", "write"])
+def test_an_interrupt_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, after: str
+) -> None:
+    folders = []
+    make = Path.mkdir
+
+    def made(self: Path, *arguments: Any, **more: Any) -> None:
+        make(self, *arguments, **more)
+        folders.append(self.name)
+        if after == "mkdir":
+            raise KeyboardInterrupt
+
+    def check(_: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "mkdir", made)
+    with pytest.raises(KeyboardInterrupt):
+        write_map(FIELD, tmp_path / "map.kml", check=check)
+    assert folders == [f".vrspray-{os.getpid()}-map.kml"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_a_killed_process_left_is_not_moved_and_names_may_be_long(tmp_path: Path) -> None:
+    path = tmp_path / f"{'ß' * 120}.kml"
+    left = tmp_path / f".vrspray-{os.getpid()}-{'ß' * 40}"
+    left.mkdir()
+    (left / "old.txt").write_text("old", "utf-8")
+    assert write_map(FIELD, path) == [path]
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_what_the_check_refuses_leaves_the_old_file(tmp_path: Path) -> None:

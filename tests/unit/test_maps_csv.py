@@ -299,7 +299,7 @@ def test_units_are_taken_from_their_columns(folder: Path) -> None:
         ("lat,lon,rate\n35,996,114,543,5\n", "bad-line", "line 2 has 5 fields, the header 3"),
         ("lat,lon,rate\n35.9,114.5,5\n35.9,114.5\n", "bad-line", "line 3 has 2 fields"),
         ("lat,lon,rate\n35.9,,5\n", "bad-number", "line 2: lon is ''"),
-        ("lat,lon,rate\n35.9,114.5,5\nx,114.5,5\n", "bad-number", "lat is"),
+        ("lat,lon,rate\n35.9,114.5,5\nx,114.5,5\n", "bad-number", "line 3: lat is 'x'"),
         ("lat,lon,rate\n35.9,114.5,5\n35.9,114.5,1e999\n", "bad-number", "line 3"),
         ("lat,lon,rate\n114.5,35.9,5\n", "swapped-axes", "look exchanged"),
         ("lat,lon,rate\n3986000,280000,5\n", "out-of-range", "line 2"),
@@ -320,6 +320,30 @@ def test_refused_with_its_line(folder: Path, text: str, code: str, says: str) ->
     assert caught.value.code == code
     assert says in str(caught.value)
     assert caught.value.fix
+
+
+@pytest.mark.parametrize("cell", ["inf", "0x10", "1_0", "abc", "5 L/ha"])
+@pytest.mark.parametrize("header", ["lat,lon,rate", "lat,lon,rate,zone", "lat,lon,plain"])
+def test_one_bad_cell_among_numbers_is_named(folder: Path, cell: str, header: str) -> None:
+    rest = ",1" if header.endswith("zone") else ""
+    text = square(header, f"1{rest}", f"2.5{rest}", f"{cell}{rest}", rest)
+    with pytest.raises(MapError) as caught:
+        read_csv(write(folder, text))
+    name = header.split(",")[2]
+    assert caught.value.code == "bad-number"
+    assert f"line 4: {name} is {cell!r}, which is no number" in str(caught.value)
+
+
+def test_one_bad_cell_beside_polygons_is_named(folder: Path) -> None:
+    text = wkt(ground(0).wkt, ground(1).wkt, ground(2).wkt).replace(";2\n", ";0x10\n")
+    with pytest.raises(MapError, match="line 3: rate is '0x10'") as caught:
+        read_csv(write(folder, text))
+    assert caught.value.code == "bad-number"
+
+
+def test_labels_may_have_letters_and_columns_of_text_are_none_of_numbers(folder: Path) -> None:
+    text = square("lat,lon,rate,plot,target", "1,101,a", "2,102,b", "3,103B,1", "4,104,2")
+    assert [band.name for band in grid_of(write(folder, text)).bands] == ["rate"]
 
 
 @pytest.mark.parametrize("content", ["lat,lon\n".encode("utf-16"), "lat,lon,Dosé".encode("cp1252")])

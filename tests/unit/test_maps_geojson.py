@@ -110,7 +110,9 @@ def test_latitude_first_is_refused_where_it_shows(tmp_path: Path) -> None:
 def test_metres_without_a_crs_are_refused(tmp_path: Path) -> None:
     ring = [[500000, 5330000], [500100, 5330000], [500100, 5330100], [500000, 5330000]]
     path = saved(tmp_path, collection(feature(1, ring)))
-    with pytest.raises(MapError, match="look like metres: give with --crs the projection") as caught:
+    with pytest.raises(
+        MapError, match="look like metres: give with --crs the projection"
+    ) as caught:
         read_map(path)
     assert caught.value.code == "wrong-crs"
     assert read_map(path, crs="EPSG:32633").crs == "EPSG:32633"
@@ -267,6 +269,24 @@ def refused(path: Path) -> str:
 )
 def test_every_refusal_has_its_code(tmp_path: Path, document: object, code: str) -> None:
     assert refused(saved(tmp_path, document)) == code
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "says"),
+    [
+        ("[" * 200_000, "too-large", "it nests too deep;"),
+        (f'{{"a": {"9" * 5000}}}', "bad-number", "a number has too many digits;"),
+    ],
+    ids=["deep", "digits"],
+)
+def test_what_python_does_not_parse_is_said_in_our_words(
+    tmp_path: Path, text: str, code: str, says: str
+) -> None:
+    path = saved(tmp_path, text)
+    with pytest.raises(MapError) as caught:
+        read_geojson(path)
+    assert caught.value.code == code
+    assert str(caught.value).startswith(f"{path}: {says}")
 
 
 def test_positions_of_which_only_some_have_a_height_are_read(tmp_path: Path) -> None:

@@ -488,6 +488,17 @@ def test_a_file_cut_short_is_refused(tmp_path: Path, options: dict[str, Any], ke
     refused("truncated", path)
 
 
+@pytest.mark.parametrize("options", [{"compress": "deflate"}, {"compress": "lzw"}])
+def test_pixels_that_cannot_be_unpacked_are_said_in_our_words(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    values = np.random.default_rng(1).uniform(5.0, 50.0, (80, 90)).astype("float32")
+    path = write(tmp_path / "rx.tif", values, **options)
+    content = path.read_bytes()
+    path.write_bytes(content[:-4000] + b"\xff" * 4000)
+    assert "damaged (its pixels cannot be read);" in refused("truncated", path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "code"),
     [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from shapely import MultiPolygon, Point, Polygon, box
+from shapely.affinity import translate
 
 from companion.errors import MapError
 from companion.maps import overlaps as overlaps_module
@@ -281,6 +282,44 @@ def test_every_fault_is_told_with_its_place(case: Case) -> None:
     assert re.search(case.says, problem.text), problem.text
     assert case.place in problem.where
     assert problem.fix
+
+
+@pytest.mark.parametrize(
+    ("given_map", "fix"),
+    [
+        (a_map((cell(0), 1.0)), "export the map with the longitude first"),
+        (
+            replace(cells_map([[1.0]]), format="text-map"),
+            "latitude stands first in this format: exchange the two columns",
+        ),
+        (replace(cells_map([[1.0]]), format="csv"), "exchange the names of the two columns"),
+        (
+            replace(a_map((cell(0), 1.0)), format="csv"),
+            "export the map with the longitude first",
+        ),
+    ],
+    ids=["geojson", "text-map", "csv of points", "csv of polygons"],
+)
+@pytest.mark.parametrize("known", ["home", "field"])
+def test_exchanged_axes_are_put_right_as_the_format_has_them(
+    given_map: MapFile, fix: str, known: str
+) -> None:
+    turned = [(x - 100.0, y) for x, y in cell(0).exterior.coords]
+    placed = _moved_west(given_map)
+    there = MultiPolygon([Polygon([(y, x) for x, y in turned])])
+    plan = Plan(homes=((WEST - 100.0, SOUTH),)) if known == "home" else Plan(boundary=there)
+    (problem,) = (one for one in check_map(placed, plan=plan) if one.code == "swapped-axes")
+    assert problem.fix == fix
+
+
+def _moved_west(given_map: MapFile) -> MapFile:
+    """Return a map 100 degrees further west, where its longitude could be a latitude."""
+    if given_map.cells is not None:
+        a, b, c, d, e, f = given_map.cells.transform
+        moved = replace(given_map.cells, transform=(a, b, c - 100.0, d, e, f))
+        return replace(given_map, cells=moved)
+    zones = [replace(zone, geometry=translate(zone.geometry, -100.0)) for zone in given_map.zones]
+    return replace(given_map, zones=tuple(zones))
 
 
 SOUND = [

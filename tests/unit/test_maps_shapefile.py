@@ -900,6 +900,27 @@ def test_a_file_shorter_than_its_header_says_is_refused_even_at_a_whole_record(
     assert caught.value.code == "truncated"
 
 
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (bytes(range(256)), "this is no .shp file"),
+        (bytes(500), "this is no .shp file"),
+        (b"PK", "this is no .shp file"),
+        (b"", "the file is empty"),
+    ],
+    ids=["other", "zeros", "short", "empty"],
+)
+def test_what_is_no_shapefile_is_to_be_copied_or_exported_again(
+    tmp_path: Path, content: bytes, says: str
+) -> None:
+    path = simple(tmp_path)
+    path.write_bytes(content)
+    with pytest.raises(MapError, match=says) as caught:
+        read_shapefile(path)
+    assert caught.value.code == "truncated"
+    assert caught.value.fix == "copy the whole set of files, or export the map again"
+
+
 def test_bytes_behind_the_last_record_do_no_harm(tmp_path: Path) -> None:
     path = simple(tmp_path)
     plain = read_shapefile(path)
@@ -1018,6 +1039,17 @@ def test_a_prj_that_is_of_no_map_is_refused(tmp_path: Path, prj: str) -> None:
     with pytest.raises(MapError, match="no usable coordinate reference system") as caught:
         read_map(path)
     assert caught.value.code == "wrong-crs"
+
+
+def test_a_damaged_prj_is_not_repeated_in_the_refusal(tmp_path: Path) -> None:
+    path = simple(tmp_path)
+    prj = path.with_suffix(".prj")
+    prj.write_text(prj.read_text()[:60])
+    with pytest.raises(MapError) as caught:
+        read_map(path)
+    assert caught.value.code == "wrong-crs"
+    assert "coordinate reference system (it is unknown or damaged);" in str(caught.value)
+    assert "GEOGCS" not in str(caught.value)
 
 
 def test_east_and_north_exchanged_are_refused(tmp_path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from companion.maps.model import MapFile, map_error
 
 # What other programs keep beside a shapefile about its old content.
 _STALE = (".sbn", ".sbx", ".qix", ".cpg")
+# Letters of the map's name in that of its folder: names have 255 bytes, a letter up to four.
+_NAME_MAX = 40
 
 
 def write_map(
@@ -31,7 +34,8 @@ def write_map(
     """Write a map in the format of the suffix, or in the one named, and return all files.
 
     They are made in a folder beside `path`, looked at by `check`, and only then moved to where
-    they belong; without `force` nothing is replaced.
+    they belong; without `force` nothing is replaced. The folder's name is known before there is
+    such a folder, so that it is removed wherever an interrupt comes.
     """
     path = Path(path)
     writer = writer_for(path, format)
@@ -39,18 +43,20 @@ def write_map(
         cell_m=cell_m, flow_width_m=flow_width_m, flow_speed_m_s=flow_speed_m_s, overlap=overlap
     )
     _check_target(path, force=force)
+    folder = path.parent / f".vrspray-{os.getpid()}-{path.name[:_NAME_MAX]}"
+    made = folder / path.name
     try:
-        with tempfile.TemporaryDirectory(prefix=".vrspray-", dir=path.parent) as folder:
-            made = Path(folder) / path.name
-            try:
-                writer.write(map_file, made, wish)
-                if check is not None:
-                    check(made)
-            except MapError as error:
-                # The operator knows nothing of the folder.
-                text = str(error).replace(str(made), str(path))
-                raise MapError(text, code=error.code, fix=error.fix) from None
-            return _moved(Path(folder), path, force=force)
+        # A process of this number may have been killed; what it left is not to be moved.
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(mode=0o700)
+        writer.write(map_file, made, wish)
+        if check is not None:
+            check(made)
+        return _moved(folder, path, force=force)
+    except MapError as error:
+        # The operator knows nothing of the folder.
+        text = str(error).replace(str(made), str(path))
+        raise MapError(text, code=error.code, fix=error.fix) from None
     except ShapelyError as error:
         raise map_error(
             map_file.path,
@@ -65,6 +71,8 @@ def write_map(
             fix="check folder, rights and free space",
             code="not-written",
         ) from None
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def writer_for(path: Path, name: str | None = None) -> Writer:

@@ -87,6 +87,9 @@ def _grid(table: Table, place: tuple[str, ...], sha256: str) -> Grid:
         crs, transform, grids, problems = cells_of_coordinates(x, y, values, table.path)
     units = _units(table, tuple(values))
     if not grids:
+        for name in table.columns:
+            if name not in place:
+                table.refuse_bad_cell(name)
         raise map_error(
             table.path,
             "no column but those of the place holds numbers",
@@ -112,7 +115,7 @@ def _coordinates(table: Table, name: str) -> Floats:
     whole = None if numbers is None else np.abs(numbers) <= COORDINATE_MAX
     if numbers is not None and whole is not None and whole.all():
         return numbers
-    index = 0 if whole is None else int(np.argmin(whole))
+    index = table.first_text(name) if whole is None else int(np.argmin(whole))
     raise map_error(
         table.path,
         f"line {table.lines[index]}: {name} is {table.columns[name][index][:40]!r}, no coordinate",

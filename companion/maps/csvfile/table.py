@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from companion.maps.layer import MAX_FILE_BYTES, MAX_RECORDS
+from companion.maps.fields import NONE, score
+from companion.maps.layer import MAX_FILE_BYTES, MAX_RECORDS, Column
 from companion.maps.model import Floats, map_error
 
 if TYPE_CHECKING:
@@ -43,8 +44,14 @@ class Table:
     lines: tuple[int, ...]
 
     def numbers(self, name: str) -> Floats | None:
-        """Return a column of numbers, NaN for blanks; None for text and for nothing at all."""
+        """Return a column of numbers, NaN for blanks; None for text and for nothing at all.
+
+        A column that is called like a rate may not have a single cell of text among its numbers:
+        it would be left aside as a whole.
+        """
         found = self._numbers(name)
+        if found is None and score(Column(name=name, values=(), numeric=True)) != NONE:
+            self.refuse_bad_cell(name)
         if found is not None and np.isinf(found).any():
             index = int(np.argmax(np.isinf(found)))
             raise map_error(
@@ -55,6 +62,25 @@ class Table:
                 code="bad-number",
             )
         return found
+
+    def first_text(self, name: str) -> int:
+        """Return the row of the first cell that is no number, 0 where all are."""
+        values = self.columns[name]
+        return next((i for i, one in enumerate(values) if not _NUMBER.fullmatch(one.strip())), 0)
+
+    def refuse_bad_cell(self, name: str) -> None:
+        """Refuse a column most of whose cells are numbers, and name the first that is none."""
+        tidy = [value.strip() for value in self.columns[name]]
+        full = [index for index, value in enumerate(tidy) if value.casefold() not in _BLANK]
+        bad = [index for index in full if _NUMBER.fullmatch(tidy[index]) is None]
+        if not bad or 2 * len(bad) >= len(full):
+            return
+        raise map_error(
+            self.path,
+            f"line {self.lines[bad[0]]}: {name} is {tidy[bad[0]][:40]!r}, which is no number",
+            fix="write a number like 12.5, or leave it blank",
+            code="bad-number",
+        )
 
     def _numbers(self, name: str) -> Floats | None:
         values = self.columns[name]

@@ -66,13 +66,15 @@ def _parse(content: bytes, path: Path) -> dict[str, object]:
         raise map_error(path, text, fix="save it as UTF-8", code="encoding") from None
     except _DuplicateError as error:
         raise map_error(path, str(error), fix=_EXPORT_AGAIN, code="duplicate-member") from None
-    except (ValueError, RecursionError) as error:
-        raise map_error(
-            path,
-            f"this is not readable JSON ({str(error)[:120]})",
-            fix=_EXPORT_AGAIN,
-            code="truncated",
-        ) from None
+    except json.JSONDecodeError as error:
+        text = f"this is not readable JSON ({str(error)[:120]})"
+        raise map_error(path, text, fix=_EXPORT_AGAIN, code="truncated") from None
+    except RecursionError:
+        text = "it nests too deep"
+        raise map_error(path, text, fix=_EXPORT_AGAIN, code="too-large") from None
+    except ValueError:  # a whole number of more than 4300 digits, which Python reads no further
+        text = "a number has too many digits"
+        raise map_error(path, text, fix=_EXPORT_AGAIN, code="bad-number") from None
     if not isinstance(document, dict):
         raise _no_map(path, "this is JSON, but not GeoJSON")
     return document

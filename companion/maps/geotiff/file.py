@@ -43,6 +43,8 @@ _COPY = re.compile(
     r"'?(?:GTIFF_DIR:\d+:)?(?:/vsimem/)?[0-9a-f-]{36}(?:/[^\s:']*)?(?:\.tif)?'?:?\s*"
 )
 
+_NO_PIXELS = re.compile(r"IReadBlock|Read failed")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Raster:
@@ -119,6 +121,8 @@ def _opened(content: bytes, path: Path, layer: str | None) -> Iterator[Any]:
         raise
     except broken as error:
         reason = _COPY.sub("", f"{error.__cause__ or error}")[:120]
+        if _NO_PIXELS.search(reason):
+            reason = "its pixels cannot be read"
         raise map_error(
             path,
             f"the GeoTIFF is cut short or damaged ({reason})",

@@ -103,8 +103,17 @@ def _exchanged(survey: Survey, known: Bounds, away_m: float) -> Problem | None:
         text=f"the map lies {away_m / 1000:.0f} km away; with latitude and longitude exchanged it "
         f"would be {turned_m / 1000:.1f} km away: its file has them the wrong way round",
         where=f"map at {_middle(survey.bounds_deg)}, expected near {_middle(known)}",
-        fix="export the map with the longitude first",
+        fix=_put_right(survey),
     )
+
+
+def _put_right(survey: Survey) -> str:
+    """Return how to exchange the axes in the format of the map."""
+    if survey.map_file.format == "text-map":
+        return "latitude stands first in this format: exchange the two columns"
+    if survey.map_file.format == "csv" and survey.cells is not None:
+        return "exchange the names of the two columns"
+    return "export the map with the longitude first"
 
 
 def _apart(survey: Survey) -> list[Problem]:

@@ -195,7 +195,7 @@ def _check_header(content: bytes, path: Path) -> None:
         raise map_error(
             path,
             f"this is no {suffix} file" if content else "the file is empty",
-            fix=f"name the .shp, or {_EXPORT_AGAIN}",
+            fix=_EXPORT_AGAIN,
             code="truncated",
         )
     length = 2 * struct.unpack_from(">i", content, 24)[0]

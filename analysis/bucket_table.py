@@ -1,0 +1,69 @@
+"""The table of a bucket test: what was caught in which time, by which valves."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from analysis.bucket import BucketCurve, Catch, fit_bucket
+from analysis.csv_rows import Row, TableError, read_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_RANGE = re.compile(r"(\d+)-(\d+)")
+
+
+def curves_of(path: Path, *, window: tuple[float, float], times: float = 1.0) -> list[BucketCurve]:
+    """Return the curve of every set in a file, in the order of the file."""
+    sets: dict[str, list[Catch]] = {}
+    for row in read_rows(path, ("duty", "seconds")):
+        sets.setdefault(row.text("set") or "", []).append(_catch(row, times))
+    curves = []
+    for name, catches in sets.items():
+        try:
+            curves.append(fit_bucket(catches, window=window, name=name))
+        except ValueError as error:
+            where = f"set {name}: " if name else ""
+            raise TableError(f"{path}: {where}{error}") from None
+    return curves
+
+
+def _catch(row: Row, times: float) -> Catch:
+    duty = row.needed("duty", low=0.0, high=100.0)
+    if not 0.0 < duty <= 1.0:
+        raise row.error(f"duty must be above 0 and at most 1, got {duty:g}; write 0.5 for 50 %")
+    millilitres = row.number("millilitres", low=0.0, high=1e6)
+    litres = row.number("litres", low=0.0, high=1e3)
+    if (millilitres is None) == (litres is None):
+        raise row.error("either millilitres or litres must be given")
+    volume_ml = millilitres if millilitres is not None else 1000.0 * (litres or 0.0)
+    if not volume_ml > 0.0:
+        raise row.error("nothing was caught; leave the line out")
+    seconds = row.needed("seconds", low=1.0, high=36_000.0)
+    return Catch(duty=duty, seconds=seconds, millilitres=times * volume_ml, line=row.line)
+
+
+def valves_of(text: str, known: Sequence[str] | None, path: Path) -> list[str]:
+    """Return the valves that a set names; nothing named is all of them.
+
+    >>> valves_of("1-3 5", None, Path("bucket.csv"))
+    ['1', '2', '3', '5']
+    """
+    valves: list[str] = []
+    for part in re.split(r"[\s,;+]+", text.strip()):
+        match = _RANGE.fullmatch(part)
+        if match and (known is None or part not in known):
+            first, last = int(match[1]), int(match[2])
+            valves += [str(number) for number in range(first, min(last, first + 255) + 1)]
+        elif part:
+            valves.append(part)
+    if known is not None:
+        strange = [name for name in valves if name not in known]
+        if strange:
+            raise TableError(
+                f"{path}: set {text!r}: no valve {', '.join(strange)} in the configuration; it has "
+                f"{', '.join(known)}"
+            )
+    return valves or list(known or ())

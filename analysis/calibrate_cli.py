@@ -1,0 +1,173 @@
+"""Command line of what is measured on a sprayer: lags and flow curves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from companion.cli.answer import AsJson, answer, note
+from companion.cli.app import Place, load_command
+from companion.errors import ConfigError, JournalError
+
+if TYPE_CHECKING:
+    from typer._click.core import Command, Context
+
+# Written elsewhere; `mission` plans a flight over the twin's route, which analysis must not know.
+OTHERS = {
+    "lag-marks": Place("analysis.calibrate_marks:lag_marks", ""),
+    "flow": Place("analysis.calibrate_flow:flow", ""),
+}
+MISSION = "sitl.calibration_mission"
+
+
+class Commands(TyperGroup):
+    """The commands of this file and those of others, imported when they are asked for."""
+
+    def list_commands(self, ctx: Context) -> list[str]:
+        """Return the names of all commands."""
+        return [*super().list_commands(ctx), *OTHERS]
+
+    def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
+        """Return one command."""
+        place = OTHERS.get(cmd_name)
+        if place is None:
+            return super().get_command(ctx, cmd_name)
+        return load_command(cmd_name, place)
+
+
+app = typer.Typer(
+    cls=Commands,
+    help="Measure a sprayer: lags from a flight's flow, from marks; flow curves.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+@app.command(epilog="Example: vrspray calibrate lag flights/flight-0001.gpkg")
+def lag(
+    journal: Annotated[Path, typer.Argument(help="File of a flight, such as flight-0001.gpkg.")],
+    meter_lag_s: Annotated[
+        float, typer.Option(help="The meter's own delay, its message's way included, in seconds.")
+    ] = 0.001,
+    plot: Annotated[Path | None, typer.Option(help="Picture of all steps (PNG).")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find on, off, up and down lags from what a flight ordered and its flow meter counted.
+
+    Exit 0: all lags; 1: too few good steps of a kind; 2: the file or an option cannot be used.
+    """
+    from analysis.calibration.flow_record import record_of
+    from analysis.calibration.identify import identify
+    from analysis.calibration.result import (
+        as_json as shape,
+    )
+    from analysis.calibration.result import (
+        draw,
+        refusal,
+        table_lines,
+    )
+    from companion.record.reader import read_journal
+
+    if not 0.0 <= meter_lag_s <= 1.0:
+        raise ConfigError(f"--meter-lag-s {meter_lag_s:g}: give 0 to 1 s")
+    content = read_journal(journal)
+    record = record_of(content.items(), content.setup)
+    if not len(record.time_s):
+        raise JournalError(
+            f"{journal}: holds no flow meter's readings; fly with a meter, or on the twin with "
+            "`vrspray sitl fly --meter-rate-hz 50`"
+        )
+    found = identify(record, meter_lag_s=meter_lag_s)
+    why = refusal(found)
+    if why is not None:
+        _refuse(f"{journal}: {why}", as_json=as_json)
+    if plot is not None:
+        try:
+            draw(found, plot)
+        except ImportError:
+            note("no picture: matplotlib is not installed (pip install vrspray[plot])")
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"--plot {plot}: cannot be written ({error})") from error
+    answer(shape(found), table_lines(found), as_json=as_json)
+
+
+def _refuse(why: str, *, as_json: bool) -> None:
+    """Say why there is no answer, and leave with 1: the work was done, and failed."""
+    line = f"error: {why}"
+    if as_json:
+        answer({"error": why}, (), as_json=True)
+    note(line)
+    raise typer.Exit(1)
+
+
+@app.command(
+    epilog="Example: vrspray calibrate mission --config examples/anyang/config.toml "
+    "--out calibration.plan"
+)
+def mission(
+    config: Annotated[Path, typer.Option(help="Configuration of the sprayer.")],
+    out: Annotated[Path, typer.Option(help="Mission to write: .plan or .waypoints.")],
+    origin: Annotated[
+        str | None,
+        typer.Option(metavar="LAT,LON", help="Begin here; default: first depot, or the map."),
+    ] = None,
+    heading_deg: Annotated[
+        float | None, typer.Option(help="Of the first pass; default: mission.angle_deg.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write the flight that `calibrate lag` needs: twelve changes of each kind, with its map.
+
+    Beside the mission lie its map and a copy of the configuration that flies it.
+    """
+    from importlib import import_module
+
+    planner = import_module(MISSION)
+    written = planner.write_calibration(
+        config, out, origin=_origin(origin), heading_deg=heading_deg
+    )
+    answer(_mission_json(written), _mission_lines(written), as_json=as_json)
+
+
+def _origin(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        latitude_deg, longitude_deg = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--origin {text}: give LATITUDE,LONGITUDE in degrees") from None
+    if not (abs(latitude_deg) <= 85.0 and abs(longitude_deg) <= 180.0):
+        raise ConfigError(f"--origin {text}: is no place on a map")
+    return latitude_deg, longitude_deg
+
+
+def _mission_json(written: Any) -> dict[str, Any]:
+    layout = written.layout
+    return {
+        "mission": str(written.mission),
+        "prescription": str(written.prescription),
+        "config": str(written.config),
+        "passes": len(layout.passes),
+        "strip_m": layout.strip_m,
+        "speed_m_s": layout.speed_m_s,
+        "volume_l": layout.volume_l,
+        "duration_s": layout.duration_s,
+    }
+
+
+def _mission_lines(written: Any) -> Iterator[str]:
+    layout = written.layout
+    yield f"mission {written.mission}, map {written.prescription}, configuration {written.config}"
+    yield (
+        f"{len(layout.passes)} passes at {layout.speed_m_s:g} m/s over strips of "
+        f"{layout.strip_m:.1f} m: about {layout.duration_s:.0f} s and {layout.volume_l:.1f} L"
+    )
+    yield "1. fill with water; look at the place on the map: there must be nothing in the way"
+    yield f"2. upload the mission; vrspray run --config {written.config}; fly it in AUTO and enable"
+    yield "3. vrspray calibrate lag JOURNAL, and paste what it prints into your own configuration"

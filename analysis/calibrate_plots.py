@@ -1,0 +1,132 @@
+"""Pictures of calibrations: marks against speed, flow against duty. Needs the extra `plot`."""
+
+from __future__ import annotations
+
+import importlib.util
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from analysis.csv_rows import TableError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+
+    from analysis.bucket import BucketCurve
+    from analysis.marks import MarksFit
+    from analysis.marks_design import Mark
+
+# Okabe and Ito's colours, told apart by all kinds of eyes.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+INK, FAINT = "#222222", "#8A8A8A"
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.edgecolor": FAINT,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+}
+DPI = 150
+# Courses that differ by less are one direction of flight.
+SAME_DEG = 15.0
+
+
+def plot_marks(marks: Sequence[Mark], fit: MarksFit, path: Path) -> None:
+    """Draw each mark against its speed, and the fitted line of every direction."""
+    with _axes(path) as axes:
+        speeds = np.array([mark.speed_m_s for mark in marks])
+        reach = np.array([0.0, 1.1 * float(speeds.max())])
+        for number, (course_deg, own) in enumerate(_by_course(marks).items()):
+            colour = COLOURS[number % len(COLOURS)]
+            axes.scatter(
+                [mark.speed_m_s for mark in own],
+                [mark.mark_m for mark in own],
+                s=22,
+                color=colour,
+                zorder=3,
+            )
+            angle = np.radians(course_deg)
+            offset = fit.datum_east_m.value * np.sin(angle) + fit.datum_north_m.value * np.cos(
+                angle
+            )
+            if fit.body_offset_m is not None:
+                offset += fit.body_offset_m.value * own[0].body_share
+            axes.plot(
+                reach,
+                offset + fit.time_error_s.value * reach,
+                color=colour,
+                lw=1.2,
+                label=f"flown towards {course_deg:.0f} deg",
+            )
+        if fit.outlier is not None:
+            worst = marks[fit.outlier]
+            axes.scatter(
+                worst.speed_m_s, worst.mark_m, s=90, color="none", ec=INK, label="left out"
+            )
+        axes.axhline(0.0, color=INK, lw=0.8)
+        axes.set_xlim(0.0, reach[1])
+        axes.set_xlabel("speed [m/s]")
+        axes.set_ylabel("mark beyond the boundary [m]")
+        time = fit.time_error_s
+        axes.set_title(
+            f"slope: {1000.0 * time.value:.0f} ms too late "
+            f"({1000.0 * time.low:.0f} to {1000.0 * time.high:.0f})"
+        )
+        axes.legend()
+
+
+def _by_course(marks: Sequence[Mark]) -> dict[float, list[Mark]]:
+    """Return the marks by direction of flight, those of one pass line together."""
+    found: dict[float, list[Mark]] = {}
+    for mark in marks:
+        near = (c for c in found if abs((mark.course_deg - c + 180.0) % 360.0 - 180.0) <= SAME_DEG)
+        found.setdefault(next(near, mark.course_deg % 360.0), []).append(mark)
+    return found
+
+
+def plot_flow(curves: Sequence[BucketCurve], path: Path) -> None:
+    """Draw every catch and the curve of each set."""
+    with _axes(path) as axes:
+        for number, curve in enumerate(curves):
+            colour = COLOURS[number % len(COLOURS)]
+            duty = np.linspace(curve.duty[0], curve.duty[-1], 200)
+            flow = [curve.flow_curve.flow_for(float(each)) for each in duty]
+            axes.plot(100.0 * duty, flow, color=colour, lw=1.2, label=curve.name or "all valves")
+            axes.scatter(
+                [100.0 * each.catch.duty for each in curve.residuals],
+                [each.catch.flow_l_min for each in curve.residuals],
+                s=16,
+                color=colour,
+                zorder=3,
+            )
+        axes.set_xlabel("duty [%]")
+        axes.set_ylabel("flow [L/min]")
+        axes.set_title("Bucket test")
+        axes.legend()
+
+
+@contextmanager
+def _axes(path: Path) -> Iterator[Axes]:
+    """Give axes to draw on, and write them to `path` at the end."""
+    if importlib.util.find_spec("matplotlib") is None:
+        raise TableError("no picture without matplotlib; pip install vrspray[plot]")
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if path.suffix.casefold() != ".png":
+        raise TableError(f"{path}: a picture is a .png")
+    with rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure.subplots()
+        try:
+            figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": None})
+        except OSError as error:
+            raise TableError(f"{path}: cannot be written ({error.strerror or error})") from None

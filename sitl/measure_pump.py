@@ -1,0 +1,102 @@
+"""Measures the lags of a sprayer whose pump makes the flow, on the twin, as a rig would.
+
+    python -m sitl.measure_pump [PLANT]
+
+prints the `[lag]` table to paste. Steps of 30 % up and down, each left alone until the flow
+stands; with a shut-off valve, the boom opened and shut at a flow that stands. What was ordered is
+compared with the volume that came. The position's age is no matter of the sprayer: it is that of
+`python -m sitl.measure_lags`, for any plant behind the same autopilot.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from statistics import fmean
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.core.schedule import LagModel
+from sitl.profile import PlantProfile, load_profile
+from sitl.pump_plant import PumpPlant
+
+Floats = NDArray[np.float64]
+
+SEEDS = (9001, 9002, 9003, 9004)
+# Nine time constants of the slowest pump: what is missing then is a ten thousandth of the step.
+DWELL_S = 15.0
+LINE_S = 1.0
+STEP_S = 0.001
+DRY = 0.02
+CYCLE = (("on", 0.5), ("up", 0.65), ("down", 0.45), ("down", 0.35), ("up", 0.5), ("off", 0.0))
+CYCLES = 3
+# Of the example's flights (examples/anyang/lags/gpio.toml).
+POSITION_S = 0.035
+
+
+def measure(profile: PlantProfile, *, output_s: float = 0.0) -> LagModel:
+    """Return the lags of this make of sprayer."""
+    seen: dict[str, list[float]] = {}
+    for seed in SEEDS:
+        for kind, lag_s in _rig(profile, seed):
+            seen.setdefault(kind, []).append(lag_s)
+    mean = {kind: fmean(values) for kind, values in seen.items()}
+    return LagModel(
+        on_s=mean["on"],
+        off_s=mean["off"],
+        up_s=mean["up"],
+        down_s=mean["down"],
+        on_start_s=min(seen["first"]),
+        off_end_s=max(seen["last"]),
+        output_s=output_s,
+        position_s=POSITION_S,
+    )
+
+
+def _rig(profile: PlantProfile, seed: int) -> list[tuple[str, float]]:
+    """Return the kind and the lag of every change of a few cycles, the first one left out."""
+    plant = PumpPlant(profile, seed=seed)
+    orders = [
+        (kind, DWELL_S * (number + 1), duty) for number, (kind, duty) in enumerate(CYCLE * CYCLES)
+    ]
+    for _, at_s, duty in orders:
+        plant.record_change(at_s, 0, duty)
+    seen = []
+    for kind, at_s, _ in orders[len(CYCLE) :]:
+        seen += _look(plant.volume_ml, kind, at_s)
+    return seen
+
+
+def _look(volume_ml: Callable[[Floats], Floats], kind: str, at_s: float) -> list[tuple[str, float]]:
+    """Return what one change showed."""
+    times: Floats = at_s + np.arange(-LINE_S, DWELL_S - STEP_S, STEP_S)
+    volume: Floats = volume_ml(times)[:, 0]
+    count = round(LINE_S / STEP_S)
+    before = (volume[count] - volume[0]) / LINE_S
+    after = (volume[-1] - volume[-1 - count]) / LINE_S
+    # The two lines meet where a sharp step would have given the same volume.
+    missing_ml = volume[count] + after * (times[-1] - at_s) - volume[-1]
+    seen = [(kind, float(missing_ml / (after - before)))]
+    flow = np.diff(volume) / STEP_S
+    wet = np.flatnonzero((flow > DRY * max(before, after)) & (times[:-1] >= at_s))
+    if kind == "on":
+        seen.append(("first", float(times[wet[0]] - at_s)))
+    if kind == "off":
+        seen.append(("last", float(times[wet[-1]] - at_s) + STEP_S))
+    return seen
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the `[lag]` table of a plant."""
+    name = arguments[0] if arguments else "pump"
+    lag = measure(load_profile(name))
+    sys.stdout.write(f"# {name}: `python -m sitl.measure_pump {name}`\n[lag]\n")
+    names = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s", "output_s")
+    for key in (*names, "position_s"):
+        sys.stdout.write(f"{key} = {getattr(lag, key):.4f}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
