@@ -73,7 +73,7 @@ def test_cells_that_change_the_area_are_told(
     tmp_path: Path, capsys: Captured, file: str, more: tuple[str, ...]
 ) -> None:
     out = tmp_path / file
-    code, found = run_json(capsys, "convert", PLOTS, out, *more, "--cell-m", "2", "--force")
+    code, found = run_json(capsys, "convert", PLOTS, out, *more, "--cell-m", "2")
     assert code == 0
     assert abs(found["area_ha"] / found["source_area_ha"] - 1.0) > 0.001
     (problem,) = (one for one in found["problems"] if one["code"] == "area-changed")
