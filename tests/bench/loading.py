@@ -55,7 +55,7 @@ def loading(*, seed: int, side: int = 150, repeats: int = 3) -> Figure:
 
 # In a process of its own, so that the peak of its memory is this map's and the libraries' alone.
 _RASTER = """
-import json, resource, sys
+import json, sys
 from pathlib import Path
 from time import perf_counter
 from companion.maps.build import build_prescription, frame_for
@@ -64,7 +64,9 @@ begin = perf_counter()
 found = read_map(Path(sys.argv[1]), unit="L/ha")
 prescription = build_prescription(found, frame_for(found))
 wall_s = perf_counter() - begin
-peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+# Not ru_maxrss, which a child inherits from the process that started it.
+status = dict(line.split(":", 1) for line in open("/proc/self/status"))
+peak_mb = int(status["VmHWM"].split()[0]) / 1024
 print(json.dumps([wall_s, peak_mb, int((prescription.cells.classes >= 0).sum())]))
 """
 
