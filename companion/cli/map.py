@@ -15,7 +15,7 @@ import typer
 from companion.assembly import flown_at
 from companion.cli.answer import AsJson, answer
 from companion.cli.map_convert import convert, show
-from companion.cli.map_grid import GRID_EXAMPLE, grid
+from companion.cli.map_grid import GRID_EXAMPLE, grid, parse_mark
 from companion.cli.map_new import NEW_EXAMPLE, new
 from companion.cli.map_offset import OFFSET_EXAMPLE, offset
 from companion.cli.map_options import File, Reading, reading_options
@@ -52,7 +52,7 @@ def check(
     With --config also whether its sprayer can deliver the rates and settle in every zone, and
     whether the map lies in its field. Exit 0: usable; 1: readable, with errors; 2: unreadable.
     """
-    plan, found = plan_of(reading.config, _home(home))
+    plan, found = plan_of(reading.config, None if home is None else parse_mark(home, "--home"))
     map_file = reading.read(file)
     found += sprayer_problems(reading.config, map_file, plan)
     result = summary(map_file, overlap=reading.overlap, plan=plan, more=found)
@@ -103,17 +103,6 @@ def _rate_line(item: Mapping[str, Any]) -> str:
     zone = "" if item["zone"] is None else f" in zone {item['zone']}"
     outside = "" if item.get("inside", True) else ", outside the field's boundary"
     return f"{item['lat']},{item['lon']}: {found}{zone}{outside}"
-
-
-def _home(text: str | None) -> tuple[float, float] | None:
-    """Return the home point, as (latitude, longitude)."""
-    if text is None:
-        return None
-    latitude, _, longitude = text.partition(",")
-    try:
-        return _place(latitude, longitude, "--home")
-    except MapError as error:
-        raise typer.BadParameter(str(error)) from None
 
 
 def _read_points(path: Path) -> list[tuple[float, float]]:

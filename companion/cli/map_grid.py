@@ -149,9 +149,22 @@ def parse_numbers(text: str, option: str) -> tuple[float, ...]:
 
 def parse_place(text: str, option: str) -> tuple[float, float, float]:
     """Return latitude, longitude and altitude; the altitude may be left out, and is 0 then."""
+    place = (*_numbers_of_place(text, option, "LAT,LON,ALT", (2, 3)), 0.0)
+    return place[0], place[1], place[2]
+
+
+def parse_mark(text: str, option: str) -> tuple[float, float]:
+    """Return latitude and longitude, and nothing else."""
+    latitude_deg, longitude_deg = _numbers_of_place(text, option, "LAT,LON", (2,))
+    return latitude_deg, longitude_deg
+
+
+def _numbers_of_place(
+    text: str, option: str, form: str, counts: tuple[int, ...]
+) -> tuple[float, ...]:
     numbers = parse_numbers(text, option)
-    if len(numbers) not in (2, 3) or not (abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0):
+    if len(numbers) not in counts or not (abs(numbers[0]) <= 90.0 and abs(numbers[1]) <= 180.0):
         raise typer.BadParameter(
-            f"{option} is {text!r}; write LAT,LON,ALT in degrees and metres, the latitude first"
+            f"{option} is {text!r}; write {form} in degrees and metres, the latitude first"
         )
-    return numbers[0], numbers[1], numbers[2] if len(numbers) == 3 else 0.0
+    return numbers

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from companion.cli.answer import AsJson, answer
+from companion.cli.map_grid import parse_mark
 from companion.errors import MapError
 from companion.maps.offset import offset_between
 
@@ -32,7 +33,7 @@ def offset(
     Read the mark (a corner of the field, a pole) out of the map, survey it with the receiver and
     the base that will fly, and paste the two lines into [prescription].
     """
-    first, second = place_of(in_map, "--map"), place_of(surveyed, "--surveyed")
+    first, second = parse_mark(in_map, "--map"), parse_mark(surveyed, "--surveyed")
     east_m, north_m = offset_between(first, second)
     distance_m = math.hypot(east_m, north_m)
     if not distance_m <= PLAUSIBLE_M:
@@ -49,17 +50,3 @@ def offset(
         f"check_surveyed = [{second[0]!r}, {second[1]!r}]",
     ]
     answer(result, lines, as_json=as_json)
-
-
-def place_of(text: str, option: str) -> tuple[float, float]:
-    """Return latitude and longitude of `LAT,LON`, or refuse in one line."""
-    try:
-        latitude_deg, longitude_deg = (float(part) for part in text.split(","))
-    except ValueError:
-        latitude_deg = longitude_deg = math.nan
-    if not (abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0):
-        raise MapError(
-            f"{option} {text!r}: no place; write LAT,LON in degrees, the latitude first",
-            code="out-of-range",
-        )
-    return latitude_deg, longitude_deg

@@ -21,7 +21,15 @@ from companion.maps.declared import Given, Unit, unit_of
 from companion.maps.fields import choose
 from companion.maps.layer import Band, Column, Grid, Layer, as_number
 from companion.maps.local import Area, frame_around, make_valid, project
-from companion.maps.model import RATE_MAX_L_HA, MapCells, MapFile, MapZone, Problem, map_error
+from companion.maps.model import (
+    RATE_MAX_L_HA,
+    MapCells,
+    MapFile,
+    MapZone,
+    Problem,
+    map_error,
+    unusable_polygons,
+)
 
 # Names of zones, the best first: the first of these columns that tells all records apart.
 _NAME_COLUMNS = ("name", "zonename", "zone", "zoneid", "zone_id", "label", "id", "fid", "level")
@@ -268,12 +276,7 @@ def ground_of(
         areas = to_longitude_latitude(native, crs, path=path)
         repaired, repairs = _repaired(areas, [names[index] for index in here])
     except ShapelyError as error:
-        raise map_error(
-            path,
-            f"its polygons cannot be used ({str(error)[:120]})",
-            fix="export the map again",
-            code="broken-geometry",
-        ) from None
+        raise unusable_polygons(path, error) from None
     ground: list[Area | None] = [None] * len(layer.geometries)
     for index, area in zip(here, repaired, strict=True):
         ground[index] = area

@@ -14,7 +14,7 @@ from companion.core.frame import LocalFrame
 from companion.core.prescription import Overlap, Prescription, Zone
 from companion.maps.cells import bounds_deg, grid_of
 from companion.maps.local import Area, frame_around, make_valid, project, project_all
-from companion.maps.model import MapFile, map_error
+from companion.maps.model import MapFile, map_error, unusable_polygons
 from companion.maps.overlaps import overlaps
 
 __all__ = ["build_prescription", "frame_for", "project"]
@@ -79,12 +79,7 @@ def build_prescription(
             sha256=map_file.sha256,
         )
     except ShapelyError as error:
-        raise map_error(
-            map_file.path,
-            f"its polygons cannot be used ({error})",
-            fix="export the map again",
-            code="broken-geometry",
-        ) from None
+        raise unusable_polygons(map_file.path, error) from None
 
 
 def _policy(map_file: MapFile, overlap: str) -> Overlap:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from pyproj.exceptions import ProjError
 from companion.core.cells import DEGREE_MAX, NO_RATE, CellGrid, Warp, monomials
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
-from companion.maps.crs import WGS84
+from companion.maps.crs import WGS84, is_wgs84
 from companion.maps.crs_place import check_extent
 from companion.maps.model import Affine, MapCells, map_error
 
@@ -37,12 +36,6 @@ def corner(transform: Affine, column: Floats, row: Floats) -> tuple[Floats, Floa
     """
     a, b, c, d, e, f = transform
     return a * column + b * row + c, d * column + e * row + f
-
-
-@lru_cache(maxsize=32)
-def is_wgs84(crs: CRS) -> bool:
-    """Tell whether the coordinates are WGS84 degrees already; the question takes 0.1 s."""
-    return bool(crs.to_epsg() == 4326)
 
 
 def to_degrees(cells: MapCells, column: Floats, row: Floats) -> tuple[Floats, Floats]:

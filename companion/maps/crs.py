@@ -6,6 +6,7 @@ Axis order is never guessed: shapefile and GeoJSON both store x before y, whatev
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from companion.maps.model import Problem, map_error
 
 __all__ = [
     "EXTENT_MAX_M", "METRES_PER_DEGREE", "SEGMENT_M", "WGS84", "Floats", "Objects", "crs_name",
-    "datum_problem", "densified", "parse_crs", "to_longitude_latitude",
+    "datum_problem", "densified", "is_wgs84", "parse_crs", "to_longitude_latitude",
 ]  # fmt: skip
 
 Objects = NDArray[np.object_]
@@ -81,6 +82,12 @@ def datum_problem(crs: CRS) -> Problem | None:
     )
 
 
+@lru_cache(maxsize=32)
+def is_wgs84(crs: CRS) -> bool:
+    """Tell whether the coordinates are WGS84 degrees already; the question takes 0.1 s."""
+    return bool(crs.to_epsg() == 4326)
+
+
 def to_longitude_latitude(geometries: Objects, crs: CRS, *, path: Path) -> Objects:
     """Return the geometries in WGS84 longitude and latitude, or refuse what cannot lie there."""
     coordinates = shapely.get_coordinates(geometries)
@@ -91,7 +98,7 @@ def to_longitude_latitude(geometries: Objects, crs: CRS, *, path: Path) -> Objec
             fix="export the map again",
             code="broken-geometry",
         )
-    if crs.to_epsg() == 4326:
+    if is_wgs84(crs):
         check_place(coordinates, coordinates, crs, path)
         return geometries
     transformer = Transformer.from_crs(crs, WGS84, always_xy=True)

@@ -15,6 +15,7 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon
+from shapely.errors import ShapelyError
 
 from companion.errors import MapError
 
@@ -136,3 +137,13 @@ def map_error(path: Path, text: str, *, fix: str, code: str = "unusable") -> Map
     """Return the error for a file that cannot be used: one line with file, reason and fix."""
     line = " ".join(f"{path}: {text}; {fix}".split())
     return MapError(line if len(line) <= 600 else f"{line[:597]}...", code=code, fix=fix)
+
+
+def unusable_polygons(path: Path, error: ShapelyError) -> MapError:
+    """Return the error for polygons with which geometry itself fails."""
+    return map_error(
+        path,
+        f"its polygons cannot be used ({str(error)[:120]})",
+        fix="repair the map where it is made, and export it again",
+        code="broken-geometry",
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from companion.errors import MapError
 from companion.maps.model import map_error
 
 
@@ -17,9 +18,14 @@ def write_whole(path: Path, content: bytes) -> None:
         finally:
             part.unlink(missing_ok=True)
     except OSError as error:
-        raise map_error(
-            path,
-            f"cannot be written ({error.strerror or error})",
-            fix="check folder, rights and free space",
-            code="not-written",
-        ) from None
+        raise not_written(path, error) from None
+
+
+def not_written(path: Path, error: OSError) -> MapError:
+    """Return the refusal of a file that the system does not let us write."""
+    return map_error(
+        path,
+        f"cannot be written ({error.strerror or error})",
+        fix="check folder, rights and free space",
+        code="not-written",
+    )

@@ -260,3 +260,20 @@ def test_cells_are_answered_for_a_file_of_points(
     code, found = run_json(capsys, "rate", "rx", "--points", str(points))
     assert code == 0
     assert [row["rate_l_ha"] for row in found["points"]] == [10.0, 20.0, None, 0.0]
+
+
+def test_the_offset_between_map_and_receiver_is_ready_to_paste(capsys: Captured) -> None:
+    marks = ("--map", "-36.0,114.5", "--surveyed", "-36.000005,114.500005")
+    code, found = run_json(capsys, "offset", *marks)
+    assert code == 0
+    # 5e-6 degrees there: 0.451 m east, 0.555 m south.
+    assert found["offset_east_m"] == pytest.approx(0.451, abs=1e-3)
+    assert found["offset_north_m"] == pytest.approx(-0.555, abs=1e-3)
+    assert execute(["map", "offset", *marks]) == 0
+    assert "check_surveyed = [-36.000005, 114.500005]" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("surveyed", ["-36.1,114.5", "here", "114.5,-36.0"])
+def test_another_mark_and_no_place_are_refused(capsys: Captured, surveyed: str) -> None:
+    assert execute(["map", "offset", "--map", "-36.0,114.5", "--surveyed", surveyed]) == 2
+    assert "--surveyed" in capsys.readouterr().err

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
 from pyproj import Geod
@@ -12,7 +11,8 @@ from shapely import MultiPolygon, Polygon, box
 from companion.errors import MapError
 from companion.maps.build import build_prescription, frame_for, project
 from companion.maps.lint import check_map, point_rates, summary
-from companion.maps.model import MapFile, MapZone
+from companion.maps.model import MapFile
+from tests.unit.lint_maps import a_map
 
 WEST, SOUTH, CELL = 114.543, 35.996, 0.001
 
@@ -20,21 +20,6 @@ WEST, SOUTH, CELL = 114.543, 35.996, 0.001
 def cell(column: float, row: float = 0.0, *, width: float = 1.0) -> Polygon:
     west, south = WEST + column * CELL, SOUTH + row * CELL
     return box(west, south, west + width * CELL, south + CELL)
-
-
-def a_map(*zones: tuple[Polygon | MultiPolygon, float | None]) -> MapFile:
-    return MapFile(
-        path=Path("rx.geojson"),
-        format="geojson",
-        crs="EPSG:4326",
-        unit="L/ha",
-        rate_field="rate",
-        zones=tuple(
-            MapZone(name=f"zone{index}", geometry=ground, rate_l_ha=rate)
-            for index, (ground, rate) in enumerate(zones)
-        ),
-        sha256="abc",
-    )
 
 
 def codes(map_file: MapFile, **more: str) -> list[str]:

@@ -16,6 +16,7 @@ from shapely import MultiPolygon
 from companion.errors import MapError
 from companion.maps.convert.plain_zones import outline_of_rates, plain_zones
 from companion.maps.convert.rasterise import cells_of, north_up
+from companion.maps.crs import is_wgs84
 from companion.maps.local import polygons_of
 from companion.maps.model import MapCells, MapFile, map_error
 
@@ -49,7 +50,7 @@ def keeps_cells(map_file: MapFile, wish: Wish) -> bool:
     if map_file.cells is None or wish.cell_m is not None:
         return False
     a, b, _, d, _, _ = map_file.cells.transform
-    return map_file.cells.crs.to_epsg() == 4326 and a > 0.0 and b == d == 0.0
+    return is_wgs84(map_file.cells.crs) and a > 0.0 and b == d == 0.0
 
 
 def _shapefile(map_file: MapFile, path: Path, _: Wish) -> None:

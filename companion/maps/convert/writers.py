@@ -11,7 +11,8 @@ from shapely.errors import ShapelyError
 
 from companion.errors import MapError
 from companion.maps.convert.formats import WRITERS, Wish, Writer
-from companion.maps.model import MapFile, map_error
+from companion.maps.model import MapFile, map_error, unusable_polygons
+from companion.maps.whole_file import not_written
 
 # What other programs keep beside a shapefile about its old content.
 _STALE = (".sbn", ".sbx", ".qix", ".cpg")
@@ -58,19 +59,9 @@ def write_map(
         text = str(error).replace(str(made), str(path))
         raise MapError(text, code=error.code, fix=error.fix) from None
     except ShapelyError as error:
-        raise map_error(
-            map_file.path,
-            f"its polygons cannot be used ({str(error)[:120]})",
-            fix="repair the map where it is made",
-            code="broken-geometry",
-        ) from None
+        raise unusable_polygons(map_file.path, error) from None
     except OSError as error:
-        raise map_error(
-            path,
-            f"cannot be written ({error.strerror or error})",
-            fix="check folder, rights and free space",
-            code="not-written",
-        ) from None
+        raise not_written(path, error) from None
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

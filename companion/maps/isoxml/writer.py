@@ -28,7 +28,7 @@ from companion.maps.isoxml.elements import (
 )
 from companion.maps.isoxml.grouping import grouped, outline
 from companion.maps.model import MapCells, MapFile, map_error
-from companion.maps.whole_file import write_whole
+from companion.maps.whole_file import not_written, write_whole
 
 GRID_NAME = "GRD00001"
 _TASK_DATA = "TASKDATA.XML"
@@ -151,9 +151,4 @@ def _write_folder(path: Path, task_data: bytes, grid: bytes | None) -> None:
         finally:
             shutil.rmtree(part, ignore_errors=True)
     except OSError as error:
-        raise map_error(
-            path,
-            f"cannot be written ({error.strerror or error})",
-            fix="check folder, rights and free space",
-            code="not-written",
-        ) from None
+        raise not_written(path, error) from None

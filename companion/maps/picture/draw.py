@@ -20,7 +20,7 @@ from companion.core.frame import LocalFrame
 from companion.maps.build import frame_for
 from companion.maps.cells import bounds_deg
 from companion.maps.local import project_all
-from companion.maps.model import MapFile, map_error
+from companion.maps.model import MapFile, map_error, unusable_polygons
 from companion.maps.totals import Totals, as_sprayed, totals
 from companion.maps.whole_file import write_whole
 
@@ -79,12 +79,7 @@ def draw(map_file: MapFile, out: Path, *, title: str) -> Totals:
     try:
         content, found = _drawn(map_file, title, suffix)
     except ShapelyError as error:
-        raise map_error(
-            map_file.path,
-            f"its polygons cannot be used ({str(error)[:120]})",
-            fix="repair the map where it is made",
-            code="broken-geometry",
-        ) from None
+        raise unusable_polygons(map_file.path, error) from None
     write_whole(out, content)
     return found
 

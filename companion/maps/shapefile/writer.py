@@ -13,7 +13,7 @@ from shapely import MultiPolygon, Polygon
 
 from companion.maps.model import MapZone, map_error
 from companion.maps.outline import BOUNDARY_NAME
-from companion.maps.whole_file import write_whole
+from companion.maps.whole_file import not_written, write_whole
 
 UNIT = "L/ha"
 # Four decimals hold a rate to a ten-thousandth of a litre; the core's limit is 100 000 L/ha.
@@ -57,9 +57,7 @@ def write_shapefile(
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
-        raise map_error(
-            path, f"cannot be written ({error})", fix="check folder and rights", code="not-written"
-        ) from None
+        raise not_written(path, error) from None
     for suffix in sorted(content, key=lambda suffix: suffix == ".shp"):
         write_whole(path if suffix == ".shp" else path.with_suffix(suffix), content[suffix])
 
