@@ -42,13 +42,15 @@ def serve(
     link: Annotated[
         str, typer.Option(help="udpout:, udpin:, tcp: or tcpin:HOST:PORT.")
     ] = "udpout:127.0.0.1:14550",
-    autopilot: Annotated[str, typer.Option(help="Firmware to behave like: ardupilot.")] = (
+    autopilot: Annotated[str, typer.Option(help="Firmware to behave like: ardupilot or px4.")] = (
         "ardupilot"
     ),
     mission: Annotated[
         Path | None, typer.Option(help="Mission, .plan or .waypoints; default: the example field.")
     ] = None,
-    scenario: Annotated[Path | None, typer.Option(help="Faults by the clock (TOML).")] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(help="Faults by the clock, and how the vehicle is (TOML).")
+    ] = None,
     speed: Annotated[float, typer.Option(help="Speed of the flight in m/s.")] = 5.0,
     field_config: Annotated[
         Path | None, typer.Option(help="Configuration that says how the valves are wired.")

@@ -19,12 +19,13 @@ from companion.config import Config, load
 from companion.core.frame import LocalFrame, course_deg
 from companion.errors import ConfigError
 from sitl.anyang import EXAMPLE, anyang_items
-from sitl.stub.build import StubOptions, build_autopilot
-from sitl.stub.faults import read_scenario
+from sitl.stub.build import StubOptions, build_autopilot, firmware_of
+from sitl.stub.firmware import Firmware
 from sitl.stub.flight_plan import starts_with_take_off
 from sitl.stub.mission_file import read_mission
-from sitl.stub.mission_items import MissionItem
+from sitl.stub.mission_items import MissionItem, item_message
 from sitl.stub.operator import Operator, Step
+from sitl.stub.scenario import Scenario, load_scenario
 from sitl.stub.server import StubServer
 from sitl.stub.sprayer import BoardKind, Sprayer, SprayerOptions
 from sitl.stub.truth import TruthLog
@@ -33,6 +34,7 @@ from sitl.wire_truth import judge
 DEFAULT_LINK = "udpout:127.0.0.1:14550"
 _SAY_EVERY_S = 5.0
 _AFTER_LANDING_S = 1.0
+_EPOCH_2015_S = 1_420_070_400  # MAVLink's time stamps count from there, in 10 us
 
 Say = Callable[[str], None]
 
@@ -75,8 +77,6 @@ class _Run:
     """One flight: the parts, what is said of it, and how it ends."""
 
     def __init__(self, options: ServeOptions, say: Say) -> None:
-        if options.autopilot != "ardupilot":
-            raise ConfigError(f"--autopilot {options.autopilot}: this version knows ardupilot only")
         if not 0.0 <= options.gust_m_s <= 10.0:
             raise ConfigError(f"--gust {options.gust_m_s:g}: give 0 to 10 m/s")
         if options.wait_s is not None and not options.wait_s >= 0.0:
@@ -84,18 +84,21 @@ class _Run:
         if not 0.5 <= options.speed_m_s <= 20.0:
             raise ConfigError(f"--speed {options.speed_m_s}: give 0.5 to 20 m/s")
         config = self._config = load(options.field_config or EXAMPLE / "config.toml")
-        items = _items(options)
+        scenario = load_scenario(options.scenario) if options.scenario else Scenario()
+        items = _items(options, firmware_of(options.autopilot, scenario))
         start_s = time.monotonic()
         home = LocalFrame(items[0].latitude_deg, items[0].longitude_deg)
-        self.sprayer = Sprayer(_sprayer_options(options, config), start_s=start_s)
+        self.sprayer = Sprayer(_sprayer_options(options, config, scenario), start_s=start_s)
         self.autopilot = build_autopilot(
             StubOptions(
                 home=home,
+                autopilot=options.autopilot,
                 items=items,
                 heading_deg=_first_course_deg(items, home),
                 speed_m_s=options.speed_m_s,
                 gust_m_s=options.gust_m_s,
-                faults=read_scenario(options.scenario) if options.scenario else (),
+                scenario=scenario,
+                signing_time=round((time.time() - _EPOCH_2015_S) * 1e5),
                 seed=options.seed,
             ),
             start_s=start_s,
@@ -193,8 +196,23 @@ def _spread_ms(late_s: list[float]) -> dict[str, float]:
     return {"p99": round(1000.0 * p99, 2), "max": round(1000.0 * ordered[-1], 2)}
 
 
-def _items(options: ServeOptions) -> tuple[MissionItem, ...]:
-    """Return the mission of the file, or the passes over the example field."""
+def _items(options: ServeOptions, firmware: Firmware) -> tuple[MissionItem, ...]:
+    """Return the mission of the file, or the passes over the example field.
+
+    What the firmware would refuse at an upload is refused here too.
+    """
+    items = _items_of_file(options)
+    for number, item in enumerate(items[1:], start=1):
+        message = item_message(item, number, current=False, to=(0, 0))
+        if firmware.refuses_item(message) is not None:
+            raise ConfigError(
+                f"{options.mission}: item {number}: {firmware.name} takes no command "
+                f"{item.command} in frame {item.frame}"
+            )
+    return items
+
+
+def _items_of_file(options: ServeOptions) -> tuple[MissionItem, ...]:
     if options.mission is None:
         return anyang_items(options.speed_m_s)
     items = read_mission(options.mission)
@@ -218,7 +236,7 @@ def _first_course_deg(items: tuple[MissionItem, ...], home: LocalFrame) -> float
     return 0.0
 
 
-def _sprayer_options(options: ServeOptions, config: Config) -> SprayerOptions:
+def _sprayer_options(options: ServeOptions, config: Config, scenario: Scenario) -> SprayerOptions:
     """Return the sprayer as the configuration wires it."""
     return SprayerOptions(
         profile=options.profile,
@@ -226,5 +244,6 @@ def _sprayer_options(options: ServeOptions, config: Config) -> SprayerOptions:
         channels=tuple(valve.channel for valve in config.boom().valves),
         closed_us=config.output.closed_us,
         full_us=config.output.full_us,
+        box_closed_s=scenario.box_closed_s,
         seed=options.seed,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from sitl.stub.protocol import Listener
+from sitl.stub.protocol import Listener, SigningKey
 
 
 @dataclass(slots=True)
@@ -23,20 +23,38 @@ class Channel:
     sets the rates for everybody on it.
     """
 
-    def __init__(self, name: str, send: Callable[[bytes], None]) -> None:
+    def __init__(
+        self, name: str, send: Callable[[bytes], None], *, key: SigningKey | None = None
+    ) -> None:
         self.name = name
         self.send = send
-        self.listener = Listener()
+        self.listener = Listener(key)
         self.heard: set[tuple[int, int]] = set()
         self.streams: dict[int, Stream] = {}
         self.busy_until_s = 0.0
+        self.parameters_left: list[int] = []
+        self.parameters_due_s = 0.0
 
-    def ask(self, message_id: int, interval_s: float | None, *, now_s: float) -> None:
-        """Set the interval of a stream; none ends it."""
+    def ask(
+        self,
+        message_id: int,
+        interval_s: float | None,
+        *,
+        now_s: float,
+        kinds_max: int | None = None,
+    ) -> None:
+        """Set the interval of a stream; none ends it.
+
+        ArduPilot keeps ten different intervals a port and takes the nearest of them for any more.
+        """
+        self.streams.pop(message_id, None)
         if interval_s is None:
-            self.streams.pop(message_id, None)
-        else:
-            self.streams[message_id] = Stream(interval_s=interval_s, due_s=now_s)
+            return
+        kept = {stream.interval_s for stream in self.streams.values()}
+        if kinds_max is not None and len(kept) >= kinds_max:
+            wanted_s = interval_s
+            interval_s = min(kept, key=lambda kept_s: abs(kept_s - wanted_s))
+        self.streams[message_id] = Stream(interval_s=interval_s, due_s=now_s)
 
     def due(self, now_s: float, *, slow_factor: float) -> list[int]:
         """Return the ids of the messages that are due, and count them as sent.

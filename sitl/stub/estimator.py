@@ -1,7 +1,8 @@
 """What the flight controller believes of its position: the truth, late and with noise.
 
-The figures are those of the twin: 1.4 cm white, 1.4 cm Gauss-Markov of 30 s, 3 cm/s of velocity;
-31 ms late, as measured on an ArduCopter SITL with default parameters (0.157 m at 5 m/s).
+The figures of ArduPilot are those of the twin: 1.4 cm white, 1.4 cm Gauss-Markov of 30 s, 3 cm/s
+of velocity; 31 ms late, as measured on an ArduCopter SITL with default parameters (0.157 m at
+5 m/s).
 """
 
 from __future__ import annotations
@@ -28,6 +29,11 @@ class EstimatorNoise:
     drift_m: float = 0.014
     drift_time_s: float = 30.0
     velocity_m_s: float = 0.03
+
+
+ARDUPILOT_NOISE = EstimatorNoise()
+# Measured on the PX4 SIH SITL: no delay along the track (below 5 ms), but a slow bias of 0.1 m.
+PX4_NOISE = EstimatorNoise(lag_s=0.0, drift_m=0.1, drift_time_s=120.0)
 
 
 class Estimator:

@@ -73,7 +73,7 @@ class Flight:
         """Arm; refused in modes that cannot be armed in."""
         if self.armed:
             return True
-        options = int(self._parameters["AUTO_OPTIONS"])
+        options = self._parameters.auto_options
         if self.mode in (RTL, LAND, BRAKE) or (self.mode == AUTO and not options & AUTO_ARMING):
             self._tell(f"Arm: {MODE_NAMES[self.mode]} mode not armable", severity=CRITICAL)
             return False
@@ -186,7 +186,7 @@ class Flight:
             return False
         if self.in_air:
             self._fly(now_s)
-        elif self.armed and int(self._parameters["AUTO_OPTIONS"]) & AUTO_TAKE_OFF:
+        elif self.armed and self._parameters.auto_options & AUTO_TAKE_OFF:
             self._begin_mission(now_s)
         return True
 
@@ -204,12 +204,12 @@ class Flight:
             self.items,
             self.frame,
             first_sequence=first_sequence,
-            speed_m_s=self._parameters.speed_m_s("WPNAV_SPEED"),
+            speed_m_s=self._parameters.speed_m_s("cruise"),
             home_altitude_m=self.home_altitude_m,
         )
 
     def _climb(self, height_m: float, now_s: float) -> None:
-        speed_m_s = self._parameters.speed_m_s("PILOT_SPEED_UP")
+        speed_m_s = self._parameters.speed_m_s("climb")
         pose = self.world.pose_at(now_s)
         self.world.begin(Climb(pose, height_m=height_m, speed_m_s=speed_m_s), now_s=now_s)
         self.phase = Phase.CLIMB
@@ -273,7 +273,7 @@ class Flight:
         if self.phase is Phase.DESCEND and self.mode == LAND:
             return
         if self.mode == RTL:
-            home = home_leg(self._parameters.speed_m_s("WPNAV_SPEED"))
+            home = home_leg(self._parameters.speed_m_s("cruise"))
             self._begin_route(self.world.pose_at(now_s), (home,))
             return
         self._hover(now_s, land_after=self.mode == LAND)
@@ -284,7 +284,7 @@ class Flight:
         self.will_land = land_after
 
     def _descend(self, now_s: float) -> None:
-        speed_m_s = self._parameters.speed_m_s("LAND_SPEED")
+        speed_m_s = self._parameters.speed_m_s("land")
         pose = self.world.pose_at(now_s)
         self.world.begin(Climb(pose, height_m=0.0, speed_m_s=speed_m_s), now_s=now_s)
         self.phase = Phase.DESCEND

@@ -1,6 +1,7 @@
 """The mission protocol: upload, download, clear, set current; one transfer at a time.
 
-ArduPilot's item 0 is home: it is replaced by the true home when it is read back.
+ArduPilot's item 0 is home: it is replaced by the true home when it is read back. PX4 has no home
+in its mission; the flight's list has one, which the wire does not count.
 """
 
 from __future__ import annotations
@@ -8,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from sitl.stub.mission_items import FRAMES, SUPPORTED, MissionItem, item_message, item_of
+from sitl.stub.mission_items import MissionItem, item_message, item_of
+from sitl.stub.modes import AUTO, Phase
 from sitl.stub.protocol import Message, dialect, sender
 
 if TYPE_CHECKING:
@@ -80,7 +82,7 @@ def handle_item(autopilot: Autopilot, channel: Channel, message: Message, now_s:
     if message.seq != len(upload.items):
         _ask(autopilot, upload, now_s)
         return
-    refusal = _refusal(message)
+    refusal = autopilot.firmware.refuses_item(message)
     if refusal is not None:
         autopilot.upload = None
         _acknowledge(autopilot, channel, upload.peer, refusal)
@@ -90,18 +92,9 @@ def handle_item(autopilot: Autopilot, channel: Channel, message: Message, now_s:
         _ask(autopilot, upload, now_s)
         return
     autopilot.upload = None
-    autopilot.flight.set_items(tuple(upload.items), now_s)
+    home = (autopilot.home_item(),) * autopilot.firmware.first_item
+    autopilot.flight.set_items((*home, *upload.items), now_s)
     _acknowledge(autopilot, channel, upload.peer, _ACCEPTED)
-
-
-def _refusal(message: Message) -> int | None:
-    """Return why an item is refused; item 0 is home and is never looked at."""
-    refusal: int | None = None
-    if message.seq > 0 and message.command not in SUPPORTED:
-        refusal = dialect.MAV_MISSION_UNSUPPORTED
-    elif message.seq > 0 and message.frame not in FRAMES:
-        refusal = dialect.MAV_MISSION_UNSUPPORTED_FRAME
-    return refusal
 
 
 def tick(autopilot: Autopilot, now_s: float) -> None:
@@ -121,7 +114,8 @@ def handle_list(autopilot: Autopilot, channel: Channel, message: Message, now_s:
     """Say how many items there are."""
     peer, kind = sender(message), message.mission_type
     own = kind == dialect.MAV_MISSION_TYPE_MISSION
-    count = len(autopilot.flight.items) if own else 0
+    items = len(autopilot.flight.items)
+    count = max(items - autopilot.firmware.first_item, 0) if own else 0
     channel.busy_until_s = now_s + _SLOW_S
     autopilot.send(channel, dialect.MAVLink_mission_count_message(peer[0], peer[1], count, kind))
 
@@ -129,12 +123,13 @@ def handle_list(autopilot: Autopilot, channel: Channel, message: Message, now_s:
 def handle_request(autopilot: Autopilot, channel: Channel, message: Message, now_s: float) -> None:
     """Send one item."""
     items, peer = autopilot.flight.items, sender(message)
-    if not message.seq < len(items) or message.mission_type != 0:
+    number = message.seq + autopilot.firmware.first_item
+    if not number < len(items) or message.mission_type != 0:
         _acknowledge(autopilot, channel, peer, dialect.MAV_MISSION_INVALID_SEQUENCE)
         return
     channel.busy_until_s = now_s + _SLOW_S
-    item = autopilot.home_item() if message.seq == 0 else items[message.seq]
-    current = message.seq == autopilot.flight.sequence
+    item = autopilot.home_item() if number == 0 else items[number]
+    current = message.seq == autopilot.wire_sequence(autopilot.flight.sequence)
     autopilot.send(channel, item_message(item, message.seq, current=current, to=peer))
 
 
@@ -154,5 +149,20 @@ def handle_set_current(
     autopilot: Autopilot, _channel: Channel, message: Message, now_s: float
 ) -> None:
     """Go on with another item; MISSION_CURRENT says which one it is."""
-    autopilot.flight.set_sequence(message.seq, now_s)
-    autopilot.broadcast(autopilot.build(dialect.MAVLINK_MSG_ID_MISSION_CURRENT, now_s))
+    autopilot.flight.set_sequence(message.seq + autopilot.firmware.first_item, now_s)
+    autopilot.broadcast(current(autopilot))
+
+
+def current(autopilot: Autopilot) -> Message:
+    """Return MISSION_CURRENT; the total does not count home."""
+    flight = autopilot.flight
+    state = dialect.MISSION_STATE_NOT_STARTED
+    if len(flight.items) < 2:
+        state = dialect.MISSION_STATE_NO_MISSION
+    elif flight.mission_complete:
+        state = dialect.MISSION_STATE_COMPLETE
+    elif flight.mode == AUTO and flight.phase is not Phase.GROUND:
+        state = dialect.MISSION_STATE_ACTIVE
+    return dialect.MAVLink_mission_current_message(
+        autopilot.wire_sequence(flight.sequence), max(len(flight.items) - 1, 0), state, 0
+    )

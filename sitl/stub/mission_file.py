@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.errors import ConfigError
-from sitl.stub.mission_items import PLACES, SUPPORTED, MissionItem
+from sitl.stub.mission_items import FLOWN, PLACES, MissionItem
 from sitl.stub.protocol import dialect
 
 _HEADER = "QGC WPL 110"
@@ -27,7 +27,7 @@ def read_mission(path: Path) -> tuple[MissionItem, ...]:
     if len(items) < 2:
         raise ConfigError(f"{path}: no mission items; plan at least a take-off and a waypoint")
     for number, item in enumerate(items[1:], start=1):
-        if item.command not in SUPPORTED:
+        if item.command not in FLOWN:
             raise ConfigError(
                 f"{path}: item {number}: the stub does not fly command {item.command}"
             )

@@ -19,15 +19,24 @@ ACTIONS = frozenset(
     {
         dialect.MAV_CMD_DO_CHANGE_SPEED,
         dialect.MAV_CMD_DO_SET_SERVO,
+        dialect.MAV_CMD_DO_SET_ACTUATOR,
         dialect.MAV_CMD_DO_SPRAYER,
         dialect.MAV_CMD_CONDITION_YAW,
     }
 )
-SUPPORTED = PLACES | ACTIONS | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH}
+FLOWN = PLACES | ACTIONS | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH}
+SUPPORTED = FLOWN - {dialect.MAV_CMD_DO_SET_ACTUATOR}
+# mavlink_mission.cpp of PX4 1.14 to 1.16: what is not there ends the upload.
+SUPPORTED_BY_PX4 = FLOWN - {
+    dialect.MAV_CMD_DO_SET_SERVO,
+    dialect.MAV_CMD_DO_SPRAYER,
+    dialect.MAV_CMD_CONDITION_YAW,
+}
 
 ACTION_NAMES = {
     dialect.MAV_CMD_DO_CHANGE_SPEED: "ChangeSpeed",
     dialect.MAV_CMD_DO_SET_SERVO: "SetServo",
+    dialect.MAV_CMD_DO_SET_ACTUATOR: "SetActuator",
     dialect.MAV_CMD_DO_SPRAYER: "Sprayer",
     dialect.MAV_CMD_CONDITION_YAW: "ConditionYaw",
 }
@@ -38,6 +47,7 @@ FRAMES = ABSOLUTE_FRAMES | {
     dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT,
     dialect.MAV_FRAME_MISSION,
 }
+PLACE_FRAMES = FRAMES - {dialect.MAV_FRAME_MISSION}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,3 +135,25 @@ def item_message(
         item.y_e7,
         item.z_m,
     )
+
+
+def refused_by_ardupilot(message: Message) -> int | None:
+    """Return why ArduPilot refuses an item; item 0 is home and is never looked at."""
+    if message.seq == 0:
+        return None
+    return _refusal(message, SUPPORTED, FRAMES)
+
+
+def refused_by_px4(message: Message) -> int | None:
+    """Return why PX4 refuses an item; one with a place needs a frame that has places."""
+    places = message.command in PLACES
+    return _refusal(message, SUPPORTED_BY_PX4, PLACE_FRAMES if places else FRAMES)
+
+
+def _refusal(message: Message, commands: frozenset[int], frames: frozenset[int]) -> int | None:
+    refusal: int | None = None
+    if message.command not in commands:
+        refusal = dialect.MAV_MISSION_UNSUPPORTED
+    elif message.frame not in frames:
+        refusal = dialect.MAV_MISSION_UNSUPPORTED_FRAME
+    return refusal

@@ -28,6 +28,7 @@ MODE_NAMES: dict[int, str] = {
 }
 
 INFO: int = dialect.MAV_SEVERITY_INFO
+WARNING: int = dialect.MAV_SEVERITY_WARNING
 CRITICAL: int = dialect.MAV_SEVERITY_CRITICAL
 
 

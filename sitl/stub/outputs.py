@@ -1,18 +1,25 @@
 """The servo outputs with ArduPilot's rules for MAV_CMD_DO_SET_SERVO.
 
 The rules are those of AP_ServoRelayEvents: an output must have a free function; the pulse is
-written as it comes, without limits; it holds for ever; before the first order it is 0.
+written as it comes, without limits; it holds for ever; before the first order it is 0. An output
+with a function of the transmitter follows that until it is written to, and again once the pilot
+moves the control beyond its dead zone (SRV_Channel_aux.cpp). With the safety switch on there are
+no pulses at all (RCOutput.cpp); what was ordered meanwhile shows when it is off.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
-from sitl.stub.parameters import OUTPUT_COUNT, Parameters
+from sitl.stub.parameters import OUTPUT_COUNT, OUTPUT_COUNT_MAX, Parameters
 
 # Disabled, RCPassThru, SprayerPump, SprayerSpinner, Gripper, RCIN1 to 16, RCIN1 to 16 scaled.
 FREE_FUNCTIONS = frozenset({0, 1, 22, 23, 28, *range(51, 67), *range(140, 156)})
+_PASS_THROUGH = 1
+_RC_INPUTS = range(51, 67)
+_DEAD_ZONE_US = 30  # RCn_DZ of a fresh vehicle is 20 to 30
 
 # An order shows in SERVO_OUTPUT_RAW about 6 ms later (measured on an ArduCopter SITL).
 READ_BACK_S = 0.006
@@ -27,35 +34,147 @@ class ServoOrder:
     pulse_us: int
 
 
-class ServoOutputs:
-    """What was last ordered of each output; every order goes on to what hangs on the outputs."""
+Written = Callable[[ServoOrder], None]
 
-    def __init__(self, parameters: Parameters, written: Callable[[ServoOrder], None]) -> None:
-        self._parameters = parameters
-        self._written = written
-        self._orders: dict[int, list[ServoOrder]] = {}
 
-    def is_free(self, channel: int) -> bool:
-        """Return whether DO_SET_SERVO may write to the output."""
-        return int(self._parameters[f"SERVO{channel}_FUNCTION"]) in FREE_FUNCTIONS
-
-    def write(self, channel: int, pulse_us: float, *, now_s: float) -> None:
-        """Write a pulse width; unclamped but for the 16 bits of the register."""
-        order = ServoOrder(at_s=now_s, channel=channel, pulse_us=int(pulse_us) & 0xFFFF)
-        self._orders[channel] = [*self._orders.get(channel, [])[-1:], order]
-        self._written(order)
-
-    def reset(self, now_s: float) -> None:
-        """Forget all orders, as a restart of the flight controller does: no pulses."""
-        for channel in list(self._orders):
-            self.write(channel, 0, now_s=now_s)
+class Outputs(Protocol):
+    """What the rest of the stub needs of the outputs of either firmware."""
 
     def pulses_us(self, now_s: float) -> tuple[int, ...]:
         """Return what SERVO_OUTPUT_RAW reads back."""
-        return tuple(self._pulse_us(channel, now_s) for channel in range(1, OUTPUT_COUNT + 1))
 
-    def _pulse_us(self, channel: int, now_s: float) -> int:
+    def write(self, channel: int, pulse_us: float, *, now_s: float) -> None:
+        """Write a pulse width, whatever the function of the output is."""
+
+    def reset(self, now_s: float) -> None:
+        """Forget all orders, as a restart of the flight controller does."""
+
+    def update(self, now_s: float, state: OutputState) -> None:
+        """Take in what else decides over the outputs."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputState:
+    """What decides over the outputs beside the orders."""
+
+    armed: bool = False
+    in_air: bool = False
+    safety_on: bool = False
+    killed: bool = False
+    terminated: bool = False
+    rc_us: Sequence[int] = ()
+
+
+class PulseRegister:
+    """The pulses at the pins, as they are and as they read back; all go on to what hangs there."""
+
+    def __init__(self, written: Written, *, read_back_s: float = READ_BACK_S) -> None:
+        self._written = written
+        self._read_back_s = read_back_s
+        self._orders: dict[int, list[ServoOrder]] = {}
+
+    def put(self, channel: int, pulse_us: int, *, now_s: float) -> None:
+        """Put a pulse width on a pin."""
+        order = ServoOrder(at_s=now_s, channel=channel, pulse_us=pulse_us)
+        kept = self._orders.setdefault(channel, [])
+        while len(kept) > 1 and kept[1].at_s <= now_s - self._read_back_s:
+            kept.pop(0)
+        kept.append(order)
+        self._written(order)
+
+    def now_us(self, channel: int) -> int | None:
+        """Return what is on a pin; None before anything was."""
+        orders = self._orders.get(channel)
+        return orders[-1].pulse_us if orders else None
+
+    def read_back_us(self, channel: int, now_s: float) -> int:
+        """Return what reads back of a pin."""
         for order in reversed(self._orders.get(channel, [])):
-            if order.at_s <= now_s - READ_BACK_S:
+            if order.at_s <= now_s - self._read_back_s:
                 return order.pulse_us
         return 0
+
+
+class ServoOutputs:
+    """What was last ordered of each output, and what of it reaches the pins."""
+
+    def __init__(self, parameters: Parameters, written: Written) -> None:
+        self._parameters = parameters
+        self._pins = PulseRegister(written)
+        self._ordered: dict[int, int] = {}
+        self._sticky: dict[int, int] = {}  # channel to the control's position when it was written
+        self._state = OutputState()
+        self._seen: tuple[int, OutputState] | None = None
+
+    @property
+    def count(self) -> int:
+        """Return how many outputs there are."""
+        return OUTPUT_COUNT_MAX if self._parameters["SERVO_32_ENABLE"] == 1.0 else OUTPUT_COUNT
+
+    def is_free(self, channel: int) -> bool:
+        """Return whether DO_SET_SERVO may write to the output."""
+        return self._function(channel) in FREE_FUNCTIONS
+
+    def write(self, channel: int, pulse_us: float, *, now_s: float) -> None:
+        """Write a pulse width; unclamped but for the 16 bits of the register."""
+        rc_us = self._rc_us(channel)
+        if rc_us is not None:
+            self._sticky[channel] = rc_us
+        self._order(channel, int(pulse_us) & 0xFFFF, now_s)
+
+    def reset(self, now_s: float) -> None:
+        """Forget all orders, as a restart of the flight controller does: no pulses."""
+        for channel in list(self._ordered):
+            self._order(channel, 0, now_s)
+        self._sticky.clear()
+        self._seen = None
+
+    def update(self, now_s: float, state: OutputState) -> None:
+        """Follow the safety switch and the transmitter."""
+        if self._seen == (self._parameters.revision, state):
+            return
+        self._seen = (self._parameters.revision, state)
+        switched = state.safety_on != self._state.safety_on
+        self._state = state
+        if switched:
+            for channel, pulse_us in self._ordered.items():
+                self._show(channel, pulse_us, now_s)
+        for channel in range(1, self.count + 1):
+            rc_us = self._rc_us(channel)
+            if rc_us is not None:
+                self._follow(channel, rc_us, now_s)
+
+    def pulses_us(self, now_s: float) -> tuple[int, ...]:
+        """Return what SERVO_OUTPUT_RAW reads back; the motors read what they would."""
+        motor_us = 0 if self._state.safety_on else 1500 if self._state.in_air else 1000
+        return tuple(
+            motor_us
+            if self._function(channel) in range(33, 41)
+            else self._pins.read_back_us(channel, now_s)
+            for channel in range(1, self.count + 1)
+        )
+
+    def _function(self, channel: int) -> int:
+        return int(self._parameters[f"SERVO{channel}_FUNCTION"])
+
+    def _rc_us(self, channel: int) -> int | None:
+        """Return the position of the control that an output follows."""
+        function = self._function(channel)
+        index = channel - 1 if function == _PASS_THROUGH else function - _RC_INPUTS.start
+        follows = function == _PASS_THROUGH or function in _RC_INPUTS
+        return self._state.rc_us[index] if follows and index < len(self._state.rc_us) else None
+
+    def _follow(self, channel: int, rc_us: int, now_s: float) -> None:
+        written_at_us = self._sticky.get(channel)
+        if written_at_us is not None and abs(rc_us - written_at_us) < _DEAD_ZONE_US:
+            return
+        self._sticky.pop(channel, None)
+        if self._ordered.get(channel) != rc_us:
+            self._order(channel, rc_us, now_s)
+
+    def _order(self, channel: int, pulse_us: int, now_s: float) -> None:
+        self._ordered[channel] = pulse_us
+        self._show(channel, pulse_us, now_s)
+
+    def _show(self, channel: int, pulse_us: int, now_s: float) -> None:
+        self._pins.put(channel, 0 if self._state.safety_on else pulse_us, now_s=now_s)

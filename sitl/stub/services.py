@@ -25,7 +25,8 @@ def handle_timesync(autopilot: Autopilot, channel: Channel, message: Message, no
 
 def timesync_request(autopilot: Autopilot, now_s: float) -> Message:
     """Return a request of the autopilot; ArduPilot adds its system id to its own time."""
-    return dialect.MAVLink_timesync_message(0, autopilot.boot_ns(now_s) + AUTOPILOT_SYSTEM)
+    added = AUTOPILOT_SYSTEM if autopilot.firmware.system_in_timesync else 0
+    return dialect.MAVLink_timesync_message(0, autopilot.boot_ns(now_s) + added)
 
 
 def handle_ping(autopilot: Autopilot, channel: Channel, message: Message, _now_s: float) -> None:
@@ -37,9 +38,10 @@ def handle_ping(autopilot: Autopilot, channel: Channel, message: Message, _now_s
 
 
 def handle_file_transfer(
-    autopilot: Autopilot, channel: Channel, message: Message, _now_s: float
+    autopilot: Autopilot, channel: Channel, message: Message, now_s: float
 ) -> None:
     """Refuse: there are no files here, and a client then goes on without."""
+    channel.busy_until_s = now_s + 1.0
     asked = bytes(message.payload)
     sequence = (int.from_bytes(asked[0:2], "little") + 1) & 0xFFFF
     answer = bytearray(_PAYLOAD_SIZE)

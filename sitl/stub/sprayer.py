@@ -12,6 +12,7 @@ from companion.errors import ConfigError
 from sitl.board import DriverBoard
 from sitl.plant import PulsedPlant
 from sitl.profile import load_profile
+from sitl.stub.box import ArmingBox
 from sitl.stub.outputs import ServoOrder
 
 Floats = NDArray[np.float64]
@@ -30,6 +31,7 @@ class SprayerOptions:
     channels: tuple[int, ...] = (9, 10, 11, 12, 13, 14)
     closed_us: float = 1000.0
     full_us: float = 2000.0
+    box_closed_s: float = 0.0  # how long a box wants to see the closed pulse first; 0: no such box
     seed: int = 0
 
 
@@ -47,6 +49,11 @@ class Sprayer:
             raise ConfigError("output.closed_us must be below output.full_us for this board")
         self.options = options
         self.orders: list[ServoOrder] = []
+        self._box = ArmingBox(
+            closed_s=options.box_closed_s,
+            closed_us=options.closed_us,
+            full_us=options.full_us,
+        )
         self._valves = {channel: valve for valve, channel in enumerate(options.channels)}
         self._plant = PulsedPlant(profile, seed=options.seed, start_s=start_s)
         # The same sprayer once more, with a short memory: from a whole flight of 150 s the litres
@@ -69,6 +76,8 @@ class Sprayer:
         valve = self._valves.get(order.channel)
         if valve is not None:
             self.orders.append(order)
+            if not self._box.passes(order):
+                return
             self._board.order(order.at_s + _WIRE_S, valve, order.pulse_us)
 
     def advance(self, until_s: float) -> None:

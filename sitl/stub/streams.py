@@ -1,24 +1,26 @@
 """The messages that a peer can ask for, each built from the state at one moment.
 
-A default ArduCopter streams nothing of this unasked; only HEARTBEAT comes by itself.
+What both firmwares send alike; `ardupilot_streams.py` and `px4_streams.py` hold the rest.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from sitl.stub.faults import FaultKind
-from sitl.stub.modes import AUTO, LANDED_STATES, Phase
+from sitl.stub.firmware import Builder
+from sitl.stub.modes import LANDED_STATES
 from sitl.stub.protocol import Message, clipped, dialect
+from sitl.stub.rc import RC_COUNT, rc_pulses_us
 from sitl.stub.world import Pose
 
 if TYPE_CHECKING:
     from sitl.stub.autopilot import Autopilot
 
 _HEADING_UNKNOWN = 65535
-_HEALTHY = (
+# MAVLink gives EKF_STATUS_REPORT and ESTIMATOR_STATUS the same flags.
+HEALTHY: int = (
     dialect.ESTIMATOR_ATTITUDE
     | dialect.ESTIMATOR_VELOCITY_HORIZ
     | dialect.ESTIMATOR_VELOCITY_VERT
@@ -28,7 +30,7 @@ _HEALTHY = (
     | dialect.ESTIMATOR_PRED_POS_HORIZ_REL
     | dialect.ESTIMATOR_PRED_POS_HORIZ_ABS
 )
-_LOST = dialect.ESTIMATOR_ATTITUDE | dialect.ESTIMATOR_CONST_POS_MODE
+LOST: int = dialect.ESTIMATOR_ATTITUDE | dialect.ESTIMATOR_CONST_POS_MODE
 _SENSORS = (
     dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
     | dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
@@ -51,8 +53,13 @@ def _heading_cdeg(heading_deg: float) -> int:
 
 
 def global_position(autopilot: Autopilot, now_s: float) -> Message:
-    """Return GLOBAL_POSITION_INT; ArduPilot goes on with the last place when it has none."""
-    pose = autopilot.believed(now_s)
+    """Return GLOBAL_POSITION_INT.
+
+    ArduPilot stamps it with the time of sending, and goes on with the last place when it has
+    none; PX4 stamps it with the time of the estimate.
+    """
+    at_s = autopilot.sample_s(now_s)
+    pose = autopilot.believed(at_s)
     latitude_e7, longitude_e7 = _place_e7(autopilot, pose)
     if autopilot.faults.active(FaultKind.ZERO_POSITION, now_s):
         latitude_e7 = longitude_e7 = 0
@@ -62,7 +69,7 @@ def global_position(autopilot: Autopilot, now_s: float) -> Message:
     if autopilot.faults.active(FaultKind.HEADING_UNKNOWN, now_s):
         heading = _HEADING_UNKNOWN
     return dialect.MAVLink_global_position_int_message(
-        autopilot.boot_ms(now_s),
+        autopilot.boot_ms(at_s),
         latitude_e7,
         longitude_e7,
         round((autopilot.flight.home_altitude_m + pose.height_m) * 1000.0),
@@ -110,14 +117,6 @@ def gps_raw(autopilot: Autopilot, now_s: float) -> Message:
     )
 
 
-def ekf_status(autopilot: Autopilot, now_s: float) -> Message:
-    """Return EKF_STATUS_REPORT; without a position it holds a constant one and says so."""
-    lost = autopilot.faults.active(FaultKind.STALE_POSITION, now_s) is not None
-    variance = 1.2 if lost else 0.05
-    flags = _LOST if lost else _HEALTHY
-    return dialect.MAVLink_ekf_status_report_message(flags, variance, variance, 0.05, 0.05, 0.0)
-
-
 def extended_state(autopilot: Autopilot, _now_s: float) -> Message:
     """Return EXTENDED_SYS_STATE."""
     return dialect.MAVLink_extended_sys_state_message(
@@ -126,19 +125,16 @@ def extended_state(autopilot: Autopilot, _now_s: float) -> Message:
 
 
 def servo_output(autopilot: Autopilot, now_s: float) -> Message:
-    """Return SERVO_OUTPUT_RAW of the first sixteen outputs; the motors read what they would."""
-    pulses = list(autopilot.outputs.pulses_us(now_s))
-    for motor in range(4):
-        pulses[motor] = 1500 if autopilot.flight.in_air else 1000
+    """Return SERVO_OUTPUT_RAW of the first sixteen outputs."""
     return dialect.MAVLink_servo_output_raw_message(
-        (autopilot.boot_ms(now_s) * 1000) & 0xFFFFFFFF, 0, *pulses
+        (autopilot.boot_ms(now_s) * 1000) & 0xFFFFFFFF, 0, *autopilot.outputs.pulses_us(now_s)[:16]
     )
 
 
 def rc_channels(autopilot: Autopilot, now_s: float) -> Message:
-    """Return RC_CHANNELS: sticks in the middle, switches low."""
-    pulses = [1500, 1500, 1500, 1500] + [1000] * 12 + [0, 0]
-    return dialect.MAVLink_rc_channels_message(autopilot.boot_ms(now_s), 16, *pulses, 254)
+    """Return RC_CHANNELS: what the transmitter says."""
+    pulses = [*rc_pulses_us(autopilot.faults, now_s), 0, 0]
+    return dialect.MAVLink_rc_channels_message(autopilot.boot_ms(now_s), RC_COUNT, *pulses, 254)
 
 
 def sys_status(_autopilot: Autopilot, _now_s: float) -> Message:
@@ -152,21 +148,6 @@ def attitude(autopilot: Autopilot, now_s: float) -> Message:
     """Return ATTITUDE, level."""
     yaw = math.radians((autopilot.believed(now_s).heading_deg + 180.0) % 360.0 - 180.0)
     return dialect.MAVLink_attitude_message(autopilot.boot_ms(now_s), 0, 0, yaw, 0, 0, 0)
-
-
-def mission_current(autopilot: Autopilot, _now_s: float) -> Message:
-    """Return MISSION_CURRENT; the total does not count home."""
-    flight = autopilot.flight
-    state = dialect.MISSION_STATE_NOT_STARTED
-    if len(flight.items) < 2:
-        state = dialect.MISSION_STATE_NO_MISSION
-    elif flight.mission_complete:
-        state = dialect.MISSION_STATE_COMPLETE
-    elif flight.mode == AUTO and flight.phase is not Phase.GROUND:
-        state = dialect.MISSION_STATE_ACTIVE
-    return dialect.MAVLink_mission_current_message(
-        flight.sequence, max(len(flight.items) - 1, 0), state, 0
-    )
 
 
 def home_position(autopilot: Autopilot, now_s: float) -> Message:
@@ -183,93 +164,27 @@ def home_position(autopilot: Autopilot, now_s: float) -> Message:
     )
 
 
-def autopilot_version(_autopilot: Autopilot, _now_s: float) -> Message:
-    """Return AUTOPILOT_VERSION: a Copter 4.6, without file transfer."""
-    capabilities = (
-        dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
-        | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
-        | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
-        | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
-    )
-    version = (4 << 24) | (6 << 16) | (0 << 8) | 255
-    zeros = [0] * 8
-    return dialect.MAVLink_autopilot_version_message(
-        capabilities, version, 0, 0, 0, zeros, zeros, zeros, 0, 0, 1
-    )
-
-
 def system_time(autopilot: Autopilot, now_s: float) -> Message:
     """Return SYSTEM_TIME without a date: nothing that is tested hangs on the calendar."""
     return dialect.MAVLink_system_time_message(0, autopilot.boot_ms(now_s))
 
 
-def heartbeat(autopilot: Autopilot, _now_s: float) -> Message:
-    """Return HEARTBEAT of an ArduCopter."""
-    flight = autopilot.flight
-    mode = (
-        dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        | dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
-        | dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
-        | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
-        | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if flight.armed else 0)
-    )
-    status = dialect.MAV_STATE_ACTIVE if flight.in_air else dialect.MAV_STATE_STANDBY
-    return dialect.MAVLink_heartbeat_message(
-        dialect.MAV_TYPE_QUADROTOR,
-        dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
-        mode,
-        flight.mode,
-        status,
-        3,
-    )
+def version_word(version: tuple[int, int, int]) -> int:
+    """Return a version as AUTOPILOT_VERSION has it, marked as a release."""
+    major, minor, patch = version
+    official: int = dialect.FIRMWARE_VERSION_TYPE_OFFICIAL
+    return major << 24 | minor << 16 | patch << 8 | official
 
 
-BUILDERS: dict[int, Callable[[Autopilot, float], Message]] = {
-    dialect.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
+COMMON: dict[int, Builder] = {
     dialect.MAVLINK_MSG_ID_SYS_STATUS: sys_status,
     dialect.MAVLINK_MSG_ID_SYSTEM_TIME: system_time,
     dialect.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw,
     dialect.MAVLINK_MSG_ID_ATTITUDE: attitude,
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position,
     dialect.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: servo_output,
-    dialect.MAVLINK_MSG_ID_MISSION_CURRENT: mission_current,
     dialect.MAVLINK_MSG_ID_RC_CHANNELS: rc_channels,
     dialect.MAVLINK_MSG_ID_VFR_HUD: vfr_hud,
-    dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
-    dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT: ekf_status,
     dialect.MAVLINK_MSG_ID_HOME_POSITION: home_position,
     dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: extended_state,
-}
-
-# Known to an ArduCopter and granted, but never sent by one with these sensors (WIND needs an
-# airspeed estimate).
-SILENT = frozenset(
-    {
-        dialect.MAVLINK_MSG_ID_WIND,
-        dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR,
-        dialect.MAVLINK_MSG_ID_RANGEFINDER,
-        dialect.MAVLINK_MSG_ID_BATTERY_STATUS,
-        dialect.MAVLINK_MSG_ID_RPM,
-        dialect.MAVLINK_MSG_ID_TERRAIN_REPORT,
-    }
-)
-
-# What REQUEST_DATA_STREAM switches together, of what there is here.
-GROUPS: dict[int, tuple[int, ...]] = {
-    dialect.MAV_DATA_STREAM_EXTENDED_STATUS: (
-        dialect.MAVLINK_MSG_ID_SYS_STATUS,
-        dialect.MAVLINK_MSG_ID_GPS_RAW_INT,
-        dialect.MAVLINK_MSG_ID_MISSION_CURRENT,
-    ),
-    dialect.MAV_DATA_STREAM_RC_CHANNELS: (
-        dialect.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
-        dialect.MAVLINK_MSG_ID_RC_CHANNELS,
-    ),
-    dialect.MAV_DATA_STREAM_POSITION: (dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,),
-    dialect.MAV_DATA_STREAM_EXTRA1: (dialect.MAVLINK_MSG_ID_ATTITUDE,),
-    dialect.MAV_DATA_STREAM_EXTRA2: (dialect.MAVLINK_MSG_ID_VFR_HUD,),
-    dialect.MAV_DATA_STREAM_EXTRA3: (
-        dialect.MAVLINK_MSG_ID_SYSTEM_TIME,
-        dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
-    ),
 }

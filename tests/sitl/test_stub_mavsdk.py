@@ -18,19 +18,21 @@ from tests.unit.stub_bench import HOME, mission
 
 mavsdk = pytest.importorskip("mavsdk.asyncio")
 pytestmark = pytest.mark.sitl
+both = pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 
 
 @asynccontextmanager
-async def connected() -> AsyncIterator[tuple[StubServer, Any]]:
+async def connected(autopilot: str) -> AsyncIterator[tuple[StubServer, Any]]:
     """The stub and MAVSDK's system on one loopback link."""
     port = free_port()
-    autopilot = build_autopilot(
-        StubOptions(home=HOME, speed_m_s=10.0, gust_m_s=0.0), start_s=time.monotonic()
+    stub = build_autopilot(
+        StubOptions(home=HOME, autopilot=autopilot, speed_m_s=10.0, gust_m_s=0.0),
+        start_s=time.monotonic(),
     )
     kind = mavsdk.ComponentType.GROUND_STATION
     async with (
         asyncio.timeout(60.0),
-        StubServer(autopilot, [f"udpout:127.0.0.1:{port}"]) as server,
+        StubServer(stub, [f"udpout:127.0.0.1:{port}"]) as server,
         mavsdk.Mavsdk(mavsdk.Configuration.create_with_component_type(kind)) as client,
     ):
         await client.add_any_connection(f"udpin://127.0.0.1:{port}")
@@ -39,9 +41,11 @@ async def connected() -> AsyncIterator[tuple[StubServer, Any]]:
         yield server, system
 
 
-def raw_items() -> list[Any]:
+def raw_items(autopilot: str) -> list[Any]:
+    """A mission as each firmware wants it: ArduPilot's begins with home."""
     from mavsdk.plugins.mission_raw import MissionItem
 
+    items = mission((0.0, 20.0))[0 if autopilot == "ardupilot" else 1 :]
     return [
         MissionItem(
             seq=number,
@@ -58,23 +62,25 @@ def raw_items() -> list[Any]:
             z=item.z_m,
             mission_type=0,
         )
-        for number, item in enumerate(mission((0.0, 20.0)))
+        for number, item in enumerate(items)
     ]
 
 
-async def test_mavsdk_uploads_a_mission_reads_it_back_arms_and_flies_it() -> None:
+@both
+async def test_mavsdk_uploads_a_mission_reads_it_back_arms_and_flies_it(autopilot: str) -> None:
     from mavsdk.asyncio.plugins.action import ActionAsync
     from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync
 
-    async with connected() as (server, system):
+    async with connected(autopilot) as (server, system):
         flight = server.autopilot.flight
         missions, action = MissionRawAsync(system), ActionAsync(system)
-        items = raw_items()
+        items = raw_items(autopilot)
         await missions.upload_mission(items)
-        assert len(flight.items) == len(items)
+        assert len(flight.items) == len(items) + (autopilot == "px4")
         back = await missions.download_mission()
-        assert [(item.command, item.x, item.y) for item in back[1:]] == [
-            (item.command, item.x, item.y) for item in items[1:]
+        first = 1 if autopilot == "ardupilot" else 0
+        assert [(item.command, item.x, item.y) for item in back[first:]] == [
+            (item.command, item.x, item.y) for item in items[first:]
         ]
         await action.arm()
         assert flight.armed
@@ -86,13 +92,58 @@ async def test_mavsdk_uploads_a_mission_reads_it_back_arms_and_flies_it() -> Non
             await on_route.wait()
 
 
-async def test_mavsdk_reads_position_and_health_of_the_stub() -> None:
+@both
+async def test_mavsdk_reads_position_and_health_of_the_stub(autopilot: str) -> None:
     from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 
-    async with connected() as (_, system):
+    async with connected(autopilot) as (_, system):
         telemetry = TelemetryAsync(system)
         await telemetry.set_rate_position(10.0)
+        await telemetry.set_rate_health(5.0)
         async for position in telemetry.subscribe_position():
-            assert position.latitude_deg == pytest.approx(HOME.latitude_deg, abs=1e-6)
-            assert position.longitude_deg == pytest.approx(HOME.longitude_deg, abs=1e-6)
+            assert position.latitude_deg == pytest.approx(HOME.latitude_deg, abs=1e-5)
+            assert position.longitude_deg == pytest.approx(HOME.longitude_deg, abs=1e-5)
             break
+        async with asyncio.timeout(20.0):
+            async for well in telemetry.subscribe_health_all_ok():
+                if well:
+                    break
+
+
+PARAMETERS = {
+    "ardupilot": ("SERVO9_FUNCTION", "WPNAV_SPEED"),
+    "px4": ("PWM_MAIN_FUNC9", "MIS_TAKEOFF_ALT"),
+}
+
+
+@both
+async def test_mavsdk_reads_and_sets_parameters(autopilot: str) -> None:
+    from mavsdk.asyncio.plugins.param import ParamAsync
+
+    whole, real = PARAMETERS[autopilot]
+    async with connected(autopilot) as (server, system):
+        kept, client = server.autopilot.parameters, ParamAsync(system)
+        assert await client.get_param_int(whole) == kept[whole]
+        await client.set_param_int(whole, 305)
+        assert kept[whole] == 305
+        await client.set_param_float(real, 7.5)
+        assert kept[real] == pytest.approx(7.5)
+        everything = await client.get_all_params()
+        names = {one.name for one in everything.int_params + everything.float_params}
+        assert len(names) == len(kept)
+
+
+@both
+async def test_mavsdk_sets_an_actuator(autopilot: str) -> None:
+    """One call and two units: microseconds on ArduPilot, -1 to 1 on PX4."""
+    from mavsdk.asyncio.plugins.action import ActionAsync
+
+    async with connected(autopilot) as (server, system):
+        action, outputs = ActionAsync(system), server.autopilot.outputs
+        await action.arm()
+        if autopilot == "ardupilot":
+            await action.set_actuator(9, 1500.0)
+        else:
+            await action.set_actuator(1, 0.0)
+        await asyncio.sleep(0.1)
+        assert outputs.pulses_us(time.monotonic())[8] == 1500

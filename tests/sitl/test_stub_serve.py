@@ -7,6 +7,7 @@ import json
 import signal
 import socket
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,15 +42,27 @@ async def ended(process: asyncio.subprocess.Process) -> tuple[int, str, str]:
     return process.returncode, out.decode(), err.decode()
 
 
-async def play_companion(client: Client) -> None:
+def half_open_servos(client: Client) -> None:
+    """Open every valve half, as ArduPilot wants it."""
+    for channel in range(9, 15):
+        client.command(dialect.MAV_CMD_DO_SET_SERVO, channel, 1500)
+
+
+def half_open_actuators(client: Client) -> None:
+    """Open every valve half, as PX4 wants it."""
+    client.command(dialect.MAV_CMD_DO_SET_ACTUATOR, *(0.0,) * 6, 0)
+
+
+async def play_companion(
+    client: Client, half_open: Callable[[Client], None] = half_open_servos
+) -> None:
     """Be heard, take the enable, open every valve half."""
     await client.hear("HEARTBEAT", within_s=20.0)
     client.say(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     order = await client.hear("COMMAND_LONG", within_s=20.0)
     assert (order.command, order.param1, order.target_component) == (216, 1.0, 191)
     client.say(dialect.MAVLink_command_ack_message(order.command, 0, 0, 0, 255, 190))
-    for channel in range(9, 15):
-        client.command(dialect.MAV_CMD_DO_SET_SERVO, channel, 1500)
+    half_open(client)
 
 
 async def test_a_flight_ends_with_the_truth_on_disk(tmp_path: Path) -> None:
@@ -88,6 +101,27 @@ def check_truth(truth: dict[str, Any], result: dict[str, Any]) -> None:
     assert truth["north_m"].max() == pytest.approx(22.2, abs=0.5)
 
 
+async def test_a_flight_on_px4_sprays_with_actuators(tmp_path: Path) -> None:
+    mission = tmp_path / "short.waypoints"
+    mission.write_text(MISSION)
+    port, out = free_port(), tmp_path / "truth"
+    async with udp_client(local=port) as client:
+        process = await start(
+            *("--link", f"udpout:127.0.0.1:{port}", "--autopilot", "px4"),
+            *("--mission", str(mission), "--out", str(out), "--speed", "10"),
+        )
+        await play_companion(client, half_open_actuators)
+        code, stdout, stderr = await ended(process)
+    assert code == 0, stderr
+    result = json.loads(stdout)
+    assert (result["state"], result["enabled"]) == ("landed", True)
+    assert result["volume_l"] > 0.0
+    pulses_us = list(np.load(out / "truth.npz")["order_pulse_us"])
+    # Disarmed from the start, open by the order, disarmed after the landing.
+    assert pulses_us[:6] == [900] * 6
+    assert pulses_us[-12:] == [1500] * 6 + [900] * 6
+
+
 async def test_an_interrupt_ends_cleanly_with_the_truth_so_far(tmp_path: Path) -> None:
     port = free_port()
     async with udp_client(local=port) as client:
@@ -110,6 +144,9 @@ def options_refused(folder: Path) -> dict[str, tuple[tuple[str, ...], str]]:
     """Return what is wrong on the command line, and what has to be in the message."""
     (folder / "broken.waypoints").write_text("nonsense")
     (folder / "broken.toml").write_text("[[fault]]\nkind = 'gremlins'\n")
+    (folder / "version.toml").write_text("[firmware]\nversion = '1.16.0'\n")
+    servo = "3 0 2 183 9 1500 0 0 0 0 0 1\n"
+    (folder / "servo.waypoints").write_text(MISSION + servo)
     (folder / "grounded.waypoints").write_text(MISSION.replace("1 0 3 22", "1 0 3 16"))
     return {
         "no take-off": (("--mission", str(folder / "grounded.waypoints")), "take-off"),
@@ -120,10 +157,18 @@ def options_refused(folder: Path) -> dict[str, tuple[tuple[str, ...], str]]:
         "link": (("--link", "carrier-pigeon"), "KIND:HOST:PORT"),
         "speed": (("--speed", "nan"), "--speed nan"),
         "autopilot": (("--autopilot", "betaflight"), "betaflight"),
+        "version": (("--scenario", str(folder / "version.toml")), "known from 4.0.0 on"),
+        "px4 mission": (
+            ("--autopilot", "px4", "--mission", str(folder / "servo.waypoints")),
+            "183",
+        ),
     }
 
 
-WRONG = ("autopilot", "config", "link", "mission", "no take-off", "profile", "scenario", "speed")
+WRONG = (
+    *("autopilot", "config", "link", "mission", "no take-off", "profile", "px4 mission"),
+    *("scenario", "speed", "version"),
+)
 
 
 @pytest.mark.parametrize("wrong", WRONG)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
+from sitl.stub.ardupilot_streams import BUILDERS
 from sitl.stub.protocol import dialect
-from sitl.stub.streams import BUILDERS
+from sitl.stub.scenario import Scenario
 from tests.unit.stub_bench import HOME, Bench, mission
 
 POSITION = dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+WIND = dialect.MAVLINK_MSG_ID_WIND
 SET_INTERVAL = dialect.MAV_CMD_SET_MESSAGE_INTERVAL
 
 
@@ -70,7 +73,7 @@ def test_streams_slow_down_while_a_mission_is_read() -> None:
     assert len(bench.companion.of("GLOBAL_POSITION_INT")) <= 7
 
 
-@pytest.mark.parametrize("message_id", sorted(BUILDERS))
+@pytest.mark.parametrize("message_id", sorted(set(BUILDERS) - {WIND}))
 def test_every_message_can_be_requested_once(message_id: int) -> None:
     bench = Bench()
     bench.run(0.1)
@@ -136,3 +139,56 @@ def test_file_transfer_is_refused_so_that_a_client_goes_on() -> None:
     bench.companion.say(dialect.MAVLink_file_transfer_protocol_message(0, 1, 1, ask))
     answer = bench.companion.last("FILE_TRANSFER_PROTOCOL").payload
     assert (answer[0], answer[3], answer[5]) == (8, 129, 4)
+
+
+def test_wind_comes_only_with_an_estimate_of_the_airspeed() -> None:
+    blown = Scenario(wind_towards_m_s=(0.0, -4.0))
+    without = Bench(scenario=blown)
+    assert without.companion.command(SET_INTERVAL, WIND, 500_000) == 0
+    without.run(2.0)
+    assert not without.companion.of("WIND")
+    bench = Bench(scenario=replace(blown, parameters={"EK3_DRAG_BCOEF_X": 20.0}))
+    assert bench.companion.command(SET_INTERVAL, WIND, 500_000) == 0
+    bench.run(1.0)
+    wind = bench.companion.last("WIND")
+    assert (wind.direction, wind.speed) == (pytest.approx(0.0), pytest.approx(4.0))
+
+
+def test_a_port_keeps_ten_different_intervals() -> None:
+    bench = Bench()
+    asked = sorted(set(BUILDERS) - {WIND, 0})[:11]
+    for number, message_id in enumerate(asked):
+        assert bench.companion.command(SET_INTERVAL, message_id, 100_000 + 10_000 * number) == 0
+    kept = {stream.interval_s for stream in bench.companion.channel.streams.values()}
+    assert len(kept) == 10
+    assert bench.companion.channel.streams[asked[-1]].interval_s == pytest.approx(0.19)
+
+
+def test_a_list_of_parameters_takes_its_time_and_slows_the_streams() -> None:
+    bench = Bench()
+    bench.companion.command(SET_INTERVAL, POSITION, 50_000)
+    bench.companion.say(dialect.MAVLink_param_request_list_message(1, 1))
+    assert len(bench.companion.of("PARAM_VALUE")) == 10
+    bench.run(1.0)
+    values = bench.companion.of("PARAM_VALUE")
+    assert [value.param_index for value in values] == list(range(len(values)))
+    assert len(values) == values[0].param_count
+    assert len(bench.companion.of("GLOBAL_POSITION_INT")) <= 7
+
+
+def test_the_second_port_of_outputs_comes_when_it_is_switched_on() -> None:
+    bench = Bench(scenario=Scenario(parameters={"SERVO_32_ENABLE": 1}))
+    assert bench.companion.command(dialect.MAV_CMD_DO_SET_SERVO, 17, 1234) == 0
+    bench.companion.command(SET_INTERVAL, dialect.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 100_000)
+    bench.run(0.5)
+    by_port = {message.port: message for message in bench.companion.of("SERVO_OUTPUT_RAW")}
+    assert set(by_port) == {0, 1}
+    assert by_port[1].servo1_raw == 1234
+
+
+def test_a_clock_can_drift_and_can_have_run_for_long() -> None:
+    bench = Bench(scenario=Scenario(drift_ppm=1000.0, uptime_s=100.0))
+    bench.run(10.0)
+    bench.companion.say(dialect.MAVLink_timesync_message(0, 5))
+    assert bench.companion.last("TIMESYNC").tc1 == pytest.approx(110.11e9)
+    assert bench.companion.request(POSITION).time_boot_ms == 110_110

@@ -1,0 +1,129 @@
+"""Scenario files: what they can set, and how they are refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from companion.errors import ConfigError
+from sitl.stub.build import StubOptions, build_autopilot, firmware_of, noise_of
+from sitl.stub.faults import FaultKind
+from sitl.stub.scenario import Scenario, load_scenario
+from tests.unit.stub_bench import HOME
+
+EVERYTHING = """
+[firmware]
+version = "1.14.1"
+commands_per_s = 20
+[parameters]
+PWM_MAIN_FUNC9 = 0
+[position]
+lag_s = 0.04
+white_m = 0.0
+[clock]
+drift_ppm = -50.0
+uptime_s = 4294900.0
+[wind]
+speed_m_s = 4.0
+from_deg = 270.0
+[box]
+closed_s = 2.0
+[signing]
+key = "000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f"
+[[fault]]
+kind = "ack-lost"
+command = 187
+fraction = 0.5
+"""
+SCENARIOS = Path(__file__).resolve().parents[2] / "examples" / "anyang" / "scenarios"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "scenario.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_everything_that_can_be_set_is_set(tmp_path: Path) -> None:
+    scenario = load_scenario(written(tmp_path, EVERYTHING))
+    assert (scenario.version, scenario.commands_per_s) == ((1, 14, 1), 20.0)
+    assert scenario.parameters == {"PWM_MAIN_FUNC9": 0.0}
+    assert scenario.wind_towards_m_s == (pytest.approx(4.0), pytest.approx(0.0))
+    assert (scenario.box_closed_s, scenario.signing_key) == (2.0, bytes(range(32)))
+    assert [fault.kind for fault in scenario.faults] == [FaultKind.ACK_LOST]
+    options = StubOptions(home=HOME, autopilot="px4", scenario=scenario)
+    assert (noise_of(options).lag_s, noise_of(options).drift_m) == (0.04, 0.1)
+    stub = build_autopilot(options, start_s=0.0)
+    assert stub.firmware.commands_per_s == 20.0
+    assert stub.parameters["PWM_MAIN_FUNC9"] == 0.0
+    assert stub.boot_ms(10.0) == round((4294900.0 + 10.0) * 1000 * (1 - 50e-6))
+
+
+def test_an_empty_scenario_is_the_firmware_as_it_is(tmp_path: Path) -> None:
+    assert load_scenario(written(tmp_path, "")) == Scenario()
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[vehicle]\nmass = 3\n", "vehicle: unknown; known: fault, parameters, firmware"),
+        ("[firmware]\nname = 'px5'\n", "firmware.name: unknown key; known: version"),
+        ("[firmware]\nversion = '1.16'\n", 'write it as "1.16.0"'),
+        ("[firmware]\nversion = 1.16\n", 'write it as "1.16.0"'),
+        ("[firmware]\ncommands_per_s = 0\n", "give 1 to 1000"),
+        ("[position]\nlag_s = nan\n", "position.lag_s = nan: give a number"),
+        ("[position]\nlag_s = -0.1\n", "position.lag_s = -0.1: give 0 to 2"),
+        ("[position]\ndrift_time_s = 0.0\n", "drift_time_s = 0: give 1 to"),
+        ("[parameters]\nSERVO9_FUNCTION = 'none'\n", "give a number"),
+        ("[parameters]\nSERVO9_FUNCTION = true\n", "give a number"),
+        ("[box]\nclosed_s = 100\n", "give 0 to 60"),
+        ("[signing]\nkey = 'abc'\n", "64 hexadecimal digits"),
+        ("[signing]\n", "64 hexadecimal digits"),
+        ("clock = 3\n", r"write it as \[clock\]"),
+        ("[[wind]]\nspeed_m_s = 1\n", r"write it as \[wind\]"),
+        ("[[fault]]\nkind = 'gremlins'\n", "gremlins"),
+    ],
+)
+def test_a_wrong_scenario_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_scenario(written(tmp_path, text))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "scenario", "said"),
+    [
+        ("px4", Scenario(version=(1, 13, 0)), "from 1.14.0 on"),
+        ("ardupilot", Scenario(version=(1, 16, 0)), "known from 4.0.0 on"),
+        ("ardupilot", Scenario(commands_per_s=30.0), "no queue"),
+        ("betaflight", Scenario(), "choose one of ardupilot, px4"),
+    ],
+)
+def test_what_the_firmware_is_not_is_refused(autopilot: str, scenario: Scenario, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        firmware_of(autopilot, scenario)
+
+
+def test_a_parameter_of_the_other_firmware_is_refused() -> None:
+    scenario = Scenario(parameters={"PWM_MAIN_FUNC9": 301.0})
+    options = StubOptions(home=HOME, scenario=scenario)
+    with pytest.raises(ConfigError, match="stub of ardupilot has no such parameter"):
+        build_autopilot(options, start_s=0.0)
+
+
+@pytest.mark.parametrize("path", sorted(SCENARIOS.glob("*.toml")), ids=lambda path: path.stem)
+def test_every_ready_scenario_makes_a_stub(path: Path) -> None:
+    scenario = load_scenario(path)
+    autopilot = "px4" if path.stem.startswith("px4-") else "ardupilot"
+    options = StubOptions(home=HOME, autopilot=autopilot, scenario=scenario)
+    stub = build_autopilot(options, start_s=0.0)
+    stub.tick(1.0)
+    assert scenario != Scenario()
+    assert stub.firmware.name == autopilot
+
+
+def test_there_are_ready_scenarios_for_both() -> None:
+    names = {path.stem for path in SCENARIOS.glob("*.toml")}
+    assert any(name.startswith("px4-") for name in names)
+    assert any(not name.startswith("px4-") for name in names)
