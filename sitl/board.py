@@ -19,8 +19,14 @@ SERVO_FRAME_S = 0.020
 # Narrower than this is no valid servo pulse. After this long without one the board closes.
 PULSE_MIN_US = 900.0
 PULSE_ABSENT_S = 0.100
+# With the alive check an open valve closes when its width has not moved for this long.
+STANDSTILL_S = 0.300
 # A width this near to closed is closed: the board must not pulse on a timer's jitter.
 CLOSED_DUTY = 0.01
+
+# Widths are never negative; these stand for a look at the clock.
+_LOOK_ABSENT = -1.0
+_LOOK_STANDSTILL = -2.0
 
 
 class DriverBoard:
@@ -29,6 +35,10 @@ class DriverBoard:
     `restarting` boards begin a new period when the width moves by 2 % of its span or to or from
     closed, and carry the debt of the old one; `free-running` boards never do: every change waits
     for the next period. Before the first order there are no pulses, and all valves are closed.
+
+    With `dither_us` above 0 the board checks that an open valve's order is alive: a width that has
+    moved by less than half of that for `STANDSTILL_S` closes the valve until it moves again. Half,
+    so that a capture's jitter of a microsecond neither feigns life nor hides it.
     """
 
     def __init__(
@@ -43,7 +53,10 @@ class DriverBoard:
         full_us: float = 2000.0,
         frame_s: float = SERVO_FRAME_S,
         overrun_s: float = 0.0,
+        dither_us: float = 0.0,
     ) -> None:
+        if not 0.0 <= dither_us <= 50.0:
+            raise ValueError(f"dither_us must lie in [0, 50], got {dither_us}")
         if not closed_us < full_us:
             raise ValueError(f"closed_us must be below full_us, got {closed_us}, {full_us}")
         self._engine = PulseEngine(pwm, valve_count, start_s=start_s, overrun_s=overrun_s)
@@ -51,12 +64,16 @@ class DriverBoard:
         self._closed_us, self._span_us = closed_us, full_us - closed_us
         self._frame_s = frame_s
         self._rng = np.random.default_rng(seed)
-        # (time, order of arrival, valve, width); a width of NaN asks whether pulses came back.
+        self._alive_us = 0.5 * dither_us
+        # (time, order of arrival, valve, width or look).
         self._due: list[tuple[float, int, int, float]] = []
         self._count = 0
         self._last_s = [-math.inf] * valve_count
         self._width_us = [0.0] * valve_count
         self._absent_since_s = [-math.inf] * valve_count
+        # Where and when the width last moved far enough to be a sign of life.
+        self._moved_us = [-math.inf] * valve_count
+        self._moved_s = [-math.inf] * valve_count
 
     @property
     def width_us(self) -> tuple[float, ...]:
@@ -84,8 +101,10 @@ class DriverBoard:
         """Return the edges at the valves since the last call up to `until_s`."""
         while self._due and self._due[0][0] <= until_s:
             at_s, _, valve, pulse_us = heapq.heappop(self._due)
-            if math.isnan(pulse_us):
-                self._check_absent(at_s, valve)
+            if pulse_us == _LOOK_ABSENT:
+                self._look_absent(at_s, valve)
+            elif pulse_us == _LOOK_STANDSTILL:
+                self._look_standstill(at_s, valve)
             else:
                 self._see(at_s, valve, pulse_us)
         return self._engine.advance(until_s)
@@ -94,13 +113,34 @@ class DriverBoard:
         was_valid = self._width_us[valve] >= PULSE_MIN_US
         self._width_us[valve] = pulse_us
         if pulse_us >= PULSE_MIN_US:
-            duty = min(max((pulse_us - self._closed_us) / self._span_us, 0.0), 1.0)
-            self._take(at_s, valve, duty if duty >= CLOSED_DUTY else 0.0)
+            if self._is_alive(at_s, valve, pulse_us):
+                self._take(at_s, valve, self._duty(pulse_us))
         elif was_valid:
             self._absent_since_s[valve] = at_s
-            self._push(at_s + PULSE_ABSENT_S, valve, math.nan)
+            self._push(at_s + PULSE_ABSENT_S, valve, _LOOK_ABSENT)
 
-    def _check_absent(self, at_s: float, valve: int) -> None:
+    def _duty(self, pulse_us: float) -> float:
+        duty = min(max((pulse_us - self._closed_us) / self._span_us, 0.0), 1.0)
+        return duty if duty >= CLOSED_DUTY else 0.0
+
+    def _is_alive(self, at_s: float, valve: int, pulse_us: float) -> bool:
+        """Return whether a width may act: it moved, or moved lately, or closes."""
+        if not self._alive_us:
+            return True
+        if abs(pulse_us - self._moved_us[valve]) >= self._alive_us:
+            self._moved_us[valve], self._moved_s[valve] = pulse_us, at_s
+            self._push(at_s + STANDSTILL_S, valve, _LOOK_STANDSTILL)
+            return True
+        return self._duty(pulse_us) == 0.0 or not self._stands_still(at_s, valve)
+
+    def _stands_still(self, at_s: float, valve: int) -> bool:
+        return not at_s - self._moved_s[valve] < STANDSTILL_S - 1e-9
+
+    def _look_standstill(self, at_s: float, valve: int) -> None:
+        if self._stands_still(at_s, valve):
+            self._take(at_s, valve, 0.0)
+
+    def _look_absent(self, at_s: float, valve: int) -> None:
         absent = self._width_us[valve] < PULSE_MIN_US
         if absent and at_s - self._absent_since_s[valve] >= PULSE_ABSENT_S - 1e-9:
             self._take(at_s, valve, 0.0)

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -129,3 +131,182 @@ def test_wrong_orders_are_refused() -> None:
         board().order(math.inf, 0, 1500)
     with pytest.raises(ValueError, match="closed_us"):
         DriverBoard(PWM, 6, seed=1, start_s=0.0, closed_us=2000, full_us=1000)
+
+
+# ------------------------------------------------------------------------------- alive dither
+
+ALIVE_US = 8
+
+
+def alive_board(**given: float) -> DriverBoard:
+    settings = {"frame_s": 0.0, "dither_us": float(ALIVE_US), **given}
+    return DriverBoard(PWM, 6, seed=1, start_s=0.0, **settings)  # type: ignore[arg-type]
+
+
+def dither(
+    one: DriverBoard,
+    until_s: float,
+    *,
+    from_s: float = 0.0,
+    pulse_us: float = 1500.0,
+    step: int = 4,
+) -> None:
+    """Move the width to and fro, ten times a second."""
+    for k in range(math.ceil((until_s - from_s) * 10 - 1e-9)):
+        one.order(from_s + 0.1 * k, 0, pulse_us + (step if k % 2 else -step))
+
+
+def closed_at(edges: list[Edge]) -> float:
+    return next(edge.at_s for edge in edges if edge.duty == 0.0)
+
+
+def test_a_width_that_moves_keeps_its_valve_at_work() -> None:
+    one = alive_board()
+    dither(one, 10.0)
+    edges = one.advance(10.0)
+    opened_s = sum(b.at_s - a.at_s for a, b in zip(edges[::2], edges[1::2], strict=False))
+    assert opened_s == pytest.approx(5.0, rel=0.01)
+    assert all(edge.duty > 0.49 for edge in edges)
+
+
+@pytest.mark.parametrize("last_s", [0.0, 0.9, 4.3])
+def test_a_width_that_stands_still_for_three_tenths_of_a_second_closes(last_s: float) -> None:
+    one = alive_board()
+    dither(one, last_s + 0.05)
+    assert closed_at(one.advance(10.0)) == pytest.approx(last_s + 0.3, abs=1e-9)
+
+
+def test_full_closes_as_well_when_it_stands_still() -> None:
+    one = alive_board()
+    one.order(1.0, 0, 2000)
+    assert one.advance(5.0) == [Edge(1.0, 0, True, 1.0), Edge(1.3, 0, False, 0.0)]
+
+
+def test_two_lost_moves_in_a_row_close_nothing() -> None:
+    one = alive_board()
+    for k in (0, 1, 2, 5, 6, 7):  # 3 and 4 are lost: 0.3 s less a moment
+        one.order(0.0999 * k, 0, 1500 + (4 if k % 2 else -4))
+    assert not any(edge.duty == 0.0 for edge in one.advance(0.9))
+
+
+def test_a_refresh_of_the_same_width_is_no_life() -> None:
+    one = alive_board()
+    one.order(0.0, 0, 1500)
+    for k in range(1, 50):
+        one.order(0.02 * k, 0, 1500)
+    edges = one.advance(2.0)
+    assert closed_at(edges) == pytest.approx(0.3)
+    assert edges[-1].duty == 0.0
+
+
+@pytest.mark.parametrize("jitter_us", [1, 1.9])
+def test_jitter_of_the_capture_is_no_life(jitter_us: float) -> None:
+    one = alive_board()
+    for k in range(100):
+        one.order(0.02 * k, 0, 1500 + jitter_us * (-1) ** k)
+    assert closed_at(one.advance(3.0)) == pytest.approx(0.3)
+
+
+def test_jitter_does_not_hide_life() -> None:
+    one = alive_board()
+    rng = np.random.default_rng(5)
+    for k in range(500):
+        move = 4 if (k // 5) % 2 else -4
+        one.order(0.02 * k, 0, 1500 + move + float(rng.uniform(-1.0, 1.0)))
+    assert not any(edge.duty == 0.0 for edge in one.advance(10.0))
+
+
+def test_it_opens_again_with_the_next_move() -> None:
+    one = alive_board()
+    one.order(0.0, 0, 2000)
+    one.order(1.0, 0, 1992)
+    edges = one.advance(1.2)
+    assert edges[1].at_s == pytest.approx(0.3)
+    assert edges[1].duty == 0.0
+    assert edges[2].at_s >= 1.0
+    assert edges[2].is_open
+
+
+def test_closed_is_closed_whether_it_moves_or_not() -> None:
+    one = alive_board()
+    dither(one, 0.15)
+    one.order(0.2, 0, 1000)
+    one.order(0.7, 0, 1000)
+    edges = one.advance(5.0)
+    assert closed_at(edges) == 0.2
+    assert edges[-1].duty == 0.0
+
+
+def test_without_the_check_a_standing_width_goes_on_for_ever() -> None:
+    one = board(frame_s=0.0)
+    one.order(0.0, 0, 2000)
+    assert one.advance(3600.0)[-1].is_open
+
+
+def test_only_the_valve_that_stands_still_closes() -> None:
+    one = alive_board()
+    dither(one, 2.0)
+    one.order(0.0, 3, 2000)
+    edges = one.advance(2.0)
+    assert {edge.valve for edge in edges if edge.duty == 0.0} == {3}
+
+
+@pytest.mark.parametrize("dither_us", [-1.0, 51.0, math.nan])
+def test_a_dither_that_makes_no_sense_is_refused(dither_us: float) -> None:
+    with pytest.raises(ValueError, match="dither_us"):
+        alive_board(dither_us=dither_us)
+
+
+# ------------------------------------------------------------------ test vectors of the document
+
+PAGE = Path(__file__).parents[2] / "docs" / "driver-board.md"
+TEN_HZ = PwmLimits(frequency_hz=10.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
+ROW = re.compile(r"^\| (\d+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", re.MULTILINE)
+
+
+def vectors() -> dict[int, tuple[list[tuple[float, float]], str]]:
+    """Return the document's rows by number: what comes in, ms and us, and the edges, ms."""
+    found = {}
+    for number, given, edges, _ in ROW.findall(PAGE.read_text(encoding="utf-8")):
+        pairs = [pair.split(":") for pair in given.split(",")]
+        found[int(number)] = ([(float(at), float(us)) for at, us in pairs], edges.strip())
+    return found
+
+
+def edges_text(number: int, orders: list[tuple[float, float]], until_ms: float) -> str:
+    one = DriverBoard(
+        TEN_HZ,
+        6,
+        seed=1,
+        start_s=0.0,
+        frame_s=0.0,
+        overrun_s=0.005 if number == 28 else 0.0,
+        dither_us=8.0 if number > 28 else 0.0,
+    )
+    valve = 1 if number == 2 else 0
+    for at_ms, pulse_us in orders:
+        one.order(at_ms / 1000.0, valve, pulse_us)
+    text, is_open = [], False
+    for edge in one.advance(until_ms / 1000.0):
+        if edge.is_open != is_open:
+            is_open = edge.is_open
+            text.append(f"{'+' if is_open else '-'}{edge.at_s * 1000:.1f}")
+    return " ".join(text) or "none"
+
+
+def test_the_document_has_all_its_rows() -> None:
+    assert sorted(vectors()) == list(range(1, 39))
+
+
+@pytest.mark.parametrize("number", range(1, 39))
+def test_the_board_does_what_the_document_says(number: int) -> None:
+    orders, said = vectors()[number]
+    made = edges_text(number, orders, 700.0)
+    _, first = vectors()[1]
+    for before in range(len(first.split()), 0, -1):
+        # `...` stands for the edges of row 1 up to where this row goes on by itself.
+        head = " ".join(edges_text(1, vectors()[1][0], 700.0).split()[:before])
+        whole = said.replace("...", head)
+        if made.startswith(whole) or "..." not in said:
+            break
+    assert made.startswith(whole)
