@@ -15,7 +15,8 @@ import typer
 from companion import runtime
 from companion.assembly import build_setup, deliverable
 from companion.cli.answer import AsJson, Overrides, answer, note
-from companion.config import Config, load
+from companion.cli.link_parts import build_link, load_with_kept
+from companion.config import Config
 from companion.config.rules import without_effect
 from companion.errors import ConfigError, LinkError
 from companion.link.component import ComponentOptions
@@ -46,9 +47,9 @@ def run_companion(
     whatever ends it.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
-    config = load(config_file, overrides=overrides or ())
+    config, given = load_with_kept(config_file, overrides or ())
     setup = build_setup(config)
-    link = VehicleLink(config.link.url, component_options(config))
+    link = build_link(config, given, component_options(config))
     executor = build_executor(config, link)
     for line in _warnings(config):
         note(line)
@@ -56,7 +57,8 @@ def run_companion(
         for problem in deliverable(setup, config.mission.speed_m_s):
             note(f"{problem.severity}: {problem.text}; {problem.fix}")
     folder = config.resolve(config.journal.folder)
-    journal = Journal.create(folder, setup=setup, setup_text=_about(config, overrides or ()))
+    journal = Journal.create(folder, setup=setup, setup_text=_about(config, given))
+    link.on_event(journal.record_event)
     try:
         with journal:
             runtime.execute(
@@ -91,7 +93,7 @@ def build_executor(config: Config, link: VehicleLink) -> PlanExecutor:
     """Return what carries plans out: servo outputs of the autopilot, or nothing."""
     output = config.output
     if output.kind == "none":
-        return DryRunExecutor(len(config.valve))
+        return DryRunExecutor(len(config.valve), has_return=output.return_channel is not None)
     if output.kind == "gpio":
         raise ConfigError(
             f'{config.path}: output.kind = "gpio": not part of this version; write "servo", or '
@@ -101,6 +103,8 @@ def build_executor(config: Config, link: VehicleLink) -> PlanExecutor:
         channels=tuple(valve.channel or 0 for valve in config.valve),
         closed_us=output.closed_us,
         full_us=output.full_us,
+        dither_us=output.dither_us,
+        return_channel=output.return_channel,
     )
     executor = ServoExecutor(options, link.order)
     link.on_order_ack(executor.acknowledge)

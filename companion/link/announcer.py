@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
 
 from companion.core.types import Decision, Inhibit
@@ -11,6 +12,12 @@ HEARTBEAT_S = 1.0
 LIVE_S = 0.1
 VALUES_S = 1.0
 TEXT_S = 1.0
+# Who connects in the middle of a flight learns within this why nothing is sprayed.
+REMIND_S = 30.0
+_LINE_MAX = 50
+_LINES_MAX = 2
+_PREFIX = "Spray: "
+_WAITING_MAX = 8
 
 _INFO, _NOTICE, _WARNING, _ERROR = 6, 5, 4, 3  # MAV_SEVERITY
 _LOUD = frozenset({Inhibit.OUTPUT_FAULT, Inhibit.ESTIMATOR_UNHEALTHY, Inhibit.SPEED_DISAGREES})
@@ -22,15 +29,19 @@ class _Beat:
     """Is due every `period_s` in the mean, however unevenly it is asked."""
 
     def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
+        self.period_s = period_s
+        self._next_s = float("-inf")
+
+    def hurry(self) -> None:
+        """Be due when next asked."""
         self._next_s = float("-inf")
 
     def is_due(self, now_s: float) -> bool:
         if now_s < self._next_s:
             return False
         late_s = now_s - self._next_s
-        on_time = late_s < self._period_s
-        self._next_s = (self._next_s if on_time else now_s) + self._period_s
+        on_time = late_s < self.period_s
+        self._next_s = (self._next_s if on_time else now_s) + self.period_s
         return True
 
 
@@ -46,11 +57,31 @@ class Announcer:
         self._values = _Beat(VALUES_S)
         self._said: frozenset[Inhibit] | None = None
         self._said_s = float("-inf")
-        self._faults: list[str] = []
+        self._waiting: deque[tuple[int, str]] = deque(maxlen=_WAITING_MAX)
+        self._noted_s = float("-inf")
+        self.tank_l: float | None = None
 
     def fault(self, text: str) -> None:
         """Have `text` said at the next turn, once."""
-        self._faults.append(text)
+        self._waiting.append((_ERROR, text))
+
+    def note(self, text: str, *, is_warning: bool = False) -> None:
+        """Have `text` said, once; the same that waits already is not said twice."""
+        entry = (_WARNING if is_warning else _NOTICE, text)
+        if entry not in self._waiting:
+            self._waiting.append(entry)
+
+    def set_values_rate(self, rate_hz: float) -> None:
+        """Tell the values this often from the next time on."""
+        self._values.period_s = 1.0 / rate_hz
+
+    def beat_soon(self) -> None:
+        """Have the heartbeat sent at the next turn: it comes from the loop, however asked for."""
+        self._heartbeat.hurry()
+
+    def repeat(self) -> None:
+        """Tell state and reasons at the next turn, though nothing has changed."""
+        self._said = None
 
     def due(self, decision: Decision | None, now_s: float) -> Iterator[bytes]:
         """Yield the messages that are due."""
@@ -58,22 +89,37 @@ class Announcer:
             yield self._encoder.named_value("SPR_LIVE", 1.0, now_s)
         if self._heartbeat.is_due(now_s):
             yield self._encoder.heartbeat(_mav_state(decision))
-        while self._faults:
-            yield self._encoder.text(_ERROR, f"Spray: {self._faults.pop(0)}")
+        yield from self._notes(now_s)
         if decision is None:
             return
         yield from self._text(decision, now_s)
         if self._values.is_due(now_s):
-            yield from self._named_values(decision, now_s)
+            yield from self.named_values(decision, now_s)
+
+    def _notes(self, now_s: float) -> Iterator[bytes]:
+        """Yield faults at once, and of the rest one in every tenth of a second."""
+        while self._waiting and (
+            self._waiting[0][0] == _ERROR or not now_s - self._noted_s < LIVE_S
+        ):
+            severity, text = self._waiting.popleft()
+            if severity != _ERROR:
+                self._noted_s = now_s
+            for line in lines(text):
+                yield self._encoder.text(severity, line)
 
     def _text(self, decision: Decision, now_s: float) -> Iterator[bytes]:
-        if decision.inhibits == self._said or now_s - self._said_s < TEXT_S:
+        is_held = _state(decision) == STATE_HELD
+        is_new = decision.inhibits != self._said or (is_held and now_s - self._said_s >= REMIND_S)
+        if not is_new or now_s - self._said_s < TEXT_S:
             return
         self._said, self._said_s = decision.inhibits, now_s
         severity = _WARNING if decision.inhibits & _LOUD else _INFO
-        yield self._encoder.text(severity, f"Spray: {reasons(decision.inhibits)}")
+        for line in lines(reasons(decision.inhibits)):
+            yield self._encoder.text(severity, line)
 
-    def _named_values(self, decision: Decision, now_s: float) -> Iterator[bytes]:
+    def named_values(self, decision: Decision, now_s: float) -> Iterator[bytes]:
+        """Yield what any ground station can show or plot."""
+        percent = 100.0 if decision.state is None else decision.state.rate_percent
         rates = [rate for rate in decision.rate_l_ha if rate is not None]
         duty = decision.plan.duty
         values = {
@@ -81,9 +127,33 @@ class Announcer:
             "SPR_FLOW": decision.flow_l_min,
             "SPR_DUTY": sum(duty) / len(duty) if duty else 0.0,
             "SPR_STATE": _state(decision),
+            "SPR_PCT": percent,
         }
+        if self.tank_l is not None:
+            values["SPR_TANK"] = self.tank_l
         for name, value in values.items():
             yield self._encoder.named_value(name, value, now_s)
+
+
+def lines(text: str) -> list[str]:
+    """Return `text` in lines that a station shows whole; what does not fit two is counted.
+
+    >>> lines("closed: not-enabled, no-position, no-heartbeat")
+    ['Spray: closed: not-enabled, no-position,', 'Spray: no-heartbeat']
+    """
+    room = _LINE_MAX - len(_PREFIX)
+    words, found = text.split(" "), [""]
+    for number, word in enumerate(words):
+        joined = f"{found[-1]} {word}".strip()
+        if len(joined) <= room:
+            found[-1] = joined
+        elif len(found) < _LINES_MAX:
+            found.append(word[:room])
+        else:
+            more = f" +{len(words) - number}"
+            found[-1] = found[-1][: room - len(more)].rstrip(",") + more
+            break
+    return [_PREFIX + line for line in found if line]
 
 
 def reasons(inhibits: frozenset[Inhibit]) -> str:

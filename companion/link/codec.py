@@ -1,39 +1,35 @@
-"""Bytes to our types, and which sender is the vehicle; nothing here does any I/O."""
+"""Bytes to our types, from whom they count; nothing here does any I/O."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
+from companion.link.census import AUTOPILOT_COMPONENT, Census, Vehicle
 from companion.link.decode import FROM_ANYONE, FROM_VEHICLE
-from companion.link.framer import Framer
+from companion.link.framer import Accept, Framer
 from companion.link.messages import Message
-from companion.link.modes import ARDUPILOT, PX4
 
 _HEARTBEAT = 0
-AUTOPILOT_COMPONENT = 1  # MAV_COMP_ID_AUTOPILOT1
-_AUTOPILOT_INVALID = 8
-# MAV_TYPE of what is no vehicle although some of them claim an autopilot: antenna tracker, ground
-# station, onboard controller, gimbal, ADS-B, camera.
-_NO_VEHICLE = frozenset({5, 6, 18, 26, 27, 30})
+_SENDERS_MAX = 64
+
+__all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Vehicle:
-    """The autopilot that the link belongs to."""
+class _Sequence:
+    """Counts the frames of one sender, and those that its numbers say are missing."""
 
-    system_id: int
-    autopilot: int
+    __slots__ = ("count", "last", "lost")
 
-    @property
-    def is_ardupilot(self) -> bool:
-        """Whether it runs ArduPilot."""
-        return self.autopilot == ARDUPILOT
+    def __init__(self) -> None:
+        self.count, self.lost, self.last = 0, 0, -1
 
-    @property
-    def is_px4(self) -> bool:
-        """Whether it runs PX4."""
-        return self.autopilot == PX4
+    def take(self, number: int) -> None:
+        if self.last >= 0:
+            # More than half the circle ahead is a frame that was overtaken or sent twice.
+            ahead = (number - self.last - 1) % 256
+            self.lost += ahead if ahead < 128 else 0
+        self.last = number
+        self.count += 1
 
 
 class Codec:
@@ -42,12 +38,18 @@ class Codec:
     `system_id` 0 takes the first autopilot; another number waits for that one.
     """
 
-    def __init__(self, *, system_id: int = 0) -> None:
-        self._wanted_system_id = system_id
-        self._framer = Framer()
-        self.vehicle: Vehicle | None = None
+    def __init__(self, *, system_id: int = 0, accept: Accept | None = None) -> None:
+        self.census = Census(system_id)
+        self._framer = Framer(accept)
+        self._senders: dict[tuple[int, int], _Sequence] = {}
         self.vehicle_counts: dict[int, int] = {}
         self.ignored_count = 0
+        self.byte_count = 0
+
+    @property
+    def vehicle(self) -> Vehicle | None:
+        """Return the autopilot that the link belongs to; None before it was heard."""
+        return self.census.vehicle
 
     @property
     def frame_count(self) -> int:
@@ -59,8 +61,27 @@ class Codec:
         """Return how many bytes belonged to no valid frame."""
         return self._framer.dropped_byte_count
 
+    @property
+    def bad_frame_count(self) -> int:
+        """Return how many frames had a wrong checksum; a false start in noise counts as one."""
+        return self._framer.bad_frame_count
+
+    @property
+    def refused_frame_count(self) -> int:
+        """Return how many sound frames had no good signature."""
+        return self._framer.refused_frame_count
+
+    @property
+    def lost_frames(self) -> dict[tuple[int, int], tuple[int, int]]:
+        """Return frames that came and frames that are missing, by (system, component).
+
+        Gaps are normal behind a router that does not pass everything on.
+        """
+        return {sender: (one.count, one.lost) for sender, one in self._senders.items()}
+
     def decode(self, data: bytes, received_s: float) -> list[Message]:
         """Return what `data` completes, in its order; never raises."""
+        self.byte_count += len(data)
         messages = []
         for raw in self._framer.push(data, received_s):
             message = self._understand(raw, received_s)
@@ -69,33 +90,24 @@ class Codec:
         return messages
 
     def _understand(self, raw: Any, received_s: float) -> Message | None:
+        sender = (raw.get_srcSystem(), raw.get_srcComponent())
+        self._count(sender, raw.get_seq())
         message_id: int = raw.get_msgId()
         if message_id in FROM_ANYONE:
             return FROM_ANYONE[message_id](raw, received_s)
-        if message_id == _HEARTBEAT and self.vehicle is None:
-            self._latch(raw)
-        if not self._is_from_vehicle(raw):
+        if message_id == _HEARTBEAT:
+            self.census.heartbeat(*sender, kind=raw.type, autopilot=raw.autopilot, now_s=received_s)
+        if self.vehicle is None or sender != (self.vehicle.system_id, AUTOPILOT_COMPONENT):
             self.ignored_count += 1
             return None
         self.vehicle_counts[message_id] = self.vehicle_counts.get(message_id, 0) + 1
         decoder = FROM_VEHICLE.get(message_id)
         return None if decoder is None else decoder(raw, received_s)
 
-    def _latch(self, heartbeat: Any) -> None:
-        """Take the sender for the vehicle if it is an autopilot; never the first that speaks."""
-        system_id = heartbeat.get_srcSystem()
-        if (
-            heartbeat.get_srcComponent() == AUTOPILOT_COMPONENT
-            and heartbeat.autopilot != _AUTOPILOT_INVALID
-            and heartbeat.type not in _NO_VEHICLE
-            and system_id != 0
-            and self._wanted_system_id in (0, system_id)
-        ):
-            self.vehicle = Vehicle(system_id=system_id, autopilot=heartbeat.autopilot)
-
-    def _is_from_vehicle(self, raw: Any) -> bool:
-        return (
-            self.vehicle is not None
-            and raw.get_srcComponent() == AUTOPILOT_COMPONENT
-            and raw.get_srcSystem() == self.vehicle.system_id
-        )
+    def _count(self, sender: tuple[int, int], number: int) -> None:
+        one = self._senders.get(sender)
+        if one is None:
+            if len(self._senders) >= _SENDERS_MAX:
+                return
+            one = self._senders[sender] = _Sequence()
+        one.take(number)

@@ -9,26 +9,31 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeGuard, get_args
 
-from companion.core.types import Decision, Input, OperatorCommand, Telemetry
+from companion.core.types import Decision, HeartbeatReport, Input, Telemetry
 from companion.link.announcer import Announcer
 from companion.link.clock import ClockOffset
 from companion.link.codec import Codec
+from companion.link.commands import SET_MESSAGE_INTERVAL, Desk
 from companion.link.encode import Encoder
 from companion.link.messages import (
     AckReceived,
     CommandReceived,
     Message,
+    ParamAsked,
+    ParamSet,
     PingReceived,
     ServoOutput,
     TimesyncReceived,
 )
+from companion.link.parameters import Parameters
+from companion.link.service import OnEvent, Service
+from companion.link.signing import Signing
+from companion.link.statistics import Meter
 from companion.link.streams import StreamRequest, StreamSupervisor, wanted_streams
+from companion.link.tank import Tank
 
 DO_SET_SERVO = 183
-DO_SPRAYER = 216
-REQUEST_MESSAGE = 512
-_AUTOPILOT_VERSION = 148
-ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3  # MAV_RESULT
+_POSITION = 33
 _TIMESYNC_S = 1.0
 _REBOOT_S = 1.0
 _INPUTS = get_args(Input)
@@ -47,23 +52,61 @@ class ComponentOptions:
 class Component:
     """One component on one link to one vehicle."""
 
-    def __init__(self, options: ComponentOptions, send: Callable[[bytes], bool]) -> None:
+    def __init__(
+        self,
+        options: ComponentOptions,
+        send: Callable[[bytes], bool],
+        *,
+        parameters: Parameters | None = None,
+        signing: Signing | None = None,
+    ) -> None:
         self._options = options
-        self._send = send
-        self._encoder = Encoder(system_id=options.system_id or 1, component_id=options.component_id)
-        self.codec = Codec(system_id=options.system_id)
+        self._transport_send = send
+        self._encoder = Encoder(
+            system_id=options.system_id or 1, component_id=options.component_id, signing=signing
+        )
+        accept = None if signing is None else signing.accepts
+        self.codec = Codec(system_id=options.system_id, accept=accept)
+        self.meter = Meter()
         self._announcer = Announcer(self._encoder)
+        self._desk = Desk(
+            parameters=parameters if parameters is not None else Parameters(), tank=Tank()
+        )
+        self._service = Service(
+            self._desk, self._encoder, self._announcer, self._send, version=options.version
+        )
         self._supervisor: StreamSupervisor | None = None
         self._boot_s: float | None = None
         self.clock = ClockOffset()
         self._timesync_s = float("-inf")
+        self.met_s: float | None = None
+        self.is_answered = False
         self.servo_output: ServoOutput | None = None
         self.on_order_ack: Callable[[int], None] | None = None
+
+    @property
+    def on_event(self) -> OnEvent | None:
+        """Return who is told what happens: `on_event(at_s, kind, text)`."""
+        return self._service.on_event
+
+    @on_event.setter
+    def on_event(self, take: OnEvent | None) -> None:
+        self._service.on_event = take
 
     @property
     def is_vehicle_known(self) -> bool:
         """Whether an autopilot has been heard."""
         return self.codec.vehicle is not None
+
+    @property
+    def address(self) -> tuple[int, int]:
+        """Return system and component that we speak as."""
+        return (self._encoder.system_id, self._encoder.component_id)
+
+    @property
+    def position_rate_hz(self) -> float | None:
+        """Return the rate at which positions come; None where it is too early to say."""
+        return None if self._supervisor is None else self._supervisor.rate_hz(_POSITION)
 
     def order(self, channel: int, pulse_us: int) -> bool:
         """Order a servo output; False where nobody is there to take it."""
@@ -75,6 +118,10 @@ class Component:
         """Tell the operator once of something that does not work."""
         self._announcer.fault(text)
 
+    def warn(self, text: str) -> None:
+        """Tell the operator of something that should be seen to."""
+        self._announcer.note(text, is_warning=True)
+
     def receive(self, data: bytes, received_s: float) -> list[Input]:
         """Return the inputs in `data`, and answer what wants an answer."""
         inputs: list[Input] = []
@@ -82,22 +129,31 @@ class Component:
             if self._supervisor is None and self.is_vehicle_known:
                 self._meet(received_s)
             if _is_input(message):
-                self._watch_boot(message)
+                self._look_at(message)
                 inputs.append(message)
             elif isinstance(message, CommandReceived):
-                inputs.extend(self._obey(message))
+                inputs.extend(self._service.obey(message))
+            elif isinstance(message, ParamAsked | ParamSet):
+                inputs.extend(self._service.serve(message))
             else:
                 self._answer(message)
+        inputs.extend(self.clock.take_report())
         return inputs
 
     def tick(self, decision: Decision | None, now_s: float) -> None:
         """Send what is due; called at every step of the control loop, at least at 20 Hz."""
+        self._service.look_at(decision, now_s)
         for frame in self._announcer.due(decision, now_s):
             self._send(frame)
+        self._service.tick(now_s)
         if self._supervisor is None:
             return
         for request in self._supervisor.due(self.codec.vehicle_counts, now_s):
             self._ask(request)
+        trouble = self._supervisor.trouble()
+        if trouble is not None:
+            self.warn(trouble)
+            self._service.tell_event(now_s, "streams", trouble)
         if now_s - self._timesync_s >= _TIMESYNC_S:
             self._timesync_s = now_s
             self._send(self._encoder.timesync(0, self.clock.ask(now_s)))
@@ -109,13 +165,20 @@ class Component:
 
     # ------------------------------------------------------------------------------- inside
 
+    def _send(self, frame: bytes) -> bool:
+        has_left = self._transport_send(frame)
+        self.meter.sent(len(frame), has_left=has_left)
+        return has_left
+
     def _meet(self, now_s: float) -> None:
         """Take the vehicle's system for ours and ask it for its streams."""
         vehicle = self.codec.vehicle
         if vehicle is None:
             return
         self._encoder.system_id = vehicle.system_id
-        self._supervisor = StreamSupervisor(may_group=vehicle.is_ardupilot)
+        self.met_s, self.is_answered = now_s, False
+        if self._supervisor is None:
+            self._supervisor = StreamSupervisor(may_group=vehicle.is_ardupilot)
         streams = wanted_streams(
             position_rate_hz=self._options.position_rate_hz, is_px4=vehicle.is_px4
         )
@@ -129,35 +192,20 @@ class Component:
         else:
             self._send(self._encoder.set_message_interval(stream.message_id, stream.rate_hz))
 
-    def _watch_boot(self, item: Input) -> None:
+    def _look_at(self, item: Input) -> None:
+        """Take from an input what the link itself has to know of it."""
+        if isinstance(item, HeartbeatReport):
+            self._desk.is_armed = item.armed
+        elif isinstance(item, Telemetry):
+            self._watch_boot(item)
+
+    def _watch_boot(self, item: Telemetry) -> None:
         """Notice a reboot, after which an autopilot has forgotten what was asked of it."""
-        if not isinstance(item, Telemetry):
-            return
         if self._boot_s is not None and item.boot_s < self._boot_s - _REBOOT_S:
             self._meet(item.received_s)
             self.clock = ClockOffset()
         self._boot_s = item.boot_s
         self.clock.position(item.boot_s, item.received_s)
-
-    def _obey(self, command: CommandReceived) -> list[Input]:
-        """Answer a command addressed to us; everything that we do not know is unsupported."""
-        if command.target_component != self._encoder.component_id:
-            return []
-        if command.target_system not in (0, self._encoder.system_id):
-            return []
-        inputs: list[Input] = []
-        result = UNSUPPORTED
-        if command.command == DO_SPRAYER:
-            inputs, result = _spray_command(command)
-        elif command.command == REQUEST_MESSAGE and command.param1 == _AUTOPILOT_VERSION:
-            result = ACCEPTED
-        sender = command.sender
-        self._send(
-            self._encoder.ack(command.command, result, sender.system_id, sender.component_id)
-        )
-        if command.command == REQUEST_MESSAGE and result == ACCEPTED:
-            self._send(self._encoder.autopilot_version(self._options.version))
-        return inputs
 
     def _answer(self, message: Message) -> None:
         if isinstance(message, AckReceived):
@@ -170,12 +218,14 @@ class Component:
             self.servo_output = message
 
     def _take_ack(self, ack: AckReceived) -> None:
-        ours = (self._encoder.system_id, self._encoder.component_id)
         # 0, 0 is an acknowledgement in the old form, which named nobody.
-        if (ack.target_system, ack.target_component) not in (ours, (0, 0)):
+        if (ack.target_system, ack.target_component) not in (self.address, (0, 0)):
             return
+        self.is_answered = True
         if ack.command == DO_SET_SERVO and self.on_order_ack is not None:
             self.on_order_ack(ack.result)
+        elif ack.command == SET_MESSAGE_INTERVAL and self._supervisor is not None:
+            self._supervisor.answered(ack.result, ack.received_s)
 
     def _take_timesync(self, message: TimesyncReceived) -> None:
         if message.tc1_ns == 0:
@@ -185,6 +235,7 @@ class Component:
         vehicle = self.codec.vehicle
         if vehicle is not None and message.sender.system_id == vehicle.system_id:
             self.clock.answer(message.tc1_ns, message.ts1_ns, message.received_s)
+            self.is_answered = self.is_answered or self.clock.offset_s is not None
 
     def _take_ping(self, ping: PingReceived) -> None:
         if (ping.target_system, ping.target_component) == (0, 0):
@@ -198,13 +249,3 @@ class Component:
 
 def _is_input(message: Message) -> TypeGuard[Input]:
     return isinstance(message, _INPUTS)
-
-
-def _spray_command(command: CommandReceived) -> tuple[list[Input], int]:
-    """Return the operator's wish in DO_SPRAYER: exactly 1 enables, exactly 0 disables."""
-    if command.param1 not in (0.0, 1.0):
-        return [], DENIED
-    wish = OperatorCommand(
-        received_s=command.received_s, enable=command.param1 == 1.0, source="command"
-    )
-    return [wish], ACCEPTED

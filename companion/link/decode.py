@@ -25,6 +25,8 @@ from companion.link.messages import (
     AckReceived,
     CommandReceived,
     Message,
+    ParamAsked,
+    ParamSet,
     PingReceived,
     Sender,
     ServoOutput,
@@ -112,11 +114,24 @@ def _landed(m: Any, received_s: float) -> LandedReport:
 
 
 def _wind(m: Any, received_s: float) -> WindReport:
-    return WindReport(received_s=received_s, speed_m_s=m.speed)
+    # `direction` is where it comes from.
+    angle = math.radians(m.direction)
+    return WindReport(
+        received_s=received_s,
+        speed_m_s=m.speed,
+        east_m_s=-m.speed * math.sin(angle),
+        north_m_s=-m.speed * math.cos(angle),
+    )
 
 
 def _wind_cov(m: Any, received_s: float) -> WindReport:
-    return WindReport(received_s=received_s, speed_m_s=math.hypot(m.wind_x, m.wind_y))
+    # x is north, y is east, and both are where it blows to.
+    return WindReport(
+        received_s=received_s,
+        speed_m_s=math.hypot(m.wind_x, m.wind_y),
+        east_m_s=m.wind_y,
+        north_m_s=m.wind_x,
+    )
 
 
 def _rc(m: Any, received_s: float) -> RcReport:
@@ -171,6 +186,37 @@ def _ping(m: Any, received_s: float) -> PingReceived:
     )
 
 
+def _param_list(m: Any, received_s: float) -> ParamAsked:
+    return ParamAsked(
+        received_s=received_s,
+        target_system=m.target_system,
+        target_component=m.target_component,
+        is_all=True,
+    )
+
+
+def _param_read(m: Any, received_s: float) -> ParamAsked:
+    return ParamAsked(
+        received_s=received_s,
+        target_system=m.target_system,
+        target_component=m.target_component,
+        is_all=False,
+        name=m.param_id if m.param_index < 0 else "",
+        index=m.param_index,
+    )
+
+
+def _param_set(m: Any, received_s: float) -> ParamSet:
+    return ParamSet(
+        received_s=received_s,
+        target_system=m.target_system,
+        target_component=m.target_component,
+        name=m.param_id,
+        value=m.param_value,
+        kind=m.param_type,
+    )
+
+
 Decoder = Callable[[Any, float], Message]
 
 # By message id. What describes the vehicle counts only when its autopilot sent it.
@@ -188,4 +234,12 @@ FROM_VEHICLE: dict[int, Decoder] = {
     231: _wind_cov,
     245: _landed,
 }
-FROM_ANYONE: dict[int, Decoder] = {4: _ping, 75: _command, 76: _command, 111: _timesync}
+FROM_ANYONE: dict[int, Decoder] = {
+    4: _ping,
+    20: _param_read,
+    21: _param_list,
+    23: _param_set,
+    75: _command,
+    76: _command,
+    111: _timesync,
+}

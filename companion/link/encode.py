@@ -6,14 +6,17 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.link.codec import AUTOPILOT_COMPONENT
+from companion.link.census import AUTOPILOT_COMPONENT
+from companion.link.signing import Signing
 
 _ONBOARD_CONTROLLER = 18
 _AUTOPILOT_INVALID = 8
 _TEXT_MAX = 50
 _NAME_MAX = 10
-# MAV_PROTOCOL_CAPABILITY: COMMAND_INT, MAVLINK2.
-_CAPABILITIES = 8 | 8192
+# MAV_PROTOCOL_CAPABILITY: PARAM_FLOAT, COMMAND_INT, MAVLINK2.
+_CAPABILITIES = 2 | 8 | 8192
+REAL32 = 9  # MAV_PARAM_TYPE; integers are encoded differently by the two firmwares
+_LINK_NUMBER = 0
 
 STATE_STANDBY = 3  # MAV_STATE
 STATE_ACTIVE = 4
@@ -23,8 +26,15 @@ STATE_CRITICAL = 5
 class Encoder:
     """Encodes as one component; `system_id` follows the vehicle's once that is known."""
 
-    def __init__(self, *, system_id: int, component_id: int) -> None:
+    def __init__(
+        self, *, system_id: int, component_id: int, signing: Signing | None = None
+    ) -> None:
         self._mav = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+        self._signing = signing
+        if signing is not None:
+            self._mav.signing.secret_key = signing.key
+            self._mav.signing.link_id = _LINK_NUMBER
+            self._mav.signing.sign_outgoing = True
 
     @property
     def system_id(self) -> int:
@@ -41,6 +51,8 @@ class Encoder:
         return int(self._mav.srcComponent)
 
     def _pack(self, message: Any) -> bytes:
+        if self._signing is not None:
+            self._mav.signing.timestamp = self._signing.next_stamp()
         frame = bytes(message.pack(self._mav))
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
@@ -106,6 +118,16 @@ class Encoder:
         return self._pack(
             self._mav.named_value_float_encode(boot_ms, name.encode("ascii")[:_NAME_MAX], value)
         )
+
+    def param_value(self, name: str, value: float, count: int, index: int) -> bytes:
+        """Return PARAM_VALUE."""
+        return self._pack(
+            self._mav.param_value_encode(name.encode("ascii"), value, REAL32, count, index)
+        )
+
+    def message_interval(self, message_id: int, interval_us: int) -> bytes:
+        """Return MESSAGE_INTERVAL: -1 is switched off, 0 is never sent."""
+        return self._pack(self._mav.message_interval_encode(message_id, interval_us))
 
     def autopilot_version(self, version: tuple[int, int, int]) -> bytes:
         """Return AUTOPILOT_VERSION with the program's version, release type official."""

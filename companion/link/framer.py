@@ -7,6 +7,7 @@ start that turns out not to be one costs a single byte.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -21,14 +22,24 @@ _SIGNED = 0x01
 STALE_S = 0.25
 
 
-class Framer:
-    """Finds MAVLink 1 and 2 frames in a stream; memory is bounded by one frame and one chunk."""
+Accept = Callable[[bytes, int], bool]
 
-    def __init__(self) -> None:
+
+class Framer:
+    """Finds MAVLink 1 and 2 frames in a stream; memory is bounded by one frame and one chunk.
+
+    `accept`, if given, is asked of every sound frame (its bytes, its message's number) whether it
+    may be believed: the check of its signature.
+    """
+
+    def __init__(self, accept: Accept | None = None) -> None:
+        self._accept = accept
         self._mav = mavlink.MAVLink(None)
         self._buffer = bytearray()
         self._oldest_s = 0.0
         self.frame_count = 0
+        self.bad_frame_count = 0
+        self.refused_frame_count = 0
         self.dropped_byte_count = 0
 
     def push(self, data: bytes, received_s: float) -> list[Any]:
@@ -38,12 +49,17 @@ class Framer:
         self._buffer += data
         messages = []
         while (length := self._next_length()) is not None:
-            message = self._decode(self._buffer[:length])
+            frame = self._buffer[:length]
+            message = self._decode(frame)
             if message is None:
+                self.bad_frame_count += 1
                 self._drop(1)
-            else:
+                continue
+            if self._accept is None or self._accept(bytes(frame), message.get_msgId()):
                 messages.append(message)
-                del self._buffer[:length]
+            else:
+                self.refused_frame_count += 1
+            del self._buffer[:length]
         self.frame_count += len(messages)
         if messages or not len(self._buffer) > len(data):
             self._oldest_s = received_s

@@ -62,6 +62,30 @@ class PingReceived:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ParamAsked:
+    """PARAM_REQUEST_LIST or PARAM_REQUEST_READ: all, or one by its name or its index."""
+
+    received_s: float
+    target_system: int
+    target_component: int
+    is_all: bool
+    name: str = ""
+    index: int = -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParamSet:
+    """PARAM_SET: a station wants a parameter to have a value."""
+
+    received_s: float
+    target_system: int
+    target_component: int
+    name: str
+    value: float
+    kind: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ServoOutput:
     """SERVO_OUTPUT_RAW: what the autopilot's outputs do, channel 1 first; 0 is no pulse."""
 
@@ -70,4 +94,13 @@ class ServoOutput:
     pulse_us: tuple[int, ...]
 
 
-Message = Input | CommandReceived | AckReceived | TimesyncReceived | PingReceived | ServoOutput
+Message = (
+    Input
+    | CommandReceived
+    | AckReceived
+    | TimesyncReceived
+    | PingReceived
+    | ParamAsked
+    | ParamSet
+    | ServoOutput
+)

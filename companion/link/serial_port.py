@@ -6,11 +6,20 @@ import asyncio
 import contextlib
 import os
 import termios
+from pathlib import Path
 
 import serial
 
 from companion.errors import LinkError
-from companion.link.transport import CLOSE_WAIT_S, LinkUrl, OnBytes, OnChange, Reconnecting
+from companion.link.transport import (
+    CLOSE_WAIT_S,
+    LinkNotYetError,
+    LinkUrl,
+    OnBytes,
+    OnChange,
+    OnTrouble,
+    Reconnecting,
+)
 
 # What waits here is behind what the kernel holds (4 kB on Linux): at 57600 baud 1 kB is 0.18 s.
 _PENDING_MAX = 1024
@@ -20,8 +29,14 @@ _READ_MAX = 4096
 class SerialTransport(Reconnecting):
     """A serial device, taken exclusively: two programs on one port corrupt each other."""
 
-    def __init__(self, url: LinkUrl, on_bytes: OnBytes, on_change: OnChange) -> None:
-        super().__init__(url, on_change)
+    def __init__(
+        self,
+        url: LinkUrl,
+        on_bytes: OnBytes,
+        on_change: OnChange,
+        on_trouble: OnTrouble | None = None,
+    ) -> None:
+        super().__init__(url, on_change, on_trouble)
         self._on_bytes = on_bytes
         self._port: serial.Serial | None = None
         self._pending = bytearray()
@@ -33,7 +48,11 @@ class SerialTransport(Reconnecting):
             port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
             # SerialException is an OSError.
-            raise LinkError(f"link.url = {self.url.text!r}: {_reason(device, error)}") from error
+            kind = LinkNotYetError if _may_come(error) else LinkError
+            raise kind(f"link.url = {self.url.text!r}: {_reason(device, error)}") from error
+        with contextlib.suppress(OSError, ValueError, NotImplementedError):
+            # Adapters of USB collect bytes for 16 ms otherwise; others do not know the setting.
+            port.set_low_latency_mode(True)
         self._port = port
         self._pending.clear()
         asyncio.get_running_loop().add_reader(port.fileno(), self._readable)
@@ -102,12 +121,42 @@ class SerialTransport(Reconnecting):
         self._drop()
 
 
+_PLACES = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "ttyAMA*", "ttyTHS*")
+_NAMED_MAX = 4
+
+
+def devices(root: Path = Path("/dev")) -> list[str]:
+    """Return the serial devices that are there; by their lasting names where they have one."""
+    found: list[Path] = []
+    for place in _PLACES:
+        known = {one.resolve() for one in found}
+        found.extend(one for one in sorted(root.glob(place)) if one.resolve() not in known)
+    return [str(one) for one in found]
+
+
+def _may_come(error: Exception) -> bool:
+    """Whether waiting can help: a device that is not there yet, or that another one holds."""
+    number = getattr(error, "errno", None)
+    return isinstance(error, FileNotFoundError) or number in (2, 6, 11, 16, 19) or _is_taken(error)
+
+
+def _is_taken(error: Exception) -> bool:
+    return "lock" in str(error)
+
+
 def _reason(device: str, error: Exception) -> str:
     number = getattr(error, "errno", None)
-    if isinstance(error, FileNotFoundError) or number == 2:
-        return f"there is no device {device}; plug it in, or see /dev/serial/by-id for its name"
+    if isinstance(error, FileNotFoundError) or number in (2, 6, 19):
+        there = devices()
+        if not there:
+            return f"there is no device {device}, nor any other serial one; plug it in"
+        more = ", ..." if len(there) > _NAMED_MAX else ""
+        return (
+            f"there is no device {device}; there are {', '.join(there[:_NAMED_MAX])}{more}: plug "
+            "it in, or write one of these"
+        )
     if number == 13:
         return f"no permission for {device}; add this user to the group dialout"
-    if number in (11, 16) or "lock" in str(error):
+    if number in (11, 16) or _is_taken(error):
         return f"{device} is in use by another program; stop that program"
     return f"{device} cannot be opened as a serial port ({error}); check device and baud rate"

@@ -14,7 +14,19 @@ _SAMPLE_S = 0.5
 _WINDOW_S = 3.0
 _ENOUGH = 0.7
 _ASK_AGAIN_S = 5.0
+# So long a stream is slow before it is asked for: then the window holds nothing of before.
+_SLOW_S = 2.0
 _FAILURES_MAX = 2
+# ArduPilot sends everything at a quarter of its rate while parameters, missions or files go over
+# the same link (GCS_Common.cpp). Asking again changes nothing, so this is waited for; for no
+# longer than a slow transfer takes.
+_QUARTER = (0.15, 0.35)
+_QUARTER_WAIT_S = 30.0
+# A stream that was right and is slow again, this often, is changed by another station.
+_FOUGHT_COUNT = 3
+# An answer to a request later than this belongs to another one.
+_ANSWER_MAX_S = 2.0
+_REFUSED = frozenset({2, 3, 4})  # MAV_RESULT denied, unsupported, failed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +75,18 @@ class _Watch:
     stream: Stream
     asked_s: float
     failures: int = 0
+    slow_since_s: float | None = None
+    is_refused: bool = False
+    was_right: bool = False
+    changed_count: int = 0
+
+    def measured(self, share: float, now_s: float) -> None:
+        """Take how much of the wanted rate has come over the last seconds."""
+        if share >= _ENOUGH:
+            self.failures, self.slow_since_s = 0, None
+            self.was_right, self.is_refused = True, False
+        elif self.slow_since_s is None and not self.stream.optional:
+            self.slow_since_s = now_s
 
 
 @dataclass(slots=True)
@@ -70,6 +94,9 @@ class StreamSupervisor:
     """Says which streams to ask for, from the counts of what arrived."""
 
     may_group: bool
+    _asked: deque[int] = field(default_factory=lambda: deque(maxlen=64))
+    _quarter_since_s: float | None = None
+    _told: set[str] = field(default_factory=set)
     _watches: list[_Watch] = field(default_factory=list)
     _samples: deque[tuple[float, dict[int, int]]] = field(
         default_factory=lambda: deque(maxlen=round(_WINDOW_S / _SAMPLE_S) + 2)
@@ -78,7 +105,10 @@ class StreamSupervisor:
     def start(self, streams: Iterable[Stream], now_s: float) -> tuple[StreamRequest, ...]:
         """Return a request for every stream: at the start, and after a reboot of the autopilot."""
         self._samples.clear()
+        self._quarter_since_s = None
         self._watches = [_Watch(stream=stream, asked_s=now_s) for stream in streams]
+        self._asked.clear()
+        self._asked.extend(watch.stream.message_id for watch in self._watches)
         return tuple(StreamRequest(stream=watch.stream, by_group=False) for watch in self._watches)
 
     def due(self, counts: Mapping[int, int], now_s: float) -> tuple[StreamRequest, ...]:
@@ -92,12 +122,73 @@ class StreamSupervisor:
         duration_s = now_s - began_s
         if duration_s < _WINDOW_S:
             return ()
+        shares = [
+            (counts.get(watch.stream.message_id, 0) - before.get(watch.stream.message_id, 0))
+            / (duration_s * watch.stream.rate_hz)
+            for watch in self._watches
+        ]
+        for watch, share in zip(self._watches, shares, strict=True):
+            watch.measured(share, now_s)
+        if self._is_quartered(shares, now_s):
+            return ()
         return tuple(
             self._ask_again(watch, now_s)
             for watch in self._watches
-            if self._is_slow(watch, counts, before, duration_s)
+            if watch.slow_since_s is not None
+            and now_s - watch.slow_since_s >= _SLOW_S
             and now_s - watch.asked_s >= _ASK_AGAIN_S
         )
+
+    def answered(self, result: int, now_s: float) -> None:
+        """Take the autopilot's answer to the oldest request that has none yet.
+
+        An answer does not name its message. One that was lost shifts the rest; so a refusal only
+        chooses how a stream that is measured to be slow is asked for.
+        """
+        if not self._asked:
+            return
+        message_id = self._asked.popleft()
+        for watch in self._watches:
+            if watch.stream.message_id == message_id:
+                young = 0.0 <= now_s - watch.asked_s <= _ANSWER_MAX_S
+                watch.is_refused = young and result in _REFUSED
+
+    def trouble(self) -> str | None:
+        """Return once what the operator should know of the rates, in a line of his screen."""
+        missing = [
+            watch
+            for watch in self._watches
+            if watch.failures > _FAILURES_MAX and not watch.was_right and not watch.changed_count
+        ]
+        said = {}
+        if any(watch.changed_count >= _FOUGHT_COUNT for watch in self._watches):
+            said["fought"] = "another station changes our stream rates"
+        if missing:
+            verb = "refused" if any(watch.is_refused for watch in missing) else "not sent as asked"
+            numbers = " ".join(str(watch.stream.message_id) for watch in missing[:4])
+            more = " ..." if len(missing) > 4 else ""
+            said["missing"] = f"{verb}: {numbers}{more}"
+        for key, text in said.items():
+            if key not in self._told:
+                self._told.add(key)
+                return text
+        return None
+
+    def _is_quartered(self, shares: list[float], now_s: float) -> bool:
+        """Whether everything comes at a quarter of its rate, and not for too long yet."""
+        low, high = _QUARTER
+        fast = [
+            share
+            for watch, share in zip(self._watches, shares, strict=True)
+            # Of a slow stream there are one or two in the window: that says nothing.
+            if not watch.stream.optional and watch.stream.rate_hz >= 5.0
+        ]
+        if not fast or not all(low <= share <= high for share in fast):
+            self._quarter_since_s = None
+            return False
+        if self._quarter_since_s is None:
+            self._quarter_since_s = now_s
+        return now_s - self._quarter_since_s <= _QUARTER_WAIT_S
 
     def rate_hz(self, message_id: int) -> float | None:
         """Return the rate measured over the last seconds; None where it is too early to say."""
@@ -106,19 +197,13 @@ class StreamSupervisor:
         (began_s, before), (ended_s, after) = self._samples[0], self._samples[-1]
         return (after.get(message_id, 0) - before.get(message_id, 0)) / (ended_s - began_s)
 
-    @staticmethod
-    def _is_slow(
-        watch: _Watch, counts: Mapping[int, int], before: Mapping[int, int], duration_s: float
-    ) -> bool:
-        message_id = watch.stream.message_id
-        rate_hz = (counts.get(message_id, 0) - before.get(message_id, 0)) / duration_s
-        if rate_hz >= _ENOUGH * watch.stream.rate_hz:
-            watch.failures = 0
-            return False
-        return not watch.stream.optional
-
     def _ask_again(self, watch: _Watch, now_s: float) -> StreamRequest:
         watch.asked_s = now_s
         watch.failures += 1
-        by_group = self.may_group and watch.failures > _FAILURES_MAX
+        if watch.was_right:
+            watch.was_right = False
+            watch.changed_count += 1
+        by_group = self.may_group and (watch.is_refused or watch.failures > _FAILURES_MAX)
+        if not by_group:
+            self._asked.append(watch.stream.message_id)
         return StreamRequest(stream=watch.stream, by_group=by_group)

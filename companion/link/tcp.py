@@ -5,11 +5,19 @@ from __future__ import annotations
 import asyncio
 import socket
 
-from companion.errors import LinkError
-from companion.link.transport import CLOSE_WAIT_S, LinkUrl, OnBytes, OnChange, Reconnecting
+from companion.link.transport import (
+    CLOSE_WAIT_S,
+    LinkNotYetError,
+    LinkUrl,
+    OnBytes,
+    OnChange,
+    OnTrouble,
+    Reconnecting,
+)
 
 _PENDING_MAX = 8 * 1024
-_CONNECT_WAIT_S = 5.0
+# Short of the five seconds within which the operator is told what is wrong.
+_CONNECT_WAIT_S = 3.0
 # A peer that vanished without a word is given up when what we sent stays unanswered this long;
 # otherwise the system would go on trying for a quarter of an hour.
 _UNANSWERED_MS = 5000
@@ -35,8 +43,14 @@ class _Connection(asyncio.Protocol):
 class TcpTransport(Reconnecting):
     """A client; a peer that reads too slowly gets nothing rather than old orders."""
 
-    def __init__(self, url: LinkUrl, on_bytes: OnBytes, on_change: OnChange) -> None:
-        super().__init__(url, on_change)
+    def __init__(
+        self,
+        url: LinkUrl,
+        on_bytes: OnBytes,
+        on_change: OnChange,
+        on_trouble: OnTrouble | None = None,
+    ) -> None:
+        super().__init__(url, on_change, on_trouble)
         self._on_bytes = on_bytes
         self._transport: asyncio.Transport | None = None
         self._connection: _Connection | None = None
@@ -49,17 +63,17 @@ class TcpTransport(Reconnecting):
                     lambda: _Connection(self, self._on_bytes), self.url.place, self.url.number
                 )
         except ConnectionRefusedError as error:
-            raise LinkError(
+            raise LinkNotYetError(
                 f"link.url = {self.url.text!r}: connection refused; nobody listens at "
                 f"{self.url.place} port {self.url.number}: start the autopilot or its router first"
             ) from error
         except (OSError, TimeoutError) as error:
-            raise LinkError(
+            raise LinkNotYetError(
                 f"link.url = {self.url.text!r}: cannot connect "
                 f"({error or 'no answer'}); check host, port and cable"
             ) from error
         if transport.is_closing():
-            raise LinkError(f"link.url = {self.url.text!r}: the other end hung up at once")
+            raise LinkNotYetError(f"link.url = {self.url.text!r}: the other end hung up at once")
         tcp: socket.socket = transport.get_extra_info("socket")
         tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNANSWERED_MS)
         self._transport, self._connection = transport, connection

@@ -16,10 +16,15 @@ from companion.errors import LinkError
 
 OnBytes = Callable[[bytes], None]
 OnChange = Callable[[bool], None]
+OnTrouble = Callable[[str], None]
 
 BACK_OFF_MIN_S, BACK_OFF_MAX_S = 0.5, 5.0
 CLOSE_WAIT_S = 0.5
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+
+
+class LinkNotYetError(LinkError):
+    """The link cannot be opened now, and may be later: a device to plug in, a router to start."""
 
 
 class Transport(Protocol):
@@ -63,11 +68,14 @@ def parse_url(url: str) -> LinkUrl:
     return LinkUrl(kind=kind, place=place.strip("[]"), number=value, text=url)
 
 
-async def open_transport(url: str, on_bytes: OnBytes, on_change: OnChange) -> Transport:
+async def open_transport(
+    url: str, on_bytes: OnBytes, on_change: OnChange, on_trouble: OnTrouble | None = None
+) -> Transport:
     """Open `url`; raises a `LinkError` of one line that says what it sees and what to change.
 
     `on_change` is told of every loss and return after that; TCP and serial links come back by
-    themselves, UDP has nothing to lose.
+    themselves, UDP has nothing to lose. With `on_trouble` a link for which waiting can help is
+    not refused: its one line goes there, and it is tried until it opens.
     """
     # The kinds are imported where they are needed: pyserial is of no use to a UDP link.
     parts = parse_url(url)
@@ -79,11 +87,11 @@ async def open_transport(url: str, on_bytes: OnBytes, on_change: OnChange) -> Tr
     if parts.kind == "tcp":
         from companion.link.tcp import TcpTransport
 
-        link = TcpTransport(parts, on_bytes, on_change)
+        link = TcpTransport(parts, on_bytes, on_change, on_trouble)
     else:
         from companion.link.serial_port import SerialTransport
 
-        link = SerialTransport(parts, on_bytes, on_change)
+        link = SerialTransport(parts, on_bytes, on_change, on_trouble)
     await link.open()
     return link
 
@@ -91,17 +99,34 @@ async def open_transport(url: str, on_bytes: OnBytes, on_change: OnChange) -> Tr
 class Reconnecting:
     """What links that can be lost have in common: they try again with growing pauses."""
 
-    def __init__(self, url: LinkUrl, on_change: OnChange) -> None:
+    def __init__(
+        self, url: LinkUrl, on_change: OnChange, on_trouble: OnTrouble | None = None
+    ) -> None:
         self.url = url
         self.is_up = False
         self._on_change = on_change
+        self._on_trouble = on_trouble
+        self._said: str | None = None
         self._again: asyncio.Task[None] | None = None
         self._closed = False
 
     async def open(self) -> None:
-        """Connect for the first time; raises a `LinkError`."""
-        await self._connect()
-        self.is_up = True
+        """Connect for the first time, or begin to try; raises a `LinkError`."""
+        try:
+            await self._connect()
+        except LinkNotYetError as error:
+            if self._on_trouble is None:
+                raise
+            self._say(error)
+            self._try_soon()
+        else:
+            self.is_up = True
+
+    def _say(self, error: LinkError) -> None:
+        """Tell why it is down, once for each reason."""
+        if self._on_trouble is not None and str(error) != self._said:
+            self._said = str(error)
+            self._on_trouble(self._said)
 
     @abstractmethod
     async def _connect(self) -> None:
@@ -131,6 +156,9 @@ class Reconnecting:
             return
         self.is_up = False
         self._on_change(False)
+        self._try_soon()
+
+    def _try_soon(self) -> None:
         self._again = asyncio.get_running_loop().create_task(self._try_again())
 
     async def _try_again(self) -> None:
@@ -139,8 +167,10 @@ class Reconnecting:
             await asyncio.sleep(pause_s)
             try:
                 await self._connect()
-            except LinkError:
+            except LinkError as error:
+                self._say(error)
                 pause_s = min(2.0 * pause_s, BACK_OFF_MAX_S)
             else:
                 self.is_up = True
+                self._said = None
                 self._on_change(True)

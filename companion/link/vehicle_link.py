@@ -7,15 +7,22 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from companion.core.types import Decision, Input
+from companion.core.types import Decision, Input, OperatorCommand, RateOverride
 from companion.link.component import Component, ComponentOptions
+from companion.link.findings import blocking
+from companion.link.parameters import Parameters
+from companion.link.service import OnEvent
+from companion.link.signing import Signing
+from companion.link.statistics import LinkStatistics
 from companion.link.transport import Transport, open_transport
+from companion.link.watch import Watch
 
 _logger = logging.getLogger(__name__)
 
 # Chunks that wait for the control loop. It empties them within a millisecond; a loop that is
 # behind by this many has other troubles than the oldest bytes.
 _CHUNKS_MAX = 512
+_STATISTICS_S = 60.0
 
 
 class VehicleLink:
@@ -30,37 +37,58 @@ class VehicleLink:
         url: str,
         options: ComponentOptions,
         *,
+        parameters: Parameters | None = None,
+        signing: Signing | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._url = url
         self._clock = clock
+        self._signing = signing
         self._chunks: deque[tuple[bytes, float]] = deque(maxlen=_CHUNKS_MAX)
         self._transport: Transport | None = None
         self._wake: Callable[[], None] = _nothing
-        self.component = Component(options, self._send)
+        self.component = Component(options, self._send, parameters=parameters, signing=signing)
+        self.component.on_event = self._event
+        self._on_event: OnEvent | None = None
+        self._watch = Watch(url, self.component, self._event)
+        self._statistics_s: float | None = None
+        self.statistics: LinkStatistics | None = None
         self._changed = False
         self._heard, self._told = True, True
 
     @property
     def fault(self) -> str | None:
-        """Return why nothing reaches the vehicle; None while the link is up.
+        """Return why nothing reaches the vehicle, or which one it is; None while all is well.
 
         A link that was away counts as up again once a step has been taken, which orders all
         closed, and the vehicle has been heard: nothing opens on what was known before.
         """
         if self._transport is None or not self._transport.is_up:
             return "link is down"
-        return None if self._heard and self._told else "link is coming back"
+        if not (self._heard and self._told):
+            return "link is coming back"
+        finding = blocking(self.component.codec.census, self._clock())
+        return None if finding is None else finding.text
 
     async def open(self, wake: Callable[[], None]) -> None:
-        """Open the link; raises a `LinkError`."""
+        """Open the link, or begin to try where waiting can help; raises a `LinkError`."""
         self._wake = wake
-        self._transport = await open_transport(self._url, self._on_bytes, self._on_change)
-        _logger.info("link up: %s", self._url)
+        self._transport = await open_transport(
+            self._url, self._on_bytes, self._on_change, self._on_trouble
+        )
+        if self._transport.is_up:
+            _logger.info("link up: %s", self._url)
+            self._watch.link_up(self._clock())
+        else:
+            self._heard = self._told = False
 
     def on_order_ack(self, take: Callable[[int], None]) -> None:
         """Have the result (MAV_RESULT) of every order that is answered given to `take`."""
         self.component.on_order_ack = take
+
+    def on_event(self, take: OnEvent) -> None:
+        """Have what happens on the link given to `take(at_s, kind, text)`, for the record."""
+        self._on_event = take
 
     def receive(self) -> list[Input]:
         """Return what came in since the last call, in its order."""
@@ -71,7 +99,9 @@ class VehicleLink:
         while self._chunks:
             data, received_s = self._chunks.popleft()
             inputs.extend(self.component.receive(data, received_s))
-        self._heard = self._heard or bool(inputs)
+        self._heard = self._heard or any(
+            not isinstance(item, OperatorCommand | RateOverride) for item in inputs
+        )
         return inputs
 
     def order(self, channel: int, pulse_us: int) -> bool:
@@ -81,17 +111,26 @@ class VehicleLink:
     def tell(self, decision: Decision | None, now_s: float) -> None:
         """Send what is due: sign of life, heartbeat, texts, values, requests."""
         self.component.tick(decision, now_s)
-        self._told = self._told or self._transport is None or self._transport.is_up
+        is_up = self._transport is None or self._transport.is_up
+        self._told = self._told or is_up
+        if is_up:
+            self._watch.look(now_s)
+        self._keep_count(now_s)
 
     def tell_fault(self, text: str) -> None:
         """Tell the operator once of something that does not work."""
-        self.component.fault(text)
+        finding = blocking(self.component.codec.census, self._clock())
+        is_that = finding is not None and finding.text == text
+        self.component.fault(finding.short if finding is not None and is_that else text)
 
     async def close(self) -> None:
         """Let go; may be called twice and before `open`."""
         transport, self._transport = self._transport, None
         if transport is not None:
             await transport.close()
+            self._count(self._clock())
+            if self._signing is not None:
+                self._signing.keep(is_last=True)
             _logger.info("link closed: %s", self._url)
 
     def _send(self, data: bytes) -> bool:
@@ -102,11 +141,41 @@ class VehicleLink:
         self._wake()
 
     def _on_change(self, is_up: bool) -> None:
-        _logger.warning("link %s: %s", "is back" if is_up else "was lost", self._url)
+        _logger.warning("link %s: %s", "is up" if is_up else "was lost", self._url)
         self._changed = is_up
         self._heard = self._told = False
         self._chunks.clear()
+        if is_up:
+            self._watch.link_up(self._clock())
         self._wake()
+
+    def _on_trouble(self, text: str) -> None:
+        _logger.warning("%s; trying again", text)
+        self._event(self._clock(), "link", text)
+
+    def _event(self, at_s: float, kind: str, text: str) -> None:
+        if self._on_event is not None:
+            self._on_event(at_s, kind, text)
+
+    def _keep_count(self, now_s: float) -> None:
+        """Write statistics down once a minute, and the signing stamp when it is due."""
+        if self._signing is not None:
+            self._signing.keep()
+        if self._statistics_s is None:
+            self._statistics_s = now_s
+        elif now_s - self._statistics_s >= _STATISTICS_S:
+            self._statistics_s = now_s
+            self._count(now_s)
+
+    def _count(self, now_s: float) -> None:
+        component = self.component
+        self.statistics = component.meter.read(
+            component.codec,
+            now_s,
+            position_hz=component.position_rate_hz,
+            round_trip_s=component.clock.round_trip_s,
+        )
+        self._event(now_s, "link", self.statistics.line())
 
 
 def _nothing() -> None:

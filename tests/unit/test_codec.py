@@ -129,9 +129,12 @@ def test_reports_keep_their_meaning() -> None:
     assert one(frame("extended_sys_state", 0, 2)) == LandedReport(received_s=2.5, in_air=True)
     assert one(frame("extended_sys_state", 0, 3)) == LandedReport(received_s=2.5, in_air=False)
     assert one(frame("extended_sys_state", 0, 0)) == LandedReport(received_s=2.5, in_air=None)
-    assert one(frame("wind", 90.0, 3.5, 0.0)) == WindReport(received_s=2.5, speed_m_s=3.5)
+    # From the east, so to the west; the other message has north and east of where it blows to.
+    assert one(frame("wind", 90.0, 3.5, 0.0)) == WindReport(
+        received_s=2.5, speed_m_s=3.5, east_m_s=-3.5, north_m_s=pytest.approx(0.0)
+    )
     covariance = frame("wind_cov", 0, 3.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    assert one(covariance) == WindReport(received_s=2.5, speed_m_s=5.0)
+    assert one(covariance) == WindReport(received_s=2.5, speed_m_s=5.0, east_m_s=4.0, north_m_s=3.0)
 
 
 @pytest.mark.parametrize(

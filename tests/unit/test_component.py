@@ -312,10 +312,38 @@ def test_reasons_that_flicker_are_told_once_a_second(peer: Peer, met: Component)
     assert 4 <= len(peer.texts()) <= 6
 
 
-def test_all_reasons_at_once_fit_into_a_text(peer: Peer, met: Component) -> None:
+def test_all_reasons_at_once_are_two_lines_that_count_the_rest(peer: Peer, met: Component) -> None:
     met.tick(inhibited(*Inhibit), 0.0)
-    (text,) = peer.texts()
-    assert len(text) == 50
+    texts = peer.texts()
+    assert [text[:7] for text in texts] == ["Spray: "] * 2
+    assert all(len(text) <= 50 for text in texts)
+    told = "".join(texts)
+    first = [inhibit for inhibit in Inhibit if inhibit in told]
+    assert first == list(Inhibit)[: len(first)]
+    assert int(texts[1].rpartition("+")[2]) == len(Inhibit) - len(first)
+
+
+def test_why_an_enabled_sprayer_is_closed_is_said_again_every_half_minute(
+    peer: Peer, component: Component
+) -> None:
+    for turn in range(2 * 61):
+        component.tick(inhibited(Inhibit.STALE_POSITION), turn * 0.5)
+    assert peer.texts() == ["Spray: closed: stale-position"] * 3
+    peer.sent.clear()
+    for turn in range(2 * 61):
+        component.tick(inhibited(Inhibit.NOT_ENABLED), 100.0 + turn * 0.5)
+    assert len(peer.texts()) == 1
+
+
+def test_notes_are_told_slowly_and_no_more_than_a_few_wait(peer: Peer, met: Component) -> None:
+    for number in range(100):
+        met.receive(peer.command(216, 2.0 + number), 0.0)
+        met.receive(peer.command(31010, 1.0), 0.0)
+    met.tick(None, 0.0)
+    assert len(peer.texts()) == 1
+    for turn in range(200):
+        met.tick(None, turn * 0.05)
+    assert peer.texts() == ["Spray: DO_SPRAYER takes 0 or 1"]
 
 
 def test_a_fault_is_told_once_as_an_error(peer: Peer, met: Component) -> None:

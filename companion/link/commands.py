@@ -1,0 +1,153 @@
+"""Commands that are addressed to us, each answered: what is done, and what is said of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from companion.core.types import Input, OperatorCommand, RateOverride
+from companion.link.messages import CommandReceived
+from companion.link.parameters import RATE_PERCENT, VALUES_HZ, Parameters
+from companion.link.tank import Tank
+
+DO_SPRAYER = 216
+PREFLIGHT_REBOOT_SHUTDOWN = 246
+GET_MESSAGE_INTERVAL = 510
+SET_MESSAGE_INTERVAL = 511
+REQUEST_MESSAGE = 512
+REQUEST_CAPABILITIES = 520
+USER_RATE, USER_REFILLED, USER_NEXT_MAP = 31010, 31011, 31012
+# MAV_RESULT
+ACCEPTED, REJECTED_FOR_NOW, DENIED, UNSUPPORTED = 0, 1, 2, 3
+
+HEARTBEAT, PARAM_VALUE, AUTOPILOT_VERSION, NAMED_VALUE_FLOAT, STATUSTEXT = 0, 22, 148, 251, 253
+OWN_MESSAGES = frozenset({HEARTBEAT, PARAM_VALUE, AUTOPILOT_VERSION, NAMED_VALUE_FLOAT, STATUSTEXT})
+VALUES_HZ_MIN, VALUES_HZ_MAX = 0.2, 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """What comes of a command: its result, inputs for the core, a text, messages to send."""
+
+    result: int
+    inputs: tuple[Input, ...] = ()
+    text: str | None = None
+    event: str | None = None
+    send: int | None = None
+    send_index: int = 0
+    interval_of: int | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class Desk:
+    """What commands look at and change."""
+
+    parameters: Parameters
+    tank: Tank
+    values_hz: float = 1.0
+    is_armed: bool = False
+    is_open: bool = False
+
+    def obey(self, command: CommandReceived) -> Answer:
+        """Return the answer; whatever we do not know is unsupported."""
+        handler = _HANDLERS.get(command.command)
+        return Answer(result=UNSUPPORTED) if handler is None else handler(self, command)
+
+
+def _sprayer(_desk: Desk, command: CommandReceived) -> Answer:
+    """Take the operator's wish: exactly 1 enables, exactly 0 disables."""
+    if command.param1 not in (0.0, 1.0):
+        return Answer(result=DENIED, text="DO_SPRAYER takes 0 or 1")
+    wish = OperatorCommand(
+        received_s=command.received_s, enable=command.param1 == 1.0, source="command"
+    )
+    return Answer(result=ACCEPTED, inputs=(wish,))
+
+
+def rate_override(desk: Desk, percent: float, received_s: float) -> Answer:
+    """Take another percentage of the prescribed rates, by command or by parameter."""
+    refusal = desk.parameters.set(RATE_PERCENT, percent, is_frozen=False)
+    if refusal is not None:
+        return Answer(result=DENIED, text=f"rate override: {refusal}")
+    taken = desk.parameters.get(RATE_PERCENT, 100.0)
+    return Answer(
+        result=ACCEPTED,
+        inputs=(RateOverride(received_s=received_s, percent=taken),),
+        text=f"rate {taken:g} %",
+        event=f"rate override {taken:g} %",
+    )
+
+
+def _user_rate(desk: Desk, command: CommandReceived) -> Answer:
+    if desk.parameters.index(RATE_PERCENT) is None:
+        return Answer(result=UNSUPPORTED)
+    return rate_override(desk, command.param1, command.received_s)
+
+
+def _refilled(desk: Desk, command: CommandReceived) -> Answer:
+    if desk.is_open:
+        return Answer(result=REJECTED_FOR_NOW, text="refilled: stop spraying first")
+    if not desk.tank.filled(command.param1):
+        most_l = desk.tank.capacity_l
+        advice = "give litres" if most_l is None else f"0 to {most_l:g} L"
+        return Answer(result=DENIED, text=f"refilled: {advice}")
+    text = f"tank {desk.tank.level_l:g} L"
+    return Answer(result=ACCEPTED, text=text, event=f"refilled, {text}")
+
+
+def _next_map(desk: Desk, _command: CommandReceived) -> Answer:
+    if desk.is_armed or desk.is_open:
+        return Answer(result=DENIED, text="next map: disarm first")
+    return Answer(result=DENIED, text="next map: there is only one")
+
+
+def _reboot(_desk: Desk, _command: CommandReceived) -> Answer:
+    return Answer(result=DENIED, text="no reboot by MAVLink")
+
+
+def _request_message(desk: Desk, command: CommandReceived) -> Answer:
+    if command.param1 not in OWN_MESSAGES:
+        return Answer(result=UNSUPPORTED)
+    index = int(command.param2) if 0 <= command.param2 < 1e4 else -1
+    if command.param1 == PARAM_VALUE and desk.parameters.at(index) is None:
+        return Answer(result=DENIED)
+    return Answer(result=ACCEPTED, send=int(command.param1), send_index=index)
+
+
+def _version(_desk: Desk, _command: CommandReceived) -> Answer:
+    return Answer(result=ACCEPTED, send=AUTOPILOT_VERSION)
+
+
+def _set_interval(desk: Desk, command: CommandReceived) -> Answer:
+    """Set how often our values are told; the signs of life are nobody's to change."""
+    if command.param1 == HEARTBEAT:
+        return Answer(result=DENIED, text="our heartbeat is 1 Hz")
+    if command.param1 != NAMED_VALUE_FLOAT:
+        return Answer(result=UNSUPPORTED)
+    interval_us = command.param2
+    if interval_us == 0.0:
+        desk.values_hz = desk.parameters.get(VALUES_HZ, 1.0)
+        return Answer(result=ACCEPTED)
+    # -1, which switches a message off, is refused: another station may be looking.
+    if not 1e6 / VALUES_HZ_MAX <= interval_us <= 1e6 / VALUES_HZ_MIN:
+        return Answer(result=DENIED, text=f"values: {VALUES_HZ_MIN:g} to {VALUES_HZ_MAX:g} Hz")
+    desk.values_hz = 1e6 / interval_us
+    return Answer(result=ACCEPTED)
+
+
+def _get_interval(_desk: Desk, command: CommandReceived) -> Answer:
+    number = command.param1
+    return Answer(result=ACCEPTED, interval_of=int(number) if 0 <= number < 65536 else 65535)
+
+
+_HANDLERS: dict[int, Callable[[Desk, CommandReceived], Answer]] = {
+    DO_SPRAYER: _sprayer,
+    PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
+    GET_MESSAGE_INTERVAL: _get_interval,
+    SET_MESSAGE_INTERVAL: _set_interval,
+    REQUEST_MESSAGE: _request_message,
+    REQUEST_CAPABILITIES: _version,
+    USER_RATE: _user_rate,
+    USER_REFILLED: _refilled,
+    USER_NEXT_MAP: _next_map,
+}

@@ -1,0 +1,129 @@
+"""What others ask of us: commands and parameters, each answered; for the component on one link."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from companion.core.types import Decision, Input
+from companion.link import commands
+from companion.link.announcer import Announcer
+from companion.link.commands import Answer, Desk
+from companion.link.encode import Encoder
+from companion.link.messages import CommandReceived, ParamAsked, ParamSet
+from companion.link.parameter_server import ParameterServer, take_over
+from companion.link.parameters import RATE_PERCENT
+
+OnEvent = Callable[[float, str, str], None]
+Version = tuple[int, int, int]
+
+
+class Service:
+    """Answers by `send`; has what it did told to the operator and to the record."""
+
+    def __init__(
+        self,
+        desk: Desk,
+        encoder: Encoder,
+        announcer: Announcer,
+        send: Callable[[bytes], bool],
+        *,
+        version: Version,
+    ) -> None:
+        self._desk = desk
+        self._encoder = encoder
+        self._announcer = announcer
+        self._send = send
+        self._version = version
+        self._server = ParameterServer(desk, encoder)
+        self._decision: Decision | None = None
+        self.on_event: OnEvent | None = None
+        take_over(desk)
+
+    def look_at(self, decision: Decision | None, now_s: float) -> None:
+        """Take what was decided: what may be changed, and what is left in the tank."""
+        desk, self._decision = self._desk, decision
+        desk.is_open = decision is not None and not decision.plan.is_off
+        desk.tank.flows(0.0 if decision is None else decision.flow_l_min, now_s)
+        self._announcer.tank_l = desk.tank.level_l
+        self._announcer.set_values_rate(desk.values_hz)
+
+    def tick(self, now_s: float) -> None:
+        """Send the next parameter of a list, if it is its turn."""
+        for frame in self._server.due(now_s):
+            self._send(frame)
+
+    def obey(self, command: CommandReceived) -> tuple[Input, ...]:
+        """Answer a command addressed to us, as often as it comes."""
+        if not self._is_ours(command.target_system, command.target_component):
+            return ()
+        answer, sender = self._desk.obey(command), command.sender
+        self._send(
+            self._encoder.ack(command.command, answer.result, sender.system_id, sender.component_id)
+        )
+        self._tell(answer, command.received_s)
+        index = self._desk.parameters.index(RATE_PERCENT)
+        if command.command == commands.USER_RATE and index is not None and answer.inputs:
+            self._tell_value(index)
+        return answer.inputs
+
+    def serve(self, message: ParamAsked | ParamSet) -> tuple[Input, ...]:
+        """Answer the parameter protocol; only a list may be asked of everyone."""
+        target = message.target_component
+        if isinstance(message, ParamAsked) and message.is_all and target == 0:
+            target = self._encoder.component_id
+        if not self._is_ours(message.target_system, target):
+            return ()
+        server = self._server
+        values = server.ask(message) if isinstance(message, ParamAsked) else server.set(message)
+        for index in values.indices:
+            self._tell_value(index)
+        if values.answer is None:
+            return ()
+        self._tell(values.answer, message.received_s)
+        return values.answer.inputs
+
+    def tell_event(self, at_s: float, kind: str, text: str) -> None:
+        """Have something taken down in the record of the flight."""
+        if self.on_event is not None:
+            self.on_event(at_s, kind, text)
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _is_ours(self, system_id: int, component_id: int) -> bool:
+        encoder = self._encoder
+        return component_id == encoder.component_id and system_id in (0, encoder.system_id)
+
+    def _tell_value(self, index: int) -> None:
+        frame = self._server.value(index)
+        if frame is not None:
+            self._send(frame)
+
+    def _tell(self, answer: Answer, at_s: float) -> None:
+        """Do what an answer consists of besides its result."""
+        if answer.text is not None:
+            self._announcer.note(answer.text)
+        if answer.event is not None:
+            self.tell_event(at_s, "command", answer.event)
+        if answer.interval_of is not None:
+            self._send(self._interval(answer.interval_of))
+        if answer.send is not None:
+            self._send_message(answer.send, answer.send_index, at_s)
+
+    def _interval(self, message_id: int) -> bytes:
+        values_us = round(1e6 / self._desk.values_hz)
+        known = {commands.HEARTBEAT: 1_000_000, commands.NAMED_VALUE_FLOAT: values_us}
+        return self._encoder.message_interval(message_id, known.get(message_id, 0))
+
+    def _send_message(self, message_id: int, index: int, at_s: float) -> None:
+        """Send one of our own messages because somebody asked for it."""
+        if message_id == commands.AUTOPILOT_VERSION:
+            self._send(self._encoder.autopilot_version(self._version))
+        elif message_id == commands.PARAM_VALUE:
+            self._tell_value(index)
+        elif message_id == commands.HEARTBEAT:
+            self._announcer.beat_soon()
+        elif message_id == commands.STATUSTEXT:
+            self._announcer.repeat()
+        elif self._decision is not None:
+            for frame in self._announcer.named_values(self._decision, at_s):
+                self._send(frame)

@@ -1,0 +1,198 @@
+"""Commands to the component: every one is answered, and none does more than it may."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from companion.core.controller import Memory, step
+from companion.core.types import RateOverride
+from companion.link.component import Component, ComponentOptions
+from companion.link.parameters import Parameters, known_parameters
+from tests import builders
+from tests.unit.test_component import VEHICLE, Peer
+
+SETUP = builders.setup()
+OPEN, _ = step(SETUP, builders.SPRAYING, Memory(), 10.0)
+CLOSED, _ = step(SETUP, None, Memory(), 10.0)
+NAN, INF = float("nan"), float("inf")
+ACCEPTED, FOR_NOW, DENIED, UNSUPPORTED = 0, 1, 2, 3
+
+
+@pytest.fixture
+def peer() -> Peer:
+    return Peer()
+
+
+@pytest.fixture
+def component(peer: Peer) -> Component:
+    made = Component(
+        ComponentOptions(), peer.take, parameters=Parameters(known_parameters({}, tank_l=40.0))
+    )
+    made.receive(peer.heartbeat(), 0.0)
+    peer.sent.clear()
+    return made
+
+
+def result(peer: Peer, component: Component, command: int, *params: float) -> int:
+    """Return the result in the only answer to a command."""
+    peer.sent.clear()
+    component.receive(peer.command(command, *params), 1.0)
+    (ack,) = peer.of("COMMAND_ACK")
+    assert (ack.command, ack.target_system, ack.target_component) == (command, 255, 190)
+    return int(ack.result)
+
+
+@pytest.mark.parametrize("percent", [80.0, 95.0, 100.0, 110.0])
+def test_a_rate_override_goes_to_the_core(peer: Peer, component: Component, percent: float) -> None:
+    inputs = component.receive(peer.command(31010, percent), 2.0)
+    assert inputs == [RateOverride(received_s=2.0, percent=percent)]
+    assert peer.of("COMMAND_ACK")[0].result == ACCEPTED
+    (value,) = peer.of("PARAM_VALUE")
+    assert (value.param_id, value.param_value) == ("SPR_RATE_PCT", percent)
+
+
+@pytest.mark.parametrize("percent", [79.99, 110.01, 0.0, -100.0, NAN, INF, -INF])
+def test_a_rate_override_out_of_bounds_is_denied(
+    peer: Peer, component: Component, percent: float
+) -> None:
+    assert component.receive(peer.command(31010, percent), 2.0) == []
+    assert peer.of("COMMAND_ACK")[0].result == DENIED
+    component.tick(None, 2.1)
+    assert peer.texts() == ["Spray: rate override: 80 to 110 only"]
+
+
+def test_a_command_that_comes_twice_is_done_once_and_answered_twice(
+    peer: Peer, component: Component
+) -> None:
+    twice = [component.receive(peer.command(31010, 90.0), 2.0) for _ in range(2)]
+    assert twice[0] == twice[1]
+    assert len(peer.of("COMMAND_ACK")) == 2
+
+
+def test_the_tank_is_known_from_the_first_filling_on(peer: Peer, component: Component) -> None:
+    component.tick(OPEN, 10.0)
+    assert peer.named("SPR_FLOW")
+    assert not peer.named("SPR_TANK")
+    component.tick(CLOSED, 10.1)
+    assert result(peer, component, 31011, 0.0) == ACCEPTED
+    for turn in range(601):
+        component.tick(OPEN, 11.0 + turn * 0.1)
+    assert OPEN.flow_l_min > 1.0
+    assert peer.named("SPR_TANK")[0] == pytest.approx(40.0, abs=0.1)
+    assert peer.named("SPR_TANK")[-1] == pytest.approx(40.0 - OPEN.flow_l_min, abs=0.1)
+
+
+@pytest.mark.parametrize("litres", [40.1, -1.0, NAN, INF])
+def test_a_filling_that_cannot_be_is_denied(
+    peer: Peer, component: Component, litres: float
+) -> None:
+    assert result(peer, component, 31011, litres) == DENIED
+    component.tick(CLOSED, 2.0)
+    assert not peer.named("SPR_TANK")
+
+
+def test_nobody_fills_the_tank_while_spraying(peer: Peer, component: Component) -> None:
+    component.tick(OPEN, 10.0)
+    assert result(peer, component, 31011, 0.0) == FOR_NOW
+
+
+@pytest.mark.parametrize("command", [31012, 246])
+def test_what_this_component_does_not_do_is_denied_with_a_text(
+    peer: Peer, component: Component, command: int
+) -> None:
+    assert result(peer, component, command, 1.0) == DENIED
+    component.tick(None, 2.0)
+    assert len(peer.texts()) == 1
+
+
+@pytest.mark.parametrize("command", [400, 183, 176, 31013, 0, 65535])
+def test_everything_else_is_unsupported(peer: Peer, component: Component, command: int) -> None:
+    assert result(peer, component, command, 1.0) == UNSUPPORTED
+
+
+@pytest.mark.parametrize(
+    ("message_id", "kind"),
+    [
+        (148.0, "AUTOPILOT_VERSION"),
+        (22.0, "PARAM_VALUE"),
+        (251.0, "NAMED_VALUE_FLOAT"),
+        (0.0, "HEARTBEAT"),
+        (253.0, "STATUSTEXT"),
+    ],
+)
+def test_our_own_messages_can_be_asked_for(
+    peer: Peer, component: Component, message_id: float, kind: str
+) -> None:
+    component.tick(CLOSED, 100.0)
+    component.tick(CLOSED, 102.0)
+    assert result(peer, component, 512, message_id) == ACCEPTED
+    component.tick(CLOSED, 102.05)
+    assert peer.of(kind)
+
+
+@pytest.mark.parametrize(
+    ("params", "expected"),
+    [((33.0,), UNSUPPORTED), ((22.0, 99.0), DENIED), ((22.0, NAN), DENIED), ((NAN,), UNSUPPORTED)],
+)
+def test_messages_that_are_not_ours_cannot(
+    peer: Peer, component: Component, params: tuple[float, ...], expected: int
+) -> None:
+    assert result(peer, component, 512, *params) == expected
+
+
+def values_in_10_s(peer: Peer, component: Component, from_s: float) -> int:
+    for turn in range(40):
+        component.tick(CLOSED, from_s + turn * 0.05)
+    peer.sent.clear()
+    for turn in range(40, 240):
+        component.tick(CLOSED, from_s + turn * 0.05)
+    assert len(peer.of("HEARTBEAT")) == 10
+    return len(peer.named("SPR_STATE"))
+
+
+def test_the_rate_of_our_values_can_be_set_within_bounds(peer: Peer, component: Component) -> None:
+    assert values_in_10_s(peer, component, 100.0) == 10
+    assert result(peer, component, 511, 251.0, 250_000.0) == ACCEPTED
+    assert values_in_10_s(peer, component, 200.0) == 40
+    peer.sent.clear()
+    component.receive(peer.command(510, 251.0), 220.0)
+    assert [(m.message_id, m.interval_us) for m in peer.of("MESSAGE_INTERVAL")] == [(251, 250_000)]
+    for interval_us in (1.0, -1.0, 1e9, NAN):
+        assert result(peer, component, 511, 251.0, interval_us) == DENIED
+    assert result(peer, component, 511, 251.0, 0.0) == ACCEPTED
+    assert values_in_10_s(peer, component, 300.0) == 10
+
+
+@pytest.mark.parametrize(("message_id", "expected"), [(0.0, DENIED), (33.0, UNSUPPORTED)])
+def test_nobody_changes_our_signs_of_life(
+    peer: Peer, component: Component, message_id: float, expected: int
+) -> None:
+    assert result(peer, component, 511, message_id, 1e6) == expected
+
+
+def test_the_sign_of_life_keeps_its_rate_whatever_is_asked(
+    peer: Peer, component: Component
+) -> None:
+    component.receive(peer.command(511, 251.0, 5e6), 0.0)
+    for turn in range(60):
+        component.tick(OPEN, turn * 0.05)
+    assert 29 <= len(peer.named("SPR_LIVE")) <= 31
+
+
+def test_the_version_can_be_asked_for_the_older_way(peer: Peer, component: Component) -> None:
+    assert result(peer, component, 520, 1.0) == ACCEPTED
+    (version,) = peer.of("AUTOPILOT_VERSION")
+    assert version.capabilities & 2  # PARAM_FLOAT
+
+
+def test_events_are_told_for_the_record(peer: Peer, component: Component) -> None:
+    told: list[Any] = []
+    component.on_event = lambda at_s, kind, text: told.append((at_s, kind, text))
+    component.receive(peer.command(31010, 90.0, system=VEHICLE), 3.0)
+    component.receive(peer.command(31011, 12.5), 4.0)
+    assert told == [
+        (3.0, "command", "rate override 90 %"),
+        (4.0, "command", "refilled, tank 12.5 L"),
+    ]
