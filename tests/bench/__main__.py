@@ -1,4 +1,10 @@
-"""Measure everything: one JSON object on stdout, a table and the progress on stderr."""
+"""Measure everything: one JSON object on stdout, a table and the progress on stderr.
+
+    python -m tests.bench [SEED] [--only 'arc-*'] [--quick] > results.json
+    python -m tests.bench --from times.json --from results.json --page docs/performance.md
+
+Parts may be measured at different times; the page says when each one was.
+"""
 
 from __future__ import annotations
 
@@ -6,122 +12,150 @@ import argparse
 import json
 import os
 import platform
+import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
-from tests.bench.accuracy import accuracy
-from tests.bench.arrival import arrivals
 from tests.bench.figures import Figure, rounded, table
-from tests.bench.flights import fly_all, tasks
-from tests.bench.loading import loading, raster
-from tests.bench.lookup import cell_lookup, lookup_growth, lookups
-from tests.bench.realtime import times_real_time
+from tests.bench.parts import PARTS, Options, Part, chosen
 from tests.bench.report import page
-from tests.bench.steps import growth, large_field, small_field
 
 SEEDS, QUICK_SEEDS = 20, 3
 PROCESSES = 2
 OURS_MIN = 0.9
+# Waiting for messages is no work: this part says nothing of how busy the machine is.
+WAITING = "arrivals"
 
-Say = Callable[[str], None]
+
+@dataclass(slots=True)
+class Run:
+    """What has been measured so far."""
+
+    figures: list[Figure] = field(default_factory=list)
+    took_s: dict[str, float] = field(default_factory=dict)
+    load: float = field(default_factory=lambda: os.getloadavg()[0])
+    worked_s: float = 0.0
+    timed_s: float = 0.0
+
+    @property
+    def wall_s(self) -> float:
+        """Return the time of all parts."""
+        return sum(self.took_s.values())
+
+    @property
+    def ours(self) -> float | None:
+        """Return which share of the time this program had a core, while times were measured."""
+        return self.worked_s / self.timed_s if self.timed_s > 0.0 else None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the results; 0 even where a target is missed: the figures are the result."""
-    given = _parser().parse_args(arguments)
-    begin, load = perf_counter(), os.getloadavg()[0]
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    parser = _parser()
+    given = parser.parse_args(words)
     count = given.seeds or (QUICK_SEEDS if given.quick else SEEDS)
-    seeds = range(given.seed, given.seed + count)
-    timed, share = timings(given.seed, is_quick=given.quick, say=say)
-    figures = [*timed, *flights(seeds, is_quick=given.quick, say=say)]
-    wall_s = perf_counter() - begin
-    print_results(figures, seed=given.seed, is_quick=given.quick, wall_s=wall_s)
+    options = Options(
+        seed=given.seed,
+        count=count,
+        is_quick=given.quick,
+        flights=given.flights,
+        processes=given.processes,
+        say=say,
+    )
+    # With saved results only what is asked for by name is measured again.
+    parts = [] if given.saved and not given.only else chosen(given.only, options)
+    if given.only and not parts:
+        parser.error(f"--only {given.only[0]}: choose of {', '.join(p.name for p in PARTS)}")
+    sources = [_read(parser, path) for path in given.saved]
+    if parts:
+        run = measure(parts, options)
+        found = results(run, options, command=f"python -m tests.bench {shlex.join(words)}".strip())
+        print_results(run.figures, found)
+        sources.append(found)
     if given.page is not None:
-        busy = f"{share:.0%} of one core was ours while timing, load average before {load:.1f}"
-        about = {
-            "machine": f"{os.cpu_count()} {platform.machine()} cores",
-            "python": platform.python_version(),
-            "busy": busy,
-        }
-        quick = " --quick" if given.quick else ""
-        text = f"{given.seed} --seeds {count}{quick} --page docs/performance.md"
-        given.page.write_text(page(figures, arguments=text, seeds=seeds, about=about), "utf-8")
+        given.page.write_text(page(sources), "utf-8")
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.bench",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("seed", nargs="?", type=int, default=1, help="the first of the seeds")
     parser.add_argument("--quick", action="store_true", help="3 seeds, 5 m/s, smaller samples")
     parser.add_argument("--seeds", type=int, help=f"how many seeds; {SEEDS} unless told")
+    parser.add_argument("--only", action="append", default=[], metavar="PATTERN", help="some parts")
+    parser.add_argument("--flights", type=int, default=0, help="calibration missions more; 200")
+    parser.add_argument("--processes", type=int, default=PROCESSES, help="flights at a time")
     parser.add_argument("--page", type=Path, help="also write a page of Markdown here")
+    parser.add_argument(
+        "--from", dest="saved", action="append", default=[], type=Path, metavar="JSON",
+        help="results saved before; of figures in two of them the later one counts",
+    )  # fmt: skip
     return parser
 
 
-def timings(seed: int, *, is_quick: bool, say: Say) -> tuple[list[Figure], float]:
-    """Measure what is measured in time, before anything runs beside it.
+def _read(parser: argparse.ArgumentParser, path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        parser.error(f"--from {path}: cannot be read ({error})")
+    if not isinstance(found, dict) or not isinstance(found.get("figures"), dict):
+        parser.error(f"--from {path}: these are no results of this program")
+    return found
 
-    Returns also which share of the time this program had a core to itself.
-    """
-    wall, cpu = perf_counter(), process_time()
-    zones = (100, 10_000) if is_quick else (100, 1_000, 10_000, 100_000)
-    say("core steps")
-    figures = [
-        small_field(seed=seed, repeats=1 if is_quick else 3),
-        large_field(seed=seed, length_m=300.0 if is_quick else 900.0),
-        growth(seed=seed, zones=zones),
-    ]
-    say("look-ups, simulation, maps")
-    figures += lookups(seed=seed)
-    figures.append(lookup_growth(seed=seed, zones=(100, 10_000 if is_quick else 100_000)))
-    figures.append(cell_lookup(seed=seed))
-    figures.append(times_real_time(seed=seed, repeats=2 if is_quick else 4))
-    figures.append(loading(seed=seed, repeats=1 if is_quick else 3))
-    figures += raster(seed=seed, repeats=1 if is_quick else 3)
+
+def measure(parts: Sequence[Part], options: Options) -> Run:
+    """Measure the parts one after the other: times first, before anything runs beside them."""
+    run = Run()
+    for part in sorted(parts, key=lambda part: not part.is_timed):
+        say(part.name)
+        wall, cpu = perf_counter(), process_time()
+        run.figures += part.run(options)
+        run.took_s[part.name] = perf_counter() - wall
+        if part.is_timed and part.name != WAITING:
+            run.worked_s += process_time() - cpu
+            run.timed_s += run.took_s[part.name]
+        say(f"{part.name}: {run.took_s[part.name]:.0f} s")
     # What other programs took away shows here: 1.0 is a machine of our own.
-    share = (process_time() - cpu) / (perf_counter() - wall)
-    if share < OURS_MIN:
-        say(f"the machine is busy: {share:.0%} of the time was ours; timings are too long")
-    say("message to orders")
-    return figures + arrivals(seed=seed, count=100 if is_quick else 400), share
+    if run.ours is not None and run.ours < OURS_MIN:
+        say(f"the machine is busy: {run.ours:.0%} of the time was ours; timings are too long")
+    return run
 
 
-def flights(seeds: range, *, is_quick: bool, say: Say) -> list[Figure]:
-    """Measure the accuracy of many flights, in two processes."""
-    todo = tasks(seeds, is_quick=is_quick)
-
-    def progress(done: int) -> None:
-        if done % 10 == 0 or done == len(todo):
-            say(f"flights: {done} of {len(todo)} paths")
-
-    return accuracy(fly_all(todo, processes=PROCESSES, progress=progress))
-
-
-def results(
-    figures: Sequence[Figure], *, seed: int, is_quick: bool, wall_s: float
-) -> dict[str, Any]:
+def results(run: Run, options: Options, *, command: str) -> dict[str, Any]:
     """Return the JSON object."""
     return {
-        "seed": seed,
-        "quick": is_quick,
+        "date": datetime.now(UTC).date().isoformat(),
+        "command": command,
+        "seed": options.seed,
+        "seeds": options.count,
+        "quick": options.is_quick,
         "machine": {
             "python": platform.python_version(),
             "architecture": platform.machine(),
             "cores": os.cpu_count(),
+            "load_before": rounded(run.load),
+            "ours_while_timing": rounded(run.ours),
         },
-        "wall_s": rounded(wall_s),
-        "missed_targets": [figure.key for figure in figures if figure.met is False],
-        "figures": {figure.key: figure.as_json() for figure in figures},
+        "wall_s": rounded(run.wall_s),
+        "parts_s": rounded(run.took_s),
+        "missed_targets": [figure.key for figure in run.figures if figure.met is False],
+        "figures": {figure.key: figure.as_json() for figure in run.figures},
     }
 
 
-def print_results(figures: Sequence[Figure], *, seed: int, is_quick: bool, wall_s: float) -> None:
+def print_results(figures: Sequence[Figure], found: dict[str, Any]) -> None:
     """Write the table to stderr and the JSON object to stdout."""
-    found = results(figures, seed=seed, is_quick=is_quick, wall_s=wall_s)
-    sys.stderr.write(table(figures) + f"\n\nseed {seed}, {wall_s:.0f} s\n")
+    parts = ", ".join(f"{name} {took:.0f} s" for name, took in found["parts_s"].items())
+    sys.stderr.write(table(figures) + f"\n\nseed {found['seed']}; {parts}\n")
     sys.stderr.flush()
     sys.stdout.write(json.dumps(found, indent=1) + "\n")
 

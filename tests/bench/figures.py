@@ -16,7 +16,8 @@ import numpy as np
 class Figure:
     """One figure with what it is judged by; `n` says how many samples stand behind it.
 
-    `alternative` is another way to do the same, measured in the same run.
+    `alternative` is another way to do the same, measured in the same run. `section` is where the
+    page has it; figures of one `row` are one line of the page's summary.
     """
 
     key: str
@@ -28,6 +29,8 @@ class Figure:
     is_at_least: bool = False
     alternative: dict[str, float | None] = field(default_factory=dict)
     details: dict[str, Any] = field(default_factory=dict)
+    section: str = ""
+    row: str = ""
 
     @property
     def met(self) -> bool | None:
@@ -49,8 +52,26 @@ class Figure:
             "bound": None if self.target is None else (">=" if self.is_at_least else "<="),
             "met": self.met,
             "alternative": rounded(self.alternative),
+            "section": self.section,
+            "row": self.row,
             **rounded(self.details),
         }
+
+    @classmethod
+    def from_json(cls, key: str, found: dict[str, Any]) -> Figure:
+        """Return the figure that `as_json` wrote."""
+        rest = dict(found)
+        known = {name: rest.pop(name) for name in ("what", "value", "unit", "n", "target")}
+        bound, _ = rest.pop("bound"), rest.pop("met")
+        return cls(
+            key=key,
+            **known,
+            is_at_least=bound == ">=",
+            alternative=rest.pop("alternative", {}),
+            section=rest.pop("section", ""),
+            row=rest.pop("row", ""),
+            details=rest,
+        )
 
 
 def rounded(value: Any) -> Any:

@@ -19,28 +19,17 @@ from statistics import fmean
 
 from analysis.evaluation import evaluate
 from companion.core.flow_trim import FlowTrim
-from companion.core.nozzle import FlowCurve
 from companion.core.types import Decision
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
-from sitl.profile import PlantProfile, load_profile
+from sitl.profile import load_profile
+from tests.bench.figures import Figure
+from tests.bench.sprayers import scaled_flow
 
 METER_RATE_HZ = 50.0
-
-
-def scaled_flow(profile: PlantProfile, gain: float) -> PlantProfile:
-    """Return a sprayer that delivers `gain` times what the measured table says."""
-    sets = tuple(
-        replace(
-            nozzles,
-            curve=FlowCurve(
-                duty=nozzles.curve.duty,
-                flow_l_min=tuple(gain * flow for flow in nozzles.curve.flow_l_min),
-            ),
-        )
-        for nozzles in profile.nozzle_sets
-    )
-    return replace(profile, nozzle_sets=sets)
+# Flow over the table: what a worn set of nozzles gives, and a sprayer just calibrated.
+GAINS = (1.08, 1.0)
+MEAN_TARGET, WORST_TARGET = 98.0, 96.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,6 +100,51 @@ def summary(flights: Sequence[Trimmed]) -> dict[str, float | None]:
         "accuracy_worst_percent": min(accuracies),
         "lag_mean_abs_m": fmean(lags) if lags else None,
     }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """One path of one sprayer, with and without the trim."""
+
+    gain: float
+    seed: int
+    speed_m_s: float = 5.0
+
+
+def fly_task(task: Task) -> list[Trimmed]:
+    """Fly both ways."""
+    return [flown(task.speed_m_s, task.gain, task.seed, law) for law in (None, FlowTrim())]
+
+
+def figures(flights: Sequence[Trimmed], *, section: str) -> list[Figure]:
+    """Return the accuracy with the trim, beside that without."""
+    made = []
+    for gain in sorted({flight.gain for flight in flights}):
+        alike = [flight for flight in flights if flight.gain == gain]
+        ours = summary([flight for flight in alike if flight.trim])
+        other = summary([flight for flight in alike if not flight.trim])
+        where = f"{100.0 * (gain - 1.0):+.0f} % of flow" if gain != 1.0 else "calibrated flow"
+        for name, words, target in (
+            ("mean", "mean", MEAN_TARGET),
+            ("worst", "worst seed", WORST_TARGET),
+        ):
+            key = f"accuracy_{name}_percent"
+            made.append(
+                Figure(
+                    key=f"flow_trim_{name}_{gain:g}",
+                    what=f"spraying accuracy, 3 % meter and slow trim, {where}: {words}",
+                    value=ours[key],
+                    unit="%",
+                    n=sum(flight.trim for flight in alike),
+                    target=target,
+                    is_at_least=True,
+                    alternative={"without a trim": other[key]},
+                    details=ours,
+                    section=section,
+                    row=f"spraying accuracy with the 3 % meter and slow trim: {words}",
+                )
+            )
+    return made
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -37,6 +37,8 @@ from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.routes import read_route
 from sitl.vehicle import Vehicle
+from tests.bench.identification_figures import Compared, all_four, summary
+from tests.bench.sprayers import PLANT, nominal_lag, scaled_flow, scaled_lag, with_sprayer
 
 if TYPE_CHECKING:
     from analysis.calibration.lag_fit import Fit
@@ -45,9 +47,7 @@ if TYPE_CHECKING:
     from companion.core.types import Input
     from sitl.vehicle import Route
 
-TARGET_S = 0.005
 METER_RATE_HZ = 50.0
-OUTPUT_S = {"gpio": 0.0, "servo": 0.012}
 TRUTH_PERIODS = 8
 TRUTH_SETTLED_S = 0.25
 DRY = 0.02
@@ -56,63 +56,38 @@ Output = Literal["gpio", "servo"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Compared:
-    """One kind in one flight, or one of the two ends."""
-
-    seed: int
-    name: str
-    count: int
-    value_s: float
-    low_s: float
-    high_s: float
-    truth_s: float
-
-    @property
-    def error_s(self) -> float:
-        """Return identified less true."""
-        return self.value_s - self.truth_s
-
-    @property
-    def covers(self) -> bool:
-        """Return whether the interval has the truth in it."""
-        return self.low_s <= self.truth_s <= self.high_s
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
-    """One flight."""
+    """One flight; the controller's lags are `lags` times the nominal, the flow `gain` times."""
 
     seed: int
     output: Output
-    plant: str
-    lags: float
+    plant: str = PLANT
+    lags: float = 1.0
+    gain: float = 1.0
 
 
 @cache
-def _mission(output: Output, lags: float) -> tuple[Setup, Route]:
+def _mission(plant: str, output: Output, lags: float) -> tuple[Setup, Route]:
     """Return set-up and route of the calibration flight; the lags are `lags` times the known."""
     with tempfile.TemporaryDirectory() as folder:
         written = write_calibration(EXAMPLE / "config.toml", Path(folder) / "calibration.plan")
         config = load(written.config)
         setup = build_setup(config)
         route = read_route(written.mission, setup.frame, speed_m_s=None, default_speed_m_s=5.0)
-    lag = setup.lag
-    wrong = {
-        name: lags * getattr(lag, name)
-        for name in ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s")
-    }
-    return replace(setup, lag=replace(lag, output_s=OUTPUT_S[output], **wrong)), route
+    if plant != PLANT:
+        setup = with_sprayer(setup, load_profile(plant))
+    return replace(setup, lag=scaled_lag(nominal_lag(plant, output), lags)), route
 
 
 def fly_once(task: Task) -> tuple[Identified, FlightRecord]:
     """Fly the mission and identify from what the journal would hold."""
-    setup, route = _mission(task.output, task.lags)
+    setup, route = _mission(task.plant, task.output, task.lags)
     trajectory = Vehicle(route, start_s=0.0, seed=task.seed).fly_to_end()
     trace: list[Input | Decision] = []
     result = fly(
         setup,
         trajectory,
-        load_profile(task.plant),
+        scaled_flow(load_profile(task.plant), task.gain),
         FlightOptions(output=task.output, seed=task.seed, meter_rate_hz=METER_RATE_HZ),
         speed_m_s=5.0,
         observer=trace.append,
@@ -122,15 +97,19 @@ def fly_once(task: Task) -> tuple[Identified, FlightRecord]:
 
 
 def compare(task: Task) -> list[Compared]:
+    """Fly, and return how the flight's lags lie to the truth."""
+    return compared(task.seed, *fly_once(task))
+
+
+def compared(seed: int, found: Identified, record: FlightRecord) -> list[Compared]:
     """Return how a flight's lags lie to the truth."""
-    found, record = fly_once(task)
     rows = []
     for kind, estimate in found.lags.items():
         fits = [fit for fit in found.fits if fit.step.kind is kind]
         truth_s = fmean(true_lag_s(record, fit) for fit in fits) - found.output_s
         rows.append(
             Compared(
-                seed=task.seed,
+                seed=seed,
                 name=kind.value,
                 count=estimate.count,
                 value_s=estimate.value,
@@ -146,7 +125,7 @@ def compare(task: Task) -> list[Compared]:
         ends = [true_end_s(record, fit) - found.output_s for fit in fits]
         rows.append(
             Compared(
-                seed=task.seed,
+                seed=seed,
                 name="on_start" if kind is Kind.ON else "off_end",
                 count=end.count,
                 value_s=end.value,
@@ -198,55 +177,11 @@ def true_end_s(record: FlightRecord, fit: Fit) -> float:
     steady = fit.after.slope_ml_s if is_on else fit.before.slope_ml_s
     wet = np.flatnonzero(flow > DRY * steady)
     if not is_on:
-        return float(times_s[wet[-1] + 1]) - at_s
+        # Ordered in the gap between two pulses, a valve at the nozzle gives nothing any more.
+        return float(times_s[wet[-1] + 1]) - at_s if len(wet) else 0.0
     # As of a valve ordered fully open: a pulse stands in the middle of its period.
     ahead_s = 0.5 * (1.0 - max(order.after for order in orders)) * record.pwm_period_s
     return float(times_s[wet[0]]) - at_s - ahead_s
-
-
-def summary(rows: Sequence[Compared], flights: int) -> dict[str, dict[str, float]]:
-    """Return the figures by kind, and of all four lags together."""
-    result = {}
-    for name in (*(kind.value for kind in Kind), "on_start", "off_end"):
-        chosen = [row for row in rows if row.name == name]
-        if not chosen:
-            continue
-        errors = np.array([row.error_s for row in chosen])
-        figures = {
-            "flights": len(chosen) / flights,
-            "steps": fmean(row.count for row in chosen),
-            "truth_s": fmean(row.truth_s for row in chosen),
-            "error_mean_s": float(errors.mean()),
-            "error_sd_s": float(errors.std(ddof=1)) if len(errors) > 1 else 0.0,
-            "error_worst_s": float(np.abs(errors).max()),
-            "half_width_s": fmean(0.5 * (row.high_s - row.low_s) for row in chosen),
-        }
-        if name == "on_start":
-            figures["safe"] = fmean(row.low_s <= row.truth_s for row in chosen)
-            figures["margin_s"] = fmean(row.truth_s - row.low_s for row in chosen)
-        elif name == "off_end":
-            figures["safe"] = fmean(row.high_s >= row.truth_s for row in chosen)
-            figures["margin_s"] = fmean(row.high_s - row.truth_s for row in chosen)
-        else:
-            figures["within_target"] = float(np.mean(np.abs(errors) <= TARGET_S))
-            figures["covered"] = fmean(row.covers for row in chosen)
-        result[name] = figures
-    return result
-
-
-def all_four(rows: Sequence[Compared], flights: int) -> dict[str, float]:
-    """Return in how many flights all four lags are within the target, and how many are covered."""
-    names = {kind.value for kind in Kind}
-    lags = [row for row in rows if row.name in names]
-    good: dict[int, int] = {}
-    for row in lags:
-        good[row.seed] = good.get(row.seed, 0) + (abs(row.error_s) <= TARGET_S)
-    return {
-        "flights": flights,
-        "all_within_target": sum(count == len(names) for count in good.values()) / flights,
-        "within_target": sum(abs(row.error_s) <= TARGET_S for row in lags) / (4 * flights),
-        "covered": fmean(row.covers for row in lags) if lags else 0.0,
-    }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -262,11 +197,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     make = partial(Task, output=given.output, plant=given.plant, lags=given.lags)
     tasks = [make(seed=seed) for seed in range(given.first, given.first + given.flights)]
     rows = [row for rows in do_all(compare, tasks, processes=given.processes) for row in rows]
-    figures = summary(rows, given.flights)
-    for name, values in figures.items():
+    kinds = summary(rows, given.flights)
+    for name, values in kinds.items():
         line = "  ".join(f"{key} {value:.4f}" for key, value in values.items())
         sys.stderr.write(f"{name:9s} {line}\n")
-    print(json.dumps({"kinds": figures, "all": all_four(rows, given.flights)}))  # noqa: T201
+    print(json.dumps({"kinds": kinds, "all": all_four(rows, given.flights)}))  # noqa: T201
     return 0
 
 

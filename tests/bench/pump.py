@@ -29,9 +29,12 @@ from sitl.profile import PlantProfile, load_profile
 from sitl.trajectory import Trajectory
 from sitl.vehicle import Leg, Route, Vehicle
 from sitl.wang import LOOK_AHEAD_S, PROGRAM_S, WangController
+from tests.bench.figures import Figure
 
 SEEDS = (1, 2, 3, 4, 5)
 SPEED_M_S = 5.0
+TARGET_M = 0.5
+METHODS = ("none", "look-ahead", "look-ahead-tuned", "scheduled")
 ZONE_M, WIDTH_M, RUN_OUT_M, ASIDE_M = 60.0, 6.0, 15.0, 1.0
 # Each 30 % above or below the one before it, in the direction of flight; L/ha.
 ROWS = (
@@ -148,17 +151,55 @@ def _mean(values: Iterable[float | None]) -> float | None:
     return fmean(there) if there else None
 
 
+def fly_task(seed: int) -> dict[str, Evaluation]:
+    """Return what came of one path with every method; the pump has a shut-off valve."""
+    return flights(load_profile("pump"), seed, METHODS)
+
+
+def figures(found: Sequence[dict[str, Evaluation]], *, section: str) -> list[Figure]:
+    """Return the lag distances of the pump's sprayer beside those of the paper's controller."""
+    by_method = {name: summary([each[name] for each in found]) for name in METHODS}
+    ours = by_method.pop("scheduled")
+    shared: dict[str, Any] = {"unit": "m", "n": ours["changes"], "section": section}
+    return [
+        Figure(
+            key="pump_lag",
+            what="lag distance, pump, 5 m/s, steps of 30 %: mean of absolute values",
+            value=ours["lag_mean_abs_m"],
+            target=TARGET_M,
+            alternative={name: each["lag_mean_abs_m"] for name, each in by_method.items()},
+            details=ours,
+            row="pump, steps of 30 %: lag distance, mean of absolute values",
+            **shared,
+        ),
+        Figure(
+            key="pump_worst_lag",
+            what="lag distance, pump, 5 m/s, steps of 30 %: worst of all seeds",
+            value=ours["lag_max_abs_m"],
+            alternative={name: each["lag_max_abs_m"] for name, each in by_method.items()},
+            **shared,
+        ),
+        Figure(
+            key="pump_missed",
+            what="changes missed, pump",
+            value=float(ours["missed"]),
+            target=0.0,
+            row="pump: changes missed",
+            **(shared | {"unit": ""}),
+        ),
+    ]
+
+
 def main(arguments: Sequence[str]) -> int:
     """Fly all methods with both kinds of pump and print the figures as JSON."""
     seeds = [int(text) for text in arguments] or list(SEEDS)
     shut_off = load_profile("pump")
     assert shut_off.pump is not None
     bare = replace(shut_off, pump=replace(shut_off.pump, shut_off=False))
-    methods = ("none", "look-ahead", "look-ahead-tuned", "scheduled")
     results: dict[str, Any] = {"seeds": seeds, "speed_m_s": SPEED_M_S}
     for name, profile in (("shut-off valve", shut_off), ("no valve", bare)):
-        flown = [flights(profile, seed, methods) for seed in seeds]
-        results[name] = {m: summary([each[m] for each in flown]) for m in methods}
+        flown = [flights(profile, seed, METHODS) for seed in seeds]
+        results[name] = {m: summary([each[m] for each in flown]) for m in METHODS}
     still = [flights(shut_off, seed, gust_m_s=0.0)["scheduled"] for seed in seeds]
     results["shut-off valve, still air"] = {"scheduled": summary(still)}
     sys.stdout.write(json.dumps(results, indent=1) + "\n")

@@ -1,58 +1,171 @@
-"""The figures as a page of Markdown: docs/performance.md."""
+"""The figures as a page of Markdown, docs/performance.md: a summary, then every section."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from datetime import UTC, datetime
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from tests.bench.figures import Figure, short
 
-_PAGE = """# Performance and accuracy, measured
+_HEAD = """# Performance and accuracy, measured
 
-Written by `.venv/bin/python -m tests.bench {arguments}` on {date}: {machine}, Python {python};
-{busy}.
-`make bench` prints the same figures as JSON over twenty seeds; `make bench SEED=N` draws others.
+Written by `make bench`'s own program from the runs below, each figure from the newest run that has
+it. `make bench` prints the same figures as JSON; `make bench SEED=N` draws other seeds.
+
+{runs}
+
 On a machine that does other work meanwhile, times are upper bounds; accuracy is the same.
 
 How it is measured: times with `time.perf_counter`, after a warm-up, with the garbage collector as
 `vrspray run` has it. *n* is the number of samples behind a figure: steps, look-ups, messages,
 changes of rate, flights. The alternative is another way to do the same, measured in the same run.
-Accuracy is that of the twin (pulsed, with noise and scatter) at the nozzle, over the seeds
-{first} to {last}, judged by `analysis/evaluation.py` ([metrics](metrics.md)); the lags are the
-nominal valve's, as a calibration would find them. Perfect knowledge is the same path and plant
-without noise, scatter or delays, with no driver board in between, for every output. The board of
-`servo` restarts its period at a change of zone, `free-running` does not.
+Accuracy is that of the twin (pulsed, with noise and scatter) at the nozzle, judged by
+`analysis/evaluation.py` ([metrics](metrics.md)). *Nominal* lags are those measured beforehand on
+other sprayers of the make; *identified* ones come from one calibration mission that the same
+sprayer flew before, by its own meter. Perfect knowledge is the same path and plant without noise,
+scatter or delays, with no driver board in between, for every output. The board of `servo` restarts
+its period at a change of zone, `free-running` does not. Where the deposit lands also depends on
+wind, tilt and droplets.
 
-{table}
+## Summary
+
+A line is met when every figure that it stands for is; the sections below have them one by one.
+
+{summary}
 """
 
+# The columns of a section of flights: beginning of the keys, heading.
+_COLUMNS = (
+    ("lag_", "mean of absolute values [m]"),
+    ("worst_lag_", "worst [m]"),
+    ("limit_ratio_", "limit ratio"),
+    ("spraying_accuracy_", "spraying accuracy [%]"),
+    ("below_perfect_", "below perfect [points]"),
+    ("settled_accuracy_", "settled [%]"),
+    ("missed_", "missed"),
+    ("apart_", "apart [%]"),
+)
+_LAG = _COLUMNS[0][0]
 
-def page(figures: Sequence[Figure], *, arguments: str, seeds: range, about: dict[str, str]) -> str:
-    """Return the whole page; `about` has the machine, in general words, and how busy it was."""
-    return _PAGE.format(
-        arguments=arguments,
-        date=datetime.now(UTC).date().isoformat(),
-        first=seeds[0],
-        last=seeds[-1],
-        table=_table(figures),
-        **about,
+
+def page(sources: Sequence[dict[str, Any]]) -> str:
+    """Return the whole page from results, the later ones before the earlier ones."""
+    figures: dict[str, Figure] = {}
+    origin: dict[str, int] = {}
+    for number, source in enumerate(sources):
+        for key, found in source["figures"].items():
+            # A figure measured again takes its old place.
+            figures[key], origin[key] = Figure.from_json(key, found), number
+    used = sorted(set(origin.values()))
+    names = {number: chr(ord("A") + place) for place, number in enumerate(used)}
+    runs = "\n".join(_run(names[number], sources[number]) for number in used)
+    everything = list(figures.values())
+    parts = [_HEAD.format(runs=runs, summary=_summary(everything))]
+    for section in dict.fromkeys(figure.section for figure in everything):
+        chosen = [figure for figure in everything if figure.section == section]
+        letters = sorted({names[origin[figure.key]] for figure in chosen})
+        parts.append(f"## {section or 'Other'}\n\nRun {', '.join(letters)}.\n\n{_section(chosen)}")
+    return "\n".join(parts)
+
+
+def _run(name: str, source: dict[str, Any]) -> str:
+    machine = source["machine"]
+    first, last = source["seed"], source["seed"] + source["seeds"] - 1
+    text = (
+        f"- **{name}**: `{source['command']}` on {source['date']}, seeds {first} to {last}, "
+        f"{machine['cores']} {machine['architecture']} cores, Python {machine['python']}"
     )
+    ours = machine.get("ours_while_timing")
+    if ours is not None:
+        text += f"; {ours:.0%} of one core was ours while timing"
+        text += f", load average before {machine['load_before']:.1f}"
+    return f"{text}."
 
 
-def _table(figures: Sequence[Figure]) -> str:
-    lines = [
-        "| Figure | Measured | Target | | n | Alternative |",
-        "|---|---|---|---|---|---|",
-    ]
+def _summary(figures: Iterable[Figure]) -> str:
+    rows: dict[str, list[Figure]] = {}
     for figure in figures:
-        bound = ">=" if figure.is_at_least else "<="
-        cells = (
-            figure.what,
-            f"{short(figure.value)} {figure.unit}".strip(),
-            "" if figure.target is None else f"{bound} {figure.target:g}",
-            {None: "", True: "met", False: "**missed**"}[figure.met],
-            str(figure.n),
-            ", ".join(f"{name} {short(value)}" for name, value in figure.alternative.items()),
-        )
-        lines.append("| " + " | ".join(cells) + " |")
+        if figure.row and figure.target is not None:
+            rows.setdefault(figure.row, []).append(figure)
+    lines = ["| What | Measured | Target | | Figures | n |", "|---|---|---|---|---|---|"]
+    for row, alike in rows.items():
+        missed = sum(not figure.met for figure in alike)
+        verdict = "met" if not missed else f"**missed** by {missed}"
+        bounds = dict.fromkeys(_bound(figure) for figure in alike)
+        cells = (row, _range(alike), ", ".join(bounds), verdict, str(len(alike)))
+        lines.append(_line((*cells, str(sum(figure.n for figure in alike)))))
     return "\n".join(lines)
+
+
+def _range(alike: Sequence[Figure]) -> str:
+    """Return the least and the greatest value."""
+    values = sorted(figure.value for figure in alike if figure.value is not None)
+    if not values:
+        return "-"
+    ends = dict.fromkeys(short(value) for value in (values[0], values[-1]))
+    return f"{' to '.join(ends)} {alike[0].unit}".strip()
+
+
+def _bound(figure: Figure) -> str:
+    if figure.target is None:
+        return ""
+    return f"{'>=' if figure.is_at_least else '<='} {figure.target:g}"
+
+
+def _section(figures: Sequence[Figure]) -> str:
+    """Return the flights as one line a kind, everything else as one line a figure."""
+    by_key = {figure.key: figure for figure in figures}
+    kinds = [
+        figure.key.removeprefix(_LAG)
+        for figure in figures
+        if figure.key.startswith(_LAG) and f"worst_{figure.key}" in by_key
+    ]
+    told = {begin + kind for kind in kinds for begin, _ in _COLUMNS}
+    rest = [figure for figure in figures if figure.key not in told]
+    tables = []
+    if kinds:
+        tables.append(_flights(kinds, by_key))
+    if rest:
+        tables.append(_figures(rest, with_target=any(f.target is not None for f in rest)))
+    return "\n\n".join(tables) + "\n"
+
+
+def _flights(kinds: Sequence[str], by_key: dict[str, Figure]) -> str:
+    heads = ("Flights", *(head for _, head in _COLUMNS), "n", "Lag distance otherwise [m]")
+    lines = [_line(heads), _line(["---"] * len(heads))]
+    for kind in kinds:
+        lag = by_key[_LAG + kind]
+        cells = [lag.what.split(", ", 1)[1].rsplit(":", 1)[0]]
+        for begin, _ in _COLUMNS:
+            figure = by_key.get(begin + kind)
+            text = "" if figure is None else short(figure.value)
+            cells.append(f"**{text}**" if figure is not None and figure.met is False else text)
+        lines.append(_line([*cells, str(lag.n), _others(lag)]))
+    targets = [_targets(begin, kinds, by_key) for begin, _ in _COLUMNS]
+    lines.append(_line(["target", *targets, "", ""]))
+    return "\n".join(lines)
+
+
+def _targets(begin: str, kinds: Sequence[str], by_key: dict[str, Figure]) -> str:
+    """Return every target of a column, in the order of its lines."""
+    found = (by_key.get(begin + kind) for kind in kinds)
+    return ", ".join(dict.fromkeys(_bound(f) for f in found if f is not None and _bound(f)))
+
+
+def _figures(figures: Sequence[Figure], *, with_target: bool) -> str:
+    heads = ["Figure", "Measured", *(("Target", "") if with_target else ()), "n", "Alternative"]
+    lines = [_line(heads), _line(["---"] * len(heads))]
+    for figure in figures:
+        cells = [figure.what, f"{short(figure.value)} {figure.unit}".strip()]
+        if with_target:
+            cells += [_bound(figure), {None: "", True: "met", False: "**missed**"}[figure.met]]
+        lines.append(_line([*cells, str(figure.n), _others(figure)]))
+    return "\n".join(lines)
+
+
+def _others(figure: Figure) -> str:
+    return ", ".join(f"{name} {short(value)}" for name, value in figure.alternative.items())
+
+
+def _line(cells: Iterable[str]) -> str:
+    return "| " + " | ".join(cells) + " |"

@@ -1,0 +1,80 @@
+"""The sprayers that are flown: each with its own curve, PWM and lags behind one controller.
+
+The nominal lags were measured beforehand on other sprayers of the make: `examples/anyang/lags` and
+`tests/bench/lags` say how. `identified_lag` takes those of one sprayer from its own meter instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from companion.core.controller import Setup
+from companion.core.nozzle import FlowCurve
+from companion.core.schedule import LagModel
+from sitl.anyang import anyang_lag
+from sitl.demo_field import MAP_SPEED_M_S, demo_setup
+from sitl.flight import FlightOptions
+from sitl.profile import PlantProfile, load_profile
+
+Output = Literal["gpio", "servo", "free-running"]
+BOTH: tuple[Literal["gpio", "servo"], ...] = ("gpio", "servo")
+OUTPUTS: tuple[Output, ...] = ("gpio", "servo", "free-running")
+PLANT = "wang-2024"
+PLANTS = (PLANT, "pinpoint")
+LAGS = Path(__file__).parent / "lags"
+KINDS = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s")
+
+
+def sprayer_setup(plant: str, output: Output, speed_m_s: float = MAP_SPEED_M_S) -> Setup:
+    """Return the example with this sprayer, its rates scaled by 5/V, and the nominal lags."""
+    setup = replace(demo_setup(speed_m_s), lag=nominal_lag(plant, output))
+    return setup if plant == PLANT else with_sprayer(setup, load_profile(plant))
+
+
+def with_sprayer(setup: Setup, profile: PlantProfile) -> Setup:
+    """Return a set-up that knows another sprayer's curve and PWM; the boom is the same."""
+    return replace(setup, nozzle_sets=profile.nozzle_sets, pwm=profile.pwm)
+
+
+def nominal_lag(plant: str, output: Output) -> LagModel:
+    """Return the lags measured beforehand for an output path."""
+    path = "gpio" if output == "gpio" else "servo"
+    if plant == PLANT:
+        return anyang_lag(path)
+    return anyang_lag(f"{plant}-{path}", LAGS)
+
+
+def perfect_lag(profile: PlantProfile, output: Output) -> LagModel:
+    """Return the nominal valve's true lags: with neither noise nor scatter they are all."""
+    return replace(profile.lags(), output_s=nominal_lag(profile.name, output).output_s)
+
+
+def scaled_lag(lag: LagModel, factor: float) -> LagModel:
+    """Return lags that are wrong by a factor; output path and position stay."""
+    return replace(lag, **{name: factor * getattr(lag, name) for name in KINDS})
+
+
+def scaled_flow(profile: PlantProfile, gain: float) -> PlantProfile:
+    """Return a sprayer that delivers `gain` times what the measured table says."""
+    sets = tuple(
+        replace(
+            nozzles,
+            curve=FlowCurve(
+                duty=nozzles.curve.duty,
+                flow_l_min=tuple(gain * flow for flow in nozzles.curve.flow_l_min),
+            ),
+        )
+        for nozzles in profile.nozzle_sets
+    )
+    return replace(profile, nozzle_sets=sets)
+
+
+def options_of(output: Output, seed: int) -> FlightOptions:
+    """Return how a flight through an output is simulated."""
+    if output == "gpio":
+        return FlightOptions(seed=seed, output="gpio")
+    board: Literal["restarting", "free-running"]
+    board = "free-running" if output == "free-running" else "restarting"
+    return FlightOptions(seed=seed, output="servo", board=board)
