@@ -60,6 +60,8 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
         across=table.across,
         lease_s=config.output.lease_s,
         flow_trim=_flow_trim(config),
+        drift=config.drift_law(),
+        rate_max_l_ha=config.product.rate_max_l_ha,
     )
 
 

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from analysis.calibration.steps import settle_s
-from companion.core.nozzle import SET_UP_FRACTION
+from companion.core.nozzle import SET_UP_FRACTION, set_change_l_min
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
     from companion.config import Config
-    from companion.core.nozzle import NozzleSet
 
 CYCLES = 12
 STEADY_S = 1.6  # of metered flow on both sides of a step
@@ -94,14 +93,10 @@ def _flows(config: Config) -> tuple[float, float]:
     low = curve.flow_for(max(pwm.duty_min + LOW_SHARE * window, curve.duty[0]))
     high = curve.flow_for(min(pwm.duty_min + HIGH_SHARE * window, curve.duty[-1]))
     if len(sets) > 1:
-        low = max(low, _set_change_l_min(sets[-2], sets[-1]) * SET_UP_FRACTION * ABOVE_SET)
+        low = max(low, set_change_l_min(sets[-2], sets[-1]) * SET_UP_FRACTION * ABOVE_SET)
     if not low <= (1.0 - STEP_MIN) * high:
         raise ConfigError(
             f"{config.path}: the largest nozzle set makes {low:.2f} to {high:.2f} L/min and no "
             f"step of {STEP_MIN:.0%} within; measure pwm.duty_min, pwm.duty_max and its curve"
         )
     return low, high
-
-
-def _set_change_l_min(small: NozzleSet, large: NozzleSet) -> float:
-    return 0.5 * (small.flow_max_l_min + max(large.flow_min_l_min, 0.0))

@@ -10,6 +10,7 @@ compared with the volume that came. The position's age is no matter of the spray
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Sequence
 from statistics import fmean
@@ -51,6 +52,8 @@ def measure(profile: PlantProfile, *, output_s: float = 0.0) -> LagModel:
         off_end_s=max(seen["last"]),
         output_s=output_s,
         position_s=POSITION_S,
+        up_time_s=mean["up time"],
+        down_time_s=mean["down time"],
     )
 
 
@@ -80,6 +83,11 @@ def _look(volume_ml: Callable[[Floats], Floats], kind: str, at_s: float) -> list
     seen = [(kind, float(missing_ml / (after - before)))]
     flow = np.diff(volume) / STEP_S
     wet = np.flatnonzero((flow > DRY * max(before, after)) & (times[:-1] >= at_s))
+    if kind in ("up", "down"):
+        # An exponential is half way after ln 2 and nine tenths after ln 10 of its time constants.
+        part = (flow - before) / (after - before)
+        half, most = (int(np.flatnonzero(part < share)[-1]) for share in (0.5, 0.9))
+        seen.append((f"{kind} time", float(times[most] - times[half]) / math.log(5.0)))
     if kind == "on":
         seen.append(("first", float(times[wet[0]] - at_s)))
     if kind == "off":
@@ -93,7 +101,7 @@ def main(arguments: Sequence[str]) -> int:
     lag = measure(load_profile(name))
     sys.stdout.write(f"# {name}: `python -m sitl.measure_pump {name}`\n[lag]\n")
     names = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s", "output_s")
-    for key in (*names, "position_s"):
+    for key in (*names, "position_s", "up_time_s", "down_time_s"):
         sys.stdout.write(f"{key} = {getattr(lag, key):.4f}\n")
     return 0
 

@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 from companion.config import tables
 from companion.config.rules import contradictions
 from companion.core.boom import Boom, Valve
+from companion.core.drift import Drift, blowing, fall_s
 from companion.core.interlock import Limits
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
 from companion.core.schedule import LagModel
@@ -47,6 +48,7 @@ class Config(tables.Table):
     mission: tables.MissionTable | None = None
     product: tables.ProductTable = tables.ProductTable()
     flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
+    drift: tables.DriftTable = tables.DriftTable()
     journal: tables.JournalTable = tables.JournalTable()
     web: tables.WebTable = tables.WebTable()
 
@@ -145,6 +147,8 @@ class Config(tables.Table):
             output_s=lag.output_s,
             position_s=lag.position_s,
             reference=lag.reference,
+            up_time_s=lag.up_time_s,
+            down_time_s=lag.down_time_s,
         )
 
     def method(self) -> Method:
@@ -172,6 +176,25 @@ class Config(tables.Table):
             wind_required=safety.wind_required,
             enable_by=frozenset(safety.enable_by),
             rc_channel=safety.rc_channel,
+        )
+
+    def drift_law(self) -> Drift | None:
+        """Return where droplets are expected to land; None unless it is to be corrected for."""
+        drift = self.drift
+        if not drift.enabled:
+            return None
+        falling_s = drift.fall_s
+        if falling_s is None:
+            falling_s = fall_s(
+                drift.droplet_um, self.boom_table.height_m, downwash_m_s=drift.downwash_m_s
+            )
+        return Drift(
+            fall_s=falling_s,
+            forward_carry_m=drift.forward_carry_m,
+            limit_m=drift.limit_m,
+            wind_max_m_s=self.safety.wind_max_m_s,
+            wind_age_max_s=drift.wind_age_max_s,
+            wind_m_s=None if drift.wind is None else blowing(*drift.wind),
         )
 
 

@@ -85,8 +85,6 @@ def without_effect(config: Config) -> Rule:
         )
     settings = {
         "web.enabled": config.web.enabled,
-        "output.dither_us": config.output.dither_us > 0,
-        "output.return_channel": config.output.return_channel is not None,
         "output.kind": config.output.kind == "gpio",
     }
     for key, is_set in settings.items():
@@ -218,6 +216,15 @@ def _lags(config: Config) -> Rule:
             key="lag.off_end_s",
             text=f"last flow before lag.off_s = {lag.off_s:g}; write at least that",
         )
+    for key, time_s, whole_s in (
+        ("up", lag.up_time_s, lag.up_s),
+        ("down", lag.down_time_s, lag.down_s),
+    ):
+        if not time_s <= whole_s:
+            yield Contradiction(
+                key=f"lag.{key}_time_s",
+                text=f"a part of lag.{key}_s = {whole_s:g}; write at most that",
+            )
 
 
 def _output(config: Config) -> Rule:
@@ -227,6 +234,13 @@ def _output(config: Config) -> Rule:
             key="output.full_us",
             text=f"within {SPAN_MIN_US} us of output.closed_us = {output.closed_us}; "
             "write the two ends of the driver's range, such as 1000 and 2000",
+        )
+    # A driver board begins a new period when the width moves by 2 % of its span.
+    elif not output.dither_us < 0.02 * abs(output.full_us - output.closed_us):
+        yield Contradiction(
+            key="output.dither_us",
+            text="2 % of full_us - closed_us or more: each move would begin a period of the "
+            "driver board anew; write 8",
         )
 
 

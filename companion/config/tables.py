@@ -22,6 +22,8 @@ Latitude = Annotated[FiniteFloat, Field(ge=-90.0, le=90.0)]
 Longitude = Annotated[FiniteFloat, Field(ge=-180.0, le=180.0)]
 
 Altitude = Annotated[FiniteFloat, Field(ge=-1000.0, le=10_000.0)]
+WindSpeed = Annotated[FiniteFloat, Field(ge=0.0, le=50.0)]
+WindFrom = Annotated[FiniteFloat, Field(ge=0.0, le=360.0)]
 Place = Annotated[tuple[Latitude, Longitude], Field(strict=False)]
 
 
@@ -36,7 +38,7 @@ class LinkTable(Table):
 
     url: str = Field(
         default="udpin:127.0.0.1:14550",
-        pattern=r"^((udpin|udpout|tcp):\S+:\d{1,5}|serial:[^\s:]+:\d{2,8})$",
+        pattern=r"^((udpin|udpout|tcp):\S+:\d{1,5}|serial:\S+:\d{2,8})$",
         description="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD",
     )
     system_id: int = Field(
@@ -45,6 +47,12 @@ class LinkTable(Table):
     component_id: int = Field(default=191, ge=1, le=255, description="of this component")
     position_rate_hz: float = Field(
         default=20, ge=1, le=100, description="positions asked for a second"
+    )
+    signing_key_file: Text | None = Field(
+        default=None, description="MAVLink 2 signing: file of the key, readable by its owner only"
+    )
+    state_folder: Text = Field(
+        default="state", description="what outlives a run: parameters set by a station, signing"
     )
 
 
@@ -210,6 +218,11 @@ class LagTable(Table):
         default="volume",
         description="what lies on the boundary: volume-equivalent step or settled end",
     )
+    up_time_s: Lag = Field(
+        default=0.0,
+        description="of a slow flow (a pump's): its time constant, a part of up_s; 0: not driven",
+    )
+    down_time_s: Lag = Field(default=0.0, description="the same, a part of down_s")
 
 
 class OutputTable(Table):
@@ -219,7 +232,10 @@ class OutputTable(Table):
     closed_us: int = Field(default=1000, ge=500, le=2500, description="servo pulse of duty 0")
     full_us: int = Field(default=2000, ge=500, le=2500, description="servo pulse of duty 1")
     dither_us: int = Field(
-        default=0, ge=0, le=50, description="alive dither for a driver board that closes without it"
+        default=0,
+        ge=0,
+        le=50,
+        description="alive dither of open valves, for a driver board that closes without it: 8",
     )
     lease_s: float = Field(
         default=0.3,
@@ -322,6 +338,38 @@ class FlowTrimTable(Table):
     settle_s: float = Field(
         default=2.0, ge=0, le=60, description="no correction for this long after a change of rate"
     )
+
+
+class DriftTable(Table):
+    """Where droplets land beside their nozzle; see drift.md."""
+
+    enabled: bool = Field(
+        default=False, description="true: the map is read where the droplets are expected to land"
+    )
+    wind: Annotated[tuple[WindSpeed, WindFrom], Field(strict=False)] | None = Field(
+        default=None,
+        description="[m/s, degrees it comes from] by the operator; else the autopilot's",
+    )
+    wind_age_max_s: float = Field(
+        default=5.0, ge=0.5, le=60, description="oldest usable report of the autopilot"
+    )
+    droplet_um: float = Field(
+        default=250.0, ge=50, le=1000, description="volume median diameter of the droplets"
+    )
+    downwash_m_s: float = Field(
+        default=8.0, ge=0, le=30, description="at the nozzles, fading to nothing at the ground"
+    )
+    fall_s: float | None = Field(
+        default=None,
+        ge=0,
+        le=60,
+        description="measured: metres of shift per m/s of wind; else from the two above and "
+        "boom.height_m",
+    )
+    forward_carry_m: float = Field(
+        default=0.2, ge=0, le=2, description="how far liquid flies on along the course"
+    )
+    limit_m: float = Field(default=2.0, ge=0, le=10, description="largest offset")
 
 
 class JournalTable(Table):

@@ -18,13 +18,16 @@ from companion.core.crossings import (
     Route,
     find_routes,
 )
+from companion.core.drift import Drift, Offset, is_same, offset
 from companion.core.flow_trim import FlowTrim, TrimMemory, Trimming
 from companion.core.frame import LocalFrame
 from companion.core.interlock import Limits, closed_plan, guard, inhibits
-from companion.core.nozzle import NozzleSet, PwmLimits, allowed_duty, choose_set
+from companion.core.nozzle import NozzleSet, PwmLimits, allowed_duty
+from companion.core.overdrive import Overdrive
 from companion.core.prescription import Prescription
-from companion.core.rate import flow_for_rate
+from companion.core.rate import flow_for_rate, overridden
 from companion.core.schedule import Dosing, LagModel, Timing, ValveSchedule, schedule
+from companion.core.sets import SetOfRate, dosing_by_valve, sets_ahead
 from companion.core.types import Decision, Inhibit, Method, SprayPlan, TimedChange, VehicleState
 
 __all__ = ["Across", "Border", "Memory", "Setup", "step"]
@@ -32,6 +35,8 @@ __all__ = ["Across", "Border", "Memory", "Setup", "step"]
 # Below this share of its width across the motion, a boom that flies askew is dosed as at it: the
 # flow that the law asks for would fall towards nothing while the strip is a blur.
 SKEW_MIN = 0.3
+# A trim stands until the next one, 50 ms later: in the mean it is half of that old.
+TRIM_AGE_S = 0.025
 # Crossings found in one step are carried on for this long, if the path does not leave its
 # prediction by more than these and none of them is to be ordered within this time.
 ROUTES_KEPT_S = 0.21
@@ -58,6 +63,8 @@ class Setup:
     across: Across = "centre"
     lease_s: float = 0.3
     flow_trim: FlowTrim | None = None
+    drift: Drift | None = None
+    rate_max_l_ha: float | None = None
     timing: Timing = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
 
@@ -100,9 +107,10 @@ class Memory:
 
     plan: SprayPlan | None = None
     set_index: int = 0
-    set_rate_l_ha: float | None = None
+    set_of_rate: SetOfRate = ()
     routes: tuple[Route, ...] = ()
     routes_from: VehicleState | None = None
+    drift_m: Offset | None = None
     trim: TrimMemory | None = None
 
 
@@ -115,14 +123,21 @@ def step(
     if reasons or state is None:
         return _closed(setup, state, reasons, sequence, memory, now_s)
     in_force = duty_in_force(memory.plan, now_s, len(setup.boom.valves))
-    routes, routes_from = _routes(setup, state, memory, now_s)
+    routes, routes_from, drift_m = _routes(setup, state, memory, now_s)
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
-    index, set_rate = _nozzle_set(setup, routes, memory, speed_m_s)
+    index, set_of_rate = _nozzle_sets(setup, state, routes, memory, speed_m_s)
     until_s = now_s + setup.lease_s
     trim = _trim(setup, state, memory, in_force, now_s)
     gain = 1.0 if trim is None else trim.sets[index].trim
-    dosing = _dosing(setup, index, _skew(state, speed_m_s) / gain)
+    skew = _skew(state, speed_m_s)
+
+    def dose(number: int) -> Dosing:
+        own = 1.0 if trim is None else trim.sets[number].trim
+        return _dosing(setup, number, skew / own, state.rate_percent)
+
+    dosing = dosing_by_valve(setup.nozzle_sets, index, set_of_rate, dose)
     soon_m_s = _speed_soon(setup, state, speed_m_s)
+    overdrive = _overdrive(setup, index)
     valves = []
     for valve, route in enumerate(routes):
         # In a turn each valve has a speed of its own.
@@ -132,11 +147,12 @@ def step(
                 route,
                 valve=valve,
                 timing=setup.timing,
-                dosing=dosing if valve in setup.nozzle_sets[index].valves else _shut,
+                dosing=dosing(valve),
                 in_force=in_force[valve],
                 speed_soon_m_s=soon_m_s * own,
                 now_s=now_s,
                 until_s=until_s,
+                overdrive=overdrive,
             )
         )
     plan = SprayPlan(
@@ -159,9 +175,10 @@ def step(
     return decision, Memory(
         plan=plan,
         set_index=index,
-        set_rate_l_ha=set_rate,
+        set_of_rate=set_of_rate,
         routes=routes,
         routes_from=routes_from,
+        drift_m=drift_m,
         trim=trim,
     )
 
@@ -196,20 +213,21 @@ def _trim(
 
 def _routes(
     setup: Setup, state: VehicleState, memory: Memory, now_s: float
-) -> tuple[tuple[Route, ...], VehicleState]:
-    """Return the valves' routes, and the state that they were found from.
+) -> tuple[tuple[Route, ...], VehicleState, Offset | None]:
+    """Return the valves' routes, the state that they were found from, and their wind offset.
 
     On a straight pass the same edges are crossed at every step: as long as the prediction holds
     and no crossing is due soon, the last ones are carried on and only their times are shifted.
     """
     found_from = memory.routes_from
-    if found_from is not None:
+    drift_m = offset(setup.drift, state, now_s)
+    if found_from is not None and is_same(drift_m, memory.drift_m):
         shift = _carried(setup, found_from, state, now_s)
         if shift is not None:
             routes = _shifted(memory.routes, shift, now_s)
             soon_s = now_s + setup.timing.longest_s + ROUTES_EXACT_S
             if all(len(route) == 1 or route[1].at_s > soon_s for route in routes):
-                return routes, found_from
+                return routes, found_from, memory.drift_m
     routes = find_routes(
         setup.prescription,
         state,
@@ -219,8 +237,9 @@ def _routes(
         border=setup.border,
         border_buffer_m=setup.border_buffer_m,
         across=setup.across,
+        drift_m=drift_m,
     )
-    return routes, state
+    return routes, state, drift_m
 
 
 def _carried(
@@ -323,29 +342,30 @@ def _skew(state: VehicleState, speed_m_s: float) -> float:
     return max(abs(along) / speed_m_s, SKEW_MIN)
 
 
-def _nozzle_set(
-    setup: Setup, routes: tuple[Route, ...], memory: Memory, speed_m_s: float
-) -> tuple[int, float | None]:
-    """Return the set to spray with, chosen anew only where the rate ahead changes.
+def _nozzle_sets(
+    setup: Setup,
+    state: VehicleState,
+    routes: tuple[Route, ...],
+    memory: Memory,
+    speed_m_s: float,
+) -> tuple[int, SetOfRate]:
+    """Return the set in use and those of the rates ahead; the middle of the boom decides."""
 
-    Inside a zone the set stays, whatever the speed does, unless it can no longer deliver.
-    """
-    if len(setup.nozzle_sets) == 1:
-        return 0, None
-    middle = routes[len(routes) // 2]
-    rates = [crossing.rate_l_ha for crossing in middle if crossing.rate_l_ha]
-    if not rates:
-        return memory.set_index, memory.set_rate_l_ha
-    rate = rates[-1]
-    flow = flow_for_rate(rate, speed_m_s, setup.boom.width_m)
-    current = setup.nozzle_sets[memory.set_index]
-    delivers = current.flow_min_l_min / 1.1 <= flow <= current.flow_max_l_min * 1.02
-    if rate == memory.set_rate_l_ha and delivers:
-        return memory.set_index, rate
-    return choose_set(setup.nozzle_sets, flow, current=memory.set_index), rate
+    def flow_of(rate_l_ha: float) -> float:
+        asked = overridden(rate_l_ha, state.rate_percent, setup.rate_max_l_ha)
+        return flow_for_rate(asked, speed_m_s, setup.boom.width_m)
+
+    return sets_ahead(
+        setup.nozzle_sets,
+        routes[len(routes) // 2],
+        in_use=memory.set_index,
+        before=memory.set_of_rate,
+        flow_of=flow_of,
+        now_s=state.time_s,
+    )
 
 
-def _dosing(setup: Setup, index: int, skew: float) -> Dosing:
+def _dosing(setup: Setup, index: int, skew: float, percent: float) -> Dosing:
     """Return the function from rate and speed to the duty of a valve of the set in use."""
     width_m = setup.boom.width_m * skew
     curve, pwm = setup.nozzle_sets[index].curve, setup.pwm
@@ -355,30 +375,47 @@ def _dosing(setup: Setup, index: int, skew: float) -> Dosing:
         key = (rate_l_ha, speed_m_s)
         found = known.get(key)
         if found is None:
-            flow = flow_for_rate(rate_l_ha, speed_m_s, width_m)
+            asked = overridden(rate_l_ha, percent, setup.rate_max_l_ha)
+            flow = flow_for_rate(asked, speed_m_s, width_m)
             found = known[key] = allowed_duty(curve.duty_for(flow), pwm)
         return found
 
     return duty
 
 
-def _shut(rate_l_ha: float, speed_m_s: float) -> float:  # noqa: ARG001
-    """Return the duty of a valve that the set in use does not have."""
-    return 0.0
+def _overdrive(setup: Setup, index: int) -> Overdrive | None:
+    """Return how a slow flow's changes are driven; None for one that is not slow."""
+    lag, pwm = setup.lag, setup.pwm
+    is_slow = max(lag.up_time_s, lag.down_time_s) > 0.0 and lag.reference == "volume"
+    if setup.method is not Method.SCHEDULED or not is_slow:
+        return None
+    return Overdrive(
+        up_time_s=lag.up_time_s,
+        down_time_s=lag.down_time_s,
+        duty_min=pwm.duty_min,
+        duty_max=pwm.duty_max,
+        flow_for=setup.nozzle_sets[index].curve.flow_for,
+    )
 
 
 def _speed_soon(setup: Setup, state: VehicleState, speed_m_s: float) -> float:
-    """Return the speed when an order given now takes effect.
+    """Return the speed that a trim ordered now should ask for.
 
-    On a straight line, however long the lag: a flow that follows as an exponential keeps up with
-    the speed if its order leads by dead time plus time constant, each direction by its own.
+    It acts after its dead time, with the next period, and stands until the next trim. A flow that
+    follows as an exponential (a pump's) keeps up with the speed if its order is ahead of it by
+    the time constant, each direction by its own.
     """
     along = (
         state.velocity_east_m_s * state.acceleration_east_m_s2
         + state.velocity_north_m_s * state.acceleration_north_m_s2
-    )
-    lag_s = setup.timing.up_s if along > 0.0 else setup.timing.down_s
-    return max(speed_m_s + along / speed_m_s * (lag_s + 0.5 * setup.pwm.period_s), 0.0)
+    ) / speed_m_s
+    timing, lag = setup.timing, setup.lag
+    lead_s = timing.up_s if along > 0.0 else timing.down_s
+    constant_s = min(lag.up_time_s if along > 0.0 else lag.down_time_s, lead_s)
+    acts_s = lead_s - constant_s + 0.5 * setup.pwm.period_s + TRIM_AGE_S
+    left = math.exp(-acts_s / state.acceleration_fade_s)
+    gained_s = state.acceleration_fade_s * (1.0 - left)
+    return max(speed_m_s + along * (gained_s + constant_s * left), 0.0)
 
 
 def _in_order(valves: list[ValveSchedule]) -> tuple[TimedChange, ...]:
@@ -400,8 +437,11 @@ def _decision(
 ) -> Decision:
     nozzles = setup.nozzle_sets[index]
     share = setup.boom.width_m / len(nozzles.valves)
+    percent, limit_l_ha = state.rate_percent, setup.rate_max_l_ha
     target = sum(
-        flow_for_rate(valves[valve].rate_now_l_ha or 0.0, speed_m_s, share)
+        flow_for_rate(
+            overridden(valves[valve].rate_now_l_ha or 0.0, percent, limit_l_ha), speed_m_s, share
+        )
         for valve in nozzles.valves
     )
     return Decision(

@@ -12,6 +12,7 @@ outside, seen in the skewed frame of path and boom.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, NamedTuple
@@ -20,12 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.core.boom import Boom
-from companion.core.estimator import ACCELERATION_TIME_S
+from companion.core.drift import Contact, Offset, joined, landed, swept
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
 from companion.core.types import VehicleState
 
 Across = Literal["centre", "mean", "max"]
 Border = Literal["inside", "volume"]
+Merge = Callable[[list[Contact]], list[Contact]]
 Floats = NDArray[np.float64]
 
 # Below these, the tenth of a second that an order looks ahead deviates from a straight line by
@@ -138,8 +140,9 @@ def _carried(
 ) -> tuple[float, float, float, float]:
     """Return velocity (east, north) and place (east, north) of the reference at `dt_s` from now."""
     ahead_s = max(dt_s, 0.0)
-    gained = ACCELERATION_TIME_S * (1.0 - math.exp(-ahead_s / ACCELERATION_TIME_S))
-    carried = ACCELERATION_TIME_S * (ahead_s - gained)
+    fade_s = state.acceleration_fade_s
+    gained = fade_s * (1.0 - math.exp(-ahead_s / fade_s))
+    carried = fade_s * (ahead_s - gained)
     return (
         state.velocity_east_m_s + ae * gained,
         state.velocity_north_m_s + an * gained,
@@ -287,10 +290,17 @@ def find_routes(
     border: Border,
     border_buffer_m: float,
     across: Across,
+    drift_m: Offset | None = None,
 ) -> tuple[Route, ...]:
-    """Return what each valve is prescribed along its predicted path, left to right."""
-    paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
+    """Return what each valve is prescribed along its predicted path, left to right.
+
+    With `drift_m` it is what the ground prescribes where the liquid lands; see `drift.py`.
+    """
     reach_m = boom.reach_m + border_buffer_m + SLIVER_M
+    if drift_m is not None:
+        state = landed(state, drift_m)
+        reach_m += math.hypot(*drift_m)
+    paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
     ends, owner = prescription.edges_near(*paths.box(reach_m))
     bases = prescription.owners_at(*_starts(paths))
     cuts = _cuts(paths, ends, owner)
@@ -303,7 +313,11 @@ def find_routes(
         for base, found in zip(bases, cuts, strict=True)
     ]
     if border == "inside":
-        _add_contacts(paths, ends[owner == FIELD], boom, border_buffer_m, closed)
+        edges = ends[owner == FIELD]
+        if drift_m is not None:
+            edges = swept(edges, drift_m)
+        merge = None if drift_m is None else joined
+        _add_contacts(paths, edges, boom, border_buffer_m, closed, merge)
     speeds = paths.speed_m_s[:, (0, -1)].tolist()
     return tuple(
         _combine(rates[valve], closed[valve], paths, speeds[valve], border)
@@ -444,16 +458,27 @@ def _centre_outside(inside: bool, cuts: list[_Cut], start_s: float) -> _Interval
 
 
 def _add_contacts(
-    paths: Paths, ends: Floats, boom: Boom, buffer_m: float, closed: list[_Intervals]
+    paths: Paths,
+    ends: Floats,
+    boom: Boom,
+    buffer_m: float,
+    closed: list[_Intervals],
+    merge: Merge | None,
 ) -> None:
     """Add to `closed` when an edge of the border lies within a strip."""
     if len(ends):
         for chord in range(len(paths.time_s) - 1):
-            _add_chord_contacts(paths, chord, ends, boom, buffer_m, closed)
+            _add_chord_contacts(paths, chord, ends, boom, buffer_m, closed, merge)
 
 
 def _add_chord_contacts(
-    paths: Paths, chord: int, ends: Floats, boom: Boom, buffer_m: float, closed: list[_Intervals]
+    paths: Paths,
+    chord: int,
+    ends: Floats,
+    boom: Boom,
+    buffer_m: float,
+    closed: list[_Intervals],
+    merge: Merge | None,
 ) -> None:
     """Add the contacts of one chord, in the skewed frame of path and boom."""
     px, py = paths.east_m[:, chord], paths.north_m[:, chord]
@@ -477,12 +502,15 @@ def _add_chord_contacts(
         return
     along = (x * ry - y * rx) / t2
     along_0, along_1 = along[:, 0::2], along[:, 1::2]
-    for valve, hit in zip(valves.tolist(), hits.tolist(), strict=True):
-        limits = _clip(
+    contacts = [
+        (valve, hit, _clip(
             (float(across_0[valve, hit]), float(along_0[valve, hit])),
             (float(across_1[valve, hit]), float(along_1[valve, hit])),
             float(half[valve, 0]),
-        )
+        ))
+        for valve, hit in zip(valves.tolist(), hits.tolist(), strict=True)
+    ]  # fmt: skip
+    for valve, _, limits in contacts if merge is None else merge(contacts):
         first, last = limits[0] - buffer_m, limits[1] + buffer_m
         reach = float(length[valve])
         if last < 0.0 or first > reach:

@@ -1,9 +1,9 @@
 """From messages to the vehicle's state at any moment: time-stamped, filtered, extrapolated.
 
 `observe` takes one input in, `estimate` carries the result to a time. Position, velocity and
-acceleration come from GLOBAL_POSITION_INT through a steady-state Kalman filter an axis; the time
-of a position is the autopilot's own clock plus the mean offset of the arrivals, less the delay of
-the autopilot's estimator (`lag.position_s`), so that jitter of the link is not taken for motion.
+acceleration come from GLOBAL_POSITION_INT through the filters of `motion.py`; the time of a
+position is the autopilot's own clock on ours (`clock.py`), less the delay of the autopilot's
+estimator (`lag.position_s`), so that jitter of the link is not taken for motion.
 """
 
 from __future__ import annotations
@@ -11,12 +11,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from companion.core.clock import Clock, tick
+from companion.core.motion import (
+    BRIDGED_MAX_S,
+    CRUISE,
+    MANOEUVRE,
+    Axis,
+    Belief,
+    Seen,
+    carried,
+    follow,
+    manoeuvre_share,
+    mixed,
+)
+from companion.core.rate import is_override
 from companion.core.types import (
+    ClockReport,
     EstimatorReport,
     FlowReport,
     GnssReport,
@@ -25,6 +37,7 @@ from companion.core.types import (
     LandedReport,
     OperatorCommand,
     OutputReport,
+    RateOverride,
     RcReport,
     SpeedReport,
     Telemetry,
@@ -35,22 +48,9 @@ from companion.core.types import (
 if TYPE_CHECKING:
     from companion.core.controller import Setup
 
-# Acceleration fades with this time constant in every prediction: gusts pass and brakes are
-# released, and a constant acceleration carried over a second would overshoot.
-ACCELERATION_TIME_S = 0.7
-# Noise that the filter assumes: RTK position, fused velocity, and the wander of the acceleration
-# of a multirotor in gusts of 1 m/s (accuracy.md section 4 for the first two).
-POSITION_SD_M = 0.02
-VELOCITY_SD_M_S = 0.03
-ACCELERATION_WANDER_M_S2_SQRT_S = 0.7
 YAW_RATE_TIME_S = 0.25
-# A position that disagrees with its prediction by more than this is a jump, not motion: the
-# filter starts anew and nothing is sprayed until the new place has been confirmed.
-JUMP_M = 2.0
+# After a jump the filters start anew, and nothing is sprayed until so many positions confirm it.
 CONFIRM_COUNT = 5
-# Arrivals later than this against the mean are late messages; the mean is not moved by more.
-CLOCK_STEP_S = 0.02
-CLOCK_RESET_S = 1.0
 SPEED_REPORT_AGE_MAX_S = 1.0
 # Fix, estimator and landed state come at 1 to 5 Hz; older than this they count as not known.
 STATUS_AGE_MAX_S = 5.0
@@ -59,31 +59,41 @@ RC_LOW_US = 1300
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Clock:
-    """Mean of arrival time minus the autopilot's time, over the last messages."""
-
-    offset_s: float
-    count: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """The filter's state, true at `time_s` on our clock."""
+    """What both filters make of the positions, true at `time_s` on our clock."""
 
     time_s: float
     boot_s: float
     received_s: float
-    east_m: float
-    north_m: float
-    velocity_east_m_s: float
-    velocity_north_m_s: float
-    acceleration_east_m_s2: float
-    acceleration_north_m_s2: float
+    cruise: Belief
+    manoeuvre: Belief
+    manoeuvre_share: float
     heading_deg: float | None
     yaw_rate_deg_s: float
     height_m: float
     velocity_known: bool
     confirm_left: int
+
+    def after(self, dt_s: float) -> tuple[Axis, Axis]:
+        """Return the motion to the east and to the north `dt_s` later."""
+        share = self.manoeuvre_share
+        return (
+            mixed(
+                carried(CRUISE, self.cruise.east, dt_s),
+                carried(MANOEUVRE, self.manoeuvre.east, dt_s),
+                share,
+            ),
+            mixed(
+                carried(CRUISE, self.cruise.north, dt_s),
+                carried(MANOEUVRE, self.manoeuvre.north, dt_s),
+                share,
+            ),
+        )
+
+    @property
+    def acceleration_fade_s(self) -> float:
+        """Return the time constant with which the acceleration is expected to fade."""
+        return CRUISE.fade_s + self.manoeuvre_share * (MANOEUVRE.fade_s - CRUISE.fade_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +102,7 @@ class Track:
 
     motion: Motion | None = None
     clock: Clock | None = None
+    clock_report: ClockReport | None = None
     position_valid: bool = False
     position_received_s: float = -math.inf
     speed: SpeedReport | None = None
@@ -103,6 +114,7 @@ class Track:
     rc: RcReport | None = None
     output: OutputReport | None = None
     flow: FlowReport | None = None
+    rate_percent: float = 100.0
     enabled: bool = False
 
 
@@ -128,6 +140,11 @@ _KEEP: dict[type, Callable[[Track, Any], Track]] = {
     WindReport: lambda track, item: replace(track, wind=item),
     OutputReport: lambda track, item: replace(track, output=item),
     FlowReport: lambda track, item: replace(track, flow=item),
+    ClockReport: lambda track, item: replace(track, clock_report=item),
+    # What is out of bounds, or no number, leaves the rate as it was.
+    RateOverride: lambda track, item: (
+        replace(track, rate_percent=item.percent) if is_override(item.percent) else track
+    ),
 }
 
 
@@ -170,9 +187,16 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         if item.boot_s > before.boot_s - 0.5:
             return replace(track, position_valid=False)  # time went back: until the next is newer
         before = None  # the autopilot's clock went back: it was restarted
-        track = replace(track, clock=None)
-    clock = _tick(track.clock, item)
-    time_s = item.boot_s + clock.offset_s - setup.lag.position_s
+        track = replace(track, clock=None, clock_report=None)
+    at_once = not track.enabled or before is None
+    clock, is_synced, moved_s = tick(track.clock, item, track.clock_report, at_once=at_once)
+    if is_synced:
+        # Its age counts from its sending, for the limit on it too.
+        sent_s = item.boot_s + clock.sent_offset_s
+        item = replace(item, received_s=min(item.received_s, sent_s))
+    if before is not None and moved_s != 0.0:
+        before = replace(before, time_s=before.time_s + moved_s)
+    time_s = item.boot_s + clock.sent_offset_s - setup.lag.position_s
     motion = _start(item, place, time_s) if before is None else _update(before, item, place, time_s)
     return replace(
         track,
@@ -198,78 +222,57 @@ def _place(item: Telemetry, setup: Setup) -> tuple[float, float] | None:
     return east_m, north_m
 
 
-def _tick(clock: Clock | None, item: Telemetry) -> Clock:
-    """Return the clock with one more arrival; a late message hardly moves it."""
-    seen_s = item.received_s - item.boot_s
-    if clock is None or not abs(seen_s - clock.offset_s) < CLOCK_RESET_S:
-        return Clock(offset_s=seen_s, count=1)
-    step_s = min(max(seen_s - clock.offset_s, -CLOCK_STEP_S), CLOCK_STEP_S)
-    count = min(clock.count + 1, 100)
-    return Clock(offset_s=clock.offset_s + step_s / count, count=count)
-
-
 def _start(item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
-    known = item.velocity_east_m_s is not None and item.velocity_north_m_s is not None
+    east, north = _seen(item, place)
+    belief = Belief(
+        Axis(place[0], east.velocity_m_s or 0.0, 0.0),
+        Axis(place[1], north.velocity_m_s or 0.0, 0.0),
+    )
     return Motion(
         time_s=time_s,
         boot_s=item.boot_s,
         received_s=item.received_s,
-        east_m=place[0],
-        north_m=place[1],
-        velocity_east_m_s=item.velocity_east_m_s or 0.0,
-        velocity_north_m_s=item.velocity_north_m_s or 0.0,
-        acceleration_east_m_s2=0.0,
-        acceleration_north_m_s2=0.0,
+        cruise=belief,
+        manoeuvre=belief,
+        manoeuvre_share=0.5,
         heading_deg=item.heading_deg,
         yaw_rate_deg_s=0.0,
         height_m=item.relative_altitude_m,
-        velocity_known=known,
+        velocity_known=east.velocity_m_s is not None,
         confirm_left=CONFIRM_COUNT,
     )
 
 
 def _update(before: Motion, item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
     dt_s = time_s - before.time_s
-    if not 0.0 < dt_s < 2.0:
+    if not 0.0 < dt_s < BRIDGED_MAX_S:
         return _start(item, place, time_s)
-    known = item.velocity_east_m_s is not None and item.velocity_north_m_s is not None
-    gains = filter_gains(round(min(max(dt_s, 0.005), 0.5) / 0.005), known)
-    east = _filter(
-        before.east_m,
-        before.velocity_east_m_s,
-        before.acceleration_east_m_s2,
-        dt_s=dt_s,
-        seen_m=place[0],
-        seen_m_s=item.velocity_east_m_s if known else None,
-        gains=gains,
-    )
-    north = _filter(
-        before.north_m,
-        before.velocity_north_m_s,
-        before.acceleration_north_m_s2,
-        dt_s=dt_s,
-        seen_m=place[1],
-        seen_m_s=item.velocity_north_m_s if known else None,
-        gains=gains,
-    )
-    if east is None or north is None:
+    east, north = _seen(item, place)
+    cruise = follow(CRUISE, before.cruise, dt_s, east, north)
+    manoeuvre = follow(MANOEUVRE, before.manoeuvre, dt_s, east, north)
+    if cruise is None or manoeuvre is None:
         return _start(item, place, time_s)
     return Motion(
         time_s=time_s,
         boot_s=item.boot_s,
         received_s=item.received_s,
-        east_m=east[0],
-        north_m=north[0],
-        velocity_east_m_s=east[1],
-        velocity_north_m_s=north[1],
-        acceleration_east_m_s2=east[2],
-        acceleration_north_m_s2=north[2],
+        cruise=cruise[0],
+        manoeuvre=manoeuvre[0],
+        manoeuvre_share=manoeuvre_share(before.manoeuvre_share, dt_s, cruise[1], manoeuvre[1]),
         heading_deg=item.heading_deg,
         yaw_rate_deg_s=_yaw_rate(before, item.heading_deg, dt_s),
         height_m=item.relative_altitude_m,
-        velocity_known=known,
+        velocity_known=east.velocity_m_s is not None,
         confirm_left=max(before.confirm_left - 1, 0),
     )
+
+
+def _seen(item: Telemetry, place: tuple[float, float]) -> tuple[Seen, Seen]:
+    """Return what a message says to the east and to the north; half a velocity is none."""
+    east_m_s, north_m_s = item.velocity_east_m_s, item.velocity_north_m_s
+    if east_m_s is None or north_m_s is None:
+        return Seen(place[0], None), Seen(place[1], None)
+    return Seen(place[0], east_m_s), Seen(place[1], north_m_s)
 
 
 def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:
@@ -280,104 +283,31 @@ def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:
     return before.yaw_rate_deg_s + share * (turned_deg / dt_s - before.yaw_rate_deg_s)
 
 
-Gains = tuple[tuple[float, float, float], tuple[float, float, float]]
-
-
-def _filter(
-    position_m: float,
-    velocity_m_s: float,
-    acceleration_m_s2: float,
-    *,
-    dt_s: float,
-    seen_m: float,
-    seen_m_s: float | None,
-    gains: Gains,
-) -> tuple[float, float, float] | None:
-    """Return one axis after prediction and correction; None for a jump."""
-    fade = math.exp(-dt_s / ACCELERATION_TIME_S)
-    gained = ACCELERATION_TIME_S * (1.0 - fade)
-    position_m += velocity_m_s * dt_s + acceleration_m_s2 * ACCELERATION_TIME_S * (dt_s - gained)
-    velocity_m_s += acceleration_m_s2 * gained
-    acceleration_m_s2 *= fade
-    off_m = seen_m - position_m
-    if not abs(off_m) <= JUMP_M:
-        return None
-    by_position, by_velocity = gains
-    off_m_s = 0.0 if seen_m_s is None else seen_m_s - velocity_m_s
-    return (
-        position_m + by_position[0] * off_m + by_velocity[0] * off_m_s,
-        velocity_m_s + by_position[1] * off_m + by_velocity[1] * off_m_s,
-        acceleration_m_s2 + by_position[2] * off_m + by_velocity[2] * off_m_s,
-    )
-
-
-@lru_cache(maxsize=256)
-def filter_gains(dt_5ms: int, velocity_known: bool) -> Gains:
-    """Return the steady-state Kalman gains for messages every `dt_5ms` times 5 ms.
-
-    The model is position, velocity and a fading acceleration driven by white noise (Singer, IEEE
-    Trans. AES 1970); the Riccati equation is iterated until it stands.
-    """
-    dt_s = dt_5ms * 0.005
-    fade = math.exp(-dt_s / ACCELERATION_TIME_S)
-    gained = ACCELERATION_TIME_S * (1.0 - fade)
-    carry = np.array(
-        [
-            [1.0, dt_s, ACCELERATION_TIME_S * (dt_s - gained)],
-            [0.0, 1.0, gained],
-            [0.0, 0.0, fade],
-        ]
-    )
-    push = np.array([[dt_s**2 / 2], [dt_s], [1.0]])
-    wander = push @ push.T * ACCELERATION_WANDER_M_S2_SQRT_S**2 * dt_s
-    seen = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])[: 2 if velocity_known else 1]
-    noise = np.diag([POSITION_SD_M**2, VELOCITY_SD_M_S**2])[: len(seen), : len(seen)]
-    spread = np.eye(3)
-    gain = np.zeros((3, len(seen)))
-    for _ in range(400):
-        spread = carry @ spread @ carry.T + wander
-        gain = spread @ seen.T @ np.linalg.inv(seen @ spread @ seen.T + noise)
-        spread = (np.eye(3) - gain @ seen) @ spread
-    columns = [tuple(float(value) for value in gain[:, i]) for i in range(len(seen))]
-    if not velocity_known:
-        columns.append((0.0, 0.0, 0.0))
-    return (
-        (columns[0][0], columns[0][1], columns[0][2]),
-        (columns[1][0], columns[1][1], columns[1][2]),
-    )
-
-
 def estimate(track: Track, now_s: float) -> VehicleState | None:
     """Return the vehicle's state at `now_s`; None before the first position."""
     motion = track.motion
     if motion is None:
         return None
     dt_s = now_s - motion.time_s
-    fade = math.exp(-min(max(dt_s, 0.0), 10.0) / ACCELERATION_TIME_S)
-    gained = ACCELERATION_TIME_S * (1.0 - fade)
-    carried = ACCELERATION_TIME_S * (dt_s - gained) if dt_s > 0.0 else 0.0
-    velocity_east = motion.velocity_east_m_s + motion.acceleration_east_m_s2 * gained
-    velocity_north = motion.velocity_north_m_s + motion.acceleration_north_m_s2 * gained
+    east, north = motion.after(dt_s)
+    velocity_east, velocity_north = east.velocity_m_s, north.velocity_m_s
     checked = _checked_speed(track, now_s)
     known = motion.velocity_known
     if not known and checked is not None:
-        velocity_east, velocity_north, known = _reported_velocity(motion, checked)
+        velocity_east, velocity_north, known = _reported_velocity(east, north, checked)
     heading = motion.heading_deg
     if heading is not None:
         heading = (heading + motion.yaw_rate_deg_s * dt_s) % 360.0
     heartbeat = track.heartbeat
     return VehicleState(
         time_s=now_s,
-        east_m=motion.east_m
-        + motion.velocity_east_m_s * dt_s
-        + motion.acceleration_east_m_s2 * carried,
-        north_m=motion.north_m
-        + motion.velocity_north_m_s * dt_s
-        + motion.acceleration_north_m_s2 * carried,
+        east_m=east.position_m,
+        north_m=north.position_m,
         velocity_east_m_s=velocity_east,
         velocity_north_m_s=velocity_north,
-        acceleration_east_m_s2=motion.acceleration_east_m_s2 * fade,
-        acceleration_north_m_s2=motion.acceleration_north_m_s2 * fade,
+        acceleration_east_m_s2=east.acceleration_m_s2,
+        acceleration_north_m_s2=north.acceleration_m_s2,
+        acceleration_fade_s=motion.acceleration_fade_s,
         heading_deg=heading,
         yaw_rate_deg_s=motion.yaw_rate_deg_s,
         height_m=motion.height_m,
@@ -397,6 +327,8 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         output_healthy=track.output is None or track.output.healthy,
         enabled=track.enabled,
         flow=track.flow,
+        wind=track.wind if track.wind and track.wind.east_m_s is not None else None,
+        rate_percent=track.rate_percent,
     )
 
 
@@ -411,10 +343,10 @@ def _checked_speed(track: Track, now_s: float) -> float | None:
     return track.speed.ground_speed_m_s
 
 
-def _reported_velocity(motion: Motion, speed_m_s: float) -> tuple[float, float, bool]:
+def _reported_velocity(east: Axis, north: Axis, speed_m_s: float) -> tuple[float, float, bool]:
     """Return the reported ground speed along the course that the positions show."""
-    east, north = motion.velocity_east_m_s, motion.velocity_north_m_s
-    seen_m_s = math.hypot(east, north)
+    seen_m_s = math.hypot(east.velocity_m_s, north.velocity_m_s)
     if not seen_m_s > 0.5:
-        return east, north, False
-    return east * speed_m_s / seen_m_s, north * speed_m_s / seen_m_s, True
+        return east.velocity_m_s, north.velocity_m_s, False
+    share = speed_m_s / seen_m_s
+    return east.velocity_m_s * share, north.velocity_m_s * share, True

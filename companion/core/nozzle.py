@@ -165,45 +165,47 @@ class NozzleSet:
 
 
 # P1: eight nozzles below 4 L/min, twelve above; the hysteresis keeps a flow near 4 from
-# switching sets back and forth (reference point of the change: 3.7 down, 4.1 up for P1's sets).
+# switching sets back and forth: 3.7 L/min down, 4.1 up for P1's sets, the smaller of which
+# delivers 4.272 L/min when open (P1 Table 2).
 SET_DOWN_FRACTION = 3.7 / 4.0
 SET_UP_FRACTION = 4.1 / 4.0
+SET_CHANGE_SHARE = 4.0 / 4.272
 
 
 def choose_set(sets: tuple[NozzleSet, ...], flow_l_min: float, *, current: int) -> int:
     """Return the index of the set to use for `flow_l_min`, with hysteresis around `current`.
 
-    Sets are ordered from the smallest to the largest flow. The change between two neighbours
-    lies in the middle of the flows that both can deliver.
+    Sets are ordered from the smallest to the largest flow. The smaller of two neighbours is used
+    as far as it reaches: fewer valves at a higher duty spray more evenly.
     """
     index = min(max(current, 0), len(sets) - 1)
     while index + 1 < len(sets):
-        if not flow_l_min > _middle(sets[index], sets[index + 1]) * SET_UP_FRACTION:
+        if not flow_l_min > set_change_l_min(sets[index], sets[index + 1]) * SET_UP_FRACTION:
             break
         index += 1
     while index > 0:
-        if not flow_l_min < _middle(sets[index - 1], sets[index]) * SET_DOWN_FRACTION:
+        if not flow_l_min < set_change_l_min(sets[index - 1], sets[index]) * SET_DOWN_FRACTION:
             break
         index -= 1
     return index
 
 
-def _middle(small: NozzleSet, large: NozzleSet) -> float:
-    """Return the flow at which the change between two sets is centred."""
-    return 0.5 * (small.flow_max_l_min + max(large.flow_min_l_min, 0.0))
+def set_change_l_min(small: NozzleSet, large: NozzleSet) -> float:
+    """Return the flow around which two sets change: not below what the larger one can deliver."""
+    reached_l_min = SET_CHANGE_SHARE * small.flow_max_l_min
+    return max(reached_l_min, large.flow_min_l_min / SET_DOWN_FRACTION)
 
 
 def allowed_duty(duty: float, limits: PwmLimits) -> float:
-    """Return the nearest duty that the valves can follow: closed, the PWM window, or open.
+    """Return the nearest duty that can be delivered: closed, the PWM window, or above it.
+
+    Between `duty_max` and open no single period can be had; whole periods of the one and the
+    other by turns (`PulseTrain`) have the mean that is wanted.
 
     >>> pwm = PwmLimits(frequency_hz=11, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
-    >>> [allowed_duty(d, pwm) for d in (0.05, 0.15, 0.5, 0.93, 0.97)]
-    [0.0, 0.2, 0.5, 0.9, 1.0]
+    >>> [allowed_duty(d, pwm) for d in (0.05, 0.15, 0.5, 0.93, 1.0)]
+    [0.0, 0.2, 0.5, 0.93, 1.0]
     """
     if not duty >= limits.duty_min / 2 or duty <= 0.0:
         return 0.0
-    if duty <= limits.duty_min:
-        return limits.duty_min
-    if duty <= limits.duty_max:
-        return duty
-    return limits.duty_max if duty < 0.5 * (limits.duty_max + 1.0) else 1.0
+    return min(max(duty, limits.duty_min), 1.0)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 from companion.core.crossings import Crossing, Route
+from companion.core.overdrive import Overdrive
 from companion.core.types import Method, TimedChange
 
 Reference = Literal["volume", "settled"]
@@ -23,9 +24,13 @@ Reference = Literal["volume", "settled"]
 DUTY_STEP = 0.002
 # Beyond this share a change of duty at once is a late change of zone and not a trim for speed.
 TRIM_MAX_SHARE = 0.08
+# Where no crossing lies behind, only the speed can have changed: up to this share is a trim.
+SPEED_MAX_SHARE = 0.25
 # A trim moves by at most this at once: below the 2 % of the span at which a driver board takes a
-# change for a new zone and restarts its period; 20 such steps a second follow any braking.
+# change for a new zone and restarts its period. What is more follows one servo frame later, so
+# that no frame holds both; 40 such steps a second follow braking by 2.5 m/s2.
 TRIM_STEP_MAX = 0.018
+TRIM_AGAIN_S = 0.025
 # No trim this shortly before a change of zone: on a servo output it would hold the change up by a
 # frame, and it would act for a fraction of a period only.
 TRIM_HOLD_S = 0.03
@@ -38,6 +43,8 @@ STICKY_S = 0.1
 class LagModel:
     """Identified lags, seconds from the order at the output (accuracy: volume-equivalent).
 
+    `up_time_s` and `down_time_s` are the part of `up_s` and `down_s` that is the time constant of
+    a flow that follows as an exponential (a pump's): with them its changes are driven.
     `on_s`, `off_s`, `up_s`, `down_s` are volume-equivalent; `on_start_s` is order to first flow
     and `off_end_s` order to less than 2 % of it (the two ends that the border rule needs);
     `output_s` is the delay of the output path; `position_s` how old the position is when the
@@ -53,6 +60,8 @@ class LagModel:
     output_s: float
     position_s: float = 0.0
     reference: Reference = "volume"
+    up_time_s: float = 0.0
+    down_time_s: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s", "output_s"):
@@ -61,6 +70,12 @@ class LagModel:
                 raise ValueError(f"{name} must lie in [0, 30] s, got {value}")
         if not -0.5 <= self.position_s <= 0.5:
             raise ValueError(f"position_s must lie in [-0.5, 0.5] s, got {self.position_s}")
+        for name, time_s, whole_s in (
+            ("up_time_s", self.up_time_s, self.up_s),
+            ("down_time_s", self.down_time_s, self.down_s),
+        ):
+            if not 0.0 <= time_s <= whole_s:
+                raise ValueError(f"{name} is a part of a lag of {whole_s} s, got {time_s}")
         if not self.on_start_s <= self.on_s:
             raise ValueError("on_start_s (first flow) cannot be later than on_s")
         if not self.off_end_s >= self.off_s:
@@ -125,11 +140,12 @@ Dosing = Callable[[float, float], float]
 
 
 class Order(NamedTuple):
-    """A change of one valve with the moment at which it is due."""
+    """A change of one valve with the moment at which it is due; `driven` past its target."""
 
     at_s: float
     duty: float
     rate_l_ha: float | None
+    driven: bool = False
 
 
 class ValveSchedule(NamedTuple):
@@ -146,8 +162,18 @@ def resolve(route: Route, dwell_min_s: float) -> tuple[Route, int]:
 
     A stay shorter than a change takes is not chased: the neighbouring rate that misapplies least
     is held through it. Closed ground is never given up: where no spray may fall stays closed, and
-    an opening too short to be used is not made.
+    an opening too short to be used is not made. Several short stays in a row may be one that is
+    still too short, hence the repetition; each round that drops one has fewer crossings.
     """
+    given_up = 0
+    while True:
+        route, dropped = _resolve_once(route, dwell_min_s)
+        given_up += dropped
+        if not dropped:
+            return route, given_up
+
+
+def _resolve_once(route: Route, dwell_min_s: float) -> tuple[Route, int]:
     kept: list[Crossing] = list(route[:1])
     dropped = 0
     i = 1
@@ -184,7 +210,9 @@ def resolve(route: Route, dwell_min_s: float) -> tuple[Route, int]:
     return tuple(kept), dropped
 
 
-def orders(route: Route, timing: Timing, dosing: Dosing) -> list[Order]:
+def orders(
+    route: Route, timing: Timing, dosing: Dosing, overdrive: Overdrive | None = None
+) -> list[Order]:
     """Return the orders of one valve along its route, in order of time.
 
     The first has no time: it held before the path began. An order that would be due before the
@@ -197,8 +225,14 @@ def orders(route: Route, timing: Timing, dosing: Dosing) -> list[Order]:
         rate = crossing.rate_l_ha
         duty = 0.0 if rate is None else dosing(rate, crossing.speed_m_s)
         at_s = crossing.at_s - timing.lead_s(made[-1].duty, duty, border=crossing.border)
-        while len(made) > 1 and made[-1].at_s >= at_s:
+        drive = None if overdrive is None else overdrive.between(made[-1].duty, duty)
+        if drive is not None:
+            at_s += drive.saved_s
+        while len(made) > 1 and (made[-1].at_s >= at_s or made[-1].driven):
             made.pop()
+        if drive is not None:
+            made.append(Order(at_s, drive.duty, rate, driven=True))
+            at_s += drive.for_s
         made.append(Order(at_s, duty, rate))
     return made
 
@@ -213,6 +247,7 @@ def schedule(
     speed_soon_m_s: float,
     now_s: float,
     until_s: float,
+    overdrive: Overdrive | None = None,
 ) -> ValveSchedule:
     """Return the changes of one valve from `now_s` until the lease ends.
 
@@ -226,30 +261,46 @@ def schedule(
     rate = route[0].rate_l_ha
     if len(route) > 1:
         resolved, unresolved = resolve(route, timing.dwell_min_s)
-        made = orders(resolved, timing, dosing)
+        made = orders(resolved, timing, dosing, overdrive)
         while due + 1 < len(made) and made[due + 1].at_s <= now_s:
             due += 1
         if due + 1 < len(made) and _already_ordered(made[due], made[due + 1], in_force, now_s):
             due += 1
         rate = made[due].rate_l_ha
     duty = 0.0 if rate is None else dosing(rate, speed_soon_m_s)
+    if made and made[due].driven:
+        duty = made[due].duty
     changes = []
     late = False
     if abs(duty - in_force) >= DUTY_STEP or (duty == 0.0) != (in_force == 0.0):
-        restart = not 0.0 < abs(duty - in_force) <= TRIM_MAX_SHARE * in_force or duty == 0.0
+        share = TRIM_MAX_SHARE if due > 0 else SPEED_MAX_SHARE
+        restart = not 0.0 < abs(duty - in_force) <= share * in_force or duty == 0.0
         late = restart and due > 0
-        if not restart and due + 1 < len(made) and made[due + 1].at_s - now_s < TRIM_HOLD_S:
-            duty = in_force
-        elif not restart:
-            duty = min(max(duty, in_force - TRIM_STEP_MAX), in_force + TRIM_STEP_MAX)
-        if duty != in_force:
-            changes.append(TimedChange(at_s=now_s, valve=valve, duty=duty, restart=restart))
+        if restart:
+            changes.append(TimedChange(at_s=now_s, valve=valve, duty=duty))
+        else:
+            next_s = made[due + 1].at_s if due + 1 < len(made) else float("inf")
+            changes.extend(_trims(valve, in_force, duty, now_s, next_s - TRIM_HOLD_S))
     changes.extend(
         TimedChange(at_s=order.at_s, valve=valve, duty=order.duty)
         for order in made[due + 1 :]
         if order.at_s < until_s
     )
     return ValveSchedule(tuple(changes), late, unresolved, _rate_at(route, now_s))
+
+
+def _trims(
+    valve: int, in_force: float, duty: float, now_s: float, until_s: float
+) -> list[TimedChange]:
+    """Return one or two small moves towards a duty, none later than `until_s`."""
+    changes = []
+    for at_s in (now_s, now_s + TRIM_AGAIN_S):
+        moved = min(max(duty, in_force - TRIM_STEP_MAX), in_force + TRIM_STEP_MAX)
+        if at_s > until_s or moved == in_force:
+            break
+        changes.append(TimedChange(at_s=at_s, valve=valve, duty=moved, restart=False))
+        in_force = moved
+    return changes
 
 
 def _holds(zone: Crossing, dosing: Dosing, speed_m_s: float, in_force: float) -> bool:

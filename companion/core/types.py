@@ -38,6 +38,7 @@ class Inhibit(StrEnum):
     NO_POSITION = "no-position"
     STALE_POSITION = "stale-position"
     INVALID_POSITION = "invalid-position"
+    POSITION_FROZEN = "position-frozen"
     FAR_FROM_FIELD = "far-from-field"
     NO_HEARTBEAT = "no-heartbeat"
     STALE_HEARTBEAT = "stale-heartbeat"
@@ -51,9 +52,12 @@ class Inhibit(StrEnum):
     SPEED_BELOW_MIN = "speed-below-min"
     SPEED_ABOVE_MAX = "speed-above-max"
     SPEED_DISAGREES = "speed-disagrees"
+    SPEED_UNCHECKED = "speed-unchecked"
     HEIGHT_BELOW_MIN = "height-below-min"
     HEIGHT_ABOVE_MAX = "height-above-max"
     WIND_ABOVE_MAX = "wind-above-max"
+    WIND_UNKNOWN = "wind-unknown"
+    RC_SWITCH = "rc-switch"
     OUTPUT_FAULT = "output-fault"
 
 
@@ -135,10 +139,23 @@ class LandedReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WindReport:
-    """Wind speed, from the autopilot or from the operator."""
+    """Wind, from the autopilot or from the operator; east and north of where it blows to.
+
+    Without a direction the two are `None`: the speed alone still limits the spraying.
+    """
 
     received_s: float
     speed_m_s: float
+    east_m_s: float | None = None
+    north_m_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeReport:
+    """Height above the crop by a sensor that looks down (DISTANCE_SENSOR); None: it sees nothing."""
+
+    received_s: float
+    height_m: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,6 +195,26 @@ class FlowReport:
     volume_ml: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RateOverride:
+    """The operator's wish to spray a percentage of what is prescribed; see `rate.overridden`."""
+
+    received_s: float
+    percent: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockReport:
+    """What TIMESYNC says of the autopilot's clock: add `offset_s` to its time to have ours.
+
+    Of the last exchanges the one with the shortest round trip; `received_s` is that of the newest.
+    """
+
+    received_s: float
+    offset_s: float
+    round_trip_s: float
+
+
 Input = (
     Telemetry
     | SpeedReport
@@ -186,10 +223,13 @@ Input = (
     | HeartbeatReport
     | LandedReport
     | WindReport
+    | RangeReport
     | RcReport
     | OperatorCommand
     | OutputReport
     | FlowReport
+    | RateOverride
+    | ClockReport
 )
 
 
@@ -228,6 +268,12 @@ class VehicleState:
     output_healthy: bool
     enabled: bool
     flow: FlowReport | None = None
+    wind: WindReport | None = None  # where its direction is known
+    rate_percent: float = 100.0
+    wind_received_s: float | None = None
+    position_frozen: bool = False  # the place stands still, the vehicle does not
+    rc_switch_on: bool | None = None  # None: no switch, or nothing young is known of it
+    acceleration_fade_s: float = 0.5  # the acceleration's time constant in every prediction
 
 
 # ---------------------------------------------------------------------------------------- plans

@@ -23,9 +23,9 @@ class DryChange:
 class DryRunExecutor(TimedExecutor):
     """For the first flights with the sprayer switched off, and for tests."""
 
-    def __init__(self, valve_count: int) -> None:
-        super().__init__(valve_count)
-        self._duty: list[float | None] = [None] * valve_count
+    def __init__(self, valve_count: int, *, has_return: bool = False) -> None:
+        super().__init__(valve_count, has_return=has_return)
+        self._duty: list[float | None] = [None] * (valve_count + has_return)
         self.changes: deque[DryChange] = deque(maxlen=_KEPT)
 
     def _apply(self, valve: int, duty: float) -> bool:

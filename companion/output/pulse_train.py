@@ -53,9 +53,9 @@ class PulseTrain:
     """The pulses of one valve. A period is planned when it begins and settled when it ends."""
 
     __slots__ = (
-        "_carry_s", "_closures", "_edges", "_end_s", "_is_open", "_last_s", "_middle_s", "_on_s",
-        "_opened_s", "_overrun_s", "_pending", "_period_s", "_phase_s", "_pwm", "_start_s",
-        "_told", "_valve", "duty", "restart_s",
+        "_carry_s", "_closures", "_edges", "_end_s", "_is_open", "_last_duty", "_last_s",
+        "_middle_s", "_on_s", "_opened_s", "_overrun_s", "_pending", "_period_s", "_phase_s",
+        "_pwm", "_start_s", "_told", "_valve", "duty", "restart_s",
     )  # fmt: skip
 
     def __init__(self, valve: int, pwm: PwmLimits, *, phase_s: float, overrun_s: float) -> None:
@@ -64,6 +64,8 @@ class PulseTrain:
         self._period_s = pwm.period_s
         self._phase_s = phase_s
         self._overrun_s = overrun_s
+        # Above this the gap is too short for the valve to close.
+        self._last_duty = min(pwm.duty_max, 1.0 - pwm.min_off_s / pwm.period_s)
         self.duty = 0.0
         self.restart_s = math.inf
         self._pending: float | None = None
@@ -132,16 +134,17 @@ class PulseTrain:
         self._told = self.duty
         out.append(Edge(at_s, self._valve, is_open, self.duty))
 
-    def _duty_reached(self) -> float:
-        """Return the duty that the minimum off time allows; what it forbids builds no debt."""
-        gap_s, least_s = (1.0 - self.duty) * self._period_s, self._pwm.min_off_s
-        if gap_s >= least_s:
-            return self.duty
-        return 1.0 - least_s / self._period_s if gap_s >= 0.5 * least_s > 0.0 else 1.0
-
     def _share(self) -> float:
-        """Return the fraction of the time in which a valve at this duty delivers."""
-        return min(self._duty_reached() + self._overrun_s / self._period_s, 1.0)
+        """Return the fraction of the time in which a valve at this duty delivers.
+
+        Above the last duty it lies between that one's and 1. No single period can have it; the
+        debt, which stays below half a minimum off time, has shorter and open periods take turns.
+        """
+        last, over = self._last_duty, self._overrun_s / self._period_s
+        if last < self.duty < 1.0:
+            low = min(last + over, 1.0)
+            return low + (self.duty - last) / (1.0 - last) * (1.0 - low)
+        return min(self.duty + over, 1.0)
 
     def _debt_at(self, at_s: float) -> float:
         """Return the on-time owed at `at_s`: carried over, due since, less what was delivered."""
@@ -170,8 +173,7 @@ class PulseTrain:
         length_s = self._length_s(at_s)
         self._end_s = at_s + length_s
         # A valve that is to stay open can never pay what it owes.
-        duty = self._duty_reached()
-        self._carry_s = carry_s if duty < 1.0 else min(carry_s, 0.0)
+        self._carry_s = carry_s if self.duty < 1.0 else min(carry_s, 0.0)
         wanted_s = self._share() * length_s + self._carry_s
         if wanted_s < length_s:
             wanted_s -= self._overrun_s
@@ -179,14 +181,14 @@ class PulseTrain:
         if self._is_open:
             self._plan_from_open(at_s, on_s, length_s, keep=keep, out=out)
         else:
-            opens_s = max(at_s + 0.5 * (length_s - on_s), self._last_s + self._pwm.min_off_s)
+            opens_s = max(at_s + self._wait_s(on_s, length_s), self._last_s + self._pwm.min_off_s)
             self._plan_pulse(opens_s, opens_s + on_s)
 
     def _plan_from_open(
         self, at_s: float, on_s: float, length_s: float, *, keep: bool, out: list[Edge]
     ) -> None:
         free_s = max(at_s, self._last_s + self._pwm.min_on_s)
-        opens_s = at_s + 0.5 * (length_s - on_s)
+        opens_s = at_s + self._wait_s(on_s, length_s)
         if on_s > 0.0 and (keep or opens_s - free_s < self._pwm.min_off_s):
             closes_s = max(at_s + on_s, free_s)
             self._middle_s = 0.5 * (at_s + closes_s)
@@ -222,16 +224,31 @@ class PulseTrain:
         late_s = (at_s - self._phase_s + 0.5 * period_s) % period_s - 0.5 * period_s
         most_s = STRETCH_MAX * period_s
         length_s = period_s - min(max(late_s, -most_s), most_s)
-        duty = self._duty_reached()
+        duty = self.duty
         if length_s < period_s and duty < 1.0:
             # Not so short that pulse or gap fall below what the valve can follow.
             need_s = max(self._pwm.min_off_s / (1.0 - duty), self._pwm.min_on_s / duty)
             length_s = max(length_s, min(need_s, period_s))
         return length_s
 
+    def _wait_s(self, on_s: float, length_s: float) -> float:
+        """Return how long after its period's begin a pulse begins: it stands in the middle.
+
+        Above the last duty it begins at once: between open periods half a gap would close nothing.
+        """
+        if self.duty > self._last_duty:
+            return 0.0
+        return 0.5 * (length_s - on_s)
+
     def _reachable_s(self, wanted_s: float, length_s: float) -> float:
         """Return the nearest on-time that the valve can follow; the rest becomes debt."""
         on_s, off_s = self._pwm.min_on_s, self._pwm.min_off_s
+        if self.duty > self._last_duty:
+            # Nothing between the last duty and open: what is near to either becomes debt.
+            off_s = (1.0 - self._last_duty) * length_s
+            gap_s = length_s - wanted_s
+            if gap_s < 1.5 * off_s:
+                return length_s if gap_s < 0.5 * off_s else length_s - off_s
         if wanted_s < on_s or wanted_s <= 0.0:
             return on_s if wanted_s > 0.5 * on_s else 0.0
         gap_s = length_s - wanted_s

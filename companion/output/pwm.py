@@ -12,6 +12,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING
 
 from companion.output.pulse_train import Edge, PulseTrain, stagger
+from companion.output.return_valve import ReturnValve
 
 if TYPE_CHECKING:
     from companion.core.nozzle import PwmLimits
@@ -36,11 +37,18 @@ class PulseEngine:
     Each pulse stands in the middle of its period. A change that restarts begins a new period and
     takes the truncated one's debt of on-time with it; a trim waits for the next period. When the
     lease ends, everything closes. `overrun_s` is how much longer a valve delivers than its pulse
-    lasts (the intercept of its flow curve), where it is known.
+    lasts (the intercept of its flow curve), where it is known. With a return valve its edges are
+    those of the valve behind the last.
     """
 
     def __init__(
-        self, pwm: PwmLimits, valve_count: int, *, start_s: float, overrun_s: float = 0.0
+        self,
+        pwm: PwmLimits,
+        valve_count: int,
+        *,
+        start_s: float,
+        overrun_s: float = 0.0,
+        has_return: bool = False,
     ) -> None:
         if not (valve_count > 0 and math.isfinite(start_s)):
             raise ValueError(f"{valve_count} valves from {start_s} s make no pulse trains")
@@ -60,6 +68,7 @@ class PulseEngine:
         self._lease_s = math.inf
         self._changes: deque[TimedChange] = deque()
         self._out: list[Edge] = []
+        self._return = ReturnValve() if has_return else None
 
     @property
     def duty(self) -> tuple[float, ...]:
@@ -73,6 +82,9 @@ class PulseEngine:
         if not plan.sequence > self._sequence:
             return False
         self._run(now_s)
+        if self._return is not None:
+            # Before the valves: what closes without notice has its way out first.
+            self._tell_return(self._return.submit(plan, self._now_s))
         self._sequence = plan.sequence
         self._changes = deque(plan.changes)
         self._lease_s = plan.lease_until_s
@@ -111,6 +123,8 @@ class PulseEngine:
         first_s = min(train.next_s for train in self._trains)
         if self._changes:
             first_s = min(first_s, self._changes[0].at_s)
+        if self._return is not None and self._return.next_s is not None:
+            first_s = min(first_s, self._return.next_s)
         return min(first_s, self._lease_s)
 
     def _run(self, until_s: float) -> None:
@@ -128,10 +142,17 @@ class PulseEngine:
             self._order(change.valve, change.duty, at_s=at_s, restart=change.restart)
         if self._lease_s <= until_s:
             self._close_all(max(self._lease_s, self._now_s))
+        if self._return is not None:
+            self._tell_return(self._return.run(until_s))
         before_s = math.nextafter(until_s, math.inf)
         for train in self._trains:
             train.run(before_s, self._out)
         self._now_s = until_s
+
+    def _tell_return(self, moves: list[tuple[float, bool]]) -> None:
+        count = len(self._trains)
+        for at_s, is_open in moves:
+            self._out.append(Edge(at_s, count, is_open, 1.0 if is_open else 0.0))
 
     def _next_restart_s(self, valve: int) -> float:
         for change in self._changes:

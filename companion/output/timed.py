@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 
 from companion.core.types import SprayPlan
+from companion.output.return_valve import ReturnValve
 
 # Clocks that disagree by less than this agree: a timer may wake early by the loop's resolution.
 _EARLY_S = 1e-6
@@ -67,10 +68,14 @@ class Lateness:
 
 
 class TimedExecutor:
-    """Follows the newest plan by one timer of the event loop; its clock is `time.monotonic`."""
+    """Follows the newest plan by one timer of the event loop; its clock is `time.monotonic`.
 
-    def __init__(self, valve_count: int) -> None:
+    With a return valve there is one output more than there are valves: 1 is open, 0 shut.
+    """
+
+    def __init__(self, valve_count: int, *, has_return: bool = False) -> None:
         self._count = valve_count
+        self._return = ReturnValve() if has_return else None
         self._plan: SprayPlan | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._is_running = False
@@ -98,6 +103,8 @@ class TimedExecutor:
             return
         now_s = asyncio.get_running_loop().time()
         before, self._plan = self._plan, plan
+        if self._return is not None:
+            self._return.submit(plan, now_s + _EARLY_S)
         self._follow(now_s, replaced=before)
         self._arm(now_s)
 
@@ -117,6 +124,10 @@ class TimedExecutor:
         """Have `valve` take `duty`; return whether that was news to it."""
 
     def _close_all(self) -> None:
+        """Order everything closed; the return valve opens first and stays open."""
+        if self._return is not None:
+            self._return.submit(None, 0.0)
+            self._apply(self._count, 1.0)
         for valve in range(self._count):
             self._apply(valve, 0.0)
 
@@ -136,15 +147,26 @@ class TimedExecutor:
     def _follow(self, now_s: float, *, replaced: SprayPlan | None = None) -> None:
         """Bring every valve to what it should have now."""
         clock = asyncio.get_running_loop().time
+        self._move_return(now_s, opens=True)
         given = [
             (valve, duty, clock())
             for valve, duty in enumerate(self._wanted(now_s))
             if self._apply(valve, duty)
         ]
+        self._move_return(now_s, opens=False)
         # Measuring waits until all orders have left.
         for plan in (self._plan, replaced):
             if plan is not None and given:
                 self._measure(plan, given)
+
+    def _move_return(self, now_s: float, *, opens: bool) -> None:
+        """Order the return valve if it is to be open (or shut): opening goes ahead of the rest."""
+        if self._return is None:
+            return
+        self._return.run(now_s + _EARLY_S)
+        is_open = self._return.is_open or self._plan is None or self.fault is not None
+        if is_open == opens:
+            self._apply(self._count, 1.0 if is_open else 0.0)
 
     def _measure(self, plan: SprayPlan, given: list[tuple[int, float, float]]) -> None:
         """Note how late orders left, where the plan had said when they should."""
@@ -172,6 +194,7 @@ class TimedExecutor:
         if not self._is_running:
             return
         plan_s = None if self._plan is None else next_event_s(self._plan, now_s + _EARLY_S)
-        times = [at_s for at_s in (plan_s, self._next_own_s()) if at_s is not None]
+        return_s = None if self._return is None else self._return.next_s
+        times = [at_s for at_s in (plan_s, return_s, self._next_own_s()) if at_s is not None]
         if times:
             self._timer = asyncio.get_running_loop().call_at(min(times), self._wake)

@@ -93,8 +93,9 @@ def test_flow_of_the_duty_of_a_flow_is_that_flow(flow: float) -> None:
 def test_an_allowed_duty_is_one_that_the_valve_can_follow(duty: float) -> None:
     pwm = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
     held = allowed_duty(duty, pwm)
-    assert held in (0.0, 1.0) or pwm.duty_min <= held <= pwm.duty_max
-    assert abs(held - duty) <= 0.1 + 1e-12
+    assert held == 0.0 or pwm.duty_min <= held <= 1.0
+    assert held == duty or abs(held - duty) <= 0.1 + 1e-12
+    assert held == duty or not pwm.duty_min <= duty <= 1.0
 
 
 @given(
@@ -128,8 +129,9 @@ def test_the_geodesic_look_ahead_is_the_straight_line_of_the_frame(
     frame = LocalFrame(latitude, 10.0)
     ahead = look_ahead_point(latitude, 10.0, course_deg=course, distance_m=distance)
     east, north = frame.to_local(*ahead)
-    assert east == pytest.approx(distance * math.sin(math.radians(course)), abs=1e-4)
-    assert north == pytest.approx(distance * math.cos(math.radians(course)), abs=1e-4)
+    # PROJ keeps the frame's origin to 1e-9 degrees, 0.11 mm.
+    assert east == pytest.approx(distance * math.sin(math.radians(course)), abs=2.5e-4)
+    assert north == pytest.approx(distance * math.cos(math.radians(course)), abs=2.5e-4)
 
 
 def turned(x: float, y: float, angle_deg: float, shift: tuple[float, float]) -> tuple[float, float]:

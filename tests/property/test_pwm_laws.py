@@ -10,7 +10,6 @@ from companion.output.pwm import Edge, PulseEngine
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 T = PWM.period_s
-REACHABLE = 1.0 - PWM.min_off_s / T - 1e-6
 
 
 def plan(duty: float, *changes: TimedChange, lease_until_s: float = 100.0) -> SprayPlan:
@@ -46,7 +45,7 @@ def open_spans(edges: list[Edge], until_s: float) -> np.ndarray:
 
 
 @settings(max_examples=60, deadline=None)
-@given(duty=st.one_of(st.floats(0.0, REACHABLE), st.just(1.0)))
+@given(duty=st.floats(0.0, 1.0))
 def test_the_mean_duty_is_right_within_half_a_percent_over_twenty_periods(duty: float) -> None:
     engine = PulseEngine(PWM, 1, start_s=0.0)
     engine.submit(plan(duty), now_s=0.0)

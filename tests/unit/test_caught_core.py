@@ -24,6 +24,7 @@ from companion.core.types import (
     VehicleState,
 )
 from companion.output.pwm import RESTART_DUTY
+from sitl.board import SERVO_FRAME_S
 from tests.builders import LAG, SPRAYING, setup
 
 NAN = math.nan
@@ -261,9 +262,16 @@ def test_no_trim_holds_up_a_change_that_is_nearly_due() -> None:
 
 @pytest.mark.parametrize("in_force", [0.47, 0.53])
 def test_a_trim_stays_below_what_restarts_a_driver_board(in_force: float) -> None:
-    ((_, duty),) = trimmed(in_force)
-    assert 0.0 < abs(duty - in_force) < RESTART_DUTY
-    assert abs(duty - 0.5) < abs(in_force - 0.5)
+    (first_s, first), (second_s, second) = trimmed(in_force)
+    for before, after in ((in_force, first), (first, second)):
+        assert 0.0 < abs(after - before) < RESTART_DUTY
+        assert abs(after - 0.5) < abs(before - 0.5)
+    assert second_s - first_s > SERVO_FRAME_S  # no frame holds both
+
+
+def test_the_second_half_of_a_trim_holds_up_no_change() -> None:
+    halves = trimmed(0.53, (1.15, 30.0))
+    assert [at_s for at_s, _ in halves] == [1.0, pytest.approx(1.05)]
 
 
 def test_no_change_is_planned_beyond_the_lease() -> None:

@@ -15,7 +15,7 @@ import shapely
 from companion.core.boom import Boom, Valve
 from companion.core.controller import Memory, step
 from companion.core.crossings import Route, find_routes, predict
-from companion.core.estimator import ACCELERATION_TIME_S
+from companion.core.motion import CRUISE
 from companion.core.nozzle import FlowCurve
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import VehicleState
@@ -115,8 +115,8 @@ def test_a_braking_aircraft_meets_the_boundary_when_its_motion_takes_it_there() 
     state = flying(10.0, 10.0, acceleration_east_m_s2=-2.5)
     (found,) = routes_of(Prescription(zones), state, one_valve(), ahead_s=1.0)
     dt_s = found[1][0] - 10.0
-    gained = ACCELERATION_TIME_S * (1.0 - math.exp(-dt_s / ACCELERATION_TIME_S))
-    there = 10.0 + 5.0 * dt_s - 2.5 * ACCELERATION_TIME_S * (dt_s - gained)
+    gained = CRUISE.fade_s * (1.0 - math.exp(-dt_s / CRUISE.fade_s))
+    there = 10.0 + 5.0 * dt_s - 2.5 * CRUISE.fade_s * (dt_s - gained)
     # One chord of evenly changing speed stands for the fading acceleration: 5 cm.
     assert there == pytest.approx(12.0, abs=0.07)
 
@@ -130,7 +130,7 @@ def test_the_speed_at_a_boundary_is_that_of_the_motion_there() -> None:
         Prescription(zones), flying(10.0, 10.0, acceleration_east_m_s2=-2.5), one_valve(),
         back_s=0.3, ahead_s=1.0, border="volume", border_buffer_m=0.1, across="centre",
     )  # fmt: skip
-    gained = ACCELERATION_TIME_S * (1.0 - math.exp(-(found[1].at_s - 10.0) / ACCELERATION_TIME_S))
+    gained = CRUISE.fade_s * (1.0 - math.exp(-(found[1].at_s - 10.0) / CRUISE.fade_s))
     assert found[1].speed_m_s == pytest.approx(5.0 - 2.5 * gained, abs=0.15)
 
 

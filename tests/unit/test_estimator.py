@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from companion.core.estimator import CONFIRM_COUNT, Track, estimate, observe
+from companion.core.motion import CRUISE, MANOEUVRE, Belief, carried
 from companion.core.types import (
+    ClockReport,
     EstimatorReport,
     Fix,
     GnssReport,
@@ -71,18 +73,17 @@ def test_two_predictions_in_a_row_are_one_and_none_is_identity() -> None:
     at = track.motion.time_s
     now = estimate(track, at)
     assert now is not None
-    assert now.east_m == track.motion.east_m
-    assert now.velocity_east_m_s == track.motion.velocity_east_m_s
-    moved = replace(
-        track,
-        motion=replace(
-            track.motion,
-            time_s=at + 0.2,
-            east_m=estimate(track, at + 0.2).east_m,  # type: ignore[union-attr]
-            velocity_east_m_s=estimate(track, at + 0.2).velocity_east_m_s,  # type: ignore[union-attr]
-            acceleration_east_m_s2=estimate(track, at + 0.2).acceleration_east_m_s2,  # type: ignore[union-attr]
-        ),
-    )
+    east, _ = track.motion.after(0.0)
+    assert (now.east_m, now.velocity_east_m_s) == (east.position_m, east.velocity_m_s)
+    motion = track.motion
+    carried_on = {
+        name: Belief(carried(model, belief.east, 0.2), carried(model, belief.north, 0.2))
+        for name, model, belief in (
+            ("cruise", CRUISE, motion.cruise),
+            ("manoeuvre", MANOEUVRE, motion.manoeuvre),
+        )
+    }
+    moved = replace(track, motion=replace(motion, time_s=at + 0.2, **carried_on))
     once, twice = estimate(track, at + 0.5), estimate(moved, at + 0.5)
     assert once is not None
     assert twice is not None
@@ -323,3 +324,156 @@ def test_reports_are_kept_and_grow_old() -> None:
 
 def test_nothing_heard_is_no_state() -> None:
     assert estimate(Track(), 10.0) is None
+
+
+# ------------------------------------------------------------------------------------ TIMESYNC
+
+WAY_S = 0.06
+
+
+def over_the_wire(now_s: float, east_m: float, **change: object) -> Telemetry:
+    """Return a position of `now_s` that was `WAY_S` on its way."""
+    return position(now_s, east_m, 0.0, **{"received_s": now_s + WAY_S, **change})
+
+
+def answer(now_s: float, **change: float) -> ClockReport:
+    given = {"received_s": now_s, "offset_s": BOOT, "round_trip_s": 0.01}
+    return ClockReport(**(given | change))
+
+
+def ahead_m(track: Track, now_s: float) -> float:
+    """Return how far the estimate is from the truth: 5 m/s eastwards, 0 at 10 s."""
+    state = estimate(track, now_s)
+    assert state is not None
+    return state.east_m - 5.0 * (now_s - 10.0)
+
+
+def flown(
+    count: int,
+    *answers: ClockReport,
+    track: Track | None = None,
+    first_s: float = 10.0,
+    hz: float = 10.0,
+) -> tuple[Track, list[float]]:
+    """Return the track after `count` delayed positions, and the error at each."""
+    track = heard(*answers, track=track)
+    errors = []
+    for i in range(count):
+        now_s = first_s + i / hz
+        track = heard(over_the_wire(now_s, 5.0 * (now_s - 10.0)), track=track)
+        errors.append(ahead_m(track, now_s + WAY_S))
+    return track, errors
+
+
+SPRAYING = heard(heartbeat(9.0), replace(ENABLE, received_s=9.0))
+
+
+def test_without_timesync_the_way_of_a_message_is_in_its_age() -> None:
+    _, errors = flown(30)
+    assert errors[-1] == pytest.approx(-5.0 * WAY_S, abs=1e-3)
+
+
+def test_timesync_takes_the_way_of_a_message_out_of_its_age() -> None:
+    _, errors = flown(30, answer(10.0))
+    assert np.abs(errors).max() < 1e-3
+
+
+def test_a_position_counts_its_age_from_its_sending() -> None:
+    track, _ = flown(10, answer(10.0))
+    state = estimate(track, 11.0)
+    assert state is not None
+    assert state.position_received_s == pytest.approx(10.9)
+
+
+def test_an_answer_while_nothing_is_sprayed_counts_at_once_and_is_no_motion() -> None:
+    track, _ = flown(30)
+    track, errors = flown(5, answer(13.0), track=track, first_s=13.0)
+    assert np.abs(errors).max() < 1e-3
+    state = estimate(track, 13.5)
+    assert state is not None
+    assert state.velocity_east_m_s == pytest.approx(5.0, abs=1e-6)
+    assert state.position_valid
+
+
+def test_an_answer_while_spraying_makes_no_jump() -> None:
+    track, errors = flown(30, track=SPRAYING)
+    track, after = flown(30, answer(13.0), track=track, first_s=13.0)
+    steps = np.diff([errors[-1], *after])
+    assert np.abs(steps).max() <= 5.0 * 0.005 * 0.1 + 1e-6
+    assert after[-1] - errors[-1] == pytest.approx(5.0 * 0.005 * 3.0, rel=0.05)
+    state = estimate(track, 16.0)
+    assert state is not None
+    assert state.velocity_east_m_s == pytest.approx(5.0, abs=1e-6)
+
+
+def test_answers_that_stop_leave_the_last_delay_and_make_no_jump() -> None:
+    track, errors = flown(30, answer(10.0), track=SPRAYING)
+    track, old = flown(100, track=track, first_s=13.0)  # the answer is 5 s old after 2 s
+    assert np.abs(np.array([*errors, *old])).max() < 1e-3
+    assert track.clock is not None
+    assert track.clock.delay_s == pytest.approx(WAY_S, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"offset_s": math.nan},
+        {"offset_s": -math.inf},
+        {"round_trip_s": math.nan},
+        {"round_trip_s": -0.001},
+        {"round_trip_s": 0.4},
+        {"received_s": 4.0},  # too old
+        {"received_s": math.nan},
+        {"offset_s": BOOT + WAY_S + 0.02},  # the positions would have come before they were sent
+        {"offset_s": BOOT - 0.6},
+        {"offset_s": BOOT - 1.7e9},  # UTC
+    ],
+)
+def test_an_answer_that_cannot_be_true_is_not_believed(change: dict[str, float]) -> None:
+    told, _ = flown(8, answer(10.0, **change))
+    plain, _ = flown(8)
+    assert told.motion == plain.motion
+    assert told.clock == plain.clock
+
+
+def test_a_reboot_forgets_what_was_known_of_the_clock() -> None:
+    track, _ = flown(30, answer(10.0))
+    late_s = 0.7  # a little less than the uptime: the old answer would look like a delay
+    track = heard(over_the_wire(13.0, 15.0, boot_s=10.0 - BOOT - late_s), track=track)
+    assert track.clock_report is None
+    assert track.clock is not None
+    assert track.clock.delay_s == 0.0
+
+
+def test_a_message_that_is_a_second_late_moves_no_clock_that_timesync_confirms() -> None:
+    track, _ = flown(30, answer(10.0), track=SPRAYING)
+    stuck = replace(over_the_wire(13.0, 15.0), received_s=14.5)
+    track = heard(answer(14.0), stuck, track=track)
+    assert ahead_m(track, 14.5) == pytest.approx(0.0, abs=0.01)
+    state = estimate(track, 14.5)
+    assert state is not None
+    assert state.position_received_s == pytest.approx(13.0, abs=0.01)  # stale: the limit closes
+
+
+@pytest.mark.parametrize("hz", [5.0, 10.0, 20.0, 50.0])
+def test_the_rate_of_positions_does_not_matter_on_a_steady_line(hz: float) -> None:
+    _, errors = flown(int(3 * hz), answer(10.0), track=SPRAYING, hz=hz)
+    assert np.abs(errors).max() < 1e-3
+
+
+def test_a_first_message_that_was_late_does_not_stay_in_the_clock() -> None:
+    track = heard(replace(over_the_wire(9.9, -0.5), received_s=9.9 + WAY_S + 0.12))
+    _, errors = flown(10, track=track)
+    assert errors[-1] == pytest.approx(-5.0 * WAY_S, abs=0.01)
+
+
+def test_a_clock_that_begins_anew_is_no_motion() -> None:
+    track, _ = flown(30)  # 60 ms on the way, and then 10
+    for i in range(3):
+        now_s = 13.0 + i / 10
+        track = heard(position(now_s, 5.0 * (now_s - 10.0), received_s=now_s + 0.01), track=track)
+        state = estimate(track, now_s + 0.01)
+        assert state is not None
+        assert state.position_valid
+        assert state.velocity_east_m_s == pytest.approx(5.0, abs=1e-6)
+        assert ahead_m(track, now_s + 0.01) == pytest.approx(-0.05, abs=1e-3)

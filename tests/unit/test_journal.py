@@ -24,6 +24,7 @@ import shapely
 from companion.core.controller import Memory, Setup, step
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import (
+    ClockReport,
     Decision,
     EstimatorReport,
     Fix,
@@ -34,6 +35,7 @@ from companion.core.types import (
     LandedReport,
     OperatorCommand,
     OutputReport,
+    RateOverride,
     RcReport,
     SpeedReport,
     Telemetry,
@@ -71,6 +73,8 @@ INPUTS: list[Input] = [
     OperatorCommand(received_s=NAN, enable=True, source="web"),
     OutputReport(received_s=1.8, healthy=False, text="änderung"),
     FlowReport(received_s=1.9, volume_ml=0.1 + 0.2),
+    ClockReport(received_s=2.1, offset_s=-1 / 3, round_trip_s=NAN),
+    RateOverride(received_s=2.0, percent=NAN),
 ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from hypothesis import strategies as st
 from companion.assembly import build_setup
 from companion.config import load
 from companion.core import types as core_types
-from companion.core.controller import Memory, step
+from companion.core.controller import TRIM_AGE_S, Memory, step
 from companion.core.types import FlowReport, Input, SprayPlan, Telemetry, TimedChange
 from companion.errors import ConfigError
 from companion.output.pwm import PulseEngine
@@ -148,6 +149,9 @@ def test_the_rig_finds_the_pumps_true_lags(profile: PlantProfile) -> None:
     for name in ("on_s", "off_s", "up_s", "down_s"):
         assert getattr(found, name) == pytest.approx(getattr(true, name), abs=0.004), name
     assert found.up_s > found.down_s + 0.4
+    assert profile.pump is not None
+    assert found.up_time_s == pytest.approx(profile.pump.up_s, abs=0.004)
+    assert found.down_time_s == pytest.approx(profile.pump.down_s, abs=0.004)
     assert found.off_end_s == pytest.approx(true.off_end_s, abs=0.02)
 
 
@@ -294,9 +298,14 @@ def test_the_core_is_given_inputs_of_numbers_and_words_and_nothing_else() -> Non
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["gaining", "braking"])
 def test_a_trim_leads_by_the_lag_of_its_own_direction(sign: float) -> None:
     mine = setup(PUMP)
-    state = flying(10.0, 30.0, acceleration_east_m_s2=0.02 * sign)
-    lag_s = (mine.lag.up_s if sign > 0.0 else mine.lag.down_s) + 0.05
-    wanted = 5.0 + 0.02 * sign * lag_s
+    state = flying(10.0, 30.0, acceleration_east_m_s2=0.1 * sign)
+    up = sign > 0.0
+    constant_s = mine.lag.up_time_s if up else mine.lag.down_time_s
+    acts_s = (mine.timing.up_s if up else mine.timing.down_s) - constant_s
+    acts_s += 0.5 * mine.pwm.period_s + TRIM_AGE_S
+    left = math.exp(-acts_s / state.acceleration_fade_s)
+    gained_s = state.acceleration_fade_s * (1.0 - left) + constant_s * left
+    wanted = 5.0 + 0.1 * sign * gained_s
     curve = mine.nozzle_sets[0].curve
     steady = curve.duty_for(18.0 * 6.0 * 5.0 * 60.0 / 10_000.0)
     plan = SprayPlan(sequence=1, issued_s=9.9, duty=(steady,), changes=(), lease_until_s=10.2)
@@ -308,7 +317,8 @@ def test_a_trim_leads_by_the_lag_of_its_own_direction(sign: float) -> None:
 
 
 def test_a_pumps_steps_are_ordered_seconds_ahead_and_its_valve_at_the_border() -> None:
-    mine = setup(PUMP)
+    # Not driven past its target: the order is the target, its lead the whole lag.
+    mine = setup(PUMP, lag=replace(measure(PUMP), up_time_s=0.0, down_time_s=0.0))
     for east_m, speed_lag_s, rate in ((60.0, mine.lag.up_s, 23.4), (120.0, mine.lag.down_s, 16.4)):
         state = flying(10.0, east_m - 5.0 * (speed_lag_s + 0.2))
         decision, _ = step(mine, state, Memory(), 10.0)

@@ -184,16 +184,83 @@ async def test_orders_are_refreshed_in_turns(wire: Wire) -> None:
     assert wire.times_s[2] - wire.times_s[0] >= 0.075
 
 
-async def test_a_dithered_pulse_moves_at_every_refresh_while_its_valve_is_open(wire: Wire) -> None:
-    options = ServoOptions(channels=CHANNELS, refresh_s=0.06, dither_us=4)
+async def test_a_dithered_pulse_moves_to_and_fro_while_its_valve_is_open(wire: Wire) -> None:
+    options = ServoOptions(channels=CHANNELS, refresh_s=0.3, dither_us=8)
     executor = ServoExecutor(options, wire.order)
     await executor.start()
     executor.submit(plan(1, 0.5, 0.0))
     wire.forget()
-    await wire.until(lambda: len(wire.orders) >= 6)
+    await wire.until(lambda: len(wire.orders) >= 8)
     await executor.stop()
-    assert [pulse for channel, pulse in wire.orders[:6] if channel == 9] == [1496, 1500, 1496]
-    assert [pulse for channel, pulse in wire.orders[:6] if channel == 10] == [1000, 1000, 1000]
+    moved = [pulse for channel, pulse in wire.orders if channel == 9]
+    assert moved[:5] == [1504, 1496, 1504, 1496, 1504]
+    times_s = [at for at, order in zip(wire.times_s, wire.orders, strict=True) if order[0] == 9]
+    assert times_s[4] - times_s[0] >= 0.39
+    # The closed one is only refreshed, and stands still.
+    assert set(wire.orders) == {(9, 1504), (9, 1496), (10, 1000), (9, 1000)}
+
+
+async def test_what_dithers_is_not_refreshed_besides(wire: Wire) -> None:
+    options = ServoOptions(channels=(9,), refresh_s=0.05, dither_us=8)
+    executor = ServoExecutor(options, wire.order)
+    await executor.start()
+    executor.submit(plan(1, 0.5))
+    wire.forget()
+    await wire.until(lambda: len(wire.orders) >= 4)
+    await executor.stop()
+    assert wire.times_s[3] - wire.times_s[0] >= 0.29
+    assert [pulse for _, pulse in wire.orders[:4]] == [1504, 1496, 1504, 1496]
+
+
+async def test_all_outputs_dither_at_once_where_one_order_carries_them(wire: Wire) -> None:
+    options = ServoOptions(channels=CHANNELS, dither_us=8, dithers_together=True)
+    executor = ServoExecutor(options, wire.order)
+    await executor.start()
+    executor.submit(plan(1, 0.5, 1.0))
+    wire.forget()
+    await wire.until(lambda: len(wire.orders) >= 4)
+    await executor.stop()
+    assert wire.orders[:4] == [(9, 1504), (10, 2000), (9, 1496), (10, 1992)]
+    assert wire.times_s[1] - wire.times_s[0] < wire.times_s[2] - wire.times_s[1]
+
+
+async def test_the_end_of_the_lease_ends_the_dither(wire: Wire) -> None:
+    executor = ServoExecutor(ServoOptions(channels=(9,), dither_us=8), wire.order)
+    await executor.start()
+    executor.submit(plan(1, 0.5, lease_s=0.15))
+    wire.forget()
+    await wire.until(lambda: (9, 1000) in wire.orders)
+    wire.forget()
+    await asyncio.sleep(0.25)
+    assert wire.orders == []
+    await executor.stop()
+
+
+async def test_a_return_valve_stands_still(wire: Wire) -> None:
+    options = ServoOptions(channels=(9,), return_channel=15, dither_us=8, refresh_s=0.05)
+    executor = ServoExecutor(options, wire.order)
+    await executor.start()
+    await wire.until(lambda: len(wire.orders) >= 8)
+    await executor.stop()
+    assert {pulse for channel, pulse in wire.orders if channel == 15} <= {1000, 2000}
+
+
+@pytest.mark.parametrize("dither_us", [1, 3, 8, 50])
+@pytest.mark.parametrize("ends", [(1000, 2000), (1900, 1100)])
+def test_a_dither_moves_by_its_width_between_closed_and_full(
+    dither_us: int, ends: tuple[int, int]
+) -> None:
+    closed_us, full_us = ends
+    options = ServoOptions(channels=(9,), closed_us=closed_us, full_us=full_us, dither_us=dither_us)
+    for duty in (0.2, 0.5, 0.9, 0.999, 1.0):
+        down, up = (
+            options.dithered_us(options.pulse_us(duty), is_up=is_up) for is_up in (False, True)
+        )
+        assert abs(up - down) == dither_us
+        assert abs(up - closed_us) > abs(down - closed_us)
+        assert abs(up - closed_us) <= abs(full_us - closed_us)
+        if duty < 0.95:
+            assert abs((up + down) / 2 - options.pulse_us(duty)) <= 0.5
 
 
 async def test_what_could_not_leave_is_ordered_by_the_next_plan(

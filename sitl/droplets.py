@@ -1,0 +1,212 @@
+"""Where the deposit lands in wind, with and without the controller's offset: the check of it.
+
+    python -m sitl.droplets
+
+The first table compares the controller's offset with ballistic droplets (`sitl/ballistics.py`)
+that fall as assumed, and otherwise. The second flies the field of Wang et al. 2024 with and
+without the offset, moves the liquid to where its droplets land, and judges the ground.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from statistics import fmean
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from analysis.border import off_target_ml
+from analysis.evaluation import evaluate
+from analysis.flight_record import Fidelity, FlightRecord
+from analysis.strips import strips_of
+from companion.cli.answer import AsJson, answer
+from companion.core.types import Input, WindReport
+from sitl.ballistics import Landing
+from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
+from sitl.disturbances import on_ground
+from sitl.droplet_shift import SPEED_M_S, TRUTHS, WIND_M_S, Shift, Truth, law, shift_of
+from sitl.flight import FlightOptions, fly
+from sitl.profile import load_profile
+
+PROFILE = "wang-2024"
+WIND_RATE_HZ = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weather:
+    """A steady wind along and across the passes, and how the droplets fall in it."""
+
+    label: str
+    along_m_s: float
+    across_m_s: float
+    truth: Truth = TRUTHS[1]
+
+
+WEATHERS = (
+    Weather(label="still air", along_m_s=0.0, across_m_s=0.0),
+    Weather(label="2 m/s along the passes", along_m_s=WIND_M_S, across_m_s=0.0),
+    Weather(label="2 m/s across", along_m_s=0.0, across_m_s=WIND_M_S),
+    Weather(label="2 m/s at 45 degrees", along_m_s=2.0**0.5, across_m_s=2.0**0.5),
+    Weather(
+        label="2 m/s along, fading (0.03 m)",
+        along_m_s=WIND_M_S,
+        across_m_s=0.0,
+        truth=Truth(label="fading", roughness_m=0.03),
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ground:
+    """How well the ground was served, with the liquid where it landed; means over the seeds.
+
+    `lag_` is at the mean place of the droplets; `off_target_ml` is over all their sizes.
+    """
+
+    label: str
+    corrected: bool
+    lag_mean_abs_m: float
+    lag_worst_m: float
+    misapplied_percent: float
+    off_target_ml: float
+    applied_ml: float
+
+
+def ground_of(
+    weather: Weather, *, corrected: bool, seeds: Iterable[int], fidelity: Fidelity
+) -> Ground:
+    """Return the figures of the flights of some seeds in one weather."""
+    wind = on_ground(demo_setup(SPEED_M_S).frame, weather.along_m_s, weather.across_m_s)
+    ahead = on_ground(demo_setup(SPEED_M_S).frame, SPEED_M_S, 0.0)
+    ways = [weather.truth.landing(wind, (sign * ahead[0], sign * ahead[1])) for sign in (1, -1)]
+    lags, worst, misapplied, outside, applied = [], [], [], [], []
+    for seed in seeds:
+        record = flown(wind, corrected=corrected, seed=seed, fidelity=fidelity)
+        found = evaluate(landed(record, ways, ahead))
+        lags.append(found.lag_distance_m.mean_abs or 0.0)
+        worst.append(found.lag_distance_m.max_abs or 0.0)
+        misapplied.append(found.misapplied_percent or 0.0)
+        applied.append(found.applied_ml)
+        for size in range(len(ways[0].east_m)):
+            one = landed(record, ways, ahead, size=size)
+            outside.append(off_target_ml(strips_of(one), one.prescription))
+    return Ground(
+        label=weather.label,
+        corrected=corrected,
+        lag_mean_abs_m=fmean(lags),
+        lag_worst_m=max(worst),
+        misapplied_percent=fmean(misapplied),
+        off_target_ml=fmean(outside),
+        applied_ml=fmean(applied),
+    )
+
+
+def flown(
+    wind_m_s: tuple[float, float], *, corrected: bool, seed: int, fidelity: Fidelity
+) -> FlightRecord:
+    """Return the truth of a flight whose controller hears of the wind at the nozzles."""
+    profile, setup = load_profile(PROFILE), demo_setup(SPEED_M_S)
+    result = fly(
+        replace(setup, lag=demo_lags(profile, "gpio"), drift=law() if corrected else None),
+        demo_trajectory(SPEED_M_S, seed),
+        profile,
+        FlightOptions(fidelity=fidelity, seed=seed),
+        speed_m_s=SPEED_M_S,
+        disturb=lambda items: with_wind(items, wind_m_s),
+    )
+    return result.record
+
+
+def with_wind(items: Iterator[Input], wind_m_s: tuple[float, float]) -> Iterator[Input]:
+    """Yield the inputs with a report of the wind every half second."""
+    due_s = -math.inf
+    for item in items:
+        if item.received_s >= due_s:
+            due_s = item.received_s + 1.0 / WIND_RATE_HZ
+            yield WindReport(
+                received_s=item.received_s,
+                speed_m_s=math.hypot(*wind_m_s),
+                east_m_s=wind_m_s[0],
+                north_m_s=wind_m_s[1],
+            )
+        yield item
+
+
+def landed(
+    record: FlightRecord,
+    ways: list[Landing],
+    ahead: tuple[float, float],
+    *,
+    size: int | None = None,
+) -> FlightRecord:
+    """Return the flight with the path that would have put its liquid straight below.
+
+    `ways` are the landings of a pass ahead and of one back; all sizes land at their mean place,
+    or only one is asked for.
+    """
+    chosen = slice(None) if size is None else slice(size, size + 1)
+    gained = np.gradient(record.east_m) * ahead[0] + np.gradient(record.north_m) * ahead[1]
+    moved = [
+        np.where(gained >= 0.0, *(float(getattr(way, name)[chosen].mean()) for way in ways))
+        for name in ("east_m", "north_m")
+    ]
+    return replace(record, east_m=record.east_m + moved[0], north_m=record.north_m + moved[1])
+
+
+def tables(shifts: Iterable[Shift], grounds: Iterable[Ground]) -> Iterator[str]:
+    """Yield both tables, as the page has them."""
+    yield "| Droplets fall | Shift [m] | of most [m] | Carry [m] | Left, corrected [m] |"
+    yield "|---|---:|---:|---:|---:|"
+    for row in shifts:
+        yield (
+            f"| {row.label} | {row.shift_m:.2f} | {row.low_m:.2f} to {row.high_m:.2f} "
+            f"| {row.carry_m:.2f} | {row.left_m:.2f} |"
+        )
+    yield ""
+    yield (
+        "| Weather | Offset | Lag, abs [m] | Worst [m] | Misapplied [%] | Outside [mL] "
+        "| Applied [mL] |"
+    )
+    yield "|---|---|---:|---:|---:|---:|---:|"
+    for each in grounds:
+        yield (
+            f"| {each.label} | {'on' if each.corrected else 'off'} | {each.lag_mean_abs_m:.3f} "
+            f"| {each.lag_worst_m:.3f} | {each.misapplied_percent:.2f} "
+            f"| {each.off_target_ml:.1f} | {each.applied_ml:.0f} |"
+        )
+
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(epilog="Example: python -m sitl.droplets --seeds 3")
+def droplets(
+    seeds: Annotated[int, typer.Option(min=0, max=100, help="Flights of seeds 1 to N.")] = 3,
+    averaged: Annotated[
+        bool, typer.Option("--averaged", help="The mean of the pulses instead of pulses.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Say where the deposit lands in wind, with and without the controller's offset."""
+    shifts = [shift_of(truth) for truth in TRUTHS]
+    grounds = [
+        ground_of(
+            weather,
+            corrected=corrected,
+            seeds=range(1, seeds + 1),
+            fidelity="averaged" if averaged else "pulsed",
+        )
+        for weather in WEATHERS
+        for corrected in (False, True)
+        if seeds
+    ]
+    result = {"shifts": [asdict(row) for row in shifts], "flights": [asdict(g) for g in grounds]}
+    answer(result, tables(shifts, grounds), as_json=as_json)
+
+
+if __name__ == "__main__":
+    sys.exit(app())
