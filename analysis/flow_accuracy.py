@@ -37,8 +37,17 @@ class FlowAccuracy:
     starting_percent: float | None
 
 
-def flow_accuracy(strips: Sequence[Strip]) -> FlowAccuracy:
-    """Return P1's SA of the total flow, one-period mean, sampled every 10 ms."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowSamples:
+    """P1's data points: SA_k [%], its time, and the one rate under all strips (else NaN)."""
+
+    time_s: Floats
+    accuracy_percent: Floats
+    rate_l_ha: Floats
+
+
+def flow_samples(strips: Sequence[Strip]) -> FlowSamples:
+    """Return SA_k of the total flow, one-period mean, every 10 ms in the field."""
     track = strips[0].track
     every = max(round(SAMPLE_S / track.step_s), 1)
     time_s = track.time_s[::every]
@@ -46,15 +55,28 @@ def flow_accuracy(strips: Sequence[Strip]) -> FlowAccuracy:
     asked = np.zeros(len(time_s))
     inside = np.ones(len(time_s), dtype=np.bool_)
     moving = track.speed_m_s[::every] > SPEED_MIN_M_S
+    rate_l_ha = strips[0].rates_at(time_s)
     for strip in strips:
         each = strip.track
+        rates = strip.rates_at(time_s)
         given += rise_over(each.volume_ml, each.period_steps)[::every] / each.period_s
         metres_s = each.speed_m_s[::every] * each.across_m[::every]
-        asked += strip.rates_at(time_s) * ML_M_PER_L_HA_M * metres_s
+        asked += rates * ML_M_PER_L_HA_M * metres_s
         inside &= strip.inside_at(time_s)
+        rate_l_ha = np.where(rates == rate_l_ha, rate_l_ha, np.nan)
     counts = inside & moving & (asked > 0.0)
-    accuracy = 100.0 * (1.0 - np.abs(given - asked)[counts] / asked[counts])
-    changed_s, started_s = _since(strips, time_s[counts])
+    return FlowSamples(
+        time_s=time_s[counts],
+        accuracy_percent=100.0 * (1.0 - np.abs(given - asked)[counts] / asked[counts]),
+        rate_l_ha=rate_l_ha[counts],
+    )
+
+
+def flow_accuracy(strips: Sequence[Strip]) -> FlowAccuracy:
+    """Return P1's SA of the total flow, one-period mean, sampled every 10 ms."""
+    samples = flow_samples(strips)
+    accuracy = samples.accuracy_percent
+    changed_s, started_s = _since(strips, samples.time_s)
     return FlowAccuracy(
         all_percent=_mean(accuracy),
         settled_percent=_mean(accuracy[changed_s >= SETTLED_AFTER_S]),

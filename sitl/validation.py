@@ -1,0 +1,105 @@
+"""The twin against what Wang et al. 2024 (P1) measured with a real sprayer, as a command.
+
+    python -m sitl.validation --out docs
+
+`validation_flights` flies, `validation_page` and `validation_pictures` show.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import shlex
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.cli.answer import AsJson, answer, note
+from companion.errors import ConfigError, VrsprayError
+from sitl.validation_flights import SPEEDS_M_S, WAYS, Validation, validate
+from sitl.validation_page import COMMAND, summary_lines, write_page
+
+IMAGES = "images"
+NOTE_EVERY = 30
+
+
+class _Told:
+    """Says on stderr how far it is; it takes minutes."""
+
+    def __init__(self, total: int) -> None:
+        self._total, self._done = total, 0
+
+    def one(self) -> None:
+        """Count one flight."""
+        self._done += 1
+        if self._done % NOTE_EVERY == 0:
+            note(f"{self._done} of {self._total} flights")
+
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+@app.command(epilog="Example: python -m sitl.validation --seeds 20 --out docs")
+def validation(
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds 1 to N.")] = 20,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write validation.md and images/validation*.png there."),
+    ] = None,
+    processes: Annotated[int, typer.Option(min=1, max=2, help="Flights at a time.")] = 2,
+    as_json: AsJson = False,
+) -> None:
+    """Fly P1's controller and ours over P1's field, beside what P1 measured."""
+    if out is not None:
+        check_folder(out)
+    result = validate(
+        range(1, seeds + 1),
+        processes=processes,
+        on_flown=_Told(len(WAYS) * len(SPEEDS_M_S) * seeds).one,
+    )
+    if out is not None:
+        command = f"{COMMAND} {shlex.join(sys.argv[1:])}".strip()
+        write_all(result, out, command=command)
+    answer(result.as_json(), summary_lines(result), as_json=as_json)
+    if not all(result.bounds().values()):
+        raise VrsprayError("the twin is not within its bounds of what P1 measured")
+
+
+def main() -> int:
+    """Run it; what a user did wrong is one line."""
+    try:
+        app()
+    except ConfigError as error:
+        note(f"error: {error}")
+        return 2
+    except VrsprayError as error:
+        note(f"error: {error}")
+        return 1
+    return 0
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse at once what could not be written after minutes of flying.
+
+    Raises:
+        ConfigError: without matplotlib, or where the folder cannot be made.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ConfigError("no pictures without matplotlib; pip install vrspray[plot]")
+    try:
+        (folder / IMAGES).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made ({error.strerror or error})") from None
+
+
+def write_all(result: Validation, folder: Path, *, command: str) -> None:
+    """Write the page and its pictures."""
+    from sitl.validation_pictures import draw_pictures
+
+    names = draw_pictures(result, folder / IMAGES)
+    write_page(result, folder, pictures=[f"{IMAGES}/{name}" for name in names], command=command)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
