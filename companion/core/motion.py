@@ -23,8 +23,8 @@ POSITION_SD_M = 0.02
 VELOCITY_SD_M_S = 0.03
 # A position that disagrees with its prediction by more than this is a jump, not motion.
 JUMP_M = 2.0
-# A vehicle changes between cruise and manoeuvre about this often.
-CHANGE_TIME_S = 2.5
+# A vehicle changes between cruise and manoeuvre about this often (2.5 to 50 s serve alike).
+CHANGE_TIME_S = 10.0
 # No filter is ever given up: it must come back within a few messages.
 SHARE_MIN = 1e-4
 # The longest time between messages that the filters bridge, and the finest step of their gains.
