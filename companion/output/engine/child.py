@@ -1,0 +1,74 @@
+"""The engine's process as the companion has it: start, packets to it, its end."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+
+from companion.output.engine.wire import PACKET_MAX
+
+COMMAND = (sys.executable, "-m", "companion.output.engine")
+KILL_MAX_S = 0.1
+
+
+class EngineChild:
+    """A child process and the socket to it. No threads and no shell; `reap` must be called."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            file = theirs.fileno()
+            self._process = subprocess.Popen(
+                [*command, str(file), str(os.getpid())],
+                pass_fds=(file,),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+            )
+        ours.setblocking(False)
+        self.socket = ours
+        self.is_connected = True
+
+    @property
+    def pid(self) -> int:
+        """Return the process id."""
+        return self._process.pid
+
+    def send(self, packet: bytes) -> bool:
+        """Hand over a packet; False if its socket is full, or it is gone."""
+        try:
+            self.socket.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+        except OSError:
+            return False
+        return True
+
+    def packets(self) -> Iterator[bytes]:
+        """Yield what it sent; an empty packet is its end."""
+        while self.is_connected:
+            try:
+                packet = self.socket.recv(PACKET_MAX)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            yield packet
+            if not packet:
+                return
+
+    def disconnect(self) -> None:
+        """Close the socket, which ends an engine that is well."""
+        self.is_connected = False
+        self.socket.close()
+
+    def kill(self) -> None:
+        """End it whatever it does; the kernel releases its lines."""
+        self._process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(KILL_MAX_S)
+
+    def reap(self) -> None:
+        """Wait for an end that is under way."""
+        self._process.wait()

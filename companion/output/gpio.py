@@ -1,0 +1,258 @@
+"""Valves on this computer's own lines: plans go to the valve engine, its reports come back.
+
+The engine is a process of its own, see `companion/output/engine`. It closes everything when the
+lease of its last plan ends, when this process dies, and when it stood still. One that gives no
+sign of life is killed here, its lines are taken over and held closed. A fault stays one.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+from companion.core.types import SprayPlan
+from companion.errors import ActuatorError
+from companion.output.engine.child import COMMAND, EngineChild
+from companion.output.engine.lines import Lines, open_lines
+from companion.output.engine.setup import EngineSetup
+from companion.output.engine.wire import (
+    Issued,
+    Kind,
+    RefusedError,
+    Status,
+    edges_from,
+    pack,
+    pack_plan,
+    status_from,
+    unpack,
+)
+from companion.output.timed import Lateness
+
+_logger = logging.getLogger(__name__)
+
+# Four signs of life missed: together with the look at it, closed 0.35 s after it stopped.
+SILENCE_MAX_S = 0.2
+WATCH_S = 0.05
+START_MAX_S = 10.0
+STOP_MAX_S = 1.0
+# What lies behind the lease is not carried out; a period that leads up to it is.
+BEYOND_LEASE_S = 0.25
+# Edges later than this at the 99th percentile are a fault; fewer than so many prove nothing.
+LATE_MAX_S = 0.005
+_LATE_COUNT_MIN = 500
+_LATE_CHECK_S = 1.0
+_KEPT = 10_000
+
+
+class GpioExecutor:
+    """Speaks with the engine by a socket; never waits but in `start` and `stop`.
+
+    `issued` holds the last edges with their planned and actual time; `on_issued`, if set, is
+    given them as they come, some twenty times a second.
+    """
+
+    def __init__(
+        self,
+        setup: EngineSetup,
+        *,
+        command: Sequence[str] = COMMAND,
+        late_max_s: float = LATE_MAX_S,
+    ) -> None:
+        self._setup = setup
+        self._count = len(setup.wiring.valves)
+        self._command = tuple(command)
+        self._late_max_s = late_max_s
+        self._child: EngineChild | None = None
+        self._held: Lines | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._ready, self._ended = asyncio.Event(), asyncio.Event()
+        self._fault: str | None = None
+        self._sequence = -1
+        self._heard_s = self._checked_s = 0.0
+        self._is_stopping = False
+        self.status = Status()
+        self.warnings: list[str] = []
+        self.lateness = Lateness()
+        self.unsent_count = 0
+        self.issued: deque[Issued] = deque(maxlen=_KEPT)
+        self.on_issued: Callable[[Sequence[Issued]], None] | None = None
+
+    @property
+    def fault(self) -> str | None:
+        """Why the outputs cannot be trusted; None while the engine is well."""
+        return self._fault
+
+    @property
+    def lease_end_count(self) -> int:
+        """Return how often the engine closed because no plan came."""
+        return self.status.lease_ends
+
+    @property
+    def engine_pid(self) -> int | None:
+        """Return the process id of the engine."""
+        return None if self._child is None else self._child.pid
+
+    async def start(self) -> None:
+        """Start the engine; on return it has the lines, closed.
+
+        Raises:
+            ActuatorError: it does not start; the text says why.
+        """
+        loop = asyncio.get_running_loop()
+        self._child = EngineChild(self._command)
+        loop.add_reader(self._child.socket, self._read)
+        self._send(pack(Kind.SETUP, self._setup.as_bytes()))
+        try:
+            await asyncio.wait_for(self._ready.wait(), START_MAX_S)
+        except TimeoutError:
+            self._fail(f"valve engine not ready within {START_MAX_S:g} s")
+        if self._fault is not None:
+            await self.stop()
+            raise ActuatorError(self._fault)
+        for text in self.warnings:
+            _logger.warning("%s", text)
+        self._heard_s = self._checked_s = loop.time()
+        self._timer = loop.call_later(WATCH_S, self._watch)
+
+    def submit(self, plan: SprayPlan) -> None:
+        """Hand a plan to the engine; an older one changes nothing."""
+        if len(plan.duty) != self._count:
+            raise ValueError(f"plan for {len(plan.duty)} valves, executor has {self._count}")
+        if self._timer is None or self._fault is not None or plan.sequence <= self._sequence:
+            return
+        self._sequence = plan.sequence
+        end_s = plan.lease_until_s + BEYOND_LEASE_S
+        if plan.changes and not plan.changes[-1].at_s < end_s:
+            plan = replace(plan, changes=tuple(c for c in plan.changes if c.at_s < end_s))
+        try:
+            packet = pack_plan(plan)
+        except RefusedError as refused:
+            # The valves stay on the last plan until its lease ends.
+            _logger.warning("plan not sent: %s", refused)
+            self.unsent_count += 1
+            return
+        self._send(packet)
+
+    async def stop(self) -> None:
+        """Have the engine close everything and end; one that does not is killed."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        child = self._child
+        if child is not None:
+            self._is_stopping = True
+            self._send(pack(Kind.STOP))
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._ended.wait(), STOP_MAX_S)
+            if not self._ended.is_set():
+                child.kill()
+                self._take_over()
+            self._disconnect()
+            # It has closed its end or was killed: what is left of its end is short.
+            child.reap()
+            self._child = None
+            _logger.info(
+                "%d edges, latest by %.1f ms, %d plans refused, %d leases ended, %d standstills",
+                self.status.edges,
+                self.status.worst_late_us / 1e3,
+                self.status.rejected,
+                self.status.lease_ends,
+                self.status.stops,
+            )
+        if self._held is not None:
+            with suppress(OSError):
+                self._held.release()
+            self._held = None
+
+    # ------------------------------------------------------------------------------- inside
+
+    def _send(self, packet: bytes) -> None:
+        # A full socket: the engine stands still, and is soon missed.
+        if self._child is None or not self._child.send(packet):
+            self.unsent_count += 1
+
+    def _read(self) -> None:
+        """Take what the engine sent."""
+        if self._child is None:
+            return
+        for packet in self._child.packets():
+            if not packet:
+                self._engine_ended()
+                return
+            self._heard_s = asyncio.get_running_loop().time()
+            try:
+                self._take(*unpack(packet))
+            except RefusedError as refused:
+                self._fail(f"valve engine: {refused}")
+
+    def _take(self, kind: Kind, body: bytes) -> None:
+        if kind is Kind.STATUS:
+            before, self.status = self.status, status_from(body)
+            if before.rejected != self.status.rejected:
+                _logger.warning("the valve engine refused a plan")
+            if before.stops != self.status.stops:
+                _logger.warning("the valve engine stood still and closed everything")
+        elif kind is Kind.EDGES:
+            edges = edges_from(body)
+            self.issued.extend(edges)
+            for edge in edges:
+                self.lateness.add(max(edge.actual_s - edge.planned_s, 0.0))
+            if self.on_issued is not None:
+                self.on_issued(edges)
+        elif kind is Kind.READY:
+            self.warnings = list(json.loads(body)["warnings"])
+            self._ready.set()
+        elif kind is Kind.FAULT:
+            self._fail(f"valve engine: {body.decode(errors='replace')}")
+
+    def _engine_ended(self) -> None:
+        """Let go of an engine that ended, or is to: what it leaves is closed from here."""
+        self._disconnect()
+        self._ended.set()
+        if not self._is_stopping and self._child is not None:
+            self._fail("valve engine ended by itself")
+            self._child.kill()
+            self._take_over()
+
+    def _disconnect(self) -> None:
+        if self._child is not None and self._child.is_connected:
+            asyncio.get_running_loop().remove_reader(self._child.socket)
+            self._child.disconnect()
+
+    def _watch(self) -> None:
+        """Look whether the engine lives; what it sent while this process was busy counts."""
+        loop = asyncio.get_running_loop()
+        self._timer = loop.call_later(WATCH_S, self._watch)
+        self._read()
+        now_s = loop.time()
+        if not (self._ended.is_set() or now_s - self._heard_s <= SILENCE_MAX_S):
+            self._fail(f"valve engine silent for {now_s - self._heard_s:.2f} s")
+            self._engine_ended()
+        elif self._ended.is_set() and self._held is None:
+            self._take_over()
+        if not now_s - self._checked_s < _LATE_CHECK_S:
+            self._checked_s = now_s
+            late_s = self.lateness.quantile_s(0.99)
+            enough = len(self.lateness.recent_s) >= _LATE_COUNT_MIN
+            if enough and late_s is not None and not late_s <= self._late_max_s:
+                self._fail(f"valves late: 1 % of edges by more than {late_s * 1e3:.1f} ms")
+                # It closes by itself when its lease ends; this is sooner.
+                self._send(pack(Kind.STOP))
+
+    def _fail(self, text: str) -> None:
+        """Note the first fault; whoever waits for the start need not."""
+        if self._fault is None:
+            self._fault = text
+        self._ready.set()
+
+    def _take_over(self) -> None:
+        """Drive the lines of an engine that is gone to their safe levels, and hold them there."""
+        try:
+            self._held = open_lines(self._setup)
+        except ActuatorError as error:
+            _logger.error("lines cannot be taken over: %s", error)
