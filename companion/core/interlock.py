@@ -7,9 +7,27 @@ a missing value and a stale one close the valves.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from companion.core.types import Fix, Inhibit, SprayPlan, VehicleState
+
+# What closed at a limit opens again this far inside it, so that noise does not make it chatter:
+# three standard deviations and more of the filtered speed (0.03 m/s), of the height, and of the
+# mean wind; never more than this share of the room between the limits.
+SPEED_MARGIN_M_S = 0.1
+HEIGHT_MARGIN_M = 0.3
+WIND_MARGIN_M_S = 0.5
+MARGIN_SHARE_MAX = 0.1
+_WITH_MARGIN = frozenset(
+    {
+        Inhibit.SPEED_BELOW_MIN,
+        Inhibit.SPEED_ABOVE_MAX,
+        Inhibit.SPEED_DISAGREES,
+        Inhibit.HEIGHT_BELOW_MIN,
+        Inhibit.HEIGHT_ABOVE_MAX,
+        Inhibit.WIND_ABOVE_MAX,
+    }
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +48,12 @@ class Limits:
     distance_max_m: float = 20_000.0
     enable_by: frozenset[str] = frozenset({"command", "rc", "web"})
     rc_channel: int | None = None
+    speed_check_required: bool = False
+    wind_age_max_s: float = 5.0
+
+    def allows(self, mode: str | None) -> bool:
+        """Whether spraying is allowed in a mode; AUTO is also what PX4 calls MISSION."""
+        return mode in self.modes or (mode == "MISSION" and "AUTO" in self.modes)
 
 
 def inhibits(
@@ -38,16 +62,46 @@ def inhibits(
     *,
     field_bounds_m: tuple[float, float, float, float],
     now_s: float,
+    before: frozenset[Inhibit] = frozenset(),
 ) -> frozenset[Inhibit]:
-    """Return every reason not to spray now."""
+    """Return every reason not to spray now; those that held `before` take more to go away."""
     if state is None:
         return frozenset({Inhibit.NO_POSITION})
+    limits = held(limits, before)
     return frozenset(
         [
             *_operator_and_vehicle(state, limits, now_s),
+            *_wind(state, limits, now_s),
             *_position(state, limits, field_bounds_m, now_s),
             *_speed_and_height(state, limits),
         ]
+    )
+
+
+def held(limits: Limits, before: frozenset[Inhibit]) -> Limits:
+    """Return the limits for one who was outside of them: a margin further in."""
+    if not before & _WITH_MARGIN:
+        return limits
+
+    def margin(reason: Inhibit, wanted: float, room: float) -> float:
+        # A room that is no room (limits the wrong way round) stays none.
+        return min(wanted, MARGIN_SHARE_MAX * max(room, 0.0)) if reason in before else 0.0
+
+    speeds = limits.speed_max_m_s - limits.speed_min_m_s
+    heights = limits.height_max_m - limits.height_min_m
+    apart, wind = limits.speed_disagreement_max_m_s, limits.wind_max_m_s
+    return replace(
+        limits,
+        speed_min_m_s=limits.speed_min_m_s
+        + margin(Inhibit.SPEED_BELOW_MIN, SPEED_MARGIN_M_S, speeds),
+        speed_max_m_s=limits.speed_max_m_s
+        - margin(Inhibit.SPEED_ABOVE_MAX, SPEED_MARGIN_M_S, speeds),
+        speed_disagreement_max_m_s=apart - margin(Inhibit.SPEED_DISAGREES, SPEED_MARGIN_M_S, apart),
+        height_min_m=limits.height_min_m
+        + margin(Inhibit.HEIGHT_BELOW_MIN, HEIGHT_MARGIN_M, heights),
+        height_max_m=limits.height_max_m
+        - margin(Inhibit.HEIGHT_ABOVE_MAX, HEIGHT_MARGIN_M, heights),
+        wind_max_m_s=wind - margin(Inhibit.WIND_ABOVE_MAX, WIND_MARGIN_M_S, wind),
     )
 
 
@@ -61,17 +115,27 @@ def _operator_and_vehicle(state: VehicleState, limits: Limits, now_s: float) -> 
         found.append(Inhibit.STALE_HEARTBEAT)
     if not state.armed:
         found.append(Inhibit.NOT_ARMED)
-    if state.mode not in limits.modes:
+    if not limits.allows(state.mode):
         found.append(Inhibit.WRONG_MODE)
     if state.in_air is not True:
         found.append(Inhibit.NOT_IN_AIR)
     if not state.output_healthy:
         found.append(Inhibit.OUTPUT_FAULT)
+    if limits.rc_channel is not None and state.rc_switch_on is not True:
+        found.append(Inhibit.RC_SWITCH)
+    return found
+
+
+def _wind(state: VehicleState, limits: Limits, now_s: float) -> list[Inhibit]:
+    """Check the wind; one that was too strong stays so until a newer report says otherwise."""
+    found = []
     wind = state.wind_m_s
-    if (wind is None and limits.wind_required) or (
-        wind is not None and not 0.0 <= wind <= limits.wind_max_m_s
-    ):
+    if wind is not None and not 0.0 <= wind <= limits.wind_max_m_s:
         found.append(Inhibit.WIND_ABOVE_MAX)
+    heard_s = state.wind_received_s
+    is_young = heard_s is not None and -0.1 <= now_s - heard_s <= limits.wind_age_max_s
+    if limits.wind_required and not (wind is not None and is_young):
+        found.append(Inhibit.WIND_UNKNOWN)
     return found
 
 
@@ -86,6 +150,8 @@ def _position(
         found.append(Inhibit.STALE_POSITION)
     if not state.position_valid:
         found.append(Inhibit.INVALID_POSITION)
+    if state.position_frozen is not False:
+        found.append(Inhibit.POSITION_FROZEN)
     west, south, east, north = field_bounds_m
     reach = limits.distance_max_m
     if not (
@@ -114,6 +180,8 @@ def _speed_and_height(state: VehicleState, limits: Limits) -> list[Inhibit]:
     checked = state.checked_speed_m_s
     if checked is not None and not abs(checked - speed) <= limits.speed_disagreement_max_m_s:
         found.append(Inhibit.SPEED_DISAGREES)
+    if checked is None and limits.speed_check_required:
+        found.append(Inhibit.SPEED_UNCHECKED)
     if not state.height_m >= limits.height_min_m:
         found.append(Inhibit.HEIGHT_BELOW_MIN)
     if not state.height_m <= limits.height_max_m:

@@ -11,11 +11,13 @@ from collections.abc import Callable
 from typing import Any
 
 from companion.core.types import (
+    BatteryReport,
     EstimatorReport,
     Fix,
     GnssReport,
     HeartbeatReport,
     LandedReport,
+    RangeReport,
     RcReport,
     SpeedReport,
     Telemetry,
@@ -27,15 +29,19 @@ from companion.link.messages import (
     Message,
     ParamAsked,
     ParamSet,
+    ParamValue,
     PingReceived,
     Sender,
     ServoOutput,
     TimesyncReceived,
 )
+from companion.link.mission_messages import CURRENT, TRANSFERS
 from companion.link.modes import autopilot_name, mode_name
 
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+_LOOKS_DOWN = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _INT16_LIMIT = 32767
+_HEADING_MAX_CDEG = 36_000  # UINT16_MAX is not known, and so is any other above a circle
 _UINT16_MAX = 65535
 # EKF_STATUS_FLAGS: what must be set, and what must not. ArduPilot documents that variances below
 # 0.5 are good, 0.5 to 0.8 acceptable and above 1 bad.
@@ -58,7 +64,7 @@ def _position(m: Any, received_s: float) -> Telemetry:
         velocity_north_m_s=_velocity(m.vx),
         velocity_east_m_s=_velocity(m.vy),
         velocity_down_m_s=_velocity(m.vz),
-        heading_deg=None if m.hdg == _UINT16_MAX else m.hdg / 100.0,
+        heading_deg=None if m.hdg > _HEADING_MAX_CDEG else m.hdg / 100.0,
     )
 
 
@@ -73,7 +79,8 @@ def _speed(m: Any, received_s: float) -> SpeedReport:
 
 def _gnss(m: Any, received_s: float) -> GnssReport:
     # 7 (static) and 8 (precise point positioning) are three-dimensional fixes at least.
-    fix = Fix(m.fix_type) if m.fix_type <= Fix.RTK_FIXED else Fix.FIX_3D
+    known = Fix.FIX_3D if m.fix_type in (7, 8) else Fix.NONE
+    fix = Fix(m.fix_type) if m.fix_type <= Fix.RTK_FIXED else known
     accuracy_m = m.h_acc / 1000.0 if m.h_acc else None
     return GnssReport(received_s=received_s, fix=fix, horizontal_accuracy_m=accuracy_m)
 
@@ -82,8 +89,8 @@ def _ekf(m: Any, received_s: float) -> EstimatorReport:
     healthy = (
         m.flags & _EKF_NEEDED == _EKF_NEEDED
         and not m.flags & _EKF_REFUSED
-        and m.velocity_variance < _EKF_VARIANCE_MAX
-        and m.pos_horiz_variance < _EKF_VARIANCE_MAX
+        and 0.0 <= m.velocity_variance < _EKF_VARIANCE_MAX
+        and 0.0 <= m.pos_horiz_variance < _EKF_VARIANCE_MAX
     )
     return EstimatorReport(received_s=received_s, healthy=healthy)
 
@@ -92,8 +99,8 @@ def _estimator(m: Any, received_s: float) -> EstimatorReport:
     healthy = (
         m.flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED
         and not m.flags & _ESTIMATOR_REFUSED
-        and m.vel_ratio < _ESTIMATOR_RATIO_MAX
-        and m.pos_horiz_ratio < _ESTIMATOR_RATIO_MAX
+        and 0.0 <= m.vel_ratio < _ESTIMATOR_RATIO_MAX
+        and 0.0 <= m.pos_horiz_ratio < _ESTIMATOR_RATIO_MAX
     )
     return EstimatorReport(received_s=received_s, healthy=healthy)
 
@@ -131,6 +138,25 @@ def _wind_cov(m: Any, received_s: float) -> WindReport:
         speed_m_s=math.hypot(m.wind_x, m.wind_y),
         east_m_s=m.wind_y,
         north_m_s=m.wind_x,
+    )
+
+
+def _range(m: Any, received_s: float) -> RangeReport | None:
+    """Return the height over the crop; None for a sensor that looks elsewhere."""
+    if m.orientation != _LOOKS_DOWN:
+        return None
+    # Quality 1 is an invalid reading, 0 is not known; the ends of the range are no reading.
+    sees = m.signal_quality != 1 and m.min_distance < m.current_distance < m.max_distance
+    return RangeReport(received_s=received_s, height_m=m.current_distance / 100.0 if sees else None)
+
+
+def _battery(m: Any, received_s: float) -> BatteryReport:
+    # -1 is not known, in both.
+    return BatteryReport(
+        received_s=received_s,
+        battery=m.id,
+        consumed=None if m.current_consumed < 0 else float(m.current_consumed),
+        remaining_percent=None if m.battery_remaining < 0 else float(m.battery_remaining),
     )
 
 
@@ -217,22 +243,32 @@ def _param_set(m: Any, received_s: float) -> ParamSet:
     )
 
 
-Decoder = Callable[[Any, float], Message]
+def _param_value(m: Any, received_s: float) -> ParamValue:
+    return ParamValue(
+        received_s=received_s, name=m.param_id, value=m.param_value, kind=m.param_type
+    )
+
+
+Decoder = Callable[[Any, float], Message | None]
 
 # By message id. What describes the vehicle counts only when its autopilot sent it.
 FROM_VEHICLE: dict[int, Decoder] = {
     0: _heartbeat,
+    22: _param_value,
     24: _gnss,
     33: _position,
     36: _servo,
     65: _rc,
     74: _speed,
     77: _ack,
+    132: _range,
+    147: _battery,
     168: _wind,
     193: _ekf,
     230: _estimator,
     231: _wind_cov,
     245: _landed,
+    **CURRENT,
 }
 FROM_ANYONE: dict[int, Decoder] = {
     4: _ping,
@@ -242,4 +278,5 @@ FROM_ANYONE: dict[int, Decoder] = {
     75: _command,
     76: _command,
     111: _timesync,
+    **TRANSFERS,
 }

@@ -79,6 +79,7 @@ PX4_AUTO = {
     6: "LAND",
     8: "FOLLOW",
     9: "PRECLAND",
+    10: "VTOL_TAKEOFF",
 }
 
 # MAV_TYPE: quadrotor, coaxial, helicopter, hexa-, octo-, tri-, dodeca-, decarotor.

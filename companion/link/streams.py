@@ -53,9 +53,20 @@ class StreamRequest:
 _EXTENDED_STATUS, _RC_CHANNELS, _POSITION, _EXTRA2, _EXTRA3 = 2, 3, 6, 11, 12
 
 
-def wanted_streams(*, position_rate_hz: float, is_px4: bool) -> tuple[Stream, ...]:
-    """Return what the core and the statistics live on; few distinct rates, as ArduPilot likes."""
+def wanted_streams(
+    *,
+    position_rate_hz: float,
+    is_px4: bool,
+    with_mission: bool = False,
+    with_battery: bool = False,
+) -> tuple[Stream, ...]:
+    """Return what the core and the statistics live on; few distinct rates, as ArduPilot likes.
+
+    `with_battery`: also the battery monitors, of which a flow meter may be one.
+    `with_mission`: also which item is flown to; PX4 has no such stream and says it by itself.
+    """
     estimator, wind = (230, 231) if is_px4 else (193, 168)
+    with_mission = with_mission and not is_px4
     return (
         Stream(message_id=33, rate_hz=position_rate_hz, group=_POSITION),
         Stream(message_id=74, rate_hz=10.0, group=_EXTRA2),
@@ -65,6 +76,9 @@ def wanted_streams(*, position_rate_hz: float, is_px4: bool) -> tuple[Stream, ..
         Stream(message_id=65, rate_hz=5.0, group=_RC_CHANNELS),
         Stream(message_id=36, rate_hz=10.0, group=_RC_CHANNELS),
         Stream(message_id=wind, rate_hz=2.0, group=_EXTRA3, optional=True),
+        Stream(message_id=132, rate_hz=10.0, group=_EXTRA3, optional=True),  # height above the crop
+        *([Stream(message_id=147, rate_hz=5.0, group=_EXTRA3)] if with_battery else []),
+        *([Stream(message_id=42, rate_hz=2.0, group=_EXTENDED_STATUS)] if with_mission else []),
     )
 
 

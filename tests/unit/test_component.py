@@ -208,7 +208,7 @@ def test_answers_to_other_peoples_questions_are_ignored(peer: Peer, met: Compone
 # ------------------------------------------------------------------------------------- streams
 
 
-WANTED = {33: 20.0, 74: 10.0, 24: 5.0, 193: 2.0, 245: 2.0, 65: 5.0, 36: 10.0}
+WANTED = {33: 20.0, 74: 10.0, 24: 5.0, 193: 2.0, 245: 2.0, 65: 5.0, 36: 10.0, 132: 10.0}
 
 
 def test_streams_are_asked_for_when_the_vehicle_is_first_heard(

@@ -6,11 +6,13 @@ import math
 from dataclasses import replace
 
 import pytest
+from hypothesis import given as drawn
+from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
-from companion.core.interlock import Limits
+from companion.core.interlock import Limits, held
 from companion.core.types import Decision, Fix, Inhibit, VehicleState
-from tests.builders import SPRAYING, setup
+from tests.builders import SPRAYING, flying, setup
 
 NAN = math.nan
 CASES: dict[Inhibit, list[dict[str, object] | None]] = {
@@ -22,6 +24,7 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
         {"position_received_s": 10.2},
     ],
     Inhibit.INVALID_POSITION: [{"position_valid": False}],
+    Inhibit.POSITION_FROZEN: [{"position_frozen": True}, {"position_frozen": None}],
     Inhibit.FAR_FROM_FIELD: [
         {"east_m": 20_049.0},
         {"north_m": NAN},
@@ -36,22 +39,35 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
     Inhibit.ESTIMATOR_UNHEALTHY: [{"estimator_healthy": False}, {"estimator_healthy": None}],
     Inhibit.HEADING_UNKNOWN: [{"heading_deg": None}, {"heading_deg": NAN}],
     Inhibit.SPEED_UNKNOWN: [{"velocity_known": False}],
-    Inhibit.SPEED_BELOW_MIN: [{"velocity_east_m_s": 0.99, "checked_speed_m_s": None}],
-    Inhibit.SPEED_ABOVE_MAX: [{"velocity_east_m_s": 12.01, "checked_speed_m_s": None}],
+    Inhibit.SPEED_BELOW_MIN: [{"velocity_east_m_s": 0.99, "checked_speed_m_s": 1.0}],
+    Inhibit.SPEED_ABOVE_MAX: [{"velocity_east_m_s": 12.01, "checked_speed_m_s": 12.0}],
     Inhibit.SPEED_DISAGREES: [{"checked_speed_m_s": 6.01}, {"checked_speed_m_s": NAN}],
+    Inhibit.SPEED_UNCHECKED: [{"checked_speed_m_s": None}],
     Inhibit.HEIGHT_BELOW_MIN: [{"height_m": 0.99}],
     Inhibit.HEIGHT_ABOVE_MAX: [{"height_m": 10.01}],
-    Inhibit.WIND_ABOVE_MAX: [{"wind_m_s": 6.01}, {"wind_m_s": NAN}],
+    Inhibit.WIND_ABOVE_MAX: [{"wind_m_s": 6.01}, {"wind_m_s": NAN}, {"wind_m_s": math.inf}],
+    Inhibit.WIND_UNKNOWN: [
+        {"wind_m_s": None},
+        {"wind_received_s": None},
+        {"wind_received_s": 4.99},
+        {"wind_received_s": 10.2},
+        {"wind_received_s": NAN},
+    ],
+    Inhibit.RC_SWITCH: [{"rc_switch_on": False}, {"rc_switch_on": None}],
     Inhibit.OUTPUT_FAULT: [{"output_healthy": False}],
 }
 
 
-def decide(change: dict[str, object] | None, limits: Limits | None = None) -> Decision:
+# Everything that can be asked for is, and all of it is there.
+STRICT = Limits(wind_required=True, speed_check_required=True, rc_channel=7)
+READY = replace(SPRAYING, wind_m_s=3.0, wind_received_s=9.9, rc_switch_on=True)
+
+
+def decide(change: dict[str, object] | None, limits: Limits = STRICT) -> Decision:
     state: VehicleState | None = None
     if change is not None:
-        state = replace(SPRAYING, **change)  # type: ignore[arg-type]
-    given = setup() if limits is None else setup(limits=limits)
-    return step(given, state, Memory(), 10.0)[0]
+        state = replace(READY, **change)  # type: ignore[arg-type]
+    return step(setup(limits=limits), state, Memory(), 10.0)[0]
 
 
 def test_nothing_inhibits_the_reference_step() -> None:
@@ -60,8 +76,18 @@ def test_nothing_inhibits_the_reference_step() -> None:
     assert not decision.plan.is_off
 
 
+# Those that flow and pressure give: their cases are in test_detection.py.
+OF_THE_LIQUID = {
+    Inhibit.LEAK,
+    Inhibit.VALVE_STUCK_OPEN,
+    Inhibit.NO_FLOW,
+    Inhibit.TANK_EMPTY,
+    Inhibit.FLOW_FAULT,
+}
+
+
 def test_every_inhibit_has_a_case() -> None:
-    assert set(CASES) == set(Inhibit)
+    assert set(CASES) | OF_THE_LIQUID == set(Inhibit)
 
 
 @pytest.mark.parametrize(
@@ -84,8 +110,83 @@ def test_what_is_no_number_closes_every_valve(name: str, value: float) -> None:
     assert decision.plan.is_off
 
 
-def test_wind_that_is_required_and_not_known_inhibits() -> None:
-    assert decide({}, Limits(wind_required=True)).inhibits == {Inhibit.WIND_ABOVE_MAX}
+UNASKED = {
+    "wind_m_s": None,
+    "wind_received_s": None,
+    "checked_speed_m_s": None,
+    "rc_switch_on": None,
+}
+
+
+def test_what_is_not_asked_for_may_be_missing() -> None:
+    assert not decide(dict(UNASKED), Limits()).inhibits
+
+
+def test_a_wind_that_was_too_strong_stays_so_however_old() -> None:
+    state = {"wind_m_s": 6.01, "wind_received_s": -1000.0}
+    assert decide(state, Limits()).inhibits == {Inhibit.WIND_ABOVE_MAX}
+
+
+@pytest.mark.parametrize(
+    ("modes", "mode", "allowed"),
+    [
+        ({"AUTO"}, "AUTO", True),
+        ({"AUTO"}, "MISSION", True),  # what PX4 calls it
+        ({"MISSION"}, "AUTO", False),
+        ({"GUIDED"}, "MISSION", False),
+        ({"AUTO"}, "AUTO_RTL", False),
+        ({"AUTO"}, None, False),
+        ({"AUTO"}, "", False),
+    ],
+)
+def test_modes(modes: set[str], mode: str | None, allowed: bool) -> None:
+    limits = replace(STRICT, modes=frozenset(modes))
+    assert decide({"mode": mode}, limits).inhibits == (set() if allowed else {Inhibit.WRONG_MODE})
+
+
+# name, value outside, value just inside, value inside by more than the margin
+MARGINS: dict[Inhibit, tuple[str, float, float, float]] = {
+    Inhibit.SPEED_BELOW_MIN: ("velocity_east_m_s", 0.99, 1.09, 1.11),
+    Inhibit.SPEED_ABOVE_MAX: ("velocity_east_m_s", 12.01, 11.91, 11.89),
+    Inhibit.SPEED_DISAGREES: ("checked_speed_m_s", 6.01, 5.91, 5.89),
+    Inhibit.HEIGHT_BELOW_MIN: ("height_m", 0.99, 1.29, 1.31),
+    Inhibit.HEIGHT_ABOVE_MAX: ("height_m", 10.01, 9.71, 9.69),
+    Inhibit.WIND_ABOVE_MAX: ("wind_m_s", 6.01, 5.51, 5.49),
+}
+
+
+@pytest.mark.parametrize("inhibit", MARGINS)
+def test_what_closed_at_a_limit_opens_a_margin_inside_it(inhibit: Inhibit) -> None:
+    name, outside, near, inside = MARGINS[inhibit]
+    given, memory, found = setup(), Memory(), []
+    for number, value in enumerate((near, outside, near, inside, near)):
+        now_s = 10.0 + 0.05 * number
+        state = flying(now_s, 6.0, **{name: value})
+        if name == "velocity_east_m_s":
+            state = replace(state, checked_speed_m_s=value)
+        decision, memory = step(given, state, memory, now_s)
+        assert decision.inhibits <= {inhibit}
+        assert decision.plan.is_off or not decision.inhibits
+        found.append(bool(decision.inhibits))
+    assert found == [False, True, True, False, False]
+
+
+@drawn(
+    low=st.floats(0.1, 20.0),
+    room=st.floats(0.0, 20.0),
+    reasons=st.frozensets(st.sampled_from(Inhibit)),
+)
+def test_a_margin_never_leaves_no_room_and_never_widens(
+    low: float, room: float, reasons: frozenset[Inhibit]
+) -> None:
+    limits = Limits(
+        speed_min_m_s=low, speed_max_m_s=low + room, height_min_m=low, height_max_m=low + room
+    )
+    after = held(limits, reasons)
+    assert limits.speed_min_m_s <= after.speed_min_m_s <= after.speed_max_m_s <= low + room
+    assert limits.height_min_m <= after.height_min_m <= after.height_max_m <= low + room
+    assert 0.9 * limits.wind_max_m_s <= after.wind_max_m_s <= limits.wind_max_m_s
+    assert 0.0 < after.speed_disagreement_max_m_s <= limits.speed_disagreement_max_m_s
 
 
 def test_values_just_inside_the_limits_do_not_inhibit() -> None:
