@@ -17,13 +17,13 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from typing import Any
 
 from companion.core.controller import Memory, Setup, step
 from companion.core.estimator import Track, estimate, observe
-from companion.core.types import Decision, Input, OutputReport
-from companion.ports import PlanExecutor, Recorder, VehicleLink
+from companion.core.types import Decision, Finding, Input, OutputReport
+from companion.ports import PlanExecutor, Recorder, Sensor, VehicleLink
 
 _logger = logging.getLogger(__name__)
 
@@ -58,6 +58,7 @@ class ControlLoop:
         executor: PlanExecutor,
         recorder: Recorder,
         clock: Callable[[], float],
+        sensors: Sequence[Sensor] = (),
     ) -> None:
         self._setup = setup
         self._link = link
@@ -66,6 +67,8 @@ class ControlLoop:
         self._clock = clock
         self._track = Track()
         self._memory = Memory()
+        self._sensors = sensors
+        self._told: frozenset[Finding] = frozenset()
         self._reported: tuple[str | None] | None = None
         self._stepped_s = float("-inf")
 
@@ -79,6 +82,8 @@ class ControlLoop:
         inputs = [*self._link.receive(), *self._output_report()]
         if not inputs and self._clock() < self.next_step_s:
             return None
+        for sensor in self._sensors:
+            inputs.extend(sensor.read(self._clock()))
         for item in inputs:
             self._recorder.record_input(item)
             self._track = observe(self._track, item, self._setup)
@@ -87,7 +92,22 @@ class ControlLoop:
         decision, self._memory = step(self._setup, state, self._memory, now_s)
         self._carry_out(decision)
         self._recorder.record_decision(decision)
+        if decision.findings:
+            self._tell_findings(decision)
         return decision
+
+    def _tell_findings(self, decision: Decision) -> None:
+        """Say once of each fault of the liquid what it is; that of a valve again with its name."""
+        for finding in decision.findings:
+            if finding in self._told:
+                continue
+            self._told |= {finding}
+            text = finding.text
+            if finding.valve is not None:
+                text += f" (valve {self._setup.boom.valves[finding.valve].name})"
+            _logger.warning("%s: %s", finding.kind, text)
+            self._link.tell_fault(text)
+            self._recorder.record_event(decision.now_s, f"fault-{finding.kind}", text)
 
     def _carry_out(self, decision: Decision) -> None:
         """Close before anything else; open only after the sign of life that allows it.
@@ -145,12 +165,18 @@ async def run(
     link: VehicleLink,
     executor: PlanExecutor,
     recorder: Recorder | None = None,
+    sensors: Sequence[Sensor] = (),
     duration_s: float | None = None,
     clock: Callable[[], float] = time.monotonic,
+    on_step: Callable[[], None] | None = None,
 ) -> int:
     """Spray until a signal comes or `duration_s` is over; return 0 then.
 
-    Raises what went wrong otherwise, a `LinkError` for a link that cannot be opened. A link that
+    `on_step` is called after each step that was carried out, and at no other time: a watchdog that
+    it feeds sees a loop that stands still.
+
+    Raises what went wrong otherwise, a `LinkError` for a link that cannot be opened, a
+    `SensorError` for a sensor. The valves are closed before any sensor is let go. A link that
     is lost later comes back by itself; until then all is closed.
     """
     taken = recorder if recorder is not None else NoRecorder()
@@ -158,15 +184,24 @@ async def run(
     with _ends_at_signals(ending):
         try:
             await link.open(ending.wake.set)
-            try:
-                await executor.start()
-                taken.record_event(clock(), "start", "")
-                control = ControlLoop(
-                    setup, link=link, executor=executor, recorder=taken, clock=clock
-                )
-                await _turn_until_the_end(control, ending, duration_s)
-            finally:
-                await executor.stop()
+            async with contextlib.AsyncExitStack() as opened:
+                for sensor in sensors:
+                    opened.push_async_callback(sensor.close)
+                    await sensor.open(ending.wake.set)
+                try:
+                    await executor.start()
+                    taken.record_event(clock(), "start", "")
+                    control = ControlLoop(
+                        setup,
+                        link=link,
+                        executor=executor,
+                        recorder=taken,
+                        clock=clock,
+                        sensors=sensors,
+                    )
+                    await _turn_until_the_end(control, ending, duration_s, on_step)
+                finally:
+                    await executor.stop()
         finally:
             await link.close()
             taken.record_event(clock(), "stop", ending.reason or "failure")
@@ -175,7 +210,10 @@ async def run(
 
 
 async def _turn_until_the_end(
-    control: ControlLoop, ending: _Ending, duration_s: float | None
+    control: ControlLoop,
+    ending: _Ending,
+    duration_s: float | None,
+    on_step: Callable[[], None] | None,
 ) -> None:
     loop = asyncio.get_running_loop()
     timers = []
@@ -184,7 +222,9 @@ async def _turn_until_the_end(
     step_timer: asyncio.TimerHandle | None = None
     try:
         while ending.reason is None:
-            control.turn()
+            decision = control.turn()
+            if decision is not None and on_step is not None:
+                on_step()
             step_timer = loop.call_at(control.next_step_s, ending.wake.set)
             await ending.wake.wait()
             ending.wake.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -15,14 +16,19 @@ import typer
 from companion import runtime
 from companion.assembly import build_setup, deliverable
 from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.gpio_parts import build_gpio
 from companion.cli.link_parts import build_link, load_with_kept
+from companion.cli.notify import Notifier
+from companion.cli.sensor_parts import build_sensors
 from companion.config import Config
 from companion.config.rules import without_effect
-from companion.errors import ConfigError, LinkError
+from companion.errors import ActuatorError, LinkError, SensorError
 from companion.link.component import ComponentOptions
+from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
+from companion.output.autopilot_budget import dither_too_much
 from companion.output.none import DryRunExecutor
-from companion.output.servo import ServoExecutor, ServoOptions
+from companion.output.servo import DITHER_S, ServoExecutor, ServoOptions
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
@@ -51,6 +57,7 @@ def run_companion(
     setup = build_setup(config)
     link = build_link(config, given, component_options(config))
     executor = build_executor(config, link)
+    sensors = build_sensors(config)
     for line in _warnings(config):
         note(line)
     if config.mission is not None:
@@ -59,15 +66,22 @@ def run_companion(
     folder = config.resolve(config.journal.folder)
     journal = Journal.create(folder, setup=setup, setup_text=_about(config, given))
     link.on_event(journal.record_event)
+    notifier = Notifier.from_environment(os.environ, pid=os.getpid())
     try:
-        with journal:
+        with journal, notifier:
             runtime.execute(
                 lambda: runtime.run(
-                    setup, link=link, executor=executor, recorder=journal, duration_s=duration_s
+                    setup,
+                    link=link,
+                    executor=executor,
+                    recorder=journal,
+                    sensors=sensors,
+                    duration_s=duration_s,
+                    on_step=notifier.stepped,
                 )
             )
-    except LinkError:
-        # A link that cannot be opened ends the run before its first step: no flight to keep.
+    except (ActuatorError, LinkError, SensorError):
+        # Without link, outputs or sensors the run ends before its first step: no flight to keep.
         if not read_journal(journal.path).entries:
             journal.path.unlink()
         raise
@@ -86,19 +100,20 @@ def component_options(config: Config) -> ComponentOptions:
         component_id=config.link.component_id,
         position_rate_hz=config.link.position_rate_hz,
         version=(major, minor, patch),
+        closed_us=config.output.closed_us,
+        full_us=config.output.full_us,
+        use_mission=config.prediction.use_mission,
+        use_battery="autopilot" in (config.flow_meter.source, config.tank.source),
     )
 
 
 def build_executor(config: Config, link: VehicleLink) -> PlanExecutor:
-    """Return what carries plans out: servo outputs of the autopilot, or nothing."""
+    """Return what carries plans out: servo outputs, lines of this computer, or nothing."""
     output = config.output
     if output.kind == "none":
         return DryRunExecutor(len(config.valve), has_return=output.return_channel is not None)
     if output.kind == "gpio":
-        raise ConfigError(
-            f'{config.path}: output.kind = "gpio": not part of this version; write "servo", or '
-            '"none" for a dry run'
-        )
+        return build_gpio(config)
     options = ServoOptions(
         channels=tuple(valve.channel or 0 for valve in config.valve),
         closed_us=output.closed_us,
@@ -106,13 +121,26 @@ def build_executor(config: Config, link: VehicleLink) -> PlanExecutor:
         dither_us=output.dither_us,
         return_channel=output.return_channel,
     )
-    executor = ServoExecutor(options, link.order)
+    executor = ServoExecutor(
+        options,
+        link.order,
+        flush=link.flush_orders,
+        say=link.note_outputs,
+        baud=serial_baud(config.link.url),
+        is_signed=config.link.signing_key_file is not None,
+    )
     link.on_order_ack(executor.acknowledge)
+    link.follow_outputs(executor)
     return executor
 
 
 def _warnings(config: Config) -> list[str]:
-    return [f"warning: {found.key}: {found.text}" for found in without_effect(config)]
+    found = [f"warning: {found.key}: {found.text}" for found in without_effect(config)]
+    if config.output.kind == "servo" and config.output.dither_us:
+        baud = serial_baud(config.link.url)
+        much = dither_too_much(baud=baud, valves=len(config.valve), every_s=DITHER_S)
+        found += [] if much is None else [f"warning: {much}"]
+    return found
 
 
 def _about(config: Config, overrides: Sequence[str]) -> dict[str, str]:

@@ -1,0 +1,102 @@
+"""One check of the doctor: what was looked at, how it is, what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Status(StrEnum):
+    """How a check ended; the values stand in the JSON."""
+
+    OK = "ok"
+    WARN = "warn"
+    FAIL = "fail"
+    NOT_APPLICABLE = "not-applicable"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """A check by its name. What is not in order says in one line how it is put in order."""
+
+    name: str
+    status: Status
+    text: str
+    fix: str = ""
+
+    def __post_init__(self) -> None:
+        if self.status in (Status.WARN, Status.FAIL) and not self.fix:
+            raise ValueError(f"check {self.name} says {self.status} without a fix")
+        for line in (self.text, self.fix):
+            if "\n" in line:
+                raise ValueError(f"check {self.name}: one line only, got {line!r}")
+
+    def as_object(self) -> dict[str, str]:
+        """Return it as it stands in the JSON."""
+        return {
+            "name": self.name,
+            "status": self.status.value,
+            "text": self.text,
+            "fix": self.fix,
+        }
+
+    def line(self) -> str:
+        """Return it for a person.
+
+        >>> warn("clock", "not synchronised", "connect to a time server").line()
+        'warn  clock: not synchronised; connect to a time server'
+        """
+        mark = "-" if self.status is Status.NOT_APPLICABLE else self.status.value
+        fix = f"; {self.fix}" if self.fix else ""
+        return f"{mark:<5} {self.name}: {self.text}{fix}"
+
+
+def ok(name: str, text: str) -> Check:
+    """Return a check that found all in order."""
+    return Check(name=name, status=Status.OK, text=_one_line(text))
+
+
+def warn(name: str, text: str, fix: str) -> Check:
+    """Return a check after which a flight is possible and something should be seen to."""
+    return Check(name=name, status=Status.WARN, text=_one_line(text), fix=_one_line(fix))
+
+
+def fail(name: str, text: str, fix: str) -> Check:
+    """Return a check after which no flight should begin."""
+    return Check(name=name, status=Status.FAIL, text=_one_line(text), fix=_one_line(fix))
+
+
+def not_applicable(name: str, why: str) -> Check:
+    """Return a check that has no meaning here, or could not be made."""
+    return Check(name=name, status=Status.NOT_APPLICABLE, text=_one_line(why))
+
+
+def is_ready(checks: Iterable[Check]) -> bool:
+    """Return whether no check failed.
+
+    >>> is_ready([ok("map", "9 zones"), warn("clock", "not synchronised", "wait")])
+    True
+    """
+    return all(check.status is not Status.FAIL for check in checks)
+
+
+def split_advice(line: str, otherwise: str) -> tuple[str, str]:
+    """Return what is wrong and what to do, of a line that says both; else with other advice.
+
+    >>> split_advice("a.toml: lag.on_s = 99: out of range; write less", "see the docs")
+    ('a.toml: lag.on_s = 99: out of range', 'write less')
+    >>> split_advice("no bytes come in: is the cable right?", "see the docs")
+    ('no bytes come in', 'is the cable right?')
+    >>> split_advice("broken", "see the docs")
+    ('broken', 'see the docs')
+    """
+    for mark in ("; ", ": "):
+        what, found, advice = line.rpartition(mark)
+        if found:
+            return what, advice
+    return line, otherwise
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

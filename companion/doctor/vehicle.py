@@ -1,0 +1,158 @@
+"""Is the vehicle ready: link, streams, position, judged from what was heard of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from companion.config import Config
+from companion.config.model import FIXES
+from companion.core.controller import Setup
+from companion.core.types import Fix
+from companion.doctor.check import Check, fail, not_applicable, ok, split_advice, warn
+from companion.doctor.vehicle_facts import Heard
+
+# Farther from the map than a take-off place is: another field, or a datum that is wrong.
+MAP_MAX_M = 2_000.0
+_VEHICLE = (
+    "heartbeat", "disarmed", "streams", "vehicle-clock", "fix", "estimator", "place", "rc-switch",
+    "wind",
+)  # fmt: skip
+
+
+def link_checks(heard: Heard, config: Config, setup: Setup | None) -> Iterator[Check]:
+    """Yield the checks of link and vehicle, but for its outputs."""
+    if heard.refused is not None:
+        yield fail("link", *split_advice(heard.refused, "correct link.url"))
+        yield from (not_applicable(name, "the link is not open") for name in _VEHICLE)
+        return
+    if heard.system_id is None:
+        yield _unheard(heard)
+        yield from (not_applicable(name, "no vehicle is heard") for name in _VEHICLE)
+        return
+    if heard.troubles:
+        yield warn("link", *split_advice(heard.troubles[-1], "see docs/link.md"))
+    else:
+        yield ok("link", heard.url)
+    yield _heartbeat(heard)
+    yield _disarmed(heard)
+    yield _streams(heard)
+    yield _clock(heard)
+    yield _fix(heard, FIXES[config.safety.fix])
+    yield _estimator(heard)
+    yield _place(heard, setup)
+    yield _rc_switch(heard, config)
+    yield _wind(heard, required=config.safety.wind_required)
+
+
+def no_link(why: str) -> Iterator[Check]:
+    """Yield the same checks where the link was not to be opened."""
+    yield from (not_applicable(name, why) for name in ("link", *_VEHICLE))
+
+
+def _unheard(heard: Heard) -> Check:
+    if heard.troubles:
+        return fail("link", *split_advice(heard.troubles[-1], "see docs/link.md"))
+    return fail(
+        "link",
+        f"{heard.url}: no heartbeat of an autopilot within {heard.waited_s:.0f} s",
+        "see that the flight controller is on, and that link.url is the way to it",
+    )
+
+
+def _heartbeat(heard: Heard) -> Check:
+    text = f"system {heard.system_id}, {heard.autopilot}, mode {heard.mode}"
+    if heard.autopilot.lower() not in ("ardupilot", "px4"):
+        return fail("heartbeat", text, "use ArduPilot or PX4, or set link.system_id")
+    return ok("heartbeat", text)
+
+
+def _disarmed(heard: Heard) -> Check:
+    if heard.is_armed is None:
+        return warn("disarmed", "no heartbeat says it", "see that heartbeats come once a second")
+    if heard.is_armed:
+        fix = "disarm and ask again: outputs are tried on a disarmed vehicle only"
+        return warn("disarmed", "the vehicle is armed", fix)
+    return ok("disarmed", "the vehicle is disarmed")
+
+
+def _streams(heard: Heard) -> Check:
+    if not heard.rates:
+        fix = "ask again with a longer --wait-s"
+        return warn("streams", "not listened to for long enough", fix)
+    slow = [rate for rate in heard.rates if not rate.is_enough]
+    if not slow:
+        rates = ", ".join(f"{rate.name} {rate.rate_hz:.0f} Hz" for rate in heard.rates[:3])
+        return ok("streams", f"{rates}, all as asked for")
+    texts = [f"{one.name} {one.rate_hz:.1f} of {one.wanted_hz:g} Hz" for one in slow]
+    fix = "look for another station that sets rates, or a link too slow (docs/link.md)"
+    # Without a position there is no spraying at all; the rest closes, or costs accuracy.
+    is_blind = any(one.name == "position" and not one.rate_hz >= 2.0 for one in slow)
+    return (fail if is_blind else warn)("streams", ", ".join(texts), fix)
+
+
+def _clock(heard: Heard) -> Check:
+    if not heard.is_clock_known:
+        fix = "see that the link passes TIMESYNC both ways; positions count as fresh until then"
+        return warn("vehicle-clock", "no answer to TIMESYNC", fix)
+    return ok("vehicle-clock", "the autopilot answers TIMESYNC")
+
+
+def _fix(heard: Heard, least: Fix) -> Check:
+    if heard.fix is None:
+        return fail("fix", "no report of the receiver", "see the receiver's cable and GPS_TYPE")
+    accuracy = "" if heard.accuracy_m is None else f", {heard.accuracy_m:.2f} m"
+    text = f"{heard.fix.name.lower().replace('_', '-')}{accuracy}"
+    if not heard.fix >= least:
+        wanted = least.name.lower().replace("_", "-")
+        fix = "wait for it outdoors, and see that corrections arrive"
+        return fail("fix", f"{text}, and {wanted} is the least", fix)
+    return ok("fix", text)
+
+
+def _estimator(heard: Heard) -> Check:
+    if heard.is_estimator_healthy is None:
+        return warn("estimator", "no report of it", "see that its stream comes (docs/link.md)")
+    if not heard.is_estimator_healthy:
+        fix = "wait for it to settle; else calibrate compass and accelerometers"
+        return fail("estimator", "the autopilot does not trust its own position", fix)
+    return ok("estimator", "healthy")
+
+
+def _place(heard: Heard, setup: Setup | None) -> Check:
+    if setup is None:
+        return not_applicable("place", "there is no map to compare it with")
+    if heard.position is None:
+        return fail("place", "no position", "wait for a fix, and see that positions are streamed")
+    place = heard.position
+    east_m, north_m = setup.frame.to_local(place.latitude_deg, place.longitude_deg)
+    west_m, south_m, to_east_m, to_north_m = setup.prescription.bounds_m
+    away_m = math.hypot(
+        max(west_m - east_m, 0.0, east_m - to_east_m),
+        max(south_m - north_m, 0.0, north_m - to_north_m),
+    )
+    if not away_m <= MAP_MAX_M:
+        fix = "load the map of this field, or correct prescription.offset_east_m and _north_m"
+        return warn("place", f"the vehicle is {away_m / 1e3:.1f} km from the map", fix)
+    return ok("place", f"{away_m:.0f} m from the map")
+
+
+def _rc_switch(heard: Heard, config: Config) -> Check:
+    name, channel = "rc-switch", config.safety.rc_channel
+    if channel is None:
+        return not_applicable(name, "safety.rc_channel is not set")
+    pulses = heard.rc_pulse_us
+    pulse_us = pulses[channel - 1] if channel <= len(pulses) else 0
+    if not 800 <= pulse_us <= 2200:
+        fix = "switch the transmitter on, and see that it sends this channel"
+        return fail(name, f"RC channel {channel} is not heard", fix)
+    return ok(name, f"RC channel {channel} reads {pulse_us} us")
+
+
+def _wind(heard: Heard, *, required: bool) -> Check:
+    if not required:
+        return not_applicable("wind", "safety.wind_required is false")
+    if not heard.has_wind:
+        fix = "have the autopilot send it, or write safety.wind_required = false and measure it"
+        return fail("wind", "no wind report, without which nothing is sprayed", fix)
+    return ok("wind", "reported by the autopilot")
