@@ -14,11 +14,14 @@ from contextlib import contextmanager
 from shapely import MultiPolygon
 
 from companion.config import Config
+from companion.config.sensor_rules import tank_capacity_l
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
 from companion.core.controller import Setup
+from companion.core.detection import Detection
 from companion.core.flow_trim import FlowTrim
 from companion.core.frame import LocalFrame
+from companion.core.liquid_law import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.prescription import FIELD, Prescription
 from companion.core.rate import flow_for_rate
@@ -60,8 +63,13 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
         across=table.across,
         lease_s=config.output.lease_s,
         flow_trim=_flow_trim(config),
+        detection=_detection(config),
+        autopilot_liquid=_autopilot_liquid(config),
         drift=config.drift_law(),
         rate_max_l_ha=config.product.rate_max_l_ha,
+        mission_braking_m_s2=(
+            config.prediction.braking_m_s2 if config.prediction.use_mission else None
+        ),
     )
 
 
@@ -75,6 +83,36 @@ def _flow_trim(config: Config) -> FlowTrim | None:
         limit=table.limit,
         meter_minimum_l_min=table.meter_minimum_l_min,
         settle_s=table.settle_s,
+    )
+
+
+def _autopilot_liquid(config: Config) -> AutopilotLiquid | None:
+    """Return which of the autopilot's battery monitors measure the liquid, if any does."""
+    meter, tank = config.flow_meter, config.tank
+    if "autopilot" not in (meter.source, tank.source):
+        return None
+    return AutopilotLiquid(
+        flow_battery=meter.battery if meter.source == "autopilot" else None,
+        tank_battery=tank.battery if tank.source == "autopilot" else None,
+        tank_l=tank_capacity_l(config) or 0.0,
+    )
+
+
+def _detection(config: Config) -> Detection | None:
+    """Return what is known of the healthy sprayer, if faults are to be detected."""
+    table, pressure = config.detection, config.pressure
+    if not table.enabled:
+        return None
+    has_pressure = pressure.source != "none"
+    return Detection(
+        spread=table.spread,
+        closed_share=table.closed_share,
+        meter_minimum_l_min=config.flow_trim.meter_minimum_l_min,
+        pressure_duty=pressure.duty if has_pressure else (),
+        pressure_kpa=pressure.kpa if has_pressure else (),
+        reserve_l=None if config.tank.source == "none" else config.tank.reserve_l,
+        meter_required=table.meter_required,
+        closed_check=table.closed_check,
     )
 
 

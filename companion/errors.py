@@ -5,6 +5,7 @@
      +-- MapError         a prescription cannot be used
      +-- LinkError        the link to the autopilot cannot be opened or was lost
      +-- ActuatorError    the valve driver refused or did not answer
+     +-- SensorError      a sensor that the configuration names is not to be had
      +-- JournalError     a journal cannot be opened, read or written
 
 A wrong argument inside our own code is a `ValueError`: a bug, not a condition.
@@ -39,6 +40,10 @@ class LinkError(VrsprayError):
 
 class ActuatorError(VrsprayError):
     """The valve driver refused an order or did not answer."""
+
+
+class SensorError(VrsprayError):
+    """A sensor that the configuration names cannot be opened."""
 
 
 class JournalError(VrsprayError):

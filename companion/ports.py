@@ -48,6 +48,19 @@ class VehicleLink(Protocol):
         """Let go of the link; may be called twice and before `open`."""
 
 
+class Sensor(Protocol):
+    """What measures the liquid; read at each step, which comes often enough for all of them."""
+
+    async def open(self, wake: Callable[[], None]) -> None:
+        """Take the sensor, or raise `SensorError`; `wake` may be called to hurry a step."""
+
+    def read(self, now_s: float) -> Sequence[Input]:
+        """Return what it has measured; its fault is a report too, and never a zero. Never waits."""
+
+    async def close(self) -> None:
+        """Let go of the sensor; may be called twice and before `open`."""
+
+
 class Recorder(Protocol):
     """Takes down what came in and what was decided; never waits, never raises."""
 

@@ -21,7 +21,6 @@ from companion.core.types import (
     Decision,
     EstimatorReport,
     Fix,
-    FlowReport,
     GnssReport,
     HeartbeatReport,
     Inhibit,
@@ -31,14 +30,17 @@ from companion.core.types import (
     Telemetry,
 )
 from sitl.board import SERVO_FRAME_S, DriverBoard
+from sitl.leg_reports import leg_reports
+from sitl.liquid_faults import LiquidFault, LiquidSensors
 from sitl.navigation import Navigation
 from sitl.outputs import WIRE_S, AveragedOutput, GpioOutput, Output, ServoOutput
-from sitl.plant import AveragedPlant, Plant, PulsedPlant
+from sitl.plant import AveragedPlant, PulsedPlant
 from sitl.pump_plant import PumpPlant
 from sitl.wang import POLL_S, WangController
 
 if TYPE_CHECKING:
     from sitl.profile import PlantProfile
+    from sitl.route import Route
     from sitl.trajectory import Trajectory
 
 # Without a position a step follows after this, as in the runtime.
@@ -53,7 +55,8 @@ MESSAGE_DELAY_S = 0.005
 class FlightOptions:
     """How a flight is simulated; `noise` and `scatter` off is perfect knowledge.
 
-    `meter_rate_hz` above 0 has the flow meter report that often.
+    `meter_rate_hz` above 0 has the flow meter report that often, `pressure_rate_hz` the pressure
+    sensor; `liquid_faults` act on sprayers with valves.
     """
 
     fidelity: Fidelity = "pulsed"
@@ -65,6 +68,8 @@ class FlightOptions:
     noise: bool = True
     scatter: bool = True
     meter_rate_hz: float = 0.0
+    pressure_rate_hz: float = 0.0
+    liquid_faults: tuple[LiquidFault, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,19 +99,33 @@ def fly(
     observer: Callable[[Decision], None] | None = None,
     on_input: Callable[[Input], None] | None = None,
     disturb: Callable[[Iterator[Input]], Iterator[Input]] | None = None,
+    mission: Route | None = None,
 ) -> FlightResult:
-    """Fly `trajectory` with our controller, or with P1's where `wang` is given."""
+    """Fly `trajectory` with our controller, or with P1's where `wang` is given.
+
+    With `mission`, the route that the trajectory flies, the controller hears which leg it is.
+    """
     if not options.scatter:
         profile = replace(profile, lag_scatter=0.0, flow_scatter=0.0)
     start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     plant, output = sprayer(profile, options, start_s)
     inputs = _inputs(setup, trajectory, options)
+    if mission is not None:
+        said_legs = leg_reports(mission, trajectory, setup.frame)
+        inputs = heapq.merge(inputs, said_legs, key=lambda item: item.received_s)
     if disturb is not None:
         inputs = disturb(inputs)
     if wang is not None:
         said = _fly_wang(wang, inputs, output, start_s)
     else:
-        meter = _Meter(plant, options.meter_rate_hz, start_s)
+        meter = LiquidSensors(
+            plant,
+            meter_rate_hz=options.meter_rate_hz,
+            pressure_rate_hz=options.pressure_rate_hz,
+            start_s=start_s,
+            faults=options.liquid_faults,
+            seed=options.seed,
+        )
         said = _fly_ours(setup, inputs, output, meter, start_s, observer, on_input)
     output.finish(end_s + TAIL_S / 2)
     sample_s = SAMPLE_S[options.fidelity]
@@ -210,32 +229,11 @@ class _Said:
     unresolved: int = 0
 
 
-class _Meter:
-    """Reads the plant's flow meter at its own rate, up to where the plant is known."""
-
-    def __init__(self, plant: Plant, rate_hz: float, start_s: float) -> None:
-        self._rate_hz, self._start_s, self._read = rate_hz, start_s, 0
-        self._per_ml = plant.profile.meter.pulses_per_l / 1000.0
-        self._count = plant.meter_counter() if rate_hz > 0.0 else None
-
-    def read(self, now_s: float) -> list[FlowReport]:
-        """Return what was counted since the last call, in order of time."""
-        if self._count is None:
-            return []
-        first, last = self._read + 1, math.floor((now_s - self._start_s) * self._rate_hz)
-        self._read = max(last, self._read)
-        times = (self._start_s + number / self._rate_hz for number in range(first, last + 1))
-        return [
-            FlowReport(received_s=at_s, volume_ml=self._count(at_s) / self._per_ml)
-            for at_s in times
-        ]
-
-
 def _fly_ours(
     setup: Setup,
     inputs: Iterator[Input],
     output: Output,
-    meter: _Meter,
+    meter: LiquidSensors,
     start_s: float,
     observer: Callable[[Decision], None] | None,
     on_input: Callable[[Input], None] | None,

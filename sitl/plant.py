@@ -138,6 +138,13 @@ class Plant:
         self._is_open = [False] * count
         self._opened_s = [-math.inf] * count
         self._active = 0
+        # What goes wrong in flight (`liquid_faults.py`): valves that stick, openings, the supply.
+        self._stuck = set(self._faults.stuck_open | self._faults.stuck_closed)
+        self._ordered = [0.0] * count
+        self._opening = [1.0] * count
+        self._supply = 1.0
+        self._leak_ml_s = 0.0
+        self._leak = _Ramps(start_s)
         self._start_s = self._forgotten_s = start_s
         spread = profile.meter.gain_spread
         self._meter = _MeterState(
@@ -186,11 +193,16 @@ class Plant:
         last = int(periods.max(initial=state.index))
         edges_s: Floats = self._start_s + period_s * np.arange(state.index, last + 2, dtype=float)
         factors = state.factors(last + 1, self.profile.meter.noise)[state.index :]
-        true_ml = self.volume_ml(edges_s).sum(axis=1)
+        true_ml = self._metered_ml(edges_s)
         edge_ml = state.volume_ml + np.concatenate(([0.0], np.cumsum(np.diff(true_ml) * factors)))
         i = periods - state.index
-        result: Floats = edge_ml[i] + factors[i] * (self.volume_ml(seen_s).sum(axis=1) - true_ml[i])
+        result: Floats = edge_ml[i] + factors[i] * (self._metered_ml(seen_s) - true_ml[i])
         return result
+
+    def _metered_ml(self, times_s: Floats) -> Floats:
+        """Return what has passed the meter: all valves, and a leak behind it."""
+        through_ml: Floats = self.volume_ml(times_s).sum(axis=1)
+        return through_ml + self._leak.volume_ml(times_s) if self._leak.steps else through_ml
 
     def meter_count(self, times_s: Floats) -> NDArray[np.int64]:
         """Return the meter's pulses up to each time."""
@@ -255,7 +267,7 @@ class Plant:
         is_open = self._is_open[valve]
         level_ml_s = 0.0
         if is_open:
-            level_ml_s = self._flow_ml_s(self._duty[valve]) * self._scatter.flow_scale[valve]
+            level_ml_s = self._flow_ml_s(self._duty[valve]) * self._scale(valve)
         change_ml_s = level_ml_s - self._level_ml_s[valve]
         if change_ml_s != 0.0:
             self._level_ml_s[valve] = level_ml_s
@@ -271,6 +283,50 @@ class Plant:
             if self._stream is not None:
                 self._stream.step(*step)
 
+    def _scale(self, valve: int) -> float:
+        return self._scatter.flow_scale[valve] * self._opening[valve] * self._supply
+
+    def stick(self, at_s: float, valve: int, *, is_open: bool) -> None:
+        """Let a valve stay as it is told here, whatever it is ordered from now on."""
+        self._stuck.add(valve)
+        self._take(at_s, valve, duty=1.0 if is_open else 0.0, is_open=is_open)
+
+    def restrict(self, at_s: float, *, openings: Sequence[float], supply: float) -> None:
+        """Let each valve's nozzles pass a share of their flow, and the supply give one of all."""
+        self._opening, self._supply = list(openings), supply
+        for valve, is_open in enumerate(self._is_open):
+            if is_open:
+                self._set_level(at_s, valve)
+        self.leak(at_s, self._leak_ml_s)
+
+    def leak(self, at_s: float, flow_ml_s: float) -> None:
+        """Let so much flow leave the line behind the meter, and through no nozzle."""
+        steps = self._leak.steps
+        change_ml_s = flow_ml_s * self._supply - sum(step[1] for step in steps)
+        self._leak_ml_s = flow_ml_s
+        if change_ml_s != 0.0:
+            step = (at_s, change_ml_s, self.profile.ramp_s)
+            self._leak.step(*step)
+            if self._stream is not None:
+                self._stream.step(*step)
+
+    def flow_and_order(self) -> tuple[float, float, float]:
+        """Return mean flow over ordered flow but for the supply, the supply, and the mean duty.
+
+        All are as ordered now: what is on its way is taken as arrived. The flow is 1 where
+        nothing is ordered.
+        """
+        ordered = [duty for duty in self._ordered if duty > 0.0]
+        if not ordered:
+            return 1.0, self._supply, 0.0
+        nominal_ml_s = sum(self._table.mean_ml_s(duty, len(ordered)) for duty in ordered)
+        flow_ml_s = self._leak_ml_s + sum(
+            self._table.mean_ml_s(duty, self._active) * self._opening[valve]
+            for valve, duty in enumerate(self._duty)
+            if duty > 0.0
+        )
+        return flow_ml_s / nominal_ml_s, self._supply, sum(ordered) / len(ordered)
+
     def _flow_ml_s(self, duty: float) -> float:
         raise NotImplementedError
 
@@ -281,7 +337,7 @@ class Plant:
         raise NotImplementedError
 
     def _follows(self, valve: int) -> bool:
-        return valve not in self._faults.stuck_open and valve not in self._faults.stuck_closed
+        return valve not in self._stuck
 
 
 class PulsedPlant(Plant):
@@ -290,6 +346,7 @@ class PulsedPlant(Plant):
     def record(self, edges: Iterable[Edge]) -> None:
         """Take down edges."""
         for edge in edges:
+            self._ordered[edge.valve] = edge.duty
             if self._follows(edge.valve):
                 self._take(edge.at_s, edge.valve, duty=edge.duty, is_open=edge.is_open)
 
@@ -310,6 +367,7 @@ class AveragedPlant(Plant):
         """Take down that `valve` has `duty` from `at_s` on."""
         if not 0.0 <= duty <= 1.0:
             raise ValueError(f"duty outside [0, 1]: {duty}")
+        self._ordered[valve] = duty
         if self._follows(valve) and duty != self._duty[valve]:
             self._take(at_s, valve, duty=duty, is_open=duty > 0.0)
 

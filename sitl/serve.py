@@ -25,6 +25,8 @@ from sitl.stub.flight_plan import starts_with_take_off
 from sitl.stub.mission_file import read_mission
 from sitl.stub.mission_items import MissionItem, item_message
 from sitl.stub.operator import Operator, Step
+from sitl.stub.parameters import OUTPUT_COUNT
+from sitl.stub.px4 import px4_parameters
 from sitl.stub.scenario import Scenario, load_scenario
 from sitl.stub.server import StubServer
 from sitl.stub.sprayer import BoardKind, Sprayer, SprayerOptions
@@ -236,12 +238,28 @@ def _first_course_deg(items: tuple[MissionItem, ...], home: LocalFrame) -> float
     return 0.0
 
 
+def _pins(options: ServeOptions, config: Config, scenario: Scenario) -> tuple[int, ...]:
+    """Return the output of each valve; PX4's channels are actuators, which parameters place."""
+    channels = tuple(valve.channel for valve in config.boom().valves)
+    if options.autopilot != "px4":
+        return channels
+    parameters = px4_parameters()
+    for name, value in scenario.parameters.items():
+        if name in parameters:
+            parameters.put(name, value)
+    actuators = {
+        int(parameters[f"PWM_MAIN_FUNC{pin}"]) - 300: pin for pin in range(OUTPUT_COUNT, 0, -1)
+    }
+    # An actuator that no output shows is a valve that nobody opens.
+    return tuple(actuators.get(channel, -channel) for channel in channels)
+
+
 def _sprayer_options(options: ServeOptions, config: Config, scenario: Scenario) -> SprayerOptions:
     """Return the sprayer as the configuration wires it."""
     return SprayerOptions(
         profile=options.profile,
         board=options.board,
-        channels=tuple(valve.channel for valve in config.boom().valves),
+        channels=_pins(options, config, scenario),
         closed_us=config.output.closed_us,
         full_us=config.output.full_us,
         box_closed_s=scenario.box_closed_s,

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 from pydantic_core import PydanticCustomError
 
-from companion.config import tables
+from companion.config import sensor_tables, tables
 from companion.config.rules import contradictions
 from companion.core.boom import Boom, Valve
 from companion.core.drift import Drift, blowing, fall_s
@@ -44,11 +44,17 @@ class Config(tables.Table):
     ]
     lag: tables.LagTable
     output: tables.OutputTable = tables.OutputTable()
+    gpio: tables.GpioTable = tables.GpioTable()
     safety: tables.SafetyTable = tables.SafetyTable()
     mission: tables.MissionTable | None = None
     product: tables.ProductTable = tables.ProductTable()
     flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
+    flow_meter: sensor_tables.FlowMeterTable = sensor_tables.FlowMeterTable()
+    pressure: sensor_tables.PressureTable = sensor_tables.PressureTable()
+    tank: sensor_tables.TankTable = sensor_tables.TankTable()
+    detection: sensor_tables.DetectionTable = sensor_tables.DetectionTable()
     drift: tables.DriftTable = tables.DriftTable()
+    prediction: tables.PredictionTable = tables.PredictionTable()
     journal: tables.JournalTable = tables.JournalTable()
     web: tables.WebTable = tables.WebTable()
 
@@ -174,6 +180,8 @@ class Config(tables.Table):
             fix=FIXES[safety.fix],
             wind_max_m_s=safety.wind_max_m_s,
             wind_required=safety.wind_required,
+            wind_age_max_s=safety.wind_age_max_s,
+            speed_check_required=safety.speed_check_required,
             enable_by=frozenset(safety.enable_by),
             rc_channel=safety.rc_channel,
         )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from companion.config.sensor_rules import sensor_contradictions
 from companion.core.nozzle import FlowCurve
 
 if TYPE_CHECKING:
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 
 # MAV_CMD_DO_SET_SERVO: ArduPilot has at most 32 outputs (SERVO1 to SERVO32).
 SERVO_OUTPUTS = 32
+# One request of the kernel's GPIO interface has 64 lines at most, a chain of registers as many.
+LINES_MAX = 64
+GPIO_LAST = {"lines": 1023, "spi595": LINES_MAX - 1}
 # Less than this between closed and full leaves a servo output too few steps for a duty.
 SPAN_MIN_US = 100
 # Passes spaced by another width than the flow law's leave skips or overlaps in every pass.
@@ -43,6 +47,8 @@ def contradictions(config: Config) -> Rule:
     )  # fmt: skip
     for rule in rules:
         yield from rule(config)
+    for key, text in sensor_contradictions(config):
+        yield Contradiction(key=key, text=text)
 
 
 def _prescription(config: Config) -> Rule:
@@ -78,14 +84,13 @@ def mismatches(config: Config) -> Rule:
 
 def without_effect(config: Config) -> Rule:
     """Yield settings that this version accepts and does not act on: silence would deceive."""
-    if config.flow_trim.enabled:
+    if config.flow_trim.enabled and config.flow_meter.source == "none":
         yield Contradiction(
             key="flow_trim.enabled",
-            text="`run` reads no flow meter in this version: its trim stays 1",
+            text="no flow meter is configured (flow_meter.source): the trim stays 1",
         )
     settings = {
         "web.enabled": config.web.enabled,
-        "output.kind": config.output.kind == "gpio",
     }
     for key, is_set in settings.items():
         if is_set:
@@ -128,19 +133,28 @@ def _channels(config: Config) -> Rule:
         return
     channels = {f"valve[{n}].channel": valve.channel for n, valve in enumerate(config.valve)}
     first = 1 if kind == "servo" else 0
-    last = SERVO_OUTPUTS if kind == "servo" else 1023
+    last = SERVO_OUTPUTS if kind == "servo" else GPIO_LAST[config.gpio.driver]
     what = "servo output" if kind == "servo" else "GPIO line"
     for key, channel in channels.items():
         if channel is None:
             yield Contradiction(key=key, text=f"missing; write the {what}, {first} to {last}")
     if config.output.return_channel is not None:
         channels["output.return_channel"] = config.output.return_channel
+    if kind == "gpio":
+        channels |= _alive(config)
+        if len(channels) > LINES_MAX:
+            yield Contradiction(key="valve", text=f"more than {LINES_MAX} lines; write fewer")
     counts = Counter(channels.values())
     for key, channel in channels.items():
         if channel is not None and not first <= channel <= last:
             yield Contradiction(key=key, text=f"no {what}; write one from {first} to {last}")
         if counts[channel] > 1:
             yield Contradiction(key=key, text=f"used twice; give each valve its own {what}")
+
+
+def _alive(config: Config) -> dict[str, int | None]:
+    line = config.gpio.alive_line
+    return {} if line is None else {"gpio.alive_line": line}
 
 
 def _nozzle_sets(config: Config) -> Rule:

@@ -223,6 +223,11 @@ class LagTable(Table):
         description="of a slow flow (a pump's): its time constant, a part of up_s; 0: not driven",
     )
     down_time_s: Lag = Field(default=0.0, description="the same, a part of down_s")
+    measured_on: str | None = Field(
+        default=None,
+        pattern=r"^\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])$",
+        description="day on which flows and lags were measured, YYYY-MM-DD; `doctor` tells its age",
+    )
 
 
 class OutputTable(Table):
@@ -247,6 +252,29 @@ class OutputTable(Table):
     chip: Text = Field(default="gpiochip0", description="gpio only")
 
 
+class GpioTable(Table):
+    """Lines of this computer, for `output.kind = "gpio"`; see gpio.md."""
+
+    driver: Literal["lines", "spi595"] = Field(
+        default="lines", description="spi595: a chain of shift registers; channels are its outputs"
+    )
+    active_low: bool = Field(
+        default=False, description="true: the driver sends current while its line is low"
+    )
+    return_valve: Literal["normally-open", "normally-closed"] = Field(
+        default="normally-open", description="kind of the return valve: open without current"
+    )
+    alive_line: int | None = Field(
+        default=None,
+        ge=0,
+        le=1023,
+        description="toggles while all is well, for a hardware dead-man",
+    )
+    realtime: bool = Field(default=True, description="ask for real-time priority")
+    spi_device: Text = Field(default="/dev/spidev0.0", description="spi595 only")
+    spi_khz: int = Field(default=1000, ge=10, le=20_000, description="clock, spi595 only")
+
+
 class SafetyTable(Table):
     """What must hold before a valve may open."""
 
@@ -258,7 +286,7 @@ class SafetyTable(Table):
         description="who may enable: MAV_CMD_DO_SPRAYER, an RC switch, the page",
     )
     rc_channel: int | None = Field(
-        default=None, ge=1, le=18, description="the RC switch, if there is one"
+        default=None, ge=1, le=18, description="the RC switch, if there is one: off closes"
     )
     modes: Annotated[tuple[Text, ...], Field(strict=False, min_length=1, max_length=20)] = Field(
         default=("AUTO",), description="flight modes in which spraying is allowed"
@@ -278,10 +306,21 @@ class SafetyTable(Table):
     speed_disagreement_max_m_s: float = Field(
         default=1.0, gt=0, le=20, description="between the two speeds that the autopilot reports"
     )
-    height_min_m: float = Field(
-        default=1.0, ge=-100, le=500, description="above home; no spraying below"
+    speed_check_required: bool = Field(
+        default=True, description="true: no spraying without the second speed (VFR_HUD)"
     )
-    height_max_m: float = Field(default=10.0, ge=-100, le=500, description="above home; none above")
+    wind_age_max_s: float = Field(
+        default=5.0, ge=1, le=60, description="oldest wind report that wind_required takes"
+    )
+    height_min_m: float = Field(
+        default=1.0,
+        ge=-100,
+        le=500,
+        description="above the crop, else above home; no spraying below",
+    )
+    height_max_m: float = Field(
+        default=10.0, ge=-100, le=500, description="above the crop, else above home; none above"
+    )
     fix: Literal["3d", "dgps", "rtk-float", "rtk-fixed"] = Field(
         default="rtk-float", description="least acceptable GNSS fix"
     )
@@ -370,6 +409,18 @@ class DriftTable(Table):
         default=0.2, ge=0, le=2, description="how far liquid flies on along the course"
     )
     limit_m: float = Field(default=2.0, ge=0, le=10, description="largest offset")
+
+
+class PredictionTable(Table):
+    """What the prediction of the vehicle's motion may use; see prediction.md."""
+
+    use_mission: bool = Field(
+        default=False,
+        description="true: the autopilot's mission is read, and braking for a stop is foreseen",
+    )
+    braking_m_s2: float = Field(
+        default=2.5, ge=0.1, le=20, description="of the vehicle at the end of a leg"
+    )
 
 
 class JournalTable(Table):

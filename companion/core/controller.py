@@ -7,9 +7,9 @@ interlock.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
-from companion.core import flow_trim
+from companion.core import detection, flow_trim
 from companion.core.boom import Boom
 from companion.core.crossings import (
     STRAIGHT_YAW_RATE_DEG_S,
@@ -18,17 +18,28 @@ from companion.core.crossings import (
     Route,
     find_routes,
 )
+from companion.core.detection import Detection, Watching, WatchMemory
 from companion.core.drift import Drift, Offset, is_same, offset
 from companion.core.flow_trim import FlowTrim, TrimMemory, Trimming
 from companion.core.frame import LocalFrame
 from companion.core.interlock import Limits, closed_plan, guard, inhibits
+from companion.core.leg import speed_after
+from companion.core.liquid_law import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits, allowed_duty
 from companion.core.overdrive import Overdrive
 from companion.core.prescription import Prescription
 from companion.core.rate import flow_for_rate, overridden
 from companion.core.schedule import Dosing, LagModel, Timing, ValveSchedule, schedule
 from companion.core.sets import SetOfRate, dosing_by_valve, sets_ahead
-from companion.core.types import Decision, Inhibit, Method, SprayPlan, TimedChange, VehicleState
+from companion.core.types import (
+    Decision,
+    Finding,
+    Inhibit,
+    Method,
+    SprayPlan,
+    TimedChange,
+    VehicleState,
+)
 
 __all__ = ["Across", "Border", "Memory", "Setup", "step"]
 
@@ -63,10 +74,14 @@ class Setup:
     across: Across = "centre"
     lease_s: float = 0.3
     flow_trim: FlowTrim | None = None
+    detection: Detection | None = None
+    autopilot_liquid: AutopilotLiquid | None = None
     drift: Drift | None = None
     rate_max_l_ha: float | None = None
+    mission_braking_m_s2: float | None = None  # None: what the mission says is not used
     timing: Timing = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
+    watching: Watching | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.lease_s <= 5.0:
@@ -75,6 +90,9 @@ class Setup:
             raise ValueError(f"look_ahead_s must lie in [0, 30] s, got {self.look_ahead_s}")
         if not 0.0 <= self.border_buffer_m <= 100.0:
             raise ValueError(f"border_buffer_m must lie in [0, 100] m, got {self.border_buffer_m}")
+        braking_m_s2 = self.mission_braking_m_s2
+        if braking_m_s2 is not None and not 0.1 <= braking_m_s2 <= 20.0:
+            raise ValueError(f"mission_braking_m_s2 must lie in [0.1, 20], got {braking_m_s2}")
         if not self.nozzle_sets:
             raise ValueError("at least one nozzle set is needed")
         count = len(self.boom.valves)
@@ -87,6 +105,10 @@ class Setup:
         law = self.flow_trim
         trimming = None if law is None else Trimming.of(law, self.lag, self.pwm)
         object.__setattr__(self, "trimming", trimming)
+        watching = None
+        if self.detection is not None:
+            watching = Watching.of(self.detection, self.nozzle_sets, self.lag, self.pwm)
+        object.__setattr__(self, "watching", watching)
 
     @property
     def back_s(self) -> float:
@@ -112,13 +134,23 @@ class Memory:
     routes_from: VehicleState | None = None
     drift_m: Offset | None = None
     trim: TrimMemory | None = None
+    watch: WatchMemory | None = None
+    reasons: frozenset[Inhibit] = frozenset()
 
 
 def step(
     setup: Setup, state: VehicleState | None, memory: Memory, now_s: float
 ) -> tuple[Decision, Memory]:
     """Return what to do from `now_s` on, and what the next step has to know."""
-    reasons = inhibits(state, setup.limits, field_bounds_m=setup.prescription.bounds_m, now_s=now_s)
+    memory = _watched(setup, state, memory, now_s)
+    reasons = inhibits(
+        state,
+        setup.limits,
+        field_bounds_m=setup.prescription.bounds_m,
+        now_s=now_s,
+        before=memory.reasons,
+    )
+    reasons |= detection.inhibits_of(memory.watch)
     sequence = 1 if memory.plan is None else memory.plan.sequence + 1
     if reasons or state is None:
         return _closed(setup, state, reasons, sequence, memory, now_s)
@@ -171,6 +203,7 @@ def step(
     decision = _decision(
         setup, state, plan, valves,
         index=index, speed_m_s=speed_m_s, flow_l_min=flow_l_min * gain, trim=trim,
+        findings=_findings(memory),
     )  # fmt: skip
     return decision, Memory(
         plan=plan,
@@ -180,7 +213,27 @@ def step(
         routes_from=routes_from,
         drift_m=drift_m,
         trim=trim,
+        watch=memory.watch,
     )
+
+
+def _watched(setup: Setup, state: VehicleState | None, memory: Memory, now_s: float) -> Memory:
+    """Return the memory with what flow, pressure and tank say of the plan until now."""
+    if setup.watching is None:
+        return memory
+    watch = detection.follow(
+        setup.watching,
+        memory.watch or WatchMemory(),
+        memory.plan,
+        state,
+        index=memory.set_index,
+        now_s=now_s,
+    )
+    return replace(memory, watch=watch)
+
+
+def _findings(memory: Memory) -> tuple[Finding, ...]:
+    return () if memory.watch is None else memory.watch.findings
 
 
 def _trim(
@@ -328,8 +381,9 @@ def _closed(
         flow_l_min=0.0,
         flow_trim=None if trim is None else trim.sets[trim.set_index].trim,
         flow_trim_state=None if trim is None else trim.state,
+        findings=_findings(memory),
     )
-    return decision, Memory(plan=plan, trim=trim)
+    return decision, Memory(plan=plan, trim=trim, watch=memory.watch, reasons=reasons)
 
 
 def _skew(state: VehicleState, speed_m_s: float) -> float:
@@ -415,7 +469,12 @@ def _speed_soon(setup: Setup, state: VehicleState, speed_m_s: float) -> float:
     acts_s = lead_s - constant_s + 0.5 * setup.pwm.period_s + TRIM_AGE_S
     left = math.exp(-acts_s / state.acceleration_fade_s)
     gained_s = state.acceleration_fade_s * (1.0 - left)
-    return max(speed_m_s + along * (gained_s + constant_s * left), 0.0)
+    soon_m_s = max(speed_m_s + along * (gained_s + constant_s * left), 0.0)
+    if state.stop_ahead is None:
+        return soon_m_s
+    acts_s = timing.down_s + 0.5 * setup.pwm.period_s + TRIM_AGE_S
+    braked_m_s = speed_after(state.stop_ahead, speed_m_s, along, state.acceleration_fade_s, acts_s)
+    return min(soon_m_s, braked_m_s)
 
 
 def _in_order(valves: list[ValveSchedule]) -> tuple[TimedChange, ...]:
@@ -434,6 +493,7 @@ def _decision(
     speed_m_s: float,
     flow_l_min: float,
     trim: TrimMemory | None,
+    findings: tuple[Finding, ...],
 ) -> Decision:
     nozzles = setup.nozzle_sets[index]
     share = setup.boom.width_m / len(nozzles.valves)
@@ -456,6 +516,7 @@ def _decision(
         unresolved_count=sum(valve.unresolved_count for valve in valves),
         flow_trim=None if trim is None else trim.sets[index].trim,
         flow_trim_state=None if trim is None else trim.state,
+        findings=findings,
     )
 
 

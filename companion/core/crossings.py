@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from companion.core.boom import Boom
 from companion.core.drift import Contact, Offset, joined, landed, swept
+from companion.core.leg import CREEP_M_S, braking_begins_s
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
 from companion.core.types import VehicleState
 
@@ -41,6 +42,8 @@ ACROSS_MIN = 0.2
 SAMPLE_ACROSS_M = 0.1
 SAMPLES_ACROSS = (5, 40)
 START_NUDGE_M = 1e-6
+# Knots of a path nearer than this are one.
+KNOTS_APART_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +94,7 @@ def predict(
     """Return the paths of points of the boom from `back_s` ago to `ahead_s` from now.
 
     The same motion as `estimator.estimate`: constant velocity plus a fading acceleration, and a
-    constant yaw rate.
+    constant yaw rate; on a straight path that ends in a stop, the braking before it.
     """
     heading_deg = state.heading_deg if state.heading_deg is not None else 0.0
     speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
@@ -114,7 +117,11 @@ def predict(
             for i, dt_s in enumerate(knots)
         ]
     else:
-        east, north, pace, middle = _straight(state, knots, heading_deg, right_m, forward_m)
+        motions = _braked(state, back_s, ahead_s)
+        if motions is None:
+            motions = [(dt_s, *_carried(state, dt_s, *_along(state))) for dt_s in knots]
+        knots = [motion[0] for motion in motions]
+        east, north, pace, middle = _straight(motions, heading_deg, right_m, forward_m)
     rights = []
     for a, b in pairwise(knots):
         turned_deg = state.yaw_rate_deg_s * (a + b) / 2 if turning else 0.0
@@ -151,25 +158,63 @@ def _carried(
     )
 
 
-def _straight(
-    state: VehicleState, knots: list[float], heading_deg: float, right_m: Floats, forward_m: Floats
-) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
-    """Return east, north and speed of all points at all knots, and the reference's places.
+# dt_s, velocity (east, north) and place (east, north) of the reference then.
+_Motion = tuple[float, float, float, float, float]
 
-    Only the acceleration along the course counts: one chord to where the other leads would miss
-    the near end of the path by more than leaving it out.
+
+def _along(state: VehicleState) -> tuple[float, float]:
+    """Return the acceleration along the course, all that counts on a straight path.
+
+    One chord to where the other leads would miss the near end of the path by more than leaving it
+    out.
     """
     ve, vn = state.velocity_east_m_s, state.velocity_north_m_s
     gain = ve * state.acceleration_east_m_s2 + vn * state.acceleration_north_m_s2
     gain /= max(ve * ve + vn * vn, 1e-9)
+    return gain * ve, gain * vn
+
+
+def _braked(state: VehicleState, back_s: float, ahead_s: float) -> list[_Motion] | None:
+    """Return the motion at the knots of a path that brakes for a stop; None if none does.
+
+    Its chords are those before the braking, of the braking and, at the stop, a creeping on.
+    """
+    stop = state.stop_ahead
+    speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+    if stop is None or not speed > CREEP_M_S:
+        return None
+    ae, an = _along(state)
+    along = (ae * state.velocity_east_m_s + an * state.velocity_north_m_s) / speed
+    begins_s = braking_begins_s(stop, speed, along, state.acceleration_fade_s, ahead_s)
+    if begins_s is None:
+        return None
+    motions = [(dt_s, *_carried(state, dt_s, ae, an)) for dt_s in (-back_s, begins_s)]
+    _, ve, vn, east_m, north_m = motions[-1]
+    pace = math.hypot(ve, vn)
+    unit_east, unit_north = ve / pace, vn / pace
+    creeps_s = max(pace - CREEP_M_S, 0.0) / stop.braking_m_s2
+    for dt_s in (min(begins_s + creeps_s, ahead_s), ahead_s):
+        braked_s = dt_s - motions[-1][0]
+        if braked_s < KNOTS_APART_S:
+            continue
+        after = max(pace - stop.braking_m_s2 * braked_s, min(pace, CREEP_M_S))
+        way_m = 0.5 * (pace + after) * braked_s
+        east_m, north_m, pace = east_m + unit_east * way_m, north_m + unit_north * way_m, after
+        motions.append((dt_s, unit_east * after, unit_north * after, east_m, north_m))
+    return motions
+
+
+def _straight(
+    motions: list[_Motion], heading_deg: float, right_m: Floats, forward_m: Floats
+) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
+    """Return east, north and speed of all points at all knots, and the reference's places."""
     angle = math.radians(heading_deg)
     sin, cos = math.sin(angle), math.cos(angle)
-    motions = [_carried(state, dt_s, gain * ve, gain * vn) for dt_s in knots]
-    middle_east, middle_north = [m[2] for m in motions], [m[3] for m in motions]
+    middle_east, middle_north = [m[3] for m in motions], [m[4] for m in motions]
     east = (right_m * cos + forward_m * sin)[:, None] + np.array(middle_east)
     north = (forward_m * cos - right_m * sin)[:, None] + np.array(middle_north)
     pace = np.empty(east.shape)
-    pace[:] = [math.hypot(m[0], m[1]) for m in motions]
+    pace[:] = [math.hypot(m[1], m[2]) for m in motions]
     return east, north, pace, list(zip(middle_east, middle_north, strict=True))
 
 

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from companion.core.clock import Clock, tick
+from companion.core.frozen import Stand, look
+from companion.core.leg import Approach, Leg, approach, learned, leg_of, stop_ahead
 from companion.core.motion import (
     BRIDGED_MAX_S,
     CRUISE,
@@ -28,6 +30,7 @@ from companion.core.motion import (
 )
 from companion.core.rate import is_override
 from companion.core.types import (
+    BatteryReport,
     ClockReport,
     EstimatorReport,
     FlowReport,
@@ -35,11 +38,16 @@ from companion.core.types import (
     HeartbeatReport,
     Input,
     LandedReport,
+    LegReport,
     OperatorCommand,
     OutputReport,
+    PressureReport,
+    RangeReport,
     RateOverride,
     RcReport,
     SpeedReport,
+    StopAhead,
+    TankReport,
     Telemetry,
     VehicleState,
     WindReport,
@@ -54,8 +62,14 @@ CONFIRM_COUNT = 5
 SPEED_REPORT_AGE_MAX_S = 1.0
 # Fix, estimator and landed state come at 1 to 5 Hz; older than this they count as not known.
 STATUS_AGE_MAX_S = 5.0
+# Both are asked for at 5 to 10 Hz, of which a slowed-down link leaves a quarter.
+RC_AGE_MAX_S = 2.0
+RANGE_AGE_MAX_S = 1.0
+# ArduPilot's and PX4's names of the mode that flies the mission.
+MISSION_MODES = frozenset({"AUTO", "MISSION"})
 RC_HIGH_US = 1700
 RC_LOW_US = 1300
+RC_SIGNAL_MAX_US = 2300
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +115,7 @@ class Track:
     """All that has been heard so far, as far as it matters."""
 
     motion: Motion | None = None
+    stand: Stand | None = None
     clock: Clock | None = None
     clock_report: ClockReport | None = None
     position_valid: bool = False
@@ -112,8 +127,14 @@ class Track:
     landed: LandedReport | None = None
     wind: WindReport | None = None
     rc: RcReport | None = None
+    switch_us: int = 0  # of the operator's channel in `rc`; 0 is no signal
+    range: RangeReport | None = None
     output: OutputReport | None = None
     flow: FlowReport | None = None
+    pressure: PressureReport | None = None
+    tank: TankReport | None = None
+    leg: Leg | None = None
+    braking_m_s2: float | None = None  # as seen at the ends of legs so far
     rate_percent: float = 100.0
     enabled: bool = False
 
@@ -122,12 +143,13 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
     """Return `track` with one more input; whatever is no number is kept out of the filter."""
     if isinstance(item, Telemetry):
         return _observe_position(track, item, setup)
-    if isinstance(item, HeartbeatReport):
-        return _observe_heartbeat(track, item, setup)
-    if isinstance(item, RcReport):
-        return _observe_rc(track, item, setup)
+    by_setup = _BY_SETUP.get(type(item))
+    if by_setup is not None:
+        return by_setup(track, item, setup)
     if isinstance(item, OperatorCommand):
         return replace(track, enabled=item.enable and item.source in setup.limits.enable_by)
+    if isinstance(item, LegReport):
+        return replace(track, leg=leg_of(item, setup.frame, setup.mission_braking_m_s2))
     return _KEEP[type(item)](track, item)
 
 
@@ -138,14 +160,26 @@ _KEEP: dict[type, Callable[[Track, Any], Track]] = {
     EstimatorReport: lambda track, item: replace(track, estimator=item),
     LandedReport: lambda track, item: replace(track, landed=item),
     WindReport: lambda track, item: replace(track, wind=item),
+    RangeReport: lambda track, item: replace(track, range=item),
     OutputReport: lambda track, item: replace(track, output=item),
     FlowReport: lambda track, item: replace(track, flow=item),
+    PressureReport: lambda track, item: replace(track, pressure=item),
+    TankReport: lambda track, item: replace(track, tank=item),
     ClockReport: lambda track, item: replace(track, clock_report=item),
     # What is out of bounds, or no number, leaves the rate as it was.
     RateOverride: lambda track, item: (
         replace(track, rate_percent=item.percent) if is_override(item.percent) else track
     ),
 }
+
+
+def _observe_battery(track: Track, item: BatteryReport, setup: Setup) -> Track:
+    """Take a flow meter or a level that the autopilot reads as one of its batteries."""
+    wiring = setup.autopilot_liquid
+    if wiring is None:
+        return track
+    flow, tank = wiring.flow(item), wiring.tank(item)
+    return replace(track, flow=flow or track.flow, tank=tank or track.tank)
 
 
 def _observe_heartbeat(track: Track, item: HeartbeatReport, setup: Setup) -> Track:
@@ -155,7 +189,7 @@ def _observe_heartbeat(track: Track, item: HeartbeatReport, setup: Setup) -> Tra
     if before is not None:
         if before.armed and not item.armed:
             enabled = False
-        if before.mode in setup.limits.modes and item.mode not in setup.limits.modes:
+        if setup.limits.allows(before.mode) and not setup.limits.allows(item.mode):
             enabled = False
     return replace(track, heartbeat=item, enabled=enabled)
 
@@ -169,11 +203,19 @@ def _observe_rc(track: Track, item: RcReport, setup: Setup) -> Track:
             enabled = before >= RC_LOW_US // 2  # an edge out of a lost signal is no wish
         elif now < RC_LOW_US <= before:
             enabled = False
-    return replace(track, rc=item, enabled=enabled)
+    switch_us = 0 if channel is None else _pulse(item, channel)
+    return replace(track, rc=item, switch_us=switch_us, enabled=enabled)
 
 
 def _pulse(report: RcReport, channel: int) -> int:
     return report.pulse_us[channel - 1] if 0 < channel <= len(report.pulse_us) else 0
+
+
+_BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
+    HeartbeatReport: _observe_heartbeat,
+    RcReport: _observe_rc,
+    BatteryReport: _observe_battery,
+}
 
 
 def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
@@ -187,7 +229,12 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         if item.boot_s > before.boot_s - 0.5:
             return replace(track, position_valid=False)  # time went back: until the next is newer
         before = None  # the autopilot's clock went back: it was restarted
-        track = replace(track, clock=None, clock_report=None)
+        track = replace(track, clock=None, clock_report=None, stand=None)
+    track = _observe_stand(track, item)
+    if before is not None and track.stand is not None and track.stand.is_frozen:
+        # It is kept out of the filters, and what comes after it has to be confirmed.
+        still = replace(before, boot_s=item.boot_s, confirm_left=CONFIRM_COUNT)
+        return replace(track, motion=still)
     at_once = not track.enabled or before is None
     clock, is_synced, moved_s = tick(track.clock, item, track.clock_report, at_once=at_once)
     if is_synced:
@@ -204,7 +251,19 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         clock=clock,
         position_valid=motion.confirm_left == 0,
         position_received_s=item.received_s,
+        braking_m_s2=_learned_braking(track, motion, item.received_s),
     )
+
+
+def _observe_stand(track: Track, item: Telemetry) -> Track:
+    """Notice a place that stands still while the vehicle does not."""
+    motion, expected_m_s = track.motion, None
+    if motion is not None and 0.0 < item.boot_s - motion.boot_s < BRIDGED_MAX_S:
+        east, north = motion.after(item.boot_s - motion.boot_s)
+        expected_m_s = math.hypot(east.velocity_m_s, north.velocity_m_s)
+    checked_m_s = _checked_speed(track, item.received_s)
+    stand = look(track.stand, item, expected_m_s=expected_m_s, reported_m_s=checked_m_s)
+    return replace(track, stand=stand)
 
 
 def _place(item: Telemetry, setup: Setup) -> tuple[float, float] | None:
@@ -278,6 +337,8 @@ def _seen(item: Telemetry, place: tuple[float, float]) -> tuple[Seen, Seen]:
 def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:
     if heading_deg is None or before.heading_deg is None:
         return 0.0
+    if not abs(heading_deg - before.heading_deg) <= 720.0:
+        return 0.0  # one of them is no number; the rate would never be one again
     turned_deg = (heading_deg - before.heading_deg + 180.0) % 360.0 - 180.0
     share = 1.0 - math.exp(-dt_s / YAW_RATE_TIME_S)
     return before.yaw_rate_deg_s + share * (turned_deg / dt_s - before.yaw_rate_deg_s)
@@ -310,10 +371,11 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         acceleration_fade_s=motion.acceleration_fade_s,
         heading_deg=heading,
         yaw_rate_deg_s=motion.yaw_rate_deg_s,
-        height_m=motion.height_m,
+        height_m=_height(track, motion, now_s),
         velocity_known=known,
         position_received_s=motion.received_s,
         position_valid=track.position_valid,
+        position_frozen=track.stand is not None and track.stand.is_frozen,
         checked_speed_m_s=checked,
         fix=track.gnss.fix if track.gnss and _young(track.gnss, now_s) else None,
         estimator_healthy=(
@@ -324,21 +386,78 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         mode=None if heartbeat is None else heartbeat.mode,
         in_air=track.landed.in_air if track.landed and _young(track.landed, now_s) else None,
         wind_m_s=track.wind.speed_m_s if track.wind else None,
+        wind_received_s=track.wind.received_s if track.wind else None,
+        rc_switch_on=_switch_on(track, now_s),
         output_healthy=track.output is None or track.output.healthy,
         enabled=track.enabled,
         flow=track.flow,
+        pressure=track.pressure,
+        tank=track.tank,
         wind=track.wind if track.wind and track.wind.east_m_s is not None else None,
         rate_percent=track.rate_percent,
+        stop_ahead=_stop_ahead(track, east, north, now_s),
     )
 
 
-def _young(report: GnssReport | EstimatorReport | LandedReport, now_s: float) -> bool:
-    return now_s - report.received_s <= STATUS_AGE_MAX_S
+def _learned_braking(track: Track, motion: Motion, now_s: float) -> float | None:
+    """Return how hard the vehicle brakes at the ends of its legs, after one more position."""
+    leg = track.leg
+    if leg is None:
+        return track.braking_m_s2
+    usual_m_s2 = leg.braking_m_s2 if track.braking_m_s2 is None else track.braking_m_s2
+    seen = _approach(track, leg, *motion.after(0.0), now_s)
+    return learned(leg.braking_m_s2, usual_m_s2, seen)
+
+
+def _stop_ahead(track: Track, east: Axis, north: Axis, now_s: float) -> StopAhead | None:
+    """Return the stop at the end of the mission's leg, if one is about to be made."""
+    leg = track.leg
+    seen = None if leg is None else _approach(track, leg, east, north, now_s)
+    if leg is None or seen is None:
+        return None
+    return stop_ahead(leg.braking_m_s2 if track.braking_m_s2 is None else track.braking_m_s2, seen)
+
+
+def _approach(track: Track, leg: Leg, east: Axis, north: Axis, now_s: float) -> Approach | None:
+    """Return how the vehicle comes to the end of its leg, while the mission is being flown."""
+    if track.heartbeat is None or track.heartbeat.mode not in MISSION_MODES:
+        return None
+    return approach(
+        leg,
+        place=(east.position_m, north.position_m),
+        velocity=(east.velocity_m_s, north.velocity_m_s),
+        acceleration=(east.acceleration_m_s2, north.acceleration_m_s2),
+        now_s=now_s,
+    )
+
+
+def _young(
+    report: GnssReport | EstimatorReport | LandedReport | RcReport | RangeReport | SpeedReport,
+    now_s: float,
+    limit_s: float = STATUS_AGE_MAX_S,
+) -> bool:
+    """Whether a report may be believed: no older than the limit, and not of the future."""
+    return -0.1 <= now_s - report.received_s <= limit_s
+
+
+def _switch_on(track: Track, now_s: float) -> bool | None:
+    """Whether the operator's switch is not off; None where nothing young is known of it."""
+    if track.rc is None or not _young(track.rc, now_s, RC_AGE_MAX_S):
+        return None
+    return RC_LOW_US <= track.switch_us <= RC_SIGNAL_MAX_US
+
+
+def _height(track: Track, motion: Motion, now_s: float) -> float:
+    """Return the height above the crop where a sensor sees it, else above home."""
+    seen = track.range
+    if seen is None or seen.height_m is None or not _young(seen, now_s, RANGE_AGE_MAX_S):
+        return motion.height_m
+    return seen.height_m
 
 
 def _checked_speed(track: Track, now_s: float) -> float | None:
     """Return the second opinion on the ground speed, if it is young enough."""
-    if track.speed is None or not now_s - track.speed.received_s <= SPEED_REPORT_AGE_MAX_S:
+    if track.speed is None or not _young(track.speed, now_s, SPEED_REPORT_AGE_MAX_S):
         return None
     return track.speed.ground_speed_m_s
 

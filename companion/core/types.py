@@ -59,6 +59,11 @@ class Inhibit(StrEnum):
     WIND_UNKNOWN = "wind-unknown"
     RC_SWITCH = "rc-switch"
     OUTPUT_FAULT = "output-fault"
+    LEAK = "leak"
+    VALVE_STUCK_OPEN = "valve-stuck-open"
+    NO_FLOW = "no-flow"
+    TANK_EMPTY = "tank-empty"
+    FLOW_FAULT = "flow-fault"
 
 
 class FlowTrimState(StrEnum):
@@ -70,6 +75,25 @@ class FlowTrimState(StrEnum):
     AT_LIMIT = "at-limit"  # for too long: it cannot correct what is wrong
     SUDDEN_CHANGE = "sudden-change"  # held: a clog or a leak, not a drift
     IMPLAUSIBLE = "implausible"  # the meter is too far from the table
+
+
+class FaultKind(StrEnum):
+    """What is wrong between the tank and the nozzles; see `detection.py`."""
+
+    CLOG = "clog"  # nozzles or the way to them let less through
+    STUCK_CLOSED = "stuck-closed"  # the flow of one valve is missing
+    LEAK = "leak"
+    STUCK_OPEN = "stuck-open"
+    SUPPLY = "supply"  # pump, regulator or suction: flow and pressure agree with each other
+    AIR = "air"
+    PUMP_OFF = "pump-off"
+    TANK_EMPTY = "tank-empty"
+    TANK_LOW = "tank-low"  # at its reserve
+    NO_FLOW = "no-flow"  # nothing of what is ordered comes, and no more is known
+    DEAD_METER = "dead-meter"
+    METER_FAULT = "meter-fault"  # the meter says so itself, or is silent
+    PRESSURE_FAULT = "pressure-fault"
+    TANK_FAULT = "tank-fault"
 
 
 # --------------------------------------------------------------------------------------- inputs
@@ -152,7 +176,7 @@ class WindReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeReport:
-    """Height above the crop by a sensor that looks down (DISTANCE_SENSOR); None: it sees nothing."""
+    """Height above the crop by a sensor that looks down (DISTANCE_SENSOR); None: sees nothing."""
 
     received_s: float
     height_m: float | None
@@ -188,11 +212,45 @@ class OutputReport:
 class FlowReport:
     """What the flow meter has counted since it was started: all valves, as its calibration has it.
 
-    A count and not a flow, so that a mean over any time can be formed from two of them.
+    A count and not a flow, so that a mean over any time can be formed from two of them. With a
+    `fault` (pulses were lost, more came than can be) the volume is no number.
     """
 
     received_s: float
     volume_ml: float
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PressureReport:
+    """Pressure before the valves, mean of a reading's time; None with a `fault` of the sensor."""
+
+    received_s: float
+    pressure_kpa: float | None
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TankReport:
+    """What is left in the tank; None where it is not known, with a `fault` where it should be."""
+
+    received_s: float
+    level_l: float | None
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatteryReport:
+    """One of the autopilot's battery monitors (BATTERY_STATUS), counted from 0.
+
+    Behind it may be ArduPilot's fuel flow meter, whose milliampere hours are millilitres, or a
+    fuel level; `None` is what it does not know.
+    """
+
+    received_s: float
+    battery: int
+    consumed: float | None
+    remaining_percent: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,6 +273,23 @@ class ClockReport:
     round_trip_s: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LegReport:
+    """The leg of its mission that the vehicle now flies: from which place to which.
+
+    `stops` says whether the vehicle comes to a stop at its end, `speed_m_s` is the speed that the
+    mission asks for on it. `received_s` is when the autopilot last said which leg it is.
+    """
+
+    received_s: float
+    from_latitude_deg: float
+    from_longitude_deg: float
+    to_latitude_deg: float
+    to_longitude_deg: float
+    stops: bool
+    speed_m_s: float | None = None
+
+
 Input = (
     Telemetry
     | SpeedReport
@@ -228,12 +303,24 @@ Input = (
     | OperatorCommand
     | OutputReport
     | FlowReport
+    | PressureReport
+    | TankReport
+    | BatteryReport
     | RateOverride
     | ClockReport
+    | LegReport
 )
 
 
 # ---------------------------------------------------------------------------------------- state
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StopAhead:
+    """The vehicle comes to a stop so far ahead along its course, braking so hard; see `leg.py`."""
+
+    distance_m: float
+    braking_m_s2: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -268,12 +355,15 @@ class VehicleState:
     output_healthy: bool
     enabled: bool
     flow: FlowReport | None = None
+    pressure: PressureReport | None = None
+    tank: TankReport | None = None
     wind: WindReport | None = None  # where its direction is known
     rate_percent: float = 100.0
     wind_received_s: float | None = None
     position_frozen: bool = False  # the place stands still, the vehicle does not
     rc_switch_on: bool | None = None  # None: no switch, or nothing young is known of it
     acceleration_fade_s: float = 0.5  # the acceleration's time constant in every prediction
+    stop_ahead: StopAhead | None = None  # None: no mission is used, or it says of no stop
 
 
 # ---------------------------------------------------------------------------------------- plans
@@ -333,6 +423,16 @@ class SprayPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """A fault between the tank and the nozzles, in words; `valve` where it can be told."""
+
+    kind: FaultKind
+    at_s: float
+    text: str
+    valve: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
     """One step of the core: one row of the journal. Replay must give the same again.
 
@@ -353,3 +453,4 @@ class Decision:
     unresolved_count: int = 0
     flow_trim: float | None = None
     flow_trim_state: FlowTrimState | None = None
+    findings: tuple[Finding, ...] = ()

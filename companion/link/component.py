@@ -21,10 +21,14 @@ from companion.link.messages import (
     Message,
     ParamAsked,
     ParamSet,
+    ParamValue,
     PingReceived,
     ServoOutput,
     TimesyncReceived,
 )
+from companion.link.mission_messages import MissionCurrent, MissionTransfer
+from companion.link.mission_reader import MissionReader
+from companion.link.outputs import ORDERS, Outputs
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent, Service
 from companion.link.signing import Signing
@@ -32,7 +36,6 @@ from companion.link.statistics import Meter
 from companion.link.streams import StreamRequest, StreamSupervisor, wanted_streams
 from companion.link.tank import Tank
 
-DO_SET_SERVO = 183
 _POSITION = 33
 _TIMESYNC_S = 1.0
 _REBOOT_S = 1.0
@@ -41,12 +44,16 @@ _INPUTS = get_args(Input)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComponentOptions:
-    """Who we are on the link and how often we want to know the position."""
+    """Who we are on the link, what we want to know how often, and the ends of the pulses."""
 
     system_id: int = 0
     component_id: int = 191
     position_rate_hz: float = 20.0
     version: tuple[int, int, int] = (0, 1, 0)
+    closed_us: int = 1000
+    full_us: int = 2000
+    use_mission: bool = False
+    use_battery: bool = False
 
 
 class Component:
@@ -68,12 +75,18 @@ class Component:
         accept = None if signing is None else signing.accepts
         self.codec = Codec(system_id=options.system_id, accept=accept)
         self.meter = Meter()
+        self.outputs = Outputs(
+            self._encoder, self._send, closed_us=options.closed_us, full_us=options.full_us
+        )
         self._announcer = Announcer(self._encoder)
         self._desk = Desk(
             parameters=parameters if parameters is not None else Parameters(), tank=Tank()
         )
         self._service = Service(
             self._desk, self._encoder, self._announcer, self._send, version=options.version
+        )
+        self._mission = MissionReader(
+            self._encoder, self._send, self.warn, is_used=options.use_mission
         )
         self._supervisor: StreamSupervisor | None = None
         self._boot_s: float | None = None
@@ -110,9 +123,7 @@ class Component:
 
     def order(self, channel: int, pulse_us: int) -> bool:
         """Order a servo output; False where nobody is there to take it."""
-        if not self.is_vehicle_known:
-            return False
-        return self._send(self._encoder.set_servo(channel, pulse_us))
+        return self.outputs.order(channel, pulse_us)
 
     def fault(self, text: str) -> None:
         """Tell the operator once of something that does not work."""
@@ -135,6 +146,8 @@ class Component:
                 inputs.extend(self._service.obey(message))
             elif isinstance(message, ParamAsked | ParamSet):
                 inputs.extend(self._service.serve(message))
+            elif isinstance(message, MissionCurrent | MissionTransfer):
+                inputs.extend(self._mission.take(message))
             else:
                 self._answer(message)
         inputs.extend(self.clock.take_report())
@@ -146,6 +159,8 @@ class Component:
         for frame in self._announcer.due(decision, now_s):
             self._send(frame)
         self._service.tick(now_s)
+        self.outputs.tick(now_s)
+        self._mission.tick(now_s, is_armed=self._desk.is_armed)
         if self._supervisor is None:
             return
         for request in self._supervisor.due(self.codec.vehicle_counts, now_s):
@@ -176,11 +191,16 @@ class Component:
         if vehicle is None:
             return
         self._encoder.system_id = vehicle.system_id
+        self.outputs.meet(vehicle)
+        self._mission.meet(vehicle.system_id)
         self.met_s, self.is_answered = now_s, False
         if self._supervisor is None:
             self._supervisor = StreamSupervisor(may_group=vehicle.is_ardupilot)
         streams = wanted_streams(
-            position_rate_hz=self._options.position_rate_hz, is_px4=vehicle.is_px4
+            position_rate_hz=self._options.position_rate_hz,
+            is_px4=vehicle.is_px4,
+            with_mission=self._options.use_mission,
+            with_battery=self._options.use_battery,
         )
         for request in self._supervisor.start(streams, now_s):
             self._ask(request)
@@ -196,6 +216,7 @@ class Component:
         """Take from an input what the link itself has to know of it."""
         if isinstance(item, HeartbeatReport):
             self._desk.is_armed = item.armed
+            self.outputs.armed(item.armed)
         elif isinstance(item, Telemetry):
             self._watch_boot(item)
 
@@ -216,13 +237,16 @@ class Component:
             self._take_ping(message)
         elif isinstance(message, ServoOutput):
             self.servo_output = message
+            self.outputs.report(message)
+        elif isinstance(message, ParamValue):
+            self.outputs.parameter(message)
 
     def _take_ack(self, ack: AckReceived) -> None:
         # 0, 0 is an acknowledgement in the old form, which named nobody.
         if (ack.target_system, ack.target_component) not in (self.address, (0, 0)):
             return
         self.is_answered = True
-        if ack.command == DO_SET_SERVO and self.on_order_ack is not None:
+        if ack.command in ORDERS and self.on_order_ack is not None:
             self.on_order_ack(ack.result)
         elif ack.command == SET_MESSAGE_INTERVAL and self._supervisor is not None:
             self._supervisor.answered(ack.result, ack.received_s)

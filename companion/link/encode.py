@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -77,6 +78,14 @@ class Encoder:
         """Return MAV_CMD_DO_SET_SERVO."""
         return self.command(mavlink.MAV_CMD_DO_SET_SERVO, float(channel), float(pulse_us))
 
+    def set_actuators(self, values: Sequence[float]) -> bytes:
+        """Return MAV_CMD_DO_SET_ACTUATOR for the first set of six, -1 to 1 each.
+
+        As COMMAND_LONG: in the form with integers PX4 takes the fifth and sixth wrongly scaled.
+        """
+        first_set = 0.0
+        return self.command(mavlink.MAV_CMD_DO_SET_ACTUATOR, *values, first_set)
+
     def set_message_interval(self, message_id: int, rate_hz: float) -> bytes:
         """Return MAV_CMD_SET_MESSAGE_INTERVAL."""
         interval_us = round(1e6 / rate_hz)
@@ -123,6 +132,32 @@ class Encoder:
         """Return PARAM_VALUE."""
         return self._pack(
             self._mav.param_value_encode(name.encode("ascii"), value, REAL32, count, index)
+        )
+
+    def param_request_read(self, name: str) -> bytes:
+        """Return PARAM_REQUEST_READ for one parameter of the autopilot, by its name."""
+        return self._pack(
+            self._mav.param_request_read_encode(
+                self.system_id, AUTOPILOT_COMPONENT, name.encode("ascii"), -1
+            )
+        )
+
+    def mission_request_list(self) -> bytes:
+        """Return MISSION_REQUEST_LIST: how many items has the autopilot's mission."""
+        return self._pack(
+            self._mav.mission_request_list_encode(self.system_id, AUTOPILOT_COMPONENT, 0)
+        )
+
+    def mission_request(self, sequence: int) -> bytes:
+        """Return MISSION_REQUEST_INT for one item."""
+        return self._pack(
+            self._mav.mission_request_int_encode(self.system_id, AUTOPILOT_COMPONENT, sequence, 0)
+        )
+
+    def mission_ack(self, result: int) -> bytes:
+        """Return the MISSION_ACK that ends a transfer."""
+        return self._pack(
+            self._mav.mission_ack_encode(self.system_id, AUTOPILOT_COMPONENT, result, 0)
         )
 
     def message_interval(self, message_id: int, interval_us: int) -> bytes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from companion.core.types import Input
+from companion.link.mission_messages import MissionCurrent, MissionTransfer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +87,16 @@ class ParamSet:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ParamValue:
+    """PARAM_VALUE of the autopilot; what `value` means depends on `kind` and on the firmware."""
+
+    received_s: float
+    name: str
+    value: float
+    kind: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ServoOutput:
     """SERVO_OUTPUT_RAW: what the autopilot's outputs do, channel 1 first; 0 is no pulse."""
 
@@ -102,5 +113,8 @@ Message = (
     | PingReceived
     | ParamAsked
     | ParamSet
+    | ParamValue
     | ServoOutput
+    | MissionCurrent
+    | MissionTransfer
 )

@@ -68,6 +68,15 @@ def parse_url(url: str) -> LinkUrl:
     return LinkUrl(kind=kind, place=place.strip("[]"), number=value, text=url)
 
 
+def serial_baud(url: str) -> int | None:
+    """Return the baud rate of a serial link; None for any other, whose speed is not known.
+
+    >>> serial_baud("serial:/dev/ttyAMA0:57600"), serial_baud("udpin:127.0.0.1:14550")
+    (57600, None)
+    """
+    return parse_url(url).number if url.startswith("serial:") else None
+
+
 async def open_transport(
     url: str, on_bytes: OnBytes, on_change: OnChange, on_trouble: OnTrouble | None = None
 ) -> Transport:

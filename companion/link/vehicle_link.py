@@ -10,6 +10,7 @@ from collections.abc import Callable
 from companion.core.types import Decision, Input, OperatorCommand, RateOverride
 from companion.link.component import Component, ComponentOptions
 from companion.link.findings import blocking
+from companion.link.outputs import OutputListener
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent
 from companion.link.signing import Signing
@@ -107,6 +108,20 @@ class VehicleLink:
     def order(self, channel: int, pulse_us: int) -> bool:
         """Order a servo output; False where the order could not leave."""
         return self.component.order(channel, pulse_us)
+
+    def flush_orders(self) -> bool:
+        """Send the orders that leave together; False where they could not leave."""
+        return self.component.outputs.flush()
+
+    def follow_outputs(self, listener: OutputListener) -> None:
+        """Have all that the vehicle says of its outputs given to who orders them."""
+        self.component.outputs.listener = listener
+
+    def note_outputs(self, text: str) -> None:
+        """Tell operator, log and record of something about the outputs that should be seen to."""
+        _logger.warning("outputs: %s", text)
+        self.component.warn(text)
+        self._event(self._clock(), "outputs", text)
 
     def tell(self, decision: Decision | None, now_s: float) -> None:
         """Send what is due: sign of life, heartbeat, texts, values, requests."""

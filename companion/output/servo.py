@@ -10,109 +10,60 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
+from companion.output.autopilot_budget import CHANGE_MIN_US, order_budget
+from companion.output.autopilot_guard import OutputGuard
+from companion.output.autopilot_options import DITHER_S, ServoOptions
+from companion.output.pwm import RESTART_DUTY
 from companion.output.timed import TimedExecutor
+
+__all__ = ["DITHER_S", "Order", "ServoExecutor", "ServoOptions"]
 
 _logger = logging.getLogger(__name__)
 
-# Below this the driver board sees no difference (0.2 % of the usual span).
-_CHANGE_MIN_US = 2
 _CLOSE_AGAIN_S = 0.05
-# An alive dither moves each open valve's width this often, so 5 Hz to and fro. A board that closes
-# after 0.3 s of standstill then outlives two lost orders in a row.
-DITHER_S = 0.1
 # After a refusal the closing orders go on, but seldom: each costs a text on the pilot's screen.
 _REFRESH_FAULT_S = 5.0
-_REFUSALS = {2: "denied", 3: "not supported", 4: "failed: is SERVOn_FUNCTION 0?"}  # MAV_RESULT
+# An order that may have been more than the autopilot's queue takes is said again after this.
+_SAY_AGAIN_S = 0.1
 
 Order = Callable[[int, int], bool]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ServoOptions:
-    """The outputs: one channel a valve, left to right, and the two ends of the pulse.
+class ServoExecutor(TimedExecutor):
+    """Gives orders by `order(channel, pulse_us)`, which says whether the order left.
 
-    At `return_channel`, if there is one, `full_us` opens a return valve and `closed_us` shuts it.
-    With `dither_us` the pulse of an open valve moves to and fro by that much, around its own width,
-    every `DITHER_S`: a board that wants to see it closes when the autopilot goes on with a pulse
-    of the past. The valves take turns, to keep the wire free; with `dithers_together` they move at
-    once, for an autopilot whose one order carries all outputs.
+    Where one order carries all outputs (PX4), `order` only takes a value and `flush` sends. Until
+    the vehicle is met it counts as one that takes an order for each output.
     """
 
-    channels: tuple[int, ...]
-    closed_us: int = 1000
-    full_us: int = 2000
-    refresh_s: float = 1.0
-    dither_us: int = 0
-    dithers_together: bool = False
-    return_channel: int | None = None
-
-    def __post_init__(self) -> None:
-        if not self.channels or len(set(self.outputs)) != len(self.outputs):
-            raise ValueError(f"each valve needs a channel of its own, got {self.channels}")
-        if not all(1 <= channel <= 32 for channel in self.outputs):
-            raise ValueError(f"servo channels are 1 to 32, got {self.outputs}")
-        for name, pulse_us in (("closed_us", self.closed_us), ("full_us", self.full_us)):
-            # The autopilot clamps nothing; what is outside is no servo pulse.
-            if not 500 <= pulse_us <= 2500:
-                raise ValueError(f"{name} must lie in [500, 2500], got {pulse_us}")
-        if not abs(self.full_us - self.closed_us) >= 100:
-            raise ValueError(f"closed_us and full_us are too near: {self.closed_us}")
-        if not 0 <= self.dither_us <= 50:
-            raise ValueError(f"dither_us must lie in [0, 50], got {self.dither_us}")
-        if not 0.05 <= self.refresh_s <= 10.0:
-            raise ValueError(f"refresh_s must lie in [0.05, 10], got {self.refresh_s}")
-
-    @property
-    def outputs(self) -> tuple[int, ...]:
-        """Return all channels, that of the return valve at the end."""
-        more = () if self.return_channel is None else (self.return_channel,)
-        return self.channels + more
-
-    def pulse_us(self, duty: float) -> int:
-        """Return the pulse for `duty`.
-
-        >>> ServoOptions(channels=(9,)).pulse_us(0.25)
-        1250
-        """
-        return round(self.closed_us + duty * (self.full_us - self.closed_us))
-
-    def dithered_us(self, pulse_us: int, *, is_up: bool) -> int:
-        """Return what is sent for `pulse_us`: half the dither to either side, but never past full.
-
-        >>> options = ServoOptions(channels=(9,), dither_us=8)
-        >>> [options.dithered_us(1500, is_up=is_up) for is_up in (False, True)]
-        [1496, 1504]
-        >>> [options.dithered_us(2000, is_up=is_up) for is_up in (False, True)]
-        [1992, 2000]
-        >>> options.dithered_us(1000, is_up=True)
-        1000
-        """
-        if pulse_us == self.closed_us or not self.dither_us:
-            return pulse_us
-        sign = 1 if self.full_us > self.closed_us else -1
-        open_us = sign * (pulse_us - self.closed_us)
-        full_us = sign * (self.full_us - self.closed_us)
-        low_us = min(open_us - self.dither_us // 2, full_us - self.dither_us)
-        return self.closed_us + sign * (low_us + (self.dither_us if is_up else 0))
-
-
-class ServoExecutor(TimedExecutor):
-    """Gives orders by `order(channel, pulse_us)`, which says whether the order left."""
-
-    def __init__(self, options: ServoOptions, order: Order) -> None:
+    def __init__(
+        self,
+        options: ServoOptions,
+        order: Order,
+        *,
+        flush: Callable[[], bool] = lambda: True,
+        say: Callable[[str], None] = _logger.warning,
+        baud: int | None = None,
+        is_signed: bool = False,
+    ) -> None:
         super().__init__(len(options.channels), has_return=options.return_channel is not None)
         self._options = options
         self._outputs = options.outputs
         self._order = order
+        self._send_staged = flush
+        self._baud, self._is_signed = baud, is_signed
+        self._guard = OutputGuard(options, say)
+        self._is_joint = False
+        self._budget = order_budget(baud=baud, is_px4=False, is_signed=is_signed)
         self._sent_us: list[int | None] = [None] * len(self._outputs)
+        self._held_us: dict[int, int] = {}
+        self._is_staged = False
         self._next_refresh = self._next_dither = 0
         self._is_up = [False] * len(self._outputs)
         self._refresh_at_s: float | None = None
         self._dither_at_s: float | None = None
-        self._fault: str | None = None
         self._was_started = False
         self.order_count = 0
         self.unsent_count = 0
@@ -120,8 +71,26 @@ class ServoExecutor(TimedExecutor):
 
     @property
     def fault(self) -> str | None:
-        """Why the outputs cannot be trusted; None while the autopilot refuses nothing."""
-        return self._fault
+        """Why the outputs cannot be trusted; None while they take orders and follow them."""
+        return self._guard.fault
+
+    # ------------------------------------------------------------- what the autopilot says
+
+    def met(self, is_px4: bool) -> Sequence[str]:
+        """Take that the vehicle was met, also again; return the parameters to read of it.
+
+        What it was told before may be forgotten or kept: everything is ordered anew.
+        """
+        self._is_joint = is_px4
+        self._budget = order_budget(baud=self._baud, is_px4=is_px4, is_signed=self._is_signed)
+        names = self._guard.met(is_px4=is_px4, now_s=asyncio.get_running_loop().time())
+        self._say_all_again()
+        return names
+
+    def armed(self, is_armed: bool) -> None:
+        """Take that the vehicle was armed or disarmed: an order of before may show only now."""
+        self._guard.armed(is_armed, asyncio.get_running_loop().time())
+        self._say_all_again()
 
     def acknowledge(self, result: int) -> None:
         """Take the autopilot's answer to an order; a refusal is a fault, and stays one.
@@ -129,13 +98,46 @@ class ServoExecutor(TimedExecutor):
         It does not say which of several orders it means, so all valves close.
         """
         self.ack_count += 1
-        if result not in _REFUSALS or self._fault is not None:
+        before = self.fault
+        self._guard.acknowledge(result)
+        self._close_if_new(before)
+
+    def learned(self, known: dict[str, float | None]) -> Sequence[str]:
+        """Take parameters of the autopilot; return those to read besides."""
+        before = self.fault
+        more = self._guard.learned(known)
+        self._close_if_new(before)
+        return more
+
+    def reported(self, port: int, pulse_us: Sequence[int], at_s: float) -> None:
+        """Take what the outputs read; what may have been lost is said again, with today's value."""
+        before = self.fault
+        again = self._guard.reported(port, pulse_us, at_s)
+        self._close_if_new(before)
+        if not (again and self._is_running) or self._guard.is_refused:
             return
-        self._fault = f"servo order {_REFUSALS[result]}"
+        now_s = asyncio.get_running_loop().time()
+        for valve in again:
+            sent_us = self._sent_us[valve]
+            if sent_us is not None and not self._budget.left(now_s) < 1.0:
+                self._give(valve, sent_us)
+        self._flush()
+
+    def _close_if_new(self, before: str | None) -> None:
+        if self.fault is not None and before is None and self._is_running:
+            now_s = asyncio.get_running_loop().time()
+            self._follow(now_s)
+            self._arm(now_s)
+
+    def _say_all_again(self) -> None:
+        """Order everything as it is to be now, whatever was ordered before."""
+        self._sent_us = [None] * len(self._outputs)
         if self._is_running:
-            loop = asyncio.get_running_loop()
-            self._follow(loop.time())
-            self._arm(loop.time())
+            now_s = asyncio.get_running_loop().time()
+            self._follow(now_s)
+            self._arm(now_s)
+
+    # ----------------------------------------------------------------------- start and stop
 
     async def start(self) -> None:
         """Order all outputs closed and begin to refresh them."""
@@ -163,36 +165,86 @@ class ServoExecutor(TimedExecutor):
             self.lease_end_count,
         )
 
-    # ------------------------------------------------------------------------------- inside
-
-    @property
-    def _pause_s(self) -> float:
-        """Return the time between two refreshes: the valves take turns, to keep the wire free."""
-        period_s = self._options.refresh_s if self._fault is None else _REFRESH_FAULT_S
-        return period_s / len(self._outputs)
+    # ------------------------------------------------------------------------------- orders
 
     def _apply(self, valve: int, duty: float) -> bool:
         pulse_us = self._options.pulse_us(duty)
         sent_us = self._sent_us[valve]
-        if sent_us is not None:
-            moved_us = abs(pulse_us - sent_us)
-            is_end = pulse_us in (self._options.closed_us, self._options.full_us)
-            if moved_us == 0 or (moved_us < _CHANGE_MIN_US and not is_end):
-                return False
+        self._held_us.pop(valve, None)
+        if sent_us is not None and not self._is_worth_it(valve, sent_us, pulse_us):
+            return False
         return self._give(valve, pulse_us)
+
+    def _is_worth_it(self, valve: int, sent_us: int, pulse_us: int) -> bool:
+        """Return whether an order may go now; a change of zone, also to closed, always may."""
+        moved_us = abs(pulse_us - sent_us)
+        if moved_us == 0:
+            return False
+        closed_us, full_us = self._options.closed_us, self._options.full_us
+        if closed_us in (pulse_us, sent_us) or moved_us >= RESTART_DUTY * abs(full_us - closed_us):
+            return True
+        if moved_us < CHANGE_MIN_US and pulse_us != full_us:
+            return False
+        least_us = float(CHANGE_MIN_US)
+        if self._budget.is_limited:
+            least_us = self._budget.trim_min_us(asyncio.get_running_loop().time())
+        if moved_us < least_us and not (least_us == CHANGE_MIN_US and pulse_us == full_us):
+            self._held_us[valve] = pulse_us
+            return False
+        return True
 
     def _give(self, valve: int, pulse_us: int) -> bool:
         """Send one order; where it cannot leave, what the output does is unknown."""
         sent_us = pulse_us
+        self._held_us.pop(valve, None)
         if valve < self._count:
             sent_us = self._options.dithered_us(pulse_us, is_up=self._is_up[valve])
         has_left = self._order(self._outputs[valve], sent_us)
         self._sent_us[valve] = pulse_us if has_left else None
-        if has_left:
-            self.order_count += 1
-        else:
+        if not has_left:
             self.unsent_count += 1
-        return has_left
+            return False
+        now_s = asyncio.get_running_loop().time()
+        self._guard.sent(valve, sent_us, now_s)
+        self.order_count += 1
+        if self._is_joint:
+            self._is_staged = True
+        else:
+            self._budget.spend(1, now_s)
+        return True
+
+    def _flush(self) -> bool:
+        """Send what was gathered, with the trims that had to wait: they cost nothing more."""
+        if not self._is_staged:
+            return False
+        for valve, pulse_us in list(self._held_us.items()):
+            self._give(valve, pulse_us)
+        self._is_staged = False
+        now_s = asyncio.get_running_loop().time()
+        if not self._send_staged():
+            self.unsent_count += 1
+            self._sent_us = [None] * len(self._outputs)
+            self._guard.forget()
+        self._budget.spend(1, now_s)
+        if self._budget.left(now_s) < 0.0 and self._refresh_at_s is not None:
+            self._refresh_at_s = min(self._refresh_at_s, now_s + _SAY_AGAIN_S)
+        return True
+
+    # ------------------------------------------------------------------- refresh and dither
+
+    @property
+    def _pause_s(self) -> float:
+        """Return the time between two refreshes: the valves take turns, to keep the wire free."""
+        period_s = _REFRESH_FAULT_S if self._guard.is_refused else self._options.refresh_s
+        return period_s if self._is_joint else period_s / len(self._outputs)
+
+    @property
+    def _is_together(self) -> bool:
+        return self._is_joint or self._options.dithers_together
+
+    @property
+    def _dither_pause_s(self) -> float:
+        return DITHER_S if self._is_together else DITHER_S / self._count
 
     def _next_own_s(self) -> float | None:
         times = [at_s for at_s in (self._refresh_at_s, self._dither_at_s) if at_s is not None]
@@ -202,22 +254,20 @@ class ServoExecutor(TimedExecutor):
         """Say orders again, and move those that are to be seen alive, when their turn has come."""
         if self._refresh_at_s is not None and not now_s < self._refresh_at_s:
             self._refresh_at_s = now_s + self._pause_s
+            self._guard.look(now_s)
             valve = self._next_refresh
             self._next_refresh = (valve + 1) % len(self._outputs)
             sent_us = self._sent_us[valve]
             # What moves is said again by moving.
             if sent_us is not None and not self._dithers(valve):
-                self._give(valve, sent_us)
+                self._give(valve, self._held_us.get(valve, sent_us))
         if self._dither_at_s is not None and not now_s < self._dither_at_s:
             # In the mean as often as said: a turn that came late delays no other.
             pause_s = self._dither_pause_s
             late = now_s - self._dither_at_s >= pause_s
             self._dither_at_s = (now_s if late else self._dither_at_s) + pause_s
             self._dither()
-
-    @property
-    def _dither_pause_s(self) -> float:
-        return DITHER_S if self._options.dithers_together else DITHER_S / self._count
+        self._flush()
 
     def _dithers(self, valve: int) -> bool:
         """Return whether the valve is open and is to be seen alive; a return valve never is."""
@@ -228,8 +278,8 @@ class ServoExecutor(TimedExecutor):
         """Move the valve whose turn it is, or all of them; one that is closed stands still."""
         turn = self._next_dither
         self._next_dither = (turn + 1) % self._count
-        for valve in range(self._count) if self._options.dithers_together else (turn,):
+        for valve in range(self._count) if self._is_together else (turn,):
             sent_us = self._sent_us[valve]
             if sent_us is not None and self._dithers(valve):
                 self._is_up[valve] = not self._is_up[valve]
-                self._give(valve, sent_us)
+                self._give(valve, self._held_us.get(valve, sent_us))

@@ -123,6 +123,10 @@ class TimedExecutor:
     def _apply(self, valve: int, duty: float) -> bool:
         """Have `valve` take `duty`; return whether that was news to it."""
 
+    def _flush(self) -> bool:
+        """Send what `_apply` has only gathered; return whether there was anything."""
+        return False
+
     def _close_all(self) -> None:
         """Order everything closed; the return valve opens first and stays open."""
         if self._return is not None:
@@ -130,6 +134,7 @@ class TimedExecutor:
             self._apply(self._count, 1.0)
         for valve in range(self._count):
             self._apply(valve, 0.0)
+        self._flush()
 
     def _next_own_s(self) -> float | None:
         """Return when the executor wants to be woken for its own ends."""
@@ -154,6 +159,9 @@ class TimedExecutor:
             if self._apply(valve, duty)
         ]
         self._move_return(now_s, opens=False)
+        if self._flush():
+            sent_s = clock()
+            given = [(valve, duty, sent_s) for valve, duty, _ in given]
         # Measuring waits until all orders have left.
         for plan in (self._plan, replaced):
             if plan is not None and given:

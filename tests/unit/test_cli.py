@@ -14,8 +14,9 @@ from companion.cli.app import COMMANDS, Place, execute, load_command, main
 from companion.cli.run import build_executor, component_options
 from companion.config import load
 from companion.core.types import SprayPlan
-from companion.errors import ActuatorError, ConfigError, LinkError, VrsprayError
+from companion.errors import ActuatorError, LinkError, VrsprayError
 from companion.link.vehicle_link import VehicleLink
+from companion.output.gpio import GpioExecutor
 from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor
 
@@ -381,12 +382,12 @@ def test_refusal_of_an_order_reaches_the_executor() -> None:
     assert executor.fault is not None
 
 
-def test_dry_run_has_no_outputs_and_gpio_is_refused() -> None:
+def test_dry_run_has_no_outputs_and_gpio_has_an_engine() -> None:
     dry = load(Path(CONFIG), overrides=["output.kind=none"])
     link = VehicleLink(dry.link.url, component_options(dry))
     assert isinstance(build_executor(dry, link), DryRunExecutor)
-    with pytest.raises(ConfigError, match="not part of this version"):
-        build_executor(load(Path(CONFIG), overrides=["output.kind=gpio"]), link)
+    gpio = load(Path(CONFIG), overrides=["output.kind=gpio"])
+    assert isinstance(build_executor(gpio, link), GpioExecutor)
 
 
 def run_arguments(folder: Path, port: int) -> list[str]:

@@ -24,6 +24,7 @@ import shapely
 from companion.core.controller import Memory, Setup, step
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import (
+    BatteryReport,
     ClockReport,
     Decision,
     EstimatorReport,
@@ -33,11 +34,15 @@ from companion.core.types import (
     HeartbeatReport,
     Input,
     LandedReport,
+    LegReport,
     OperatorCommand,
     OutputReport,
+    PressureReport,
+    RangeReport,
     RateOverride,
     RcReport,
     SpeedReport,
+    TankReport,
     Telemetry,
     WindReport,
 )
@@ -69,12 +74,25 @@ INPUTS: list[Input] = [
     HeartbeatReport(received_s=1.3, autopilot="px4", armed=True, mode='"AUTO"\n\udc80'),
     LandedReport(received_s=1.4, in_air=None),
     WindReport(received_s=INF, speed_m_s=2.5),
+    RangeReport(received_s=1.55, height_m=None),
     RcReport(received_s=1.6, pulse_us=(1500, 0, 65535)),
     OperatorCommand(received_s=NAN, enable=True, source="web"),
     OutputReport(received_s=1.8, healthy=False, text="änderung"),
     FlowReport(received_s=1.9, volume_ml=0.1 + 0.2),
     ClockReport(received_s=2.1, offset_s=-1 / 3, round_trip_s=NAN),
+    LegReport(
+        received_s=2.2,
+        from_latitude_deg=36.1,
+        from_longitude_deg=NAN,
+        to_latitude_deg=-0.1,
+        to_longitude_deg=1 / 3,
+        stops=True,
+        speed_m_s=None,
+    ),
     RateOverride(received_s=2.0, percent=NAN),
+    PressureReport(received_s=2.2, pressure_kpa=None, fault="1.2 mA: wire broken"),
+    TankReport(received_s=2.3, level_l=1 / 3),
+    BatteryReport(received_s=2.4, battery=1, consumed=4711.0, remaining_percent=None),
 ]
 
 

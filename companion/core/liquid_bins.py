@@ -1,0 +1,187 @@
+"""Evidence of what flows: what the meter counted beside what was ordered, in whole PWM periods.
+
+The table's volume of each valve is taken as late as the sprayer is, at the exact times of the
+changes, so that an order whose flow is still on its way is no difference. A bin is a few PWM
+periods long: the pulses cancel in it, and a fault shows within a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from companion.core.flow_window import STALE_S, is_usable
+from companion.core.types import FlowReport, PressureReport, SprayPlan
+
+# Whole periods of about this time: short enough to see a fault within a second, long enough that
+# 1 % of noise a period and the meter's pulses leave about 1 %.
+BIN_S = 0.25
+# The ramp of a valve is over within this: a bin that begins later is not bent by it.
+EDGE_S = 0.05
+
+
+class Order(NamedTuple):
+    """From `at_s` on: what the table says of each valve, and the pressure that goes with it."""
+
+    at_s: float
+    flows_ml_s: tuple[float, ...]
+    pressure_kpa: float | None
+
+
+class Bin(NamedTuple):
+    """Some whole periods: expected volume of each valve, metered volume, pressure over expected.
+
+    `is_whole` says that the same valves were open all the time: what the lags leave at the ends
+    of a pass is no evidence.
+    """
+
+    begin_s: float
+    end_s: float
+    expected_ml: tuple[float, ...]
+    metered_ml: float
+    pressure: float | None
+    is_whole: bool = True
+
+    @property
+    def all_ml(self) -> float:
+        """Return the expected volume of all valves."""
+        return math.fsum(self.expected_ml)
+
+
+class Collecting(NamedTuple):
+    """The bin that is being filled; `from_s` is None where none is."""
+
+    orders: tuple[Order, ...] = ()
+    last: FlowReport | None = None
+    from_s: float | None = None
+    from_ml: float = 0.0
+    pressure_s: float = -math.inf
+    pressure_sum: float = 0.0
+    pressure_count: int = 0
+
+
+def bin_length_s(period_s: float) -> float:
+    """Return the length of a bin.
+
+    >>> round(bin_length_s(1.0 / 11.0) * 11.0, 6)
+    3.0
+    """
+    return max(round(BIN_S / period_s), 1) * period_s
+
+
+def duties_of(plan: SprayPlan, until_s: float) -> Iterable[tuple[float, tuple[float, ...]]]:
+    """Yield (time, duty of each valve) of what `plan` has brought about by `until_s`."""
+    duty = list(plan.duty)
+    yield plan.issued_s, tuple(duty)
+    for change in plan.changes:
+        if change.at_s > until_s or change.at_s >= plan.lease_until_s:
+            break
+        duty[change.valve] = change.duty
+        yield max(change.at_s, plan.issued_s), tuple(duty)
+    if plan.lease_until_s <= until_s:
+        yield plan.lease_until_s, (0.0,) * len(duty)
+
+
+def with_orders(
+    orders: tuple[Order, ...], new: Iterable[Order], *, keep_from_s: float
+) -> tuple[Order, ...]:
+    """Return the orders with newer ones, without those over before `keep_from_s`."""
+    grown = list(orders)
+    for order in new:
+        if grown and order.at_s <= grown[-1].at_s:
+            order = order._replace(at_s=grown[-1].at_s)
+        if not grown or order[1:] != grown[-1][1:]:
+            grown.append(order)
+    kept = 0
+    while kept + 1 < len(grown) and grown[kept + 1].at_s <= keep_from_s:
+        kept += 1
+    return tuple(grown[kept:])
+
+
+def expected_ml(orders: tuple[Order, ...], begin_s: float, end_s: float) -> tuple[float, ...]:
+    """Return the table's volume of each valve between two times."""
+    sums = [0.0] * (len(orders[0].flows_ml_s) if orders else 0)
+    for number, order in enumerate(orders):
+        until_s = orders[number + 1].at_s if number + 1 < len(orders) else end_s
+        length_s = min(until_s, end_s) - max(order.at_s, begin_s)
+        if length_s > 0.0:
+            for valve, flow_ml_s in enumerate(order.flows_ml_s):
+                sums[valve] += flow_ml_s * length_s
+    return tuple(sums)
+
+
+def _is_whole(orders: tuple[Order, ...], begin_s: float, end_s: float) -> bool:
+    """Whether the same valves were open from `begin_s` to `end_s`, and a little before."""
+    open_now: set[tuple[bool, ...]] = set()
+    for number, order in enumerate(orders):
+        until_s = orders[number + 1].at_s if number + 1 < len(orders) else end_s
+        if order.at_s < end_s and until_s > begin_s - EDGE_S:
+            open_now.add(tuple(flow > 0.0 for flow in order.flows_ml_s))
+    return len(open_now) <= 1
+
+
+def pressed(
+    state: Collecting, report: PressureReport | None, *, delay_s: float, now_s: float
+) -> Collecting:
+    """Return the bin with a pressure more, over that which goes with the orders of its time."""
+    if report is None or report.pressure_kpa is None or not report.received_s > state.pressure_s:
+        return state
+    if not (0.0 <= now_s - report.received_s <= STALE_S and abs(report.pressure_kpa) < 1e6):
+        return state
+    state = state._replace(pressure_s=report.received_s)
+    then_s = report.received_s - delay_s
+    for order in reversed(state.orders):
+        if order.at_s <= then_s:
+            if order.pressure_kpa is None:
+                return state
+            return state._replace(
+                pressure_sum=state.pressure_sum + report.pressure_kpa / order.pressure_kpa,
+                pressure_count=state.pressure_count + 1,
+            )
+    return state
+
+
+def collected(
+    state: Collecting, report: FlowReport | None, *, bin_s: float, delay_s: float, now_s: float
+) -> tuple[Collecting, Bin | None]:
+    """Return the bin in progress after a count, and the one that it filled.
+
+    A count that is stale, no number or does not go on from the last one begins anew.
+    """
+    last = state.last
+    if not is_usable(report, last, now_s):
+        sound = report is not None and math.isfinite(report.volume_ml)
+        return _begun(state, None)._replace(last=report if sound else None), None
+    assert report is not None  # is_usable
+    if last is None or state.from_s is None:
+        return _begun(state, report), None
+    if report.received_s == last.received_s:
+        return state, None
+    edge_s = state.from_s + bin_s
+    if report.received_s < edge_s:
+        return state._replace(last=report), None
+    if not state.orders or state.orders[0].at_s > state.from_s - delay_s:
+        return _begun(state, report), None  # what was ordered then is not known
+    share = (edge_s - last.received_s) / (report.received_s - last.received_s)
+    edge_ml = last.volume_ml + min(max(share, 0.0), 1.0) * (report.volume_ml - last.volume_ml)
+    count = state.pressure_count
+    filled = Bin(
+        begin_s=state.from_s,
+        end_s=edge_s,
+        expected_ml=expected_ml(state.orders, state.from_s - delay_s, edge_s - delay_s),
+        metered_ml=edge_ml - state.from_ml,
+        pressure=state.pressure_sum / count if count else None,
+        is_whole=_is_whole(state.orders, state.from_s - delay_s, edge_s - delay_s),
+    )
+    return _begun(state, report)._replace(from_s=edge_s, from_ml=edge_ml), filled
+
+
+def _begun(state: Collecting, report: FlowReport | None) -> Collecting:
+    return state._replace(
+        last=report,
+        from_s=None if report is None else report.received_s,
+        from_ml=0.0 if report is None else report.volume_ml,
+        pressure_sum=0.0,
+        pressure_count=0,
+    )

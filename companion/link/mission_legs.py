@@ -1,0 +1,101 @@
+"""From the items of a mission to the leg that is flown, and whether it ends in a stop.
+
+Where the items leave that open it is taken not to: a stop that is foreseen and not made misplaces
+a change, one that is not foreseen is seen by the positions a moment later.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from companion.core.types import LegReport
+from companion.link.mission_messages import MissionItem
+
+# MAV_CMD. Numbers below 95 are flown to or waited at, the rest is done on the way.
+_WAYPOINT, _LOITER_UNLIMITED, _LOITER_TIME, _LAND, _TAKE_OFF = 16, 17, 19, 21, 22
+_NAVIGATION_END = 95
+_CHANGE_SPEED, _JUMP = 178, 177
+_STRAIGHT_TO = frozenset({_WAYPOINT, _LOITER_UNLIMITED, _LOITER_TIME, _LAND})
+_STRAIGHT_FROM = frozenset({_WAYPOINT, _LOITER_UNLIMITED, _LOITER_TIME, _TAKE_OFF})
+# A copter that is not told to wait flies through a bend; one as sharp as this it brakes for: each
+# leg is a ramp down to its end, and the next one's first acceleration leads across.
+_STOPS_FROM_DEG = 60.0
+
+
+def leg_report(items: Sequence[MissionItem], sequence: int, received_s: float) -> LegReport | None:
+    """Return the straight leg to item `sequence`; None where there is none, or none is known."""
+    number = _next_flown(items, sequence)
+    if number is None or items[number].command not in _STRAIGHT_TO:
+        return None
+    before = _flown_before(items, number)
+    start, end = (None if before is None else items[before].place), items[number].place
+    if start is None or end is None:
+        return None
+    return LegReport(
+        received_s=received_s,
+        from_latitude_deg=start[0],
+        from_longitude_deg=start[1],
+        to_latitude_deg=end[0],
+        to_longitude_deg=end[1],
+        stops=_stops(items, number, start, end),
+        speed_m_s=_speed_m_s(items, number),
+    )
+
+
+def _next_flown(items: Sequence[MissionItem], first: int) -> int | None:
+    for number in range(max(first, 0), len(items)):
+        if items[number].command < _NAVIGATION_END:
+            return number
+    return None
+
+
+def _flown_before(items: Sequence[MissionItem], number: int) -> int | None:
+    """Return the item that the leg to `number` begins at; take-offs may have no place."""
+    for before in range(number - 1, -1, -1):
+        command = items[before].command
+        if command == _TAKE_OFF and items[before].place is None:
+            continue
+        if command < _NAVIGATION_END:
+            return before if command in _STRAIGHT_FROM else None
+    return None
+
+
+def _stops(
+    items: Sequence[MissionItem], number: int, start: tuple[float, float], end: tuple[float, float]
+) -> bool:
+    item = items[number]
+    if item.command != _WAYPOINT or item.param1 > 0.0:
+        return True
+    following = _next_flown(items, number + 1)
+    between = items[number + 1 : following]
+    if any(one.command == _JUMP for one in between):
+        return False
+    if following is None or items[following].command not in (_WAYPOINT, _LAND):
+        # Nothing follows, or the way home. A curve (a spline) is flown into without a stop.
+        return following is None or items[following].command != 82
+    after = items[following].place
+    if after is None:
+        return items[following].command == _LAND
+    return _bend_deg(start, end, after) >= _STOPS_FROM_DEG
+
+
+def _bend_deg(
+    start: tuple[float, float], end: tuple[float, float], after: tuple[float, float]
+) -> float:
+    """Return the change of course at `end`; 180 where the next place is the same."""
+    shrink = math.cos(math.radians(end[0]))
+    north, east = end[0] - start[0], (end[1] - start[1]) * shrink
+    next_north, next_east = after[0] - end[0], (after[1] - end[1]) * shrink
+    if not math.hypot(next_north, next_east) > 1e-8:
+        return 180.0
+    cross = north * next_east - east * next_north
+    return abs(math.degrees(math.atan2(cross, north * next_north + east * next_east)))
+
+
+def _speed_m_s(items: Sequence[MissionItem], number: int) -> float | None:
+    """Return the speed that was last set before an item."""
+    for item in reversed(items[:number]):
+        if item.command == _CHANGE_SPEED and item.param2 > 0.0:
+            return item.param2
+    return None

@@ -1,0 +1,132 @@
+"""How much a spray line needs: the rate under every valve, integrated along it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from missions.strips import Floats, directions, lengths_m, no_lines
+
+M2_PER_HA = 10_000.0
+# The rate is read at the middle of steps of this length, longer where there would be too many.
+STEP_M = 1.0
+POINTS_MAX = 200_000
+
+
+class Rates(Protocol):
+    """Whatever knows the rate at places; NaN where there is none."""
+
+    def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
+        """Return the rate at each place [L/ha]."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Uniform:
+    """One rate everywhere."""
+
+    rate_l_ha: float
+
+    def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:  # noqa: ARG002
+        """Return the rate at each place [L/ha]."""
+        return np.full(len(east_m), self.rate_l_ha)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Demand:
+    """What one line needs up to each of the distances `at_m` from its start."""
+
+    at_m: Floats
+    litres: Floats
+
+    @property
+    def total_l(self) -> float:
+        """Return what the whole line needs."""
+        return float(self.litres[-1])
+
+    def cuts_m(self, pieces: int) -> Floats:
+        """Return where to cut the line so that every piece needs as much: pieces + 1 places.
+
+        >>> Demand(at_m=np.array([0.0, 10.0]), litres=np.array([0.0, 2.0])).cuts_m(2).tolist()
+        [0.0, 5.0, 10.0]
+        """
+        shares = np.linspace(0.0, 1.0, pieces + 1)
+        if self.total_l > 0.0:
+            cuts = np.interp(shares * self.total_l, self.litres, self.at_m)
+            cuts[0], cuts[-1] = self.at_m[0], self.at_m[-1]
+        else:
+            cuts = shares * self.at_m[-1]
+        return cuts
+
+
+def valve_places(width_m: float, valves: tuple[tuple[float, float], ...]) -> Floats:
+    """Return (right_m, width_m) of each valve's strip; one in the middle without valves.
+
+    Strips that do not add up to the swath are scaled to it: the swath is what is sprayed.
+    """
+    places = np.array(valves or ((0.0, width_m),), dtype=np.float64)
+    places[:, 1] *= width_m / places[:, 1].sum()
+    return places
+
+
+def demands(
+    lines: Floats, rates: Rates, *, width_m: float, valves: tuple[tuple[float, float], ...] = ()
+) -> list[Demand]:
+    """Return the demand along every line; each valve gives the rate at the middle of its strip."""
+    if not len(lines):
+        return []
+    places = valve_places(width_m, valves)
+    length_m = lengths_m(lines)
+    step_m = max(STEP_M, float(length_m.sum()) * len(places) / POINTS_MAX)
+    if isinstance(rates, Uniform):
+        step_m = math.inf
+    counts = np.maximum(np.ceil(length_m / step_m), 1).astype(np.int64)
+    owner = np.repeat(np.arange(len(lines)), counts)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    each_m = (length_m / counts)[owner]
+    along = directions(lines)[owner]
+    middle = lines[owner, :2] + along * ((number + 0.5) * each_m)[:, None]
+    flow = np.zeros(len(owner))  # litres per metre, times M2_PER_HA
+    for right_m, strip_m in places:
+        rate = rates.rates_at(
+            middle[:, 0] + along[:, 1] * right_m, middle[:, 1] - along[:, 0] * right_m
+        )
+        flow += np.nan_to_num(rate, nan=0.0) * strip_m
+    used = flow * each_m / M2_PER_HA
+    found = []
+    for index, part in enumerate(np.split(used, np.cumsum(counts)[:-1])):
+        at_m = np.linspace(0.0, length_m[index], len(part) + 1)
+        found.append(Demand(at_m=at_m, litres=np.concatenate([[0.0], np.cumsum(part)])))
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pieces:
+    """Spray lines as they are given to sorties: `line` is which line each is cut from."""
+
+    ends: Floats
+    litres: Floats
+    line: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+
+    def __len__(self) -> int:
+        return len(self.ends)
+
+
+def cut(lines: Floats, demand: list[Demand], *, piece_max_l: float) -> Pieces:
+    """Return the lines in equal pieces of at most `piece_max_l`; whole ones that need less."""
+    rows, litres, owner = [no_lines()], [np.empty(0)], [np.empty(0, dtype=np.int64)]
+    for index, (row, need) in enumerate(zip(lines, demand, strict=True)):
+        count = max(1, math.ceil(need.total_l / piece_max_l - 1e-9))
+        cuts = need.cuts_m(count)
+        length_m = need.at_m[-1]
+        places = row[:2] + np.outer(cuts / length_m, row[2:] - row[:2])
+        places[-1] = row[2:]
+        rows.append(np.column_stack([places[:-1], places[1:]]))
+        litres.append(np.full(count, need.total_l / count))
+        owner.append(np.full(count, index, dtype=np.int64))
+    return Pieces(
+        ends=np.concatenate(rows), litres=np.concatenate(litres), line=np.concatenate(owner)
+    )

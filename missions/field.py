@@ -1,0 +1,169 @@
+"""The field in metres: where the aircraft may fly, and which ground may be sprayed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+from shapely.affinity import translate
+from shapely.geometry.base import BaseGeometry
+
+from companion.core.frame import LocalFrame
+from companion.core.prescription import SLIVER_M
+from companion.maps.local import Area, as_area, make_valid, polygons_of, project
+from companion.maps.local import places as places_of
+from missions.errors import PlanError
+from missions.strips import Floats
+
+# Coordinates are rounded when they are written, and a long edge is straight in degrees for one
+# program and in metres for another: strips keep this far from the border.
+MARGIN_M = 0.0025
+SIMPLER_M = 0.001
+EXTENT_MAX_M = 20_000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Field:
+    """`outline` is as given; `fly` lies in it without holes and obstacles; `spray` in `fly`.
+
+    `limit` is all that may be sprayed; `spray` keeps a margin from its edge.
+    `blocked` is what may not be flown over, not even on the way to the field.
+    """
+
+    frame: LocalFrame
+    outline: Area
+    fly: Area
+    spray: Area
+    limit: BaseGeometry
+    blocked: BaseGeometry
+
+    @property
+    def area_m2(self) -> float:
+        """Return the ground that is to be sprayed."""
+        return float(self.limit.area)
+
+
+def frame_of(boundary: MultiPolygon | Polygon) -> LocalFrame:
+    """Return the frame around the middle of the field's bounds."""
+    west, south, east, north = boundary.bounds
+    return LocalFrame(latitude_deg=(south + north) / 2, longitude_deg=(west + east) / 2)
+
+
+def build_field(
+    boundary: Area,
+    *,
+    obstacles: Sequence[Area] = (),
+    no_spray: Sequence[Area] = (),
+    obstacle_buffer_m: float = 2.0,
+    no_spray_buffer_m: float = 0.0,
+    swath_width_m: float,
+    frame: LocalFrame | None = None,
+    offset_m: tuple[float, float] = (0.0, 0.0),
+) -> Field:
+    """Return the field of a boundary and what lies in it, all in longitude and latitude.
+
+    `offset_m` moves all of it: the offset between map and receiver (prescription.offset_east_m).
+
+    Raises:
+        PlanError: where nothing is left that a strip of the swath's width fits on.
+    """
+    frame = frame or frame_of(boundary)
+    outline = _closed(both_ways(boundary, frame))
+    west, south, east, north = outline.bounds
+    if not max(east - west, north - south) <= EXTENT_MAX_M:
+        raise PlanError(
+            f"the field spans {max(east - west, north - south) / 1000.0:.0f} km; give one field"
+        )
+    outline = translate(outline, *offset_m)
+    holes = [Polygon(ring) for part in polygons_of(outline) for ring in part.interiors]
+    kept = [
+        translate(local_area(area, frame), *offset_m).buffer(obstacle_buffer_m)
+        for area in obstacles
+    ]
+    blocked = shapely.union_all([*holes, *kept])
+    flown = outline.difference(shapely.union_all(kept)) if kept else outline
+    fly = _ground(flown)
+    closed = [
+        translate(local_area(area, frame), *offset_m).buffer(no_spray_buffer_m) for area in no_spray
+    ]
+    spray = fly if not closed else _without(fly, closed)
+    if spray is None or fly is None:
+        raise PlanError("obstacles and no-spray areas leave nothing of the field to spray")
+    _check_width(spray, swath_width_m)
+    return Field(
+        frame=frame,
+        outline=outline,
+        fly=fly,
+        spray=spray,
+        limit=flown.difference(shapely.union_all(closed)) if closed else flown,
+        blocked=blocked,
+    )
+
+
+def local_area(area: Area, frame: LocalFrame) -> Area:
+    """Return an area in metres, valid."""
+    local = project(area, frame)
+    valid = local if local.is_valid else make_valid(local)
+    if valid is None:
+        raise PlanError("an area of the field has no ground; draw it again")
+    return valid
+
+
+def _closed(area: Area) -> Area:
+    """Return the ground without the cracks that digitising leaves between zones.
+
+    Only where it then has fewer parts and holes: a narrow notch that is drawn stays.
+    """
+    half_m = SLIVER_M / 2.0
+    closed = area.buffer(half_m, join_style="mitre").buffer(-half_m, join_style="mitre")
+    found = as_area(polygons_of(closed))
+    return area if found is None or not _pieces(found) < _pieces(area) else found
+
+
+def _pieces(area: Area) -> int:
+    return sum(1 + len(part.interiors) for part in polygons_of(area))
+
+
+def _ground(area: BaseGeometry) -> Area | None:
+    """Return the ground a margin inside the area, with few vertices."""
+    inside = area.buffer(-MARGIN_M, join_style="mitre").simplify(SIMPLER_M)
+    return as_area(polygons_of(inside))
+
+
+def _without(fly: Area | None, closed: Sequence[BaseGeometry]) -> Area | None:
+    if fly is None:
+        return None
+    left = fly.difference(shapely.union_all(closed).buffer(MARGIN_M, join_style="mitre"))
+    return as_area(polygons_of(left))
+
+
+def _check_width(spray: Area, swath_width_m: float) -> None:
+    if spray.buffer(-swath_width_m / 2.0).is_empty:
+        raise PlanError(
+            f"the field is nowhere as wide as the swath of {swath_width_m:g} m "
+            "(mission.swath_width_m); spray it by hand, or with a narrower boom"
+        )
+
+
+def both_ways(area: Area, frame: LocalFrame) -> Area:
+    """Return the ground inside edges that are straight in metres and inside those in degrees.
+
+    Over 1 km the two part by centimetres, and nobody says which of them a boundary means.
+    """
+    points = shapely.get_coordinates(area)
+    east_m, north_m = frame.to_local_all(points[:, 1].tolist(), points[:, 0].tolist())
+    straight = shapely.set_coordinates(
+        shapely.from_wkb(shapely.to_wkb(area)), np.column_stack([east_m, north_m])
+    )
+    local = local_area(area, frame)
+    if not straight.is_valid:
+        return local
+    return as_area(polygons_of(local.intersection(straight))) or local
+
+
+def local_points(points: Sequence[tuple[float, float]], frame: LocalFrame) -> Floats:
+    """Return (latitude, longitude) points as rows of east and north."""
+    return places_of(points, frame)

@@ -1,0 +1,57 @@
+"""Writing a plan; the suffix says in which format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from companion.maps.whole_file import write_whole
+from missions.errors import PlanError
+from missions.files.geojson import geojson_text
+from missions.files.kml import kml_text
+from missions.files.plan_file import plan_text
+from missions.files.waypoints import waypoints_text
+from missions.plan import Plan
+
+ONE_SORTIE = (".plan", ".waypoints")
+FORMATS = (*ONE_SORTIE, ".geojson", ".kml")
+
+
+def check_suffix(out: Path) -> None:
+    """Refuse a file whose suffix names no format."""
+    if out.suffix.casefold() not in FORMATS:
+        raise PlanError(
+            f"--out {out}: the format {out.suffix or 'without a suffix'} is not known; "
+            f"take one of {', '.join(FORMATS)}"
+        )
+
+
+def paths_of(out: Path, sorties: int) -> list[Path]:
+    """Return the files that are written: of formats for one sortie, one for each.
+
+    The first sortie is in the file that was asked for, the others are numbered beside it.
+
+    >>> [path.name for path in paths_of(Path("m.plan"), 3)]
+    ['m.plan', 'm-2.plan', 'm-3.plan']
+    """
+    if out.suffix.casefold() not in ONE_SORTIE:
+        return [out]
+    more = [out.with_name(f"{out.stem}-{number}{out.suffix}") for number in range(2, sorties + 1)]
+    return [out, *more]
+
+
+def write_plan(plan: Plan, out: Path, *, with_sprayer: bool = False) -> list[Path]:
+    """Write the plan and return the files; all texts are made before the first is written."""
+    check_suffix(out)
+    suffix = out.suffix.casefold()
+    if suffix == ".geojson":
+        texts = [geojson_text(plan)]
+    elif suffix == ".kml":
+        texts = [kml_text(plan)]
+    elif suffix == ".plan":
+        texts = [plan_text(plan, each, with_sprayer=with_sprayer) for each in plan.sorties]
+    else:
+        texts = [waypoints_text(plan, each, with_sprayer=with_sprayer) for each in plan.sorties]
+    paths = paths_of(out, len(texts))
+    for path, text in zip(paths, texts, strict=True):
+        write_whole(path, text.encode("utf-8"))
+    return paths

@@ -1,0 +1,124 @@
+"""The time from every end of a piece to every other, and to the depots."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from missions.demand import Pieces
+from missions.free_space import FreeSpace
+from missions.strips import Floats, directions
+from missions.turns import Motion
+
+Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+
+# So many pairs are looked at for free sight; where there are more, each end's nearest ones.
+SIGHTS_MAX = 60_000
+NEAR = 24
+# What one more landing, refill and take-off costs the search: fewer, fuller tanks. No flight time.
+REFILL_S = 60.0
+# Two lines of one border are flown without a stop where they meet this close and this straight:
+# at 15 degrees an arc of 23 m leaves the corner by 0.2 m, and a copter of 2.5 m/s2 flies it at
+# 7.6 m/s.
+JOIN_M, JOIN_DEG = 0.6, 15.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Network:
+    """Ends 2 i and 2 i + 1 are start and end of piece i; `home_s` is by depot and end.
+
+    `between_s` has a last row and column for the depot that is nearest to the other end, with
+    half of a refill.
+    """
+
+    between_s: Floats
+    home_s: Floats
+    near: Ints
+    litres: Floats
+
+    @property
+    def depot(self) -> int:
+        """Return the index of the depot in `between_s`."""
+        return len(self.between_s) - 1
+
+
+def build_network(pieces: Pieces, depots: Floats, space: FreeSpace, motion: Motion) -> Network:
+    """Return the network; of pairs far apart that do not see each other, a lower bound."""
+    ends = pieces.ends.reshape(-1, 2)
+    count = len(ends)
+    far_m = np.hypot(
+        ends[:, 0][:, None] - ends[:, 0][None, :], ends[:, 1][:, None] - ends[:, 1][None, :]
+    )
+    ranks = far_m.copy()
+    own = np.arange(count)
+    ranks[own, own] = ranks[own, own ^ 1] = np.inf
+    kept = min(NEAR, max(count - 2, 1))
+    near = np.argpartition(ranks, kept - 1, axis=1)[:, :kept] if count > 2 else own[:, None] ^ 1
+    order = np.argsort(np.take_along_axis(ranks, near, axis=1), axis=1, kind="stable")
+    near = np.take_along_axis(near, order, axis=1)
+    if not space.is_convex:
+        _bend(far_m, ends, near, space)
+    between = np.zeros((count + 1, count + 1))
+    between[:count, :count] = motion.legs_s(far_m)
+    rows, columns = _flown_through(pieces.ends, far_m, near)
+    between[rows, columns] = between[columns, rows] = -motion.speed_m_s / motion.acceleration_m_s2
+    home_m = np.hypot(
+        depots[:, 0][:, None] - ends[:, 0][None, :], depots[:, 1][:, None] - ends[:, 1][None, :]
+    )
+    if not space.is_convex:
+        _bend_home(home_m, depots, ends, space)
+    home = motion.legs_s(home_m)
+    between[count, :count] = between[:count, count] = home.min(axis=0) + REFILL_S / 2.0
+    return Network(between_s=between, home_s=home, near=near, litres=pieces.litres)
+
+
+def _flown_through(lines: Floats, far_m: Floats, near: Ints) -> tuple[Ints, Ints]:
+    """Return pairs of ends at which a line goes on in the next so straight that none stops."""
+    away = np.repeat(directions(lines), 2, axis=0)
+    away[::2] *= -1.0  # how the line leaves at each of its ends
+    rows, columns = np.repeat(np.arange(len(far_m)), near.shape[1]), near.ravel()
+    straight = -(away[rows] * away[columns]).sum(axis=1)
+    through = (far_m[rows, columns] < JOIN_M) & (straight > math.cos(math.radians(JOIN_DEG)))
+    through &= (rows >> 1) != (columns >> 1)
+    return rows[through], columns[through]
+
+
+def _bend(far_m: Floats, ends: Floats, near: Ints, space: FreeSpace) -> None:
+    """Put the length of the bent way where two ends do not see each other."""
+    count = len(ends)
+    if count * count <= SIGHTS_MAX:
+        rows, columns = np.triu_indices(count, 1)
+    else:
+        rows, columns = np.repeat(np.arange(count), near.shape[1]), near.ravel()
+    hidden = ~space.sees(ends[rows], ends[columns])
+    rows, columns = rows[hidden], columns[hidden]
+    if not len(rows) or not len(space.corners):
+        return
+    to_corners = space.to_corners_m(ends)
+    first = _min_plus(to_corners, space.between_m)
+    bent = np.array([np.min(first[a] + to_corners[b]) for a, b in zip(rows, columns, strict=True)])
+    # No way through: far apart for the search, whatever the ferry around will cost.
+    bent = np.where(np.isfinite(bent), bent, 3.0 * far_m[rows, columns] + 1000.0)
+    far_m[rows, columns] = far_m[columns, rows] = bent
+
+
+def _bend_home(home_m: Floats, depots: Floats, ends: Floats, space: FreeSpace) -> None:
+    to_corners = space.to_corners_m(ends)
+    for number, depot in enumerate(depots):
+        hidden = np.flatnonzero(~space.sees(np.tile(depot, (len(ends), 1)), ends))
+        reach = space.to_corners_m(depot[None, :])
+        if not len(hidden) or not reach.size:
+            continue
+        first = _min_plus(reach, space.between_m)[0]
+        bent = np.min(first[None, :] + to_corners[hidden], axis=1)
+        home_m[number, hidden] = np.where(np.isfinite(bent), bent, home_m[number, hidden])
+
+
+def _min_plus(left: Floats, right: Floats) -> Floats:
+    """Return the shortest sums over all stations between: a product with min and plus."""
+    result = np.full((len(left), right.shape[1]), np.inf)
+    for station in range(right.shape[0]):
+        np.minimum(result, left[:, station][:, None] + right[station][None, :], out=result)
+    return result

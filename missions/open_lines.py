@@ -1,0 +1,104 @@
+"""Parallel lines from border to border, and passes along the border only where they are needed.
+
+Where an edge runs along the lines or square to them, they fit it by themselves; a pass along it
+would only be sprayed twice at its corners and cost its turns. Slanted edges leave triangles at
+the ends of the lines: there the pass along the border is flown.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import shapely
+from shapely import Polygon
+from shapely.geometry.base import BaseGeometry
+
+from missions.coverage import reachable
+from missions.strips import Floats, directions, joined, no_lines, rectangles, united
+from missions.swaths import LINE_MIN_M, axes, count_across
+
+# So much of the reachable ground may be left for patches.
+LEFT_SHARE = 0.0002
+# An edge that is a hair off the lines' course must not cut them short. The ground keeps a larger
+# margin from what may be sprayed (`field.MARGIN_M`).
+SLACK_M = 0.001
+
+
+def open_lines(ground: BaseGeometry, width_m: float, angle_deg: float) -> Floats:
+    """Return evenly spaced lines, each as long as its strip stays on the ground."""
+    turned_by = axes(angle_deg)
+    turned = shapely.transform(ground, lambda points: points @ turned_by.T)
+    lines = joined([_of_part(part, width_m) for part in shapely.get_parts(turned)])
+    return np.column_stack([lines[:, :2] @ turned_by, lines[:, 2:] @ turned_by])
+
+
+def _of_part(part: Polygon, width_m: float) -> Floats:
+    west, low, east, high = part.bounds
+    count = count_across(high - low, width_m)
+    if count == 1:
+        middles = np.array([(low + high) / 2.0])
+    else:
+        middles = np.linspace(low + width_m / 2.0, high - width_m / 2.0, count)
+    half_m = width_m / 2.0 - SLACK_M
+    ends = np.full(count, west - 1.0), np.full(count, east + 1.0)
+    across = np.column_stack([ends[0], middles, ends[1], middles])
+    bands = rectangles(across, 2.0 * half_m)
+    outside, band_of = shapely.get_parts(shapely.difference(bands, part), return_index=True)
+    bounds = shapely.bounds(outside)
+    rows = [
+        (start, middle, end, middle)
+        for number, middle in enumerate(middles.tolist())
+        for start, end in _gaps(bounds[band_of == number][:, [0, 2]].tolist())
+    ]
+    return np.array(rows) if rows else no_lines()
+
+
+def _gaps(spans: list[list[float]]) -> list[tuple[float, float]]:
+    """Return what lies between spans, where it is long enough for a line.
+
+    >>> _gaps([[-1.0, 0.0], [4.0, 5.0], [3.0, 4.5], [9.0, 10.0]])
+    [(0.0, 3.0), (5.0, 9.0)]
+    """
+    gaps, reached = [], math.inf
+    for start, end in sorted(spans):
+        if start - reached > LINE_MIN_M:
+            gaps.append((reached, start))
+        reached = end if math.isinf(reached) else max(reached, end)
+    return gaps
+
+
+def needed_passes(lines: Floats, passes: Floats, ground: BaseGeometry, width_m: float) -> Floats:
+    """Return the parts of passes along the border that cover what the lines leave out."""
+    target = reachable(ground, width_m)
+    missing = target.difference(united(lines, width_m))
+    allowed_m2 = LEFT_SHARE * target.area
+    chosen = no_lines()
+    left = passes
+    while len(left) and missing.area > allowed_m2:
+        gain = shapely.area(shapely.intersection(rectangles(left, width_m), missing))
+        order = np.argsort(-gain, kind="stable")
+        # Several at a time: those that gain next to the most, as long as they are apart.
+        some = [int(at) for at in order[:8] if gain[at] > max(0.5 * gain[order[0]], 1e-3)]
+        if not some:
+            break
+        new = joined([_trimmed(left[at], missing, width_m) for at in some])
+        chosen = joined([chosen, new])
+        missing = missing.difference(united(new, width_m))
+        left = np.delete(left, some, axis=0)
+    return chosen
+
+
+def _trimmed(line: Floats, missing: BaseGeometry, width_m: float) -> Floats:
+    """Return the part of a pass along which something is missing."""
+    row = line[None, :]
+    points = shapely.get_coordinates(missing.intersection(rectangles(row, width_m)[0]))
+    if not len(points):
+        return no_lines()
+    along = directions(row)[0]
+    length_m = float(np.hypot(*(line[2:] - line[:2])))
+    where = (points - line[:2]) @ along
+    start, end = max(float(where.min()), 0.0), min(float(where.max()), length_m)
+    lack_m = max(LINE_MIN_M - (end - start), 0.0)
+    start, end = max(start - lack_m, 0.0), min(end + lack_m, length_m)
+    return np.array([[*(line[:2] + along * start), *(line[:2] + along * end)]])

@@ -1,0 +1,87 @@
+"""What passes and inner lines leave out: sharp corners, and places no wider than a swath."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from missions.coverage import reachable
+from missions.strips import NARROWER_M, Floats, joined, no_lines, rectangles, stretched, united
+from missions.swaths import LINE_MIN_M
+
+# So much may stay uncovered of what can be reached: half of what the plan as a whole may miss.
+LEFT_SHARE = 0.0002
+PATCH_MIN_M2 = 0.02
+ROUNDS = 4
+PATCHES_MAX = 200
+ANGLES = 12
+# A line grows to both sides from a seed of this half length.
+SEED_M = 0.05
+
+
+def patches(lines: Floats, ground: BaseGeometry, width_m: float) -> Floats:
+    """Return more lines, for ground that the others miss though a strip could reach it."""
+    target = reachable(ground, width_m)
+    covered = united(lines, width_m)
+    allowed_m2 = LEFT_SHARE * target.area
+    tight = ground.buffer(NARROWER_M)
+    shapely.prepare(tight)
+    added = no_lines()
+    for _ in range(ROUNDS):
+        missing = shapely.get_parts(target.difference(covered))
+        missing = missing[shapely.area(missing) > 0.0]
+        if not shapely.area(missing).sum() > allowed_m2:
+            break
+        largest = missing[np.argsort(-shapely.area(missing), kind="stable")][:PATCHES_MAX]
+        new = joined([_over(patch, tight, width_m) for patch in largest])
+        if not len(new):
+            break
+        added = joined([added, new])
+        covered = shapely.union_all([covered, *rectangles(new, width_m)])
+    return added
+
+
+def _over(patch: BaseGeometry, ground: BaseGeometry, width_m: float) -> Floats:
+    """Return the line whose strip covers most of a patch and nothing outside; none for crumbs."""
+    if not patch.area > PATCH_MIN_M2:
+        return no_lines()
+    lines = _candidates(patch, ground, width_m)
+    if not len(lines):
+        return no_lines()
+    strips = rectangles(lines, width_m)
+    inside = shapely.covers(ground, rectangles(lines, width_m - 2.0 * NARROWER_M))
+    gain = np.where(inside, shapely.area(shapely.intersection(strips, patch)), 0.0)
+    best = int(np.argmax(gain))
+    if not gain[best] > PATCH_MIN_M2:
+        return no_lines()
+    return lines[[best]]
+
+
+def _candidates(patch: BaseGeometry, ground: BaseGeometry, width_m: float) -> Floats:
+    """Return lines over the patch in many directions, moved aside from it by parts of a swath."""
+    near = patch.buffer(2.0 * width_m).intersection(ground)
+    points = shapely.get_coordinates(near)
+    step = np.diff(points, axis=0)
+    long = step[np.argsort(-np.hypot(*step.T), kind="stable")[:ANGLES]]
+    courses = np.concatenate(
+        [np.arctan2(long[:, 1], long[:, 0]), np.arange(ANGLES) * np.pi / ANGLES]
+    )
+    courses = np.concatenate([courses, courses + np.pi / 2.0])
+    corners = shapely.get_coordinates(patch)
+    middle = shapely.get_coordinates(patch.representative_point())[0]
+    rows, before_m, after_m = [], [], []
+    for course in courses.tolist():
+        along = np.array([np.cos(course), np.sin(course)])
+        right = np.array([along[1], -along[0]])
+        s, t = corners @ along, corners @ right
+        here = float(middle @ along)
+        for aside in np.linspace(t.max() - width_m / 2.0, t.min() + width_m / 2.0, 7).tolist():
+            place = along * here + right * aside
+            rows.append([*(place - along * SEED_M), *(place + along * SEED_M)])
+            before_m.append(here - float(s.min()))
+            after_m.append(float(s.max()) - here)
+    seeds = np.array(rows)
+    inside = shapely.covers(ground, rectangles(seeds, width_m - 2.0 * NARROWER_M))
+    wanted = np.maximum(np.array([before_m, after_m])[:, inside], LINE_MIN_M / 2.0)
+    return stretched(seeds[inside], wanted[0], wanted[1], ground, width_m)

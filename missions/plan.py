@@ -1,0 +1,167 @@
+"""A planned mission: sorties of legs, and what they come to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+from companion.core.frame import LocalFrame
+from missions.coverage import Coverage
+from missions.field import Field
+from missions.strips import Floats
+from missions.turns import Turn
+
+Place = tuple[float, float]
+Kind = Literal["spray", "transit", "ferry"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """What the plan is made for; `valves` are (right_m, width_m), `moves` the length of search."""
+
+    swath_width_m: float
+    speed_m_s: float
+    height_m: float = 3.5
+    acceleration_m_s2: float = 2.5
+    turn: Turn = "stop"
+    angle_deg: float | None = None
+    tank_l: float = 40.0
+    reserve_l: float = 1.0
+    valves: tuple[tuple[float, float], ...] = ()
+    moves: int = 40_000
+    seed: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
+            if not 0.0 < getattr(self, name) < 1e5:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not 0.0 <= self.reserve_l < self.tank_l:
+            raise ValueError(f"a reserve of {self.reserve_l} L leaves nothing of {self.tank_l} L")
+
+    @property
+    def usable_l(self) -> float:
+        """Return what of a full tank is sprayed before the refill."""
+        return self.tank_l - self.reserve_l
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Leg:
+    """A way at one speed: a straight spray line, or a transit or ferry that may bend."""
+
+    kind: Kind
+    points: tuple[Place, ...]
+    speed_m_s: float
+    seconds: float
+    volume_l: float = 0.0
+
+    @property
+    def length_m(self) -> float:
+        """Return the length of the way."""
+        return sum(math.dist(a, b) for a, b in pairwise(self.points))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sortie:
+    """What is flown with one tank, from a depot and back."""
+
+    number: int
+    depot: int
+    legs: tuple[Leg, ...]
+
+    def length_m(self, kind: Kind) -> float:
+        """Return the length of all legs of one kind."""
+        return sum(leg.length_m for leg in self.legs if leg.kind == kind)
+
+    @property
+    def volume_l(self) -> float:
+        """Return what is sprayed."""
+        return sum(leg.volume_l for leg in self.legs)
+
+    @property
+    def flight_s(self) -> float:
+        """Return the time of all legs."""
+        return sum(leg.seconds for leg in self.legs)
+
+    @property
+    def lines(self) -> int:
+        """Return the number of spray lines."""
+        return sum(leg.kind == "spray" for leg in self.legs)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """The whole mission; `lines` are all spray lines before they were cut into sorties."""
+
+    field: Field
+    settings: Settings
+    angle_deg: float
+    lines: Floats
+    coverage: Coverage
+    depots: tuple[Place, ...]
+    suggested_depot: bool
+    sorties: tuple[Sortie, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Return the frame of all places."""
+        return self.field.frame
+
+    def length_m(self, kind: Kind) -> float:
+        """Return the length of all legs of one kind."""
+        return sum(sortie.length_m(kind) for sortie in self.sorties)
+
+    @property
+    def volume_l(self) -> float:
+        """Return what is sprayed in all."""
+        return sum(sortie.volume_l for sortie in self.sorties)
+
+    @property
+    def flight_s(self) -> float:
+        """Return the time of all sorties."""
+        return sum(sortie.flight_s for sortie in self.sorties)
+
+    @property
+    def turns(self) -> int:
+        """Return how often one spray line follows another in the same sortie."""
+        return sum(max(sortie.lines - 1, 0) for sortie in self.sorties)
+
+    def summary(self) -> dict[str, object]:
+        """Return the figures of the plan."""
+        total_m = sum(self.length_m(kind) for kind in ("spray", "transit", "ferry"))
+        return {
+            "coverage_percent": self.coverage.percent,
+            "reachable_percent": self.coverage.reachable_percent,
+            "overlap_percent": self.coverage.overlap_percent,
+            "outside_m2": self.coverage.outside_m2,
+            "largest_skip_m2": self.coverage.largest_skip_m2,
+            "area_ha": self.field.area_m2 / 10_000.0,
+            "angle_deg": self.angle_deg,
+            "swaths": len(self.lines),
+            "turns": self.turns,
+            "spray_m": self.length_m("spray"),
+            "transit_m": self.length_m("transit"),
+            "ferry_m": self.length_m("ferry"),
+            "total_m": total_m,
+            "flight_s": self.flight_s,
+            "volume_l": self.volume_l,
+            "depots": [list(self.frame.to_geographic(*depot)) for depot in self.depots],
+            "depot_suggested": self.suggested_depot,
+            "sorties": [self._sortie(sortie) for sortie in self.sorties],
+            "warnings": list(self.warnings),
+        }
+
+    def _sortie(self, sortie: Sortie) -> dict[str, object]:
+        return {
+            "number": sortie.number,
+            "depot": list(self.frame.to_geographic(*self.depots[sortie.depot])),
+            "volume_l": sortie.volume_l,
+            "swaths": sortie.lines,
+            "spray_m": sortie.length_m("spray"),
+            "transit_m": sortie.length_m("transit"),
+            "ferry_m": sortie.length_m("ferry"),
+            "total_m": sum(leg.length_m for leg in sortie.legs),
+            "flight_s": sortie.flight_s,
+        }

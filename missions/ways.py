@@ -1,0 +1,116 @@
+"""Ways between places of a mission: inside the field where there is one, around it where not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import shapely
+from shapely import Point
+from shapely.geometry.base import BaseGeometry
+
+from missions.errors import PlanError
+from missions.field import Field
+from missions.free_space import FreeSpace, free_space
+from missions.strips import Floats
+
+Place = tuple[float, float]
+
+# How far outside the hull of field and depots a ferry may go around what blocks it.
+AROUND_M = 50.0
+# A depot this close to the field stands on its edge.
+ON_EDGE_M = 0.05
+DEPOT_FAR_M = 20_000.0
+
+
+@dataclass(frozen=True)
+class Ways:
+    """Inside the field, and around it."""
+
+    field: Field
+    depots: Floats
+    inside: FreeSpace
+
+    @cached_property
+    def around(self) -> FreeSpace:
+        """Return the space outside: the hull of field and depots, without what blocks."""
+        everything = shapely.union_all(
+            [self.field.outline, shapely.MultiPoint(self.depots.tolist())]
+        )
+        space = everything.convex_hull.buffer(AROUND_M).difference(self.field.blocked)
+        return free_space(space)
+
+    def between(self, start: Place, end: Place) -> tuple[list[Place], bool]:
+        """Return the way between two places of the field, and whether it leaves the field."""
+        way = self.inside.way(start, end)
+        if way:
+            return way, False
+        way = self.around.way(start, end)
+        if not way:
+            raise PlanError(
+                "no way leads from one part of the field to another past its obstacles; "
+                "plan the parts one by one"
+            )
+        return way, True
+
+    def home(self, depot: int, end: Place) -> list[Place]:
+        """Return the way from a depot to a place of the field: the shortest way in, then inside."""
+        start = (float(self.depots[depot][0]), float(self.depots[depot][1]))
+        entry = shapely.get_coordinates(shapely.shortest_line(self.field.fly, Point(start)))[0]
+        gate = (float(entry[0]), float(entry[1]))
+        if math.dist(start, gate) < ON_EDGE_M:
+            return [start, *self.between(gate, end)[0][1:]]
+        return [*self.around.way(start, gate), *self.between(gate, end)[0][1:]]
+
+
+def build_ways(field: Field, depots: Floats) -> Ways:
+    """Return the ways of a field with its depots, which must be places one can stand at.
+
+    Raises:
+        PlanError: for a depot in an obstacle or hole, or beyond reach.
+    """
+    for number, (east_m, north_m) in enumerate(depots.tolist(), start=1):
+        if not (math.isfinite(east_m) and math.isfinite(north_m)):
+            raise PlanError(f"depot {number} is no place near the field (mission.depots)")
+        far_m = float(field.outline.distance(Point(east_m, north_m)))
+        if not far_m <= DEPOT_FAR_M:
+            raise PlanError(
+                f"depot {number} lies {far_m / 1000.0:.0f} km from the field; write "
+                "[latitude, longitude] in mission.depots, with their signs"
+            )
+        if _is_in(field.blocked, east_m, north_m):
+            latitude_deg, longitude_deg = field.frame.to_geographic(east_m, north_m)
+            raise PlanError(
+                f"depot {number} at {latitude_deg:.6f}, {longitude_deg:.6f} lies in an obstacle "
+                "or its buffer; move it (mission.depots)"
+            )
+    return Ways(field=field, depots=depots, inside=free_space(field.fly))
+
+
+def _is_in(blocked: BaseGeometry, east_m: float, north_m: float) -> bool:
+    return bool(shapely.contains_xy(blocked, east_m, north_m)) if not blocked.is_empty else False
+
+
+def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:
+    """Return the place on the edge of the field from which the litres are nearest."""
+    rings = [shapely.get_exterior_ring(part) for part in shapely.get_parts(field.fly)]
+    length_m = sum(ring.length for ring in rings)
+    step_m = max(25.0, length_m / 120.0)
+    places = np.concatenate(
+        [
+            shapely.get_coordinates(
+                shapely.line_interpolate_point(ring, np.arange(0.0, ring.length, step_m))
+            )
+            for ring in rings
+        ]
+    )
+    middle = (lines[:, :2] + lines[:, 2:]) / 2.0
+    thirds = np.concatenate([middle, (lines[:, :2] + middle) / 2, (lines[:, 2:] + middle) / 2])
+    weight = np.tile(np.maximum(litres, 1e-9), 3)
+    far_m = np.hypot(
+        places[:, 0][:, None] - thirds[:, 0][None, :], places[:, 1][:, None] - thirds[:, 1][None, :]
+    )
+    best: Floats = places[[int(np.argmin(far_m @ weight))]]
+    return best

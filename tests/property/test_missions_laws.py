@@ -1,0 +1,131 @@
+"""Laws of planning on any field: all is covered, nothing leaves, turning it changes nothing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from shapely import Polygon
+from shapely.affinity import rotate
+
+from missions.coverage import reachable
+from missions.demand import Uniform, cut, demands
+from missions.field import build_field
+from missions.free_space import free_space
+from missions.network import build_network
+from missions.open_lines import needed_passes, open_lines
+from missions.patches import patches
+from missions.plan import Settings
+from missions.planner import plan_mission
+from missions.savings import by_savings, cost_s
+from missions.search import improve
+from missions.strips import joined, lengths_m, rectangles, united
+from missions.swaths import border_passes, inner_ground, inner_lines
+from missions.turns import Motion
+from tests.bench.missions import FRAME, random_field, to_degrees
+
+WIDTH_M = 7.0
+MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5)
+seeds = st.integers(min_value=0, max_value=5_000)
+angles = st.floats(min_value=0.0, max_value=180.0)
+
+
+def ground_of(seed: int) -> shapely.Polygon | shapely.MultiPolygon:
+    """Return a random field that a strip fits on."""
+    for number in range(seed, seed + 20):
+        ground = random_field(number)[1]
+        if not ground.buffer(-WIDTH_M / 2.0 - 0.01).is_empty:
+            return ground
+    raise AssertionError("no field is wide enough")
+
+
+@given(seed=seeds, angle_deg=angles)
+@settings(max_examples=15)
+def test_passes_and_inner_lines_cover_and_stay_inside(seed: int, angle_deg: float) -> None:
+    ground = ground_of(seed)
+    inner = inner_ground(ground, WIDTH_M)
+    lines = joined([border_passes(ground, WIDTH_M), inner_lines(inner, WIDTH_M, angle_deg)])
+    covered = united(lines, WIDTH_M)
+    assert covered.difference(ground.buffer(1e-4)).area == pytest.approx(0.0, abs=1e-9)
+    assert inner.difference(covered).area <= 2e-4 * ground.area + 0.2
+
+
+@given(seed=seeds, angle_deg=angles)
+@settings(max_examples=15)
+def test_lines_from_border_to_border_cover_and_stay_inside(seed: int, angle_deg: float) -> None:
+    ground = ground_of(seed)
+    straight = open_lines(ground, WIDTH_M, angle_deg)
+    passes = border_passes(ground, WIDTH_M)
+    lines = joined([straight, needed_passes(straight, passes, ground, WIDTH_M)])
+    lines = joined([lines, patches(lines, ground, WIDTH_M)])
+    covered = united(lines, WIDTH_M)
+    assert covered.difference(ground.buffer(2.1e-3)).area == pytest.approx(0.0, abs=1e-9)
+    target = reachable(ground, WIDTH_M)
+    assert covered.intersection(target).area >= 0.999 * target.area
+
+
+@given(angle_deg=angles, wide_m=st.floats(15.0, 80.0), long_m=st.floats(60.0, 300.0))
+@settings(max_examples=10)
+def test_a_turned_field_has_a_turned_plan(angle_deg: float, wide_m: float, long_m: float) -> None:
+    shape = Polygon([(0, 0), (wide_m, 0.0), (wide_m * 1.3, long_m), (0, long_m * 0.9)])
+    figures = []
+    for turned in (shape, rotate(shape, angle_deg, origin=(0.0, 0.0))):
+        field = build_field(to_degrees(turned), swath_width_m=WIDTH_M, frame=FRAME)
+        chosen = Settings(swath_width_m=WIDTH_M, speed_m_s=6.0, moves=0)
+        plan = plan_mission(field, chosen, Uniform(rate_l_ha=9.0))
+        figures.append((plan.coverage.percent, lengths_m(plan.lines).sum(), plan.angle_deg))
+    assert figures[0][0] == pytest.approx(figures[1][0], abs=0.1)
+    # The coarse search stands on other courses, so that the same field may find a better one.
+    assert figures[0][1] == pytest.approx(figures[1][1], rel=0.05)
+
+
+@given(seed=seeds, tank_l=st.floats(2.0, 30.0))
+@settings(max_examples=12)
+def test_every_piece_is_flown_once_and_no_tank_runs_dry(seed: int, tank_l: float) -> None:
+    ground = ground_of(seed)
+    passes = border_passes(ground, WIDTH_M)
+    lines = joined([passes, inner_lines(inner_ground(ground, WIDTH_M), WIDTH_M, 30.0)])[:60]
+    pieces = cut(lines, demands(lines, Uniform(rate_l_ha=20.0), width_m=WIDTH_M), piece_max_l=1.0)
+    assert lengths_m(pieces.ends).sum() == pytest.approx(lengths_m(lines).sum())
+    assert pieces.litres.max() <= 1.0 + 1e-9
+    network = build_network(pieces, lines[:1, :2], free_space(ground), MOTION)
+    first = by_savings(network, tank_l)
+    better = improve(network, first, tank_l, moves=800)
+    for orders in (first, better):
+        assert sorted(enter >> 1 for order in orders for enter in order) == list(range(len(pieces)))
+        loads = [sum(pieces.litres[enter >> 1] for enter in order) for order in orders]
+        assert max(loads) <= tank_l + 1e-6
+    assert cost_s(network, better) <= cost_s(network, first) + 1e-6
+
+
+@given(seed=seeds)
+@settings(max_examples=12)
+def test_a_way_stays_in_the_free_space_and_is_no_shorter_than_the_line(seed: int) -> None:
+    ground = ground_of(seed)
+    parts = sorted(shapely.get_parts(ground), key=lambda part: -part.area)
+    inside = parts[0].buffer(-0.5)
+    if inside.is_empty:
+        return
+    points = shapely.get_coordinates(max(shapely.get_parts(inside), key=lambda p: p.area).exterior)
+    start, end = tuple(points[0].tolist()), tuple(points[len(points) // 2].tolist())
+    way = free_space(ground).way(start, end)
+    assert way
+    line = shapely.LineString(way)
+    assert line.difference(ground.buffer(1e-3)).length == pytest.approx(0.0, abs=1e-6)
+    assert line.length >= math.dist(start, end) - 1e-6
+
+
+@given(
+    x=st.floats(-1e4, 1e4), y=st.floats(-1e4, 1e4), course=st.floats(0.0, 6.28),
+    length_m=st.floats(0.5, 2000.0), width_m=st.floats(0.5, 30.0),
+)  # fmt: skip
+def test_a_strip_is_as_long_and_wide_as_its_line_says(
+    x: float, y: float, course: float, length_m: float, width_m: float
+) -> None:
+    row = [x, y, x + length_m * math.cos(course), y + length_m * math.sin(course)]
+    strip = rectangles(np.array([row]), width_m)[0]
+    assert strip.area == pytest.approx(length_m * width_m, rel=1e-6)

@@ -1,0 +1,137 @@
+"""`vrspray plan`: files, figures and refusals, as they are typed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import shapely
+from shapely import Polygon, box
+
+from companion.cli.app import execute
+from sitl.stub.mission_file import read_mission
+from tests.bench.missions import to_degrees
+
+ANYANG = Path(__file__).parents[2] / "examples" / "anyang"
+
+
+def written(ground: Polygon, path: Path) -> Path:
+    """Write an outline as GeoJSON and return its path."""
+    geometry = json.loads(shapely.to_geojson(to_degrees(ground)))
+    feature = {"type": "Feature", "properties": {}, "geometry": geometry}
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any], str]:
+    """Return exit code, the JSON object and stderr."""
+    code = execute(["plan", *map(str, words), "--json"])
+    out, err = capsys.readouterr()
+    return code, json.loads(out), err
+
+
+def test_the_papers_field_is_planned_with_its_map(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = tmp_path / "field.plan"
+    code, found, _ = run(
+        capsys, ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml", "--out", out
+    )
+    assert code == 0
+    assert {
+        "coverage_percent", "overlap_percent", "outside_m2", "swaths", "turns", "spray_m",
+        "total_m", "flight_s", "planning_s", "volume_l", "sorties",
+    } <= set(found)  # fmt: skip
+    assert found["coverage_percent"] > 99.9
+    assert found["outside_m2"] == 0.0
+    assert found["swaths"] == 5
+    assert found["files"] == [str(out)]
+    assert read_mission(out)[-1].command == 20
+    # 120 m by 25 m at a mean of some 24 L/ha, a fifth of it twice.
+    assert 6.0 < found["volume_l"] < 9.0
+
+
+def test_a_prescription_stands_for_its_own_field(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = ANYANG / "prescription.shp"
+    code, found, _ = run(
+        capsys, file, "--prescription", file, "--swath-m", "3", "--out", tmp_path / "m.geojson"
+    )
+    assert code == 0
+    assert found["coverage_percent"] > 99.8
+
+
+def test_without_a_map_one_rate_holds(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    field = written(box(0, 0, 120, 240), tmp_path / "f.geojson")
+    code, found, _ = run(capsys, field, "--rate-l-ha", "10", "--out", tmp_path / "m.kml")
+    assert code == 0
+    assert found["volume_l"] == pytest.approx(found["spray_m"] * 6.0 / 1000.0)
+
+
+def test_rates_beyond_the_sprayer_are_warned_of(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    code, found, err = run(
+        capsys, ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml",
+        "--speed-m-s", "11", "--out", tmp_path / "m.plan",
+    )  # fmt: skip
+    assert code == 0
+    assert any("L/min" in warning for warning in found["warnings"])
+    assert "warning: " in err
+
+
+BOW_TIE = Polygon([(0, 0), (100, 100), (100, 0), (0, 100)])
+
+
+@pytest.mark.parametrize(
+    ("ground", "more", "says"),
+    [
+        (BOW_TIE, [], "f.geojson"),
+        (box(0, 0, 4, 100), [], "nowhere as wide as the swath of 6 m"),
+        (box(0, 0, 100, 100), ["--tank-l", "0.5"], "a reserve of 1.0 L"),
+        (box(0, 0, 100, 100), ["--tank-l", "1.01"], "mission.tank_l"),
+        (box(0, 0, 100, 100), ["--depot", "-48,11"], "depot 1"),
+        (box(0, 0, 100, 100), ["--depot", "north"], "--depot"),
+        (box(0, 0, 100, 100), ["--rate-l-ha", "0"], "rate above zero"),
+        (box(0, 0, 100, 100), ["--rate-l-ha", "nan"], "--rate-l-ha"),
+        (box(0, 0, 100, 100), ["--swath-m", "-6"], "swath_width_m must be positive"),
+        (box(0, 0, 100, 100), ["--speed-m-s", "nan"], "speed_m_s must be positive"),
+        (box(0, 0, 100, 100), ["--obstacle", "none.shp"], "none.shp"),
+        (box(0, 0, 100, 100), ["--prescription", "none.shp"], "none.shp"),
+        (box(0, 0, 60_000, 100), [], "the field spans 60 km"),
+    ],
+)
+def test_a_refusal_is_one_line_and_no_file(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, ground: Polygon, more: list[str], says: str
+) -> None:
+    field = written(ground, tmp_path / "f.geojson")
+    code, found, err = run(capsys, field, *more, "--out", tmp_path / "m.plan")
+    assert code == 2
+    assert says in found["error"]
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "m.plan").exists()
+
+
+def test_an_unknown_format_is_refused_before_any_work(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    code, found, _ = run(capsys, tmp_path / "none.shp", "--out", tmp_path / "m.pdf")
+    assert code == 2
+    assert ".pdf is not known" in found["error"]
+
+
+def test_an_obstacle_keeps_its_buffer(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    field = written(box(0, 0, 120, 120), tmp_path / "f.geojson")
+    mast = written(box(55, 55, 65, 65), tmp_path / "o.geojson")
+    code, found, _ = run(capsys, field, "--obstacle", mast, "--out", tmp_path / "m.geojson")
+    assert code == 0
+    features = json.loads((tmp_path / "m.geojson").read_text())["features"]
+    around = to_degrees(box(53.1, 53.1, 66.9, 66.9))
+    ways = [shapely.LineString(each["geometry"]["coordinates"])
+            for each in features if each["geometry"]["type"] == "LineString"]  # fmt: skip
+    assert ways
+    assert not any(way.intersects(around) for way in ways)
+    assert found["coverage_percent"] > 99.8
