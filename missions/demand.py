@@ -47,19 +47,21 @@ class Demand:
         """Return what the whole line needs."""
         return float(self.litres[-1])
 
-    def cuts_m(self, pieces: int) -> Floats:
-        """Return where to cut the line so that every piece needs as much: pieces + 1 places.
+    def cuts_m(self, piece_max_l: float) -> tuple[Floats, Floats]:
+        """Return where to cut the line, both ends among it, and what each piece needs.
 
-        >>> Demand(at_m=np.array([0.0, 10.0]), litres=np.array([0.0, 2.0])).cuts_m(2).tolist()
-        [0.0, 5.0, 10.0]
+        All but the last need as much as they may, so that tanks can be emptied with them.
+
+        >>> need = Demand(at_m=np.array([0.0, 10.0]), litres=np.array([0.0, 2.5]))
+        >>> [found.tolist() for found in need.cuts_m(1.0)]
+        [[0.0, 4.0, 8.0, 10.0], [1.0, 1.0, 0.5]]
         """
-        shares = np.linspace(0.0, 1.0, pieces + 1)
-        if self.total_l > 0.0:
-            cuts = np.interp(shares * self.total_l, self.litres, self.at_m)
-            cuts[0], cuts[-1] = self.at_m[0], self.at_m[-1]
-        else:
-            cuts = shares * self.at_m[-1]
-        return cuts
+        count = max(1, math.ceil(self.total_l / piece_max_l - 1e-9))
+        litres = np.minimum(np.arange(count + 1) * piece_max_l, self.total_l)
+        cuts = np.interp(litres, self.litres, self.at_m)
+        cuts[0], cuts[-1] = self.at_m[0], self.at_m[-1]
+        litres[-1] = self.total_l
+        return cuts, np.diff(litres)
 
 
 def valve_places(width_m: float, valves: tuple[tuple[float, float], ...]) -> Floats:
@@ -116,17 +118,16 @@ class Pieces:
 
 
 def cut(lines: Floats, demand: list[Demand], *, piece_max_l: float) -> Pieces:
-    """Return the lines in equal pieces of at most `piece_max_l`; whole ones that need less."""
+    """Return the lines in pieces of at most `piece_max_l`; whole ones that need less."""
     rows, litres, owner = [no_lines()], [np.empty(0)], [np.empty(0, dtype=np.int64)]
     for index, (row, need) in enumerate(zip(lines, demand, strict=True)):
-        count = max(1, math.ceil(need.total_l / piece_max_l - 1e-9))
-        cuts = need.cuts_m(count)
+        cuts, each_l = need.cuts_m(piece_max_l)
         length_m = need.at_m[-1]
         places = row[:2] + np.outer(cuts / length_m, row[2:] - row[:2])
         places[-1] = row[2:]
         rows.append(np.column_stack([places[:-1], places[1:]]))
-        litres.append(np.full(count, need.total_l / count))
-        owner.append(np.full(count, index, dtype=np.int64))
+        litres.append(each_l)
+        owner.append(np.full(len(each_l), index, dtype=np.int64))
     return Pieces(
         ends=np.concatenate(rows), litres=np.concatenate(litres), line=np.concatenate(owner)
     )

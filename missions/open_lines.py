@@ -76,7 +76,7 @@ def needed_passes(lines: Floats, passes: Floats, ground: BaseGeometry, width_m: 
     chosen = no_lines()
     left = passes
     while len(left) and missing.area > allowed_m2:
-        gain = shapely.area(shapely.intersection(rectangles(left, width_m), missing))
+        gain = _gain_m2(left, missing, width_m)
         order = np.argsort(-gain, kind="stable")
         # Several at a time: those that gain next to the most, as long as they are apart.
         some = [int(at) for at in order[:8] if gain[at] > max(0.5 * gain[order[0]], 1e-3)]
@@ -87,6 +87,15 @@ def needed_passes(lines: Floats, passes: Floats, ground: BaseGeometry, width_m: 
         missing = missing.difference(united(new, width_m))
         left = np.delete(left, some, axis=0)
     return chosen
+
+
+def _gain_m2(passes: Floats, missing: BaseGeometry, width_m: float) -> Floats:
+    """Return how much of what is missing each pass would cover, patch by patch."""
+    strips, patches = rectangles(passes, width_m), shapely.get_parts(missing)
+    one, patch = shapely.STRtree(patches).query(strips)
+    common = shapely.area(shapely.intersection(strips[one], patches[patch]))
+    gain = np.bincount(one, weights=common, minlength=len(passes))
+    return np.asarray(gain, dtype=np.float64)
 
 
 def _trimmed(line: Floats, missing: BaseGeometry, width_m: float) -> Floats:

@@ -179,7 +179,9 @@ def _found(
     if kind in _OF_ONE_VALVE:
         valve = _valve(watching, memory, evidence.bins, is_open=_OF_ONE_VALVE[kind])
     percent = 100.0 * (evidence.flow - 1.0)
-    pressed = "" if evidence.pressure is None else f", pressure {100.0 * (evidence.pressure - 1.0):+.0f} %"
+    pressed = ""
+    if evidence.pressure is not None:
+        pressed = f", pressure {100.0 * (evidence.pressure - 1.0):+.0f} %"
     text = f"{_TEXTS[kind]}: flow {percent:+.0f} %{pressed}"
     at_s = evidence.bins[-1].end_s
     found = Finding(kind=kind, at_s=at_s, text=text, valve=valve)

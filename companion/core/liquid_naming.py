@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from statistics import fmean
 from typing import NamedTuple
 
 from companion.core.liquid_bins import Bin
@@ -55,7 +54,7 @@ class Evidence(NamedTuple):
             bins=sure,
             gain=gain,
             flow=math.fsum(each.metered_ml for each in sure) / expected_ml,
-            pressure=fmean(pressures) / pressure_gain if pressures else None,
+            pressure=_mean(pressures) / pressure_gain if pressures else None,
             open_ml_s=open_ml_s,
         )
 
@@ -64,7 +63,7 @@ class Evidence(NamedTuple):
         """Whether the flow jumps from bin to bin, as no liquid does."""
         flows = [each.metered_ml / (self.gain * each.all_ml) for each in self.bins]
         moves = [abs(b - a) for a, b in pairwise(flows)]
-        return len(moves) >= 2 and fmean(moves) > RESTLESS_SHARE
+        return len(moves) >= 2 and _mean(moves) > RESTLESS_SHARE
 
     @property
     def is_supply(self) -> bool:
@@ -73,6 +72,10 @@ class Evidence(NamedTuple):
             return False
         conductance = self.flow / math.sqrt(self.pressure)
         return abs(conductance - 1.0) < SUPPLY_SHARE * abs(self.flow - 1.0)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values)
 
 
 def name_of_nothing(evidence: Evidence, *, is_air_before: bool, is_tank_low: bool) -> FaultKind:
@@ -109,7 +112,7 @@ def _share(evidence: Evidence, *, is_open: bool) -> float:
         used = [volume for volume in each.expected_ml if volume > 0.0]
         if not used:
             continue
-        mean_ml = evidence.gain * fmean(used)
+        mean_ml = evidence.gain * _mean(used)
         wrong_ml += each.metered_ml - evidence.gain * each.all_ml
         open_ml = evidence.gain * evidence.open_ml_s * (each.end_s - each.begin_s)
         valve_ml += open_ml - mean_ml if is_open else mean_ml

@@ -130,8 +130,8 @@ def nearest_order(lines: Floats) -> Floats:
 
 def longest_edge_deg(ground: Area) -> float:
     """Return the course of the longest edge of the outline as it is drawn."""
-    outline = max(polygons_of(ground), key=lambda part: part.area).simplify(0.5)
-    points = shapely.get_coordinates(outline.exterior)
+    outline = max(polygons_of(ground), key=lambda part: part.area).exterior.simplify(0.5)
+    points = shapely.get_coordinates(outline)
     step = np.diff(points, axis=0)
     longest = step[int(np.argmax(np.hypot(*step.T)))]
     return math.degrees(math.atan2(longest[0], longest[1]))

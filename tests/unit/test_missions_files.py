@@ -25,7 +25,8 @@ from tests.bench.missions import FRAME, to_degrees
 @pytest.fixture(scope="module")
 def plan() -> Plan:
     """Return a plan of several sorties around a hole."""
-    ground = box(0.0, 0.0, 200.0, 150.0) - box(80.0, 60.0, 120.0, 90.0)
+    hole = [(80.0, 60.0), (120.0, 60.0), (120.0, 90.0), (80.0, 90.0)]
+    ground = Polygon([(0.0, 0.0), (200.0, 0.0), (200.0, 150.0), (0.0, 150.0)], [hole])
     field = build_field(to_degrees(ground), swath_width_m=6.0, frame=FRAME)
     settings = Settings(swath_width_m=6.0, speed_m_s=5.0, tank_l=20.0, reserve_l=0.0, moves=500)
     return plan_mission(field, settings, Uniform(rate_l_ha=20.0))

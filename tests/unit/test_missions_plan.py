@@ -15,6 +15,7 @@ from missions.demand import Rates, Uniform, cut, demands
 from missions.errors import PlanError
 from missions.field import Field, build_field
 from missions.free_space import free_space
+from missions.map_rates import MapRates
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.strips import lengths_m, rectangles
@@ -94,6 +95,23 @@ def test_the_demand_is_the_integral_of_the_map() -> None:
     assert pieces.litres == pytest.approx([exact_l / 3.0] * 3)
     assert lengths_m(pieces.ends).sum() == pytest.approx(70.0)
     assert lengths_m(pieces.ends)[0] > lengths_m(pieces.ends)[-1]
+
+
+def test_the_rates_of_many_places_are_those_of_the_prescription() -> None:
+    zones = [
+        Zone(name="w", polygon=box(0, 0, 60, 100), rate_l_ha=10.0),
+        Zone(name="e", polygon=box(50, 0, 90, 100), rate_l_ha=30.0),
+        Zone(name="hole", polygon=box(10, 10, 20, 20), rate_l_ha=0.0),
+    ]
+    draw = np.random.default_rng(1)
+    east_m, north_m = draw.uniform(0.0, 100.0, 500), draw.uniform(0.0, 100.0, 500)
+    for default in (None, 5.0):
+        made = Prescription(
+            zones, boundary=box(0, 0, 100, 100), overlap="max", default_rate_l_ha=default
+        )
+        found = MapRates(made).rates_at(east_m, north_m)
+        assert found == pytest.approx(made.rates_at(east_m, north_m), nan_ok=True)
+        assert len(np.unique(found[~np.isnan(found)])) == (2 if default is None else 3)
 
 
 def test_every_valve_reads_the_rate_of_its_own_strip() -> None:
@@ -197,9 +215,7 @@ def test_overlap_and_outside_are_measured() -> None:
         (box(0, 0, 100, 100), 0.1, "mission.tank_l"),
     ],
 )
-def test_what_cannot_be_planned_is_refused(
-    ground: Polygon, tank_l: float, says: str
-) -> None:
+def test_what_cannot_be_planned_is_refused(ground: Polygon, tank_l: float, says: str) -> None:
     with pytest.raises(PlanError, match=says):
         plan_of(ground, tank_l=tank_l)
 
