@@ -256,11 +256,10 @@ class FlowTable:
 
     def open_ml_s(self, duty: float, active: int) -> float:
         """Return the flow of one open valve in a train of pulses: such that the mean is right."""
-        off_s = (1.0 - duty) * self._pwm.period_s
-        if off_s < self._pwm.min_off_s:
-            # The engine lengthens or fills a gap that the valve cannot follow.
-            off_s = self._pwm.min_off_s if off_s >= 0.5 * self._pwm.min_off_s > 0.0 else 0.0
-        share = 1.0 - off_s / self._pwm.period_s + (self._surplus if off_s > 0.0 else 0.0)
+        # Above the last duty whole periods take turns, and only some of them have a gap.
+        last = min(self._pwm.duty_max, 1.0 - self._pwm.min_off_s / self._pwm.period_s)
+        with_gap = 1.0 if duty <= last else (1.0 - duty) / (1.0 - last)
+        share = duty + self._surplus * with_gap
         return self.mean_ml_s(duty, active) / min(max(share, 1e-3), 1.0)
 
 

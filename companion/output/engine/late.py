@@ -43,7 +43,9 @@ class LateEdges:
         """Take edges in the order of their times."""
         for edge in edges:
             queue = self._lines[edge.valve].queue
-            if not edge.is_open and edge.duty == 0.0:
+            # Towards the safe state there is no pulse to keep: what it was to do before is void.
+            is_return = edge.valve >= self._valves
+            if edge.is_open if is_return else not edge.is_open and edge.duty == 0.0:
                 queue.clear()
             queue.append(edge)
             self._waiting.add(edge.valve)
