@@ -4,6 +4,7 @@
 PYTHON ?= python3
 SEED ?=
 ARGS ?=
+WORKERS ?= 2
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
@@ -24,8 +25,8 @@ setup: $(INSTALLED) ## the virtual environment, from the lock files
 demo: $(INSTALLED) ## fly the demo; pictures and figures in demo-out
 	$(BIN)/vrspray demo --out demo-out $(ARGS)
 
-test: $(INSTALLED) ## all tests (ARGS="-k lag" for some)
-	$(BIN)/pytest $(ARGS)
+test: $(INSTALLED) ## all tests (ARGS="-k lag" for some; WORKERS=0 for one process)
+	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 
 lint: format-check ruff mypy imports ## format, ruff, mypy, import rules
 

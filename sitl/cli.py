@@ -53,7 +53,10 @@ def serve(
     ] = None,
     speed: Annotated[float, typer.Option(help="Speed of the flight in m/s.")] = 5.0,
     field_config: Annotated[
-        Path | None, typer.Option(help="Configuration that says how the valves are wired.")
+        Path | None,
+        typer.Option(
+            help="Configuration that says how the valves are wired; default: the example."
+        ),
     ] = None,
     profile: Annotated[str, typer.Option(help="Sprayer profile.")] = "wang-2024",
     board: Annotated[Board, typer.Option(help="restarting or free-running.")] = Board.RESTARTING,

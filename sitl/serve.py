@@ -41,6 +41,10 @@ _EPOCH_2015_S = 1_420_070_400  # MAVLink's time stamps count from there, in 10 u
 Say = Callable[[str], None]
 
 
+# How the example is wired: PX4 counts actuators where ArduPilot counts outputs.
+FIELD_CONFIGS = {"ardupilot": "config.toml", "px4": "px4.toml"}
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServeOptions:
     """What the command line says."""
@@ -85,7 +89,9 @@ class _Run:
             raise ConfigError(f"--wait-s {options.wait_s:g}: give 0 or more seconds")
         if not 0.5 <= options.speed_m_s <= 20.0:
             raise ConfigError(f"--speed {options.speed_m_s}: give 0.5 to 20 m/s")
-        config = self._config = load(options.field_config or EXAMPLE / "config.toml")
+        config = self._config = load(
+            options.field_config or EXAMPLE / FIELD_CONFIGS.get(options.autopilot, "config.toml")
+        )
         scenario = load_scenario(options.scenario) if options.scenario else Scenario()
         items = _items(options, firmware_of(options.autopilot, scenario))
         start_s = time.monotonic()
