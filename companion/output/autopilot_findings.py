@@ -23,6 +23,8 @@ _FIRST_FUNCTION = 300  # Peripheral via Actuator Set 1 is 301
 _SPRAYER = frozenset({22, 23})
 _PILOT = frozenset({1, *range(51, 67), *range(140, 156)})
 _GRIPPER = 28
+# A parameter of the watchdog script; it exists only while the script is loaded.
+_WATCHDOG = "SPRW_ENABLE"
 # Of the span: nearer to closed than this is closed for a driver board.
 _CLOSED_SHARE = 0.01
 
@@ -45,7 +47,8 @@ def wanted_parameters(options: ServoOptions, *, is_px4: bool) -> tuple[str, ...]
         )
     functions = tuple(f"SERVO{channel}_FUNCTION" for channel in options.outputs)
     more = ("SERVO_32_ENABLE",) if max(options.outputs) > 16 else ()
-    return (*functions, "SPRAY_ENABLE", "BRD_SAFETY_DEFLT", "BRD_SAFETY_MASK", *more)
+    safety = ("BRD_SAFETY_DEFLT", "BRD_SAFETY_MASK", _WATCHDOG)
+    return (*functions, "SPRAY_ENABLE", *safety, *more)
 
 
 def more_parameters(options: ServoOptions, known: Known, *, is_px4: bool) -> tuple[str, ...]:
@@ -94,6 +97,17 @@ def findings(options: ServoOptions, known: Known, *, is_px4: bool) -> list[Findi
     return sorted(_merged(found), key=lambda finding: not finding.is_fault)
 
 
+def dead_man(options: ServoOptions, known: Known, *, is_px4: bool) -> Finding | None:
+    """Return what is missing for the valves to close when this computer dies.
+
+    Either a script on ArduPilot, or a board that wants its widths to move; PX4 has only the board.
+    """
+    if options.dither_us or (not is_px4 and known.get(_WATCHDOG) == 1.0):
+        return None
+    what = "output.dither_us is 0" if is_px4 else f"no watchdog script ({_WATCHDOG})"
+    return _warning(f"{what}: valves stay open if I die")
+
+
 def _merged(found: Sequence[Finding]) -> Iterator[Finding]:
     """Yield each finding once: those that differ in the number of the output only are counted."""
     alike: dict[tuple[bool, str], list[Finding]] = {}
@@ -116,17 +130,22 @@ def _ardupilot(options: ServoOptions, known: Known) -> Iterator[Finding]:
             yield _function(channel, value, is_sprayer_on=known.get("SPRAY_ENABLE") == 1.0)
     if max(options.outputs) > 16 and known.get("SERVO_32_ENABLE") == 0.0:
         yield _fault("SERVO_32_ENABLE is 0: no outputs above 16; set it to 1 and reboot")
-    mask = known.get("BRD_SAFETY_MASK")
+    mask = _whole(known.get("BRD_SAFETY_MASK"))
     missing = sum(
         1 << channel - 1
         for channel in options.outputs
-        if channel <= 16 and not int(mask or 0) >> channel - 1 & 1
+        if channel <= 16 and not mask >> channel - 1 & 1
     )
     if known.get("BRD_SAFETY_DEFLT") == 1.0 and missing:
         yield _warning(
             "safety switch: no pulses before it is pressed, unless BRD_SAFETY_MASK is "
-            f"{int(mask or 0) + missing}"
+            f"{mask + missing}"
         )
+
+
+def _whole(value: float | None) -> int:
+    """Return a mask of bits; what is no such number has none set."""
+    return int(value) if value is not None and 0.0 <= value < 2**32 else 0
 
 
 def _function(channel: int, value: float, *, is_sprayer_on: bool) -> Finding:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 from companion.output.autopilot_check import OutputCheck, Reading, ardupilot_places
 from companion.output.autopilot_findings import (
+    dead_man,
     findings,
     more_parameters,
     px4_pins,
@@ -90,6 +91,8 @@ class OutputGuard:
         if self._is_px4:
             self._check.look_at(px4_places(self._options.outputs, self._known))
         found = findings(self._options, self._known, is_px4=self._is_px4)
+        missing = dead_man(self._options, self._known, is_px4=self._is_px4)
+        found += [] if missing is None else [missing]
         faults = [finding.text for finding in found if finding.is_fault]
         self._finding = faults[0] if faults else None
         for text in [*faults[1:], *(finding.text for finding in found if not finding.is_fault)]:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.autopilot_budget import OrderBudget, dither_too_much, order_budget
 from companion.output.autopilot_check import OutputCheck, ardupilot_places
-from companion.output.autopilot_findings import findings, wanted_parameters
+from companion.output.autopilot_findings import dead_man, findings, wanted_parameters
 from companion.output.servo import ServoExecutor, ServoOptions
 
 CHANNELS = (1, 2, 3)
@@ -349,5 +349,24 @@ async def test_a_refusal_is_explained_by_the_parameters() -> None:
     assert executor.fault == "servo order failed: is SERVOn_FUNCTION 0?"
     executor.learned({"SERVO9_FUNCTION": 0.0, "SERVO10_FUNCTION": 33.0, "SPRAY_ENABLE": None})
     assert executor.fault == "SERVO10_FUNCTION is 33: orders are refused; set it to 0"
-    assert said == []
+    assert [text for text in said if "SPRW" not in text] == []
     await executor.stop()
+
+
+@pytest.mark.parametrize("value", [None, 0.0, math.nan, 2.0])
+def test_that_nothing_closes_for_a_dead_computer_is_said(value: float | None) -> None:
+    with_board = ServoOptions(channels=CHANNELS, dither_us=8)
+    for is_px4 in (False, True):
+        found = dead_man(OPTIONS, {"SPRW_ENABLE": value}, is_px4=is_px4)
+        assert found is not None
+        assert not found.is_fault
+        assert dead_man(with_board, {"SPRW_ENABLE": value}, is_px4=is_px4) is None
+    assert "SPRW_ENABLE" in wanted_parameters(OPTIONS, is_px4=False)
+    assert dead_man(OPTIONS, {"SPRW_ENABLE": 1.0}, is_px4=False) is None
+    assert dead_man(OPTIONS, {"SPRW_ENABLE": 1.0}, is_px4=True) is not None
+
+
+def test_a_mask_that_is_no_number_has_no_bit() -> None:
+    known = {"BRD_SAFETY_DEFLT": 1.0, "BRD_SAFETY_MASK": math.nan}
+    texts = [found.text for found in findings(OPTIONS, known, is_px4=False)]
+    assert any(text.endswith("BRD_SAFETY_MASK is 7") for text in texts)
