@@ -48,11 +48,11 @@ bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 mutants: $(INSTALLED) ## each known way to break the code makes a test fail (ARGS="lease" for some)
 	$(BIN)/python -m tests.mutations $(ARGS)
 
-faults: ## faults injected over many flights
+faults: ## faults injected over many flights (not yet: says what it waits for)
 	@echo "make faults: not part of this version; it needs the fault campaign." >&2; exit 1
 
-test-gpio: ## GPIO output against a simulated chip
-	@echo "make test-gpio: not part of this version; it needs the GPIO engine and a kernel with gpio-sim." >&2; exit 1
+test-gpio: ## GPIO output against a simulated chip (not yet: says what it waits for)
+	@echo "make test-gpio: no such tests yet; they need a kernel with gpio-sim. make test runs the valve engine on lines in memory." >&2; exit 1
 
 docs: $(INSTALLED) ## every link in the documents leads somewhere
 	$(BIN)/pytest --quiet tests/unit/test_foundation.py -k link

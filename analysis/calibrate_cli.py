@@ -80,8 +80,8 @@ def lag(
     record = record_of(content.items(), content.setup)
     if not len(record.time_s):
         raise JournalError(
-            f"{journal}: holds no flow meter's readings; fly with a meter, or on the twin with "
-            "`vrspray sitl fly --meter-rate-hz 50`"
+            f"{journal}: holds no flow meter's readings; fly with a meter that [flow_meter] in the "
+            "configuration names, or on the twin with `vrspray sitl fly --meter-rate-hz 50`"
         )
     found = identify(record, meter_lag_s=meter_lag_s)
     why = refusal(found)

@@ -181,7 +181,7 @@ def _run(options: Any) -> dict[str, Any]:
 def _print_error(text: str, *, as_json: bool) -> None:
     import json
 
-    typer.echo(text, err=True)
+    typer.echo(f"error: {text}", err=True)
     if as_json:
         typer.echo(json.dumps({"error": text}))
 

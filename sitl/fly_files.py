@@ -92,9 +92,10 @@ def fly_lines(result: dict[str, Any]) -> Iterator[str]:
         f"lag distance: {_number(lag['mean_abs'])} m mean, {_number(lag['max_abs'])} m worst of "
         f"{lag['count']} changes; {flight['apart']} apart, {flight['missed']} missed"
     )
+    ratio = flight["limit_ratio"]
+    best = "" if ratio is None else f", {ratio:.2f} times the least possible"
     yield (
-        f"misapplied {_number(flight['misapplied_percent'], 2)} %, "
-        f"{_number(flight['limit_ratio'], 2)} times the least possible; "
+        f"misapplied {_number(flight['misapplied_percent'], 2)} %{best}; "
         f"spraying accuracy {_number(flight['spraying_accuracy_percent'], 2)} %"
     )
     yield (
@@ -105,6 +106,8 @@ def fly_lines(result: dict[str, Any]) -> Iterator[str]:
         f"{result['simulated_s']:.0f} s in {result['wall_s']:.2f} s: "
         f"{result['times_real_time']:.0f} times real time"
     )
+    for text in result["notes"]:
+        yield f"note: {text}"
 
 
 def _number(value: float | None, digits: int = 3) -> str:

@@ -43,6 +43,7 @@ Say = Callable[[str], None]
 
 # How the example is wired: PX4 counts actuators where ArduPilot counts outputs.
 FIELD_CONFIGS = {"ardupilot": "config.toml", "px4": "px4.toml"}
+_OTHER = {"ardupilot": "px4", "px4": "ardupilot"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +94,7 @@ class _Run:
             options.field_config or EXAMPLE / FIELD_CONFIGS.get(options.autopilot, "config.toml")
         )
         scenario = load_scenario(options.scenario) if options.scenario else Scenario()
-        items = _items(options, firmware_of(options.autopilot, scenario))
+        items = _items(options, _firmware(options.autopilot, scenario))
         start_s = time.monotonic()
         home = LocalFrame(items[0].latitude_deg, items[0].longitude_deg)
         self.sprayer = Sprayer(_sprayer_options(options, config, scenario), start_s=start_s)
@@ -202,6 +203,25 @@ def _spread_ms(late_s: list[float]) -> dict[str, float]:
     ordered = sorted(late_s) or [0.0]
     p99 = ordered[int(0.99 * (len(ordered) - 1))]
     return {"p99": round(1000.0 * p99, 2), "max": round(1000.0 * ordered[-1], 2)}
+
+
+def _firmware(autopilot: str, scenario: Scenario) -> Firmware:
+    """Return the personality; where only the other one fits the scenario, name the option."""
+    try:
+        return firmware_of(autopilot, scenario)
+    except ConfigError as error:
+        other = _OTHER.get(autopilot)
+        if other is None or not _can_be(other, scenario):
+            raise
+        raise ConfigError(f"{error}; for this scenario give --autopilot {other}") from error
+
+
+def _can_be(autopilot: str, scenario: Scenario) -> bool:
+    try:
+        firmware_of(autopilot, scenario)
+    except ConfigError:
+        return False
+    return True
 
 
 def _items(options: ServeOptions, firmware: Firmware) -> tuple[MissionItem, ...]:

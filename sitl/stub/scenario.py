@@ -14,7 +14,7 @@ from typing import Any
 
 from companion.errors import ConfigError
 from sitl.stub.estimator import EstimatorNoise
-from sitl.stub.faults import Fault, read_faults, read_table
+from sitl.stub.faults import Fault, FaultKind, read_faults, read_table
 from sitl.stub.firmware import Version
 
 _KNOWN: dict[str, tuple[str, ...]] = {
@@ -63,6 +63,7 @@ class Scenario:
 
 def load_scenario(path: Path) -> Scenario:
     """Return what a scenario file says."""
+    check_scenario(path)
     table = read_table(path)
     known = ("fault", "parameters", *_KNOWN)
     for name, entry in table.items():
@@ -94,6 +95,19 @@ def load_scenario(path: Path) -> Scenario:
         box_closed_s=reader.number("box", "closed_s", 0.0),
         signing_key=reader.key() if "signing" in table else None,
     )
+
+
+def check_scenario(path: Path) -> None:
+    """Refuse a file that is not there, and a fault of no known kind, saying what to give."""
+    if not path.exists():
+        raise ConfigError(f"--scenario {path}: no such file")
+    entries = read_table(path).get("fault")
+    kinds = tuple(kind.value for kind in FaultKind)
+    for number, entry in enumerate(entries if isinstance(entries, list) else ()):
+        if not isinstance(entry, dict) or entry.get("kind") in kinds:
+            continue
+        wrong = f"kind = {entry['kind']!r}: unknown" if "kind" in entry else "kind: missing"
+        raise ConfigError(f"{path}: fault[{number}].{wrong}; known kinds: {', '.join(kinds)}")
 
 
 class _Reader:

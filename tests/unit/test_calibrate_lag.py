@@ -398,4 +398,6 @@ def test_a_journal_without_a_meter_is_refused_with_exit_2(
         journal.record_decision(plan(1, 0.5, issued_s=1.0))
         path = journal.path
     assert execute(["calibrate", "lag", str(path)]) == 2
-    assert "no flow meter" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "no flow meter" in error
+    assert "[flow_meter]" in error and "sitl fly --meter-rate-hz" in error

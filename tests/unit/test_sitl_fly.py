@@ -14,6 +14,7 @@ from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
 from sitl.anyang import anyang_items, anyang_route
 from sitl.fly import FlyOptions, fly_mission, prepare
+from sitl.fly_files import fly_lines
 from sitl.mission_writing import write_mission
 from sitl.routes import read_route
 from sitl.stub.mission_file import read_mission
@@ -21,6 +22,7 @@ from sitl.stub.mission_file import read_mission
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 ANYANG = EXAMPLES / "anyang"
 ORCHARD = EXAMPLES / "orchard"
+PUMP = EXAMPLES / "pump"
 KEYS = {
     "speed_m_s", "method", "lag_distance_m", "settled_lag_distance_m", "misapplied_percent",
     "spraying_accuracy_percent", "limit_ratio", "settled_accuracy_percent", "border_margin_m",
@@ -62,6 +64,7 @@ def test_one_flight_comes_out_as_one_json_object(
     assert flight["off_target_ml"] == 0.0
     assert flight["limit_ratio"] >= 1.0
     assert result["warnings"] == []
+    assert result["notes"] == []
     assert result["times_real_time"] == result["simulated_s"] / result["wall_s"]
     assert "plant wang-2024" in said.err
 
@@ -164,6 +167,83 @@ def test_what_does_not_go_together_is_refused(
         prepare(replace(options, **change))
 
 
+def tiny_mission(folder: Path) -> Path:
+    """The first two fifths of a pass over the example field."""
+    items = anyang_items(5.0)
+    first, last = items[1], items[3]
+    near = replace(
+        last,
+        x_e7=round(first.x_e7 + 0.4 * (last.x_e7 - first.x_e7)),
+        y_e7=round(first.y_e7 + 0.4 * (last.y_e7 - first.y_e7)),
+    )
+    write_mission((*items[:3], near, items[-1]), folder)
+    return folder / "mission.waypoints"
+
+
+def test_a_pump_has_no_least_possible_and_is_warned_of_short_zones(tmp_path: Path) -> None:
+    options = FlyOptions(config=PUMP / "config.toml", mission=tiny_mission(tmp_path), plant="pump")
+    flown = fly_mission(options, silent)
+    result = flown.as_json()
+    assert flown.perfect is None
+    assert result["flights"][0]["limit_ratio"] is None
+    text = "\n".join(fly_lines(result))
+    assert "misapplied" in text
+    assert "least possible" not in text
+    (warning,) = result["warnings"]
+    assert warning["code"] == "zones-too-short"
+    assert "3.8 s that the pump's flow takes" in warning["text"]
+    assert "19 m and more" in warning["fix"]
+
+
+@pytest.mark.parametrize(("speed_m_s", "warns"), [(5.0, True), (2.0, False)])
+def test_zones_are_too_short_for_a_pump_by_their_time(
+    short_mission: Path, speed_m_s: float, warns: bool
+) -> None:
+    config = PUMP / "config.toml"
+    options = FlyOptions(config=config, mission=short_mission, plant="pump", speed_m_s=speed_m_s)
+    assert ("zones-too-short" in {problem.code for problem in prepare(options).warnings}) is warns
+
+
+def with_drift(folder: Path, table: str) -> Path:
+    """Write the example's configuration with an offset for the wind."""
+    text = (ANYANG / "config.toml").read_text(encoding="utf-8")
+    for name in ("prescription.shp", "boundary.geojson"):
+        text = text.replace(f'"{name}"', f'"{(ANYANG / name).as_posix()}"')
+    path = folder / "drift.toml"
+    path.write_text(f"{text}\n[drift]\nenabled = true\n{table}\n", encoding="utf-8")
+    return path
+
+
+def test_an_offset_for_the_wind_is_told_and_the_least_possible_has_none(
+    options: FlyOptions, tmp_path: Path
+) -> None:
+    windy = with_drift(tmp_path, "droplet_um = 250.0\nwind = [2.0, 270.0]")
+    mission = tiny_mission(tmp_path)
+    flown = fly_mission(replace(options, config=windy, mission=mission), silent)
+    calm = fly_mission(replace(options, mission=mission), silent)
+    assert flown.perfect == calm.perfect
+    assert flown.evaluation != calm.evaluation
+    notes = [line for line in fly_lines(flown.as_json()) if line.startswith("note: ")]
+    assert len(notes) == 1
+    assert "judged at the nozzle" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("table", "text"),
+    [
+        ("", "no wind is told; give drift.wind"),
+        ("wind = [20.0, 270.0]", "above safety.wind_max_m_s"),
+    ],
+)
+def test_an_offset_that_moves_nothing_says_why(
+    options: FlyOptions, tmp_path: Path, table: str, text: str
+) -> None:
+    config = with_drift(tmp_path, f"droplet_um = 250.0\n{table}")
+    flown = fly_mission(replace(options, config=config, mission=tiny_mission(tmp_path)), silent)
+    (note,) = flown.as_json()["notes"]
+    assert text in note
+
+
 def scenario(folder: Path, kind: str) -> Path:
     path = folder / "scenario.toml"
     path.write_text(
@@ -194,6 +274,20 @@ def test_a_fault_of_the_scenario_closes_the_valves(
     under_fault = (record.time_s > 13.0) & (record.time_s < 14.9)
     assert np.ptp(volume_ml[under_fault]) == 0.0
     assert volume_ml[-1] > 0.0
+
+
+def test_a_scenario_that_is_not_there_is_named_with_its_option(
+    short_mission: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert execute(command(short_mission, "--scenario", "nope.toml")) == 2
+    assert capsys.readouterr().err == "error: --scenario nope.toml: no such file\n"
+
+
+def test_an_unknown_kind_of_fault_is_refused_with_the_known_ones(
+    options: FlyOptions, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match="'gremlins': unknown; known kinds: ack-lost, ack-late"):
+        prepare(replace(options, scenario=scenario(tmp_path, "gremlins")))
 
 
 def test_a_fault_of_the_wire_is_refused(options: FlyOptions, tmp_path: Path) -> None:

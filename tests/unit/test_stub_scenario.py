@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from companion.errors import ConfigError
+from sitl.cli import app
+from sitl.serve import ServeOptions, serve
 from sitl.stub.build import StubOptions, build_autopilot, firmware_of, noise_of
 from sitl.stub.faults import FaultKind
 from sitl.stub.scenario import Scenario, load_scenario
@@ -82,7 +87,14 @@ def test_an_empty_scenario_is_the_firmware_as_it_is(tmp_path: Path) -> None:
         ("[signing]\n", "64 hexadecimal digits"),
         ("clock = 3\n", r"write it as \[clock\]"),
         ("[[wind]]\nspeed_m_s = 1\n", r"write it as \[wind\]"),
-        ("[[fault]]\nkind = 'gremlins'\n", "gremlins"),
+        (
+            "[[fault]]\nkind = 'gremlins'\n",
+            r"fault\[0\].kind = 'gremlins': unknown; known kinds: ack-",
+        ),
+        ("[[fault]]\nkind = [3]\n", r"kind = \[3\]: unknown; known kinds: ack-lost"),
+        ("[[fault]]\nat_s = 3\n", r"fault\[0\].kind: missing; known kinds: ack-lost"),
+        ("[[fault]]\nkind = 'rc'\nfraction = 2\n", r"fault\[0\]: fraction must lie"),
+        ("fault = [3]\n", "one table each"),
     ],
 )
 def test_a_wrong_scenario_is_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
@@ -103,6 +115,31 @@ def test_a_wrong_scenario_is_refused_in_one_line(tmp_path: Path, text: str, said
 def test_what_the_firmware_is_not_is_refused(autopilot: str, scenario: Scenario, said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         firmware_of(autopilot, scenario)
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "text", "said"),
+    [
+        ("ardupilot", "[firmware]\nversion = '1.14.1'\n", "4.0.0 on; .* give --autopilot px4"),
+        ("ardupilot", "[firmware]\ncommands_per_s = 30\n", "no queue .* give --autopilot px4"),
+        ("px4", "[firmware]\nversion = '4.5.0'\n", "1.14.0 on; .* give --autopilot ardupilot"),
+        ("px4", "[firmware]\nversion = '3.6.0'\n", "from 1.14.0 on$"),
+        ("px5", "[firmware]\nversion = '1.14.1'\n", "ardupilot, px4$"),
+    ],
+)
+def test_a_scenario_of_the_other_autopilot_names_the_option(
+    tmp_path: Path, autopilot: str, text: str, said: str
+) -> None:
+    options = ServeOptions(autopilot=autopilot, scenario=written(tmp_path, text))
+    with pytest.raises(ConfigError, match=said):
+        asyncio.run(serve(options, lambda _text: None))
+
+
+def test_a_scenario_that_is_not_there_is_told_in_one_line() -> None:
+    said = CliRunner().invoke(app, ["serve", "--json", "--scenario", "nope.toml"])
+    assert said.exit_code == 2
+    assert said.stderr == "error: --scenario nope.toml: no such file\n"
+    assert json.loads(said.stdout) == {"error": "--scenario nope.toml: no such file"}
 
 
 def test_a_parameter_of_the_other_firmware_is_refused() -> None:
