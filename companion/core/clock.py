@@ -99,9 +99,9 @@ def _arrived(clock: Clock | None, item: Telemetry, report: ClockReport | None) -
         return replace(clock, offset_s=seen_s, count=1, received_s=item.received_s)
     step_s = min(max(seen_s - clock.offset_s, -CLOCK_STEP_S), CLOCK_STEP_S)
     count = min(clock.count + 1, 100)
-    return replace(
-        clock,
+    return Clock(
         offset_s=clock.offset_s + step_s / count,
         count=count,
+        delay_s=clock.delay_s,
         received_s=item.received_s,
     )

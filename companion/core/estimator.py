@@ -230,11 +230,11 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
             return replace(track, position_valid=False)  # time went back: until the next is newer
         before = None  # the autopilot's clock went back: it was restarted
         track = replace(track, clock=None, clock_report=None, stand=None)
-    track = _observe_stand(track, item)
-    if before is not None and track.stand is not None and track.stand.is_frozen:
+    stand = _stand(track, item)
+    if before is not None and stand.is_frozen:
         # It is kept out of the filters, and what comes after it has to be confirmed.
         still = replace(before, boot_s=item.boot_s, confirm_left=CONFIRM_COUNT)
-        return replace(track, motion=still)
+        return replace(track, motion=still, stand=stand)
     at_once = not track.enabled or before is None
     clock, is_synced, moved_s = tick(track.clock, item, track.clock_report, at_once=at_once)
     if is_synced:
@@ -249,21 +249,21 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         track,
         motion=motion,
         clock=clock,
+        stand=stand,
         position_valid=motion.confirm_left == 0,
         position_received_s=item.received_s,
         braking_m_s2=_learned_braking(track, motion, item.received_s),
     )
 
 
-def _observe_stand(track: Track, item: Telemetry) -> Track:
-    """Notice a place that stands still while the vehicle does not."""
+def _stand(track: Track, item: Telemetry) -> Stand:
+    """Return what shows a place that stands still while the vehicle does not."""
     motion, expected_m_s = track.motion, None
     if motion is not None and 0.0 < item.boot_s - motion.boot_s < BRIDGED_MAX_S:
         east, north = motion.after(item.boot_s - motion.boot_s)
         expected_m_s = math.hypot(east.velocity_m_s, north.velocity_m_s)
     checked_m_s = _checked_speed(track, item.received_s)
-    stand = look(track.stand, item, expected_m_s=expected_m_s, reported_m_s=checked_m_s)
-    return replace(track, stand=stand)
+    return look(track.stand, item, expected_m_s=expected_m_s, reported_m_s=checked_m_s)
 
 
 def _place(item: Telemetry, setup: Setup) -> tuple[float, float] | None:

@@ -160,11 +160,13 @@ def _correct(
     off_m_s = 0.0 if seen.velocity_m_s is None else seen.velocity_m_s - ahead.velocity_m_s
     first, both, second = by.weight
     unlikely = first * off_m * off_m + 2.0 * both * off_m * off_m_s + second * off_m_s * off_m_s
-    position, velocity, acceleration = (
-        value + p * off_m + v * off_m_s
-        for value, p, v in zip(ahead, by.by_position, by.by_velocity, strict=True)
+    p, v = by.by_position, by.by_velocity
+    corrected = Axis(
+        ahead.position_m + p[0] * off_m + v[0] * off_m_s,
+        ahead.velocity_m_s + p[1] * off_m + v[1] * off_m_s,
+        ahead.acceleration_m_s2 + p[2] * off_m + v[2] * off_m_s,
     )
-    return Axis(position, velocity, acceleration), -0.5 * unlikely - by.half_log
+    return corrected, -0.5 * unlikely - by.half_log
 
 
 def carried(model: Model, axis: Axis, dt_s: float) -> Axis:
@@ -172,11 +174,13 @@ def carried(model: Model, axis: Axis, dt_s: float) -> Axis:
     if dt_s <= 0.0:
         position_m = axis.position_m + axis.velocity_m_s * dt_s
         return Axis(position_m, axis.velocity_m_s, axis.acceleration_m_s2)
-    gained, acceleration = model.gained_s(dt_s), axis.acceleration_m_s2
+    position_m, velocity_m_s, acceleration = axis
+    fade_s = model.fade_s
+    gained = fade_s * (1.0 - math.exp(-dt_s / fade_s))
     return Axis(
-        axis.position_m + axis.velocity_m_s * dt_s + acceleration * model.carried_s2(dt_s),
-        axis.velocity_m_s + acceleration * gained,
-        acceleration * (1.0 - gained / model.fade_s),
+        position_m + velocity_m_s * dt_s + acceleration * (fade_s * (dt_s - gained)),
+        velocity_m_s + acceleration * gained,
+        acceleration * (1.0 - gained / fade_s),
     )
 
 
@@ -196,4 +200,8 @@ def mixed(first: Axis, second: Axis, share: float) -> Axis:
     >>> mixed(Axis(0.0, 1.0, 0.0), Axis(0.0, 3.0, 4.0), 0.25)
     Axis(position_m=0.0, velocity_m_s=1.5, acceleration_m_s2=1.0)
     """
-    return Axis(*(a + share * (b - a) for a, b in zip(first, second, strict=True)))
+    return Axis(
+        first.position_m + share * (second.position_m - first.position_m),
+        first.velocity_m_s + share * (second.velocity_m_s - first.velocity_m_s),
+        first.acceleration_m_s2 + share * (second.acceleration_m_s2 - first.acceleration_m_s2),
+    )
