@@ -11,24 +11,18 @@ from dataclasses import dataclass, field, replace
 
 from companion.core import detection, flow_trim
 from companion.core.boom import Boom
-from companion.core.crossings import (
-    STRAIGHT_YAW_RATE_DEG_S,
-    Across,
-    Border,
-    Route,
-    find_routes,
-)
+from companion.core.crossings import Across, Border, Route
 from companion.core.detection import Detection, Watching, WatchMemory
-from companion.core.drift import Drift, Offset, is_same, offset
+from companion.core.dosing import dosing_of, overdrive_of, skew_of, speed_soon
+from companion.core.drift import Drift, Offset
 from companion.core.flow_trim import FlowTrim, TrimMemory, Trimming
 from companion.core.frame import LocalFrame
 from companion.core.interlock import Limits, closed_plan, guard, inhibits
-from companion.core.leg import speed_after
 from companion.core.liquid_law import AutopilotLiquid
-from companion.core.nozzle import NozzleSet, PwmLimits, allowed_duty
-from companion.core.overdrive import Overdrive
+from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.prescription import Prescription
 from companion.core.rate import flow_for_rate, overridden
+from companion.core.routes import ROUTES_KEPT_S, routes_ahead
 from companion.core.schedule import Dosing, LagModel, Timing, ValveSchedule, schedule
 from companion.core.sets import SetOfRate, dosing_by_valve, sets_ahead
 from companion.core.types import (
@@ -42,18 +36,6 @@ from companion.core.types import (
 )
 
 __all__ = ["Across", "Border", "Memory", "Setup", "step"]
-
-# Below this share of its width across the motion, a boom that flies askew is dosed as at it: the
-# flow that the law asks for would fall towards nothing while the strip is a blur.
-SKEW_MIN = 0.3
-# A trim stands until the next one, 50 ms later: in the mean it is half of that old.
-TRIM_AGE_S = 0.025
-# Crossings found in one step are carried on for this long, if the path does not leave its
-# prediction by more than these and none of them is to be ordered within this time.
-ROUTES_KEPT_S = 0.21
-ROUTES_ASIDE_M = 0.05
-ROUTES_ALONG_M = 0.2
-ROUTES_EXACT_S = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,21 +137,21 @@ def step(
     if reasons or state is None:
         return _closed(setup, state, reasons, sequence, memory, now_s)
     in_force = duty_in_force(memory.plan, now_s, len(setup.boom.valves))
-    routes, routes_from, drift_m = _routes(setup, state, memory, now_s)
+    routes, routes_from, drift_m = routes_ahead(setup, state, memory, now_s)
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
     index, set_of_rate = _nozzle_sets(setup, state, routes, memory, speed_m_s)
     until_s = now_s + setup.lease_s
     trim = _trim(setup, state, memory, in_force, now_s)
     gain = 1.0 if trim is None else trim.sets[index].trim
-    skew = _skew(state, speed_m_s)
+    skew = skew_of(state, speed_m_s)
 
     def dose(number: int) -> Dosing:
         own = 1.0 if trim is None else trim.sets[number].trim
-        return _dosing(setup, number, skew / own, state.rate_percent)
+        return dosing_of(setup, number, skew / own, state.rate_percent)
 
     dosing = dosing_by_valve(setup.nozzle_sets, index, set_of_rate, dose)
-    soon_m_s = _speed_soon(setup, state, speed_m_s)
-    overdrive = _overdrive(setup, index)
+    soon_m_s = speed_soon(setup, state, speed_m_s)
+    overdrive = overdrive_of(setup, index)
     valves = []
     for valve, route in enumerate(routes):
         # In a turn each valve has a speed of its own.
@@ -264,87 +246,6 @@ def _trim(
     )
 
 
-def _routes(
-    setup: Setup, state: VehicleState, memory: Memory, now_s: float
-) -> tuple[tuple[Route, ...], VehicleState, Offset | None]:
-    """Return the valves' routes, the state that they were found from, and their wind offset.
-
-    On a straight pass the same edges are crossed at every step: as long as the prediction holds
-    and no crossing is due soon, the last ones are carried on and only their times are shifted.
-    """
-    found_from = memory.routes_from
-    drift_m = offset(setup.drift, state, now_s)
-    if found_from is not None and is_same(drift_m, memory.drift_m):
-        shift = _carried(setup, found_from, state, now_s)
-        if shift is not None:
-            routes = _shifted(memory.routes, shift, now_s)
-            soon_s = now_s + setup.timing.longest_s + ROUTES_EXACT_S
-            if all(len(route) == 1 or route[1].at_s > soon_s for route in routes):
-                return routes, found_from, memory.drift_m
-    routes = find_routes(
-        setup.prescription,
-        state,
-        setup.boom,
-        back_s=setup.back_s,
-        ahead_s=setup.ahead_s,
-        border=setup.border,
-        border_buffer_m=setup.border_buffer_m,
-        across=setup.across,
-        drift_m=drift_m,
-    )
-    return routes, state, drift_m
-
-
-def _carried(
-    setup: Setup, before: VehicleState, state: VehicleState, now_s: float
-) -> tuple[float, float, float] | None:
-    """Return how far along, how fast then and how fast now; None where the prediction fails."""
-    age_s = now_s - before.time_s
-    turning = max(abs(before.yaw_rate_deg_s), abs(state.yaw_rate_deg_s))
-    if not (0.0 <= age_s <= ROUTES_KEPT_S and turning < STRAIGHT_YAW_RATE_DEG_S):
-        return None
-    then_east = before.velocity_east_m_s + before.acceleration_east_m_s2 * age_s
-    then_north = before.velocity_north_m_s + before.acceleration_north_m_s2 * age_s
-    east, north = state.velocity_east_m_s, state.velocity_north_m_s
-    speed, then = math.hypot(east, north), math.hypot(then_east, then_north)
-    if not (speed > 0.5 and then > 0.5):
-        return None
-    half = 0.5 * age_s * age_s
-    off_east = state.east_m - before.east_m - before.velocity_east_m_s * age_s
-    off_east -= before.acceleration_east_m_s2 * half
-    off_north = state.north_m - before.north_m - before.velocity_north_m_s * age_s
-    off_north -= before.acceleration_north_m_s2 * half
-    aside = abs(off_north * east - off_east * north) / speed
-    bend = abs(then_east * north - then_north * east) / (speed * then)
-    turned_deg = ((state.heading_deg or 0.0) - (before.heading_deg or 0.0) + 180.0) % 360.0 - 180.0
-    aside += bend * speed * (setup.timing.longest_s + ROUTES_EXACT_S)
-    aside += math.radians(abs(turned_deg)) * setup.boom.reach_m
-    along = (off_east * east + off_north * north) / speed
-    if not (aside <= ROUTES_ASIDE_M and abs(along) <= ROUTES_ALONG_M):
-        return None
-    return along, then, speed
-
-
-def _shifted(
-    routes: tuple[Route, ...], shift: tuple[float, float, float], now_s: float
-) -> tuple[Route, ...]:
-    """Return the routes with their crossings at the times that the new position gives."""
-    along_m, then, speed = shift
-    moved: list[Route] = []
-    for route in routes:
-        if len(route) == 1:
-            moved.append(route)
-            continue
-        moved.append(
-            route[:1]
-            + tuple(
-                crossing._replace(at_s=now_s + ((crossing.at_s - now_s) * then - along_m) / speed)
-                for crossing in route[1:]
-            )
-        )
-    return tuple(moved)
-
-
 def duty_in_force(plan: SprayPlan | None, now_s: float, valve_count: int) -> tuple[float, ...]:
     """Return what `plan` has brought about by `now_s`: its changes so far; closed after it."""
     if plan is None or not now_s < plan.lease_until_s:
@@ -386,16 +287,6 @@ def _closed(
     return decision, Memory(plan=plan, trim=trim, watch=memory.watch, reasons=reasons)
 
 
-def _skew(state: VehicleState, speed_m_s: float) -> float:
-    """Return the boom's width across the motion over its width: |cos(heading - course)|."""
-    if state.heading_deg is None or not speed_m_s > 0.0:
-        return 1.0
-    heading = math.radians(state.heading_deg)
-    along = state.velocity_north_m_s * math.cos(heading)
-    along += state.velocity_east_m_s * math.sin(heading)
-    return max(abs(along) / speed_m_s, SKEW_MIN)
-
-
 def _nozzle_sets(
     setup: Setup,
     state: VehicleState,
@@ -417,64 +308,6 @@ def _nozzle_sets(
         flow_of=flow_of,
         now_s=state.time_s,
     )
-
-
-def _dosing(setup: Setup, index: int, skew: float, percent: float) -> Dosing:
-    """Return the function from rate and speed to the duty of a valve of the set in use."""
-    width_m = setup.boom.width_m * skew
-    curve, pwm = setup.nozzle_sets[index].curve, setup.pwm
-    known: dict[tuple[float, float], float] = {}  # neighbours ask for the same
-
-    def duty(rate_l_ha: float, speed_m_s: float) -> float:
-        key = (rate_l_ha, speed_m_s)
-        found = known.get(key)
-        if found is None:
-            asked = overridden(rate_l_ha, percent, setup.rate_max_l_ha)
-            flow = flow_for_rate(asked, speed_m_s, width_m)
-            found = known[key] = allowed_duty(curve.duty_for(flow), pwm)
-        return found
-
-    return duty
-
-
-def _overdrive(setup: Setup, index: int) -> Overdrive | None:
-    """Return how a slow flow's changes are driven; None for one that is not slow."""
-    lag, pwm = setup.lag, setup.pwm
-    is_slow = max(lag.up_time_s, lag.down_time_s) > 0.0 and lag.reference == "volume"
-    if setup.method is not Method.SCHEDULED or not is_slow:
-        return None
-    return Overdrive(
-        up_time_s=lag.up_time_s,
-        down_time_s=lag.down_time_s,
-        duty_min=pwm.duty_min,
-        duty_max=pwm.duty_max,
-        flow_for=setup.nozzle_sets[index].curve.flow_for,
-    )
-
-
-def _speed_soon(setup: Setup, state: VehicleState, speed_m_s: float) -> float:
-    """Return the speed that a trim ordered now should ask for.
-
-    It acts after its dead time, with the next period, and stands until the next trim. A flow that
-    follows as an exponential (a pump's) keeps up with the speed if its order is ahead of it by
-    the time constant, each direction by its own.
-    """
-    along = (
-        state.velocity_east_m_s * state.acceleration_east_m_s2
-        + state.velocity_north_m_s * state.acceleration_north_m_s2
-    ) / speed_m_s
-    timing, lag = setup.timing, setup.lag
-    lead_s = timing.up_s if along > 0.0 else timing.down_s
-    constant_s = min(lag.up_time_s if along > 0.0 else lag.down_time_s, lead_s)
-    acts_s = lead_s - constant_s + 0.5 * setup.pwm.period_s + TRIM_AGE_S
-    left = math.exp(-acts_s / state.acceleration_fade_s)
-    gained_s = state.acceleration_fade_s * (1.0 - left)
-    soon_m_s = max(speed_m_s + along * (gained_s + constant_s * left), 0.0)
-    if state.stop_ahead is None:
-        return soon_m_s
-    acts_s = timing.down_s + 0.5 * setup.pwm.period_s + TRIM_AGE_S
-    braked_m_s = speed_after(state.stop_ahead, speed_m_s, along, state.acceleration_fade_s, acts_s)
-    return min(soon_m_s, braked_m_s)
 
 
 def _in_order(valves: list[ValveSchedule]) -> tuple[TimedChange, ...]:

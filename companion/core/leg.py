@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from companion.core.frame import LocalFrame
+from companion.core.motion import gained_s
 from companion.core.types import LegReport, StopAhead
 
 # The autopilot says at 2 Hz which item it flies to; three seconds without are no news but a loss.
@@ -151,9 +152,9 @@ def learned(said_m_s2: float, usual_m_s2: float, seen: Approach | None) -> float
 
 def ahead(along_m_s2: float, fade_s: float, speed_m_s: float, dt_s: float) -> tuple[float, float]:
     """Return speed and way after `dt_s` at an acceleration along the course that fades."""
-    gained_s = fade_s * (1.0 - math.exp(-dt_s / fade_s))
-    way_m = speed_m_s * dt_s + along_m_s2 * fade_s * (dt_s - gained_s)
-    return speed_m_s + along_m_s2 * gained_s, way_m
+    gained = gained_s(dt_s, fade_s)
+    way_m = speed_m_s * dt_s + along_m_s2 * fade_s * (dt_s - gained)
+    return speed_m_s + along_m_s2 * gained, way_m
 
 
 def braking_begins_s(

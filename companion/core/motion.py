@@ -35,19 +35,21 @@ DOUBLINGS = 14
 Matrix = NDArray[np.float64]
 
 
+def gained_s(dt_s: float, fade_s: float) -> float:
+    """Return the velocity gained over `dt_s` by an acceleration of 1 m/s2 that fades."""
+    return fade_s * (1.0 - math.exp(-dt_s / fade_s))
+
+
+def carried_s2(dt_s: float, fade_s: float) -> float:
+    """Return the way gained over `dt_s` by an acceleration of 1 m/s2 that fades."""
+    return fade_s * (dt_s - gained_s(dt_s, fade_s))
+
+
 class Model(NamedTuple):
     """An acceleration driven by white noise that fades (Singer, IEEE Trans. AES 1970)."""
 
     wander_m_s2_sqrt_s: float
     fade_s: float
-
-    def gained_s(self, dt_s: float) -> float:
-        """Return the velocity gained by an acceleration of 1 m/s2 over `dt_s`."""
-        return self.fade_s * (1.0 - math.exp(-dt_s / self.fade_s))
-
-    def carried_s2(self, dt_s: float) -> float:
-        """Return the way gained by an acceleration of 1 m/s2 over `dt_s`."""
-        return self.fade_s * (dt_s - self.gained_s(dt_s))
 
 
 # Tried on simulated flights: cruise in gusts of 1 m/s at 2 and 5 m/s, a speed that swings by
@@ -95,8 +97,8 @@ def gains(model: Model, steps: int, velocity_known: bool) -> Gains:
     dt_s = steps * GAIN_STEP_S
     carry = np.array(
         [
-            [1.0, dt_s, model.carried_s2(dt_s)],
-            [0.0, 1.0, model.gained_s(dt_s)],
+            [1.0, dt_s, carried_s2(dt_s, model.fade_s)],
+            [0.0, 1.0, gained_s(dt_s, model.fade_s)],
             [0.0, 0.0, math.exp(-dt_s / model.fade_s)],
         ]
     )
@@ -176,7 +178,7 @@ def carried(model: Model, axis: Axis, dt_s: float) -> Axis:
         return Axis(position_m, axis.velocity_m_s, axis.acceleration_m_s2)
     position_m, velocity_m_s, acceleration = axis
     fade_s = model.fade_s
-    gained = fade_s * (1.0 - math.exp(-dt_s / fade_s))
+    gained = gained_s(dt_s, fade_s)
     return Axis(
         position_m + velocity_m_s * dt_s + acceleration * (fade_s * (dt_s - gained)),
         velocity_m_s + acceleration * gained,

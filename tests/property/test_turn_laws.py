@@ -10,8 +10,9 @@ import shapely
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from companion.core.crossings import STRAIGHT_YAW_RATE_DEG_S, find_routes
+from companion.core.crossings import find_routes
 from companion.core.motion import CRUISE
+from companion.core.paths import STRAIGHT_YAW_RATE_DEG_S
 from companion.core.prescription import Prescription, Zone
 from tests.builders import boom, flying
 

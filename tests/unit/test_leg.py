@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.core.controller import Memory, Setup, step
-from companion.core.crossings import predict
 from companion.core.estimator import Track, estimate, observe
 from companion.core.leg import (
     Approach,
@@ -24,14 +23,14 @@ from companion.core.leg import (
     speed_after,
     stop_ahead,
 )
+from companion.core.paths import predict
 from companion.core.types import (
     HeartbeatReport,
     LegReport,
     StopAhead,
-    Telemetry,
     VehicleState,
 )
-from tests.builders import flying, setup
+from tests.builders import flying, position, setup
 
 NAN = math.nan
 SETUP = setup(mission_braking_m_s2=2.5)
@@ -272,19 +271,7 @@ def heard(over: Setup, *more: LegReport, mode: str = "AUTO") -> VehicleState:
     track = observe(track, beat, over)
     for count in range(20):
         now_s = 9.5 + 0.05 * count
-        latitude, longitude = over.frame.to_geographic(15.0 + 0.25 * count, 3.0)
-        position = Telemetry(
-            received_s=now_s,
-            boot_s=now_s,
-            latitude_deg=latitude,
-            longitude_deg=longitude,
-            relative_altitude_m=3.5,
-            velocity_north_m_s=0.0,
-            velocity_east_m_s=5.0,
-            velocity_down_m_s=0.0,
-            heading_deg=90.0,
-        )
-        track = observe(track, position, over)
+        track = observe(track, position(now_s, 15.0 + 0.25 * count, 3.0), over)
     for item in more:
         track = observe(track, item, over)
     state = estimate(track, 10.5)

@@ -64,6 +64,12 @@ def test_every_inhibit_and_every_finally_of_the_code_has_its_mutant() -> None:
     assert sum("`finally`" in name for name in names) == 2 * finals
 
 
+def test_every_mutant_applies_to_the_code_as_it_is() -> None:
+    texts = {found.file: (ROOT / found.file).read_text("utf-8") for found in listed(ROOT)}
+    idle = [found.name for found in listed(ROOT) if found.applied(texts[found.file]) is None]
+    assert idle == []
+
+
 def test_no_two_mutants_have_one_name() -> None:
     names = [found.name for found in listed(ROOT)]
     assert sorted(names) == sorted(set(names))

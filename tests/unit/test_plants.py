@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from companion.assembly import build_setup
 from companion.config import load
 from companion.core import types as core_types
-from companion.core.controller import TRIM_AGE_S, Memory, step
+from companion.core.controller import Memory, step
+from companion.core.dosing import TRIM_AGE_S
 from companion.core.types import FlowReport, Input, SprayPlan, Telemetry, TimedChange
 from companion.errors import ConfigError
 from companion.output.pwm import PulseEngine

@@ -1,0 +1,96 @@
+"""When a strip touches the border: its whole width counts, in the skewed frame of path and boom."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from companion.core.boom import Boom
+from companion.core.drift import Contact
+from companion.core.paths import Floats, Paths, time_on_chord
+
+# Contacts of a strip with the sides of what an edge sweeps, to those with the edge (`drift.py`).
+Merge = Callable[[list[Contact]], list[Contact]]
+# From when until when a strip is closed.
+Intervals = list[tuple[float, float]]
+
+# A boom that lies nearly along its own motion covers no strip that could be judged.
+ACROSS_MIN = 0.2
+
+
+def add_contacts(
+    paths: Paths,
+    ends: Floats,
+    boom: Boom,
+    buffer_m: float,
+    closed: list[Intervals],
+    merge: Merge | None,
+) -> None:
+    """Add to `closed` when an edge of the border lies within a strip."""
+    if len(ends):
+        for chord in range(len(paths.time_s) - 1):
+            _add_chord_contacts(paths, chord, ends, boom, buffer_m, closed, merge)
+
+
+def _add_chord_contacts(
+    paths: Paths,
+    chord: int,
+    ends: Floats,
+    boom: Boom,
+    buffer_m: float,
+    closed: list[Intervals],
+    merge: Merge | None,
+) -> None:
+    """Add the contacts of one chord, in the skewed frame of path and boom."""
+    px, py = paths.east_m[:, chord], paths.north_m[:, chord]
+    dx, dy = paths.step_east_m[:, chord], paths.step_north_m[:, chord]
+    length = paths.length_m[:, chord]
+    rx, ry = paths.right[chord]
+    safe = np.maximum(length, 1e-12)
+    turn = (dx * ry - dy * rx) / safe  # sine of the angle from path to boom
+    if not np.abs(turn).min() >= ACROSS_MIN:
+        for intervals in closed:
+            intervals.append((paths.time_s[chord], paths.time_s[chord + 1]))
+        return
+    ux, uy, t2 = (dx / safe)[:, None], (dy / safe)[:, None], turn[:, None]
+    x, y = ends[:, 0::2].ravel() - px[:, None], ends[:, 1::2].ravel() - py[:, None]
+    across = (ux * y - uy * x) / t2
+    across_0, across_1 = across[:, 0::2], across[:, 1::2]
+    half = (boom.half_width_m + buffer_m)[:, None]
+    touching = (np.minimum(across_0, across_1) <= half) & (np.maximum(across_0, across_1) >= -half)
+    valves, hits = touching.nonzero()
+    if not len(valves):
+        return
+    along = (x * ry - y * rx) / t2
+    along_0, along_1 = along[:, 0::2], along[:, 1::2]
+    contacts = [
+        (valve, hit, _clip(
+            (float(across_0[valve, hit]), float(along_0[valve, hit])),
+            (float(across_1[valve, hit]), float(along_1[valve, hit])),
+            float(half[valve, 0]),
+        ))
+        for valve, hit in zip(valves.tolist(), hits.tolist(), strict=True)
+    ]  # fmt: skip
+    for valve, _, limits in contacts if merge is None else merge(contacts):
+        first, last = limits[0] - buffer_m, limits[1] + buffer_m
+        reach = float(length[valve])
+        if last < 0.0 or first > reach:
+            continue
+        begin = time_on_chord(paths, chord, valve, max(first, 0.0), reach)[0]
+        end = time_on_chord(paths, chord, valve, min(last, reach), reach)[0]
+        beyond = last > reach and chord == len(paths.time_s) - 2
+        closed[valve].append((begin, math.inf if beyond else end))
+
+
+def _clip(a: tuple[float, float], b: tuple[float, float], half_m: float) -> tuple[float, float]:
+    """Return the least and greatest `along` of the edge a-b within the strip's width."""
+    (u0, s0), (u1, s1) = a, b
+    if u0 == u1:
+        return min(s0, s1), max(s0, s1)
+    ends = []
+    for u, s in (a, b):
+        held = min(max(u, -half_m), half_m)
+        ends.append(s if held == u else s0 + (s1 - s0) * (held - u0) / (u1 - u0))
+    return min(ends), max(ends)
