@@ -1,7 +1,8 @@
-"""Ready-made parts for the tests of the core: a field of plots, a boom, a state that may spray."""
+"""Ready-made parts for tests: a field of plots, a boom, a state that may spray, messages, plans."""
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +16,7 @@ from companion.core.interlock import Limits
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
 from companion.core.prescription import Prescription, Zone
 from companion.core.schedule import LagModel
-from companion.core.types import Fix, Method, VehicleState
+from companion.core.types import Fix, Method, SprayPlan, Telemetry, TimedChange, VehicleState
 
 CURVE = FlowCurve(
     duty=(0.2, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0),
@@ -127,3 +128,39 @@ def along(course_deg: float, speed_m_s: float = 5.0) -> dict[str, float]:
         "heading_deg": course_deg % 360.0,
         "checked_speed_m_s": speed_m_s,
     }
+
+
+def position(received_s: float, east_m: float, north_m: float, /, **change: object) -> Telemetry:
+    """Return the message of a position in the frame of `setup`, eastwards at 5 m/s."""
+    latitude, longitude = setup().frame.to_geographic(east_m, north_m)
+    given: dict[str, object] = {
+        "received_s": received_s,
+        "boot_s": received_s,
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "relative_altitude_m": 3.5,
+        "velocity_north_m_s": 0.0,
+        "velocity_east_m_s": 5.0,
+        "velocity_down_m_s": 0.0,
+        "heading_deg": 90.0,
+    }
+    return Telemetry(**(given | change))  # type: ignore[arg-type]
+
+
+def now() -> float:
+    """Return the time of the running loop, by which executors act."""
+    return asyncio.get_running_loop().time()
+
+
+def plan(
+    sequence: int, *duty: float, changes: tuple[TimedChange, ...] = (), lease_s: float = 2.0
+) -> SprayPlan:
+    """Return a plan that is issued now."""
+    issued_s = now()
+    return SprayPlan(
+        sequence=sequence,
+        issued_s=issued_s,
+        duty=duty,
+        changes=changes,
+        lease_until_s=issued_s + lease_s,
+    )

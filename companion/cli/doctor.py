@@ -18,6 +18,7 @@ from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.run import component_options
 from companion.cli.sensor_parts import build_sensors
 from companion.cli.service_unit import is_ours, quoted, watchdog_is_on
+from companion.cli.servo_parts import servo_options
 from companion.cli.systemd import properties, read_unit, unit_path
 from companion.config import Config
 from companion.core.controller import Setup
@@ -26,7 +27,7 @@ from companion.doctor.computer import computer_checks
 from companion.doctor.computer_facts import read_computer
 from companion.doctor.gpio import gpio_checks, read_chip, read_register
 from companion.doctor.listen import listen
-from companion.doctor.outputs import output_checks, servo_options
+from companion.doctor.outputs import output_checks
 from companion.doctor.paper import configuration_checks, map_checks, refused_configuration
 from companion.doctor.sensors import Read, read_sensors, sensor_check
 from companion.doctor.serial_device import read_device, serial_check

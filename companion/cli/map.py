@@ -132,6 +132,7 @@ def _place(
     latitude: str | float | None, longitude: str | float | None, where: str
 ) -> tuple[float, float]:
     try:
+        # None is refused below, as a TypeError.
         place = float(latitude), float(longitude)  # type: ignore[arg-type]
     except (TypeError, ValueError):
         place = (999.0, 999.0)

@@ -136,6 +136,7 @@ def reading_options(command: Callable[..., None]) -> Callable[..., None]:
             answers["origin"] = parse_place(answers["origin"], "--origin")
         command(reading=Reading(config=config, **answers), **given)
 
+    # Typer reads it; the type of a function does not know it.
     expanded.__signature__ = signature.replace(  # type: ignore[attr-defined]
         parameters=[item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in own] + added
     )

@@ -20,6 +20,7 @@ from companion.cli.gpio_parts import build_gpio
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.notify import Notifier
 from companion.cli.sensor_parts import build_sensors
+from companion.cli.servo_parts import build_servo, servo_options
 from companion.config import Config
 from companion.config.rules import without_effect
 from companion.errors import ActuatorError, LinkError, SensorError
@@ -28,7 +29,7 @@ from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_budget import dither_too_much
 from companion.output.none import DryRunExecutor
-from companion.output.servo import DITHER_S, ServoExecutor, ServoOptions
+from companion.output.servo import DITHER_S
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
@@ -110,28 +111,12 @@ def component_options(config: Config) -> ComponentOptions:
 def build_executor(config: Config, link: VehicleLink) -> PlanExecutor:
     """Return what carries plans out: servo outputs, lines of this computer, or nothing."""
     output = config.output
-    if output.kind == "none":
-        return DryRunExecutor(len(config.valve), has_return=output.return_channel is not None)
+    options = servo_options(config)
+    if options is not None:
+        return build_servo(config, options, link)
     if output.kind == "gpio":
         return build_gpio(config)
-    options = ServoOptions(
-        channels=tuple(valve.channel or 0 for valve in config.valve),
-        closed_us=output.closed_us,
-        full_us=output.full_us,
-        dither_us=output.dither_us,
-        return_channel=output.return_channel,
-    )
-    executor = ServoExecutor(
-        options,
-        link.order,
-        flush=link.flush_orders,
-        say=link.note_outputs,
-        baud=serial_baud(config.link.url),
-        is_signed=config.link.signing_key_file is not None,
-    )
-    link.on_order_ack(executor.acknowledge)
-    link.follow_outputs(executor)
-    return executor
+    return DryRunExecutor(len(config.valve), has_return=output.return_channel is not None)
 
 
 def _warnings(config: Config) -> list[str]:

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 from pydantic_core import PydanticCustomError
 
-from companion.config import sensor_tables, tables
+from companion.config import correction_tables, sensor_tables, sprayer_tables, tables
 from companion.config.rules import contradictions
 from companion.core.boom import Boom, Valve
 from companion.core.drift import Drift, blowing, fall_s
@@ -34,27 +34,27 @@ class Config(tables.Table):
     link: tables.LinkTable = tables.LinkTable()
     prescription: tables.PrescriptionTable | None = None
     # The method `boom` returns the core's type, so that the table cannot have the name.
-    boom_table: tables.BoomTable = Field(alias="boom")
+    boom_table: sprayer_tables.BoomTable = Field(alias="boom")
     valve: Annotated[
-        tuple[tables.ValveTable, ...], Field(strict=False, min_length=1, max_length=256)
+        tuple[sprayer_tables.ValveTable, ...], Field(strict=False, min_length=1, max_length=256)
     ]
-    pwm: tables.PwmTable = tables.PwmTable()
+    pwm: sprayer_tables.PwmTable = sprayer_tables.PwmTable()
     nozzle_set: Annotated[
-        tuple[tables.NozzleSetTable, ...], Field(strict=False, min_length=1, max_length=32)
+        tuple[sprayer_tables.NozzleSetTable, ...], Field(strict=False, min_length=1, max_length=32)
     ]
-    lag: tables.LagTable
-    output: tables.OutputTable = tables.OutputTable()
-    gpio: tables.GpioTable = tables.GpioTable()
+    lag: sprayer_tables.LagTable
+    output: sprayer_tables.OutputTable = sprayer_tables.OutputTable()
+    gpio: sprayer_tables.GpioTable = sprayer_tables.GpioTable()
     safety: tables.SafetyTable = tables.SafetyTable()
     mission: tables.MissionTable | None = None
     product: tables.ProductTable = tables.ProductTable()
-    flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
+    flow_trim: correction_tables.FlowTrimTable = correction_tables.FlowTrimTable()
     flow_meter: sensor_tables.FlowMeterTable = sensor_tables.FlowMeterTable()
     pressure: sensor_tables.PressureTable = sensor_tables.PressureTable()
     tank: sensor_tables.TankTable = sensor_tables.TankTable()
     detection: sensor_tables.DetectionTable = sensor_tables.DetectionTable()
-    drift: tables.DriftTable = tables.DriftTable()
-    prediction: tables.PredictionTable = tables.PredictionTable()
+    drift: correction_tables.DriftTable = correction_tables.DriftTable()
+    prediction: correction_tables.PredictionTable = correction_tables.PredictionTable()
     journal: tables.JournalTable = tables.JournalTable()
     web: tables.WebTable = tables.WebTable()
 

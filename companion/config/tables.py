@@ -2,7 +2,8 @@
 
 One class a table, one line a key. Unknown keys are refused and numbers are strict, so that a slip
 of the pen is never a setting. What must be measured on the sprayer has no default. How a file is
-read, and what is said of a wrong one, is in `load.py`.
+read, and what is said of a wrong one, is in `load.py`. The tables of the sprayer itself, of the
+corrections and of the sensors have files of their own.
 """
 
 from __future__ import annotations
@@ -13,17 +14,13 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 Text = Annotated[str, Field(min_length=1, max_length=500)]
 Texts = Annotated[tuple[Text, ...], Field(strict=False, max_length=1000)]
-Lag = Annotated[FiniteFloat, Field(ge=0.0, le=30.0)]
 Rate = Annotated[FiniteFloat, Field(ge=0.0, le=100_000.0)]
-Offset = Annotated[FiniteFloat, Field(ge=-50.0, le=50.0)]
 Width = Annotated[FiniteFloat, Field(gt=0.0, le=100.0)]
 Duty = Annotated[FiniteFloat, Field(ge=0.0, le=1.0)]
 Latitude = Annotated[FiniteFloat, Field(ge=-90.0, le=90.0)]
 Longitude = Annotated[FiniteFloat, Field(ge=-180.0, le=180.0)]
 
 Altitude = Annotated[FiniteFloat, Field(ge=-1000.0, le=10_000.0)]
-WindSpeed = Annotated[FiniteFloat, Field(ge=0.0, le=50.0)]
-WindFrom = Annotated[FiniteFloat, Field(ge=0.0, le=360.0)]
 Place = Annotated[tuple[Latitude, Longitude], Field(strict=False)]
 
 
@@ -131,150 +128,6 @@ class PrescriptionTable(Table):
     exclusions: Texts = Field(default=(), description="files with polygons that are never sprayed")
 
 
-class BoomTable(Table):
-    """The boom."""
-
-    width_m: Width = Field(description="measured: effective width of every flow law")
-    height_m: float = Field(default=3.5, ge=0.1, le=100, description="above the crop when spraying")
-    forward_m: Offset = Field(
-        default=0.0, description="of the boom, ahead of the autopilot's position reference"
-    )
-
-
-class ValveTable(Table):
-    """One valve; the tables run from left to right."""
-
-    name: Text = Field(description="as nozzle_set.valves calls it")
-    right_m: Offset = Field(
-        description="measured: centre of its strip, right of the position reference; left is < 0"
-    )
-    channel: int | None = Field(
-        default=None, ge=0, le=1023, description="servo output 1 to 32, or GPIO line"
-    )
-    nozzles: int | None = Field(
-        default=None, ge=1, le=1000, description="how many it feeds; information"
-    )
-    width_m: Width | None = Field(
-        default=None,
-        description="of its strip; else boom.width_m over the valves of the largest set",
-    )
-    forward_m: Offset | None = Field(default=None, description="instead of boom.forward_m")
-
-
-class PwmTable(Table):
-    """What the valves and their drivers can follow."""
-
-    frequency_hz: float = Field(default=11.0, ge=0.1, le=1000, description="of the pulses")
-    duty_min: Duty = Field(default=0.2, description="smallest duty that gives an even flow")
-    duty_max: Duty = Field(default=0.9, description="largest duty below fully open")
-    min_on_s: float = Field(default=0.010, ge=0, le=10, description="shortest pulse that opens")
-    min_off_s: float = Field(default=0.010, ge=0, le=10, description="shortest gap that closes")
-    valve: Literal["normally-closed", "normally-open"] = Field(
-        default="normally-closed", description="normally-open needs safety.pump_cutoff = true"
-    )
-
-
-class NozzleSetTable(Table):
-    """Valves that spray together, and what they deliver; all of it measured."""
-
-    valves: Annotated[tuple[Text, ...], Field(strict=False, min_length=1, max_length=1000)] = Field(
-        description="names of the valves"
-    )
-    duty: Annotated[tuple[Duty, ...], Field(strict=False, min_length=2, max_length=1000)] = Field(
-        description="measured points, increasing"
-    )
-    flow_l_min: Annotated[
-        tuple[Annotated[FiniteFloat, Field(ge=0, le=10_000)], ...],
-        Field(strict=False, min_length=2, max_length=1000),
-    ] = Field(description="flow of the whole set at these duties, increasing")
-
-
-class LagTable(Table):
-    """How late the spray is; measured (`vrspray calibrate`)."""
-
-    method: Literal["scheduled", "look-ahead", "none"] = Field(
-        default="scheduled", description="how changes are placed"
-    )
-    look_ahead_s: Annotated[
-        tuple[Annotated[FiniteFloat, Field(ge=0.0, le=10.0)], ...],
-        Field(strict=False, min_length=1, max_length=3),
-    ] = Field(
-        default=(0.10, 0.42, 0.45), description="T1, T2, T3 of Wang et al. 2024; look-ahead only"
-    )
-    on_s: Lag = Field(description="measured: order to volume-equivalent step, closed to open")
-    off_s: Lag = Field(description="measured: the same, open to closed")
-    up_s: Lag = Field(description="measured: the same, to a larger flow")
-    down_s: Lag = Field(description="measured: the same, to a smaller flow")
-    on_start_s: Lag = Field(description="measured: order to first flow; at most on_s")
-    off_end_s: Lag = Field(description="measured: order to less than 2 % of flow; at least off_s")
-    output_s: Lag = Field(description="measured: order to the pulse, the output path's delay")
-    position_s: float = Field(
-        default=0.0,
-        ge=-0.5,
-        le=0.5,
-        description="how old the position is when the autopilot sends it",
-    )
-    reference: Literal["volume", "settled"] = Field(
-        default="volume",
-        description="what lies on the boundary: volume-equivalent step or settled end",
-    )
-    up_time_s: Lag = Field(
-        default=0.0,
-        description="of a slow flow (a pump's): its time constant, a part of up_s; 0: not driven",
-    )
-    down_time_s: Lag = Field(default=0.0, description="the same, a part of down_s")
-    measured_on: str | None = Field(
-        default=None,
-        pattern=r"^\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])$",
-        description="day on which flows and lags were measured, YYYY-MM-DD; `doctor` tells its age",
-    )
-
-
-class OutputTable(Table):
-    """How the orders reach the valves."""
-
-    kind: Literal["servo", "gpio", "none"] = Field(default="servo", description="none: a dry run")
-    closed_us: int = Field(default=1000, ge=500, le=2500, description="servo pulse of duty 0")
-    full_us: int = Field(default=2000, ge=500, le=2500, description="servo pulse of duty 1")
-    dither_us: int = Field(
-        default=0,
-        ge=0,
-        le=50,
-        description="alive dither of open valves, for a driver board that closes without it: 8",
-    )
-    lease_s: float = Field(
-        default=0.3,
-        ge=0.1,
-        le=2,
-        description="valves close by themselves this long after the last plan",
-    )
-    return_channel: int | None = Field(default=None, ge=0, le=1023, description="of a return valve")
-    chip: Text = Field(default="gpiochip0", description="gpio only")
-
-
-class GpioTable(Table):
-    """Lines of this computer, for `output.kind = "gpio"`; see gpio.md."""
-
-    driver: Literal["lines", "spi595"] = Field(
-        default="lines", description="spi595: a chain of shift registers; channels are its outputs"
-    )
-    active_low: bool = Field(
-        default=False, description="true: the driver sends current while its line is low"
-    )
-    return_valve: Literal["normally-open", "normally-closed"] = Field(
-        default="normally-open", description="kind of the return valve: open without current"
-    )
-    alive_line: int | None = Field(
-        default=None,
-        ge=0,
-        le=1023,
-        description="toggles while all is well, for a hardware dead-man",
-    )
-    realtime: bool = Field(default=True, description="ask for real-time priority")
-    spi_device: Text = Field(default="/dev/spidev0.0", description="spi595 only")
-    spi_khz: int = Field(default=1000, ge=10, le=20_000, description="clock, spi595 only")
-
-
 class SafetyTable(Table):
     """What must hold before a valve may open."""
 
@@ -359,68 +212,6 @@ class ProductTable(Table):
     registration: Text | None = Field(default=None, description="for the record")
     rate_max_l_ha: Rate | None = Field(default=None, description="a map above it is refused")
     droplet_class: Text | None = Field(default=None, description="for the record")
-
-
-class FlowTrimTable(Table):
-    """Slow correction by a flow meter; see flow-trim.md."""
-
-    enabled: bool = Field(
-        default=False, description="true: flows are divided by metered over expected flow"
-    )
-    tau_s: float = Field(default=5.0, ge=1, le=600, description="time constant of the correction")
-    limit: float = Field(
-        default=0.15, ge=0.01, le=0.25, description="largest correction, as a share of the flow"
-    )
-    meter_minimum_l_min: float = Field(
-        default=0.5, ge=0, le=10_000, description="the meter's smallest flow; none is taken below"
-    )
-    settle_s: float = Field(
-        default=2.0, ge=0, le=60, description="no correction for this long after a change of rate"
-    )
-
-
-class DriftTable(Table):
-    """Where droplets land beside their nozzle; see drift.md."""
-
-    enabled: bool = Field(
-        default=False, description="true: the map is read where the droplets are expected to land"
-    )
-    wind: Annotated[tuple[WindSpeed, WindFrom], Field(strict=False)] | None = Field(
-        default=None,
-        description="[m/s, degrees it comes from] by the operator; else the autopilot's",
-    )
-    wind_age_max_s: float = Field(
-        default=5.0, ge=0.5, le=60, description="oldest usable report of the autopilot"
-    )
-    droplet_um: float = Field(
-        default=250.0, ge=50, le=1000, description="volume median diameter of the droplets"
-    )
-    downwash_m_s: float = Field(
-        default=8.0, ge=0, le=30, description="at the nozzles, fading to nothing at the ground"
-    )
-    fall_s: float | None = Field(
-        default=None,
-        ge=0,
-        le=60,
-        description="measured: metres of shift per m/s of wind; else from the two above and "
-        "boom.height_m",
-    )
-    forward_carry_m: float = Field(
-        default=0.2, ge=0, le=2, description="how far liquid flies on along the course"
-    )
-    limit_m: float = Field(default=2.0, ge=0, le=10, description="largest offset")
-
-
-class PredictionTable(Table):
-    """What the prediction of the vehicle's motion may use; see prediction.md."""
-
-    use_mission: bool = Field(
-        default=False,
-        description="true: the autopilot's mission is read, and braking for a stop is foreseen",
-    )
-    braking_m_s2: float = Field(
-        default=2.5, ge=0.1, le=20, description="of the vehicle at the end of a leg"
-    )
 
 
 class JournalTable(Table):

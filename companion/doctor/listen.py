@@ -31,13 +31,12 @@ _SETTLE_S = 1.0
 _MEASURE_S = 3.0
 _STEP_S = 0.05
 _CLOSE_EVERY_S = 1.0
+# Besides SPRW_ENABLE, which `wanted_parameters` has.
 WATCHDOG_PARAMETERS = (
-    "SPRW_ENABLE",
     "SPRW_FIRST",
     "SPRW_LAST",
     "SPRW_MASK",
     "SPRW_CLOSED_US",
-    "SPRW_COMPID",
     "SPRW_RET_CH",
 )
 _NAMES = {33: "position", 74: "speed", 24: "GNSS", 193: "estimator", 230: "estimator"} | {
@@ -85,7 +84,7 @@ class Ear:
         self.is_learned = not more
         return more
 
-    def reported(self, port: int, pulse_us: Sequence[int], at_s: float) -> None:  # noqa: ARG002
+    def reported(self, port: int, pulse_us: Sequence[int], at_s: float) -> None:  # noqa: ARG002 - OutputListener
         """Take what the outputs read."""
         self._ports[port] = tuple(pulse_us)
 

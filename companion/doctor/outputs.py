@@ -4,32 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from companion.config import Config
 from companion.doctor.check import Check, fail, not_applicable, ok, warn
 from companion.doctor.listen import rest_pulses
 from companion.doctor.vehicle_facts import Heard
 from companion.output.autopilot_check import TOLERANCE_US
 from companion.output.autopilot_findings import Finding, findings, px4_wiring
+from companion.output.autopilot_guard import REFUSALS
 from companion.output.autopilot_options import ServoOptions
 
 _NAMES = ("output-parameters", "disarmed-values", "watchdog-script", "closed-order")
-_REFUSALS = {2: "denied", 3: "not supported", 4: "failed"}  # MAV_RESULT
 _MASK_OUTPUTS = 16
 Known = Mapping[str, float | None]
-
-
-def servo_options(config: Config) -> ServoOptions | None:
-    """Return how the valves hang on the autopilot; None where they do not."""
-    output = config.output
-    if output.kind != "servo":
-        return None
-    return ServoOptions(
-        channels=tuple(valve.channel or 0 for valve in config.valve),
-        closed_us=output.closed_us,
-        full_us=output.full_us,
-        dither_us=output.dither_us,
-        return_channel=output.return_channel,
-    )
 
 
 def output_checks(heard: Heard | None, options: ServoOptions | None) -> Iterator[Check]:
@@ -156,10 +141,10 @@ def _closed(heard: Heard, options: ServoOptions) -> Check:
         return not_applicable(name, "not on PX4: its outputs follow orders only while armed")
     if not heard.is_closed_ordered:
         return not_applicable(name, "tried on a disarmed vehicle only")
-    refused = [result for result in heard.order_results if result in _REFUSALS]
+    refused = [result for result in heard.order_results if result in REFUSALS]
     if refused:
         fix = "set SERVOn_FUNCTION of the valves to 0"
-        return fail(name, f"order {_REFUSALS[refused[0]]} by the autopilot", fix)
+        return fail(name, f"order {REFUSALS[refused[0]]} by the autopilot", fix)
     for channel, pulse_us in rest_pulses(options).items():
         wrong = _reading(name, channel, heard.outputs_us.get(channel), pulse_us)
         if wrong is not None:

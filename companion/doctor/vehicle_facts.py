@@ -6,9 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from companion.core.types import Fix
-
-# So much of a wanted rate counts as all of it, as the link itself counts.
-ENOUGH = 0.7
+from companion.link.streams import ENOUGH
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

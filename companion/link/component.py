@@ -94,7 +94,6 @@ class Component:
         self._timesync_s = float("-inf")
         self.met_s: float | None = None
         self.is_answered = False
-        self.servo_output: ServoOutput | None = None
         self.on_order_ack: Callable[[int], None] | None = None
 
     @property
@@ -236,7 +235,6 @@ class Component:
         elif isinstance(message, PingReceived):
             self._take_ping(message)
         elif isinstance(message, ServoOutput):
-            self.servo_output = message
             self.outputs.report(message)
         elif isinstance(message, ParamValue):
             self.outputs.parameter(message)

@@ -14,6 +14,7 @@ from companion.link.mission_messages import MissionItem
 
 # MAV_CMD. Numbers below 95 are flown to or waited at, the rest is done on the way.
 _WAYPOINT, _LOITER_UNLIMITED, _LOITER_TIME, _LAND, _TAKE_OFF = 16, 17, 19, 21, 22
+_SPLINE_WAYPOINT = 82
 _NAVIGATION_END = 95
 _CHANGE_SPEED, _JUMP = 178, 177
 _STRAIGHT_TO = frozenset({_WAYPOINT, _LOITER_UNLIMITED, _LOITER_TIME, _LAND})
@@ -73,7 +74,7 @@ def _stops(
         return False
     if following is None or items[following].command not in (_WAYPOINT, _LAND):
         # Nothing follows, or the way home. A curve (a spline) is flown into without a stop.
-        return following is None or items[following].command != 82
+        return following is None or items[following].command != _SPLINE_WAYPOINT
     after = items[following].place
     if after is None:
         return items[following].command == _LAND

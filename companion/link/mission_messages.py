@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from companion.link.census import AUTOPILOT_COMPONENT
+
 _FLOWN_STATES = frozenset({0, 3})  # MISSION_STATE unknown, active
 # MAV_FRAME whose places are latitude and longitude: GLOBAL, GLOBAL_RELATIVE_ALT,
 # GLOBAL_TERRAIN_ALT, each also in its older _INT form.
@@ -109,7 +111,7 @@ def _ended(m: Any, received_s: float) -> MissionTransfer | None:
 
 def _asked(m: Any, received_s: float) -> MissionTransfer | None:
     # A vehicle asks for items that are written to it, anyone else for items to read.
-    is_vehicle = m.get_srcComponent() == 1
+    is_vehicle = m.get_srcComponent() == AUTOPILOT_COMPONENT
     return _transfer(m, received_s, MissionStep.UPLOAD if is_vehicle else MissionStep.DOWNLOAD)
 
 
@@ -117,7 +119,7 @@ def _read(m: Any, received_s: float) -> MissionTransfer | None:
     return _transfer(m, received_s, MissionStep.DOWNLOAD)
 
 
-def _cleared(m: Any, received_s: float) -> MissionTransfer | None:
+def _written(m: Any, received_s: float) -> MissionTransfer | None:
     return _transfer(m, received_s, MissionStep.UPLOAD)
 
 
@@ -125,11 +127,11 @@ Transfer = Callable[[Any, float], MissionTransfer | None]
 
 CURRENT: dict[int, Callable[[Any, float], MissionCurrent]] = {42: _current}
 TRANSFERS: dict[int, Transfer] = {
-    38: _cleared,  # MISSION_WRITE_PARTIAL_LIST
+    38: _written,  # MISSION_WRITE_PARTIAL_LIST
     40: _asked,  # MISSION_REQUEST
     43: _read,  # MISSION_REQUEST_LIST
     44: _count,
-    45: _cleared,  # MISSION_CLEAR_ALL
+    45: _written,  # MISSION_CLEAR_ALL
     47: _ended,
     51: _asked,  # MISSION_REQUEST_INT
     73: _item,

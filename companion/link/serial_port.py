@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import termios
 from pathlib import Path
@@ -24,6 +25,9 @@ from companion.link.transport import (
 # What waits here is behind what the kernel holds (4 kB on Linux): at 57600 baud 1 kB is 0.18 s.
 _PENDING_MAX = 1024
 _READ_MAX = 4096
+# What pyserial's errors carry: a device that is not there, and one that another program holds.
+_MISSING = frozenset({errno.ENOENT, errno.ENXIO, errno.ENODEV})
+_TAKEN = frozenset({errno.EAGAIN, errno.EBUSY})
 
 
 class SerialTransport(Reconnecting):
@@ -36,8 +40,7 @@ class SerialTransport(Reconnecting):
         on_change: OnChange,
         on_trouble: OnTrouble | None = None,
     ) -> None:
-        super().__init__(url, on_change, on_trouble)
-        self._on_bytes = on_bytes
+        super().__init__(url, on_bytes, on_change, on_trouble)
         self._port: serial.Serial | None = None
         self._pending = bytearray()
         self._emptied = asyncio.Event()
@@ -48,7 +51,8 @@ class SerialTransport(Reconnecting):
             port = serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError, termios.error) as error:
             # SerialException is an OSError.
-            kind = LinkNotYetError if _may_come(error) else LinkError
+            may_come = _number(error) in _MISSING | _TAKEN
+            kind = LinkNotYetError if may_come else LinkError
             raise kind(f"link.url = {self.url.text!r}: {_reason(device, error)}") from error
         with contextlib.suppress(OSError, ValueError, NotImplementedError):
             # Adapters of USB collect bytes for 16 ms otherwise; others do not know the setting.
@@ -134,19 +138,13 @@ def devices(root: Path = Path("/dev")) -> list[str]:
     return [str(one) for one in found]
 
 
-def _may_come(error: Exception) -> bool:
-    """Whether waiting can help: a device that is not there yet, or that another one holds."""
-    number = getattr(error, "errno", None)
-    return isinstance(error, FileNotFoundError) or number in (2, 6, 11, 16, 19) or _is_taken(error)
-
-
-def _is_taken(error: Exception) -> bool:
-    return "lock" in str(error)
+def _number(error: Exception) -> int | None:
+    return error.errno if isinstance(error, OSError) else None
 
 
 def _reason(device: str, error: Exception) -> str:
-    number = getattr(error, "errno", None)
-    if isinstance(error, FileNotFoundError) or number in (2, 6, 19):
+    number = _number(error)
+    if number in _MISSING:
         there = devices()
         if not there:
             return f"there is no device {device}, nor any other serial one; plug it in"
@@ -155,8 +153,8 @@ def _reason(device: str, error: Exception) -> str:
             f"there is no device {device}; there are {', '.join(there[:_NAMED_MAX])}{more}: plug "
             "it in, or write one of these"
         )
-    if number == 13:
+    if number == errno.EACCES:
         return f"no permission for {device}; add this user to the group dialout"
-    if number in (11, 16) or _is_taken(error):
+    if number in _TAKEN:
         return f"{device} is in use by another program; stop that program"
     return f"{device} cannot be opened as a serial port ({error}); check device and baud rate"

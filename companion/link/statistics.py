@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.link.codec import Codec
+from companion.link.codec import AUTOPILOT_COMPONENT, Codec
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,7 +84,8 @@ class Meter:
         vehicle = codec.vehicle
         lost_percent = None
         if vehicle is not None:
-            came, lost = codec.lost_frames.get((vehicle.system_id, 1), (0, 0))
+            autopilot = (vehicle.system_id, AUTOPILOT_COMPONENT)
+            came, lost = codec.lost_frames.get(autopilot, (0, 0))
             lost_percent = 100.0 * lost / (came + lost) if came else None
         return LinkStatistics(
             bytes_in=codec.byte_count,

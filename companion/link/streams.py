@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 
 _SAMPLE_S = 0.5
 _WINDOW_S = 3.0
-_ENOUGH = 0.7
+# So much of a wanted rate counts as all of it.
+ENOUGH = 0.7
 _ASK_AGAIN_S = 5.0
 # So long a stream is slow before it is asked for: then the window holds nothing of before.
 _SLOW_S = 2.0
@@ -96,7 +97,7 @@ class _Watch:
 
     def measured(self, share: float, now_s: float) -> None:
         """Take how much of the wanted rate has come over the last seconds."""
-        if share >= _ENOUGH:
+        if share >= ENOUGH:
             self.failures, self.slow_since_s = 0, None
             self.was_right, self.is_refused = True, False
         elif self.slow_since_s is None and not self.stream.optional:

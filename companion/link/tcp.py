@@ -50,8 +50,7 @@ class TcpTransport(Reconnecting):
         on_change: OnChange,
         on_trouble: OnTrouble | None = None,
     ) -> None:
-        super().__init__(url, on_change, on_trouble)
-        self._on_bytes = on_bytes
+        super().__init__(url, on_bytes, on_change, on_trouble)
         self._transport: asyncio.Transport | None = None
         self._connection: _Connection | None = None
 

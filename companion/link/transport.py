@@ -109,10 +109,15 @@ class Reconnecting:
     """What links that can be lost have in common: they try again with growing pauses."""
 
     def __init__(
-        self, url: LinkUrl, on_change: OnChange, on_trouble: OnTrouble | None = None
+        self,
+        url: LinkUrl,
+        on_bytes: OnBytes,
+        on_change: OnChange,
+        on_trouble: OnTrouble | None = None,
     ) -> None:
         self.url = url
         self.is_up = False
+        self._on_bytes = on_bytes
         self._on_change = on_change
         self._on_trouble = on_trouble
         self._said: str | None = None

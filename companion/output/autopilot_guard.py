@@ -23,7 +23,7 @@ from companion.output.autopilot_findings import (
 from companion.output.autopilot_options import ServoOptions
 
 # MAV_RESULT, and what most likely lies behind it; PX4 only ever accepts.
-_REFUSALS = {2: "denied", 3: "not supported", 4: "failed"}
+REFUSALS = {2: "denied", 3: "not supported", 4: "failed"}
 _CAUSES = {2: "", 3: ": firmware built without it?", 4: ": is SERVOn_FUNCTION 0?"}
 # Outputs count as following again when they have done so for this long.
 _RECOVERED_S = 1.0
@@ -101,9 +101,9 @@ class OutputGuard:
 
     def acknowledge(self, result: int) -> None:
         """Take the answer to an order. It does not say to which one."""
-        if result in _REFUSALS and self._refused is None:
+        if result in REFUSALS and self._refused is None:
             cause = "" if self._is_px4 else _CAUSES[result]
-            self._refused = f"servo order {_REFUSALS[result]}{cause}"
+            self._refused = f"servo order {REFUSALS[result]}{cause}"
 
     def armed(self, is_armed: bool, now_s: float) -> None:
         """Take whether the vehicle is armed: PX4's outputs follow no order while it is not."""

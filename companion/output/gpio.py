@@ -35,7 +35,7 @@ from companion.output.timed import Lateness
 
 _logger = logging.getLogger(__name__)
 
-# Four signs of life missed: together with the look at it, closed 0.35 s after it stopped.
+# Four signs of life missed: together with the look at it, closed 0.25 s after it stopped.
 SILENCE_MAX_S = 0.2
 WATCH_S = 0.05
 START_MAX_S = 10.0

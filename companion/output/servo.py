@@ -185,9 +185,7 @@ class ServoExecutor(TimedExecutor):
             return True
         if moved_us < CHANGE_MIN_US and pulse_us != full_us:
             return False
-        least_us = float(CHANGE_MIN_US)
-        if self._budget.is_limited:
-            least_us = self._budget.trim_min_us(asyncio.get_running_loop().time())
+        least_us = self._budget.trim_min_us(asyncio.get_running_loop().time())
         if moved_us < least_us and not (least_us == CHANGE_MIN_US and pulse_us == full_us):
             self._held_us[valve] = pulse_us
             return False

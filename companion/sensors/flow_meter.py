@@ -73,7 +73,7 @@ class FlowMeter:
 
     def volume_ml(self) -> float:
         """Return what has been counted since the start."""
-        return self.counter.count * 1000.0 / self.counter.meter.pulses_per_l
+        return self.counter.volume_ml
 
     async def close(self) -> None:
         """Let go of the line."""

@@ -94,6 +94,11 @@ class PulseCounter:
         while self._echoes and self._echoes[0] < at_s - KEPT_S:
             self._echoes.popleft()
 
+    @property
+    def volume_ml(self) -> float:
+        """Return what has been counted since the start."""
+        return self.count * 1000.0 / self.meter.pulses_per_l
+
     def fault(self, now_s: float) -> str:
         """Return in words why the count cannot be believed; empty while it can."""
         if not now_s - self._lost_s > FAULT_S:
@@ -136,4 +141,4 @@ class PulseCounter:
         self._reported_s = at_s
         if fault:
             return FlowReport(received_s=at_s, volume_ml=math.nan, fault=fault)
-        return FlowReport(received_s=at_s, volume_ml=self.count * 1000.0 / self.meter.pulses_per_l)
+        return FlowReport(received_s=at_s, volume_ml=self.volume_ml)

@@ -22,7 +22,7 @@ class Counter(Protocol):
     """What counts the flow."""
 
     def volume_ml(self) -> float:
-        """Return what has been metered since the start; no number while the meter is at fault."""
+        """Return what has been metered since the start; NaN where that is not known."""
 
 
 class LevelGauge(Protocol):

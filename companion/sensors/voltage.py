@@ -102,6 +102,7 @@ class I2cVoltage:
     def open(self) -> None:
         """Open the bus and read once."""
         try:
+            # It need not be there, and where it is the ignore is not used.
             import smbus2  # type: ignore[import-not-found, unused-ignore]
         except ImportError as error:
             raise SensorError(

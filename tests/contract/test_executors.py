@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import pytest
 
 from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import TimedChange
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wiring import Wiring
 from companion.output.gpio import GpioExecutor
 from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.ports import PlanExecutor
+from tests.builders import now, plan
 
 VALVES = 3
 
@@ -121,10 +122,6 @@ BENCHES: dict[str, Callable[[], Bench]] = {
 }
 
 
-def now() -> float:
-    return asyncio.get_running_loop().time()
-
-
 @pytest.fixture(params=BENCHES)
 def idle(request: pytest.FixtureRequest) -> Iterator[Bench]:
     """Yield each executor, not started."""
@@ -137,19 +134,6 @@ async def bench(idle: Bench) -> AsyncIterator[Bench]:
     await idle.executor.start()
     yield idle
     await idle.executor.stop()
-
-
-def plan(
-    sequence: int, *duty: float, changes: tuple[TimedChange, ...] = (), lease_s: float = 2.0
-) -> SprayPlan:
-    issued_s = now()
-    return SprayPlan(
-        sequence=sequence,
-        issued_s=issued_s,
-        duty=duty,
-        changes=changes,
-        lease_until_s=issued_s + lease_s,
-    )
 
 
 async def test_stop_before_start_is_allowed(idle: Bench) -> None:

@@ -32,7 +32,7 @@ from sitl.stub.sprayer import Sprayer, SprayerOptions
 from sitl.stub.truth import TruthLog
 from sitl.wire_truth import judge
 from tests.sitl.udp_router import udp_router
-from tests.unit.stub_bench import HOME, mission
+from tests.unit.stub_bench import HOME, mission, of_firmware
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang"
 SPEED_M_S = 5.0
@@ -194,8 +194,7 @@ def kept_parameters(folder: Path) -> dict[str, float]:
 def passes(autopilot: str) -> tuple[MissionItem, ...]:
     """Return one pass over the field, to hover behind it, as each firmware wants it."""
     items = mission((0.0, FIRST_M + len(RATES_L_HA) * PLOT_M + RUN_OUT_M), land=False)
-    # ArduPilot's begins with home.
-    return items if autopilot == "ardupilot" else items[1:]
+    return of_firmware(autopilot, items)
 
 
 def prescribed_l() -> float:

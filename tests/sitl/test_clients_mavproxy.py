@@ -1,102 +1,20 @@
 """MAVProxy, written by others, on one link with the companion and the autopilot.
 
-Skipped where it is not installed: see `test_stub_mavproxy.py`.
+Skipped where it is not installed: see docs/testing.md.
 """
 
 from __future__ import annotations
 
 import asyncio
-import os
-import shutil
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
 
-from sitl.stub.mission_items import MissionItem
 from sitl.stub.modes import Phase
 from tests.sitl.client_bench import Bench, flying_bench, passes, prescribed_l
+from tests.sitl.other_clients import TO_AUTO, Console, mavproxy, needs_mavproxy, waypoint_file
 
-MAVPROXY = os.environ.get("VRSPRAY_MAVPROXY") or shutil.which("mavproxy.py")
-pytestmark = [
-    pytest.mark.sitl,
-    pytest.mark.skipif(MAVPROXY is None, reason="MAVProxy is not installed"),
-]
-# MAVProxy 1.8.75 does not know PX4's modes by name.
-TO_AUTO = {"ardupilot": "mode AUTO", "px4": "long DO_SET_MODE 1 4 4"}
-MODULES = "log,wp,param,mode,arm,cmdlong,misc,link,ftp"
-
-
-class Console:
-    """MAVProxy's console."""
-
-    def __init__(self, process: asyncio.subprocess.Process) -> None:
-        self.said = ""
-        self._process = process
-        self._news = asyncio.Event()
-
-    def type(self, line: str) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.write(f"{line}\n".encode())
-
-    async def read(self) -> None:
-        assert self._process.stdout is not None
-        while received := await self._process.stdout.read(4096):
-            self.said += received.decode(errors="replace")
-            self._news.set()
-
-    async def until(self, done: Callable[[], bool], *, within_s: float = 30.0) -> None:
-        try:
-            async with asyncio.timeout(within_s):
-                while not done():
-                    self._news.clear()
-                    await self._news.wait()
-        except TimeoutError:
-            pytest.fail(f"did not happen; MAVProxy said:\n{self.said}")
-
-    async def answers(self, line: str, expected: str) -> None:
-        """Type a line and wait for what it is to be answered."""
-        before = self.said.count(expected)
-        self.type(line)
-        await self.until(lambda: self.said.count(expected) > before)
-
-
-@asynccontextmanager
-async def console(bench: Bench, folder: Path) -> AsyncIterator[Console]:
-    """Connect MAVProxy to the link of the bench."""
-    pipe = asyncio.subprocess.PIPE
-    options = (f"--master={bench.url}", "--mav20", "--no-state", f"--default-modules={MODULES}")
-    process = await asyncio.create_subprocess_exec(
-        *(str(MAVPROXY), *options),
-        stdin=pipe,
-        stdout=pipe,
-        stderr=asyncio.subprocess.STDOUT,
-        cwd=folder,
-        env={**os.environ, "HOME": str(folder)},
-    )
-    shown = Console(process)
-    reading = asyncio.create_task(shown.read())
-    try:
-        await shown.until(lambda: "Detected vehicle 1:1" in shown.said)
-        yield shown
-    finally:
-        if process.returncode is None:
-            process.kill()
-        await process.wait()
-        await reading
-
-
-def mission_file(items: tuple[MissionItem, ...], folder: Path) -> Path:
-    """Write the mission for MAVProxy's `wp load`."""
-    lines = ["QGC WPL 110"]
-    for number, item in enumerate(items):
-        place = (item.x_e7 * 1e-7, item.y_e7 * 1e-7, item.z_m)
-        row = (number, int(number == 0), item.frame, item.command, 0, 0, 0, 0, *place, 1)
-        lines.append("\t".join(str(one) for one in row))
-    path = folder / "field.waypoints"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+pytestmark = [pytest.mark.sitl, needs_mavproxy]
 
 
 async def speak_to_the_companion(shown: Console) -> None:
@@ -119,7 +37,7 @@ async def speak_to_the_companion(shown: Console) -> None:
 
 async def begin_the_mission(bench: Bench, shown: Console, folder: Path) -> None:
     """Upload the mission, arm, and have it flown."""
-    shown.type(f"wp load {mission_file(passes(bench.name), folder)}")
+    shown.type(f"wp load {waypoint_file(passes(bench.name), folder)}")
     await shown.until(lambda: "TYPE_MISSION: ACCEPTED" in shown.said)
     shown.type("arm throttle")
     await bench.until(lambda: bench.stub.flight.armed)
@@ -141,7 +59,7 @@ async def test_the_companion_sprays_the_map_while_mavproxy_flies_its_mission(
     async with (
         asyncio.timeout(80.0),
         flying_bench("ardupilot", tmp_path) as bench,
-        console(bench, folder) as shown,
+        mavproxy(bench.url, folder) as shown,
     ):
         await speak_to_the_companion(shown)
         await begin_the_mission(bench, shown, folder)
@@ -157,7 +75,7 @@ async def test_mavproxy_reaches_both_through_a_router_and_px4_flies_its_mission(
     async with (
         asyncio.timeout(80.0),
         flying_bench("px4", tmp_path) as bench,
-        console(bench, folder) as shown,
+        mavproxy(bench.url, folder) as shown,
     ):
         await speak_to_the_companion(shown)
         await begin_the_mission(bench, shown, folder)

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from sitl.stub.mission_items import MissionItem
 from sitl.stub.protocol import dialect
 from tests.sitl.client_bench import Bench, flying_bench, kept_parameters, passes, prescribed_l
+from tests.sitl.other_clients import raw_items
 
 mavsdk = pytest.importorskip("mavsdk.asyncio")
 pytestmark = pytest.mark.sitl
@@ -121,29 +121,6 @@ async def ground(bench: Bench) -> AsyncIterator[Ground]:
         finally:
             listening.cancel()
             await asyncio.gather(listening, return_exceptions=True)
-
-
-def raw_items(items: tuple[MissionItem, ...]) -> list[Any]:
-    from mavsdk.plugins.mission_raw import MissionItem as RawItem
-
-    return [
-        RawItem(
-            seq=number,
-            frame=item.frame,
-            command=item.command,
-            current=int(number == 0),
-            autocontinue=1,
-            param1=item.param1,
-            param2=item.param2,
-            param3=item.param3,
-            param4=item.param4,
-            x=item.x_e7,
-            y=item.y_e7,
-            z=item.z_m,
-            mission_type=0,
-        )
-        for number, item in enumerate(items)
-    ]
 
 
 @both

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -15,6 +14,7 @@ from companion.errors import LinkError
 from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.protocol import Listener, Speaker, dialect
 from sitl.stub.server import StubServer
+from tests.sitl.wire_peer import free_port
 from tests.unit.stub_bench import HOME
 
 pytestmark = pytest.mark.sitl
@@ -25,13 +25,6 @@ POSITION = dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
 def stub(*urls: str) -> StubServer:
     autopilot = build_autopilot(StubOptions(home=HOME), start_s=time.monotonic())
     return StubServer(autopilot, urls)
-
-
-def free_port(kind: int = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 class Client(asyncio.DatagramProtocol):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -13,8 +13,9 @@ import pytest
 from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.modes import AUTO, Phase
 from sitl.stub.server import StubServer
-from tests.sitl.test_stub_links import free_port
-from tests.unit.stub_bench import HOME, mission
+from tests.sitl.other_clients import raw_items
+from tests.sitl.wire_peer import free_port
+from tests.unit.stub_bench import HOME, mission, of_firmware
 
 mavsdk = pytest.importorskip("mavsdk.asyncio")
 pytestmark = pytest.mark.sitl
@@ -41,29 +42,12 @@ async def connected(autopilot: str) -> AsyncIterator[tuple[StubServer, Any]]:
         yield server, system
 
 
-def raw_items(autopilot: str) -> list[Any]:
-    """A mission as each firmware wants it: ArduPilot's begins with home."""
-    from mavsdk.plugins.mission_raw import MissionItem
-
-    items = mission((0.0, 20.0))[0 if autopilot == "ardupilot" else 1 :]
-    return [
-        MissionItem(
-            seq=number,
-            frame=item.frame,
-            command=item.command,
-            current=int(number == 0),
-            autocontinue=1,
-            param1=item.param1,
-            param2=item.param2,
-            param3=item.param3,
-            param4=item.param4,
-            x=item.x_e7,
-            y=item.y_e7,
-            z=item.z_m,
-            mission_type=0,
-        )
-        for number, item in enumerate(items)
-    ]
+async def until(server: StubServer, done: Callable[[], bool]) -> None:
+    """Wait until something that the stub has gone through makes `done` true."""
+    is_done = asyncio.Event()
+    server.ticked = lambda _: is_done.set() if done() else None
+    async with asyncio.timeout(20.0):
+        await is_done.wait()
 
 
 @both
@@ -74,7 +58,7 @@ async def test_mavsdk_uploads_a_mission_reads_it_back_arms_and_flies_it(autopilo
     async with connected(autopilot) as (server, system):
         flight = server.autopilot.flight
         missions, action = MissionRawAsync(system), ActionAsync(system)
-        items = raw_items(autopilot)
+        items = raw_items(of_firmware(autopilot, mission((0.0, 20.0))))
         await missions.upload_mission(items)
         assert len(flight.items) == len(items) + (autopilot == "px4")
         back = await missions.download_mission()
@@ -86,10 +70,7 @@ async def test_mavsdk_uploads_a_mission_reads_it_back_arms_and_flies_it(autopilo
         assert flight.armed
         await missions.start_mission()
         assert flight.mode == AUTO
-        on_route = asyncio.Event()
-        server.ticked = lambda _: on_route.set() if flight.phase is Phase.ROUTE else None
-        async with asyncio.timeout(20.0):
-            await on_route.wait()
+        await until(server, lambda: flight.phase is Phase.ROUTE)
 
 
 @both
@@ -145,5 +126,4 @@ async def test_mavsdk_sets_an_actuator(autopilot: str) -> None:
             await action.set_actuator(9, 1500.0)
         else:
             await action.set_actuator(1, 0.0)
-        await asyncio.sleep(0.1)
-        assert outputs.pulses_us(time.monotonic())[8] == 1500
+        await until(server, lambda: outputs.pulses_us(time.monotonic())[8] == 1500)

@@ -17,7 +17,8 @@ from typer.testing import CliRunner
 
 from sitl.cli import app
 from sitl.stub.protocol import dialect
-from tests.sitl.test_stub_links import Client, free_port, udp_client
+from tests.sitl.test_stub_links import Client, udp_client
+from tests.sitl.wire_peer import free_port
 
 pytestmark = pytest.mark.sitl
 

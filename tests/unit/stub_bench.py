@@ -28,6 +28,11 @@ def mission(*legs: tuple[float, float], land: bool = True) -> tuple[MissionItem,
     )
 
 
+def of_firmware(autopilot: str, items: tuple[MissionItem, ...]) -> tuple[MissionItem, ...]:
+    """Return a mission as a firmware wants it: ArduPilot's begins with home."""
+    return items if autopilot == "ardupilot" else items[1:]
+
+
 class Peer:
     """Somebody on the link: a companion or a ground station."""
 

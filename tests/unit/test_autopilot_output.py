@@ -9,31 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core.types import SprayPlan, TimedChange
 from companion.output.autopilot_budget import OrderBudget, dither_too_much, order_budget
 from companion.output.autopilot_check import OutputCheck, ardupilot_places
 from companion.output.autopilot_findings import dead_man, findings, wanted_parameters
 from companion.output.servo import ServoExecutor, ServoOptions
+from tests.builders import now, plan
 
 CHANNELS = (1, 2, 3)
 OPTIONS = ServoOptions(channels=CHANNELS)
-
-
-def now() -> float:
-    return asyncio.get_running_loop().time()
-
-
-def plan(
-    sequence: int, *duty: float, changes: tuple[TimedChange, ...] = (), lease_s: float = 5.0
-) -> SprayPlan:
-    issued_s = now()
-    return SprayPlan(
-        sequence=sequence,
-        issued_s=issued_s,
-        duty=duty,
-        changes=changes,
-        lease_until_s=issued_s + lease_s,
-    )
 
 
 # ------------------------------------------------------------------------------- the budget

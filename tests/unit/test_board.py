@@ -186,7 +186,9 @@ def test_two_lost_moves_in_a_row_close_nothing() -> None:
     one = alive_board()
     for k in (0, 1, 2, 5, 6, 7):  # 3 and 4 are lost: 0.3 s less a moment
         one.order(0.0999 * k, 0, 1500 + (4 if k % 2 else -4))
-    assert not any(edge.duty == 0.0 for edge in one.advance(0.9))
+    edges = one.advance(0.9)
+    assert edges
+    assert not any(edge.duty == 0.0 for edge in edges)
 
 
 def test_a_refresh_of_the_same_width_is_no_life() -> None:
@@ -213,7 +215,9 @@ def test_jitter_does_not_hide_life() -> None:
     for k in range(500):
         move = 4 if (k // 5) % 2 else -4
         one.order(0.02 * k, 0, 1500 + move + float(rng.uniform(-1.0, 1.0)))
-    assert not any(edge.duty == 0.0 for edge in one.advance(10.0))
+    edges = one.advance(10.0)
+    assert edges
+    assert not any(edge.duty == 0.0 for edge in edges)
 
 
 def test_it_opens_again_with_the_next_move() -> None:

@@ -25,6 +25,7 @@ from companion.core.types import (
 )
 from companion.output.pwm import RESTART_DUTY
 from sitl.board import SERVO_FRAME_S
+from tests import builders
 from tests.builders import LAG, SPRAYING, setup
 
 NAN = math.nan
@@ -95,18 +96,7 @@ def test_each_limit_by_itself_refuses_what_is_no_number(
 
 
 def position(boot_s: float, received_s: float, east_m: float) -> Telemetry:
-    latitude, longitude = setup().frame.to_geographic(east_m, 3.0)
-    return Telemetry(
-        received_s=received_s,
-        boot_s=boot_s,
-        latitude_deg=latitude,
-        longitude_deg=longitude,
-        relative_altitude_m=3.5,
-        velocity_north_m_s=0.0,
-        velocity_east_m_s=5.0,
-        velocity_down_m_s=0.0,
-        heading_deg=90.0,
-    )
+    return builders.position(received_s, east_m, 3.0, boot_s=boot_s)
 
 
 def test_an_autopilot_that_restarted_within_a_second_has_a_clock_of_its_own() -> None:

@@ -8,12 +8,12 @@ import pytest
 
 from companion.cli.link_parts import build_link
 from companion.cli.run import component_options
+from companion.cli.servo_parts import servo_options
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
 from companion.core.types import Fix
 from companion.doctor import listen as listening
 from companion.doctor.listen import listen
-from companion.doctor.outputs import servo_options
 from companion.doctor.vehicle_facts import Heard
 from companion.link import parameter_reader
 from companion.link.vehicle_link import VehicleLink

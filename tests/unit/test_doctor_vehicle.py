@@ -9,12 +9,13 @@ from types import SimpleNamespace
 import pytest
 
 from companion.assembly import build_setup
+from companion.cli.servo_parts import servo_options
 from companion.config import load
 from companion.core.types import Fix
 from companion.doctor import gpio
 from companion.doctor.check import Check, Status
 from companion.doctor.gpio import Chip, Line, gpio_checks, read_chip, read_register
-from companion.doctor.outputs import output_checks, servo_options, watchdog_trouble
+from companion.doctor.outputs import output_checks, watchdog_trouble
 from companion.doctor.serial_device import Device, read_device, serial_check
 from companion.doctor.vehicle import link_checks, no_link
 from companion.doctor.vehicle_facts import Heard, Position, Rate

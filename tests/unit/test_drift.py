@@ -20,7 +20,7 @@ from companion.core.drift import Drift, fall_s
 from companion.core.estimator import Track, estimate, observe
 from companion.core.interlock import Limits
 from companion.core.prescription import Prescription, Zone
-from companion.core.types import Inhibit, Input, Telemetry, VehicleState, WindReport
+from companion.core.types import Inhibit, Input, VehicleState, WindReport
 from companion.record.setup_json import field_names_of, setup_to_json
 from sitl.ballistics import Air, fall, spectrum_um
 from sitl.droplet_shift import TRUTHS, law, shift_of
@@ -30,7 +30,7 @@ from sitl.profile import load_profile
 from sitl.route import Leg
 from sitl.route import Route as SimulatedRoute
 from sitl.vehicle import Vehicle
-from tests.builders import SPRAYING, along, flying, setup
+from tests.builders import SPRAYING, along, flying, position, setup
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "anyang" / "config.toml"
@@ -65,7 +65,8 @@ def test_offset_does_not_grow_with_speed() -> None:
         drift.offset(LAW, flying(10.0, 6.0, wind=wind(1.0, 1.0), **along(90.0, speed)), 10.0)
         for speed in (2.0, 12.0)
     )
-    assert slow == fast != None  # noqa: E711
+    assert slow is not None
+    assert slow == fast
 
 
 @pytest.mark.parametrize(
@@ -247,15 +248,7 @@ def test_a_wind_above_its_maximum_closes_and_is_not_corrected_for() -> None:
 
 def test_the_state_has_a_wind_only_with_its_direction() -> None:
     given = setup()
-    latitude, longitude = given.frame.to_geographic(6.0, 3.0)
-    told: list[Input] = [
-        Telemetry(
-            received_s=10.0, boot_s=1.0, latitude_deg=latitude, longitude_deg=longitude,
-            relative_altitude_m=3.5, velocity_north_m_s=0.0, velocity_east_m_s=5.0,
-            velocity_down_m_s=0.0, heading_deg=90.0,
-        ),
-        WindReport(received_s=10.0, speed_m_s=2.0),
-    ]  # fmt: skip
+    told: list[Input] = [position(10.0, 6.0, 3.0), WindReport(received_s=10.0, speed_m_s=2.0)]
     track = Track()
     for item in told:
         track = observe(track, item, given)

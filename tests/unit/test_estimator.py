@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.core.estimator import CONFIRM_COUNT, Track, estimate, observe
+from companion.core.estimator import Track, estimate, observe
 from companion.core.motion import CRUISE, MANOEUVRE, Belief, carried
 from companion.core.types import (
     ClockReport,
@@ -25,6 +25,8 @@ from companion.core.types import (
     Telemetry,
     WindReport,
 )
+from companion.core.vehicle_motion import CONFIRM_COUNT
+from tests import builders
 from tests.builders import LAG, setup
 
 SETUP = setup()
@@ -32,19 +34,7 @@ BOOT = 3.0  # the autopilot's clock is this much behind ours
 
 
 def position(now_s: float, east_m: float, north_m: float = 0.0, **change: object) -> Telemetry:
-    latitude, longitude = SETUP.frame.to_geographic(east_m, north_m)
-    given: dict[str, object] = {
-        "received_s": now_s,
-        "boot_s": now_s - BOOT,
-        "latitude_deg": latitude,
-        "longitude_deg": longitude,
-        "relative_altitude_m": 3.5,
-        "velocity_north_m_s": 0.0,
-        "velocity_east_m_s": 5.0,
-        "velocity_down_m_s": 0.0,
-        "heading_deg": 90.0,
-    }
-    return Telemetry(**(given | change))  # type: ignore[arg-type]
+    return builders.position(now_s, east_m, north_m, **{"boot_s": now_s - BOOT, **change})
 
 
 def heard(*items: Input, track: Track | None = None) -> Track:

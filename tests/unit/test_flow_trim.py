@@ -28,11 +28,10 @@ from companion.core.types import (
     HeartbeatReport,
     LandedReport,
     OperatorCommand,
-    Telemetry,
 )
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
-from tests.builders import CURVE, flying, plots, setup
+from tests.builders import CURVE, flying, plots, position, setup
 from tests.unit.trim_bench import STEP_S, TrimBench, tracking
 
 NAN, INF = math.nan, math.inf
@@ -487,7 +486,6 @@ def test_a_trimmed_flight_is_replayed_to_the_bit(tmp_path: Path) -> None:
     with Journal.create(tmp_path, setup=TRIMMED, started_s=10.0, waits=True) as journal:
         for number in range(200):
             now_s = 10.0 + number * STEP_S
-            latitude, longitude = TRIMMED.frame.to_geographic(10.0 + 0.25 * number, 3.0)
             volume_ml += 0.0 if not made else made[-1].flow_l_min * 1.05 * STEP_S / 0.06
             inputs = [
                 HeartbeatReport(received_s=now_s, autopilot="ardupilot", armed=True, mode="AUTO"),
@@ -496,12 +494,8 @@ def test_a_trimmed_flight_is_replayed_to_the_bit(tmp_path: Path) -> None:
                 LandedReport(received_s=now_s, in_air=True),
                 OperatorCommand(received_s=now_s, enable=True, source="command"),
                 FlowReport(received_s=now_s, volume_ml=volume_ml),
-                Telemetry(
-                    received_s=now_s, boot_s=number * STEP_S, latitude_deg=latitude,
-                    longitude_deg=longitude, relative_altitude_m=3.5, velocity_north_m_s=0.0,
-                    velocity_east_m_s=5.0, velocity_down_m_s=0.0, heading_deg=90.0,
-                ),
-            ]  # fmt: skip
+                position(now_s, 10.0 + 0.25 * number, 3.0, boot_s=number * STEP_S),
+            ]
             for item in inputs:
                 journal.record_input(item)
                 core.observe(item)

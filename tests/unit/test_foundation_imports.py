@@ -22,7 +22,7 @@ ALLOWED = {
 }
 CORE_ALLOWED = {
     "numpy": None,
-    "shapely": {"prescription.py", "crossings.py", "cells.py"},
+    "shapely": {"prescription.py", "cells.py"},
     "pyproj": {"frame.py"},
 }
 PURE = {

@@ -8,7 +8,7 @@ import os
 import pty
 import socket
 import tty
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from companion.link.component import ComponentOptions
 from companion.link.serial_port import devices
 from companion.link.signing import Signing
 from companion.link.vehicle_link import VehicleLink
-from tests.unit.test_transport import free_port
+from tests.sitl.wire_peer import free_port
 
 KEY = bytes(range(32))
 
@@ -274,16 +274,6 @@ async def test_frames_that_are_not_signed_with_our_key_are_said_so(
 
 
 # ------------------------------------------------------------------------ links that are not there
-
-
-@pytest.fixture
-def terminal() -> Iterator[tuple[int, str]]:
-    far, near = pty.openpty()
-    tty.setraw(near)
-    device = os.ttyname(near)
-    os.close(near)
-    yield far, device
-    os.close(far)
 
 
 @pytest.fixture

@@ -13,33 +13,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import TimedChange
 from companion.link import ardupilot, px4
 from companion.link.component import Component, ComponentOptions
 from companion.link.encode import Encoder
 from companion.link.parameter_reader import ParameterReader
 from companion.output.autopilot_findings import px4_wiring, wanted_parameters
 from companion.output.servo import ServoExecutor, ServoOptions
+from tests.builders import now, plan
 
 CHANNELS = (1, 2, 3)
 OPTIONS = ServoOptions(channels=CHANNELS)
-
-
-def now() -> float:
-    return asyncio.get_running_loop().time()
-
-
-def plan(
-    sequence: int, *duty: float, changes: tuple[TimedChange, ...] = (), lease_s: float = 5.0
-) -> SprayPlan:
-    issued_s = now()
-    return SprayPlan(
-        sequence=sequence,
-        issued_s=issued_s,
-        duty=duty,
-        changes=changes,
-        lease_until_s=issued_s + lease_s,
-    )
 
 
 class Joint:

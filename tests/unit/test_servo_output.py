@@ -10,6 +10,7 @@ import pytest
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.output.timed import duties_at, next_event_s
+from tests.builders import now, plan
 
 CHANNELS = (9, 10)
 OPTIONS = ServoOptions(channels=CHANNELS)
@@ -42,26 +43,6 @@ class Wire:
     def forget(self) -> None:
         self.orders.clear()
         self.times_s.clear()
-
-
-def now() -> float:
-    return asyncio.get_running_loop().time()
-
-
-def plan(
-    sequence: int,
-    *duty: float,
-    changes: tuple[TimedChange, ...] = (),
-    lease_s: float = 5.0,
-) -> SprayPlan:
-    issued_s = now()
-    return SprayPlan(
-        sequence=sequence,
-        issued_s=issued_s,
-        duty=duty,
-        changes=changes,
-        lease_until_s=issued_s + lease_s,
-    )
 
 
 @pytest.fixture

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import pty
 import socket
 import tty
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,6 +14,7 @@ import pytest
 import companion.link.transport as transport_module
 from companion.errors import LinkError
 from companion.link.transport import Transport, open_transport
+from tests.sitl.wire_peer import free_port
 
 
 class Inbox:
@@ -50,12 +49,6 @@ class Inbox:
 
     async def open(self, url: str) -> Transport:
         return await open_transport(url, self.on_bytes, self.on_change)
-
-
-def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture
@@ -205,18 +198,6 @@ async def test_a_tcp_peer_that_does_not_read_gets_no_old_orders() -> None:
     writer.transport.abort()
     await link.close()
     await server.stop()
-
-
-@pytest.fixture
-def terminal() -> Iterator[tuple[int, str]]:
-    """Yield a pseudo-terminal: the descriptor of its far end, and its device."""
-    far, near = pty.openpty()
-    tty.setraw(near)
-    device = os.ttyname(near)
-    os.close(near)
-    yield far, device
-    with contextlib.suppress(OSError):
-        os.close(far)
 
 
 async def read_exactly(descriptor: int, count: int) -> bytes:

@@ -1,0 +1,127 @@
+"""The vehicle's motion as its positions tell it: both filters of `motion.py`, course and height."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from companion.core.motion import (
+    BRIDGED_MAX_S,
+    CRUISE,
+    MANOEUVRE,
+    Axis,
+    Belief,
+    Seen,
+    carried,
+    follow,
+    manoeuvre_share,
+    mixed,
+)
+from companion.core.types import Telemetry
+
+YAW_RATE_TIME_S = 0.25
+# After a jump the filters start anew, and nothing is sprayed until so many positions confirm it.
+CONFIRM_COUNT = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """What both filters make of the positions, true at `time_s` on our clock."""
+
+    time_s: float
+    boot_s: float
+    received_s: float
+    cruise: Belief
+    manoeuvre: Belief
+    manoeuvre_share: float
+    heading_deg: float | None
+    yaw_rate_deg_s: float
+    height_m: float
+    velocity_known: bool
+    confirm_left: int
+
+    def after(self, dt_s: float) -> tuple[Axis, Axis]:
+        """Return the motion to the east and to the north `dt_s` later."""
+        share = self.manoeuvre_share
+        return (
+            mixed(
+                carried(CRUISE, self.cruise.east, dt_s),
+                carried(MANOEUVRE, self.manoeuvre.east, dt_s),
+                share,
+            ),
+            mixed(
+                carried(CRUISE, self.cruise.north, dt_s),
+                carried(MANOEUVRE, self.manoeuvre.north, dt_s),
+                share,
+            ),
+        )
+
+    @property
+    def acceleration_fade_s(self) -> float:
+        """Return the time constant with which the acceleration is expected to fade."""
+        return CRUISE.fade_s + self.manoeuvre_share * (MANOEUVRE.fade_s - CRUISE.fade_s)
+
+
+def begun(item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
+    """Return what a first position says."""
+    east, north = _seen(item, place)
+    belief = Belief(
+        Axis(place[0], east.velocity_m_s or 0.0, 0.0),
+        Axis(place[1], north.velocity_m_s or 0.0, 0.0),
+    )
+    return Motion(
+        time_s=time_s,
+        boot_s=item.boot_s,
+        received_s=item.received_s,
+        cruise=belief,
+        manoeuvre=belief,
+        manoeuvre_share=0.5,
+        heading_deg=item.heading_deg,
+        yaw_rate_deg_s=0.0,
+        height_m=item.relative_altitude_m,
+        velocity_known=east.velocity_m_s is not None,
+        confirm_left=CONFIRM_COUNT,
+    )
+
+
+def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
+    """Return the motion after one more position; it begins anew after a gap and after a jump."""
+    dt_s = time_s - before.time_s
+    if not 0.0 < dt_s < BRIDGED_MAX_S:
+        return begun(item, place, time_s)
+    east, north = _seen(item, place)
+    cruise = follow(CRUISE, before.cruise, dt_s, east, north)
+    manoeuvre = follow(MANOEUVRE, before.manoeuvre, dt_s, east, north)
+    if cruise is None or manoeuvre is None:
+        return begun(item, place, time_s)
+    return Motion(
+        time_s=time_s,
+        boot_s=item.boot_s,
+        received_s=item.received_s,
+        cruise=cruise[0],
+        manoeuvre=manoeuvre[0],
+        manoeuvre_share=manoeuvre_share(before.manoeuvre_share, dt_s, cruise[1], manoeuvre[1]),
+        heading_deg=item.heading_deg,
+        yaw_rate_deg_s=_yaw_rate(before, item.heading_deg, dt_s),
+        height_m=item.relative_altitude_m,
+        velocity_known=east.velocity_m_s is not None,
+        confirm_left=max(before.confirm_left - 1, 0),
+    )
+
+
+def _seen(item: Telemetry, place: tuple[float, float]) -> tuple[Seen, Seen]:
+    """Return what a message says to the east and to the north; half a velocity is none."""
+    east_m_s, north_m_s = item.velocity_east_m_s, item.velocity_north_m_s
+    if east_m_s is None or north_m_s is None:
+        return Seen(place[0], None), Seen(place[1], None)
+    return Seen(place[0], east_m_s), Seen(place[1], north_m_s)
+
+
+def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:
+    if heading_deg is None or before.heading_deg is None:
+        return 0.0
+    if not abs(heading_deg - before.heading_deg) <= 720.0:
+        return 0.0  # one of them is no number; the rate would never be one again
+    turned_deg = (heading_deg - before.heading_deg + 180.0) % 360.0 - 180.0
+    share = 1.0 - math.exp(-dt_s / YAW_RATE_TIME_S)
+    return before.yaw_rate_deg_s + share * (turned_deg / dt_s - before.yaw_rate_deg_s)
