@@ -2,7 +2,7 @@
 
 What was caught at each duty is averaged; where flow does not rise with duty neighbours are pooled
 (isotonic regression), so that the curve is one that the controller takes. The same holds for a
-pump, with the pump's command as duty.
+pump on a motor's output, with the width of its pulse in place of the duty.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import fmean
 
+from analysis.bucket_scale import DUTY, Scale
 from companion.core.nozzle import FlowCurve
 
 DUTIES_MIN = 5
@@ -21,8 +22,6 @@ SPREAD_MAX = 0.05
 LEFT_OUT_MAX = 0.05
 # A hand on a stopwatch and a bucket is off by 0.3 s: 1.5 % of this.
 SECONDS_MIN = 20.0
-# Between duties farther apart than this the curve is a guess.
-GAP_MAX = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +84,11 @@ class BucketCurve:
 
 
 def fit_bucket(
-    catches: Sequence[Catch], *, window: tuple[float, float], name: str = ""
+    catches: Sequence[Catch],
+    *,
+    window: tuple[float, float],
+    name: str = "",
+    scale: Scale = DUTY,
 ) -> BucketCurve:
     """Return the curve of one set; `window` is the least and the largest duty of the PWM.
 
@@ -95,9 +98,9 @@ def fit_bucket(
     duties = sorted({catch.duty for catch in catches})
     groups = [[catch for catch in catches if catch.duty == duty] for duty in duties]
     flows = [_mean_flow(group) for group in groups]
-    duty, flow, pooled = _monotone(duties, flows, [len(group) for group in groups])
+    duty, flow, pooled = _monotone(duties, flows, [len(group) for group in groups], scale)
     if len(duty) < 2:
-        raise ValueError("at least two duties are needed at which the flow rises")
+        raise ValueError(f"at least two {scale.plural} are needed at which the flow rises")
     curve = FlowCurve(duty=tuple(duty), flow_l_min=tuple(flow))
     left_out = [_left_out_percent(duty, flow, value) for value in duties]
     means = tuple(
@@ -112,7 +115,7 @@ def fit_bucket(
         means=means,
         residuals=residuals,
         repeatability_percent=_repeatability(means),
-        warnings=(*pooled, *_doubts(means, window), *_short(catches)),
+        warnings=(*pooled, *_doubts(means, window, scale), *_short(catches)),
     )
 
 
@@ -123,7 +126,7 @@ def _mean_flow(group: Sequence[Catch]) -> float:
 
 
 def _monotone(
-    duties: Sequence[float], flows: Sequence[float], counts: Sequence[int]
+    duties: Sequence[float], flows: Sequence[float], counts: Sequence[int], scale: Scale
 ) -> tuple[list[float], list[float], list[str]]:
     """Return the points with neighbours pooled until flow rises, and what was pooled.
 
@@ -145,8 +148,8 @@ def _monotone(
             )
         blocks.append(block)
     pooled = [
-        f"the flow does not rise from duty {low:g} to {high:g}: taken together as {flow:.3f} "
-        f"L/min at {duty:.3g}; measure again"
+        f"the flow does not rise from {scale.name} {scale.say(low)} to {scale.say(high)}: taken "
+        f"together as {flow:.3f} L/min at {scale.full * duty:.4g}{scale.unit}; measure again"
         for duty, flow, _, low, high in blocks
         if high > low
     ]
@@ -201,10 +204,12 @@ def _repeatability(means: Sequence[DutyMean]) -> float | None:
     return math.sqrt(square / spare)
 
 
-def _doubts(means: Sequence[DutyMean], window: tuple[float, float]) -> list[str]:
+def _doubts(means: Sequence[DutyMean], window: tuple[float, float], scale: Scale) -> list[str]:
     doubts = []
     if len(means) < DUTIES_MIN:
-        doubts.append(f"{len(means)} duties are few for a curve; measure at {DUTIES_MIN} or more")
+        doubts.append(
+            f"{len(means)} {scale.plural} are few for a curve; measure at {DUTIES_MIN} or more"
+        )
     outside = [
         mean.duty for mean in means if not window[0] <= mean.duty <= window[1] and mean.duty < 1.0
     ]
@@ -214,27 +219,28 @@ def _doubts(means: Sequence[DutyMean], window: tuple[float, float]) -> list[str]
             f"{window[0]:g} to {window[1]:g}: the controller does not use it"
         )
     doubts += [
-        f"the catches at duty {mean.duty:g} spread by {mean.spread_percent:.1f} %; measure again"
+        f"the catches at {scale.name} {scale.say(mean.duty)} spread by "
+        f"{mean.spread_percent:.1f} %; measure again"
         for mean in means
         if mean.spread_percent is not None and mean.spread_percent > 100.0 * SPREAD_MAX
     ]
     single = [mean.duty for mean in means if mean.count == 1]
     if single:
         doubts.append(
-            f"measured once at duty {', '.join(f'{duty:g}' for duty in single)}: twice shows "
+            f"measured once at {scale.name} {', '.join(map(scale.say, single))}: twice shows "
             "mistakes"
         )
     doubts += [
-        f"no catch between duty {a.duty:g} and {b.duty:g}"
+        f"no catch between {scale.name} {scale.say(a.duty)} and {scale.say(b.duty)}"
         for a, b in pairwise(means)
-        if b.duty - a.duty > GAP_MAX
+        if b.duty - a.duty > scale.gap_max + 1e-9
     ]
     rough = [(abs(mean.left_out_percent), mean.duty) for mean in means if mean.left_out_percent]
     if rough and max(rough)[0] > 100.0 * LEFT_OUT_MAX:
         off, duty = max(rough)
         doubts.append(
-            f"the curve is uneven: without duty {duty:g} it is {off:.1f} % off there; measure "
-            "again, or more duties beside it"
+            f"the curve is uneven: without {scale.name} {scale.say(duty)} it is {off:.1f} % off "
+            f"there; measure again, or more {scale.plural} beside it"
         )
     return doubts
 

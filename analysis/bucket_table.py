@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from analysis.bucket import BucketCurve, Catch, fit_bucket
-from analysis.csv_rows import Row, TableError, read_rows
+from analysis.bucket_scale import PULSE, PULSE_FULL_US
+from analysis.csv_rows import Row, TableError, column_names, read_rows
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+# Of a pump's table: the width of the pulse that its speed controller was given.
+PULSE_COLUMN = "us"
 _RANGE = re.compile(r"(\d+)-(\d+)")
 
 
@@ -30,10 +33,34 @@ def curves_of(path: Path, *, window: tuple[float, float], times: float = 1.0) ->
     return curves
 
 
+def is_of_a_pump(path: Path) -> bool:
+    """Return whether a file was measured by the pulse widths of a motor and not by duties."""
+    names = column_names(path)
+    return PULSE_COLUMN in names and "duty" not in names
+
+
+def pump_curve_of(path: Path, *, times: float = 1.0) -> BucketCurve:
+    """Return the curve of a pump; its duties are shares of `PULSE_FULL_US`."""
+    catches = []
+    for row in read_rows(path, (PULSE_COLUMN, "seconds")):
+        if row.text("set"):
+            raise row.error("a pump has one curve; leave the column set out")
+        pulse_us = row.needed(PULSE_COLUMN, low=500.0, high=PULSE_FULL_US)
+        catches.append(_caught(row, times, duty=pulse_us / PULSE_FULL_US))
+    try:
+        return fit_bucket(catches, window=(0.0, 1.0), scale=PULSE)
+    except ValueError as error:
+        raise TableError(f"{path}: {error}") from None
+
+
 def _catch(row: Row, times: float) -> Catch:
     duty = row.needed("duty", low=0.0, high=100.0)
     if not 0.0 < duty <= 1.0:
         raise row.error(f"duty must be above 0 and at most 1, got {duty:g}; write 0.5 for 50 %")
+    return _caught(row, times, duty=duty)
+
+
+def _caught(row: Row, times: float, *, duty: float) -> Catch:
     millilitres = row.number("millilitres", low=0.0, high=1e6)
     litres = row.number("litres", low=0.0, high=1e3)
     if (millilitres is None) == (litres is None):

@@ -1,4 +1,4 @@
-"""`vrspray calibrate flow`: from a bucket test to the `[[nozzle_set]]` of the configuration."""
+"""`vrspray calibrate flow`: from a bucket test to `[[nozzle_set]]` or `[pump]`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ def flow(
         typer.Argument(
             metavar="CSV",
             help="Columns duty (0 to 1), seconds, millilitres or litres; set (valves, as 1-4 or "
-            "1 2 3 4) may be added. Repeated rows are welcome.",
+            "1 2 3 4) may be added. us (a motor's pulse) instead of duty: a pump's curve. Repeated "
+            "rows are welcome.",
         ),
     ],
     config: Annotated[
@@ -45,15 +46,23 @@ def flow(
 ) -> None:
     """Make the flow curve of valves or pump from a bucket test.
 
-    Catch what all nozzles of a set give in a measured time, at five duties or more, twice each.
+    Catch what all nozzles of a set give in a measured time, at five duties or more, twice each. Of
+    a pump whose speed makes the flow: what all nozzles give, at five pulse widths or more.
 
     Example: vrspray calibrate flow bucket.csv --config config.toml --plot curve.png
     """
-    from analysis.bucket_table import curves_of
+    from analysis.bucket_table import curves_of, is_of_a_pump
     from analysis.csv_rows import TableError
 
     if compare not in (None, PAPER):
         raise TableError(f"--compare {compare}: there is only {PAPER}")
+    if is_of_a_pump(csv):
+        from analysis.calibrate_pump import pump_flow
+
+        if compare is not None:
+            raise TableError(f"--compare {compare}: was measured by duty, {csv} by pulse widths")
+        pump_flow(csv, config=config, times=times, plot=plot, as_json=as_json)
+        return
     names, window = _known(config)
     curves = curves_of(csv, window=window, times=times)
     result = _result(curves, csv, names)

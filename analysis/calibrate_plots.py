@@ -90,22 +90,24 @@ def _by_course(marks: Sequence[Mark]) -> dict[float, list[Mark]]:
     return found
 
 
-def plot_flow(curves: Sequence[BucketCurve], path: Path) -> None:
-    """Draw every catch and the curve of each set."""
+def plot_flow(
+    curves: Sequence[BucketCurve], path: Path, *, full: float = 100.0, what: str = "duty [%]"
+) -> None:
+    """Draw every catch and the curve of each set; `full` is what stands for a duty of 1."""
     with _axes(path) as axes:
         for number, curve in enumerate(curves):
             colour = COLOURS[number % len(COLOURS)]
             duty = np.linspace(curve.duty[0], curve.duty[-1], 200)
             flow = [curve.flow_curve.flow_for(float(each)) for each in duty]
-            axes.plot(100.0 * duty, flow, color=colour, lw=1.2, label=curve.name or "all valves")
+            axes.plot(full * duty, flow, color=colour, lw=1.2, label=curve.name or "all valves")
             axes.scatter(
-                [100.0 * each.catch.duty for each in curve.residuals],
+                [full * each.catch.duty for each in curve.residuals],
                 [each.catch.flow_l_min for each in curve.residuals],
                 s=16,
                 color=colour,
                 zorder=3,
             )
-        axes.set_xlabel("duty [%]")
+        axes.set_xlabel(what)
         axes.set_ylabel("flow [L/min]")
         axes.set_title("Bucket test")
         axes.legend()

@@ -45,6 +45,8 @@ def _sentence(result: ReplayResult) -> str:
 
 def _notes(result: ReplayResult) -> list[str]:
     notes = []
+    if result.training not in (None, "no"):
+        notes.append(f"training: {result.training}")
     if result.first_difference:
         notes.append(f"first difference: {result.first_difference}")
     if result.lost:

@@ -66,17 +66,18 @@ class Row:
         return TableError(f"{self.path}: line {self.line}: {text}")
 
 
+def column_names(path: Path) -> list[str]:
+    """Return the names of a file's columns; none of an empty one."""
+    lines = _lines(path)
+    return _names(lines[0][1])[0] if lines else []
+
+
 def read_rows(path: Path, needed: Sequence[str]) -> list[Row]:
     """Return the rows of a CSV file whose first line names at least the columns `needed`."""
-    lines = [
-        (number, line)
-        for number, line in enumerate(_text(path).splitlines(), 1)
-        if line.strip(" \t,;") and not line.lstrip().startswith("#")
-    ]
+    lines = _lines(path)
     if not lines:
         raise TableError(f"{path}: the file is empty; its first line names {', '.join(needed)}")
-    delimiter = max(DELIMITERS, key=lambda each: len(_split(lines[0][1], each)))
-    names = [name.casefold() for name in _split(lines[0][1], delimiter)]
+    names, delimiter = _names(lines[0][1])
     missing = [name for name in needed if name not in names]
     if missing:
         raise TableError(
@@ -89,6 +90,21 @@ def read_rows(path: Path, needed: Sequence[str]) -> list[Row]:
     if not rows:
         raise TableError(f"{path}: there are no rows below the names of the columns")
     return rows
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Return the lines that are neither blank nor notes, with their numbers."""
+    return [
+        (number, line)
+        for number, line in enumerate(_text(path).splitlines(), 1)
+        if line.strip(" \t,;") and not line.lstrip().startswith("#")
+    ]
+
+
+def _names(line: str) -> tuple[list[str], str]:
+    """Return the names of the columns and what stands between them."""
+    delimiter = max(DELIMITERS, key=lambda each: len(_split(line, each)))
+    return [name.casefold() for name in _split(line, delimiter)], delimiter
 
 
 def _row(path: Path, number: int, fields: Iterable[str], names: Sequence[str]) -> Row:

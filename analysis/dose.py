@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.strips import Strip
+    from companion.core.boom import Boom
     from companion.core.prescription import Prescription
 
 
@@ -65,6 +66,23 @@ def volume_error_percent(
     asked_all = sum(asked_ml.values())
     overall = _error_percent(sum(given_ml.values()), asked_all) if asked_all > 0.0 else None
     return overall, by_zone
+
+
+def section_error_percent(strips: Sequence[Strip], boom: Boom) -> dict[str, float]:
+    """Return applied against prescribed volume of each section, inside the field.
+
+    A pump gives all sections of a boom one flow: what it gives to one too much another lacks.
+    """
+    found = {}
+    for strip, valve in zip(strips, boom.valves, strict=True):
+        ends_s = np.array([(run.start_s, run.end_s) for run in strip.runs if run.inside])
+        given_ml, asked_ml = (
+            float(np.diff(strip.track.at(values, ends_s.reshape(-1, 2)), axis=1).sum())
+            for values in (strip.track.volume_ml, strip.asked_ml)
+        )
+        if asked_ml > 0.0:
+            found[valve.name] = _error_percent(given_ml, asked_ml)
+    return found
 
 
 def _error_percent(given_ml: float, asked_ml: float) -> float:

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from analysis.border import BorderCrossing, border_crossings, held_by_border, off_target_ml
-from analysis.dose import misapplied_percent, volume_error_percent
+from analysis.dose import misapplied_percent, section_error_percent, volume_error_percent
 from analysis.flight_record import FlightMeta, FlightRecord, whole_boom
 from analysis.flow_accuracy import flow_accuracy
 from analysis.lag import Step, Verdict, measure_steps
@@ -86,6 +86,7 @@ class Evaluation:
     overlap_m2: float
     volume_error_percent: float | None
     zone_volume_error_percent: dict[str, float]
+    section_volume_error_percent: dict[str, float]
     applied_ml: float
     steps: tuple[Step, ...]
     settled_steps: tuple[SettledStep, ...]
@@ -113,6 +114,7 @@ class Evaluation:
             "overlap_m2": self.overlap_m2,
             "volume_error_percent": self.volume_error_percent,
             "zone_volume_error_percent": dict(self.zone_volume_error_percent),
+            "section_volume_error_percent": dict(self.section_volume_error_percent),
             "applied_ml": self.applied_ml,
         }
 
@@ -151,6 +153,7 @@ def evaluate(record: FlightRecord) -> Evaluation:
         overlap_m2=sum(switch.overlap_m2 for switch in switches),
         volume_error_percent=volume_error,
         zone_volume_error_percent=zone_errors,
+        section_volume_error_percent=section_error_percent(strips, record.boom),
         applied_ml=float((record.volume_ml[-1] - record.volume_ml[0]).sum()),
         steps=tuple(all_steps),
         settled_steps=tuple(settled),

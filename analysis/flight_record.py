@@ -25,13 +25,18 @@ Fidelity = Literal["averaged", "pulsed"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightMeta:
-    """What was flown, for the rows of tables; no metric depends on it."""
+    """What was flown, for the rows of tables; no metric depends on it.
+
+    `training` is the mark of the flight's journal: `water` or `dry` where no product was sprayed,
+    `no` where one was, None where nobody says.
+    """
 
     speed_m_s: float
     method: str
     fidelity: Fidelity
     output: str
     seed: int
+    training: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

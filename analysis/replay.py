@@ -62,6 +62,7 @@ class ReplayResult:
     lost: int
     is_closed: bool
     is_what_if: bool
+    training: str | None = None
 
 
 def replay(
@@ -99,6 +100,7 @@ def replay(
         lost=content.lost,
         is_closed=content.is_closed,
         is_what_if=bool(overrides),
+        training=content.training,
     )
 
 

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from shapely import MultiPolygon
 
 from companion.config import Config
+from companion.config.motors import atomisers_of, pump_of
 from companion.config.sensor_rules import tank_capacity_l
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
@@ -70,6 +71,8 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
         mission_braking_m_s2=(
             config.prediction.braking_m_s2 if config.prediction.use_mission else None
         ),
+        pump=pump_of(config),
+        atomisers=atomisers_of(config),
     )
 
 
@@ -120,7 +123,7 @@ def read_configured_map(config: Config) -> MapFile:
     """Return the map that the configuration names, read as it says."""
     table = _prescription_table(config)
     with _naming(config, "prescription.file", table.file):
-        return read_map(
+        found = read_map(
             config.resolve(table.file),
             rate_field=table.rate_field,
             unit=table.unit,
@@ -132,6 +135,13 @@ def read_configured_map(config: Config) -> MapFile:
             merge=table.merge,
             origin=table.origin,
         )
+    if table.sha256 is not None and not found.sha256.startswith(table.sha256):
+        raise ConfigError(
+            f"{config.path}: prescription.sha256 = {show_value(table.sha256)}: "
+            f"{table.file} is another map, its hash begins with {found.sha256[:8]}; look at it by "
+            "`vrspray map check`, then write these digits"
+        )
+    return found
 
 
 @contextmanager

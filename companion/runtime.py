@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 from companion.core.controller import Memory, Setup, step
 from companion.core.estimator import Track, estimate, observe
@@ -26,6 +26,8 @@ from companion.core.types import Decision, Finding, Input, OutputReport
 from companion.ports import PlanExecutor, Recorder, Sensor, VehicleLink
 
 _logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 SWITCH_S = 0.0002
 
@@ -69,7 +71,7 @@ class ControlLoop:
         self._memory = Memory()
         self._sensors = sensors
         self._told: frozenset[Finding] = frozenset()
-        self._reported: tuple[str | None] | None = None
+        self._reported: tuple[str | None, str | None] | None = None
         self._stepped_s = float("-inf")
 
     @property
@@ -123,17 +125,23 @@ class ControlLoop:
 
     def _output_report(self) -> Iterator[Input]:
         """Yield what changed in the way to the valves: the link to the vehicle, or the outputs."""
-        fault = self._executor.fault or self._link.fault
-        if self._reported == (fault,):
+        faults = (self._executor.fault, self._link.fault)
+        if self._reported == faults:
             return
-        first, self._reported = self._reported is None, (fault,)
+        first, self._reported = self._reported is None, faults
+        fault = faults[0] or faults[1]
         now_s = self._clock()
         if fault is not None:
             _logger.warning("outputs: %s", fault)
             self._link.tell_fault(fault)
         if not first or fault is not None:
             self._recorder.record_event(now_s, "outputs", fault or "healthy")
-        yield OutputReport(received_s=now_s, healthy=fault is None, text=fault or "")
+        yield OutputReport(
+            received_s=now_s,
+            healthy=faults[0] is None,
+            link_up=faults[1] is None,
+            text=fault or "",
+        )
 
 
 class _Ending:
@@ -262,7 +270,7 @@ def precise_event_loop() -> asyncio.AbstractEventLoop:
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 
-def execute(start: Callable[[], Coroutine[Any, Any, int]]) -> int:
+def execute(start: Callable[[], Coroutine[Any, Any, T]]) -> T:
     """Run `start()` on a precise event loop, with what exists by now out of the collector's way."""
     gc.collect()
     gc.freeze()

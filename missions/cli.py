@@ -13,6 +13,7 @@ from companion.cli.answer import AsJson, answer, note
 from companion.cli.map_grid import parse_mark
 from companion.config import load
 from missions.files.write import check_suffix, write_plan
+from missions.picture import check_picture, draw_plan
 from missions.plan import Plan
 from missions.planner import plan_mission
 from missions.reading import Asked, names_of, read_task
@@ -54,6 +55,10 @@ def plan(
     ] = None,
     swath_m: Annotated[float | None, typer.Option(metavar="M", help="Spacing of passes.")] = None,
     speed_m_s: Annotated[float | None, typer.Option(metavar="V", help="In the passes.")] = None,
+    speed_max_m_s: Annotated[
+        float | None,
+        typer.Option(metavar="V", help="Where rates are too low for the valves, up to this."),
+    ] = None,
     angle_deg: Annotated[
         float | None, typer.Option(metavar="DEG", help="Course of the passes; else the best.")
     ] = None,
@@ -67,6 +72,9 @@ def plan(
     sprayer: Annotated[
         bool, typer.Option("--sprayer", help="Add DO_SPRAYER at every line; ArduPilot only.")
     ] = False,
+    png: Annotated[
+        Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Plan the passes over a field, sortie by sortie, and write the mission.
@@ -75,6 +83,8 @@ def plan(
     """
     start = perf_counter()
     check_suffix(out)
+    if png is not None:
+        check_picture(png)
     for name, value in (("--angle-deg", angle_deg), ("--rate-l-ha", rate_l_ha)):
         if value is not None and not (math.isfinite(value) and abs(value) < 1e5):
             raise typer.BadParameter(f"{name} is {value}; write a number")
@@ -92,6 +102,7 @@ def plan(
     changes: dict[str, float | int | None] = {
         "swath_width_m": swath_m,
         "speed_m_s": speed_m_s,
+        "speed_max_m_s": speed_max_m_s,
         "angle_deg": angle_deg,
         "tank_l": tank_l,
         "moves": MOVES[effort],
@@ -100,11 +111,12 @@ def plan(
     planned = plan_mission(task.field, task.settings, task.rates, depots=task.depots)
     took_s = perf_counter() - start
     files = write_plan(planned, out, with_sprayer=sprayer)
-    warnings = [*planned.warnings, *task.warnings]
+    if png is not None:
+        draw_plan(planned, png, title=field.stem)
+    warnings = planned.warnings
     result = planned.summary() | {
         "planning_s": took_s,
         "files": [str(path) for path in files],
-        "warnings": warnings,
     }
     answer(result, _lines(planned, result, files), as_json=as_json)
     for warning in warnings:
@@ -128,7 +140,17 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
     ]
     lines += [
         f"sortie {sortie.number:3}  {sortie.volume_l:7.2f} L  {sortie.flight_s / 60.0:6.1f} min  "
-        f"{sortie.lines} lines"
+        f"{sortie.lines} lines, {_speeds(sortie.speeds_m_s)}"
         for sortie in planned.sorties
     ]
     return lines
+
+
+def _speeds(speeds_m_s: tuple[float, float]) -> str:
+    """Return speeds in words.
+
+    >>> _speeds((6.0, 6.0)), _speeds((4.5, 6.0))
+    ('6 m/s', '4.5 to 6 m/s')
+    """
+    low, high = speeds_m_s
+    return f"{high:g} m/s" if low == high else f"{low:g} to {high:g} m/s"

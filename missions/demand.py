@@ -8,6 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
+from missions.extents import Extents
+from missions.stretches import stretches
 from missions.strips import Floats, directions, lengths_m, no_lines
 
 M2_PER_HA = 10_000.0
@@ -47,6 +49,15 @@ class Demand:
         """Return what the whole line needs."""
         return float(self.litres[-1])
 
+    def part(self, start_m: float, end_m: float) -> Demand:
+        """Return what is needed between two distances from the start."""
+        if start_m <= self.at_m[0] and end_m >= self.at_m[-1]:
+            return self
+        inside = (self.at_m > start_m) & (self.at_m < end_m)
+        at_m = np.concatenate([[start_m], self.at_m[inside], [end_m]])
+        litres = np.interp(at_m, self.at_m, self.litres)
+        return Demand(at_m=at_m, litres=litres - litres[0])
+
     def cuts_m(self, piece_max_l: float) -> tuple[Floats, Floats]:
         """Return where to cut the line, both ends among it, and what each piece needs.
 
@@ -75,15 +86,23 @@ def valve_places(width_m: float, valves: tuple[tuple[float, float], ...]) -> Flo
 
 
 def demands(
-    lines: Floats, rates: Rates, *, width_m: float, valves: tuple[tuple[float, float], ...] = ()
+    lines: Floats,
+    rates: Rates,
+    *,
+    width_m: float,
+    valves: tuple[tuple[float, float], ...] = (),
+    extents: Extents | None = None,
 ) -> list[Demand]:
-    """Return the demand along every line; each valve gives the rate at the middle of its strip."""
+    """Return the demand along every line; each valve gives the rate at the middle of its strip.
+
+    With `extents` a valve whose strip touches the border gives nothing.
+    """
     if not len(lines):
         return []
     places = valve_places(width_m, valves)
     length_m = lengths_m(lines)
     step_m = max(STEP_M, float(length_m.sum()) * len(places) / POINTS_MAX)
-    if isinstance(rates, Uniform):
+    if isinstance(rates, Uniform) and extents is None:
         step_m = math.inf
     counts = np.maximum(np.ceil(length_m / step_m), 1).astype(np.int64)
     owner = np.repeat(np.arange(len(lines)), counts)
@@ -91,12 +110,19 @@ def demands(
     each_m = (length_m / counts)[owner]
     along = directions(lines)[owner]
     middle = lines[owner, :2] + along * ((number + 0.5) * each_m)[:, None]
+    near = np.empty(0, dtype=np.int64)
+    if extents is not None:
+        near = np.flatnonzero(~extents.deep_inside(middle))
+    to_right = np.column_stack([along[near, 1], -along[near, 0]])
     flow = np.zeros(len(owner))  # litres per metre, times M2_PER_HA
     for right_m, strip_m in places:
         rate = rates.rates_at(
             middle[:, 0] + along[:, 1] * right_m, middle[:, 1] - along[:, 0] * right_m
         )
-        flow += np.nan_to_num(rate, nan=0.0) * strip_m
+        rate = np.nan_to_num(rate, nan=0.0)
+        if extents is not None:
+            rate[near] *= extents.is_open(middle[near], to_right, (float(right_m), float(strip_m)))
+        flow += rate * strip_m
     used = flow * each_m / M2_PER_HA
     found = []
     for index, part in enumerate(np.split(used, np.cumsum(counts)[:-1])):
@@ -117,17 +143,25 @@ class Pieces:
         return len(self.ends)
 
 
-def cut(lines: Floats, demand: list[Demand], *, piece_max_l: float) -> Pieces:
-    """Return the lines in pieces of at most `piece_max_l`; whole ones that need less."""
+def cut(
+    lines: Floats, demand: list[Demand], *, piece_max_l: float, margin_m: float = 0.0
+) -> Pieces:
+    """Return the lines in pieces of at most `piece_max_l`; whole ones that need less.
+
+    Long stretches on which nothing is prescribed are no piece at all, but for `margin_m`.
+    """
     rows, litres, owner = [no_lines()], [np.empty(0)], [np.empty(0, dtype=np.int64)]
-    for index, (row, need) in enumerate(zip(lines, demand, strict=True)):
-        cuts, each_l = need.cuts_m(piece_max_l)
-        length_m = need.at_m[-1]
-        places = row[:2] + np.outer(cuts / length_m, row[2:] - row[:2])
-        places[-1] = row[2:]
-        rows.append(np.column_stack([places[:-1], places[1:]]))
-        litres.append(each_l)
-        owner.append(np.full(len(each_l), index, dtype=np.int64))
+    for index, (row, whole) in enumerate(zip(lines, demand, strict=True)):
+        length_m = whole.at_m[-1]
+        for start_m, end_m in stretches(whole.at_m, whole.litres, margin_m=margin_m):
+            need = whole.part(start_m, end_m)
+            cuts, each_l = need.cuts_m(piece_max_l)
+            places = row[:2] + np.outer(cuts / length_m, row[2:] - row[:2])
+            if end_m == length_m:
+                places[-1] = row[2:]
+            rows.append(np.column_stack([places[:-1], places[1:]]))
+            litres.append(each_l)
+            owner.append(np.full(len(each_l), index, dtype=np.int64))
     return Pieces(
         ends=np.concatenate(rows), litres=np.concatenate(litres), line=np.concatenate(owner)
     )

@@ -1,4 +1,4 @@
-"""What planning refuses."""
+"""What planning and uploading refuse."""
 
 from __future__ import annotations
 
@@ -7,3 +7,7 @@ from companion.errors import VrsprayError
 
 class PlanError(VrsprayError):
     """A mission cannot be planned: the message says what, where and what to change."""
+
+
+class UploadError(VrsprayError):
+    """A mission is not uploaded: the message says why and what to do."""

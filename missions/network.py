@@ -62,8 +62,13 @@ def build_network(pieces: Pieces, depots: Floats, space: FreeSpace, motion: Moti
         _bend(far_m, ends, near, space)
     between = np.zeros((count + 1, count + 1))
     between[:count, :count] = motion.legs_s(far_m)
+    stops_s = motion.speed_m_s / motion.acceleration_m_s2
     rows, columns = _flown_through(pieces.ends, far_m, near)
-    between[rows, columns] = between[columns, rows] = -motion.speed_m_s / motion.acceleration_m_s2
+    between[rows, columns] = between[columns, rows] = -stops_s
+    rows, columns = _flown_on(pieces)
+    along_m = np.hypot(*(ends[rows] - ends[columns]).T)
+    between[rows, columns] = between[columns, rows] = along_m / motion.speed_m_s - stops_s
+    _know(near, rows, columns)
     home_m = np.hypot(
         depots[:, 0][:, None] - ends[:, 0][None, :], depots[:, 1][:, None] - ends[:, 1][None, :]
     )
@@ -83,6 +88,19 @@ def _flown_through(lines: Floats, far_m: Floats, near: Ints) -> tuple[Ints, Ints
     through = (far_m[rows, columns] < JOIN_M) & (straight > math.cos(math.radians(JOIN_DEG)))
     through &= (rows >> 1) != (columns >> 1)
     return rows[through], columns[through]
+
+
+def _flown_on(pieces: Pieces) -> tuple[Ints, Ints]:
+    """Return pairs of ends at which one piece of a line follows another, a gap between or not."""
+    follows = np.flatnonzero(np.diff(pieces.line) == 0)
+    return 2 * follows + 1, 2 * follows + 2
+
+
+def _know(near: Ints, rows: Ints, columns: Ints) -> None:
+    """Have each of these pairs among the near ends of both, in place of the farthest."""
+    for one, other in (*zip(rows, columns, strict=True), *zip(columns, rows, strict=True)):
+        if other not in near[one]:
+            near[one, -1] = other
 
 
 def _bend(far_m: Floats, ends: Floats, near: Ints, space: FreeSpace) -> None:

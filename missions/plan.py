@@ -19,7 +19,12 @@ Kind = Literal["spray", "transit", "ferry"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """What the plan is made for; `valves` are (right_m, width_m), `moves` the length of search."""
+    """What the plan is made for; `valves` are (right_m, width_m), `moves` the length of search.
+
+    `flow_l_min` is the least and the largest flow of the whole boom, `speeds_m_s` the least and
+    the highest speed that a leg may have, `settle_s` how long a rate must last to be there.
+    `border_buffer_m` is what the companion keeps its valves' strips off the border, if it does.
+    """
 
     swath_width_m: float
     speed_m_s: float
@@ -32,6 +37,10 @@ class Settings:
     valves: tuple[tuple[float, float], ...] = ()
     moves: int = 40_000
     seed: int = 1
+    flow_l_min: tuple[float, float] | None = None
+    speeds_m_s: tuple[float, float] = (0.0, 0.0)
+    settle_s: float = 0.0
+    border_buffer_m: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
@@ -86,8 +95,15 @@ class Sortie:
 
     @property
     def lines(self) -> int:
-        """Return the number of spray lines."""
-        return sum(leg.kind == "spray" for leg in self.legs)
+        """Return the number of spray lines; one with several speeds is several legs."""
+        kinds = [leg.kind == "spray" for leg in self.legs]
+        return sum(is_spray and not before for before, is_spray in pairwise([False, *kinds]))
+
+    @property
+    def speeds_m_s(self) -> tuple[float, float]:
+        """Return the least and the highest speed of the spray lines."""
+        speeds = [leg.speed_m_s for leg in self.legs if leg.kind == "spray"]
+        return min(speeds), max(speeds)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,4 +180,5 @@ class Plan:
             "ferry_m": sortie.length_m("ferry"),
             "total_m": sum(leg.length_m for leg in sortie.legs),
             "flight_s": sortie.flight_s,
+            "speeds_m_s": list(sortie.speeds_m_s),
         }

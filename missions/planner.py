@@ -10,10 +10,13 @@ from missions.angle import cost_s, ranked
 from missions.coverage import measure
 from missions.demand import Rates, demands
 from missions.errors import PlanError
+from missions.extents import extents_of
 from missions.field import Field, local_points
 from missions.open_lines import needed_passes, open_lines
+from missions.paced import paced, range_warnings
 from missions.patches import patches
 from missions.plan import Plan, Settings
+from missions.short import short_warnings
 from missions.sorties import plan_sorties
 from missions.strips import Floats, joined
 from missions.swaths import border_passes, inner_ground, inner_lines
@@ -54,13 +57,18 @@ def _planned(
         turn=settings.turn,
     )
     lines, angle_deg = spray_lines(field, settings, motion)
-    demand = demands(lines, rates, width_m=width_m, valves=settings.valves)
+    kept_m = settings.border_buffer_m
+    extents = None
+    if kept_m is not None:
+        extents = extents_of(field.limit, width_m=width_m, buffer_m=kept_m)
+    demand = demands(lines, rates, width_m=width_m, valves=settings.valves, extents=extents)
     litres = np.array([need.total_l for need in demand])
     if not float(litres.sum()) > 0.0:
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
     given = _depots(field.frame, depots)
     places = given if len(given) else suggested_depot(field, lines, litres)
     ways = build_ways(field, places)
+    sorties = paced(plan_sorties(lines, demand, ways, settings, motion), rates, settings)
     return Plan(
         field=field,
         settings=settings,
@@ -69,7 +77,11 @@ def _planned(
         coverage=measure(lines, field.limit, width_m),
         depots=tuple((float(east_m), float(north_m)) for east_m, north_m in places),
         suggested_depot=not len(given),
-        sorties=plan_sorties(lines, demand, ways, settings, motion),
+        sorties=sorties.sorties,
+        warnings=(
+            *range_warnings(sorties.misses, field.frame, settings),
+            *short_warnings(sorties.sorties, rates, field.frame, settings),
+        ),
     )
 
 

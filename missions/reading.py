@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
 from shapely import MultiPolygon
 
-from companion.assembly import above_label, read_configured_map, undelivered
+from companion.assembly import above_label, flow_range, read_configured_map
 from companion.config import Config
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
@@ -39,7 +41,6 @@ class Task:
     settings: Settings
     rates: Rates
     depots: tuple[tuple[float, float], ...]
-    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +89,6 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         settings=settings,
         rates=_rates(asked, config, map_file, boundary, frame),
         depots=asked.depots or tuple(configured),
-        warnings=_warnings(config, map_file, settings),
     )
 
 
@@ -110,10 +110,20 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             tank_l=mission.tank_l,
             reserve_l=mission.reserve_l,
             valves=tuple((valve.right_m, valve.width_m) for valve in config.boom().valves),
+            flow_l_min=_flows(config),
+            speeds_m_s=(config.safety.speed_min_m_s, 0.0),
+            settle_s=_settle_s(config),
+            border_buffer_m=_kept_m(config),
         )
-    given = {name: value for name, value in changes.items() if value is not None}
+    given: dict[str, Any] = {name: each for name, each in changes.items() if each is not None}
+    highest = given.pop("speed_max_m_s", None)
+    if highest is not None:
+        limit = math.inf if config is None else config.safety.speed_max_m_s
+        if not 0.0 < highest <= limit:
+            raise PlanError(f"--speed-max-m-s {highest:g}: safety.speed_max_m_s is {limit:g}")
+        given["speeds_m_s"] = (settings.speeds_m_s[0], highest)
     try:
-        return replace(settings, **given)  # type: ignore[arg-type]
+        return replace(settings, **given)
     except ValueError as error:
         raise PlanError(f"this cannot be flown: {error}") from error
 
@@ -201,21 +211,23 @@ def _many(area: Area) -> MultiPolygon:
     return area if isinstance(area, MultiPolygon) else MultiPolygon([area])
 
 
-def _warnings(
-    config: Config | None, map_file: MapFile | None, settings: Settings
-) -> tuple[str, ...]:
-    """Return which rates the sprayer cannot deliver at the planned speed."""
-    if config is None or map_file is None:
-        return ()
-    problems = undelivered(
-        map_file.rates_l_ha,
-        sets=config.nozzle_sets(),
-        pwm=config.pwm_limits(),
-        width_m=config.boom_table.width_m,
-        speed_m_s=settings.speed_m_s,
-        speeds_m_s=(config.safety.speed_min_m_s, config.safety.speed_max_m_s),
-    )
-    return tuple(f"{problem.text}; {problem.fix}" for problem in problems)
+def _flows(config: Config) -> tuple[float, float]:
+    """Return what the nozzle sets deliver over the swath, which may be a little off the boom."""
+    low, high = flow_range(config.nozzle_sets(), config.pwm_limits())
+    return low, high
+
+
+def _kept_m(config: Config) -> float | None:
+    """Return how far valves are kept off the border; None where the configuration lets them be."""
+    table = config.prescription
+    return table.border_buffer_m if table is not None and table.border == "inside" else None
+
+
+def _settle_s(config: Config) -> float:
+    """Return how long a rate must last to be there: the slowest change and one PWM period."""
+    lag = config.lag
+    slowest_s = max(lag.on_s, lag.off_s, lag.up_s, lag.down_s) + lag.output_s
+    return slowest_s + config.pwm_limits().period_s
 
 
 def names_of(paths: Sequence[Path]) -> str:

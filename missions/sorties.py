@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -28,7 +29,8 @@ def plan_sorties(
     lines: Floats, demand: list[Demand], ways: Ways, settings: Settings, motion: Motion
 ) -> tuple[Sortie, ...]:
     """Return all sorties, each within a tank."""
-    pieces = cut(lines, demand, piece_max_l=_piece_max_l(demand, settings))
+    run_in_m = settings.speed_m_s**2 / (2.0 * settings.acceleration_m_s2)
+    pieces = cut(lines, demand, piece_max_l=_piece_max_l(demand, settings), margin_m=run_in_m)
     heaviest = float(pieces.litres.max(initial=0.0))
     if not heaviest <= settings.usable_l * (1.0 + 1e-9):
         raise PlanError(
@@ -88,32 +90,38 @@ class _Drawn:
     def legs(self, order: Order, depot: int) -> tuple[Leg, ...]:
         """Return the legs from the depot along all pieces and back."""
         runs = self._runs(order)
-        out = self._ways.home(depot, runs[0][0])
+        out = self._ways.home(depot, runs[0].start)
         legs = [self._leg("ferry", out)]
-        for number, (start, end, litres) in enumerate(runs):
+        for number, run in enumerate(runs):
             if number:
-                previous = runs[number - 1]
-                way, leaves = self._ways.between(previous[1], start)
-                through = _is_through(previous, (start, end, litres))
-                legs.append(self._leg("ferry" if leaves else "transit", way, through=through))
-            legs.append(self._leg("spray", [start, end], litres=litres))
-        legs.append(self._leg("ferry", self._ways.home(depot, runs[-1][1])[::-1]))
+                legs.append(self._join(runs[number - 1], run))
+            legs.append(self._leg("spray", [run.start, run.end], litres=run.litres))
+        legs.append(self._leg("ferry", self._ways.home(depot, runs[-1].end)[::-1]))
         return tuple(legs)
 
-    def _runs(self, order: Order) -> list[tuple[Place, Place, float]]:
-        """Return start, end and litres of spray lines; pieces that follow each other are one."""
-        runs: list[tuple[Place, Place, float]] = []
-        line_before = -1
+    def _runs(self, order: Order) -> list[_Run]:
+        """Return spray lines; pieces that follow each other are one."""
+        runs: list[_Run] = []
         for enter in order:
-            start, end = (_place(self._ends[enter]), _place(self._ends[enter ^ 1]))
-            litres = float(self._pieces.litres[enter >> 1])
-            line = int(self._pieces.line[enter >> 1])
-            if runs and line == line_before and _far_m(runs[-1][1], start) < TOUCH_M:
-                runs[-1] = (runs[-1][0], end, runs[-1][2] + litres)
-            else:
-                runs.append((start, end, litres))
-            line_before = line
+            run = _Run(
+                start=_place(self._ends[enter]),
+                end=_place(self._ends[enter ^ 1]),
+                litres=float(self._pieces.litres[enter >> 1]),
+                line=int(self._pieces.line[enter >> 1]),
+            )
+            if runs and run.line == runs[-1].line and _far_m(runs[-1].end, run.start) < TOUCH_M:
+                run = replace(run, start=runs[-1].start, litres=runs[-1].litres + run.litres)
+                runs.pop()
+            runs.append(run)
         return runs
+
+    def _join(self, before: _Run, after: _Run) -> Leg:
+        """Return the way from one line to the next: through, where neither has to stop."""
+        is_on = before.line == after.line or _far_m(before.end, after.start) < JOIN_M
+        if is_on and _is_straight(before, after):
+            return self._leg("transit", [before.end, after.start], through=True)
+        way, leaves = self._ways.between(before.end, after.start)
+        return self._leg("ferry" if leaves else "transit", way)
 
     def _leg(
         self, kind: Kind, points: list[Place], *, litres: float = 0.0, through: bool = False
@@ -122,13 +130,23 @@ class _Drawn:
         parts_m = [_far_m(a, b) for a, b in pairwise(points)]
         seconds = float(motion.legs_s(np.array(parts_m)).sum()) if parts_m else 0.0
         if through:
-            seconds = -motion.speed_m_s / motion.acceleration_m_s2
+            seconds = sum(parts_m) / motion.speed_m_s - motion.speed_m_s / motion.acceleration_m_s2
         elif kind == "transit" and len(points) == 2:
             seconds = motion.between_passes_s(parts_m[0])
         return Leg(
             kind=kind, points=tuple(points), speed_m_s=motion.speed_m_s, seconds=seconds,
             volume_l=litres,
         )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Run:
+    """A spray line, or the part of one that is flown at once; `line` is which."""
+
+    start: Place
+    end: Place
+    litres: float
+    line: int
 
 
 def _place(point: list[float]) -> Place:
@@ -139,11 +157,10 @@ def _far_m(a: Place, b: Place) -> float:
     return float(np.hypot(b[0] - a[0], b[1] - a[1]))
 
 
-def _is_through(first: tuple[Place, Place, float], second: tuple[Place, Place, float]) -> bool:
-    """Return whether the aircraft flies from one line into the next without a stop."""
-    if not _far_m(first[1], second[0]) < JOIN_M:
-        return False
-    one = np.subtract(first[1], first[0])
-    two = np.subtract(second[1], second[0])
+def _is_straight(first: _Run, second: _Run) -> bool:
+    """Return whether the aircraft flies from one line into the next without a turn."""
+    way = np.subtract(second.start, first.end)
+    one, two = np.subtract(first.end, first.start), np.subtract(second.end, second.start)
     cosine = float(one @ two) / float(np.hypot(*one) * np.hypot(*two))
-    return bool(cosine > np.cos(np.radians(JOIN_DEG)))
+    ahead = float(way @ one) >= 0.0 or float(np.hypot(*way)) < JOIN_M
+    return ahead and bool(cosine > np.cos(np.radians(JOIN_DEG)))

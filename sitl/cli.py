@@ -63,11 +63,18 @@ def serve(
     gust: Annotated[float, typer.Option(help="Gusts in m/s.")] = 1.0,
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for the truth.")] = None,
+    sensors: Annotated[
+        Path | None,
+        typer.Option(help="Folder for a pressure sensor that `run` reads as iio device."),
+    ] = None,
     wait_s: Annotated[
         float | None, typer.Option(help="How long to wait for a companion; default: for ever.")
     ] = None,
     no_enable: Annotated[
         bool, typer.Option("--no-enable", help="Leave the enabling of the spraying out.")
+    ] = False,
+    ground: Annotated[
+        bool, typer.Option("--ground", help="Stay on the ground, disarmed: for ground work.")
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
@@ -90,7 +97,9 @@ def serve(
         gust_m_s=gust,
         seed=seed,
         out=out,
+        sensors=sensors,
         enable=not no_enable,
+        ground=ground,
         wait_s=wait_s,
     )
     try:

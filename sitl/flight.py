@@ -30,15 +30,16 @@ from companion.core.types import (
     Telemetry,
 )
 from sitl.board import SERVO_FRAME_S, DriverBoard
+from sitl.drives import DrivenOutput, DriveTruth, Motors, Ranges
 from sitl.leg_reports import leg_reports
 from sitl.liquid_faults import LiquidFault, LiquidSensors
 from sitl.navigation import Navigation
 from sitl.outputs import WIRE_S, AveragedOutput, GpioOutput, Output, ServoOutput
-from sitl.plant import AveragedPlant, PulsedPlant
-from sitl.pump_plant import PumpPlant
+from sitl.plants import duty_plant, edge_plant
 from sitl.wang import POLL_S, WangController
 
 if TYPE_CHECKING:
+    from sitl.plant import Plant
     from sitl.profile import PlantProfile
     from sitl.route import Route
     from sitl.trajectory import Trajectory
@@ -56,7 +57,8 @@ class FlightOptions:
     """How a flight is simulated; `noise` and `scatter` off is perfect knowledge.
 
     `meter_rate_hz` above 0 has the flow meter report that often, `pressure_rate_hz` the pressure
-    sensor; `liquid_faults` act on sprayers with valves.
+    sensor; `liquid_faults` act on sprayers with valves. `drive_ranges_us` are stop and full pulse
+    of each motor as the program has them; without them they are the plant's own.
     """
 
     fidelity: Fidelity = "pulsed"
@@ -70,11 +72,12 @@ class FlightOptions:
     meter_rate_hz: float = 0.0
     pressure_rate_hz: float = 0.0
     liquid_faults: tuple[LiquidFault, ...] = ()
+    drive_ranges_us: Ranges = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """The truth of a flight and what the controller said of it."""
+    """The truth of a flight and what the controller said of it; `drives` where there are motors."""
 
     record: FlightRecord
     steps: int
@@ -82,6 +85,7 @@ class FlightResult:
     unresolved: int
     inhibits: frozenset[Inhibit]
     simulated_s: float
+    drives: DriveTruth | None = None
 
 
 Progress = Callable[[float], None]
@@ -132,17 +136,22 @@ def fly(
     samples = math.floor((end_s + TAIL_S - start_s) / sample_s) + 1
     times: Floats = start_s + sample_s * np.arange(samples, dtype=np.float64)
     path = trajectory.at(times)
+    volume_ml = plant.volume_ml(times)
+    # Where a pump makes the flow an open valve says nothing of being at its limit.
+    limits = (
+        (0.0, math.inf) if profile.has_sections else (profile.pwm.duty_min, profile.pwm.duty_max)
+    )
     record = FlightRecord(
         time_s=times,
         east_m=path.east_m,
         north_m=path.north_m,
         heading_deg=path.heading_deg,
-        volume_ml=plant.volume_ml(times),
+        volume_ml=volume_ml,
         boom=setup.boom,
         prescription=setup.prescription,
         pwm_period_s=profile.pwm.period_s,
-        duty_limits=(profile.pwm.duty_min, profile.pwm.duty_max),
-        nozzle_sets=setup.nozzle_sets,
+        duty_limits=limits,
+        nozzle_sets=() if profile.has_sections else setup.nozzle_sets,
         orders=tuple(output.orders),
         meta=FlightMeta(
             speed_m_s=speed_m_s,
@@ -159,22 +168,29 @@ def fly(
         unresolved=said.unresolved,
         inhibits=frozenset(said.inhibits),
         simulated_s=end_s - start_s,
+        drives=(
+            output.motors.truth(times, volume_ml) if isinstance(output, DrivenOutput) else None
+        ),
     )
 
 
-def sprayer(
-    profile: PlantProfile, options: FlightOptions, start_s: float
-) -> tuple[AveragedPlant | PulsedPlant | PumpPlant, Output]:
+def sprayer(profile: PlantProfile, options: FlightOptions, start_s: float) -> tuple[Plant, Output]:
     """Return a plant and the output path that drives it; a pump has no pulses."""
+    plant, output = _valves(profile, options, start_s)
+    if not profile.drive_count:
+        return plant, output
+    motors = Motors(profile, plant, start_s=start_s, ranges_us=options.drive_ranges_us)
+    # A motor's pulse waits for its frame of 50 Hz, on the autopilot or on this computer.
+    return plant, DrivenOutput(output, motors, delay_s=WIRE_S + 0.5 * SERVO_FRAME_S)
+
+
+def _valves(profile: PlantProfile, options: FlightOptions, start_s: float) -> tuple[Plant, Output]:
+    """Return a plant and the output path of its valves."""
     if options.fidelity == "averaged" or profile.pump is not None:
-        averaged: AveragedPlant | PumpPlant
-        if profile.pump is not None:
-            averaged = PumpPlant(profile, seed=options.seed, start_s=start_s)
-        else:
-            averaged = AveragedPlant(profile, seed=options.seed, start_s=start_s)
+        averaged = duty_plant(profile, seed=options.seed, start_s=start_s)
         delay_s = WIRE_S + 0.5 * SERVO_FRAME_S if options.output == "servo" else 0.0
         return averaged, AveragedOutput(averaged, delay_s=delay_s)
-    pulsed = PulsedPlant(profile, seed=options.seed, start_s=start_s)
+    pulsed = edge_plant(profile, seed=options.seed, start_s=start_s)
     if options.output == "gpio":
         return pulsed, GpioOutput(pulsed, start_s=start_s)
     board = DriverBoard(

@@ -30,6 +30,7 @@ from companion.maps.model import Problem
 from sitl.board import SERVO_FRAME_S
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.input_faults import check_on_inputs, with_faults
+from sitl.motor_parts import check_motors, droplet_figures, fits, ranges_us
 from sitl.outputs import WIRE_S
 from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
@@ -112,6 +113,7 @@ class Flown:
             "late": self.result.late,
             "unresolved": self.result.unresolved,
             "inhibits": sorted(self.result.inhibits),
+            "droplets": droplet_figures(self.task.setup, self.result.drives),
         }
         return {
             "flights": [flight],
@@ -137,7 +139,7 @@ def fly_mission(options: FlyOptions, say: Say) -> Flown:
     say(f"flown {result.simulated_s:.0f} s in {wall_s:.2f} s; evaluating")
     evaluation = evaluate(result.record)
     perfect = None
-    if task.profile.pump is None:
+    if task.profile.pump is None and not task.profile.drive_count:
         perfect = evaluate(_perfect_flight(task, trajectory, options).record)
     return Flown(
         task=task,
@@ -209,7 +211,7 @@ def _too_short(
     setup: Setup, profile: PlantProfile, over: Iterable[tuple[Leg, LineString]]
 ) -> Iterator[Problem]:
     """Yield a warning if stretches of one rate are over before a pump's flow stands."""
-    pump = profile.pump
+    pump = profile.makes_flow
     if pump is None:
         return
     # Until an exponential is within 10 % of its step: Koo's 2.6 to 3.8 s, as docs/plants.md has it.
@@ -289,13 +291,16 @@ def _plant(name: str | None, setup: Setup) -> PlantProfile:
             raise ConfigError(
                 f"--plant {name}: it has {profile.valve_count} valves, the configuration {count}"
             )
+        check_motors(profile, setup, name)
         return profile
     shipped = [load_profile(path) for path in sorted(PROFILES.glob("*.toml"))]
-    fitting = [profile for profile in shipped if profile.valve_count == count]
+    fitting = [
+        profile for profile in shipped if profile.valve_count == count and fits(profile, setup)
+    ]
     if not fitting:
         raise ConfigError(
-            f"no sprayer profile has {count} valves; give one: --plant FILE.toml, written as "
-            "those in sitl/profiles"
+            f"no sprayer profile has {count} valves and these motors; give one: --plant FILE.toml, "
+            "written as those in sitl/profiles"
         )
     full = math.log(setup.nozzle_sets[-1].flow_max_l_min)
     return min(fitting, key=lambda p: abs(math.log(p.nozzle_sets[-1].flow_max_l_min) - full))
@@ -349,6 +354,7 @@ def _flight_options(task: Task, options: FlyOptions) -> FlightOptions:
         seed=options.seed,
         position_rate_hz=float(task.config.link.position_rate_hz),
         meter_rate_hz=options.meter_rate_hz,
+        drive_ranges_us=ranges_us(task.config),
     )
 
 

@@ -48,7 +48,7 @@ def truth_arrays(flown: Flown) -> dict[str, Any]:
     """Return the true flight as arrays; metres are in the frame that the journal names."""
     record, orders = flown.result.record, flown.result.record.orders
     path = flown.trajectory.at(record.time_s)
-    return {
+    return _motor_arrays(flown) | {
         "time_s": record.time_s,
         "east_m": record.east_m,
         "north_m": record.north_m,
@@ -60,6 +60,20 @@ def truth_arrays(flown: Flown) -> dict[str, Any]:
         "order_time_s": np.array([order.at_s for order in orders], dtype=np.float64),
         "order_valve": np.array([order.valve for order in orders], dtype=np.int64),
         "order_duty": np.array([order.duty for order in orders], dtype=np.float64),
+    }
+
+
+def _motor_arrays(flown: Flown) -> dict[str, Any]:
+    """Return what pump and atomisers were told and did; nothing without any."""
+    truth = flown.result.drives
+    if truth is None:
+        return {}
+    return {
+        "drive_time_s": np.array([order.at_s for order in truth.orders], dtype=np.float64),
+        "drive_number": np.array([order.drive for order in truth.orders], dtype=np.int64),
+        "drive_us": np.array([order.pulse_us for order in truth.orders], dtype=np.float64),
+        "atomiser_rpm": truth.rpm,
+        "atomiser_vmd_um": truth.vmd_um,
     }
 
 
@@ -102,6 +116,12 @@ def fly_lines(result: dict[str, Any]) -> Iterator[str]:
         f"applied {flight['applied_ml'] / 1000.0:.3f} L, off target {flight['off_target_ml']:.1f} "
         f"mL, on ground of rate 0 {flight['zero_rate_ml']:.1f} mL"
     )
+    for drops in flight["droplets"]:
+        yield (
+            f"{drops['atomiser']}: {_number(drops['in_class_percent'], 1)} % of the volume is "
+            f"{drops['droplet_class'] or 'of a class'}, {_number(drops['near_percent'], 1)} % lies "
+            f"within 15 % of {drops['wanted_um']:g} um; mean {_number(drops['mean_vmd_um'], 0)} um"
+        )
     yield (
         f"{result['simulated_s']:.0f} s in {result['wall_s']:.2f} s: "
         f"{result['times_real_time']:.0f} times real time"

@@ -91,9 +91,12 @@ class LiquidSensors:
         pressure_rate_hz: float = 0.0,
         start_s: float,
         faults: Sequence[LiquidFault] = (),
+        also: Sequence[Plant] = (),
         seed: int = 0,
     ) -> None:
+        """Put sensors on `plant`; faults act on it and, all the same, on the plants of `also`."""
         self._plant = plant
+        self._plants = (plant, *also)
         self._start_s = start_s
         self._rates_hz = (meter_rate_hz, pressure_rate_hz)
         self._read = [0, 0]
@@ -119,13 +122,29 @@ class LiquidSensors:
         if faults and plant.profile.pump is not None:
             raise ValueError("faults of the liquid act on sprayers with valves")
 
-    def read(self, now_s: float) -> list[Input]:
-        """Return what was measured since the last call, after the faults that were due."""
+    def add(self, fault: LiquidFault) -> None:
+        """Take a fault more, whose time was not known before."""
+        self._faults.append(fault)
+
+    def act(self, now_s: float) -> None:
+        """Let the faults act that are due."""
         for number, fault in enumerate(self._faults):
             if fault.from_s <= now_s:
                 self._act(number, fault, now_s)
+
+    def counted_ml(self, now_s: float) -> float:
+        """Return what the meter has counted; asked for in order of time."""
+        return self._pulses(now_s) / self._per_ml
+
+    def pressure_kpa(self) -> float:
+        """Return one sample of the pressure sensor."""
+        return self._pressure_kpa()
+
+    def read(self, now_s: float) -> list[Input]:
+        """Return what was measured since the last call, after the faults that were due."""
+        self.act(now_s)
         reports: list[Input] = [
-            FlowReport(received_s=at_s, volume_ml=self._pulses(at_s) / self._per_ml)
+            FlowReport(received_s=at_s, volume_ml=self.counted_ml(at_s))
             for at_s in self._due(0, now_s)
         ]
         reports += [
@@ -181,26 +200,35 @@ class LiquidSensors:
     def _supplied(self, supply: float, now_s: float) -> None:
         if supply != self._supply:
             self._supply = supply
-            self._plant.restrict(now_s, openings=self._openings, supply=supply)
+            self._restrict(now_s)
+
+    def _restrict(self, now_s: float) -> None:
+        for plant in self._plants:
+            plant.restrict(now_s, openings=self._openings, supply=self._supply)
 
     def _clogged(self, fault: LiquidFault, now_s: float) -> None:
         for valve in range(len(self._openings)):
             if fault.valve is None or valve == fault.valve:
                 self._openings[valve] = 1.0 - fault.share
-        self._plant.restrict(now_s, openings=self._openings, supply=self._supply)
+        self._restrict(now_s)
 
     def _stuck(self, fault: LiquidFault, now_s: float) -> None:
         assert fault.valve is not None  # __post_init__
         is_open = fault.kind is LiquidFaultKind.STUCK_OPEN
-        self._plant.stick(now_s, fault.valve, is_open=is_open)
+        self._stick(now_s, fault.valve, is_open=is_open)
+
+    def _stick(self, now_s: float, valve: int, *, is_open: bool) -> None:
+        for plant in self._plants:
+            plant.stick(now_s, valve, is_open=is_open)
 
     def _all_shut(self, _fault: LiquidFault, now_s: float) -> None:
         for valve in range(len(self._openings)):
-            self._plant.stick(now_s, valve, is_open=False)
+            self._stick(now_s, valve, is_open=False)
 
     def _leaking(self, fault: LiquidFault, now_s: float) -> None:
         full_l_min = self._plant.profile.nozzle_sets[-1].flow_max_l_min
-        self._plant.leak(now_s, fault.share * full_l_min * ML_S_PER_L_MIN)
+        for plant in self._plants:
+            plant.leak(now_s, fault.share * full_l_min * ML_S_PER_L_MIN)
 
     def _weakened(self, fault: LiquidFault, now_s: float) -> None:
         self._supplied(1.0 - fault.share, now_s)

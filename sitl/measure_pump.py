@@ -2,10 +2,11 @@
 
     python -m sitl.measure_pump [PLANT]
 
-prints the `[lag]` table to paste. Steps of 30 % up and down, each left alone until the flow
-stands; with a shut-off valve, the boom opened and shut at a flow that stands. What was ordered is
-compared with the volume that came. The position's age is no matter of the sprayer: it is that of
-`python -m sitl.measure_lags`, for any plant behind the same autopilot.
+prints the `[lag]` table to paste, and `[pump]` where the pump has an order of its own. Steps of
+30 % up and down, each left alone until the flow stands; with valves, the boom opened and shut at a
+flow that stands. What was ordered is compared with the volume that came. The position's age is no
+matter of the sprayer: it is that of `python -m sitl.measure_lags`, for any plant behind the same
+autopilot.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 from companion.core.schedule import LagModel
 from sitl.profile import PlantProfile, load_profile
 from sitl.pump_plant import PumpPlant
+from sitl.section_plant import SectionPlant
 
 Floats = NDArray[np.float64]
 
@@ -71,6 +73,72 @@ def _rig(profile: PlantProfile, seed: int) -> list[tuple[str, float]]:
     return seen
 
 
+def measure_sections(profile: PlantProfile, *, output_s: float = 0.0) -> tuple[LagModel, LagModel]:
+    """Return the lags of a pump with an order of its own, and those of its sections' valves."""
+    pump: dict[str, list[float]] = {}
+    valves: dict[str, list[float]] = {}
+    for seed in SEEDS:
+        for seen, found in ((pump, _pump_rig(profile, seed)), (valves, _valve_rig(profile, seed))):
+            for kind, lag_s in found:
+                seen.setdefault(kind, []).append(lag_s)
+    mean = {kind: fmean(values) for kind, values in pump.items()}
+    of_valves = {kind: fmean(values) for kind, values in valves.items()}
+    return LagModel(
+        on_s=mean["on"],
+        off_s=mean["off"],
+        up_s=mean["up"],
+        down_s=mean["down"],
+        on_start_s=min(pump["first"]),
+        off_end_s=max(pump["last"]),
+        up_time_s=mean["up time"],
+        down_time_s=mean["down time"],
+        output_s=output_s,
+        position_s=POSITION_S,
+    ), LagModel(
+        on_s=of_valves["on"],
+        off_s=of_valves["off"],
+        # On-off valves change no flow; what stands here is not used.
+        up_s=of_valves["on"],
+        down_s=of_valves["off"],
+        on_start_s=min(valves["first"]),
+        off_end_s=max(valves["last"]),
+        output_s=output_s,
+        position_s=POSITION_S,
+    )
+
+
+def _pump_rig(profile: PlantProfile, seed: int) -> list[tuple[str, float]]:
+    """Return kind and lag of the pump's changes, all sections open."""
+    assert profile.supply is not None
+    plant, supply = SectionPlant(profile, seed=seed), profile.supply
+    for valve in range(profile.valve_count):
+        plant.record_change(0.0, valve, 1.0)
+    seen = []
+    orders = [
+        (kind, DWELL_S * (number + 1), part) for number, (kind, part) in enumerate(CYCLE * CYCLES)
+    ]
+    for _, at_s, part in orders:
+        plant.record_pump(at_s, supply.stop_us + part * (supply.max_us - supply.stop_us))
+    for kind, at_s, _ in orders[len(CYCLE) :]:
+        seen += _look(lambda times: plant.volume_ml(times).sum(axis=1)[:, None], kind, at_s)
+    return seen
+
+
+def _valve_rig(profile: PlantProfile, seed: int) -> list[tuple[str, float]]:
+    """Return kind and lag of the sections' openings and closings, the pump at half."""
+    assert profile.supply is not None
+    plant, supply = SectionPlant(profile, seed=seed), profile.supply
+    plant.record_pump(0.0, 0.5 * (supply.stop_us + supply.max_us))
+    orders = [(kind, DWELL_S * (number + 1)) for number, kind in enumerate(("on", "off") * CYCLES)]
+    for kind, at_s in orders:
+        for valve in range(profile.valve_count):
+            plant.record_change(at_s, valve, 1.0 if kind == "on" else 0.0)
+    seen = []
+    for kind, at_s in orders:
+        seen += _look(lambda times: plant.volume_ml(times).sum(axis=1)[:, None], kind, at_s)
+    return seen
+
+
 def _look(volume_ml: Callable[[Floats], Floats], kind: str, at_s: float) -> list[tuple[str, float]]:
     """Return what one change showed."""
     times: Floats = at_s + np.arange(-LINE_S, DWELL_S - STEP_S, STEP_S)
@@ -98,11 +166,23 @@ def _look(volume_ml: Callable[[Floats], Floats], kind: str, at_s: float) -> list
 def main(arguments: Sequence[str]) -> int:
     """Print the `[lag]` table of a plant."""
     name = arguments[0] if arguments else "pump"
-    lag = measure(load_profile(name))
-    sys.stdout.write(f"# {name}: `python -m sitl.measure_pump {name}`\n[lag]\n")
-    names = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s", "output_s")
-    for key in (*names, "position_s", "up_time_s", "down_time_s"):
-        sys.stdout.write(f"{key} = {getattr(lag, key):.4f}\n")
+    profile = load_profile(name)
+    sys.stdout.write(f"# {name}: `python -m sitl.measure_pump {name}`\n")
+    names: tuple[str, ...] = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s")
+    names = (*names, "output_s", "position_s")
+    lag = pump = None
+    if profile.has_sections:
+        pump, lag = measure_sections(profile)
+    else:
+        lag = measure(profile)
+        names = (*names, "up_time_s", "down_time_s")
+    sys.stdout.write("[lag]\n")
+    sys.stdout.writelines(f"{key} = {getattr(lag, key):.4f}\n" for key in names)
+    if pump is not None:
+        rows = {"spin_up_s": "on_start_s", "stop_end_s": "off_end_s"}
+        rows |= {key: key for key in ("up_s", "down_s", "up_time_s", "down_time_s")}
+        sys.stdout.write("\n[pump]\n")
+        sys.stdout.writelines(f"{key} = {getattr(pump, rows[key]):.4f}\n" for key in rows)
     return 0
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -87,3 +87,35 @@ class MeterStream:
             self._part_ml += step_s * (self._flow_ml_s + 0.5 * self._slope_ml_s2 * step_s)
             self._flow_ml_s += self._slope_ml_s2 * step_s
             self._at_s = until_s
+
+
+class _Volume(Protocol):
+    """A flow that knows its volume at any one time."""
+
+    def volume_at(self, time_s: float) -> float:
+        """Return the cumulative volume."""
+
+
+class VolumeMeter(MeterStream):
+    """The meter of a flow that is no chain of ramps: a pump's."""
+
+    def __init__(
+        self,
+        flow: _Volume,
+        *,
+        start_s: float,
+        period_s: float,
+        lag_s: float,
+        per_ml: float,
+        factors: Callable[[int], list[float]],
+    ) -> None:
+        super().__init__(
+            start_s=start_s, period_s=period_s, lag_s=lag_s, per_ml=per_ml, factors=factors
+        )
+        self._flow = flow
+        self._seen_ml = 0.0
+
+    def _run(self, until_s: float) -> None:
+        volume_ml = self._flow.volume_at(until_s)
+        self._part_ml += volume_ml - self._seen_ml
+        self._seen_ml = volume_ml

@@ -15,13 +15,33 @@ from companion.core.types import TimedChange
 from companion.output.pwm import PulseEngine
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from companion.core.types import SprayPlan
+    from companion.output.pwm import Edge
     from sitl.board import DriverBoard
-    from sitl.plant import AveragedPlant, PulsedPlant
-    from sitl.pump_plant import PumpPlant
+    from sitl.profile import PlantProfile
 
 # An order is on its way to the autopilot this long: 44 bytes over a telemetry port.
 WIRE_S = 0.002
+
+
+class TakesDuties(Protocol):
+    """A plant that is fed with changes of duty."""
+
+    profile: PlantProfile
+
+    def record_change(self, at_s: float, valve: int, duty: float) -> None:
+        """Take down that `valve` has `duty` from `at_s` on."""
+
+
+class TakesEdges(Protocol):
+    """A plant that is fed with edges."""
+
+    profile: PlantProfile
+
+    def record(self, edges: Iterable[Edge]) -> None:
+        """Take down edges."""
 
 
 class Output(Protocol):
@@ -91,7 +111,7 @@ class PlanFollower:
 class AveragedOutput:
     """Duties act as they are, after the mean delay of the output path."""
 
-    def __init__(self, plant: AveragedPlant | PumpPlant, *, delay_s: float = 0.0) -> None:
+    def __init__(self, plant: TakesDuties, *, delay_s: float = 0.0) -> None:
         self._plant = plant
         self._delay_s = delay_s
         self._follower = PlanFollower(plant.profile.valve_count)
@@ -117,7 +137,7 @@ class AveragedOutput:
 class GpioOutput:
     """The pulse engine, to the edge."""
 
-    def __init__(self, plant: PulsedPlant, *, start_s: float) -> None:
+    def __init__(self, plant: TakesEdges, *, start_s: float) -> None:
         profile = plant.profile
         self._plant = plant
         self._engine = PulseEngine(
@@ -147,7 +167,7 @@ class ServoOutput:
 
     def __init__(
         self,
-        plant: PulsedPlant,
+        plant: TakesEdges,
         board: DriverBoard,
         *,
         wire_s: float = WIRE_S,

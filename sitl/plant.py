@@ -47,7 +47,7 @@ class Flow(Protocol):
         """Drop what is only needed for times before `before_s`."""
 
 
-class _Ramps:
+class Ramps:
     """The flow of one valve: steps, each spread over a ramp, and their integral."""
 
     def __init__(self, start_s: float) -> None:
@@ -81,6 +81,21 @@ class _Ramps:
         more_ml = knot_ml[i] + since_s * (flow_ml_s[i] + 0.5 * slope[i] * since_s)
         result: Floats = volume_ml + np.where(i >= 0, more_ml, 0.0)
         return result
+
+    def lines(self) -> tuple[Floats, Floats, Floats]:
+        """Return since when the flow is which line: time, flow [mL/s], slope; from long ago on."""
+        if self._knots is None and self._steps:
+            self._knots = self._build()
+        base, flat = np.array([self._from_ml_s]), np.zeros(1)
+        if self._knots is None:
+            return np.array([self._from_s]), base, flat
+        at_s, slope, flow_ml_s, _ = self._knots
+        first_s = np.minimum(self._from_s, at_s[:1]) - 1.0
+        return (
+            np.concatenate((first_s, at_s)),
+            np.concatenate((base, base + flow_ml_s)),
+            np.concatenate((flat, slope)),
+        )
 
     def _build(self) -> tuple[Floats, Floats, Floats, Floats]:
         steps = np.array(self._steps)
@@ -131,7 +146,7 @@ class Plant:
         self._scatter = draw_scatter(profile, rng)
         self._table = flow_table(profile)
         count = profile.valve_count
-        self._ramps = [_Ramps(start_s) for _ in range(count)]
+        self._ramps = [Ramps(start_s) for _ in range(count)]
         self._flows: Sequence[Flow] = self._ramps
         self._level_ml_s = [0.0] * count
         self._duty = [0.0] * count
@@ -144,7 +159,7 @@ class Plant:
         self._opening = [1.0] * count
         self._supply = 1.0
         self._leak_ml_s = 0.0
-        self._leak = _Ramps(start_s)
+        self._leak = Ramps(start_s)
         self._start_s = self._forgotten_s = start_s
         spread = profile.meter.gain_spread
         self._meter = _MeterState(

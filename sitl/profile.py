@@ -16,6 +16,7 @@ from companion.core.boom import Boom, Valve
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
 from companion.core.schedule import LagModel
 from companion.errors import ConfigError
+from sitl.supply import Atomiser, Supply, read_atomiser
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -66,7 +67,8 @@ class PlantProfile:
     An edge at the driver becomes flow `dead_open_s` (or `dead_close_s`) later, as a ramp of
     `ramp_s` (`ramp_close_s` where closing takes another time). The scatters are 1 sd between
     valves: of the whole lag, and of the flow. With a `pump` it is the pump's speed that makes the
-    flow, and the edges are those of its shut-off valve.
+    flow, and the edges are those of its shut-off valve. A `supply` is a pump with an order of its
+    own, and what is not PWM is on-off; the curve of a pump that modulates is of its range.
     """
 
     name: str
@@ -83,6 +85,8 @@ class PlantProfile:
     meter: Meter
     ramp_close_s: float | None = None
     pump: Pump | None = None
+    supply: Supply | None = None
+    atomisers: tuple[Atomiser, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.nozzle_sets or not 0.0 < self.boom_width_m < 1000.0:
@@ -108,6 +112,34 @@ class PlantProfile:
             and self.closing_s == self.ramp_s
         ):
             raise ValueError("a pump has one valve_count, with equal edges to open and to shut")
+        self._check_drives()
+
+    def _check_drives(self) -> None:
+        if self.pump is not None and self.supply is not None:
+            raise ValueError("[pump] and [supply] are two kinds of sprayer; give one of them")
+        for atomiser in self.atomisers:
+            if not set(atomiser.valves) <= set(range(self.valve_count)):
+                raise ValueError(f"atomiser {atomiser.name}: no such valves {atomiser.valves}")
+
+    @property
+    def drive_count(self) -> int:
+        """Return how many motors have an order of their own."""
+        return (self.supply is not None) + len(self.atomisers)
+
+    @property
+    def has_sections(self) -> bool:
+        """Return whether a pump makes the flow, and valves only open and shut."""
+        return self.supply is not None and self.supply.control == "modulates"
+
+    @property
+    def makes_flow(self) -> Pump | None:
+        """Return how the flow follows the pump that makes it; None where valves do."""
+        supply = self.supply
+        if supply is None or supply.control != "modulates":
+            return self.pump
+        return Pump(
+            dead_s=supply.dead_s, up_s=supply.up_s, down_s=supply.down_s, shut_off=supply.valves
+        )
 
     @property
     def closing_s(self) -> float:
@@ -132,8 +164,8 @@ class PlantProfile:
 
     def lags(self, shift_s: float = 0.0) -> LagModel:
         """Return the lags of a valve that is `shift_s` later than the nominal one, no output."""
-        if self.pump is not None:
-            return self._pump_lags(self.pump)
+        if self.makes_flow is not None:
+            return self._pump_lags(self.makes_flow)
         lag_s = self.mean_lag_s + shift_s
         return LagModel(
             on_s=lag_s,
@@ -291,12 +323,15 @@ def _profile(table: dict[str, Any]) -> PlantProfile:
         for entry in table.pop("nozzle_set")
     )
     pwm, meter, flow = table.pop("pwm"), table.pop("meter"), table.pop("flow")
-    pump = table.pop("pump", None)
+    pump, supply = table.pop("pump", None), table.pop("supply", None)
+    atomisers = tuple(read_atomiser(entry) for entry in table.pop("atomiser", ()))
     return PlantProfile(
         pwm=PwmLimits(**pwm),
         meter=Meter(**meter),
         nozzle_sets=sets,
         pump=None if pump is None else Pump(**pump),
+        supply=None if supply is None else Supply(**supply),
+        atomisers=atomisers,
         **flow,
         **table,
     )

@@ -15,12 +15,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sitl.meter import MeterStream
+from sitl.meter import MeterStream, VolumeMeter
 from sitl.plant import Faults, Floats, Plant
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from sitl.profile import PlantProfile, Pump
 
 # What is left below this of a distance to the pump's level [mL/s] or of a slope is rounding.
@@ -140,31 +138,6 @@ class PumpFlow:
         )
 
 
-class _PumpMeter(MeterStream):
-    """The meter behind a pump: its flow is no chain of ramps."""
-
-    def __init__(
-        self,
-        flow: PumpFlow,
-        *,
-        start_s: float,
-        period_s: float,
-        lag_s: float,
-        per_ml: float,
-        factors: Callable[[int], list[float]],
-    ) -> None:
-        super().__init__(
-            start_s=start_s, period_s=period_s, lag_s=lag_s, per_ml=per_ml, factors=factors
-        )
-        self._flow = flow
-        self._seen_ml = 0.0
-
-    def _run(self, until_s: float) -> None:
-        volume_ml = self._flow.volume_at(until_s)
-        self._part_ml += volume_ml - self._seen_ml
-        self._seen_ml = volume_ml
-
-
 class PumpPlant(Plant):
     """One channel for the whole boom: the pump's speed, and the shut-off valve where there is one.
 
@@ -203,7 +176,7 @@ class PumpPlant(Plant):
     def meter_stream(self) -> MeterStream:
         """Return the meter to be read in passing."""
         meter, state = self.profile.meter, self._meter
-        return _PumpMeter(
+        return VolumeMeter(
             self._flow,
             start_s=self._start_s,
             period_s=self.profile.pwm.period_s,

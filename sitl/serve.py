@@ -22,6 +22,8 @@ from sitl.anyang import EXAMPLE, anyang_items
 from sitl.stub.build import StubOptions, build_autopilot, firmware_of
 from sitl.stub.firmware import Firmware
 from sitl.stub.flight_plan import starts_with_take_off
+from sitl.stub.liquid import LiquidOptions, words_of
+from sitl.stub.liquid_entries import TAKE_OFF
 from sitl.stub.mission_file import read_mission
 from sitl.stub.mission_items import MissionItem, item_message
 from sitl.stub.operator import Operator, Step
@@ -61,7 +63,9 @@ class ServeOptions:
     gust_m_s: float = 1.0
     seed: int = 0
     out: Path | None = None
+    sensors: Path | None = None
     enable: bool = True
+    ground: bool = False
     wait_s: float | None = None
 
 
@@ -113,6 +117,8 @@ class _Run:
             start_s=start_s,
             written=self.sprayer.take,
         )
+        if self.sprayer.liquid is not None:
+            self.autopilot.batteries = self.sprayer.liquid.batteries
         self.operator = Operator(self.autopilot, enable=options.enable)
         self.truth = TruthLog(self.autopilot.flight.world, self.sprayer, home)
         self._options = options
@@ -122,7 +128,7 @@ class _Run:
         self._step = self.operator.step
         self._done = asyncio.Event()
         self._gave_up = False
-        self._texts = 0
+        self._texts = self._faults = 0
         self.late_s: list[float] = []
         self.autopilot.says = lambda text: say(f"autopilot: {text}")
 
@@ -140,14 +146,18 @@ class _Run:
 
     def tick(self, now_s: float) -> None:
         """Let operator, sprayer and log go on; called after each tick of the stub."""
-        self.operator.tick(now_s)
+        if not self._options.ground:
+            self.operator.tick(now_s)
+        take_off_s = self.autopilot.faults.take_off_s
+        if take_off_s is not None:
+            self.sprayer.begins(TAKE_OFF, take_off_s)
         self.sprayer.advance(now_s)
         self.truth.tick(now_s, flying=self.operator.step in (Step.FLYING, Step.LANDING))
         self._tell(now_s)
         if self.operator.step is Step.DONE and now_s >= self.truth.until_s + _AFTER_LANDING_S:
             self._done.set()
         wait_s = self._options.wait_s
-        waiting = self.operator.step is Step.WAITING
+        waiting = self.operator.step is Step.WAITING and not self._options.ground
         if waiting and wait_s is not None and now_s - self._start_s > wait_s:
             self._gave_up = True
             self._done.set()
@@ -163,6 +173,11 @@ class _Run:
             "late_ms": _spread_ms(self.late_s),
             **self.truth.summary(),
         }
+        if self.sprayer.liquid is not None:
+            begun = self.sprayer.liquid.begun(time.monotonic())
+            summary["liquid"] = [
+                {"fault": words_of(fault), "from_s": round(fault.from_s, 3)} for fault in begun
+            ]
         if self._options.out is not None:
             self.truth.write(self._options.out, summary)
             if summary["state"] == Step.DONE.value:
@@ -186,6 +201,10 @@ class _Run:
         for text in texts[self._texts :]:
             self._say(f"companion: {text}")
         self._texts = len(texts)
+        begun = [] if self.sprayer.liquid is None else self.sprayer.liquid.begun(now_s)
+        for fault in begun[self._faults :]:
+            self._say(f"liquid: {words_of(fault)}")
+        self._faults = len(begun)
         flying = self.operator.step in (Step.FLYING, Step.LANDING)
         if self.operator.step is self._step and not (flying and now_s >= self._say_due_s):
             return
@@ -264,9 +283,20 @@ def _first_course_deg(items: tuple[MissionItem, ...], home: LocalFrame) -> float
     return 0.0
 
 
-def _pins(options: ServeOptions, config: Config, scenario: Scenario) -> tuple[int, ...]:
-    """Return the output of each valve; PX4's channels are actuators, which parameters place."""
-    channels = tuple(valve.channel for valve in config.boom().valves)
+def _drive_channels(config: Config) -> tuple[int, ...]:
+    """Return the channels of the motors, as the configuration has them."""
+    pump = () if config.pump is None else (config.pump,)
+    motors = (*pump, *config.atomiser)
+    if any(motor.output != "autopilot" for motor in motors):
+        raise ConfigError(
+            f'{config.path}: a motor with output = "pwm" hangs on this computer, where the '
+            "simulated autopilot does not see it; fly it with `vrspray sitl fly`"
+        )
+    return tuple(motor.channel for motor in motors)
+
+
+def _pins(options: ServeOptions, scenario: Scenario, channels: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the output of each channel; PX4's are actuators, which parameters place."""
     if options.autopilot != "px4":
         return channels
     parameters = px4_parameters()
@@ -280,14 +310,34 @@ def _pins(options: ServeOptions, config: Config, scenario: Scenario) -> tuple[in
     return tuple(actuators.get(channel, -channel) for channel in channels)
 
 
+def _liquid(options: ServeOptions, scenario: Scenario) -> LiquidOptions | None:
+    """Return what goes wrong with the liquid and who sees it; None where nothing is asked for."""
+    batteries = (scenario.meter_battery, scenario.tank_battery)
+    if options.autopilot == "px4" and batteries != (None, None):
+        raise ConfigError(
+            f"{scenario.source}: sensors: PX4 has no fuel flow meter; leave meter_battery and "
+            "tank_battery out, or give --autopilot ardupilot"
+        )
+    found = LiquidOptions(
+        entries=scenario.liquid,
+        meter_battery=scenario.meter_battery,
+        tank_battery=scenario.tank_battery,
+        tank_l=scenario.tank_l,
+        pressure_folder=options.sensors,
+    )
+    return None if found == LiquidOptions() else found
+
+
 def _sprayer_options(options: ServeOptions, config: Config, scenario: Scenario) -> SprayerOptions:
     """Return the sprayer as the configuration wires it."""
     return SprayerOptions(
         profile=options.profile,
         board=options.board,
-        channels=_pins(options, config, scenario),
+        channels=_pins(options, scenario, tuple(valve.channel for valve in config.boom().valves)),
         closed_us=config.output.closed_us,
         full_us=config.output.full_us,
         box_closed_s=scenario.box_closed_s,
+        liquid=_liquid(options, scenario),
         seed=options.seed,
+        drive_channels=_pins(options, scenario, _drive_channels(config)),
     )

@@ -37,11 +37,15 @@ COMMANDS = {
         "sitl.demo_cli:demo", "Fly the field of the first paper by all methods; compare them."
     ),
     "run": Place("companion.cli.run:run", "Spray: the companion beside the flight controller."),
+    "ground": Place(
+        "companion.cli.ground:app", "Prime, flush, rinse, catch, click: on the ground, key held."
+    ),
     "doctor": Place("companion.cli.doctor:app", "Check all that must hold before a flight."),
     "service": Place("companion.cli.service:app", "Run as a service, with systemd's watchdog."),
     "config": Place("companion.cli.config:app", "Check or show a configuration; print its schema."),
     "map": Place("companion.cli.map:app", "Check, show, convert and make prescription maps."),
     "plan": Place("missions.cli:app", "Plan the passes over a field, sortie by sortie."),
+    "upload": Place("missions.upload.cli:app", "Put a mission on the vehicle; read it back."),
     "sitl": Place("sitl.cli:app", "Simulated flight controller and sprayer."),
     "calibrate": Place(
         "analysis.calibrate_cli:app", "Measure lags and flow curves; plan the flight for it."

@@ -13,6 +13,8 @@ from typing import Annotated
 import typer
 
 from companion.cli.answer import AsJson, Overrides, answer
+from companion.cli.doctor_click import guided_click
+from companion.cli.doctor_watchdogs import watchdog_checks
 from companion.cli.gpio_parts import engine_setup
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.run import component_options
@@ -25,6 +27,7 @@ from companion.core.controller import Setup
 from companion.doctor.check import Check, Status, fail, is_ready, split_advice
 from companion.doctor.computer import computer_checks
 from companion.doctor.computer_facts import read_computer
+from companion.doctor.engine import engine_checks, read_engine
 from companion.doctor.gpio import gpio_checks, read_chip, read_register
 from companion.doctor.listen import listen
 from companion.doctor.outputs import output_checks
@@ -50,12 +53,21 @@ def doctor(
     wait_s: Annotated[
         float, typer.Option(min=1.0, max=120.0, help="Listen to the vehicle for at most this long.")
     ] = 10.0,
+    is_click: Annotated[
+        bool, typer.Option("--click", help="Guided: let each valve click; nothing else is checked.")
+    ] = False,
+    is_watchdogs: Annotated[
+        bool, typer.Option("--watchdogs", help="Try the watchdogs; nothing else is checked.")
+    ] = False,
+    is_wet: Annotated[
+        bool, typer.Option("--wet", help="With --click: with water, judged by the flow meter.")
+    ] = False,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Check all that must hold before a flight; say of each how it is and what to do.
 
-    A disarmed ArduPilot is ordered to close its valves; nothing else is ordered.
+    A disarmed ArduPilot is ordered to close its valves; nothing is opened without --click.
     Exit 0: no check failed; 1: one did; 2: the configuration cannot be used.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.ERROR)
@@ -65,7 +77,14 @@ def doctor(
     except ConfigError as error:
         checks, code = [refused_configuration(error), *_computer(None)], 2
     else:
-        checks = [*_all(config, given, wait_s=None if no_vehicle else wait_s)]
+        vehicle_s = None if no_vehicle else wait_s
+        checks = []
+        if is_watchdogs:
+            checks += watchdog_checks(config, given, wait_s=vehicle_s)
+        if is_click or is_wet:
+            checks += guided_click(config, given, is_wet=is_wet)
+        if not (is_click or is_wet or is_watchdogs):
+            checks += _all(config, given, wait_s=vehicle_s)
         code = 0 if is_ready(checks) else 1
     answer(
         {"ok": is_ready(checks), "checks": [check.as_object() for check in checks]},
@@ -92,6 +111,7 @@ def _all(config: Config, given: tuple[str, ...], *, wait_s: float | None) -> Ite
 def _gpio(config: Config) -> Iterator[Check]:
     if config.output.kind != "gpio":
         yield from gpio_checks(None, None)
+        yield from engine_checks(None)
         return
     setup = engine_setup(config)
     is_register = setup.backend == "spi595"
@@ -99,6 +119,7 @@ def _gpio(config: Config) -> Iterator[Check]:
         read_register(setup.device) if is_register else read_chip(setup.device, setup.wiring.lines)
     )
     yield from gpio_checks(chip, setup.wiring)
+    yield from engine_checks(read_engine(setup))
 
 
 def _computer(config: Config | None) -> Iterator[Check]:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from companion.cli.answer import note
 from companion.config import Config, load
+from companion.config.sensor_rules import tank_capacity_l
 from companion.errors import ConfigError
 from companion.link.component import ComponentOptions
 from companion.link.parameters import SETTINGS, Parameters, known_parameters
@@ -44,7 +45,7 @@ def build_link(config: Config, given: Sequence[str], options: ComponentOptions) 
     state = _state_file(config)
     in_force = {key: value for key, (value, _) in config.settings().items()}
     settings = {key: float(in_force[key]) for key, _, _ in SETTINGS.values() if key in in_force}
-    tank_l = None if config.mission is None else config.mission.tank_l
+    tank_l = tank_capacity_l(config)
 
     def save(values: Mapping[str, float]) -> bool:
         return write_state(state, values)

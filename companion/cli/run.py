@@ -16,11 +16,10 @@ import typer
 from companion import runtime
 from companion.assembly import build_setup, deliverable
 from companion.cli.answer import AsJson, Overrides, answer, note
-from companion.cli.gpio_parts import build_gpio
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.notify import Notifier
-from companion.cli.sensor_parts import build_sensors
-from companion.cli.servo_parts import build_servo, servo_options
+from companion.cli.output_parts import build_outputs, parts_of
+from companion.cli.sensor_parts import build_sensors, follow_refills
 from companion.config import Config
 from companion.config.rules import without_effect
 from companion.errors import ActuatorError, LinkError, SensorError
@@ -28,7 +27,7 @@ from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_budget import dither_too_much
-from companion.output.none import DryRunExecutor
+from companion.output.gpio import GpioExecutor
 from companion.output.servo import DITHER_S
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
@@ -45,6 +44,9 @@ def run_companion(
     duration_s: Annotated[
         float | None, typer.Option(min=0.0, max=1e7, help="Stop by itself after this time.")
     ] = None,
+    is_water: Annotated[
+        bool, typer.Option("--water", help="Training with water: marked in every record.")
+    ] = False,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
@@ -54,19 +56,27 @@ def run_companion(
     whatever ends it.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
-    config, given = load_with_kept(config_file, overrides or ())
+    wanted = (*(overrides or ()), *(["journal.training=true"] if is_water else []))
+    config, given = load_with_kept(config_file, wanted)
+    training = training_mark(config)
     setup = build_setup(config)
-    link = build_link(config, given, component_options(config))
+    link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
     sensors = build_sensors(config)
+    follow_refills(sensors, link)
     for line in _warnings(config):
         note(line)
     if config.mission is not None:
         for problem in deliverable(setup, config.mission.speed_m_s):
             note(f"{problem.severity}: {problem.text}; {problem.fix}")
     folder = config.resolve(config.journal.folder)
-    journal = Journal.create(folder, setup=setup, setup_text=_about(config, given))
+    journal = Journal.create(
+        folder, setup=setup, setup_text=_about(config, given), training=training
+    )
     link.on_event(journal.record_event)
+    for part in parts_of(executor):
+        if isinstance(part, GpioExecutor):
+            part.on_event = journal.record_event
     notifier = Notifier.from_environment(os.environ, pid=os.getpid())
     try:
         with journal, notifier:
@@ -87,13 +97,22 @@ def run_companion(
             journal.path.unlink()
         raise
     answer(
-        {"journal": str(journal.path), "lost_rows": journal.lost},
+        {"journal": str(journal.path), "lost_rows": journal.lost, "training": training},
         [f"journal: {journal.path}"],
         as_json=as_json,
     )
 
 
-def component_options(config: Config) -> ComponentOptions:
+def training_mark(config: Config) -> str:
+    """Return what of this run is no spraying of a product: `water`, `dry`, or `no`."""
+    if config.output.kind == "none":
+        return "dry"
+    return "water" if config.journal.training else "no"
+
+
+def component_options(
+    config: Config, *, training: str = "no", watch_mission: bool = False
+) -> ComponentOptions:
     """Return who we are on the link."""
     major, minor, patch, *_ = (*map(int, re.findall(r"\d+", version("vrspray"))), 0, 0, 0)
     return ComponentOptions(
@@ -105,18 +124,14 @@ def component_options(config: Config) -> ComponentOptions:
         full_us=config.output.full_us,
         use_mission=config.prediction.use_mission,
         use_battery="autopilot" in (config.flow_meter.source, config.tank.source),
+        watch_mission=watch_mission,
+        training="" if training == "no" else training,
     )
 
 
 def build_executor(config: Config, link: VehicleLink) -> PlanExecutor:
     """Return what carries plans out: servo outputs, lines of this computer, or nothing."""
-    output = config.output
-    options = servo_options(config)
-    if options is not None:
-        return build_servo(config, options, link)
-    if output.kind == "gpio":
-        return build_gpio(config)
-    return DryRunExecutor(len(config.valve), has_return=output.return_channel is not None)
+    return build_outputs(config, link)
 
 
 def _warnings(config: Config) -> list[str]:

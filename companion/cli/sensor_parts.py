@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from companion.config import Config
 from companion.config.sensor_rules import tank_capacity_l
 from companion.config.sensor_tables import ConverterTable
+from companion.link.vehicle_link import VehicleLink
 from companion.ports import Sensor
 from companion.sensors.current_loop import CurrentLoop
+from companion.sensors.estop import EstopSwitch
 from companion.sensors.flow_meter import FlowMeter
 from companion.sensors.gauge import Gauge
 from companion.sensors.gpiod_edges import GpiodEdges
+from companion.sensors.gpiod_level import GpiodLevel
 from companion.sensors.pressure import PressureSensor
 from companion.sensors.pulses import Meter
 from companion.sensors.tank import TankSensor
@@ -24,6 +29,9 @@ PRESSURE_PERIODS = 3
 def build_sensors(config: Config) -> list[Sensor]:
     """Return the sensors that this computer reads, in the order in which they are read."""
     sensors: list[Sensor] = []
+    if config.safety.estop_line is not None:
+        line = GpiodLevel(config.output.chip, config.safety.estop_line, key="safety.estop_line")
+        sensors.append(EstopSwitch(line))
     meter = _flow_meter(config)
     if meter is not None:
         sensors.append(meter)
@@ -34,6 +42,13 @@ def build_sensors(config: Config) -> list[Sensor]:
     if tank is not None:
         sensors.append(tank)
     return sensors
+
+
+def follow_refills(sensors: Sequence[Sensor], link: VehicleLink) -> None:
+    """Have the tank's sensor learn of what the operator fills in."""
+    for sensor in sensors:
+        if isinstance(sensor, TankSensor):
+            link.on_refilled(sensor.refilled)
 
 
 def _flow_meter(config: Config) -> FlowMeter | None:

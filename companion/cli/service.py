@@ -14,6 +14,7 @@ import typer
 
 from companion.cli.answer import AsJson, answer
 from companion.cli.gpio_parts import engine_setup
+from companion.cli.motor_parts import motor_closer_arguments, pwm_drives
 from companion.cli.service_unit import Unit
 from companion.cli.systemd import (
     NAME,
@@ -129,6 +130,7 @@ def build_unit(config: Config, *, is_user: bool, account: str, is_realtime: bool
     """Return the unit for a configuration on this computer."""
     is_gpio = config.output.kind == "gpio"
     closer = closer_arguments(engine_setup(config)) if is_gpio else []
+    closer += motor_closer_arguments(config)
     folders = (config.journal.folder, config.link.state_folder)
     try:
         return Unit(
@@ -140,6 +142,7 @@ def build_unit(config: Config, *, is_user: bool, account: str, is_realtime: bool
             account=account,
             groups=tuple(group for group in _GROUPS if _exists(group)),
             is_realtime=is_realtime,
+            writes_sysfs=bool(pwm_drives(config)),
         )
     except ValueError as error:
         raise ServiceError(f"{config.path}: {error}") from error

@@ -49,6 +49,7 @@ class Unit:
     account: str = ""
     groups: tuple[str, ...] = ()
     is_realtime: bool = False
+    writes_sysfs: bool = False
 
     def text(self) -> str:
         """Return the unit's file."""
@@ -86,7 +87,11 @@ class Unit:
     def _sandbox(self) -> str:
         # Root without its capabilities could not write to a folder of another user.
         is_root = self.account in ("", "root")
-        return _SANDBOX.format(
+        # Hardware PWM is written in /sys, which this would make read-only.
+        sandbox = (
+            _SANDBOX.replace("ProtectKernelTunables=yes\n", "") if self.writes_sysfs else _SANDBOX
+        )
+        return sandbox.format(
             writable=" ".join(quoted(path) for path in self.writable),
             capabilities="# Better run as a user: --run-as USER"
             if is_root

@@ -1,7 +1,8 @@
-"""From the configuration to the valves behind the autopilot's servo outputs."""
+"""From the configuration to the valves and motors behind the autopilot's servo outputs."""
 
 from __future__ import annotations
 
+from companion.cli.motor_parts import motors
 from companion.config import Config
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
@@ -9,16 +10,20 @@ from companion.output.servo import ServoExecutor, ServoOptions
 
 
 def servo_options(config: Config) -> ServoOptions | None:
-    """Return how the valves hang on the autopilot; None where they do not."""
+    """Return what hangs on the autopilot, valves or motors; None where nothing does."""
     output = config.output
-    if output.kind != "servo":
+    channels = tuple(valve.channel for valve in config.valve if valve.channel is not None)
+    has_valves = output.kind == "servo" and bool(channels)
+    drives = tuple(motor.drive for motor in motors(config) if motor.chip is None)
+    if not has_valves and not drives:
         return None
     return ServoOptions(
-        channels=tuple(valve.channel or 0 for valve in config.valve),
+        channels=channels if has_valves else (),
         closed_us=output.closed_us,
         full_us=output.full_us,
         dither_us=output.dither_us,
-        return_channel=output.return_channel,
+        return_channel=output.return_channel if has_valves else None,
+        drives=drives,
     )
 
 

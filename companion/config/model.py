@@ -8,7 +8,14 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, PrivateAttr, model_validator
 from pydantic_core import PydanticCustomError
 
-from companion.config import correction_tables, sensor_tables, sprayer_tables, tables
+from companion.config import (
+    correction_tables,
+    motor_tables,
+    motors,
+    sensor_tables,
+    sprayer_tables,
+    tables,
+)
 from companion.config.rules import contradictions
 from companion.core.boom import Boom, Valve
 from companion.core.drift import Drift, blowing, fall_s
@@ -25,6 +32,8 @@ FIXES = {
     "rtk-float": Fix.RTK_FLOAT,
     "rtk-fixed": Fix.RTK_FIXED,
 }
+# Ten times what an RTK receiver says of itself when all is well.
+RTK_ACCURACY_MAX_M = 0.3
 
 
 class Config(tables.Table):
@@ -45,6 +54,10 @@ class Config(tables.Table):
     lag: sprayer_tables.LagTable
     output: sprayer_tables.OutputTable = sprayer_tables.OutputTable()
     gpio: sprayer_tables.GpioTable = sprayer_tables.GpioTable()
+    pump: motor_tables.PumpTable | None = None
+    atomiser: Annotated[
+        tuple[motor_tables.AtomiserTable, ...], Field(strict=False, max_length=32)
+    ] = ()
     safety: tables.SafetyTable = tables.SafetyTable()
     mission: tables.MissionTable | None = None
     product: tables.ProductTable = tables.ProductTable()
@@ -120,6 +133,9 @@ class Config(tables.Table):
 
     def nozzle_sets(self) -> tuple[NozzleSet, ...]:
         """Return the measured sets, from the smallest to the largest flow."""
+        of_pump = motors.pump_set(self)
+        if of_pump is not None:
+            return (of_pump,)
         index = {valve.name: number for number, valve in enumerate(self.valve)}
         sets = [
             NozzleSet(
@@ -131,7 +147,16 @@ class Config(tables.Table):
         return tuple(sorted(sets, key=lambda nozzles: nozzles.flow_max_l_min))
 
     def pwm_limits(self) -> PwmLimits:
-        """Return what the valves can follow."""
+        """Return what the valves can follow, or the pump that makes their flow."""
+        least = motors.fraction_min(self)
+        if least is not None:
+            return PwmLimits(
+                frequency_hz=self.pwm.frequency_hz,
+                duty_min=least,
+                duty_max=1.0,
+                min_on_s=0.0,
+                min_off_s=0.0,
+            )
         return PwmLimits(
             frequency_hz=self.pwm.frequency_hz,
             duty_min=self.pwm.duty_min,
@@ -184,7 +209,16 @@ class Config(tables.Table):
             speed_check_required=safety.speed_check_required,
             enable_by=frozenset(safety.enable_by),
             rc_channel=safety.rc_channel,
+            accuracy_max_m=self._accuracy_max_m(),
+            estop_required=safety.estop_line is not None,
         )
+
+    def _accuracy_max_m(self) -> float | None:
+        """Return the limit on what the receiver says of itself; by default only of an RTK fix."""
+        safety = self.safety
+        if safety.accuracy_max_m is None and FIXES[safety.fix] >= Fix.RTK_FLOAT:
+            return RTK_ACCURACY_MAX_M
+        return safety.accuracy_max_m
 
     def drift_law(self) -> Drift | None:
         """Return where droplets are expected to land; None unless it is to be corrected for."""

@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
+from companion.config.motor_rules import motor_contradictions, motor_warnings
+from companion.config.motors import makes_flow
 from companion.config.sensor_rules import sensor_contradictions
 from companion.core.nozzle import FlowCurve
 
@@ -47,7 +49,7 @@ def contradictions(config: Config) -> Rule:
     )  # fmt: skip
     for rule in rules:
         yield from rule(config)
-    for key, text in sensor_contradictions(config):
+    for key, text in chain(motor_contradictions(config), sensor_contradictions(config)):
         yield Contradiction(key=key, text=text)
 
 
@@ -89,6 +91,8 @@ def without_effect(config: Config) -> Rule:
             key="flow_trim.enabled",
             text="no flow meter is configured (flow_meter.source): the trim stays 1",
         )
+    for key, text in motor_warnings(config):
+        yield Contradiction(key=key, text=text)
     settings = {
         "web.enabled": config.web.enabled,
     }
@@ -136,7 +140,7 @@ def _channels(config: Config) -> Rule:
     last = SERVO_OUTPUTS if kind == "servo" else GPIO_LAST[config.gpio.driver]
     what = "servo output" if kind == "servo" else "GPIO line"
     for key, channel in channels.items():
-        if channel is None:
+        if channel is None and not makes_flow(config):
             yield Contradiction(key=key, text=f"missing; write the {what}, {first} to {last}")
     if config.output.return_channel is not None:
         channels["output.return_channel"] = config.output.return_channel
@@ -148,7 +152,7 @@ def _channels(config: Config) -> Rule:
     for key, channel in channels.items():
         if channel is not None and not first <= channel <= last:
             yield Contradiction(key=key, text=f"no {what}; write one from {first} to {last}")
-        if counts[channel] > 1:
+        if channel is not None and counts[channel] > 1:
             yield Contradiction(key=key, text=f"used twice; give each valve its own {what}")
 
 
@@ -172,7 +176,8 @@ def _nozzle_sets(config: Config) -> Rule:
         if len(set(table.valves)) != len(table.valves):
             yield Contradiction(key=f"{key}.valves", text="a valve stands twice; name it once")
         used.update(table.valves)
-        yield from _curve(table.duty, table.flow_l_min, key)
+        if not makes_flow(config):
+            yield from _curve(table.duty, table.flow_l_min, key)
     for number, name in enumerate(names):
         if name not in used:
             yield Contradiction(
@@ -182,6 +187,14 @@ def _nozzle_sets(config: Config) -> Rule:
 
 
 def _curve(duty: tuple[float, ...], flow_l_min: tuple[float, ...], key: str) -> Rule:
+    for name, values in (("duty", duty), ("flow_l_min", flow_l_min)):
+        if not values:
+            yield Contradiction(
+                key=f"{key}.{name}",
+                text="missing, and required but behind a pump that makes the flow; write the "
+                "measured points",
+            )
+            return
     if len(duty) != len(flow_l_min):
         yield Contradiction(
             key=f"{key}.flow_l_min",

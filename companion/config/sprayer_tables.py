@@ -62,12 +62,12 @@ class NozzleSetTable(Table):
         description="names of the valves"
     )
     duty: Annotated[tuple[Duty, ...], Field(strict=False, min_length=2, max_length=1000)] = Field(
-        description="measured points, increasing"
+        default=(), description="measured points, increasing; none with a pump that makes the flow"
     )
     flow_l_min: Annotated[
         tuple[Annotated[FiniteFloat, Field(ge=0, le=10_000)], ...],
         Field(strict=False, min_length=2, max_length=1000),
-    ] = Field(description="flow of the whole set at these duties, increasing")
+    ] = Field(default=(), description="flow of the whole set at these duties, increasing")
 
 
 class LagTable(Table):

@@ -57,6 +57,11 @@ class PrescriptionTable(Table):
     """The map, and how it is read."""
 
     file: Text = Field(description="the map, relative to this file")
+    sha256: str | None = Field(
+        default=None,
+        pattern=r"^[0-9a-f]{8,64}$",
+        description="first digits of the map's hash as `map check` shows it; another map is refused",
+    )
     rate_field: Text | None = Field(
         default=None, description="where the map has several candidates"
     )
@@ -177,6 +182,18 @@ class SafetyTable(Table):
     fix: Literal["3d", "dgps", "rtk-float", "rtk-fixed"] = Field(
         default="rtk-float", description="least acceptable GNSS fix"
     )
+    accuracy_max_m: float | None = Field(
+        default=None,
+        gt=0,
+        le=100,
+        description="worst horizontal accuracy that the receiver may report; 0.3 with an RTK fix",
+    )
+    estop_line: int | None = Field(
+        default=None,
+        ge=0,
+        le=1023,
+        description="GPIO line of an emergency stop that opens a contact to ground when pressed",
+    )
     pump_cutoff: bool = Field(
         default=False, description="true: a relay cuts the pump when this computer fails"
     )
@@ -218,6 +235,9 @@ class JournalTable(Table):
     """The record of each flight."""
 
     folder: Text = Field(default="flights", description="relative to this file")
+    training: bool = Field(
+        default=False, description="true: flown with water; marked in every record"
+    )
 
 
 class WebTable(Table):

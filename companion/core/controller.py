@@ -9,27 +9,32 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from companion.core import detection, flow_trim
+from companion.core import detection, flow_trim, sprayer_state
+from companion.core.atomiser import Atomiser
 from companion.core.boom import Boom
 from companion.core.crossings import Across, Border, Route
 from companion.core.detection import Detection, Watching, WatchMemory
-from companion.core.dosing import dosing_of, overdrive_of, skew_of, speed_soon
+from companion.core.dosing import Sprayer, dosing_of, overdrive_of, skew_of, speed_soon
 from companion.core.drift import Drift, Offset
+from companion.core.drives import liquid_of, ran, ways, with_drives, with_rates
 from companion.core.flow_trim import FlowTrim, TrimMemory, Trimming
 from companion.core.frame import LocalFrame
-from companion.core.interlock import Limits, closed_plan, guard, inhibits
+from companion.core.interlock import Held, Limits, closed_plan, guard, inhibits, settled
 from companion.core.liquid_law import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.prescription import Prescription
+from companion.core.pump import DRY, Pump, Pumping, PumpMemory, on_off
 from companion.core.rate import flow_for_rate, overridden
 from companion.core.routes import ROUTES_KEPT_S, routes_ahead
 from companion.core.schedule import Dosing, LagModel, Timing, ValveSchedule, schedule
 from companion.core.sets import SetOfRate, dosing_by_valve, sets_ahead
+from companion.core.sprayer_state import BOOT, Machine, shown
 from companion.core.types import (
     Decision,
     Finding,
     Inhibit,
     Method,
+    SprayerState,
     SprayPlan,
     TimedChange,
     VehicleState,
@@ -61,7 +66,10 @@ class Setup:
     drift: Drift | None = None
     rate_max_l_ha: float | None = None
     mission_braking_m_s2: float | None = None  # None: what the mission says is not used
+    pump: Pump | None = None
+    atomisers: tuple[Atomiser, ...] = ()
     timing: Timing = field(init=False, repr=False, compare=False)
+    pumping: Pumping | None = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
     watching: Watching | None = field(init=False, repr=False, compare=False)
 
@@ -84,13 +92,43 @@ class Setup:
             self.method, self.lag, look_ahead_s=self.look_ahead_s, period_s=self.pwm.period_s
         )
         object.__setattr__(self, "timing", timing)
-        law = self.flow_trim
-        trimming = None if law is None else Trimming.of(law, self.lag, self.pwm)
+        object.__setattr__(self, "pumping", self._pumping())
+        law, doses = self.flow_trim, self.doses
+        trimming = None if law is None else Trimming.of(law, doses.lag, doses.pwm)
         object.__setattr__(self, "trimming", trimming)
         watching = None
         if self.detection is not None:
-            watching = Watching.of(self.detection, self.nozzle_sets, self.lag, self.pwm)
+            watching = Watching.of(self.detection, doses.nozzle_sets, doses.lag, doses.pwm)
         object.__setattr__(self, "watching", watching)
+
+    def _pumping(self) -> Pumping | None:
+        if self.pump is None:
+            return None
+        if self.pump.curve is not None and len(self.nozzle_sets) > 1:
+            raise ValueError("a pump that makes the flow has one nozzle set")
+        return Pumping.of(
+            self.pump,
+            self.boom,
+            method=self.method,
+            look_ahead_s=self.look_ahead_s,
+            valve_timing=self.timing,
+            rate_max_l_ha=self.rate_max_l_ha,
+        )
+
+    @property
+    def doses(self) -> Sprayer:
+        """Return what makes the flow: the valves, or the pump in their place."""
+        return self if self.pumping is None else self.pumping
+
+    @property
+    def longest_s(self) -> float:
+        """Return the longest lead of any order: of valves, pump and atomisers."""
+        longest_s = self.timing.longest_s
+        if self.pumping is not None:
+            longest_s = max(longest_s, self.pumping.timing.longest_s)
+        for atomiser in self.atomisers:
+            longest_s = max(longest_s, atomiser.spin_up_s + self.lag.output_s)
+        return longest_s
 
     @property
     def back_s(self) -> float:
@@ -100,8 +138,7 @@ class Setup:
     @property
     def ahead_s(self) -> float:
         """Return how far ahead a path must reach: the lease, the longest lead and a short stay."""
-        timing = self.timing
-        longest_s = timing.longest_s + 2.0 * timing.dwell_min_s
+        longest_s = self.longest_s + 2.0 * self.timing.dwell_min_s
         return self.lease_s + longest_s + ROUTES_KEPT_S + 0.05
 
 
@@ -118,6 +155,9 @@ class Memory:
     trim: TrimMemory | None = None
     watch: WatchMemory | None = None
     reasons: frozenset[Inhibit] = frozenset()
+    held: Held = ()
+    machine: Machine = BOOT
+    pump: PumpMemory = DRY
 
 
 def step(
@@ -132,7 +172,11 @@ def step(
         now_s=now_s,
         before=memory.reasons,
     )
-    reasons |= detection.inhibits_of(memory.watch)
+    reasons, held = settled(reasons | detection.inhibits_of(memory.watch), memory.held, now_s)
+    machine, reasons = sprayer_state.follow(memory.machine, reasons, state)
+    memory = replace(
+        memory, held=held, machine=machine, pump=ran(setup, memory.pump, memory.plan, now_s)
+    )
     sequence = 1 if memory.plan is None else memory.plan.sequence + 1
     if reasons or state is None:
         return _closed(setup, state, reasons, sequence, memory, now_s)
@@ -141,7 +185,7 @@ def step(
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
     index, set_of_rate = _nozzle_sets(setup, state, routes, memory, speed_m_s)
     until_s = now_s + setup.lease_s
-    trim = _trim(setup, state, memory, in_force, now_s)
+    trim = _trim(setup, state, memory, now_s)
     gain = 1.0 if trim is None else trim.sets[index].trim
     skew = skew_of(state, speed_m_s)
 
@@ -153,7 +197,8 @@ def step(
     soon_m_s = speed_soon(setup, state, speed_m_s)
     overdrive = overdrive_of(setup, index)
     valves = []
-    for valve, route in enumerate(routes):
+    own_ways, pump_memory = ways(setup, routes, memory.pump, now_s)
+    for valve, route in enumerate(own_ways):
         # In a turn each valve has a speed of its own.
         own = route[0].speed_m_s / speed_m_s if abs(state.yaw_rate_deg_s) > 1.0 else 1.0
         valves.append(
@@ -161,7 +206,7 @@ def step(
                 route,
                 valve=valve,
                 timing=setup.timing,
-                dosing=dosing(valve),
+                dosing=dosing(valve) if setup.pumping is None else on_off,
                 in_force=in_force[valve],
                 speed_soon_m_s=soon_m_s * own,
                 now_s=now_s,
@@ -176,6 +221,10 @@ def step(
         changes=_in_order(valves),
         lease_until_s=until_s,
     )
+    plan = with_drives(
+        setup, state, plan, routes,
+        before=memory.plan, memory=pump_memory, speed_m_s=speed_m_s, skew=skew, gain=gain,
+    )  # fmt: skip
     plan = guard(plan, reasons, lease_s=setup.lease_s)
     flow_l_min = _flow(setup, plan, index)
     if setup.trimming is not None and trim is not None:
@@ -183,9 +232,9 @@ def step(
             setup.trimming, trim, flow_l_min=flow_l_min, index=index, now_s=now_s
         )
     decision = _decision(
-        setup, state, plan, valves,
+        setup, state, plan, with_rates(setup, valves, routes, now_s),
         index=index, speed_m_s=speed_m_s, flow_l_min=flow_l_min * gain, trim=trim,
-        findings=_findings(memory),
+        findings=_findings(setup, memory), sprayer=shown(machine, is_open=plan.opens),
     )  # fmt: skip
     return decision, Memory(
         plan=plan,
@@ -196,6 +245,9 @@ def step(
         drift_m=drift_m,
         trim=trim,
         watch=memory.watch,
+        held=held,
+        machine=machine,
+        pump=pump_memory,
     )
 
 
@@ -206,7 +258,7 @@ def _watched(setup: Setup, state: VehicleState | None, memory: Memory, now_s: fl
     watch = detection.follow(
         setup.watching,
         memory.watch or WatchMemory(),
-        memory.plan,
+        liquid_of(setup, memory.plan),
         state,
         index=memory.set_index,
         now_s=now_s,
@@ -214,34 +266,40 @@ def _watched(setup: Setup, state: VehicleState | None, memory: Memory, now_s: fl
     return replace(memory, watch=watch)
 
 
-def _findings(memory: Memory) -> tuple[Finding, ...]:
-    return () if memory.watch is None else memory.watch.findings
+def _findings(setup: Setup, memory: Memory) -> tuple[Finding, ...]:
+    if memory.watch is None:
+        return ()
+    if setup.pumping is None:
+        return memory.watch.findings
+    # The one valve that was watched is the pump: nothing tells which section it is.
+    return tuple(replace(finding, valve=None) for finding in memory.watch.findings)
 
 
 def _trim(
     setup: Setup,
     state: VehicleState,
     memory: Memory,
-    in_force: tuple[float, ...],
     now_s: float,
 ) -> TrimMemory | None:
     """Return the trims after the meter's newest count; None where no trim is configured."""
     if setup.trimming is None:
         return None
     before = memory.trim or flow_trim.begin(len(setup.nozzle_sets))
-    is_steady, plan = memory.plan is not None, memory.plan
+    plan, doses = liquid_of(setup, memory.plan), setup.doses
+    is_steady = plan is not None
     for change in plan.changes if plan is not None else ():
         if change.at_s > now_s:
             break
         is_steady = is_steady and not change.restart
-    duties = [in_force[valve] for valve in setup.nozzle_sets[memory.set_index].valves]
+    in_force = duty_in_force(plan, now_s, len(setup.boom.valves))
+    duties = [in_force[valve] for valve in doses.nozzle_sets[memory.set_index].valves]
     low, high = min(duties), max(duties)
     return flow_trim.follow(
         setup.trimming,
         before,
         state.flow,
         is_steady=is_steady and low > 0.0,
-        is_saturated=not setup.pwm.duty_min < low <= high < setup.pwm.duty_max,
+        is_saturated=not doses.pwm.duty_min < low <= high < doses.pwm.duty_max,
         now_s=now_s,
     )
 
@@ -282,9 +340,18 @@ def _closed(
         flow_l_min=0.0,
         flow_trim=None if trim is None else trim.sets[trim.set_index].trim,
         flow_trim_state=None if trim is None else trim.state,
-        findings=_findings(memory),
+        findings=_findings(setup, memory),
+        sprayer=shown(memory.machine, is_open=False),
     )
-    return decision, Memory(plan=plan, trim=trim, watch=memory.watch, reasons=reasons)
+    return decision, Memory(
+        plan=plan,
+        trim=trim,
+        watch=memory.watch,
+        reasons=reasons,
+        held=memory.held,
+        machine=memory.machine,
+        pump=memory.pump._replace(is_early=False),
+    )
 
 
 def _nozzle_sets(
@@ -327,16 +394,20 @@ def _decision(
     flow_l_min: float,
     trim: TrimMemory | None,
     findings: tuple[Finding, ...],
+    sprayer: SprayerState,
 ) -> Decision:
     nozzles = setup.nozzle_sets[index]
-    share = setup.boom.width_m / len(nozzles.valves)
     percent, limit_l_ha = state.rate_percent, setup.rate_max_l_ha
-    target = sum(
+    # As if all valves of the set had the rate of this one.
+    flows = [
         flow_for_rate(
-            overridden(valves[valve].rate_now_l_ha or 0.0, percent, limit_l_ha), speed_m_s, share
+            overridden(valves[valve].rate_now_l_ha or 0.0, percent, limit_l_ha),
+            speed_m_s,
+            setup.boom.width_m,
         )
         for valve in nozzles.valves
-    )
+    ]
+    target = sum(flows) / len(flows)
     return Decision(
         now_s=plan.issued_s,
         state=state,
@@ -350,12 +421,15 @@ def _decision(
         flow_trim=None if trim is None else trim.sets[index].trim,
         flow_trim_state=None if trim is None else trim.state,
         findings=findings,
+        sprayer=sprayer,
+        out_of_range_count=sum(not nozzles.curve.delivers(flow) for flow in flows),
     )
 
 
 def _flow(setup: Setup, plan: SprayPlan, index: int) -> float:
     """Return the flow [L/min] that the table says of the duties in force from now on."""
-    nozzles = setup.nozzle_sets[index]
-    now = duty_in_force(plan, plan.issued_s, len(setup.boom.valves))
+    liquid = liquid_of(setup, plan)
+    nozzles = setup.doses.nozzle_sets[index]
+    now = duty_in_force(liquid, plan.issued_s, len(setup.boom.valves))
     flows = {duty: nozzles.curve.flow_for(duty) for duty in set(now)}
     return sum(flows[now[valve]] for valve in nozzles.valves) / len(nozzles.valves)

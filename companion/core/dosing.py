@@ -3,23 +3,40 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import Protocol
 
+from companion.core.boom import Boom
 from companion.core.leg import speed_after
-from companion.core.nozzle import allowed_duty
+from companion.core.nozzle import NozzleSet, PwmLimits, allowed_duty
 from companion.core.overdrive import Overdrive
 from companion.core.rate import flow_for_rate, overridden
-from companion.core.schedule import Dosing
+from companion.core.schedule import Dosing, LagModel, Timing
 from companion.core.types import Method, VehicleState
-
-if TYPE_CHECKING:
-    from companion.core.controller import Setup
 
 # Below this share of its width across the motion, a boom that flies askew is dosed as at it: the
 # flow that the law asks for would fall towards nothing while the strip is a blur.
 SKEW_MIN = 0.3
 # A trim stands until the next one, 50 ms later: in the mean it is half of that old.
 TRIM_AGE_S = 0.025
+
+
+class Sprayer(Protocol):
+    """What doses: the valves of a set-up, or a pump that makes the flow of all of them."""
+
+    @property
+    def boom(self) -> Boom: ...  # noqa: D102
+    @property
+    def nozzle_sets(self) -> tuple[NozzleSet, ...]: ...  # noqa: D102
+    @property
+    def pwm(self) -> PwmLimits: ...  # noqa: D102
+    @property
+    def lag(self) -> LagModel: ...  # noqa: D102
+    @property
+    def method(self) -> Method: ...  # noqa: D102
+    @property
+    def timing(self) -> Timing: ...  # noqa: D102
+    @property
+    def rate_max_l_ha(self) -> float | None: ...  # noqa: D102
 
 
 def skew_of(state: VehicleState, speed_m_s: float) -> float:
@@ -32,7 +49,7 @@ def skew_of(state: VehicleState, speed_m_s: float) -> float:
     return max(abs(along) / speed_m_s, SKEW_MIN)
 
 
-def dosing_of(setup: Setup, index: int, skew: float, percent: float) -> Dosing:
+def dosing_of(setup: Sprayer, index: int, skew: float, percent: float) -> Dosing:
     """Return the function from rate and speed to the duty of a valve of the set in use."""
     width_m = setup.boom.width_m * skew
     curve, pwm = setup.nozzle_sets[index].curve, setup.pwm
@@ -50,7 +67,7 @@ def dosing_of(setup: Setup, index: int, skew: float, percent: float) -> Dosing:
     return duty
 
 
-def overdrive_of(setup: Setup, index: int) -> Overdrive | None:
+def overdrive_of(setup: Sprayer, index: int) -> Overdrive | None:
     """Return how a slow flow's changes are driven; None for one that is not slow."""
     lag, pwm = setup.lag, setup.pwm
     is_slow = max(lag.up_time_s, lag.down_time_s) > 0.0 and lag.reference == "volume"
@@ -65,7 +82,7 @@ def overdrive_of(setup: Setup, index: int) -> Overdrive | None:
     )
 
 
-def speed_soon(setup: Setup, state: VehicleState, speed_m_s: float) -> float:
+def speed_soon(setup: Sprayer, state: VehicleState, speed_m_s: float) -> float:
     """Return the speed that a trim ordered now should ask for.
 
     It acts after its dead time, with the next period, and stands until the next trim. A flow that

@@ -22,6 +22,7 @@ from companion.core.types import (
     BatteryReport,
     ClockReport,
     EstimatorReport,
+    EstopReport,
     FlowReport,
     GnssReport,
     HeartbeatReport,
@@ -86,6 +87,8 @@ class Track:
     braking_m_s2: float | None = None  # as seen at the ends of legs so far
     rate_percent: float = 100.0
     enabled: bool = False
+    operator_wishes: int = 0  # how often somebody has enabled anew, or disabled
+    estops: frozenset[str] | None = None  # which are pressed; None: none was heard of
 
 
 def observe(track: Track, item: Input, setup: Setup) -> Track:
@@ -95,8 +98,6 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
     by_setup = _BY_SETUP.get(type(item))
     if by_setup is not None:
         return by_setup(track, item, setup)
-    if isinstance(item, OperatorCommand):
-        return replace(track, enabled=item.enable and item.source in setup.limits.enable_by)
     if isinstance(item, LegReport):
         return replace(track, leg=leg_of(item, setup.frame, setup.mission_braking_m_s2))
     return _KEEP[type(item)](track, item)
@@ -140,20 +141,49 @@ def _observe_heartbeat(track: Track, item: HeartbeatReport, setup: Setup) -> Tra
             enabled = False
         if setup.limits.allows(before.mode) and not setup.limits.allows(item.mode):
             enabled = False
+        if not item.received_s - before.received_s <= setup.limits.consent_gap_max_s:
+            enabled = False
     return replace(track, heartbeat=item, enabled=enabled)
+
+
+def _observe_operator(track: Track, item: OperatorCommand, setup: Setup) -> Track:
+    """Take the operator's wish; to disable also ends a stop that was commanded."""
+    if not item.enable and track.estops:
+        track = replace(track, estops=track.estops - {"command"})
+    return _wished(track, item.enable and item.source in setup.limits.enable_by)
+
+
+def _observe_estop(track: Track, item: EstopReport, _setup: Setup) -> Track:
+    """Take the consent back at a stop; while it is pressed nobody can give it."""
+    pressed = track.estops or frozenset()
+    if item.pressed is not False:
+        return replace(track, estops=pressed | {item.source}, enabled=False)
+    return replace(track, estops=pressed - {item.source})
+
+
+def _wished(track: Track, enabled: bool) -> Track:
+    """Return the track after a wish; to repeat that one may spray is no new wish."""
+    is_new = not (enabled and track.enabled)
+    return replace(
+        track,
+        enabled=enabled and not track.estops,
+        operator_wishes=track.operator_wishes + is_new,
+    )
 
 
 def _observe_rc(track: Track, item: RcReport, setup: Setup) -> Track:
     """Only the edges of the switch count: up enables, down disables, a lost signal disables."""
-    channel, enabled = setup.limits.rc_channel, track.enabled
+    channel, wish = setup.limits.rc_channel, None
     if channel is not None and "rc" in setup.limits.enable_by and track.rc is not None:
         before, now = _pulse(track.rc, channel), _pulse(item, channel)
         if before <= RC_HIGH_US < now:
-            enabled = before >= RC_LOW_US // 2  # an edge out of a lost signal is no wish
+            wish = before >= RC_LOW_US // 2  # an edge out of a lost signal is no wish
         elif now < RC_LOW_US <= before:
-            enabled = False
+            wish = False
+    if wish is not None:
+        track = _wished(track, wish)
     switch_us = 0 if channel is None else _pulse(item, channel)
-    return replace(track, rc=item, switch_us=switch_us, enabled=enabled)
+    return replace(track, rc=item, switch_us=switch_us)
 
 
 def _pulse(report: RcReport, channel: int) -> int:
@@ -162,6 +192,8 @@ def _pulse(report: RcReport, channel: int) -> int:
 
 _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
     HeartbeatReport: _observe_heartbeat,
+    OperatorCommand: _observe_operator,
+    EstopReport: _observe_estop,
     RcReport: _observe_rc,
     BatteryReport: _observe_battery,
 }
@@ -246,6 +278,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
     if heading is not None:
         heading = (heading + motion.yaw_rate_deg_s * dt_s) % 360.0
     heartbeat = track.heartbeat
+    gnss = track.gnss if track.gnss is not None and _young(track.gnss, now_s) else None
     return VehicleState(
         time_s=now_s,
         east_m=east.position_m,
@@ -263,7 +296,8 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         position_valid=track.position_valid,
         position_frozen=track.stand is not None and track.stand.is_frozen,
         checked_speed_m_s=checked,
-        fix=track.gnss.fix if track.gnss and _young(track.gnss, now_s) else None,
+        fix=None if gnss is None else gnss.fix,
+        horizontal_accuracy_m=None if gnss is None else gnss.horizontal_accuracy_m,
         estimator_healthy=(
             track.estimator.healthy if track.estimator and _young(track.estimator, now_s) else None
         ),
@@ -275,7 +309,10 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         wind_received_s=track.wind.received_s if track.wind else None,
         rc_switch_on=_switch_on(track, now_s),
         output_healthy=track.output is None or track.output.healthy,
+        link_up=track.output is None or track.output.link_up,
         enabled=track.enabled,
+        operator_wishes=track.operator_wishes,
+        estop=None if track.estops is None else bool(track.estops),
         flow=track.flow,
         pressure=track.pressure,
         tank=track.tank,

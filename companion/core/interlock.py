@@ -18,6 +18,13 @@ SPEED_MARGIN_M_S = 0.1
 HEIGHT_MARGIN_M = 0.3
 WIND_MARGIN_M_S = 0.5
 MARGIN_SHARE_MAX = 0.1
+# What says that the place may be wrong stays for this long after it was last said: a fix that
+# comes and goes is none.
+HOLD_S = {
+    Inhibit.FIX_TOO_LOW: 1.0,
+    Inhibit.ACCURACY_TOO_LOW: 1.0,
+    Inhibit.ESTIMATOR_UNHEALTHY: 1.0,
+}
 _WITH_MARGIN = frozenset(
     {
         Inhibit.SPEED_BELOW_MIN,
@@ -50,6 +57,10 @@ class Limits:
     rc_channel: int | None = None
     speed_check_required: bool = False
     wind_age_max_s: float = 5.0
+    accuracy_max_m: float | None = None  # None: what the receiver says of itself is not judged
+    estop_required: bool = False
+    # Heartbeats that stayed away for longer take the operator's consent along.
+    consent_gap_max_s: float = 10.0
 
     def allows(self, mode: str | None) -> bool:
         """Whether spraying is allowed in a mode; AUTO is also what PX4 calls MISSION."""
@@ -70,7 +81,8 @@ def inhibits(
     limits = held(limits, before)
     return frozenset(
         [
-            *_operator_and_vehicle(state, limits, now_s),
+            *_operator(state, limits),
+            *_vehicle(state, limits, now_s),
             *_wind(state, limits, now_s),
             *_position(state, limits, field_bounds_m, now_s),
             *_speed_and_height(state, limits),
@@ -105,10 +117,19 @@ def held(limits: Limits, before: frozenset[Inhibit]) -> Limits:
     )
 
 
-def _operator_and_vehicle(state: VehicleState, limits: Limits, now_s: float) -> list[Inhibit]:
+def _operator(state: VehicleState, limits: Limits) -> list[Inhibit]:
     found = []
+    if state.estop is True or (limits.estop_required and state.estop is not False):
+        found.append(Inhibit.ESTOP)
     if not state.enabled:
         found.append(Inhibit.NOT_ENABLED)
+    if limits.rc_channel is not None and state.rc_switch_on is not True:
+        found.append(Inhibit.RC_SWITCH)
+    return found
+
+
+def _vehicle(state: VehicleState, limits: Limits, now_s: float) -> list[Inhibit]:
+    found = []
     if state.heartbeat_received_s is None:
         found.append(Inhibit.NO_HEARTBEAT)
     elif not -0.1 <= now_s - state.heartbeat_received_s <= limits.heartbeat_age_max_s:
@@ -121,8 +142,8 @@ def _operator_and_vehicle(state: VehicleState, limits: Limits, now_s: float) -> 
         found.append(Inhibit.NOT_IN_AIR)
     if not state.output_healthy:
         found.append(Inhibit.OUTPUT_FAULT)
-    if limits.rc_channel is not None and state.rc_switch_on is not True:
-        found.append(Inhibit.RC_SWITCH)
+    if not state.link_up:
+        found.append(Inhibit.LINK_LOST)
     return found
 
 
@@ -161,6 +182,9 @@ def _position(
         found.append(Inhibit.FAR_FROM_FIELD)
     if state.fix is None or not state.fix >= limits.fix:
         found.append(Inhibit.FIX_TOO_LOW)
+    accuracy_m, worst_m = state.horizontal_accuracy_m, limits.accuracy_max_m
+    if accuracy_m is not None and worst_m is not None and not 0.0 <= accuracy_m <= worst_m:
+        found.append(Inhibit.ACCURACY_TOO_LOW)
     if state.estimator_healthy is not True:
         found.append(Inhibit.ESTIMATOR_UNHEALTHY)
     if state.heading_deg is None or not abs(state.heading_deg) <= 360.0:
@@ -187,6 +211,19 @@ def _speed_and_height(state: VehicleState, limits: Limits) -> list[Inhibit]:
     if not state.height_m <= limits.height_max_m:
         found.append(Inhibit.HEIGHT_ABOVE_MAX)
     return found
+
+
+# Reasons that stay, and until when.
+Held = tuple[tuple[Inhibit, float], ...]
+
+
+def settled(
+    reasons: frozenset[Inhibit], before: Held, now_s: float
+) -> tuple[frozenset[Inhibit], Held]:
+    """Return the reasons with those that have not been gone for long enough, and what stays."""
+    still = tuple((reason, s) for reason, s in before if reason not in reasons and not now_s >= s)
+    anew = tuple((reason, now_s + hold_s) for reason, hold_s in HOLD_S.items() if reason in reasons)
+    return reasons.union(reason for reason, _ in still), anew + still
 
 
 def closed_plan(*, sequence: int, valve_count: int, now_s: float, lease_s: float) -> SprayPlan:

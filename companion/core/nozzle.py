@@ -41,6 +41,8 @@ class PwmLimits:
 
 # Points of the table from which the inverse of a curve starts.
 INVERSE_POINTS = 256
+# A flow as far outside the measured range as a bucket test errs is taken as inside.
+RANGE_SLACK = 0.02
 
 
 def _pchip_slopes(x: tuple[float, ...], y: tuple[float, ...]) -> tuple[float, ...]:
@@ -117,6 +119,16 @@ class FlowCurve:
         m0, m1 = self._slopes[i] * h, self._slopes[i + 1] * h
         a, b = 2 * (y0 - y1) + m0 + m1, 3 * (y1 - y0) - 2 * m0 - m1
         return min(max(((a * t + b) * t + m0) * t + y0, y0), y1)
+
+    def delivers(self, flow_l_min: float) -> bool:
+        """Return whether a flow lies in the measured range, give or take 2 %; 0 is closed.
+
+        >>> curve = FlowCurve(duty=(0.2, 0.5, 1.0), flow_l_min=(1.0, 2.0, 4.0))
+        >>> [curve.delivers(flow) for flow in (0.0, 0.9, 0.99, 4.05, 4.1)]
+        [True, False, True, True, False]
+        """
+        low, high = (1.0 - RANGE_SLACK) * self.flow_l_min[0], self.flow_l_min[-1]
+        return flow_l_min == 0.0 or low <= flow_l_min <= (1.0 + RANGE_SLACK) * high
 
     def flow_for(self, duty: float) -> float:
         """Return the flow at `duty`: the inverse of `duty_for`, to 1e-5 of the flow.

@@ -35,7 +35,7 @@ def routes_ahead(
         shift = _shift(setup, found_from, state, now_s)
         if shift is not None:
             routes = _shifted(memory.routes, shift, now_s)
-            soon_s = now_s + setup.timing.longest_s + ROUTES_EXACT_S
+            soon_s = now_s + setup.longest_s + ROUTES_EXACT_S
             if all(len(route) == 1 or route[1].at_s > soon_s for route in routes):
                 return routes, found_from, memory.drift_m
     routes = find_routes(
@@ -74,7 +74,7 @@ def _shift(
     aside = abs(off_north * east - off_east * north) / speed
     bend = abs(then_east * north - then_north * east) / (speed * then)
     turned_deg = ((state.heading_deg or 0.0) - (before.heading_deg or 0.0) + 180.0) % 360.0 - 180.0
-    aside += bend * speed * (setup.timing.longest_s + ROUTES_EXACT_S)
+    aside += bend * speed * (setup.longest_s + ROUTES_EXACT_S)
     aside += math.radians(abs(turned_deg)) * setup.boom.reach_m
     along = (off_east * east + off_north * north) / speed
     if not (aside <= ROUTES_ASIDE_M and abs(along) <= ROUTES_ALONG_M):

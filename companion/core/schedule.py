@@ -286,7 +286,7 @@ def schedule(
         for order in made[due + 1 :]
         if order.at_s < until_s
     )
-    return ValveSchedule(tuple(changes), late, unresolved, _rate_at(route, now_s))
+    return ValveSchedule(tuple(changes), late, unresolved, rate_at(route, now_s))
 
 
 def _trims(
@@ -317,7 +317,8 @@ def _already_ordered(now: Order, following: Order, in_force: float, now_s: float
     return to_next <= 0.03 * max(following.duty, in_force) and to_next < abs(now.duty - in_force)
 
 
-def _rate_at(route: Route, now_s: float) -> float | None:
+def rate_at(route: Route, now_s: float) -> float | None:
+    """Return what a route prescribes at a time."""
     rate = route[0].rate_l_ha
     for crossing in route:
         if crossing.at_s <= now_s:

@@ -34,6 +34,8 @@ class Method(StrEnum):
 class Inhibit(StrEnum):
     """Every reason not to spray: in the journal, on the page, in STATUSTEXT."""
 
+    ESTOP = "estop"
+    REARM_NEEDED = "rearm-needed"  # the cause of a fault or a stop is gone, nobody has said so
     NOT_ENABLED = "not-enabled"
     NO_POSITION = "no-position"
     STALE_POSITION = "stale-position"
@@ -46,6 +48,7 @@ class Inhibit(StrEnum):
     WRONG_MODE = "wrong-mode"
     NOT_IN_AIR = "not-in-air"
     FIX_TOO_LOW = "fix-too-low"
+    ACCURACY_TOO_LOW = "accuracy-too-low"
     ESTIMATOR_UNHEALTHY = "estimator-unhealthy"
     HEADING_UNKNOWN = "heading-unknown"
     SPEED_UNKNOWN = "speed-unknown"
@@ -59,11 +62,24 @@ class Inhibit(StrEnum):
     WIND_UNKNOWN = "wind-unknown"
     RC_SWITCH = "rc-switch"
     OUTPUT_FAULT = "output-fault"
+    LINK_LOST = "link-lost"
     LEAK = "leak"
     VALVE_STUCK_OPEN = "valve-stuck-open"
     NO_FLOW = "no-flow"
     TANK_EMPTY = "tank-empty"
     FLOW_FAULT = "flow-fault"
+
+
+class SprayerState(StrEnum):
+    """What the sprayer may do; see `sprayer_state.py`. Their order is that of `SPR_STATE`."""
+
+    BOOT = "boot"  # vehicle and position were not heard yet
+    SAFE = "safe"  # closed, something is missing
+    READY = "ready"  # closed, only the operator, the take-off or the mission is missing
+    ARMED = "armed"  # may open; closed because nothing is prescribed here, or too slow or high
+    SPRAYING = "spraying"
+    FAULT = "fault"  # latched
+    ESTOP = "estop"  # latched
 
 
 class FlowTrimState(StrEnum):
@@ -155,10 +171,14 @@ class HeartbeatReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LandedReport:
-    """Whether the vehicle flies (EXTENDED_SYS_STATE); `None` where the autopilot cannot tell."""
+    """Whether the vehicle flies (EXTENDED_SYS_STATE); `None` where the autopilot cannot tell.
+
+    Between the two, taking off or landing, it is neither in the air nor on the ground.
+    """
 
     received_s: float
     in_air: bool | None
+    on_ground: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -201,11 +221,21 @@ class OperatorCommand:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputReport:
-    """What the executor of plans says of itself; a fault inhibits."""
+    """What the executor of plans says of itself, and whether the link to the vehicle is up."""
 
     received_s: float
     healthy: bool
     text: str = ""
+    link_up: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstopReport:
+    """An emergency stop: a switch on a `line`, or a `command`; a broken wire is pressed."""
+
+    received_s: float
+    pressed: bool
+    source: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -302,6 +332,7 @@ Input = (
     | RcReport
     | OperatorCommand
     | OutputReport
+    | EstopReport
     | FlowReport
     | PressureReport
     | TankReport
@@ -364,6 +395,10 @@ class VehicleState:
     rc_switch_on: bool | None = None  # None: no switch, or nothing young is known of it
     acceleration_fade_s: float = 0.5  # the acceleration's time constant in every prediction
     stop_ahead: StopAhead | None = None  # None: no mission is used, or it says of no stop
+    horizontal_accuracy_m: float | None = None  # None: the receiver does not tell
+    link_up: bool = True
+    estop: bool | None = None  # None: no switch has been heard of
+    operator_wishes: int = 0  # how often the operator has enabled anew, or disabled
 
 
 # ---------------------------------------------------------------------------------------- plans
@@ -392,12 +427,62 @@ class TimedChange:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DriveChange:
+    """A motor takes `fraction` of its range at `at_s`."""
+
+    at_s: float
+    fraction: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.fraction <= 1.0:
+            raise ValueError(f"fraction outside [0, 1]: {self.fraction}")
+        if not abs(self.at_s) < float("inf"):
+            raise ValueError(f"time of a change is not finite: {self.at_s}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DrivePlan:
+    """What a motor (a pump, an atomiser) does: 0 is stopped, 1 the end of its range.
+
+    `fraction` holds from the plan's `issued_s`; `changes` follow in order of time.
+    """
+
+    fraction: float
+    changes: tuple[DriveChange, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.fraction <= 1.0:
+            raise ValueError(f"fraction outside [0, 1]: {self.fraction}")
+        if not all(a.at_s <= b.at_s for a, b in pairwise(self.changes)):
+            raise ValueError("changes of a drive are not in order of time")
+
+    @property
+    def is_off(self) -> bool:
+        """Whether it stands still, now and later."""
+        return not self.fraction and not any(change.fraction for change in self.changes)
+
+    def at(self, now_s: float) -> float:
+        """Return the fraction at `now_s`; the lease is the plan's to mind.
+
+        >>> DrivePlan(fraction=0.0, changes=(DriveChange(at_s=1.0, fraction=0.4),)).at(1.0)
+        0.4
+        """
+        fraction = self.fraction
+        for change in self.changes:
+            if not change.at_s <= now_s:
+                break
+            fraction = change.fraction
+        return fraction
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SprayPlan:
-    """The whole future of all valves, until the lease ends; closed after that.
+    """The whole future of all valves and drives, until the lease ends; closed after that.
 
     `duty` holds from `issued_s`, one value a valve; `changes` follow in order of time. A newer
     plan (by `sequence`) replaces what has not happened yet. An executor that is given the same
-    duty again does nothing.
+    duty again does nothing. `drives` are the pump, where there is one, and the atomisers in the
+    order of their tables; a plan without any has them all stopped.
     """
 
     sequence: int
@@ -405,6 +490,7 @@ class SprayPlan:
     duty: tuple[float, ...]
     changes: tuple[TimedChange, ...]
     lease_until_s: float
+    drives: tuple[DrivePlan, ...] = ()
 
     def __post_init__(self) -> None:
         if not all(0.0 <= duty <= 1.0 for duty in self.duty):
@@ -418,8 +504,13 @@ class SprayPlan:
 
     @property
     def is_off(self) -> bool:
-        """Whether every valve is closed, now and later."""
-        return not any(self.duty) and not any(change.duty for change in self.changes)
+        """Whether every valve is closed and every drive stopped, now and later."""
+        return not self.opens and all(drive.is_off for drive in self.drives)
+
+    @property
+    def opens(self) -> bool:
+        """Whether a valve is open, now or later."""
+        return any(self.duty) or any(change.duty for change in self.changes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -454,3 +545,5 @@ class Decision:
     flow_trim: float | None = None
     flow_trim_state: FlowTrimState | None = None
     findings: tuple[Finding, ...] = ()
+    sprayer: SprayerState = SprayerState.BOOT
+    out_of_range_count: int = 0  # valves whose prescribed rate they cannot deliver at this speed

@@ -28,7 +28,7 @@ def computer_checks(found: Computer, *, needs_engine: bool) -> Iterator[Check]:
     yield _memory(found, needs_engine=needs_engine)
     yield _governor(found)
     yield _throttling(found)
-    yield _watchdog(found)
+    yield hardware_watchdog_check(found)
 
 
 def _python(found: Computer) -> Check:
@@ -127,7 +127,8 @@ def _throttling(found: Computer) -> Check:
     return ok(name, "none since the start")
 
 
-def _watchdog(found: Computer) -> Check:
+def hardware_watchdog_check(found: Computer) -> Check:
+    """Return whether the computer's own watchdog runs, and within what its counter holds."""
     name, dog = "hardware-watchdog", found.watchdog
     fix = "write RuntimeWatchdogSec=15 into /etc/systemd/system.conf"
     if dog is None:

@@ -5,8 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 
-from companion.core.types import Decision, Inhibit
-from companion.link.encode import STATE_ACTIVE, STATE_CRITICAL, STATE_STANDBY, Encoder
+from companion.core.types import Decision, Inhibit, SprayerState
+from companion.link.encode import (
+    STATE_ACTIVE,
+    STATE_BOOT,
+    STATE_CRITICAL,
+    STATE_EMERGENCY,
+    STATE_STANDBY,
+    Encoder,
+)
 
 HEARTBEAT_S = 1.0
 LIVE_S = 0.1
@@ -14,15 +21,36 @@ VALUES_S = 1.0
 TEXT_S = 1.0
 # Who connects in the middle of a flight learns within this why nothing is sprayed.
 REMIND_S = 30.0
+# What no product is sprayed with is marked; as numbers for ground stations.
+TRAINING = {"water": 1.0, "dry": 2.0, "ground": 3.0}
 _LINE_MAX = 50
 _LINES_MAX = 2
 _PREFIX = "Spray: "
 _WAITING_MAX = 8
 
 _INFO, _NOTICE, _WARNING, _ERROR = 6, 5, 4, 3  # MAV_SEVERITY
-_LOUD = frozenset({Inhibit.OUTPUT_FAULT, Inhibit.ESTIMATOR_UNHEALTHY, Inhibit.SPEED_DISAGREES})
+_LOUD = frozenset(
+    {
+        Inhibit.ESTOP,
+        Inhibit.REARM_NEEDED,
+        Inhibit.OUTPUT_FAULT,
+        Inhibit.LINK_LOST,
+        Inhibit.ESTIMATOR_UNHEALTHY,
+        Inhibit.SPEED_DISAGREES,
+    }
+)
 
-STATE_OFF, STATE_HELD, STATE_READY = 0.0, 1.0, 2.0
+# As numbers for ground stations: 0 boot, 1 safe, 2 ready, 3 armed, 4 spraying, 5 fault, 6 estop.
+_NUMBER = {state: float(number) for number, state in enumerate(SprayerState)}
+_MAV_STATE = {
+    SprayerState.BOOT: STATE_BOOT,
+    SprayerState.SAFE: STATE_STANDBY,
+    SprayerState.READY: STATE_STANDBY,
+    SprayerState.ARMED: STATE_ACTIVE,
+    SprayerState.SPRAYING: STATE_ACTIVE,
+    SprayerState.FAULT: STATE_CRITICAL,
+    SprayerState.ESTOP: STATE_EMERGENCY,
+}
 
 
 class _Beat:
@@ -51,8 +79,9 @@ class Announcer:
     So the heartbeat and SPR_LIVE prove that decisions are being made, not that a process exists.
     """
 
-    def __init__(self, encoder: Encoder) -> None:
+    def __init__(self, encoder: Encoder, *, training: str = "") -> None:
         self._encoder = encoder
+        self._training = TRAINING.get(training)
         self._heartbeat, self._live = _Beat(HEARTBEAT_S), _Beat(LIVE_S)
         self._values = _Beat(VALUES_S)
         self._said: frozenset[Inhibit] | None = None
@@ -88,7 +117,8 @@ class Announcer:
         if decision is not None and not decision.plan.is_off and self._live.is_due(now_s):
             yield self._encoder.named_value("SPR_LIVE", 1.0, now_s)
         if self._heartbeat.is_due(now_s):
-            yield self._encoder.heartbeat(_mav_state(decision))
+            state = SprayerState.BOOT if decision is None else decision.sprayer
+            yield self._encoder.heartbeat(_MAV_STATE[state])
         yield from self._notes(now_s)
         if decision is None:
             return
@@ -108,7 +138,7 @@ class Announcer:
                 yield self._encoder.text(severity, line)
 
     def _text(self, decision: Decision, now_s: float) -> Iterator[bytes]:
-        is_held = _state(decision) == STATE_HELD
+        is_held = bool(decision.inhibits) and Inhibit.NOT_ENABLED not in decision.inhibits
         is_new = decision.inhibits != self._said or (is_held and now_s - self._said_s >= REMIND_S)
         if not is_new or now_s - self._said_s < TEXT_S:
             return
@@ -126,11 +156,13 @@ class Announcer:
             "SPR_RATE": sum(rates) / len(rates) if rates else 0.0,
             "SPR_FLOW": decision.flow_l_min,
             "SPR_DUTY": sum(duty) / len(duty) if duty else 0.0,
-            "SPR_STATE": _state(decision),
+            "SPR_STATE": _NUMBER[decision.sprayer],
             "SPR_PCT": percent,
         }
         if self.tank_l is not None:
             values["SPR_TANK"] = self.tank_l
+        if self._training is not None:
+            values["SPR_TRAIN"] = self._training
         for name, value in values.items():
             yield self._encoder.named_value(name, value, now_s)
 
@@ -165,16 +197,3 @@ def reasons(inhibits: frozenset[Inhibit]) -> str:
     if not inhibits:
         return "ready"
     return "closed: " + ", ".join(inhibit for inhibit in Inhibit if inhibit in inhibits)
-
-
-def _state(decision: Decision) -> float:
-    if not decision.inhibits:
-        return STATE_READY
-    return STATE_OFF if Inhibit.NOT_ENABLED in decision.inhibits else STATE_HELD
-
-
-def _mav_state(decision: Decision | None) -> int:
-    if decision is None or Inhibit.NOT_ENABLED in decision.inhibits:
-        faulty = decision is not None and Inhibit.OUTPUT_FAULT in decision.inhibits
-        return STATE_CRITICAL if faulty else STATE_STANDBY
-    return STATE_CRITICAL if Inhibit.OUTPUT_FAULT in decision.inhibits else STATE_ACTIVE

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from companion.core.types import Input, OperatorCommand, RateOverride
+from companion.core.types import EstopReport, Input, OperatorCommand, RateOverride
 from companion.link.messages import CommandReceived
 from companion.link.parameters import RATE_PERCENT, VALUES_HZ, Parameters
 from companion.link.tank import Tank
@@ -17,6 +17,7 @@ SET_MESSAGE_INTERVAL = 511
 REQUEST_MESSAGE = 512
 REQUEST_CAPABILITIES = 520
 USER_RATE, USER_REFILLED, USER_NEXT_MAP = 31010, 31011, 31012
+USER_ESTOP = 31014
 # MAV_RESULT
 ACCEPTED, REJECTED_FOR_NOW, DENIED, UNSUPPORTED = 0, 1, 2, 3
 
@@ -47,6 +48,8 @@ class Desk:
     values_hz: float = 1.0
     is_armed: bool = False
     is_open: bool = False
+    # The sensor that counts the tank, where there is one; whether it takes this many litres.
+    on_refilled: Callable[[float], bool] | None = None
 
     def obey(self, command: CommandReceived) -> Answer:
         """Return the answer; whatever we do not know is unsupported."""
@@ -62,6 +65,12 @@ def _sprayer(_desk: Desk, command: CommandReceived) -> Answer:
         received_s=command.received_s, enable=command.param1 == 1.0, source="command"
     )
     return Answer(result=ACCEPTED, inputs=(wish,))
+
+
+def _estop(_desk: Desk, command: CommandReceived) -> Answer:
+    """Take an emergency stop, whatever its parameters: DO_SPRAYER 0 ends it."""
+    stop = EstopReport(received_s=command.received_s, pressed=True, source="command")
+    return Answer(result=ACCEPTED, inputs=(stop,), text="emergency stop", event="emergency stop")
 
 
 def rate_override(desk: Desk, percent: float, received_s: float) -> Answer:
@@ -87,10 +96,15 @@ def _user_rate(desk: Desk, command: CommandReceived) -> Answer:
 def _refilled(desk: Desk, command: CommandReceived) -> Answer:
     if desk.is_open:
         return Answer(result=REJECTED_FOR_NOW, text="refilled: stop spraying first")
+    before_l = desk.tank.level_l
     if not desk.tank.filled(command.param1):
         most_l = desk.tank.capacity_l
         advice = "give litres" if most_l is None else f"0 to {most_l:g} L"
         return Answer(result=DENIED, text=f"refilled: {advice}")
+    level_l = desk.tank.level_l
+    if level_l is not None and desk.on_refilled is not None and not desk.on_refilled(level_l):
+        desk.tank.level_l = before_l
+        return Answer(result=DENIED, text="refilled: more than tank.capacity_l")
     text = f"tank {desk.tank.level_l:g} L"
     return Answer(result=ACCEPTED, text=text, event=f"refilled, {text}")
 
@@ -150,4 +164,5 @@ _HANDLERS: dict[int, Callable[[Desk, CommandReceived], Answer]] = {
     USER_RATE: _user_rate,
     USER_REFILLED: _refilled,
     USER_NEXT_MAP: _next_map,
+    USER_ESTOP: _estop,
 }

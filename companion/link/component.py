@@ -54,6 +54,8 @@ class ComponentOptions:
     full_us: int = 2000
     use_mission: bool = False
     use_battery: bool = False
+    watch_mission: bool = False
+    training: str = ""
 
 
 class Component:
@@ -78,7 +80,7 @@ class Component:
         self.outputs = Outputs(
             self._encoder, self._send, closed_us=options.closed_us, full_us=options.full_us
         )
-        self._announcer = Announcer(self._encoder)
+        self._announcer = Announcer(self._encoder, training=options.training)
         self._desk = Desk(
             parameters=parameters if parameters is not None else Parameters(), tank=Tank()
         )
@@ -94,6 +96,7 @@ class Component:
         self._timesync_s = float("-inf")
         self.met_s: float | None = None
         self.is_answered = False
+        self.mission_active: bool | None = None
         self.on_order_ack: Callable[[int], None] | None = None
 
     @property
@@ -104,6 +107,15 @@ class Component:
     @on_event.setter
     def on_event(self, take: OnEvent | None) -> None:
         self._service.on_event = take
+
+    @property
+    def on_refilled(self) -> Callable[[float], bool] | None:
+        """Return who is told of a filling in litres, and says whether it can be one."""
+        return self._desk.on_refilled
+
+    @on_refilled.setter
+    def on_refilled(self, take: Callable[[float], bool] | None) -> None:
+        self._desk.on_refilled = take
 
     @property
     def is_vehicle_known(self) -> bool:
@@ -128,6 +140,10 @@ class Component:
         """Tell the operator once of something that does not work."""
         self._announcer.fault(text)
 
+    def note(self, text: str) -> None:
+        """Tell the operator of something that is as it should be."""
+        self._announcer.note(text)
+
     def warn(self, text: str) -> None:
         """Tell the operator of something that should be seen to."""
         self._announcer.note(text, is_warning=True)
@@ -146,6 +162,8 @@ class Component:
             elif isinstance(message, ParamAsked | ParamSet):
                 inputs.extend(self._service.serve(message))
             elif isinstance(message, MissionCurrent | MissionTransfer):
+                if isinstance(message, MissionCurrent):
+                    self.mission_active = message.is_active
                 inputs.extend(self._mission.take(message))
             else:
                 self._answer(message)
@@ -193,12 +211,15 @@ class Component:
         self.outputs.meet(vehicle)
         self._mission.meet(vehicle.system_id)
         self.met_s, self.is_answered = now_s, False
+        self.mission_active = None
+        if self._options.training:
+            self.note(f"training: {self._options.training}")
         if self._supervisor is None:
             self._supervisor = StreamSupervisor(may_group=vehicle.is_ardupilot)
         streams = wanted_streams(
             position_rate_hz=self._options.position_rate_hz,
             is_px4=vehicle.is_px4,
-            with_mission=self._options.use_mission,
+            with_mission=self._options.use_mission or self._options.watch_mission,
             with_battery=self._options.use_battery,
         )
         for request in self._supervisor.start(streams, now_s):

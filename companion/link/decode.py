@@ -117,7 +117,7 @@ def _heartbeat(m: Any, received_s: float) -> HeartbeatReport:
 def _landed(m: Any, received_s: float) -> LandedReport:
     # MAV_LANDED_STATE: 0 unknown, 1 on ground, 2 in air, 3 taking off, 4 landing.
     in_air = None if m.landed_state == 0 else m.landed_state == 2
-    return LandedReport(received_s=received_s, in_air=in_air)
+    return LandedReport(received_s=received_s, in_air=in_air, on_ground=m.landed_state == 1)
 
 
 def _wind(m: Any, received_s: float) -> WindReport:

@@ -9,7 +9,8 @@ from typing import Any
 
 from companion.link.census import AUTOPILOT_COMPONENT
 
-_FLOWN_STATES = frozenset({0, 3})  # MISSION_STATE unknown, active
+_UNKNOWN_STATE, _ACTIVE_STATE = 0, 3  # MISSION_STATE
+_FLOWN_STATES = frozenset({_UNKNOWN_STATE, _ACTIVE_STATE})
 # MAV_FRAME whose places are latitude and longitude: GLOBAL, GLOBAL_RELATIVE_ALT,
 # GLOBAL_TERRAIN_ALT, each also in its older _INT form.
 _GLOBAL_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
@@ -40,13 +41,14 @@ class MissionCurrent:
     """MISSION_CURRENT of the vehicle: which of how many items it flies to.
 
     `total` is 0 where it is not told; `is_flown` is False where the mission is paused, complete
-    or not begun.
+    or not begun. `is_active` says the same of one that tells, and is None where it does not.
     """
 
     received_s: float
     sequence: int
     total: int
     is_flown: bool = True
+    is_active: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,8 +70,14 @@ class MissionTransfer:
 
 def _current(m: Any, received_s: float) -> MissionCurrent:
     # 65535 is the total of a vehicle that has no missions; old ones send neither total nor state.
-    is_flown = m.mission_state in _FLOWN_STATES
-    return MissionCurrent(received_s=received_s, sequence=m.seq, total=m.total, is_flown=is_flown)
+    told = m.mission_state != _UNKNOWN_STATE
+    return MissionCurrent(
+        received_s=received_s,
+        sequence=m.seq,
+        total=m.total,
+        is_flown=m.mission_state in _FLOWN_STATES,
+        is_active=m.mission_state == _ACTIVE_STATE if told else None,
+    )
 
 
 def _transfer(

@@ -78,7 +78,8 @@ def wanted_streams(
         Stream(message_id=36, rate_hz=10.0, group=_RC_CHANNELS),
         Stream(message_id=wind, rate_hz=2.0, group=_EXTRA3, optional=True),
         Stream(message_id=132, rate_hz=10.0, group=_EXTRA3, optional=True),  # height above the crop
-        *([Stream(message_id=147, rate_hz=5.0, group=_EXTRA3)] if with_battery else []),
+        # ArduPilot's battery monitors take turns: three of them come 3 times a second each.
+        *([Stream(message_id=147, rate_hz=10.0, group=_EXTRA3)] if with_battery else []),
         *([Stream(message_id=42, rate_hz=2.0, group=_EXTENDED_STATUS)] if with_mission else []),
     )
 

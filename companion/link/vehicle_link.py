@@ -105,6 +105,27 @@ class VehicleLink:
         )
         return inputs
 
+    def on_refilled(self, take: Callable[[float], bool]) -> None:
+        """Have the operator's fillings given to `take(litres)`, which says whether it can be."""
+        self.component.on_refilled = take
+
+    def announce(self, text: str) -> None:
+        """Tell the operator of something that is as it should be."""
+        self.component.note(text)
+
+    @property
+    def mission_active(self) -> bool | None:
+        """Whether the vehicle says that it flies its mission; None where it does not say."""
+        return self.component.mission_active
+
+    @property
+    def rival(self) -> str | None:
+        """Return who speaks here as we do, such as a companion that is flying; None: nobody."""
+        address = self.component.address
+        if not self.component.codec.census.is_heard(*address, self._clock()):
+            return None
+        return f"another companion speaks as {address[0]}/{address[1]}"
+
     def order(self, channel: int, pulse_us: int) -> bool:
         """Order a servo output; False where the order could not leave."""
         return self.component.order(channel, pulse_us)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from companion.output.autopilot_options import ServoOptions
+    from companion.output.autopilot_options import DriveOutput, ServoOptions
 
 Known = Mapping[str, float | None]
 
@@ -185,21 +185,29 @@ def _pin(options: ServoOptions, known: Known, channel: int, name: str) -> Iterat
             key = "closed_us" if wanted == options.closed_us else "full_us"
             yield _fault(f"{name.format(kind)} is {value:g}: set it to {wanted} (output.{key})")
     is_return = channel == options.return_channel
+    drive = options.drive_at(channel)
     rest_us = options.full_us if is_return else options.closed_us
+    if drive is not None:
+        rest_us = drive.stop_us
+        if not (ends[0] <= drive.stop_us and drive.max_us <= ends[1]):
+            yield _fault(f"drive at {channel}: keep its pulses within {ends[0]} to {ends[1]} us")
     disarmed = known.get(name.format("DIS"))
     if disarmed is not None and disarmed != rest_us:
         text = f"{name.format('DIS')} is {disarmed:g}: set it to {rest_us}"
-        if not is_return and _is_open(options, disarmed):
+        if not is_return and _is_open(options, disarmed, drive):
             yield _fault(f"{text}, else disarming opens")
         else:
             yield _warning(text)
     failed = known.get(name.format("FAIL"))
-    if failed is not None and failed >= 0.0 and not is_return and _is_open(options, failed):
+    is_active = failed is not None and not is_return and _is_open(options, failed, drive)
+    if failed is not None and failed >= 0.0 and is_active:
         yield _warning(f"{name.format('FAIL')} is {failed:g}, which opens: set it to {rest_us}")
 
 
-def _is_open(options: ServoOptions, pulse_us: float) -> bool:
+def _is_open(options: ServoOptions, pulse_us: float, drive: DriveOutput | None) -> bool:
     """Return whether a pulse opens a valve: it lies on the side of `full_us`, or is no number."""
+    if drive is not None:
+        return not pulse_us <= drive.stop_us
     share = (pulse_us - options.closed_us) / (options.full_us - options.closed_us)
     return not share <= _CLOSED_SHARE
 

@@ -10,8 +10,33 @@ DITHER_S = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DriveOutput:
+    """A motor's output: where it stops, and the end of its range."""
+
+    channel: int
+    stop_us: int = 1000
+    max_us: int = 2000
+
+    def __post_init__(self) -> None:
+        if not 500 <= self.stop_us < self.max_us <= 2500:
+            raise ValueError(
+                f"stop_us and max_us must rise from 500 to 2500, got {self.stop_us}, {self.max_us}"
+            )
+
+    def pulse_us(self, fraction: float) -> int:
+        """Return the pulse for a fraction of the range.
+
+        >>> DriveOutput(channel=5, stop_us=1100, max_us=1900).pulse_us(0.5)
+        1500
+        """
+        return round(self.stop_us + fraction * (self.max_us - self.stop_us))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ServoOptions:
     """The outputs: one channel a valve, left to right, and the two ends of the pulse.
+
+    Drives have ends of their own; without valves they are all there is.
 
     At `return_channel`, if there is one, `full_us` opens a return valve and `closed_us` shuts it.
     With `dither_us` the pulse of an open valve moves to and fro by that much, around its own width,
@@ -27,9 +52,10 @@ class ServoOptions:
     dither_us: int = 0
     dithers_together: bool = False
     return_channel: int | None = None
+    drives: tuple[DriveOutput, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.channels or len(set(self.outputs)) != len(self.outputs):
+        if not self.outputs or len(set(self.outputs)) != len(self.outputs):
             raise ValueError(f"each valve needs a channel of its own, got {self.channels}")
         if not all(1 <= channel <= 32 for channel in self.outputs):
             raise ValueError(f"servo channels are 1 to 32, got {self.outputs}")
@@ -46,9 +72,30 @@ class ServoOptions:
 
     @property
     def outputs(self) -> tuple[int, ...]:
-        """Return all channels, that of the return valve at the end."""
+        """Return all channels: of the valves, of the return valve, of the drives."""
         more = () if self.return_channel is None else (self.return_channel,)
-        return self.channels + more
+        return self.channels + more + tuple(drive.channel for drive in self.drives)
+
+    def drive_at(self, channel: int) -> DriveOutput | None:
+        """Return the drive on a channel, if it is one."""
+        return next((drive for drive in self.drives if drive.channel == channel), None)
+
+    def ends_us(self, output: int) -> tuple[int, int]:
+        """Return the pulses of 0 and of 1 at an output, counted as in `outputs`."""
+        number = output - (len(self.outputs) - len(self.drives))
+        if number < 0:
+            return self.closed_us, self.full_us
+        return self.drives[number].stop_us, self.drives[number].max_us
+
+    def pulse_at(self, output: int, value: float) -> int:
+        """Return the pulse for a duty, or for a drive's fraction, at an output.
+
+        >>> pump = DriveOutput(channel=5, stop_us=1100)
+        >>> ServoOptions(channels=(9,), drives=(pump,)).pulse_at(1, 0.0)
+        1100
+        """
+        low_us, high_us = self.ends_us(output)
+        return round(low_us + value * (high_us - low_us))
 
     def pulse_us(self, duty: float) -> int:
         """Return the pulse for `duty`.

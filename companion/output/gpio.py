@@ -14,11 +14,13 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 from companion.core.types import SprayPlan
 from companion.errors import ActuatorError
 from companion.output.engine.child import COMMAND, EngineChild
-from companion.output.engine.lines import Lines, open_lines
+from companion.output.engine.held import HeldLines
+from companion.output.engine.selftest import SelfTest
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import (
     Issued,
@@ -53,7 +55,8 @@ class GpioExecutor:
     """Speaks with the engine by a socket; never waits but in `start` and `stop`.
 
     `issued` holds the last edges with their planned and actual time; `on_issued`, if set, is
-    given them as they come, some twenty times a second.
+    given them as they come, some twenty times a second. `on_event`, if set, is told of the
+    self-test: `on_event(at_s, kind, text)`.
     """
 
     def __init__(
@@ -68,7 +71,7 @@ class GpioExecutor:
         self._command = tuple(command)
         self._late_max_s = late_max_s
         self._child: EngineChild | None = None
-        self._held: Lines | None = None
+        self._held = HeldLines(setup)
         self._timer: asyncio.TimerHandle | None = None
         self._ready, self._ended = asyncio.Event(), asyncio.Event()
         self._fault: str | None = None
@@ -77,10 +80,12 @@ class GpioExecutor:
         self._is_stopping = False
         self.status = Status()
         self.warnings: list[str] = []
+        self.self_test: SelfTest | None = None
         self.lateness = Lateness()
         self.unsent_count = 0
         self.issued: deque[Issued] = deque(maxlen=_KEPT)
         self.on_issued: Callable[[Sequence[Issued]], None] | None = None
+        self.on_event: Callable[[float, str, str], None] | None = None
 
     @property
     def fault(self) -> str | None:
@@ -98,10 +103,13 @@ class GpioExecutor:
         return None if self._child is None else self._child.pid
 
     async def start(self) -> None:
-        """Start the engine; on return it has the lines, closed.
+        """Start the engine; on return it has the lines, closed, or the fault says why not.
+
+        What fails its self-test stays here with a fault and never opens, so that whoever looks at
+        the vehicle's messages is told; a restart tests anew.
 
         Raises:
-            ActuatorError: it does not start; the text says why.
+            ActuatorError: no engine answers at all.
         """
         loop = asyncio.get_running_loop()
         self._child = EngineChild(self._command)
@@ -111,11 +119,14 @@ class GpioExecutor:
             await asyncio.wait_for(self._ready.wait(), START_MAX_S)
         except TimeoutError:
             self._fail(f"valve engine not ready within {START_MAX_S:g} s")
-        if self._fault is not None:
+        if self.self_test is None:
             await self.stop()
-            raise ActuatorError(self._fault)
+            raise ActuatorError(self._fault or "valve engine not ready")
         for text in self.warnings:
             _logger.warning("%s", text)
+        (_logger.warning if self.self_test.fault else _logger.info)("%s", self.self_test.text())
+        if self.on_event is not None:
+            self.on_event(loop.time(), "self-test", self.self_test.text())
         self._heard_s = self._checked_s = loop.time()
         self._timer = loop.call_later(WATCH_S, self._watch)
 
@@ -151,7 +162,7 @@ class GpioExecutor:
                 await asyncio.wait_for(self._ended.wait(), STOP_MAX_S)
             if not self._ended.is_set():
                 child.kill()
-                self._take_over()
+                self._held.take(asyncio.get_running_loop().time())
             self._disconnect()
             # It has closed its end or was killed: what is left of its end is short.
             child.reap()
@@ -164,10 +175,7 @@ class GpioExecutor:
                 self.status.lease_ends,
                 self.status.stops,
             )
-        if self._held is not None:
-            with suppress(OSError):
-                self._held.release()
-            self._held = None
+        self._held.release()
 
     # ------------------------------------------------------------------------------- inside
 
@@ -205,10 +213,19 @@ class GpioExecutor:
             if self.on_issued is not None:
                 self.on_issued(edges)
         elif kind is Kind.READY:
-            self.warnings = list(json.loads(body)["warnings"])
-            self._ready.set()
+            self._take_ready(json.loads(body))
         elif kind is Kind.FAULT:
-            self._fail(f"valve engine: {body.decode(errors='replace')}")
+            text = body.decode(errors="replace")
+            # Before it is ready: it could not have its lines, and that is its whole self-test.
+            self.self_test = self.self_test or SelfTest(fault=text)
+            self._fail(f"valve engine: {text}")
+
+    def _take_ready(self, ready: dict[str, Any]) -> None:
+        self.warnings = list(ready["warnings"])
+        self.self_test = SelfTest.from_object(ready["self_test"])
+        if self.self_test.fault:
+            self._fail(f"valve engine: {self.self_test.fault}")
+        self._ready.set()
 
     def _engine_ended(self) -> None:
         """Let go of an engine that ended, or is to: what it leaves is closed from here."""
@@ -217,7 +234,7 @@ class GpioExecutor:
         if not self._is_stopping and self._child is not None:
             self._fail("valve engine ended by itself")
             self._child.kill()
-            self._take_over()
+            self._held.take(asyncio.get_running_loop().time())
 
     def _disconnect(self) -> None:
         if self._child is not None and self._child.is_connected:
@@ -233,8 +250,8 @@ class GpioExecutor:
         if not (self._ended.is_set() or now_s - self._heard_s <= SILENCE_MAX_S):
             self._fail(f"valve engine silent for {now_s - self._heard_s:.2f} s")
             self._engine_ended()
-        elif self._ended.is_set() and self._held is None:
-            self._take_over()
+        elif self._ended.is_set():
+            self._held.take(now_s)
         if not now_s - self._checked_s < _LATE_CHECK_S:
             self._checked_s = now_s
             late_s = self.lateness.quantile_s(0.99)
@@ -249,10 +266,3 @@ class GpioExecutor:
         if self._fault is None:
             self._fault = text
         self._ready.set()
-
-    def _take_over(self) -> None:
-        """Drive the lines of an engine that is gone to their safe levels, and hold them there."""
-        try:
-            self._held = open_lines(self._setup)
-        except ActuatorError as error:
-            _logger.error("lines cannot be taken over: %s", error)

@@ -86,21 +86,17 @@ class PulseTrain:
         return self.duty if self._pending is None else self._pending
 
     @property
-    def next_s(self) -> float:
-        """Return when something happens next."""
-        return self._edges[0][0] if self._edges else self._end_s
+    def next_times_s(self) -> tuple[float, float]:
+        """Return when something happens next, and when one who is woken by a timer is to look.
 
-    @property
-    def next_look_s(self) -> float:
-        """Return when to look next, for who is woken by a timer: `next_s`, or a little later.
-
-        The begin of a period moves nothing while half a gap lies before its pulse; looked at
-        together with another valve's edge it costs no wake-up of its own.
+        The begin of a period moves nothing while half a gap lies before its pulse; looked at a
+        little later, together with another valve's edge, it costs no wake-up of its own.
         """
-        rests = not (self._edges or self._is_open) and self._pending is None
-        if rests and self.duty <= self._last_duty:
-            return self._end_s + LOOK_LATER_S
-        return self.next_s
+        if self._edges:
+            next_s = self._edges[0][0]
+            return next_s, next_s
+        rests = not self._is_open and self._pending is None and self.duty <= self._last_duty
+        return self._end_s, self._end_s + LOOK_LATER_S if rests else self._end_s
 
     def run(self, before_s: float, out: list[Edge]) -> None:
         """Let everything happen that is due before `before_s`."""

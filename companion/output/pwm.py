@@ -133,8 +133,10 @@ class PulseEngine:
         first_s = min(times_s)
         if self._changes:
             first_s = min(first_s, self._changes[0].at_s)
-        if self._return is not None and self._return.next_s is not None:
-            first_s = min(first_s, self._return.next_s)
+        if self._return is not None:
+            return_s = self._return.next_s
+            if return_s is not None:
+                first_s = min(first_s, return_s)
         return min(first_s, self._lease_s)
 
     def _run(self, until_s: float) -> None:
@@ -155,11 +157,12 @@ class PulseEngine:
             self._close_all(max(self._lease_s, self._now_s))
         if self._return is not None:
             self._tell_return(self._return.run(until_s))
-        for valve, next_s in enumerate(self._next_s):
-            if next_s <= until_s:
-                train = self._trains[valve]
-                train.run(math.nextafter(until_s, math.inf), self._out)
-                self._note_next(valve)
+        if min(self._next_s) <= until_s:
+            after_s = math.nextafter(until_s, math.inf)
+            for valve, next_s in enumerate(self._next_s):
+                if next_s <= until_s:
+                    self._trains[valve].run(after_s, self._out)
+                    self._note_next(valve)
         self._now_s = until_s
 
     def _tell_return(self, moves: list[tuple[float, bool]]) -> None:
@@ -180,8 +183,7 @@ class PulseEngine:
         self._note_next(valve)
 
     def _note_next(self, valve: int) -> None:
-        self._next_s[valve] = self._trains[valve].next_s
-        self._look_s[valve] = self._trains[valve].next_look_s
+        self._next_s[valve], self._look_s[valve] = self._trains[valve].next_times_s
 
     def _close_all(self, at_s: float) -> None:
         self._lease_s = math.inf

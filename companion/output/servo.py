@@ -1,4 +1,4 @@
-"""Valves behind the autopilot's servo outputs: one timed order for each change of duty.
+"""Valves and drives behind the autopilot's servo outputs: one timed order for each change.
 
 A driver board at each output turns the pulse width into the valve's PWM: 0 at `closed_us`, fully
 open at `full_us`. Orders are fire-and-forget: a lost one is not repeated late but overtaken by
@@ -48,7 +48,11 @@ class ServoExecutor(TimedExecutor):
         baud: int | None = None,
         is_signed: bool = False,
     ) -> None:
-        super().__init__(len(options.channels), has_return=options.return_channel is not None)
+        super().__init__(
+            len(options.channels),
+            has_return=options.return_channel is not None,
+            drive_count=len(options.drives),
+        )
         self._options = options
         self._outputs = options.outputs
         self._order = order
@@ -144,7 +148,8 @@ class ServoExecutor(TimedExecutor):
         self._was_started = True
         now_s = asyncio.get_running_loop().time()
         self._refresh_at_s = now_s + self._pause_s
-        self._dither_at_s = now_s + self._dither_pause_s if self._options.dither_us else None
+        dithers = self._options.dither_us > 0 and self._count > 0
+        self._dither_at_s = now_s + self._dither_pause_s if dithers else None
         await super().start()
 
     async def stop(self) -> None:
@@ -168,7 +173,7 @@ class ServoExecutor(TimedExecutor):
     # ------------------------------------------------------------------------------- orders
 
     def _apply(self, valve: int, duty: float) -> bool:
-        pulse_us = self._options.pulse_us(duty)
+        pulse_us = self._options.pulse_at(valve, duty)
         sent_us = self._sent_us[valve]
         self._held_us.pop(valve, None)
         if sent_us is not None and not self._is_worth_it(valve, sent_us, pulse_us):
@@ -180,7 +185,7 @@ class ServoExecutor(TimedExecutor):
         moved_us = abs(pulse_us - sent_us)
         if moved_us == 0:
             return False
-        closed_us, full_us = self._options.closed_us, self._options.full_us
+        closed_us, full_us = self._options.ends_us(valve)
         if closed_us in (pulse_us, sent_us) or moved_us >= RESTART_DUTY * abs(full_us - closed_us):
             return True
         if moved_us < CHANGE_MIN_US and pulse_us != full_us:

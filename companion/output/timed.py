@@ -37,12 +37,23 @@ def duties_at(plan: SprayPlan, now_s: float) -> tuple[float, ...]:
     return tuple(duty)
 
 
+def fractions_at(plan: SprayPlan, now_s: float, count: int) -> tuple[float, ...]:
+    """Return what each of `count` drives is to have at `now_s`: all stopped after the lease.
+
+    A plan that says nothing of drives has them stopped.
+    """
+    if not now_s < plan.lease_until_s or not plan.drives:
+        return (0.0,) * count
+    return tuple(drive.at(now_s) for drive in plan.drives)
+
+
 def next_event_s(plan: SprayPlan, now_s: float) -> float | None:
     """Return when the plan next asks for something, the end of its lease included."""
     if not now_s < plan.lease_until_s:
         return None
     ahead = (change.at_s for change in plan.changes if change.at_s > now_s)
-    return min(chain(ahead, (plan.lease_until_s,)))
+    drives = (each.at_s for drive in plan.drives for each in drive.changes if each.at_s > now_s)
+    return min(chain(ahead, drives, (plan.lease_until_s,)))
 
 
 @dataclass(slots=True)
@@ -70,11 +81,14 @@ class Lateness:
 class TimedExecutor:
     """Follows the newest plan by one timer of the event loop; its clock is `time.monotonic`.
 
-    With a return valve there is one output more than there are valves: 1 is open, 0 shut.
+    With a return valve there is one output more than there are valves: 1 is open, 0 shut. Drives
+    come behind that; a plan's drives are nothing to an executor that has none.
     """
 
-    def __init__(self, valve_count: int, *, has_return: bool = False) -> None:
+    def __init__(self, valve_count: int, *, has_return: bool = False, drive_count: int = 0) -> None:
         self._count = valve_count
+        self._first_drive = valve_count + has_return
+        self._drive_count = drive_count
         self._return = ReturnValve() if has_return else None
         self._plan: SprayPlan | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -99,6 +113,10 @@ class TimedExecutor:
             return
         if len(plan.duty) != self._count:
             raise ValueError(f"plan for {len(plan.duty)} valves, executor has {self._count}")
+        if self._drive_count and len(plan.drives) not in (0, self._drive_count):
+            raise ValueError(
+                f"plan for {len(plan.drives)} drives, executor has {self._drive_count}"
+            )
         if self._plan is not None and plan.sequence <= self._plan.sequence:
             return
         now_s = asyncio.get_running_loop().time()
@@ -132,6 +150,8 @@ class TimedExecutor:
         if self._return is not None:
             self._return.submit(None, 0.0)
             self._apply(self._count, 1.0)
+        for drive in range(self._drive_count):
+            self._apply(self._first_drive + drive, 0.0)
         for valve in range(self._count):
             self._apply(valve, 0.0)
         self._flush()
@@ -153,11 +173,13 @@ class TimedExecutor:
         """Bring every valve to what it should have now."""
         clock = asyncio.get_running_loop().time
         self._move_return(now_s, opens=True)
+        self._drive(now_s, stops=True)
         given = [
             (valve, duty, clock())
             for valve, duty in enumerate(self._wanted(now_s))
             if self._apply(valve, duty)
         ]
+        self._drive(now_s, stops=False)
         self._move_return(now_s, opens=False)
         if self._flush():
             sent_s = clock()
@@ -166,6 +188,18 @@ class TimedExecutor:
         for plan in (self._plan, replaced):
             if plan is not None and given:
                 self._measure(plan, given)
+
+    def _drive(self, now_s: float, *, stops: bool) -> None:
+        """Stop the drives that are to stand, ahead of the valves; or move the others, behind."""
+        for drive, fraction in enumerate(self._fractions(now_s)):
+            if (fraction == 0.0) == stops:
+                self._apply(self._first_drive + drive, fraction)
+
+    def _fractions(self, now_s: float) -> tuple[float, ...]:
+        """Return what the drives are to have now; without a plan, and with a fault, stopped."""
+        if self._plan is None or self.fault is not None or not self._drive_count:
+            return (0.0,) * self._drive_count
+        return fractions_at(self._plan, now_s + _EARLY_S, self._drive_count)
 
     def _move_return(self, now_s: float, *, opens: bool) -> None:
         """Order the return valve if it is to be open (or shut): opening goes ahead of the rest."""

@@ -17,9 +17,19 @@ from types import ModuleType
 
 import numpy as np
 
-from companion.core import boom, controller, frame, interlock, nozzle, schedule, types
+from companion.core import (
+    atomiser,
+    boom,
+    controller,
+    frame,
+    interlock,
+    nozzle,
+    pump,
+    schedule,
+    types,
+)
 
-_MODULES = (types, boom, nozzle, schedule, interlock, frame, controller)
+_MODULES = (types, boom, nozzle, schedule, interlock, frame, pump, atomiser, controller)
 _SCALARS = frozenset({float, int, str, bool, type(None)})
 _SET = "frozenset"
 

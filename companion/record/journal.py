@@ -81,6 +81,7 @@ class Journal:
         started_s: float | None = None,
         queue_rows: int = QUEUE_ROWS,
         waits: bool = False,
+        training: str | None = None,
     ) -> Journal:
         """Begin the next flight's file in `folder`: flight-0001.gpkg, flight-0002.gpkg, ...
 
@@ -93,10 +94,13 @@ class Journal:
             started_s: what the companion's clock shows now; a simulation has its own.
             queue_rows: how far the disk may fall behind.
             waits: for simulations, faster than any disk: wait rather than drop.
+            training: `no` for a product, else what it is: `water`, `dry`. None: nobody says.
         """
         now_s = time.monotonic() if started_s is None else started_s
         started = datetime.now(UTC)
         meta = {**(setup_text or {}), **_about(setup, started, now_s)}
+        if training is not None:
+            meta["training"] = training
         try:
             folder.mkdir(parents=True, exist_ok=True)
             path = _new_file(folder, setup, meta)

@@ -54,6 +54,11 @@ class JournalContent:
         """Whether the flight ended in order; otherwise its last second may be missing."""
         return self.meta.get("closed") != "no"
 
+    @property
+    def training(self) -> str | None:
+        """What of this flight was no spraying of a product: `water`, `dry`, `no`; None: unknown."""
+        return self.meta.get("training")
+
     def value(self, entry: Entry) -> Input | Decision:
         """Return the input or the decision itself, exact to the last bit."""
         try:

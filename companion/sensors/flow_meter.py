@@ -5,10 +5,11 @@ Where the edges come from is behind `EdgeSource`: the kernel's GPIO (`gpiod_edge
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from companion.core.types import Input
+from companion.core.types import FlowReport, Input
 from companion.sensors.pulses import Edge, Meter, PulseCounter
 
 
@@ -19,7 +20,7 @@ class EdgeSource(Protocol):
         """Take the line."""
 
     def read(self) -> Sequence[Edge]:
-        """Return what came since the last call; never waits."""
+        """Return what came since the last call; never waits. OSError where the line is gone."""
 
     def close(self) -> None:
         """Let go of the line; may be called twice and before `open`."""
@@ -66,8 +67,13 @@ class FlowMeter:
         self._source.open()
 
     def read(self, now_s: float) -> Sequence[Input]:
-        """Return the count."""
-        for edge in self._source.read():
+        """Return the count, or why there is none."""
+        try:
+            edges = self._source.read()
+        except OSError as error:
+            text = f"flow meter: its line cannot be read: {error.strerror or error}"
+            return [FlowReport(received_s=now_s, volume_ml=math.nan, fault=text)]
+        for edge in edges:
             self.counter.take(edge)
         return [self.counter.report(now_s)]
 

@@ -7,6 +7,7 @@ from datetime import timedelta
 from typing import Any
 
 from companion.errors import SensorError
+from companion.gpio_chip import find_chip, load_gpiod
 from companion.sensors.pulses import Edge
 
 # A second of pulses at 1 kHz; the kernel drops and numbers what does not fit.
@@ -18,23 +19,14 @@ class GpiodEdges:
     """The rising edges of one line; the module is only needed where a line is."""
 
     def __init__(self, chip: str, line: int, *, pull: str = "as-is") -> None:
-        self._chip = chip if chip.startswith("/") else f"/dev/{chip}"
+        self._chip = chip
         self._line = line
         self._pull = pull
         self._request: Any = None
 
     def open(self) -> None:
         """Take the line: SensorError where the module, the chip or the line is not to be had."""
-        try:
-            import gpiod
-        except ImportError as error:
-            raise SensorError(
-                'flow_meter.source = "gpio" needs the module gpiod: pip install "gpiod>=2"'
-            ) from error
-        if int(getattr(gpiod, "__version__", "1").split(".")[0]) < 2:
-            raise SensorError(
-                'the module gpiod is version 1: pip install "gpiod>=2" in this environment'
-            )
+        gpiod = load_gpiod(SensorError)
         bias = {
             "up": gpiod.line.Bias.PULL_UP,
             "down": gpiod.line.Bias.PULL_DOWN,
@@ -48,7 +40,7 @@ class GpiodEdges:
         )
         try:
             self._request = gpiod.request_lines(
-                self._chip,
+                find_chip(gpiod, self._chip, SensorError),
                 consumer="vrspray flow meter",
                 config={self._line: settings},
                 event_buffer_size=BUFFER_SIZE,

@@ -70,6 +70,7 @@ class PulseCounter:
         self._echoes: deque[float] = deque()
         self._number: int | None = None
         self._lost_s = -math.inf
+        self._is_loss_told = True
         self._reported_s = -math.inf
 
     def take(self, edge: Edge) -> None:
@@ -83,6 +84,7 @@ class PulseCounter:
             self.count += lost
             self.lost_count += lost
             self._lost_s = at_s
+            self._is_loss_told = False
         if self._edges and not at_s - self._edges[-1][0] >= ECHO_SHARE * self.meter.period_min_s:
             self.echo_count += 1
             self._echoes.append(at_s)
@@ -101,6 +103,10 @@ class PulseCounter:
 
     def fault(self, now_s: float) -> str:
         """Return in words why the count cannot be believed; empty while it can."""
+        if not self._is_loss_told:
+            # What a full buffer drops are its oldest edges: at the first look the loss is as old
+            # as all that the buffer holds.
+            self._lost_s, self._is_loss_told = max(self._lost_s, now_s), True
         if not now_s - self._lost_s > FAULT_S:
             return f"flow meter: {self.lost_count} pulses lost"
         echoes = sum(1 for at_s in self._echoes if now_s - at_s <= FAULT_S)

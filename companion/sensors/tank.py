@@ -74,6 +74,18 @@ class TankSensor:
         counted_ml = self._counted_ml()
         self._full_l, self._at_ml = litres, 0.0 if counted_ml is None else counted_ml
 
+    def refilled(self, litres: float) -> bool:
+        """Take a filling that the operator tells of; whether it goes into the tank.
+
+        A level begins its mean anew, as what it saw before is not in the tank any more, and the
+        next report is made at once.
+        """
+        if not 0.0 <= litres <= self._capacity_l:
+            return False
+        self.filled(litres)
+        self._mean_l, self._reported_s = None, -math.inf
+        return True
+
     def read(self, now_s: float) -> Sequence[Input]:
         """Return what is left, once a second."""
         level_l, fault = self._level(now_s)

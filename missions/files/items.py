@@ -16,7 +16,6 @@ RELATIVE, NO_PLACE = 3, 2
 GROUND_SPEED = 1.0
 # Waypoints closer than this to the one before say nothing new: a border goes on in its next line.
 SAME_M = 0.6
-SAME_SEEN_M = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,25 +41,31 @@ def items_of(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) -> tuple
     Valves follow the map by position; `with_sprayer` adds DO_SPRAYER before and after each line
     as a belt, for ArduPilot, which alone takes it.
     """
-    settings = plan.settings
-    places = waypoints_of(sortie, apart=with_sprayer)
+    stops = waypoints_of(sortie, apart=with_sprayer)
     yaw_deg = _fixed_yaw(plan)
-    first = places[0][0]
-    items = [
-        _placed(plan, TAKEOFF, first),
-        Item(
-            command=CHANGE_SPEED, frame=NO_PLACE,
-            params=(GROUND_SPEED, settings.speed_m_s, -1.0, 0.0),
-        ),
-    ]  # fmt: skip
-    for place, opens in places[1:]:
-        items.append(_placed(plan, WAYPOINT, place, yaw_deg=yaw_deg))
-        if with_sprayer and opens is not None:
+    speed_m_s = plan.settings.speed_m_s
+    items = [_placed(plan, TAKEOFF, stops[0].place), _speed(speed_m_s)]
+    for stop in stops[1:]:
+        if stop.speed_m_s != speed_m_s:
+            speed_m_s = stop.speed_m_s
+            items.append(_speed(speed_m_s))
+        items.append(_placed(plan, WAYPOINT, stop.place, yaw_deg=yaw_deg))
+        if with_sprayer and stop.opens is not None:
             items.append(
-                Item(command=SPRAYER, frame=NO_PLACE, params=(float(opens), 0.0, 0.0, 0.0))
+                Item(command=SPRAYER, frame=NO_PLACE, params=(float(stop.opens), 0.0, 0.0, 0.0))
             )
+    if speed_m_s != plan.settings.speed_m_s:
+        items.append(_speed(plan.settings.speed_m_s))
     items.append(Item(command=RETURN_TO_LAUNCH, frame=NO_PLACE, params=(0.0, 0.0, 0.0, 0.0)))
     return tuple(items)
+
+
+def _speed(speed_m_s: float) -> Item:
+    """Return the item that sets the speed of all ways after it."""
+    return Item(
+        command=CHANGE_SPEED, frame=NO_PLACE,
+        params=(GROUND_SPEED, round(speed_m_s, 3), -1.0, 0.0),
+    )  # fmt: skip
 
 
 def _fixed_yaw(plan: Plan) -> float | None:
@@ -68,38 +73,46 @@ def _fixed_yaw(plan: Plan) -> float | None:
     return plan.angle_deg % 360.0 if plan.settings.turn == "strafe" else None
 
 
-def waypoints_of(sortie: Sortie, *, apart: bool = False) -> list[tuple[Place, bool | None]]:
-    """Return the places of a sortie from the depot on, and whether a line begins or ends there.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stop:
+    """A place of the way, the speed of the way to it, and whether a line begins or ends there."""
 
-    Where one line goes on in the next, their ends are one place in the middle, unless `apart`.
+    place: Place
+    speed_m_s: float
+    opens: bool | None = None
+
+
+def waypoints_of(sortie: Sortie, *, apart: bool = False) -> list[Stop]:
+    """Return the places of a sortie from the depot on.
+
+    Where one line goes on in the next, their ends are one place in the middle, unless `apart`;
+    where the speed changes inside a line, there is a place and nothing closes.
     The way back to the depot is left to the return, but for its bends.
     """
-    places: list[tuple[Place, bool | None]] = []
     legs = sortie.legs
-    places.append((legs[0].points[0], None))
+    stops = [Stop(place=legs[0].points[0], speed_m_s=legs[0].speed_m_s)]
     for number, leg in enumerate(legs):
         if leg.kind == "spray":
-            _add(places, leg.points[0], True, apart=apart)
-            _add(places, leg.points[-1], False, apart=apart)
+            goes_on = legs[number - 1].kind == "spray"
+            ends = number + 1 == len(legs) or legs[number + 1].kind != "spray"
+            if not goes_on:
+                _add(stops, leg.points[0], legs[number - 1].speed_m_s, apart=apart)
+            stops.append(
+                Stop(place=leg.points[-1], speed_m_s=leg.speed_m_s, opens=False if ends else None)
+            )
             continue
-        is_last = number == len(legs) - 1
-        for place in leg.points[1:-1]:
-            places.append((place, None))
-        if is_last:
-            break
-    return places
+        stops += [Stop(place=place, speed_m_s=leg.speed_m_s) for place in leg.points[1:-1]]
+    return stops
 
 
-def _add(
-    places: list[tuple[Place, bool | None]], place: Place, opens: bool, *, apart: bool
-) -> None:
-    near_m = SAME_SEEN_M if apart else SAME_M
-    last, opened = places[-1]
-    if opens and opened is False and math.dist(last, place) < near_m and not apart:
-        middle = ((last[0] + place[0]) / 2.0, (last[1] + place[1]) / 2.0)
-        places[-1] = (middle, None)
+def _add(stops: list[Stop], place: Place, speed_m_s: float, *, apart: bool) -> None:
+    """Add the start of a line; one that the last line goes on in is already there."""
+    last = stops[-1]
+    if last.opens is False and math.dist(last.place, place) < SAME_M and not apart:
+        middle = ((last.place[0] + place[0]) / 2.0, (last.place[1] + place[1]) / 2.0)
+        stops[-1] = Stop(place=middle, speed_m_s=last.speed_m_s)
         return
-    places.append((place, opens))
+    stops.append(Stop(place=place, speed_m_s=speed_m_s, opens=True))
 
 
 def _placed(plan: Plan, command: int, place: Place, *, yaw_deg: float | None = None) -> Item:

@@ -69,6 +69,18 @@ def heartbeat(autopilot: Autopilot, _now_s: float) -> Message:
     )
 
 
+def battery_status(autopilot: Autopilot, _now_s: float) -> Message:
+    """Return BATTERY_STATUS of one monitor; they take turns (GCS_Common.cpp)."""
+    monitors = autopilot.batteries()
+    autopilot.battery_turn = (autopilot.battery_turn + 1) % len(monitors)
+    found = monitors[autopilot.battery_turn]
+    percent = -1 if found.remaining_percent is None else found.remaining_percent
+    consumed = -1 if found.consumed is None else found.consumed
+    return dialect.MAVLink_battery_status_message(
+        found.number, 0, 0, 32767, [65535] * 10, -1, consumed, -1, percent
+    )
+
+
 BUILDERS: Mapping[int, Builder] = {
     **COMMON,
     dialect.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
@@ -76,11 +88,17 @@ BUILDERS: Mapping[int, Builder] = {
     dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
     dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT: ekf_status,
     dialect.MAVLINK_MSG_ID_WIND: wind,
+    dialect.MAVLINK_MSG_ID_BATTERY_STATUS: battery_status,
 }
 
 
 def withholds(autopilot: Autopilot, message_id: int, _now_s: float) -> bool:
-    """Return whether a message is not sent now: WIND, without an estimate of the airspeed."""
+    """Return whether a message is not sent now.
+
+    WIND, without an estimate of the airspeed; BATTERY_STATUS, without a monitor.
+    """
+    if message_id == dialect.MAVLINK_MSG_ID_BATTERY_STATUS:
+        return not autopilot.batteries()
     is_wind = message_id == dialect.MAVLINK_MSG_ID_WIND
     return bool(is_wind and not autopilot.parameters["EK3_DRAG_BCOEF_X"] > 0.0)
 
@@ -99,7 +117,6 @@ SILENT = frozenset(
     {
         dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR,
         dialect.MAVLINK_MSG_ID_RANGEFINDER,
-        dialect.MAVLINK_MSG_ID_BATTERY_STATUS,
         dialect.MAVLINK_MSG_ID_RPM,
         dialect.MAVLINK_MSG_ID_TERRAIN_REPORT,
     }

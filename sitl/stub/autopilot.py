@@ -6,7 +6,7 @@ the other stands in its `Firmware`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from sitl.stub import actions, mission, parameters, routing
 from sitl.stub.acknowledgements import Acknowledgements
@@ -15,6 +15,7 @@ from sitl.stub.channel import Channel
 from sitl.stub.faults import Fault, FaultKind
 from sitl.stub.impairment import Impairment
 from sitl.stub.incidents import Incidents
+from sitl.stub.liquid import Battery
 from sitl.stub.mission_items import MissionItem
 from sitl.stub.modes import INFO
 from sitl.stub.outputs import OutputState
@@ -45,7 +46,11 @@ class Autopilot:
         self.wind_towards_m_s = parts.wind_towards_m_s
         self.channels: list[Channel] = []
         self.upload: mission.Upload | None = None
+        self.fence: tuple[MissionItem, ...] = ()
         self.script: Script | None = None
+        # The battery monitors: those of flow meter and tank too, where the sprayer has them.
+        self.batteries: Callable[[], Sequence[Battery]] = tuple
+        self.battery_turn = -1
         self.hears: Callable[[Message, float], None] = lambda _message, _now_s: None
         self.says: Callable[[str], None] = lambda _text: None
         self.queue = parts.queue()

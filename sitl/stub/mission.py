@@ -1,7 +1,8 @@
 """The mission protocol: upload, download, clear, set current; one transfer at a time.
 
 ArduPilot's item 0 is home: it is replaced by the true home when it is read back. PX4 has no home
-in its mission; the flight's list has one, which the wire does not count.
+in its mission; the flight's list has one, which the wire does not count. A fence is kept and read
+back, and flown through; rally points are not kept.
 """
 
 from __future__ import annotations
@@ -22,79 +23,106 @@ _SLOW_S = 1.0
 _RETRY_S = 1.0
 _TIMEOUT_S = 8.0
 COUNT_MAX = 2000
+# ArduPilot has 560 B for a fence, 8 of them for a vertex; PX4 64 vertices or more, by board.
+FENCE_MAX = 64
+_MISSION, _FENCE = dialect.MAV_MISSION_TYPE_MISSION, dialect.MAV_MISSION_TYPE_FENCE
+_FENCE_COMMANDS = frozenset(
+    range(dialect.MAV_CMD_NAV_FENCE_RETURN_POINT, dialect.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION + 1)
+)
 
 
 @dataclass(slots=True, kw_only=True)
 class Upload:
-    """A mission on its way in."""
+    """A mission or a fence on its way in."""
 
     channel: Channel
     peer: tuple[int, int]
     count: int
     asked_s: float
     heard_s: float
+    kind: int = _MISSION
     items: list[MissionItem] = field(default_factory=list)
 
 
-def _acknowledge(autopilot: Autopilot, channel: Channel, peer: tuple[int, int], kind: int) -> None:
-    autopilot.send(channel, dialect.MAVLink_mission_ack_message(peer[0], peer[1], kind))
+def _acknowledge(
+    autopilot: Autopilot,
+    channel: Channel,
+    peer: tuple[int, int],
+    result: int,
+    kind: int = _MISSION,
+) -> None:
+    autopilot.send(channel, dialect.MAVLink_mission_ack_message(peer[0], peer[1], result, kind))
 
 
 def _ask(autopilot: Autopilot, upload: Upload, now_s: float) -> None:
     upload.asked_s = now_s
     request = dialect.MAVLink_mission_request_int_message(
-        upload.peer[0], upload.peer[1], len(upload.items)
+        upload.peer[0], upload.peer[1], len(upload.items), upload.kind
     )
     autopilot.send(upload.channel, request)
 
 
 def handle_count(autopilot: Autopilot, channel: Channel, message: Message, now_s: float) -> None:
-    """Begin an upload; fences and rally points are not kept."""
-    peer = sender(message)
-    if message.mission_type != dialect.MAV_MISSION_TYPE_MISSION:
-        kind = _ACCEPTED if message.count == 0 else dialect.MAV_MISSION_UNSUPPORTED
-        reply = dialect.MAVLink_mission_ack_message(peer[0], peer[1], kind, message.mission_type)
-        autopilot.send(channel, reply)
+    """Begin an upload; rally points are not kept."""
+    peer, kind = sender(message), message.mission_type
+    if kind not in (_MISSION, _FENCE):
+        result = _ACCEPTED if message.count == 0 else dialect.MAV_MISSION_UNSUPPORTED
+        _acknowledge(autopilot, channel, peer, result, kind)
         return
     if autopilot.upload is not None and autopilot.upload.peer != peer:
-        _acknowledge(autopilot, channel, peer, dialect.MAV_MISSION_DENIED)
+        _acknowledge(autopilot, channel, peer, dialect.MAV_MISSION_DENIED, kind)
         return
-    if message.count > COUNT_MAX:
-        _acknowledge(autopilot, channel, peer, dialect.MAV_MISSION_NO_SPACE)
+    if message.count > (COUNT_MAX if kind == _MISSION else FENCE_MAX):
+        _acknowledge(autopilot, channel, peer, dialect.MAV_MISSION_NO_SPACE, kind)
         return
     if message.count == 0:
-        autopilot.flight.set_items((), now_s)
-        _acknowledge(autopilot, channel, peer, _ACCEPTED)
+        _keep(autopilot, kind, (), now_s)
+        _acknowledge(autopilot, channel, peer, _ACCEPTED, kind)
         return
     channel.busy_until_s = now_s + _SLOW_S
-    upload = Upload(channel=channel, peer=peer, count=message.count, asked_s=now_s, heard_s=now_s)
+    upload = Upload(
+        channel=channel, peer=peer, count=message.count, asked_s=now_s, heard_s=now_s, kind=kind
+    )
     autopilot.upload = upload
     _ask(autopilot, upload, now_s)
+
+
+def _keep(autopilot: Autopilot, kind: int, items: tuple[MissionItem, ...], now_s: float) -> None:
+    if kind == _FENCE:
+        autopilot.fence = items
+    else:
+        autopilot.flight.set_items(items, now_s)
+
+
+def _refusal(autopilot: Autopilot, upload: Upload, message: Message) -> int | None:
+    if upload.kind == _MISSION:
+        return autopilot.firmware.refuses_item(message)
+    return None if message.command in _FENCE_COMMANDS else dialect.MAV_MISSION_UNSUPPORTED
 
 
 def handle_item(autopilot: Autopilot, channel: Channel, message: Message, now_s: float) -> None:
     """Take one item in and ask for the next one, or end the upload."""
     upload = autopilot.upload
-    if upload is None or sender(message) != upload.peer:
+    if upload is None or sender(message) != upload.peer or message.mission_type != upload.kind:
         return
     upload.heard_s = now_s
     channel.busy_until_s = now_s + _SLOW_S
     if message.seq != len(upload.items):
         _ask(autopilot, upload, now_s)
         return
-    refusal = autopilot.firmware.refuses_item(message)
+    refusal = _refusal(autopilot, upload, message)
     if refusal is not None:
         autopilot.upload = None
-        _acknowledge(autopilot, channel, upload.peer, refusal)
+        _acknowledge(autopilot, channel, upload.peer, refusal, upload.kind)
         return
     upload.items.append(item_of(message))
     if len(upload.items) < upload.count:
         _ask(autopilot, upload, now_s)
         return
     autopilot.upload = None
-    home = (autopilot.home_item(),) * autopilot.firmware.first_item
-    autopilot.flight.set_items((*home, *upload.items), now_s)
-    _acknowledge(autopilot, channel, upload.peer, _ACCEPTED)
+    home = (autopilot.home_item(),) * (autopilot.firmware.first_item if not upload.kind else 0)
+    _keep(autopilot, upload.kind, (*home, *upload.items), now_s)
+    _acknowledge(autopilot, channel, upload.peer, _ACCEPTED, upload.kind)
 
 
 def tick(autopilot: Autopilot, now_s: float) -> None:
@@ -104,8 +132,8 @@ def tick(autopilot: Autopilot, now_s: float) -> None:
         return
     if now_s - upload.heard_s > _TIMEOUT_S:
         autopilot.upload = None
-        kind = dialect.MAV_MISSION_OPERATION_CANCELLED
-        _acknowledge(autopilot, upload.channel, upload.peer, kind)
+        result = dialect.MAV_MISSION_OPERATION_CANCELLED
+        _acknowledge(autopilot, upload.channel, upload.peer, result, upload.kind)
     elif now_s - upload.asked_s > _RETRY_S:
         _ask(autopilot, upload, now_s)
 
@@ -113,36 +141,42 @@ def tick(autopilot: Autopilot, now_s: float) -> None:
 def handle_list(autopilot: Autopilot, channel: Channel, message: Message, now_s: float) -> None:
     """Say how many items there are."""
     peer, kind = sender(message), message.mission_type
-    own = kind == dialect.MAV_MISSION_TYPE_MISSION
-    items = len(autopilot.flight.items)
-    count = max(items - autopilot.firmware.first_item, 0) if own else 0
+    items, first = _kept(autopilot, kind)
     channel.busy_until_s = now_s + _SLOW_S
+    count = max(len(items) - first, 0)
     autopilot.send(channel, dialect.MAVLink_mission_count_message(peer[0], peer[1], count, kind))
+
+
+def _kept(autopilot: Autopilot, kind: int) -> tuple[tuple[MissionItem, ...], int]:
+    """Return what there is of a kind, and the index of what the wire calls item 0."""
+    if kind == _MISSION:
+        return autopilot.flight.items, autopilot.firmware.first_item
+    return (autopilot.fence if kind == _FENCE else ()), 0
 
 
 def handle_request(autopilot: Autopilot, channel: Channel, message: Message, now_s: float) -> None:
     """Send one item."""
-    items, peer = autopilot.flight.items, sender(message)
-    number = message.seq + autopilot.firmware.first_item
-    if not number < len(items) or message.mission_type != 0:
-        _acknowledge(autopilot, channel, peer, dialect.MAV_MISSION_INVALID_SEQUENCE)
+    peer, kind = sender(message), message.mission_type
+    items, first = _kept(autopilot, kind)
+    number = message.seq + first
+    if not number < len(items):
+        _acknowledge(autopilot, channel, peer, dialect.MAV_MISSION_INVALID_SEQUENCE, kind)
         return
     channel.busy_until_s = now_s + _SLOW_S
-    item = autopilot.home_item() if number == 0 else items[number]
-    current = message.seq == autopilot.wire_sequence(autopilot.flight.sequence)
-    autopilot.send(channel, item_message(item, message.seq, current=current, to=peer))
+    is_mission = kind == _MISSION
+    item = autopilot.home_item() if is_mission and number == 0 else items[number]
+    at = autopilot.wire_sequence(autopilot.flight.sequence)
+    current = is_mission and message.seq == at
+    autopilot.send(channel, item_message(item, message.seq, current=current, to=peer, kind=kind))
 
 
 def handle_clear(autopilot: Autopilot, channel: Channel, message: Message, now_s: float) -> None:
-    """Forget the mission."""
-    if message.mission_type in (
-        dialect.MAV_MISSION_TYPE_MISSION,
-        dialect.MAV_MISSION_TYPE_ALL,
-    ):
-        autopilot.flight.set_items((), now_s)
-    peer = sender(message)
-    reply = dialect.MAVLink_mission_ack_message(peer[0], peer[1], _ACCEPTED, message.mission_type)
-    autopilot.send(channel, reply)
+    """Forget the mission, the fence, or both."""
+    kind = message.mission_type
+    for each in (_MISSION, _FENCE):
+        if kind in (each, dialect.MAV_MISSION_TYPE_ALL):
+            _keep(autopilot, each, (), now_s)
+    _acknowledge(autopilot, channel, sender(message), _ACCEPTED, kind)
 
 
 def handle_set_current(

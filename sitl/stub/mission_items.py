@@ -116,7 +116,7 @@ def item_of(message: Message) -> MissionItem:
 
 
 def item_message(
-    item: MissionItem, sequence: int, *, current: bool, to: tuple[int, int]
+    item: MissionItem, sequence: int, *, current: bool, to: tuple[int, int], kind: int = 0
 ) -> Message:
     """Return MISSION_ITEM_INT for one item."""
     return dialect.MAVLink_mission_item_int_message(
@@ -134,6 +134,7 @@ def item_message(
         item.x_e7,
         item.y_e7,
         item.z_m,
+        kind,
     )
 
 

@@ -16,6 +16,7 @@ from companion.errors import ConfigError
 from sitl.stub.estimator import EstimatorNoise
 from sitl.stub.faults import Fault, FaultKind, read_faults, read_table
 from sitl.stub.firmware import Version
+from sitl.stub.liquid_entries import LiquidEntry, read_liquid
 
 _KNOWN: dict[str, tuple[str, ...]] = {
     "firmware": ("version", "commands_per_s"),
@@ -24,6 +25,7 @@ _KNOWN: dict[str, tuple[str, ...]] = {
     "wind": ("speed_m_s", "from_deg"),
     "box": ("closed_s",),
     "signing": ("key",),
+    "sensors": ("meter_battery", "tank_battery", "tank_l"),
 }
 _LIMITS: dict[str, tuple[float, float]] = {
     "commands_per_s": (1.0, 1000.0),
@@ -32,6 +34,9 @@ _LIMITS: dict[str, tuple[float, float]] = {
     "speed_m_s": (0.0, 30.0),
     "from_deg": (0.0, 360.0),
     "closed_s": (0.0, 60.0),
+    "meter_battery": (0.0, 15.0),
+    "tank_battery": (0.0, 15.0),
+    "tank_l": (0.1, 1000.0),
     "lag_s": (0.0, 2.0),
     "wire_s": (0.0, 2.0),
     "white_m": (0.0, 10.0),
@@ -59,17 +64,21 @@ class Scenario:
     wind_towards_m_s: tuple[float, float] = (0.0, 0.0)
     box_closed_s: float = 0.0
     signing_key: bytes | None = None
+    liquid: tuple[LiquidEntry, ...] = ()
+    meter_battery: int | None = None
+    tank_battery: int | None = None
+    tank_l: float = 10.0
 
 
 def load_scenario(path: Path) -> Scenario:
     """Return what a scenario file says."""
     check_scenario(path)
     table = read_table(path)
-    known = ("fault", "parameters", *_KNOWN)
+    known = ("fault", "parameters", *_KNOWN, "liquid")
     for name, entry in table.items():
         if name not in known:
             raise ConfigError(f"{path}: {name}: unknown; known: {', '.join(known)}")
-        if name != "fault" and not isinstance(entry, dict):
+        if name not in ("fault", "liquid") and not isinstance(entry, dict):
             raise ConfigError(f"{path}: {name}: write it as [{name}]")
         for key in entry if name in _KNOWN else ():
             if key not in _KNOWN[name]:
@@ -94,6 +103,10 @@ def load_scenario(path: Path) -> Scenario:
         wind_towards_m_s=reader.wind() if wind else (0.0, 0.0),
         box_closed_s=reader.number("box", "closed_s", 0.0),
         signing_key=reader.key() if "signing" in table else None,
+        liquid=read_liquid(path, table),
+        meter_battery=reader.battery("meter_battery"),
+        tank_battery=reader.battery("tank_battery"),
+        tank_l=reader.number("sensors", "tank_l", 10.0),
     )
 
 
@@ -129,6 +142,15 @@ class _Reader:
         """Return a table of numbers, whatever their names are."""
         entries = self._table.get(name, {})
         return {key: self._checked(name, key, value) for key, value in entries.items()}
+
+    def battery(self, key: str) -> int | None:
+        """Return the number of a battery monitor, counted from 0; None where there is none."""
+        if key not in self._table.get("sensors", {}):
+            return None
+        value = self.number("sensors", key, 0.0)
+        if value != int(value):
+            raise ConfigError(f"{self._path}: sensors.{key} = {value:g}: give a whole number")
+        return int(value)
 
     def version(self) -> Version:
         """Return the firmware's version."""

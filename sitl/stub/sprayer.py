@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
-from sitl.board import DriverBoard
-from sitl.plant import PulsedPlant
+from sitl.board import SERVO_FRAME_S, DriverBoard
+from sitl.drives import Motors
+from sitl.plants import edge_plant
 from sitl.profile import load_profile
 from sitl.stub.box import ArmingBox
+from sitl.stub.liquid import Liquid, LiquidOptions
+from sitl.stub.liquid_entries import SPRAYING
 from sitl.stub.outputs import ServoOrder
 
 Floats = NDArray[np.float64]
@@ -24,7 +27,10 @@ BoardKind = Literal["restarting", "free-running"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SprayerOptions:
-    """Which sprayer, and how it is wired: one servo channel a valve, left to right."""
+    """Which sprayer, and how it is wired: one servo channel a valve, left to right.
+
+    `drive_channels` are the pump's, where it has an order of its own, and the atomisers'.
+    """
 
     profile: str = "wang-2024"
     board: BoardKind = "restarting"
@@ -32,7 +38,21 @@ class SprayerOptions:
     closed_us: float = 1000.0
     full_us: float = 2000.0
     box_closed_s: float = 0.0  # how long a box wants to see the closed pulse first; 0: no such box
+    liquid: LiquidOptions | None = None
     seed: int = 0
+    drive_channels: tuple[int, ...] = ()
+
+
+class _Both:
+    """The pump's orders to both plants of one sprayer."""
+
+    def __init__(self, *plants: object) -> None:
+        self._plants = plants
+
+    def record_pump(self, at_s: float, pulse_us: float) -> None:
+        """Take down that the pump is ordered so from `at_s` on."""
+        for plant in self._plants:
+            plant.record_pump(at_s, pulse_us)  # type: ignore[attr-defined]
 
 
 class Sprayer:
@@ -45,6 +65,11 @@ class Sprayer:
                 f"the configuration wires {len(options.channels)} valves, the sprayer "
                 f"{options.profile} has {profile.valve_count}; choose another with --profile"
             )
+        if len(options.drive_channels) != profile.drive_count:
+            raise ConfigError(
+                f"the configuration wires {len(options.drive_channels)} motors, the sprayer "
+                f"{options.profile} has {profile.drive_count}; choose another with --profile"
+            )
         if not options.closed_us < options.full_us:
             raise ConfigError("output.closed_us must be below output.full_us for this board")
         self.options = options
@@ -55,10 +80,22 @@ class Sprayer:
             full_us=options.full_us,
         )
         self._valves = {channel: valve for valve, channel in enumerate(options.channels)}
-        self._plant = PulsedPlant(profile, seed=options.seed, start_s=start_s)
+        self._drives = {channel: number for number, channel in enumerate(options.drive_channels)}
+        self._plant = edge_plant(profile, seed=options.seed, start_s=start_s)
         # The same sprayer once more, with a short memory: from a whole flight of 150 s the litres
         # of now took 4 to 8 ms (measured on two x86 cores), so 1 to 2; the wire waits meanwhile.
-        self._recent = PulsedPlant(profile, seed=options.seed, start_s=start_s)
+        self._recent = edge_plant(profile, seed=options.seed, start_s=start_s)
+        self.motors = Motors(profile, _Both(self._plant, self._recent), start_s=start_s)
+        self.liquid: Liquid | None = None
+        if options.liquid is not None:
+            self.liquid = Liquid(
+                options.liquid,
+                self._recent,
+                also=(self._plant,),
+                start_s=start_s,
+                seed=options.seed,
+            )
+        self._is_opened = False
         self._board = DriverBoard(
             profile.pwm,
             profile.valve_count,
@@ -73,11 +110,19 @@ class Sprayer:
 
     def take(self, order: ServoOrder) -> None:
         """Take an order of the autopilot; those of other outputs are none of ours."""
+        drive = self._drives.get(order.channel)
+        if drive is not None:
+            # No pulse is a stop to a speed controller, as one that is too short is.
+            at_s = order.at_s + _WIRE_S + 0.5 * SERVO_FRAME_S
+            self.motors.order(at_s, drive, order.pulse_us)
         valve = self._valves.get(order.channel)
         if valve is not None:
             self.orders.append(order)
             if not self._box.passes(order):
                 return
+            if not self._is_opened and order.pulse_us > self.options.closed_us:
+                self._is_opened = True
+                self.begins(SPRAYING, order.at_s)
             self._board.order(order.at_s + _WIRE_S, valve, order.pulse_us)
 
     def advance(self, until_s: float) -> None:
@@ -85,6 +130,13 @@ class Sprayer:
         edges = self._board.advance(until_s)
         self._plant.record(edges)
         self._recent.record(edges)
+        if self.liquid is not None:
+            self.liquid.advance(until_s, self.volume_l)
+
+    def begins(self, moment: str, at_s: float) -> None:
+        """Take that a moment has come from which faults of the liquid count."""
+        if self.liquid is not None:
+            self.liquid.begins(moment, at_s)
 
     def volume_ml(self, times_s: Floats) -> Floats:
         """Return (n, valves): what each valve has delivered up to each time."""

@@ -83,6 +83,15 @@ def cpu_s(pid: int) -> float:
         return math.nan  # it ended: its fault tells why
 
 
+def wakes(pid: int) -> int:
+    """Return how often a process has gone to sleep by itself, to be woken again."""
+    try:
+        text = Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return 0
+    return int(text.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
+
+
 async def own_process(for_s: float, *, realtime: bool) -> dict[str, Any]:
     """Return what the engine shows as a process of its own."""
     executor = GpioExecutor(setup(realtime=realtime), late_max_s=math.inf)
@@ -90,20 +99,24 @@ async def own_process(for_s: float, *, realtime: bool) -> dict[str, Any]:
     await executor.start()
     pid = executor.engine_pid or 0
     begin_s = time.monotonic()
-    begin_cpu_s = cpu_s(pid)
+    begin_cpu_s, begin_wakes = cpu_s(pid), wakes(pid)
     load = asyncio.create_task(busy(begin_s + for_s))
     number = 0
     while time.monotonic() < begin_s + for_s:
         executor.submit(plan(number, time.monotonic()))
         number += 1
         await asyncio.sleep(PLAN_S)
-    share = (cpu_s(pid) - begin_cpu_s) / (time.monotonic() - begin_s)
+    took_s = time.monotonic() - begin_s
+    share, woken = (cpu_s(pid) - begin_cpu_s) / took_s, wakes(pid) - begin_wakes
     await load
     found = _figures(list(executor.issued))
     status, warnings, fault = executor.status, executor.warnings, executor.fault
     await executor.stop()
     return found | {
         "cpu_percent": 100.0 * share,
+        "wakes_a_second": woken / took_s,
+        "us_a_wake": 1e6 * share * took_s / max(woken, 1),
+        "writes_a_second": status.writes / took_s,
         "standstills": status.stops,
         "dropped_reports": status.dropped_reports,
         "refused_plans": status.rejected,
@@ -252,7 +265,7 @@ def gpio_edges(*, seed: int = 0, is_quick: bool = False) -> list[Figure]:
             n=fifo.get("edges", 0),
             target=TARGET_FIFO_MS,
             alternative=others,
-            details=found,
+            details=found | {"load_average": os.getloadavg()[0]},
         ),
         Figure(
             key="gpio_p99_plain_ms",

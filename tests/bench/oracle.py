@@ -73,7 +73,7 @@ _GOOD: dict[type, Callable[[Any], bool]] = {
     HeartbeatReport: lambda item: item.armed and item.mode in ("AUTO", "MISSION"),
     GnssReport: lambda item: item.fix >= Fix.RTK_FLOAT,
     EstimatorReport: lambda item: item.healthy,
-    OutputReport: lambda item: item.healthy,
+    OutputReport: lambda item: item.healthy and item.link_up,
     LandedReport: lambda item: item.in_air is True,
     SpeedReport: lambda item: 0.0 <= item.ground_speed_m_s <= 13.0,
     WindReport: lambda item: 0.0 <= item.speed_m_s <= 6.0,

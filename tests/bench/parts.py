@@ -21,7 +21,7 @@ from tests.bench.flights import (
     pinpoint_tasks,
     tasks,
 )
-from tests.bench.timings import TIMINGS, arrival_times, core_times, map_times
+from tests.bench.timings import TIMINGS, arrival_times, core_times, edge_times, map_times
 
 Work = TypeVar("Work")
 Done = TypeVar("Done")
@@ -180,10 +180,15 @@ def _arrivals(options: Options) -> list[Figure]:
     return arrival_times(seed=options.seed, is_quick=options.is_quick)
 
 
+def _edges(options: Options) -> list[Figure]:
+    return edge_times(seed=options.seed, is_quick=options.is_quick)
+
+
 PARTS: tuple[Part, ...] = (
     Part(name="steps", section=TIMINGS, run=_core),
     Part(name="maps", section=TIMINGS, run=_maps),
     Part(name="arrivals", section=TIMINGS, run=_arrivals),
+    Part(name="gpio-edges", section=TIMINGS, run=_edges),
     Part(name="field", section=FIELD_SECTION, run=_field),
     Part(name="pinpoint", section=FIELD_SECTION, run=_pinpoint),
     Part(name="identified", section=IDENTIFIED_SECTION, run=_identified),

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from tests.bench.arrival import arrivals
 from tests.bench.figures import Figure
+from tests.bench.gpio_edges import gpio_edges
 from tests.bench.loading import loading, raster
 from tests.bench.lookup import cell_lookup, lookup_growth, lookups
 from tests.bench.realtime import times_real_time
@@ -40,6 +41,11 @@ def map_times(*, seed: int, is_quick: bool) -> list[Figure]:
 def arrival_times(*, seed: int, is_quick: bool) -> list[Figure]:
     """Return what passes from a message to the last order's bytes."""
     return _rows(arrivals(seed=seed, count=100 if is_quick else 400))
+
+
+def edge_times(*, seed: int, is_quick: bool) -> list[Figure]:
+    """Return how late the edges of the valve engine are, and what it costs."""
+    return _rows(gpio_edges(seed=seed, is_quick=is_quick))
 
 
 def _rows(figures: Iterable[Figure]) -> list[Figure]:

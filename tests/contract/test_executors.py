@@ -10,6 +10,8 @@ import pytest
 
 from companion.core.nozzle import PwmLimits
 from companion.core.types import TimedChange
+from companion.output.autopilot_options import DriveOutput
+from companion.output.composite import CompositeExecutor, Part
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wiring import Wiring
 from companion.output.gpio import GpioExecutor
@@ -114,11 +116,22 @@ def gpio_bench() -> Bench:
     return Bench(executor=executor, seen=seen, reports_s=0.1)
 
 
+def composite_bench() -> Bench:
+    """Valves behind the autopilot, a pump behind something else."""
+    valves = servo_bench()
+    pump = ServoExecutor(
+        ServoOptions(channels=(), drives=(DriveOutput(channel=5),)), lambda channel, pulse_us: True
+    )
+    parts = [Part(executor=pump, drives=(0,)), Part(executor=valves.executor, has_valves=True)]
+    return Bench(executor=CompositeExecutor(parts), seen=valves.seen)
+
+
 BENCHES: dict[str, Callable[[], Bench]] = {
     "servo": servo_bench,
     "px4": px4_bench,
     "none": dry_bench,
     "gpio": gpio_bench,
+    "composite": composite_bench,
 }
 
 

@@ -162,7 +162,7 @@ async def give_commands(station: Ground) -> None:
     await station.until(lambda: station.has_said("not-armed"))
     assert await station.command(dialect.MAV_CMD_DO_SPRAYER, 0.5) == DENIED
     assert await station.command(dialect.MAV_CMD_DO_SPRAYER, 0.0) == ACCEPTED
-    await station.until(lambda: station.value("SPR_STATE") == 0.0)
+    await station.until(lambda: station.value("SPR_STATE") == 2.0)
     assert await station.command(RATE_OVERRIDE, 90.0) == ACCEPTED
     await station.until(lambda: station.value("SPR_PCT") == 90.0)
     assert await station.command(RATE_OVERRIDE, 120.0) == DENIED

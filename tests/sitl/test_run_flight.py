@@ -324,7 +324,7 @@ async def test_a_lost_tcp_link_closes_and_comes_back_closed_first() -> None:
     flight = Flight(companion, peer)
     await flight.until_spraying()
     await host.hang_up()
-    await companion.notes.until(lambda d: Inhibit.OUTPUT_FAULT in d.inhibits)
+    await companion.notes.until(lambda d: Inhibit.LINK_LOST in d.inhibits)
     assert companion.notes.decisions[-1].plan.is_off
     count = len(peer.orders)
     await host.connected.wait()

@@ -45,6 +45,10 @@ class WirePeer:
         self.start_east_m, self.speed_m_s = east_m, speed_m_s
         self.started_s = time.monotonic()
         self.mode, self.armed, self.landed_state = 3, True, 2
+        self.autopilot = 3
+        self.twin = False  # somebody else speaks as component 191
+        self.is_landed_told = True
+        self.mission_state = 0  # not told
         self.servo_result = ACCEPTED
         self.is_silent = False
         self.orders: list[Order] = []
@@ -53,6 +57,7 @@ class WirePeer:
         self.write: Callable[[bytes], None] = lambda data: None
         self._mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         self._ground = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        self._twin = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
         self._parser = mavlink.MAVLink(None)
         self._parser.robust_parsing = True
         self._streams: dict[int, asyncio.Task[None]] = {}
@@ -103,6 +108,9 @@ class WirePeer:
         if message is not None:
             self.write(bytes(message.pack(self._mav)))
             self._mav.seq = (self._mav.seq + 1) % 256
+        if self.twin and message_id == 0:
+            beat = self._twin.heartbeat_encode(18, 8, 0, 0, 4)
+            self.write(bytes(beat.pack(self._twin)))
 
     def _compose(self, message_id: int) -> Any:
         now_s = time.monotonic()
@@ -111,7 +119,9 @@ class WirePeer:
         latitude, longitude = self.frame.to_geographic(self.east_m(now_s), 3.0)
         pulses = [self.outputs.get(channel, 0) for channel in range(1, 17)]
         return {
-            0: lambda: mav.heartbeat_encode(2, 3, 1 | (128 if self.armed else 0), self.mode, 4),
+            0: lambda: mav.heartbeat_encode(
+                2, self.autopilot, 1 | (128 if self.armed else 0), self.mode, 4
+            ),
             33: lambda: mav.global_position_int_encode(
                 boot_ms,
                 round(latitude * 1e7),
@@ -126,7 +136,10 @@ class WirePeer:
             74: lambda: mav.vfr_hud_encode(0.0, self.speed_m_s, 90, 0, 60.0, 0.0),
             24: lambda: mav.gps_raw_int_encode(0, 6, 0, 0, 0, 0, 0, 0, 0, 20, h_acc=14),
             193: lambda: mav.ekf_status_report_encode(HEALTHY_EKF, 0.1, 0.1, 0.1, 0.1, 0.0),
-            245: lambda: mav.extended_sys_state_encode(0, self.landed_state),
+            245: lambda: (
+                mav.extended_sys_state_encode(0, self.landed_state) if self.is_landed_told else None
+            ),
+            42: lambda: mav.mission_current_encode(1, 4, self.mission_state),
             65: lambda: mav.rc_channels_encode(boot_ms, 8, *([1500] * 8), *([65535] * 10), 255),
             36: lambda: mav.servo_output_raw_encode(0, 0, *pulses),
         }.get(message_id, lambda: None)()

@@ -125,6 +125,14 @@ def test_default_rate_holds_inside_the_boundary_only() -> None:
 # ------------------------------------------------------------------------------ what is refused
 
 
+def test_a_map_with_another_hash_is_refused() -> None:
+    found = build_setup(load(EXAMPLE)).prescription.sha256
+    for digits in (found, found[:8]):
+        assert build_setup(load(EXAMPLE, overrides=[f"prescription.sha256={digits}"]))
+    with pytest.raises(ConfigError, match=f"begins with {found[:8]}"):
+        build_setup(load(EXAMPLE, overrides=["prescription.sha256=0123456789abcdef"]))
+
+
 def test_map_above_the_label_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"27\.8 L/ha, above product.rate_max_l_ha = 27\.5"):
         setup_with("product.rate_max_l_ha=27.5")

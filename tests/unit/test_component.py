@@ -358,7 +358,7 @@ def test_values_are_told_once_a_second(peer: Peer, met: Component) -> None:
     for turn in range(60):
         met.tick(OPEN, turn * 0.05)
     assert len(peer.named("SPR_FLOW")) == 3
-    assert peer.named("SPR_STATE") == [2.0] * 3
+    assert peer.named("SPR_STATE") == [4.0] * 3
     assert peer.named("SPR_RATE")[0] == pytest.approx(20.0)
 
 

@@ -452,9 +452,11 @@ def test_latched_reason_alone_closes_every_valve(inhibit: Inhibit) -> None:
     assert decision.findings == (finding,)
     decision, memory = step(watched, flying(10.1, 6.5), memory, 10.1)
     assert decision.plan.is_off
-    decision, memory = step(watched, flying(10.2, 7.0, enabled=False), memory, 10.2)
+    disabled = flying(10.2, 7.0, enabled=False, operator_wishes=1)
+    decision, memory = step(watched, disabled, memory, 10.2)
     assert decision.inhibits == {Inhibit.NOT_ENABLED}
-    assert not step(watched, flying(10.3, 7.5), memory, 10.3)[0].plan.is_off
+    enabled = flying(10.3, 7.5, operator_wishes=2)
+    assert not step(watched, enabled, memory, 10.3)[0].plan.is_off
 
 
 def test_decision_with_findings_comes_back_from_the_journal() -> None:

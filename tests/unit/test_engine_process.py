@@ -17,6 +17,7 @@ import pytest
 from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ActuatorError
+from companion.output.engine.selftest import WAKES
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import CHANGES_MAX
 from companion.output.engine.wiring import Wiring
@@ -31,10 +32,16 @@ OPEN = 0b11
 class Bench:
     """An executor whose engine writes its levels into a file."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, wake_late_max_s: float | None = None) -> None:
         self.path = path
         self.executor = GpioExecutor(
-            EngineSetup(wiring=Wiring(valves=(17, 18)), pwm=PWM, backend="file", device=str(path))
+            EngineSetup(
+                wiring=Wiring(valves=(17, 18)),
+                pwm=PWM,
+                backend="file",
+                device=str(path),
+                wake_late_max_s=wake_late_max_s,
+            )
         )
         self.sequence = 0
 
@@ -188,14 +195,62 @@ def _lives(pid: int) -> bool:
     return state not in ("Z", "X")
 
 
-async def test_an_engine_that_cannot_have_its_lines_says_why(tmp_path: Path) -> None:
-    device = str(tmp_path / "none" / "levels")
-    executor = GpioExecutor(
-        EngineSetup(wiring=Wiring(valves=(1,)), pwm=PWM, backend="file", device=device)
-    )
-    with pytest.raises(ActuatorError, match=f"{device}: No such file"):
-        await executor.start()
-    assert executor.engine_pid is None
+async def test_an_engine_that_cannot_have_its_lines_says_why_and_never_opens(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bench = Bench(tmp_path / "none" / "levels")
+    told: list[tuple[str, str]] = []
+    bench.executor.on_event = lambda at_s, kind, text: told.append((kind, text))
+    await bench.executor.start()
+    try:
+        fault = f"{bench.path}: No such file or directory; is it free, and may this user open it?"
+        assert bench.executor.fault == f"valve engine: {fault}"
+        assert told == [("self-test", f"failed: {fault}")]
+        # Once they can be had they are taken, and held closed: the fault stays.
+        bench.path.parent.mkdir()
+        await until(bench.path.exists)
+        assert bench.executor.fault == f"valve engine: {fault}"
+        bench.open()
+        await asyncio.sleep(0.1)
+        assert bench.levels == 0
+        assert sum("taken over" in record.message for record in caplog.records) <= 1
+    finally:
+        await bench.executor.stop()
+
+
+async def test_an_engine_that_wakes_late_is_a_fault_and_never_opens(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "levels", wake_late_max_s=0.0)
+    await bench.executor.start()
+    try:
+        assert "late; allow rtprio" in str(bench.executor.fault)
+        bench.open()
+        await asyncio.sleep(0.2)
+        assert bench.levels == 0
+        assert bench.executor.status.accepted == 0
+        assert bench.executor.engine_pid is not None
+        # Even a plan that reaches it opens nothing: the fault is its own as well.
+        bench.executor._fault = None
+        bench.open()
+        await until(lambda: bench.executor.status.accepted > 0)
+        await until(lambda: bench.executor.fault is not None)
+        assert bench.levels == 0
+    finally:
+        await bench.executor.stop()
+
+
+async def test_a_good_self_test_is_told(tmp_path: Path) -> None:
+    bench = Bench(tmp_path / "levels")
+    told: list[tuple[str, str]] = []
+    bench.executor.on_event = lambda at_s, kind, text: told.append((kind, text))
+    await bench.executor.start()
+    await bench.executor.stop()
+    assert bench.executor.fault is None
+    found = bench.executor.self_test
+    assert found is not None
+    assert (found.outputs, found.levels_read_back, found.alive_toggles) == (2, True, None)
+    assert found.wakes == WAKES
+    assert 0.0 <= found.median_late_s <= found.p99_late_s <= found.worst_late_s
+    assert told == [("self-test", found.text())]
 
 
 async def test_an_engine_that_is_no_engine_is_a_failed_start() -> None:

@@ -121,6 +121,9 @@ def test_a_plan_opens_and_its_lease_closes(bench: Bench) -> None:
     bench.run(1.0)
     assert bench.valves == 0
     assert bench.engine.status().lease_ends == 1
+    bench.plan(1.0, 1.0)
+    bench.run(1.0)
+    assert bench.engine.status().lease_ends == 2
 
 
 def test_the_return_valve_shuts_after_the_valves_open_and_opens_before_they_close(
@@ -166,6 +169,36 @@ def test_a_standstill_closes_first_and_old_plans_are_void(bench: Bench) -> None:
     assert bench.valves == 0
     bench.plan(1.0, 1.0)
     assert bench.valves == 0b11
+
+
+def test_alive_stands_still_after_a_standstill_until_a_new_plan(bench: Bench) -> None:
+    bench.run(0.2, renew=(1.0, 0.5))
+    bench.now_s += GAP_S + 0.01
+    bench.turn()
+    assert not bench.engine.status().is_alive
+    count = len(bench.seen)
+    bench.run(0.5)
+    assert len({levels & ALIVE for _, levels in bench.seen[count:]}) == 1
+    bench.plan(0.0, 0.0)
+    assert bench.engine.status().is_alive
+
+
+def test_signs_of_life_keep_their_mean_and_begin_anew_after_a_delay(bench: Bench) -> None:
+    def beats() -> int:
+        return sum(kind is Kind.STATUS for kind, _ in bench.told)
+
+    for _ in range(40):
+        # Looked at late, by another part of a period each time.
+        bench.now_s += 0.027
+        bench.turn()
+    assert beats() == pytest.approx(40 * 0.027 / BEAT_S, abs=1)
+    before = beats()
+    bench.now_s += BEAT_S + 0.045
+    bench.turn()
+    bench.turn()
+    assert beats() == before + 1
+    assert bench.engine.next_s >= bench.now_s + BEAT_S - 0.027
+    assert bench.engine.status().stops == 0
 
 
 def test_a_plan_that_wakes_a_stopped_engine_opens_nothing_by_itself(bench: Bench) -> None:

@@ -55,12 +55,33 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
     ],
     Inhibit.RC_SWITCH: [{"rc_switch_on": False}, {"rc_switch_on": None}],
     Inhibit.OUTPUT_FAULT: [{"output_healthy": False}],
+    Inhibit.LINK_LOST: [{"link_up": False}],
+    Inhibit.ESTOP: [{"estop": True}, {"estop": None}],
+    Inhibit.ACCURACY_TOO_LOW: [
+        {"horizontal_accuracy_m": 0.301},
+        {"horizontal_accuracy_m": NAN},
+        {"horizontal_accuracy_m": -0.01},
+        {"horizontal_accuracy_m": math.inf},
+    ],
 }
 
 
 # Everything that can be asked for is, and all of it is there.
-STRICT = Limits(wind_required=True, speed_check_required=True, rc_channel=7)
-READY = replace(SPRAYING, wind_m_s=3.0, wind_received_s=9.9, rc_switch_on=True)
+STRICT = Limits(
+    wind_required=True,
+    speed_check_required=True,
+    rc_channel=7,
+    accuracy_max_m=0.3,
+    estop_required=True,
+)
+READY = replace(
+    SPRAYING,
+    wind_m_s=3.0,
+    wind_received_s=9.9,
+    rc_switch_on=True,
+    estop=False,
+    horizontal_accuracy_m=0.02,
+)
 
 
 def decide(change: dict[str, object] | None, limits: Limits = STRICT) -> Decision:
@@ -76,7 +97,8 @@ def test_nothing_inhibits_the_reference_step() -> None:
     assert not decision.plan.is_off
 
 
-# Those that flow and pressure give: their cases are in test_detection.py.
+# Those that flow and pressure give: their cases are in test_detection.py. The one that a latch
+# gives has its own in test_sprayer_state.py.
 OF_THE_LIQUID = {
     Inhibit.LEAK,
     Inhibit.VALVE_STUCK_OPEN,
@@ -87,7 +109,7 @@ OF_THE_LIQUID = {
 
 
 def test_every_inhibit_has_a_case() -> None:
-    assert set(CASES) | OF_THE_LIQUID == set(Inhibit)
+    assert set(CASES) | OF_THE_LIQUID | {Inhibit.REARM_NEEDED} == set(Inhibit)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +137,8 @@ UNASKED = {
     "wind_received_s": None,
     "checked_speed_m_s": None,
     "rc_switch_on": None,
+    "estop": None,
+    "horizontal_accuracy_m": None,
 }
 
 

@@ -28,6 +28,7 @@ from companion.core.types import (
     ClockReport,
     Decision,
     EstimatorReport,
+    EstopReport,
     Fix,
     FlowReport,
     GnssReport,
@@ -78,6 +79,7 @@ INPUTS: list[Input] = [
     RcReport(received_s=1.6, pulse_us=(1500, 0, 65535)),
     OperatorCommand(received_s=NAN, enable=True, source="web"),
     OutputReport(received_s=1.8, healthy=False, text="änderung"),
+    EstopReport(received_s=1.85, pressed=True, source="line"),
     FlowReport(received_s=1.9, volume_ml=0.1 + 0.2),
     ClockReport(received_s=2.1, offset_s=-1 / 3, round_trip_s=NAN),
     LegReport(

@@ -71,16 +71,48 @@ def test_without_a_map_one_rate_holds(capsys: pytest.CaptureFixture[str], tmp_pa
     assert found["volume_l"] == pytest.approx(found["spray_m"] * 6.0 / 1000.0)
 
 
-def test_rates_beyond_the_sprayer_are_warned_of(
+def test_lines_are_flown_no_faster_than_the_sprayer_keeps_up(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    code, found, err = run(
+    code, found, _ = run(
         capsys, ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml",
         "--speed-m-s", "11", "--out", tmp_path / "m.plan",
     )  # fmt: skip
     assert code == 0
-    assert any("L/min" in warning for warning in found["warnings"])
+    assert found["warnings"] == []
+    low, high = found["sorties"][0]["speeds_m_s"]
+    assert 4.0 < low < high < 11.0
+    ordered = {item.param2 for item in read_mission(tmp_path / "m.plan") if item.command == 178}
+    assert {low, high, 11.0} <= ordered
+
+
+def test_rates_beyond_the_sprayer_are_warned_of_with_a_place(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    code, found, err = run(
+        capsys, ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml",
+        "--rate-l-ha", "300", "--out", tmp_path / "m.plan",
+    )  # fmt: skip
+    assert code == 0
+    assert len(found["warnings"]) == 1
+    assert "300 L/ha at 1 m/s takes" in found["warnings"][0]
+    assert "sortie 1 near 35.99" in found["warnings"][0]
     assert "warning: " in err
+
+
+def test_too_low_a_rate_is_flown_faster_only_where_that_is_allowed(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = [ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml", "--speed-m-s", "2",
+             "--rate-l-ha", "5", "--out", tmp_path / "m.plan"]  # fmt: skip
+    _, found, _ = run(capsys, *words)
+    assert "(--speed-max-m-s)" in found["warnings"][0]
+    assert found["sorties"][0]["speeds_m_s"] == [2.0, 2.0]
+    _, found, _ = run(capsys, *words, "--speed-max-m-s", "10")
+    assert found["warnings"] == []
+    assert 2.0 < found["sorties"][0]["speeds_m_s"][0] <= 10.0
+    code, found, _ = run(capsys, *words, "--speed-max-m-s", "40")
+    assert (code, "safety.speed_max_m_s" in found["error"]) == (2, True)
 
 
 BOW_TIE = Polygon([(0, 0), (100, 100), (100, 0), (0, 100)])

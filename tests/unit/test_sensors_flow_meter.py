@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion import gpio_chip
 from companion.core.types import FlowReport
 from companion.errors import SensorError
 from companion.sensors.flow_meter import FlowMeter, VirtualEdges
@@ -77,6 +79,28 @@ def test_pulses_that_the_kernel_dropped_are_counted_and_a_fault() -> None:
     after = counter.report(2.2)
     assert not after.fault
     assert after.volume_ml == 8 * 1000.0 / 4600.0
+
+
+def test_a_loss_that_is_found_late_is_told_once_it_is_found() -> None:
+    counter = counted([1.0, 1.01])
+    # The reader stood still for longer than a fault lasts; the loss lies before all that is left.
+    for number in range(8, 208):
+        counter.take(Edge(1.1 + 0.01 * number, number))
+    assert counter.report(4.0).fault == "flow meter: 5 pulses lost"
+    assert counter.report(4.9).fault
+    assert not counter.report(5.1).fault
+    assert counter.count == 207
+
+
+def test_a_line_that_is_gone_is_a_fault_and_no_standstill() -> None:
+    class Gone(VirtualEdges):
+        def read(self) -> list[Edge]:
+            raise OSError(19, "No such device")
+
+    (report,) = FlowMeter(METER, Gone()).read(3.0)
+    assert isinstance(report, FlowReport)
+    assert (report.received_s, math.isnan(report.volume_ml)) == (3.0, True)
+    assert report.fault == "flow meter: its line cannot be read: No such device"
 
 
 def test_an_echo_of_an_edge_is_no_pulse_and_many_are_a_fault() -> None:
@@ -177,8 +201,16 @@ def fake_gpiod(request: FakeRequest | OSError, version: str = "2.3.0") -> Module
     return module
 
 
+@pytest.fixture
+def dev(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the folder of devices of a computer with one chip."""
+    (tmp_path / "gpiochip0").touch()
+    monkeypatch.setattr(gpio_chip, "DEV", tmp_path)
+    return tmp_path
+
+
 def test_line_is_asked_for_with_the_clock_of_the_control_loop(
-    monkeypatch: pytest.MonkeyPatch,
+    dev: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     request = FakeRequest([[(1_500_000_000, 1), (1_600_000_000, 2)], [(1_700_000_000, 3)]])
     module = fake_gpiod(request)
@@ -188,7 +220,7 @@ def test_line_is_asked_for_with_the_clock_of_the_control_loop(
     edges.open()
     assert edges.read() == [Edge(1.5, 1), Edge(1.6, 2), Edge(1.7, 3)]
     asked = module.__dict__["asked"]
-    assert asked["path"] == "/dev/gpiochip0"
+    assert asked["path"] == str(dev / "gpiochip0")
     assert asked["config"] == {
         24: {
             "direction": "in",
@@ -205,14 +237,14 @@ def test_line_is_asked_for_with_the_clock_of_the_control_loop(
 @pytest.mark.parametrize(
     ("module", "words"),
     [
-        (None, 'pip install "gpiod>=2"'),
-        (fake_gpiod(FakeRequest([]), version="1.6.3"), "version 1"),
+        (None, "pip install 'vrspray[gpio]'"),
+        (fake_gpiod(FakeRequest([]), version="1.6.3"), "1.6.3 is too old"),
         (fake_gpiod(OSError(16, "Device or resource busy")), "flow_meter.line = 24"),
-        (fake_gpiod(FileNotFoundError(2, "No such file")), "/dev/gpiochip0"),
+        (fake_gpiod(FileNotFoundError(2, "No such file")), "gpiochip0: [Errno 2]"),
     ],
 )
 def test_a_line_that_is_not_to_be_had_is_said_in_one_line(
-    monkeypatch: pytest.MonkeyPatch, module: ModuleType | None, words: str
+    dev: Path, monkeypatch: pytest.MonkeyPatch, module: ModuleType | None, words: str
 ) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", module)
     with pytest.raises(SensorError) as refused:

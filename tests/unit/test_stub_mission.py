@@ -94,12 +94,53 @@ def test_clearing_forgets_the_mission() -> None:
     assert download(bench.companion) == ()
 
 
-def test_fences_are_not_kept() -> None:
+FENCE, RALLY = dialect.MAV_MISSION_TYPE_FENCE, dialect.MAV_MISSION_TYPE_RALLY
+CORNERS = tuple(
+    MissionItem(command=5001, frame=0, param1=3.0, x_e7=one, y_e7=two)
+    for one, two in ((1, 2), (3, 4), (5, 6))
+)
+
+
+def test_a_fence_is_kept_beside_the_mission_and_cleared_alone() -> None:
+    bench = Bench(items=ITEMS)
+    peer = bench.companion
+    peer.say(dialect.MAVLink_mission_count_message(1, 1, len(CORNERS), FENCE))
+    for number, item in enumerate(CORNERS):
+        assert peer.last("MISSION_REQUEST_INT").mission_type == FENCE
+        peer.say(item_message(item, number, current=False, to=(1, 1), kind=FENCE))
+    assert (peer.last("MISSION_ACK").type, peer.last("MISSION_ACK").mission_type) == (0, FENCE)
+    assert bench.autopilot.fence == CORNERS
+    assert bench.autopilot.flight.items == ITEMS
+    peer.say(dialect.MAVLink_mission_request_list_message(1, 1, FENCE))
+    assert peer.last("MISSION_COUNT").count == len(CORNERS)
+    peer.say(dialect.MAVLink_mission_request_int_message(1, 1, 2, FENCE))
+    assert item_of(peer.last("MISSION_ITEM_INT")) == CORNERS[2]
+    assert peer.last("MISSION_ITEM_INT").mission_type == FENCE
+    peer.say(dialect.MAVLink_mission_clear_all_message(1, 1, FENCE))
+    assert (bench.autopilot.fence, bench.autopilot.flight.items) == ((), ITEMS)
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "answer"),
+    [
+        (RALLY, 3, dialect.MAV_MISSION_UNSUPPORTED),
+        (FENCE, 65, dialect.MAV_MISSION_NO_SPACE),
+        (dialect.MAV_MISSION_TYPE_MISSION, 2001, dialect.MAV_MISSION_NO_SPACE),
+    ],
+)
+def test_what_has_no_room_is_refused(kind: int, count: int, answer: int) -> None:
     bench = Bench()
-    fence = dialect.MAV_MISSION_TYPE_FENCE
-    bench.companion.say(dialect.MAVLink_mission_count_message(1, 1, 3, fence))
-    answer = bench.companion.last("MISSION_ACK")
-    assert (answer.type, answer.mission_type) == (dialect.MAV_MISSION_UNSUPPORTED, fence)
+    bench.companion.say(dialect.MAVLink_mission_count_message(1, 1, count, kind))
+    found = bench.companion.last("MISSION_ACK")
+    assert (found.type, found.mission_type) == (answer, kind)
+
+
+def test_a_waypoint_is_no_part_of_a_fence() -> None:
+    bench = Bench()
+    bench.companion.say(dialect.MAVLink_mission_count_message(1, 1, 1, FENCE))
+    bench.companion.say(item_message(ITEMS[1], 0, current=False, to=(1, 1), kind=FENCE))
+    assert bench.companion.last("MISSION_ACK").type == dialect.MAV_MISSION_UNSUPPORTED
+    assert bench.autopilot.fence == ()
 
 
 def test_a_waypoint_file_is_read(tmp_path: Path) -> None:

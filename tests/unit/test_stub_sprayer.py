@@ -44,3 +44,29 @@ def test_orders_of_other_outputs_are_none_of_its() -> None:
 def test_a_configuration_with_another_number_of_valves_is_refused() -> None:
     with pytest.raises(ConfigError, match="wires 2 valves"):
         Sprayer(SprayerOptions(channels=(9, 10)), start_s=0.0)
+
+
+def test_a_pump_behind_its_output_feeds_the_sections_that_are_open() -> None:
+    options = SprayerOptions(profile="pump-sections", drive_channels=(15,))
+    sprayer = Sprayer(options, start_s=0.0)
+    for channel in options.channels:
+        sprayer.take(ServoOrder(at_s=0.5, channel=channel, pulse_us=2000))
+    for number in range(1501):
+        now_s = 0.02 * number
+        if number == 50:
+            sprayer.take(ServoOrder(at_s=now_s, channel=15, pulse_us=1600))
+        if number == 1000:
+            sprayer.take(ServoOrder(at_s=now_s, channel=15, pulse_us=0))
+        sprayer.advance(now_s)
+        now_l = sprayer.volume_l(now_s)
+    assert sprayer.volume_l(30.0) == pytest.approx(now_l)
+    before, after, end = sprayer.volume_ml(np.array([10.0, 20.0, 30.0])).sum(axis=1)
+    # The curve of the profile: 4.3 L/min at 0.6 of the pump's range; no pulse is a stop.
+    assert after - before == pytest.approx(4.3 * 10.0 * 1000.0 / 60.0, rel=0.01)
+    assert end - after < 0.2 * (after - before)
+    assert [order.pulse_us for order in sprayer.motors.orders] == [1600, 0]
+
+
+def test_a_configuration_with_other_motors_is_refused() -> None:
+    with pytest.raises(ConfigError, match="wires 0 motors"):
+        Sprayer(SprayerOptions(profile="pump-sections"), start_s=0.0)

@@ -27,6 +27,9 @@ class EngineChild:
                 pass_fds=(file,),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
+                # Linux shares the processor among sessions first: in ours, a busy companion would
+                # leave the engine's wake-ups a twentieth of a processor that others want as well.
+                start_new_session=True,
             )
         ours.setblocking(False)
         self.socket = ours

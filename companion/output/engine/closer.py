@@ -2,8 +2,9 @@
 
 For `ExecStopPost` of the service, which runs after every end of it, crash and watchdog included:
 `python -m companion.output.engine.closer --chip gpiochip0 --low 17 18 --high 22`, or for a shift
-register `--spi /dev/spidev0.0 --bytes 000008`. It needs no configuration, no file and nothing of
-the companion, so that it works where those are the trouble.
+register `--spi /dev/spidev0.0 --bytes 000008`. Motors on hardware PWM, which pulses on by itself,
+are stopped by `--pwm 0:1:1000` (chip, output, microseconds of stop). It needs no configuration, no
+file and nothing of the companion, so that it works where those are the trouble.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TypeVar
 
 from companion.errors import ActuatorError
@@ -63,10 +65,16 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--high", type=int, nargs="*", default=[], metavar="LINE")
     parser.add_argument("--spi", metavar="DEVICE", help="a shift register instead of lines")
     parser.add_argument("--bytes", type=bytes.fromhex, default=b"", metavar="HEX")
+    parser.add_argument("--pwm", nargs="*", default=[], metavar="CHIP:OUTPUT:STOP_US")
+    parser.add_argument("--pwm-root", type=Path, default=Path("/sys/class/pwm"), metavar="DIR")
     given = parser.parse_args(arguments)
     lines = [*given.low, *given.high]
-    if not (given.bytes if given.spi else lines):
+    if not (given.bytes if given.spi else lines) and not given.pwm:
         parser.error("nothing to close: name lines, or the bytes of a register")
+    # The motors first: a pump is not to work against closed valves.
+    failed = [each for each in given.pwm if not _stop_motor(given.pwm_root, each)]
+    if not (given.bytes if given.spi else lines):
+        return int(bool(failed))
     try:
         if given.spi:
             _patiently(lambda: _close_register(given.spi, given.bytes))
@@ -77,7 +85,22 @@ def main(arguments: Sequence[str]) -> int:
     except (OSError, ActuatorError) as error:
         sys.stderr.write(f"closer: {error}\n")
         return 1
-    return 0
+    return int(bool(failed))
+
+
+def _stop_motor(root: Path, motor: str) -> bool:
+    """Give a motor its pulse of stop, then none; False where that cannot be done."""
+    try:
+        chip, output, stop_us = (int(part) for part in motor.split(":"))
+        folder = root / f"pwmchip{chip}" / f"pwm{output}"
+        if not folder.is_dir():
+            return True  # never taken: it does not pulse
+        (folder / "duty_cycle").write_text(str(1000 * stop_us))
+        (folder / "enable").write_text("0")
+    except (OSError, ValueError) as error:
+        sys.stderr.write(f"closer: --pwm {motor}: {error}\n")
+        return False
+    return True
 
 
 def _open_lines(chip: str, lines: Sequence[int], levels: int) -> Lines:

@@ -6,15 +6,17 @@ goes wrong closes: a write that fails, a level that does not read back, a stands
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
+from itertools import islice
 
 from companion.output.engine.lines import Lines
 from companion.output.engine.schedule import Schedule
+from companion.output.engine.selftest import wrong_lines
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import (
     EDGES_MAX,
-    Issued,
     Kind,
     RefusedError,
     Status,
@@ -29,6 +31,8 @@ from companion.output.pulse_train import Edge
 BEAT_S = 0.05
 # Two turns are at most a beat apart; longer, and the process was stopped, or the computer slept.
 GAP_S = 0.1
+# A sign of life waits this long for an edge, so that it seldom costs a wake-up of its own.
+BEAT_LATER_S = 0.005
 # An edge later than this is counted: 6 mm at 6 m/s.
 LATE_COUNTED_S = 0.001
 _REPORTS_MAX = 4096
@@ -59,7 +63,14 @@ class Engine:
         self._beat_s = now_s + BEAT_S
         self._safe = self._levels = self._wiring.safe_levels
         self._alive_bit = 0 if self._wiring.alive is None else 1 << self._wiring.alive
-        self._reports: deque[Issued] = deque()
+        # What `Issued` has, as bare tuples: some hundred are made a second.
+        self._reports: deque[tuple[float, float, int, bool, float]] = deque(maxlen=_REPORTS_MAX)
+        outputs = range(len(setup.wiring.valves) + setup.wiring.has_return)
+        self._levels_of = [
+            tuple(setup.wiring.level(n, is_open=is_open) << n for is_open in (False, True))
+            for n in outputs
+        ]
+        self._due_s = math.inf
         self.fault: str | None = None
         self.accepted = self.rejected = self.edges = self.dropped = 0
         self.stops = self.writes = self.late = 0
@@ -71,9 +82,7 @@ class Engine:
     @property
     def next_s(self) -> float:
         """Return when the next turn is due."""
-        if self.fault is not None:
-            return self._beat_s
-        return min(self._beat_s, self._schedule.next_s)
+        return min(self._beat_s + BEAT_LATER_S, self._due_s)
 
     def receive(self, kind: Kind, body: bytes) -> None:
         """Take a packet of the companion; one that is no good is counted and changes nothing."""
@@ -86,6 +95,7 @@ class Engine:
             return
         self._notice_standstill()
         refusal = self._schedule.submit(plan, self._clock())
+        self._look_ahead()
         if refusal is None:
             self.accepted += 1
         else:
@@ -100,10 +110,19 @@ class Engine:
         """Do what is due."""
         self._notice_standstill()
         now_s = self._clock()
-        if self.fault is None:
+        if self._due_s <= now_s:
             self._issue(self._schedule.due(now_s))
+            self._look_ahead()
         if self._beat_s <= now_s:
             self._beat(now_s)
+
+    def fail(self, text: str) -> None:
+        """Close for good; the ALIVE line stands still from now on."""
+        if self.fault is None:
+            self.fault = text
+            self._schedule.halt(self._clock())
+            self._look_ahead()
+            self._close_all()
 
     def close(self) -> None:
         """Close everything and let go of the lines, whatever happens on the way."""
@@ -145,20 +164,22 @@ class Engine:
         self._close_all()
         self.stops += 1
         self._schedule.halt(self._clock())
+        self._look_ahead()
+
+    def _look_ahead(self) -> None:
+        """Note when something is due next; nothing is after a fault."""
+        self._due_s = self._schedule.next_s if self.fault is None else math.inf
 
     def _issue(self, edges: list[Edge]) -> None:
         if not edges:
             return
-        levels = self._levels
-        for edge in edges:
-            bit = 1 << edge.valve
-            is_high = self._wiring.level(edge.valve, is_open=edge.is_open)
-            levels = levels | bit if is_high else levels & ~bit
+        levels, levels_of = self._levels, self._levels_of
+        for _, output, is_open, _ in edges:
+            levels = levels & ~(1 << output) | levels_of[output][is_open]
         if levels != self._levels:
             self._write(levels)
         actual_s = self._clock()
-        for edge in edges:
-            self._note(Issued(edge.at_s, actual_s, edge.valve, edge.is_open, edge.duty))
+        self._note([(at_s, actual_s, output, o, duty) for at_s, output, o, duty in edges])
         # Stopped between the look at the clock and the write, it has written what is past.
         self._notice_standstill()
 
@@ -169,35 +190,29 @@ class Engine:
     def _note_closed(self) -> None:
         """Report every output as moved: whoever follows the reports need not guess."""
         now_s, count = self._clock(), len(self._wiring.valves)
-        for output in range(count + self._wiring.has_return):
-            is_open = output >= count
-            self._note(Issued(now_s, now_s, output, is_open, float(is_open)))
+        outputs = range(count + self._wiring.has_return)
+        self._note([(now_s, now_s, n, n >= count, float(n >= count)) for n in outputs])
 
-    def _note(self, issued: Issued) -> None:
-        self.edges += 1
-        late_s = issued.actual_s - issued.planned_s
-        self.worst_late_s = max(self.worst_late_s, late_s)
-        self.late += late_s > LATE_COUNTED_S
-        if len(self._reports) >= _REPORTS_MAX:
-            self._reports.popleft()
-            self.dropped += 1
-        self._reports.append(issued)
+    def _note(self, issued: list[tuple[float, float, int, bool, float]]) -> None:
+        self.edges += len(issued)
+        for planned_s, actual_s, *_ in issued:
+            late_s = actual_s - planned_s
+            if late_s > self.worst_late_s:
+                self.worst_late_s = late_s
+            if late_s > LATE_COUNTED_S:
+                self.late += 1
+        # A full queue drops the oldest by itself.
+        self.dropped += max(len(self._reports) + len(issued) - _REPORTS_MAX, 0)
+        self._reports.extend(issued)
 
     def _write(self, levels: int) -> None:
         self._levels = levels
         try:
             self._lines.write(levels)
         except OSError as error:
-            self._fail(f"outputs cannot be written: {error.strerror or error}")
+            self.fail(f"outputs cannot be written: {error.strerror or error}")
         else:
             self.writes += 1
-
-    def _fail(self, text: str) -> None:
-        """Close for good; the ALIVE line stands still from now on."""
-        if self.fault is None:
-            self.fault = text
-            self._schedule.halt(self._clock())
-            self._close_all()
 
     def _beat(self, now_s: float) -> None:
         # In the mean as often as said; after a standstill it begins anew.
@@ -215,20 +230,16 @@ class Engine:
         try:
             found = self._lines.read()
         except OSError as error:
-            self._fail(f"outputs cannot be read: {error.strerror or error}")
+            self.fail(f"outputs cannot be read: {error.strerror or error}")
             return
         if found is not None and found != self._levels:
-            wrong = [
-                str(line)
-                for output, line in enumerate(self._wiring.lines)
-                if (found ^ self._levels) >> output & 1
-            ]
-            self._fail("outputs do not take their level: " + ", ".join(wrong))
+            wrong = wrong_lines(found, self._levels, self._wiring)
+            self.fail(f"outputs do not take their level: {wrong}")
 
     def report(self) -> None:
         """Send the edges since the last report, and the status; what is not taken waits."""
         while self._reports:
-            batch = [self._reports[n] for n in range(min(EDGES_MAX, len(self._reports)))]
+            batch = list(islice(self._reports, EDGES_MAX))
             if not self._send(pack_edges(batch)):
                 break
             for _ in batch:

@@ -2,52 +2,27 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from companion import gpio_chip
 from companion.errors import ActuatorError
+from companion.gpio_chip import DEV
 
 CONSUMER = "vrspray"
-DEV = Path("/dev")
 # Whether Raspberry Pi's kernels leave a released line at its last level ("Y") or make it an input.
 PERSIST = Path("/sys/module/pinctrl_bcm2835/parameters/persist_gpio_outputs")
 
 
 def load_gpiod() -> Any:
     """Return the module `gpiod`; ActuatorError where there is none, or version 1 of it."""
-    try:
-        gpiod = importlib.import_module("gpiod")
-    except ImportError as error:
-        raise ActuatorError(
-            "the Python package gpiod is missing: pip install 'vrspray[gpio]'"
-        ) from error
-    version = str(getattr(gpiod, "__version__", "1"))
-    if not version.partition(".")[0].isdigit() or int(version.partition(".")[0]) < 2:
-        # Debian 12's own package is version 1 under the same name, with another interface.
-        raise ActuatorError(f"gpiod {version} is too old: pip install 'gpiod>=2.1'")
-    return gpiod
+    return gpio_chip.load_gpiod(ActuatorError)
 
 
 def find_chip(gpiod: Any, name: str, *, folder: Path | None = None) -> str:
-    """Return the path of a chip by its name, path or label.
-
-    A label (`pinctrl-bcm2711`, `pinctrl-rp1`) is the safest: the number of a Raspberry Pi 5's
-    chip has changed with its kernels.
-    """
-    folder = folder or DEV
-    path = folder / name
-    if path.exists():
-        return str(path)
-    labels = []
-    for other in sorted(folder.glob("gpiochip*")):
-        with gpiod.Chip(str(other)) as chip:
-            label = chip.get_info().label
-        if label == name:
-            return str(other)
-        labels.append(f"{other.name} ({label})")
-    raise ActuatorError(f"no GPIO chip {name}; there are: " + (", ".join(labels) or "none"))
+    """Return the path of a chip by its name, path or label; ActuatorError where there is none."""
+    return gpio_chip.find_chip(gpiod, name, ActuatorError, folder=folder or DEV)
 
 
 def keeps_levels(path: Path = PERSIST) -> bool | None:

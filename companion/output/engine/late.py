@@ -53,7 +53,17 @@ class LateEdges:
     @property
     def next_s(self) -> float:
         """Return when the next edge that was held up may be issued."""
-        return min((self._due_s(self._lines[n]) for n in self._waiting), default=math.inf)
+        if not self._waiting:
+            return math.inf
+        lines = self._lines
+        return min(self._due_s(lines[n], lines[n].queue[0]) for n in self._waiting)
+
+    def pass_on(self, edges: list[Edge], now_s: float) -> list[Edge]:
+        """Return what is to be written now, of `edges` and of what was held up before."""
+        if not self._waiting and self._all_at_once(edges, now_s):
+            return edges
+        self.add(edges)
+        return self.due(now_s)
 
     def due(self, now_s: float) -> list[Edge]:
         """Return what is to be written now; an output moves at most once."""
@@ -61,7 +71,7 @@ class LateEdges:
         for number in sorted(self._waiting):
             line = self._lines[number]
             moved = False
-            while line.queue and self._due_s(line) <= now_s:
+            while line.queue and self._due_s(line, line.queue[0]) <= now_s:
                 edge = line.queue[0]
                 if edge.is_open != line.is_open:
                     if moved:
@@ -75,6 +85,20 @@ class LateEdges:
             else:
                 self.held_count += 1
         return out
+
+    def _all_at_once(self, edges: list[Edge], now_s: float) -> bool:
+        """Take edges of one output each if nothing holds any of them up: the usual case."""
+        lines = self._lines
+        if len(edges) > 1 and len({edge.valve for edge in edges}) < len(edges):
+            return False
+        for edge in edges:
+            if self._due_s(lines[edge.valve], edge) > now_s:
+                return False
+        for edge in edges:
+            line = lines[edge.valve]
+            if edge.is_open != line.is_open:
+                self._move(line, edge, now_s)
+        return True
 
     def clear(self, now_s: float) -> None:
         """Forget everything: all valves were closed, the return valve opened, by other means."""
@@ -90,14 +114,12 @@ class LateEdges:
         late_s = now_s - edge.at_s
         line.late_s = late_s if late_s > LATE_S else 0.0
 
-    def _due_s(self, line: _Line) -> float:
-        edge = line.queue[0]
-        if edge.is_open == line.is_open or (not edge.is_open and edge.duty == 0.0):
-            return edge.at_s
-        if edge.valve >= self._valves:
-            return edge.at_s
-        if edge.is_open:
+    def _due_s(self, line: _Line, edge: Edge) -> float:
+        at_s, valve, is_open, duty = edge
+        if valve >= self._valves or is_open == line.is_open or (not is_open and duty == 0.0):
+            return at_s
+        if is_open:
             # A hair less than the minimum: sums of times are not exact.
-            return max(edge.at_s, line.moved_s + self._min_off_s - 1e-9)
-        length_s = KEPT * (edge.at_s - line.planned_s) if line.late_s else 0.0
-        return max(edge.at_s, line.moved_s + max(length_s, self._min_on_s - 1e-9))
+            return max(at_s, line.moved_s + self._min_off_s - 1e-9)
+        length_s = KEPT * (at_s - line.planned_s) if line.late_s else 0.0
+        return max(at_s, line.moved_s + max(length_s, self._min_on_s - 1e-9))

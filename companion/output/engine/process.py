@@ -12,12 +12,14 @@ import select
 import signal
 import socket
 import time
+from contextlib import suppress
 
 from companion.errors import ActuatorError
 from companion.output.engine.engine import Engine
 from companion.output.engine.gpiod_lines import keeps_levels
 from companion.output.engine.lines import open_lines
 from companion.output.engine.realtime import be_on_time, die_with_parent
+from companion.output.engine.selftest import self_test
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import PACKET_MAX, Kind, RefusedError, pack, unpack
 from companion.output.engine.wiring import hazards
@@ -41,6 +43,10 @@ def serve(connection: socket.socket, *, parent: int) -> int:
     except (ActuatorError, ValueError, TypeError, KeyError) as error:
         _send(connection, pack(Kind.FAULT, str(error).encode()))
         return 1
+    warnings = be_on_time(realtime=setup.realtime)
+    found = self_test(
+        lines, setup.wiring, late_max_s=setup.late_max_s, clock=time.monotonic, sleep=time.sleep
+    )
     engine = Engine(
         setup,
         lines,
@@ -49,13 +55,17 @@ def serve(connection: socket.socket, *, parent: int) -> int:
         send=lambda packet: _send(connection, packet),
     )
     try:
-        warnings = be_on_time(realtime=setup.realtime)
+        if found.fault:
+            engine.fail(found.fault)
         keeps = keeps_levels() if setup.backend == "gpiod" else None
         warnings += hazards(setup.wiring, keeps_levels=keeps)
-        _send(connection, pack(Kind.READY, json.dumps({"warnings": warnings}).encode()))
+        ready = {"warnings": warnings, "self_test": found.as_object()}
+        _send(connection, pack(Kind.READY, json.dumps(ready).encode()))
         _run(engine, connection, wake)
     finally:
-        engine.close()
+        # A device that is gone takes no order; that it is gone has been told.
+        with suppress(OSError):
+            engine.close()
     engine.report()
     return 0
 

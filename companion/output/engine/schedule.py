@@ -65,8 +65,7 @@ class Schedule:
         if -math.inf < self.lease_until_s <= now_s:
             self.lease_until_s = -math.inf
             self.lease_end_count += 1
-        self._late.add(self._pulses.advance(now_s))
-        return self._late.due(now_s)
+        return self._late.pass_on(self._pulses.advance(now_s), now_s)
 
     @property
     def next_s(self) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -136,9 +136,12 @@ def plan_from(body: bytes) -> SprayPlan:
         raise RefusedError(str(error)) from error
 
 
-def pack_edges(edges: Sequence[Issued]) -> bytes:
-    """Return the packet of some edges, at most `EDGES_MAX`."""
-    parts = [_EDGE.pack(e.planned_s, e.actual_s, e.duty, e.output, e.is_open) for e in edges]
+def pack_edges(edges: Iterable[tuple[float, float, int, bool, float]]) -> bytes:
+    """Return the packet of some edges, at most `EDGES_MAX`; each has what `Issued` has."""
+    parts = [
+        _EDGE.pack(planned_s, actual_s, duty, output, is_open)
+        for planned_s, actual_s, output, is_open, duty in edges
+    ]
     return pack(Kind.EDGES, b"".join(parts))
 
 

@@ -1,0 +1,233 @@
+"""What the tables of the motors must say together with the others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from companion.config.motors import (
+    DROPLET_UM,
+    atomiser_of,
+    droplet_um,
+    has_valve_outputs,
+    makes_flow,
+    pump_curve,
+)
+
+if TYPE_CHECKING:
+    from companion.config.model import Config
+    from companion.config.motor_tables import AtomiserTable, PumpTable
+
+Found = Iterator[tuple[str, str]]
+SPAN_MIN_US = 100
+
+
+def motor_contradictions(config: Config) -> Found:
+    """Yield (key, what is wrong and what to write instead)."""
+    if config.pump is not None:
+        yield from _pulses(config.pump)
+        if makes_flow(config):
+            yield from _modulating(config, config.pump)
+        else:
+            yield from _constant(config.pump)
+    for number, table in enumerate(config.atomiser):
+        yield from _atomiser(config, table, f"atomiser[{number}]")
+    yield from _outputs(config)
+
+
+def motor_warnings(config: Config) -> Found:
+    """Yield what works, and is unwise."""
+    pump = config.pump
+    if pump is not None and pump.control == "constant" and config.output.return_channel is None:
+        yield (
+            "pump.control",
+            "without output.return_channel the pump stops with the last valve and starts with the "
+            "first: the flow comes late at each of them",
+        )
+    if makes_flow(config) and len(config.valve) > 1:
+        yield (
+            "pump.control",
+            "one pump gives all sections one rate: where the map asks them for different ones, "
+            "only their sum is right",
+        )
+    for number, table in enumerate(config.atomiser):
+        least = _rpm(config, table, _flows(config)[0])
+        if not least >= table.rpm[0]:
+            yield (
+                f"atomiser[{number}].rpm",
+                f"at the least flow {least:.0f} rpm would do, its curve begins at "
+                f"{table.rpm[0]:g}: droplets are smaller there",
+            )
+
+
+def _pulses(pump: PumpTable) -> Found:
+    if not pump.max_us - pump.stop_us >= SPAN_MIN_US:
+        yield (
+            "pump.max_us",
+            f"less than {SPAN_MIN_US} us above pump.stop_us = {pump.stop_us}; write the two ends "
+            "of the ESC's range, such as 1000 and 2000",
+        )
+    for key in ("min_us", "run_us"):
+        value = getattr(pump, key)
+        if value is not None and not pump.stop_us < value <= pump.max_us:
+            yield (
+                f"pump.{key}",
+                f"not above pump.stop_us = {pump.stop_us} and at most pump.max_us = "
+                f"{pump.max_us}; write a pulse at which it runs",
+            )
+
+
+def _constant(pump: PumpTable) -> Found:
+    if pump.run_us is None:
+        yield "pump.run_us", 'missing; with control = "constant" write the pulse at which it runs'
+
+
+def _modulating(config: Config, pump: PumpTable) -> Found:
+    for key in ("us", "flow_l_min"):
+        if not getattr(pump, key):
+            yield f"pump.{key}", "missing; write the measured curve of the pump"
+    for key in ("spin_up_s", "up_s", "down_s", "stop_end_s"):
+        if getattr(pump, key) is None:
+            yield f"pump.{key}", "missing; write the lag as measured"
+    if pump.run_us is not None:
+        yield "pump.run_us", 'goes with control = "constant"; remove it'
+    yield from _increasing("pump", {"us": pump.us, "flow_l_min": pump.flow_l_min})
+    if pump.us and not pump.stop_us < pump.us[0] <= pump.us[-1] <= pump.max_us:
+        yield (
+            "pump.us",
+            f"reaches outside pump.stop_us = {pump.stop_us} to pump.max_us = {pump.max_us}; "
+            "correct the one or the other",
+        )
+    if pump.min_us is not None and pump.us and not pump.min_us <= pump.us[-1]:
+        yield "pump.min_us", f"above the curve, which ends at {pump.us[-1]}; write less"
+    for key in ("up", "down"):
+        whole_s, part_s = getattr(pump, f"{key}_s"), getattr(pump, f"{key}_time_s")
+        if not part_s <= whole_s:
+            yield (
+                f"pump.{key}_time_s",
+                f"a part of pump.{key}_s = {whole_s:g}; write at most that",
+            )
+    yield from _sections(config)
+
+
+def _sections(config: Config) -> Found:
+    """Yield what does not go with valves that are on-off sections behind the pump."""
+    if len(config.nozzle_set) > 1:
+        yield "nozzle_set", "a pump that makes the flow has one set; name all valves in one"
+    (table, *_) = config.nozzle_set
+    if table.duty or table.flow_l_min:
+        yield (
+            "nozzle_set[0].duty",
+            "the pump makes the flow, and its curve counts; remove duty and flow_l_min",
+        )
+    pulsing = sorted(config.pwm.model_fields_set - {"valve"})
+    if pulsing:
+        yield (
+            f"pwm.{pulsing[0]}",
+            "valves behind a pump that makes the flow are on-off and do not pulse; remove it, or "
+            'write pump.control = "constant"',
+        )
+    for key in ("up_time_s", "down_time_s"):
+        if getattr(config.lag, key):
+            yield f"lag.{key}", f"of the pump: write it as pump.{key}"
+    missing = [n for n, valve in enumerate(config.valve) if valve.channel is None]
+    if missing and has_valve_outputs(config):
+        yield (
+            f"valve[{missing[0]}].channel",
+            "missing; write it for each valve, or for none where the nozzles are always open",
+        )
+    if not has_valve_outputs(config) and config.output.return_channel is not None:
+        yield (
+            "output.return_channel",
+            "no valve has a channel: the way out is never shut; give valves channels or remove it",
+        )
+    if not has_valve_outputs(config) and config.output.kind == "gpio":
+        yield "output.kind", 'no valve has a channel, so there is nothing on lines; write "servo"'
+
+
+def _increasing(key: str, curve: dict[str, tuple[float, ...]]) -> Found:
+    (first, one), (second, other) = curve.items()
+    if len(one) != len(other):
+        yield (
+            f"{key}.{second}",
+            f"{len(other)} values for {len(one)} pulses; write one for each",
+        )
+    for name, values in ((first, one), (second, other)):
+        if not all(a < b for a, b in pairwise(values)):
+            yield (
+                f"{key}.{name}",
+                "must be strictly increasing; write the points in order of the pulse",
+            )
+
+
+def _atomiser(config: Config, table: AtomiserTable, key: str) -> Found:
+    broken = [*_increasing(key, {"us": table.us, "rpm": table.rpm})]
+    if broken:
+        yield from broken
+        return
+    if not table.us[-1] - table.stop_us >= SPAN_MIN_US or not table.stop_us < table.us[0]:
+        yield (
+            f"{key}.us",
+            f"not all above {key}.stop_us = {table.stop_us}; correct the one or the other",
+        )
+        return
+    if droplet_um(config, table) is None:
+        yield (
+            f"{key}.droplet_um",
+            "missing, and product.droplet_class is none of "
+            + ", ".join(f'"{name}"' for name in DROPLET_UM)
+            + "; write the wanted median diameter",
+        )
+        return
+    fastest = _rpm(config, table, _flows(config)[1])
+    if not fastest <= table.rpm[-1]:
+        yield (
+            f"{key}.rpm",
+            f"{fastest:.0f} rpm are wanted at the largest flow, the curve ends at "
+            f"{table.rpm[-1]:g}; write a larger droplet_um, or fit more atomisers",
+        )
+
+
+def _flows(config: Config) -> tuple[float, float]:
+    """Return the least and the largest flow of the boom; 0 where no curve says it."""
+    pump = config.pump
+    if pump is not None and makes_flow(config):
+        flows = [pump_curve(pump).flow_l_min] if pump.us and pump.flow_l_min else []
+    else:
+        flows = [table.flow_l_min for table in config.nozzle_set if table.flow_l_min]
+    if not flows:
+        return 0.0, 0.0
+    return min(each[0] for each in flows), max(each[-1] for each in flows)
+
+
+def _rpm(config: Config, table: AtomiserTable, boom_flow_l_min: float) -> float:
+    atomiser = atomiser_of(config, table)
+    flow_l_min = atomiser.share * boom_flow_l_min
+    return atomiser.law.rpm_for(atomiser.droplet_um, flow_l_min) if flow_l_min > 0.0 else 0.0
+
+
+def _outputs(config: Config) -> Found:
+    """Yield outputs that are none, or that two share."""
+    every: dict[str, PumpTable | AtomiserTable] = {
+        f"atomiser[{number}]": table for number, table in enumerate(config.atomiser)
+    }
+    if config.pump is not None:
+        every["pump"] = config.pump
+    found: dict[str, tuple[str, int, int]] = {}
+    for key, table in every.items():
+        if table.output == "autopilot" and table.channel < 1:
+            yield f"{key}.channel", "no servo output; write one from 1 to 32"
+        chip = table.chip if table.output == "pwm" else -1
+        found[f"{key}.channel"] = (table.output, chip, table.channel)
+    if config.output.kind == "servo":
+        for number, valve in enumerate(config.valve):
+            if valve.channel is not None:
+                found[f"valve[{number}].channel"] = ("autopilot", -1, valve.channel)
+        if config.output.return_channel is not None:
+            found["output.return_channel"] = ("autopilot", -1, config.output.return_channel)
+    counts = Counter(found.values())
+    for key, where in found.items():
+        if counts[where] > 1 and not key.startswith(("valve", "output")):
+            yield key, "used twice; give each valve and each motor its own output"

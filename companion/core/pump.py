@@ -1,0 +1,236 @@
+"""A pump on a motor's output: it makes the flow, or it supplies valves that do.
+
+A pump that makes the flow (`modulates`) is one more valve to the laws of the schedule: its route is
+that of the whole boom, its duty the motor's fraction, its lags are its own. The valves, where
+there are any, are on-off sections then. Whatever the laws say, the last word has
+`drive_plans.behind_path`: the pump never runs while there is no way out for what it pumps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+from companion.core.boom import Boom
+from companion.core.boom_route import boom_route, bridged
+from companion.core.crossings import Crossing, Route
+from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.schedule import LagModel, Timing, rate_at, resolve
+from companion.core.types import Method
+
+Control = Literal["modulates", "constant"]
+# What lets out what is pumped: the valves alone, a return valve beside them, or nozzles that
+# nothing shuts.
+Way = Literal["valves", "return", "always"]
+
+# An ESC takes a pulse each 20 ms.
+FRAME_HZ = 50.0
+# A first-order flow stands within 2 % after so many time constants.
+SETTLED_TIMES = 4.0
+# Steps of the sections nearer to each other than this part of the time constant are one step.
+MERGE_SHARE = 0.25
+MERGE_MIN_S = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pump:
+    """What is measured of a pump; fractions are of its range, from stop (0) to its end (1).
+
+    `curve` is its flow by fraction, for one that modulates. `run_fraction` is where a constant
+    one runs. In `lag`, `on_start_s` is from stop to first flow, `off_end_s` from the order to
+    stop until nothing comes any more.
+    """
+
+    control: Control
+    way: Way
+    lag: LagModel
+    curve: FlowCurve | None = None
+    fraction_min: float = 0.0
+    run_fraction: float = 0.0
+
+    def __post_init__(self) -> None:
+        if (self.control == "modulates") != (self.curve is not None):
+            raise ValueError("a pump that modulates has a curve, and no other")
+        if not 0.0 <= self.fraction_min < 1.0:
+            raise ValueError(f"fraction_min must lie in [0, 1), got {self.fraction_min}")
+        if self.control == "constant" and not 0.0 < self.run_fraction <= 1.0:
+            raise ValueError(f"run_fraction must lie in (0, 1], got {self.run_fraction}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pumping:
+    """A modulating pump as the laws of dosing see it: a set-up with one valve, the motor."""
+
+    pump: Pump
+    boom: Boom
+    nozzle_sets: tuple[NozzleSet, ...]
+    pwm: PwmLimits
+    lag: LagModel
+    method: Method
+    timing: Timing
+    valve_timing: Timing
+    rate_max_l_ha: float | None
+
+    @classmethod
+    def of(
+        cls,
+        pump: Pump,
+        boom: Boom,
+        *,
+        method: Method,
+        look_ahead_s: float,
+        valve_timing: Timing,
+        rate_max_l_ha: float | None,
+    ) -> Pumping | None:
+        """Return how the flow is made; None where the pump only supplies it."""
+        if pump.curve is None:
+            return None
+        pwm = PwmLimits(
+            frequency_hz=FRAME_HZ,
+            duty_min=pump.fraction_min,
+            duty_max=1.0,
+            min_on_s=0.0,
+            min_off_s=0.0,
+        )
+        timing = Timing.of(method, pump.lag, look_ahead_s=look_ahead_s, period_s=pwm.period_s)
+        if method is Method.SCHEDULED:
+            timing = _by_way(pump, timing, valve_timing)
+        return cls(
+            pump=pump,
+            boom=boom,
+            nozzle_sets=(NozzleSet(valves=(0,), curve=pump.curve),),
+            pwm=pwm,
+            lag=pump.lag,
+            method=method,
+            timing=timing,
+            valve_timing=valve_timing,
+            rate_max_l_ha=rate_max_l_ha,
+        )
+
+    @property
+    def early_s(self) -> float:
+        """Return how much sooner than by its own lag a valve opens for the pump's start."""
+        if self.pump.way != "valves" or self.method is not Method.SCHEDULED:
+            return 0.0
+        return max(self.timing.on_s - self.valve_timing.on_s, 0.0)
+
+    @property
+    def early_border_s(self) -> float:
+        """Return the same at the border."""
+        if self.pump.way != "valves" or self.method is not Method.SCHEDULED:
+            return 0.0
+        return max(self.timing.border_on_s - self.valve_timing.border_on_s, 0.0)
+
+
+def _by_way(pump: Pump, own: Timing, valve: Timing) -> Timing:
+    """Return the pump's leads where valves make the edges of what is sprayed.
+
+    It stops with the last valve. With a return valve it stands at its flow before the first one
+    opens; without one it starts as that valve opens.
+    """
+    if pump.way == "always":
+        return own
+    shut = replace(own, off_s=valve.off_s, border_off_s=valve.border_off_s)
+    if pump.way == "valves":
+        return shut
+    lag = pump.lag
+    rise_s = SETTLED_TIMES * lag.up_time_s or 2.0 * (lag.on_s - lag.on_start_s)
+    ready_s = lag.on_start_s + rise_s + lag.output_s + max(valve.on_s, valve.border_on_s)
+    return replace(shut, on_s=ready_s, border_on_s=ready_s)
+
+
+class PumpMemory(NamedTuple):
+    """When liquid last flowed by what was ordered, and whether a valve is open ahead of it."""
+
+    ran_s: float = float("-inf")
+    is_early: bool = False
+
+
+DRY = PumpMemory()
+
+
+def sections(
+    pumping: Pumping, routes: tuple[Route, ...], memory: PumpMemory, now_s: float
+) -> tuple[tuple[Route, ...], bool]:
+    """Return the routes of on-off valves, and whether the first one opens ahead of the flow.
+
+    Without a return valve the pump can only start behind an open valve. The first valve to open
+    does so early enough for the pump's first flow to be in time, if the pump has stood still for
+    long enough that nothing comes out before.
+    """
+    dwell_s = pumping.valve_timing.dwell_min_s
+    shut = tuple(_on_off(route, dwell_s) for route in routes)
+    is_open = any(_is_open_at(route, now_s) for route in shut)
+    is_dry = now_s - memory.ran_s >= pumping.lag.off_end_s
+    is_early = not is_open and (memory.is_early or is_dry) and pumping.early_s > 0.0
+    if not is_early:
+        return shut, False
+    starts = [_start_s(route, now_s) for route in shut]
+    first_s = min(starts)
+    return tuple(
+        _opened_early(route, now_s, pumping) if start_s <= first_s else route
+        for route, start_s in zip(shut, starts, strict=True)
+    ), True
+
+
+def _on_off(route: Route, dwell_s: float) -> Route:
+    """Return where a valve is open and where it is shut, without stays too short for it."""
+    made: list[Crossing] = []
+    for step in route:
+        is_open = bool(step.rate_l_ha)
+        if not made or (made[-1].rate_l_ha is not None) != is_open:
+            made.append(step if is_open else step._replace(rate_l_ha=None))
+    return resolve(tuple(made), dwell_s)[0]
+
+
+def _is_open_at(route: Route, now_s: float) -> bool:
+    is_open = route[0].rate_l_ha is not None
+    for step in route[1:]:
+        if step.at_s <= now_s:
+            is_open = step.rate_l_ha is not None
+    return is_open
+
+
+def _start_s(route: Route, now_s: float) -> float:
+    ahead = (step.at_s for step in route[1:] if step.rate_l_ha is not None and step.at_s > now_s)
+    return next(ahead, float("inf"))
+
+
+def _opened_early(route: Route, now_s: float, pumping: Pumping) -> Route:
+    """Return the route with its next opening sooner: what lies ahead of it is shut anyway."""
+    made: list[Crossing] = list(route)
+    for i, step in enumerate(route):
+        if i and step.rate_l_ha is not None and step.at_s > now_s:
+            by_s = pumping.early_border_s if step.border else pumping.early_s
+            at_s = max(step.at_s - by_s, route[i - 1].at_s)
+            made[i] = step._replace(at_s=at_s)
+            break
+    return tuple(made)
+
+
+def on_off(rate_l_ha: float, speed_m_s: float) -> float:  # noqa: ARG001
+    """Return the duty of an on-off valve."""
+    return 1.0 if rate_l_ha > 0.0 else 0.0
+
+
+def pump_route(pumping: Pumping, routes: tuple[Route, ...]) -> Route:
+    """Return the pump's route: the whole boom's, of what the valves really do."""
+    lag, timing = pumping.lag, pumping.timing
+    dwell_s = pumping.valve_timing.dwell_min_s
+    merge_s = max(MERGE_SHARE * max(lag.up_time_s, lag.down_time_s), MERGE_MIN_S)
+    sprayed = tuple(_where_open(route, _on_off(route, dwell_s)) for route in routes)
+    whole = boom_route(sprayed, pumping.boom, merge_s=merge_s)
+    if pumping.pump.way == "always":
+        return whole
+    return bridged(whole, timing.on_s)
+
+
+def _where_open(route: Route, on: Route) -> Route:
+    """Return the rates of a route where its on-off route is open, and nothing elsewhere."""
+    steps = {step.at_s: step for step in (*route, *on)}
+    made: list[Crossing] = []
+    for at_s in sorted(steps):
+        rate = (rate_at(route, at_s) or None) if _is_open_at(on, at_s) else None
+        if not made or rate != made[-1].rate_l_ha:
+            made.append(steps[at_s]._replace(rate_l_ha=rate))
+    return tuple(made)

@@ -1,0 +1,144 @@
+"""Sorties with a speed for each leg; what stays out of the valves' range, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from companion.core.frame import LocalFrame
+from missions.demand import Rates
+from missions.plan import Leg, Settings, Sortie
+from missions.speeds import Miss, Stretches, between, choices, chosen, misses_of, stretches_of
+from missions.strips import Floats
+
+# A part of a line shorter than this is no leg of its own.
+PART_MIN_M = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Paced:
+    """Sorties with their speeds, and what no allowed speed brings into range."""
+
+    sorties: tuple[Sortie, ...]
+    misses: tuple[tuple[int, Miss], ...]
+
+
+def paced(sorties: Sequence[Sortie], rates: Rates, settings: Settings) -> Paced:
+    """Return the sorties, each line at the speeds that its rates need.
+
+    A line with several speeds becomes several legs, one after the other without a stop.
+    """
+    if settings.flow_l_min is None:
+        return Paced(sorties=tuple(sorties), misses=())
+    found, misses = [], []
+    for sortie in sorties:
+        legs: list[Leg] = []
+        for leg in sortie.legs:
+            if leg.kind != "spray":
+                legs.append(leg)
+                continue
+            parts = stretches_of(leg, rates, settings)
+            taken = chosen(parts, choices(parts, settings), settings.acceleration_m_s2)
+            misses += [(sortie.number, m) for m in misses_of(leg, parts, taken, settings)]
+            legs += _split(leg, parts, taken, settings)
+        found.append(replace(sortie, legs=_joined(legs, settings)))
+    return Paced(sorties=tuple(found), misses=tuple(misses))
+
+
+def _split(leg: Leg, parts: Stretches, taken: Floats, settings: Settings) -> list[Leg]:
+    """Return the legs of a line; before a slower one the aircraft brakes in the faster one."""
+    last = np.flatnonzero(np.append(np.diff(taken) != 0.0, True))
+    speeds = taken[last]
+    if len(speeds) == 1 and speeds[0] == settings.speed_m_s:
+        return [leg]
+    length_m = leg.length_m
+    cuts = np.concatenate([[0.0], parts.ends_m[last]])
+    cuts[-1] = length_m
+    for number in range(1, len(speeds)):
+        slows = speeds[number - 1] ** 2 - speeds[number] ** 2
+        brake_m = max(slows, 0.0) / (2.0 * settings.acceleration_m_s2)
+        cuts[number] = max(cuts[number] - brake_m, cuts[number - 1] + PART_MIN_M)
+        cuts[number] = min(cuts[number], length_m)
+    at_m = np.concatenate([[0.0], parts.ends_m])
+    at_m[-1] = length_m
+    litres = np.interp(cuts, at_m, np.concatenate([[0.0], np.cumsum(parts.litres)]))
+    litres[-1] = leg.volume_l
+    legs, before = [], 0.0
+    for number, speed in enumerate(speeds.tolist()):
+        if cuts[number + 1] - cuts[number] < 1e-6:
+            continue
+        points = (between(leg, cuts[number] / length_m), between(leg, cuts[number + 1] / length_m))
+        seconds = (cuts[number + 1] - cuts[number]) / speed
+        seconds += max(speed - before, 0.0) ** 2 / (2.0 * settings.acceleration_m_s2 * speed)
+        legs.append(
+            Leg(
+                kind="spray", points=points, speed_m_s=speed, seconds=float(seconds),
+                volume_l=float(litres[number + 1] - litres[number]),
+            )
+        )  # fmt: skip
+        before = speed
+    stop_s = legs[-1].speed_m_s / (2.0 * settings.acceleration_m_s2)
+    legs[-1] = replace(legs[-1], seconds=legs[-1].seconds + stop_s)
+    ends = (leg.points[0], leg.points[-1])
+    legs[0] = replace(legs[0], points=(ends[0], legs[0].points[1]))
+    legs[-1] = replace(legs[-1], points=(legs[-1].points[0], ends[1]))
+    return legs
+
+
+def _joined(legs: list[Leg], settings: Settings) -> tuple[Leg, ...]:
+    """Return the legs, those between two lines at a speed that suits the lines.
+
+    One flown through without a stop has the slower speed of the two. A side step too short for
+    its speed to matter has that of the next line: one order less.
+    """
+    found = list(legs)
+    acceleration = settings.acceleration_m_s2
+    for number, leg in enumerate(legs):
+        if leg.kind != "transit" or not 0 < number < len(legs) - 1:
+            continue
+        after = legs[number + 1].speed_m_s
+        slower = min(legs[number - 1].speed_m_s, after)
+        if leg.seconds < leg.length_m / leg.speed_m_s:
+            if slower < settings.speed_m_s:
+                seconds = leg.length_m / slower - slower / acceleration
+                found[number] = replace(leg, speed_m_s=slower, seconds=seconds)
+        elif len(leg.points) == 2 and leg.length_m <= after**2 / acceleration:
+            found[number] = replace(leg, speed_m_s=after)
+    return tuple(found)
+
+
+def range_warnings(
+    misses: Sequence[tuple[int, Miss]], frame: LocalFrame, settings: Settings
+) -> tuple[str, ...]:
+    """Return what stays too much and what too little for the valves, with the worst place."""
+    if settings.flow_l_min is None:
+        return ()
+    low, high = settings.flow_l_min
+    texts = []
+    for is_high in (True, False):
+        some = [(number, miss) for number, miss in misses if (miss.flow_l_min > high) == is_high]
+        if not some:
+            continue
+        number, worst = (max if is_high else min)(some, key=lambda each: each[1].flow_l_min)
+        latitude_deg, longitude_deg = frame.to_geographic(*worst.place)
+        length_m = sum(miss.length_m for _, miss in some)
+        texts.append(
+            f"{math.ceil(length_m)} m of lines take {'more' if is_high else 'less'} than the "
+            f"nozzle sets deliver ({low:.2f} to {high:.2f} L/min): {worst.rate_l_ha:g} L/ha at "
+            f"{worst.speed_m_s:g} m/s takes {worst.flow_l_min:.2f} L/min, sortie {number} near "
+            f"{latitude_deg:.6f}, {longitude_deg:.6f}; {_fix(worst, settings, is_high=is_high)}"
+        )
+    return tuple(texts)
+
+
+def _fix(worst: Miss, settings: Settings, *, is_high: bool) -> str:
+    low, high = settings.flow_l_min or (0.0, math.inf)
+    if is_high:
+        return f"fit larger nozzles: below {settings.speeds_m_s[0]:g} m/s nothing is sprayed"
+    speed = math.ceil(10.0 * worst.speed_m_s * low / worst.flow_l_min) / 10.0
+    if worst.flow_l_min <= 0.0 or not math.isfinite(high):
+        return "fit smaller nozzles"
+    return f"allow {speed:g} m/s (--speed-max-m-s), or fit smaller nozzles"

@@ -1,0 +1,229 @@
+"""A plan as a picture: swaths and route of each sortie in its colour, depots, what is missed.
+
+All that needs matplotlib here (extra `plot`), imported when it is asked for.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from companion.maps.local import polygons_of
+from companion.maps.picture.draw import Sheet, sheet_for
+from companion.maps.whole_file import write_whole
+from missions.errors import PlanError
+from missions.picture_legend import (
+    ABOVE_IN,
+    BELOW_IN,
+    CLOSED,
+    FIELD,
+    LEFT_IN,
+    RIGHT_IN,
+    SKIPPED,
+    TWICE,
+    colour_of,
+    draw_scale,
+    write_legend,
+    write_title,
+)
+from missions.plan import Leg, Plan, Sortie
+from missions.strips import Objects, rectangles
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".png", ".svg", ".pdf")
+# Of a large field more dots an inch, so that a swath is some dots wide.
+DPI_MIN, DPI_MAX, SWATH_DOTS = 110.0, 250.0, 7.0
+# What is nowhere this wide is the rounding of strips that touch, and the margin of the border.
+SEEN_M = 0.05
+_METADATA: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None},
+}  # fmt: skip
+
+
+def check_picture(out: Path) -> None:
+    """Refuse a picture that cannot be made, before any work."""
+    if out.suffix.casefold() not in SUFFIXES:
+        raise PlanError(f"--png {out}: pictures are written as {', '.join(SUFFIXES)}")
+    if importlib.util.find_spec("matplotlib") is None:
+        raise PlanError("no picture without matplotlib; install it: pip install 'vrspray[plot]'")
+
+
+def draw_plan(plan: Plan, out: Path, *, title: str) -> None:
+    """Draw a plan into a PNG, SVG or PDF file."""
+    check_picture(out)
+    from matplotlib import rc_context
+
+    suffix = out.suffix.casefold()
+    sheet = sheet_for(_bounds_m(plan))
+    swath_in = plan.settings.swath_width_m / sheet.metres_per_inch
+    dpi = min(max(SWATH_DOTS / swath_in, DPI_MIN), DPI_MAX)
+    with rc_context({"font.family": "DejaVu Sans", "svg.hashsalt": "vrspray"}):
+        content = BytesIO()
+        figure = _figure(plan, sheet, title)
+        figure.savefig(content, format=suffix[1:], dpi=dpi, metadata=_METADATA[suffix])
+    write_whole(out, content.getvalue())
+
+
+def sprayed_twice(strips: Objects) -> BaseGeometry:
+    """Return the ground that lies under more than one strip."""
+    tree = shapely.STRtree(strips)
+    one, other = tree.query(strips, predicate="intersects")
+    keep = one < other
+    return shapely.union_all(shapely.intersection(strips[one[keep]], strips[other[keep]]))
+
+
+def _figure(plan: Plan, sheet: Sheet, title: str) -> Figure:
+    from matplotlib.figure import Figure
+
+    swath_pt = 72.0 * plan.settings.swath_width_m / sheet.metres_per_inch
+    wide = sheet.map_in[0] + LEFT_IN + RIGHT_IN
+    high = sheet.map_in[1] + BELOW_IN + ABOVE_IN
+    figure = Figure(figsize=(wide, high), facecolor="white")
+    axes = figure.add_axes(
+        (LEFT_IN / wide, BELOW_IN / high, sheet.map_in[0] / wide, sheet.map_in[1] / high)
+    )
+    west, south, east, north = sheet.ground_m
+    axes.set_xlim(west, east)
+    axes.set_ylim(south, north)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color("0.75")
+    seen = {"closed": _draw_field(axes, plan)} | _draw_strips(axes, plan, swath_pt=swath_pt)
+    for sortie in plan.sorties:
+        _draw_route(axes, sortie, swath_pt=swath_pt, points_per_m=72.0 / sheet.metres_per_inch)
+    _draw_depots(axes, plan)
+    draw_scale(axes, sheet)
+    write_title(figure, plan, title)
+    write_legend(figure, plan, seen, left=(LEFT_IN + sheet.map_in[0] + 0.3) / wide)
+    return figure
+
+
+def _bounds_m(plan: Plan) -> tuple[float, float, float, float]:
+    ways = [shapely.LineString(leg.points) for each in plan.sorties for leg in each.legs
+            if leg.length_m > 0.0]  # fmt: skip
+    west, south, east, north = shapely.total_bounds(
+        np.array([plan.field.outline, *ways, shapely.MultiPoint(list(plan.depots))], dtype=object)
+    ).tolist()
+    return west, south, east, north
+
+
+def _fill(axes: Axes, areas: Iterable[BaseGeometry], **style: Any) -> None:
+    from matplotlib.collections import PathCollection
+
+    from companion.maps.picture.ground import outline_of
+
+    paths = [outline_of(part) for area in areas for part in polygons_of(area)]
+    if paths:
+        axes.add_collection(PathCollection(paths, **style), autolim=False)
+
+
+def _draw_field(axes: Axes, plan: Plan) -> bool:
+    """Draw the ground; return whether some of it is not to be sprayed."""
+    field = plan.field
+    _fill(axes, [field.outline], facecolors=FIELD, edgecolors="black", linewidths=1.3, zorder=1.0)
+    closed = shapely.union_all([field.blocked, field.outline.difference(field.limit)])
+    _fill(
+        axes, [closed], facecolors="0.9", edgecolors=CLOSED, hatch="////", linewidths=0.8,
+        zorder=1.5,
+    )  # fmt: skip
+    return not closed.is_empty
+
+
+def _draw_strips(axes: Axes, plan: Plan, *, swath_pt: float) -> dict[str, bool]:
+    """Draw what each sortie sprays, what is sprayed twice and what is left; say what there is."""
+    width_m = plan.settings.swath_width_m
+    everything = []
+    for sortie in plan.sorties:
+        lines = np.array([[*leg.points[0], *leg.points[-1]] for leg in _sprayed(sortie)])
+        if not len(lines):
+            continue
+        strips = rectangles(lines, width_m)
+        everything.append(strips)
+        colour = colour_of(sortie.number)
+        _fill(
+            axes, strips, facecolors=[(*colour, 0.34)], edgecolors=[(*colour, 0.6)],
+            linewidths=min(0.5, 0.03 * swath_pt), zorder=2.0,
+        )  # fmt: skip
+    strips = np.concatenate(everything)
+    twice = _seen(sprayed_twice(strips))
+    # Ground of a line on which nothing is prescribed is not missed.
+    planned = shapely.union_all(rectangles(plan.lines, width_m))
+    skipped = _seen(shapely.difference(plan.field.limit, planned))
+    bare = _seen(shapely.difference(planned, shapely.union_all(strips)))
+    _fill(axes, [twice], facecolors=TWICE, alpha=0.38, linewidths=0.0, zorder=3.0)
+    _fill(axes, [skipped], facecolors=SKIPPED, edgecolors=SKIPPED, linewidths=1.0, zorder=6.0)
+    found = {"twice": twice, "skipped": skipped, "bare": bare}
+    return {name: not area.is_empty for name, area in found.items()}
+
+
+def _seen(area: BaseGeometry) -> BaseGeometry:
+    half_m = SEEN_M / 2.0
+    return area.buffer(-half_m, join_style="mitre").buffer(half_m, join_style="mitre")
+
+
+def _sprayed(sortie: Sortie) -> list[Leg]:
+    return [leg for leg in sortie.legs if leg.kind == "spray"]
+
+
+def _draw_route(axes: Axes, sortie: Sortie, *, swath_pt: float, points_per_m: float) -> None:
+    from matplotlib.collections import LineCollection
+
+    dark = tuple(0.65 * part for part in colour_of(sortie.number))
+    thin = min(1.1, max(0.12 * swath_pt, 0.25))
+    styles = (("spray", "-", thin), ("transit", "-", 0.8 * thin), ("ferry", "--", thin))
+    for kind, style, width in styles:
+        ways = [leg.points for leg in sortie.legs if leg.kind == kind and leg.length_m > 0.0]
+        if ways:
+            shade = "0.15" if kind == "transit" else dark
+            axes.add_collection(
+                LineCollection(ways, colors=[shade], linestyles=style, linewidths=width, zorder=4),
+                autolim=False,
+            )
+    head_pt = min(9.0, max(0.9 * swath_pt, 3.0))
+    for leg in _sprayed(sortie):
+        _draw_arrows(axes, leg, dark, head_pt=head_pt, length_pt=leg.length_m * points_per_m)
+
+
+def _draw_arrows(
+    axes: Axes, leg: Leg, colour: tuple[float, ...], *, head_pt: float, length_pt: float
+) -> None:
+    """Draw which way a line is flown, where it has room for that."""
+    if length_pt < 3.0 * head_pt:
+        return
+    (x0, y0), (x1, y1) = leg.points[0], leg.points[-1]
+    step = 0.5 * head_pt / length_pt
+    for share in (0.5,) if length_pt < 40.0 * head_pt else (0.25, 0.75):
+        x, y = x0 + share * (x1 - x0), y0 + share * (y1 - y0)
+        axes.annotate(
+            "", xy=(x + step * (x1 - x0), y + step * (y1 - y0)), xytext=(x, y),
+            arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 0.1 * head_pt,
+                        "mutation_scale": head_pt, "shrinkA": 0.0, "shrinkB": 0.0},
+            annotation_clip=False,
+            zorder=5,
+        )  # fmt: skip
+
+
+def _draw_depots(axes: Axes, plan: Plan) -> None:
+    for number, (east_m, north_m) in enumerate(plan.depots, start=1):
+        axes.plot(
+            [east_m], [north_m], marker="s", markersize=13, color="black",
+            markeredgecolor="white",
+            zorder=7,
+        )  # fmt: skip
+        label = "D" if len(plan.depots) == 1 else str(number)
+        axes.text(
+            east_m, north_m, label, ha="center", va="center_baseline", color="white", fontsize=9,
+            fontweight="bold",
+            zorder=8,
+        )  # fmt: skip

@@ -1,0 +1,157 @@
+"""A speed for each leg, such that every rate on it lies within the valves' range.
+
+A rate r on a strip w wide takes a flow of r v w: too much of it is flown slower, too little
+faster, as far as allowed. Of all ways to choose, the one that takes the least time: a table over
+the stretches of a line and the speeds that any of them asks for (Viterbi 1967).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from companion.core.rate import flow_for_rate
+from missions.demand import M2_PER_HA, Rates, valve_places
+from missions.plan import Leg, Place, Settings
+from missions.strips import Floats
+
+# Rates are looked at this often along a line.
+STEP_M = 1.0
+SPEEDS_MAX = 24
+# Speeds are round numbers, and a change of speed costs the pilot's attention: so many seconds.
+ROUND_M_S, CHANGE_S = 0.1, 1.0
+# A metre outside the range weighs more than any time saved, and one far outside more still.
+OUTSIDE_S_M, FARTHER_S_M = 10.0, 100.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Miss:
+    """A stretch on which no allowed speed brings the rate into the valves' range."""
+
+    rate_l_ha: float
+    flow_l_min: float
+    speed_m_s: float
+    length_m: float
+    place: Place
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stretches:
+    """Parts of a line with one range of speeds each: `low` and `high` are 0 and inf without."""
+
+    ends_m: Floats
+    low: Floats
+    high: Floats
+    litres: Floats
+    least_l_ha: Floats
+    most_l_ha: Floats
+
+
+def speed_range(rate_l_ha: Floats, settings: Settings) -> tuple[Floats, Floats]:
+    """Return the least and the highest speed at which the valves deliver rates above zero."""
+    if settings.flow_l_min is None:
+        return np.zeros_like(rate_l_ha), np.full_like(rate_l_ha, np.inf)
+    per_m_s = flow_for_rate(1.0, 1.0, settings.swath_width_m) * rate_l_ha
+    low, high = settings.flow_l_min
+    return low / per_m_s, high / per_m_s
+
+
+def stretches_of(leg: Leg, rates: Rates, settings: Settings) -> Stretches:
+    """Return the stretches of a spray line along which the range of speeds is the same."""
+    start, end = np.array(leg.points[0]), np.array(leg.points[-1])
+    length_m = leg.length_m
+    count = max(1, math.ceil(length_m / STEP_M))
+    along = (end - start) / length_m
+    middle = start + np.outer((np.arange(count) + 0.5) * length_m / count, along)
+    least, most, used = np.full(count, np.inf), np.zeros(count), np.zeros(count)
+    for right_m, strip_m in valve_places(settings.swath_width_m, settings.valves):
+        found = rates.rates_at(middle[:, 0] + along[1] * right_m, middle[:, 1] - along[0] * right_m)
+        rate = np.nan_to_num(found, nan=0.0)
+        least = np.where(rate > 0.0, np.minimum(least, rate), least)
+        most = np.maximum(most, rate)
+        used += rate * strip_m * (length_m / count) / M2_PER_HA
+    bare = ~(most > 0.0)
+    low, _ = speed_range(np.where(bare, 1.0, least), settings)
+    _, high = speed_range(np.where(bare, 1.0, most), settings)
+    low, high = np.where(bare, 0.0, low), np.where(bare, np.inf, high)
+    new = np.flatnonzero((low[1:] != low[:-1]) | (high[1:] != high[:-1])) + 1
+    first = np.concatenate([[0], new])
+    total = float(used.sum())
+    share = leg.volume_l / total if total > 0.0 else 0.0
+    return Stretches(
+        ends_m=np.append(new, count) * (length_m / count),
+        low=low[first],
+        high=high[first],
+        litres=np.add.reduceat(used, first) * share,
+        least_l_ha=np.where(bare, 0.0, least)[first],
+        most_l_ha=most[first],
+    )
+
+
+def choices(found: Stretches, settings: Settings) -> Floats:
+    """Return the speeds worth trying: the planned one, and what the stretches ask for."""
+    least, most = settings.speeds_m_s
+    least, most = min(least, settings.speed_m_s), max(most, settings.speed_m_s)
+    slower = np.floor(found.high[np.isfinite(found.high)] / ROUND_M_S + 1e-9) * ROUND_M_S
+    faster = np.ceil(found.low / ROUND_M_S - 1e-9) * ROUND_M_S
+    asked = np.concatenate(
+        [slower[slower < settings.speed_m_s], faster[faster > settings.speed_m_s]]
+    )
+    asked = np.unique(np.round(np.clip(asked, max(least, ROUND_M_S), most), 6))
+    if len(asked) > SPEEDS_MAX:
+        asked = asked[np.linspace(0, len(asked) - 1, SPEEDS_MAX).astype(int)]
+    speeds: Floats = np.unique(np.append(asked, settings.speed_m_s))
+    return speeds
+
+
+def chosen(found: Stretches, speeds: Floats, acceleration_m_s2: float) -> Floats:
+    """Return the speed of each stretch that takes the least time in all."""
+    length_m = np.diff(found.ends_m, prepend=0.0)[:, None]
+    over = speeds / found.high[:, None] - 1.0
+    under = found.low[:, None] / speeds - 1.0
+    outside = np.maximum(np.maximum(over, under), 0.0)
+    beyond = np.where(outside > 1e-6, OUTSIDE_S_M + FARTHER_S_M * outside, 0.0)
+    cost = length_m * (1.0 / speeds + beyond)
+    step = speeds[None, :] - speeds[:, None]
+    change = np.where(step == 0.0, 0.0, CHANGE_S + step**2 / (2.0 * acceleration_m_s2 * speeds))
+    best, came_from = cost[0], []
+    for row in cost[1:]:
+        ways = best[:, None] + change
+        came_from.append(ways.argmin(axis=0))
+        best = ways.min(axis=0) + row
+    at = int(best.argmin())
+    order = [at]
+    for row in reversed(came_from):
+        at = int(row[at])
+        order.append(at)
+    taken: Floats = speeds[order[::-1]]
+    return taken
+
+
+def misses_of(leg: Leg, found: Stretches, taken: Floats, settings: Settings) -> list[Miss]:
+    """Return the stretches that stay outside the valves' range, with the place of each middle."""
+    starts_m = np.concatenate([[0.0], found.ends_m[:-1]])
+    missed = []
+    for number in np.flatnonzero((taken > found.high + 1e-6) | (taken < found.low - 1e-6)).tolist():
+        speed = float(taken[number])
+        too_fast = speed > found.high[number]
+        rate = float((found.most_l_ha if too_fast else found.least_l_ha)[number])
+        share = (starts_m[number] + found.ends_m[number]) / 2.0 / leg.length_m
+        missed.append(
+            Miss(
+                rate_l_ha=rate,
+                flow_l_min=flow_for_rate(rate, speed, settings.swath_width_m),
+                speed_m_s=speed,
+                length_m=float(found.ends_m[number] - starts_m[number]),
+                place=between(leg, share),
+            )
+        )
+    return missed
+
+
+def between(leg: Leg, share: float) -> Place:
+    """Return the place at a share of a straight leg's length."""
+    (x0, y0), (x1, y1) = leg.points[0], leg.points[-1]
+    return x0 + share * (x1 - x0), y0 + share * (y1 - y0)

@@ -1,0 +1,1 @@
+"""A mission file onto the vehicle, verified by reading back; MAVSDK only where it talks."""

@@ -1,0 +1,121 @@
+"""What each firmware refuses, known before anything is sent, and whether what is there is it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from missions.upload.items import (
+    FENCE_FIRST,
+    FENCE_LAST,
+    PLACES,
+    SAME_FRAME,
+    TAKEOFF,
+    TERRAIN,
+    WAYPOINT,
+    Firmware,
+    MissionFile,
+    WireItem,
+)
+
+FIRMWARES: dict[Firmware, str] = {"ardupilot": "ArduPilot", "px4": "PX4"}
+# PX4 1.14 and newer: not in the list that ends an upload, or not in the one that ends a start.
+REFUSED: dict[Firmware, frozenset[int]] = {
+    "ardupilot": frozenset({187}),
+    "px4": frozenset({82, 112, 114, 115, 181, 183, 215, 216}),
+}
+FIXES = {
+    216: "plan without --sprayer: valves follow the map by position",
+    183: "valves follow the map by position: leave it out",
+    187: "valves follow the map by position: leave it out",
+}
+# 2e-7 degrees are 2 cm: PX4 keeps degrees as floating point. ArduPilot keeps whole centimetres.
+PLACE_E7, HEIGHT_M, PARAM = 2, 0.011, 1e-3
+YAW = 3
+# Copters of ArduPilot take no radius and no yaw from a waypoint.
+NOT_KEPT: dict[Firmware, dict[int, tuple[int, ...]]] = {
+    "ardupilot": {WAYPOINT: (1, 2, 3), TAKEOFF: (0, 1, 2, 3)},
+    "px4": {WAYPOINT: (2,), TAKEOFF: (1, 2)},
+}
+
+
+def refusal(file: MissionFile, firmware: Firmware) -> str | None:
+    """Return why the firmware would refuse this mission, and what to do; None where it takes it.
+
+    Items are numbered as ground stations do: home is 0.
+    """
+    name = FIRMWARES[firmware]
+    for number, item in enumerate(file.items, start=1):
+        if item.command in REFUSED[firmware]:
+            fix = FIXES.get(item.command, "leave it out")
+            return f"{file.path}: item {number}: {name} takes no {item.name}; {fix}"
+        if firmware == "px4" and SAME_FRAME.get(item.frame) == TERRAIN:
+            return (
+                f"{file.path}: item {number}: PX4 takes no height above terrain; "
+                "plan heights above home"
+            )
+    return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compared:
+    """`differences` make another mission of it; `left_out` is what the firmware never keeps."""
+
+    differences: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def compare(sent: Sequence[WireItem], back: Sequence[WireItem], firmware: Firmware) -> Compared:
+    """Return what of the mission that was sent is not the one that is there.
+
+    ArduPilot's item 0 is home, which it replaces by its own.
+    """
+    is_fence = bool(sent) and FENCE_FIRST <= sent[0].command <= FENCE_LAST
+    first = 1 if firmware == "ardupilot" and not is_fence else 0
+    if len(sent) != len(back):
+        text = f"{len(sent) - first} items were sent, {len(back) - first} are there"
+        return Compared(differences=(text,), left_out=())
+    differences: list[str] = []
+    left_out: list[str] = []
+    pairs = list(zip(sent, back, strict=True))[first:]
+    for number, (one, other) in enumerate(pairs, start=1):
+        for index, text in _differences(one, other):
+            is_lost = index in NOT_KEPT[firmware].get(one.command, ())
+            (left_out if is_lost else differences).append(f"item {number} ({one.name}): {text}")
+    return Compared(differences=tuple(differences), left_out=tuple(left_out))
+
+
+def _differences(one: WireItem, other: WireItem) -> list[tuple[int, str]]:
+    """Return what differs, each with the parameter's index; -1 for all else."""
+    if one.command != other.command:
+        return [(-1, f"{other.name} is there")]
+    found = []
+    if one.command in PLACES and (one.x or one.y):
+        found += _of_place(one, other)
+    for index, (value, kept) in enumerate(zip(one.params, other.params, strict=True)):
+        if not _is_same(value, kept, is_yaw=index == YAW and one.command in (WAYPOINT, TAKEOFF)):
+            found.append((index, f"parameter {index + 1} was {value:g}, {kept:g} is there"))
+    return found
+
+
+def _of_place(one: WireItem, other: WireItem) -> list[tuple[int, str]]:
+    if not (abs(one.x - other.x) <= PLACE_E7 and abs(one.y - other.y) <= PLACE_E7):
+        places = [f"{item.x / 1e7:.7f} {item.y / 1e7:.7f}" for item in (one, other)]
+        return [(-1, f"was at {places[0]}, {places[1]} is there")]
+    if FENCE_FIRST <= one.command <= FENCE_LAST:  # a corner has no height
+        return []
+    if SAME_FRAME.get(one.frame) != SAME_FRAME.get(other.frame):
+        return [(-1, f"was in frame {one.frame}, {other.frame} is there")]
+    if not abs(one.z_m - other.z_m) <= HEIGHT_M:
+        return [(-1, f"was {one.z_m:g} m high, {other.z_m:g} is there")]
+    return []
+
+
+def _is_same(value: float, kept: float, *, is_yaw: bool) -> bool:
+    """Return whether a parameter is kept; one left open may come back as zero or open."""
+    if math.isnan(value) or value == 0.0:
+        return math.isnan(kept) or kept == 0.0
+    if is_yaw:
+        return abs((value - kept + 180.0) % 360.0 - 180.0) <= 0.1
+    return abs(value - kept) <= PARAM * max(1.0, abs(value))

@@ -1,0 +1,90 @@
+"""`vrspray upload`: a mission file onto the vehicle."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.cli.answer import AsJson, answer, note
+from missions.upload.checks import FIRMWARES
+from missions.upload.items import MissionFile
+from missions.upload.mavsdk_vehicle import connected
+from missions.upload.reading import read_mission_file
+from missions.upload.transfer import TransferError, Uploaded, What, put
+
+WAIT_S = 15.0
+FAILED = 1
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+@app.command(epilog="Example: vrspray upload field.plan --link udpin:0.0.0.0:14550")
+def upload(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="One sortie: .plan or .waypoints.")],
+    link: Annotated[
+        str,
+        typer.Option(
+            metavar="URL", help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEV:BAUD."
+        ),
+    ],
+    fence: Annotated[
+        bool, typer.Option("--fence/--no-fence", help="Upload the fence of a .plan, too.")
+    ] = True,
+    while_armed: Annotated[
+        bool, typer.Option("--while-armed", help="Change the mission under an armed vehicle.")
+    ] = False,
+    wait_s: Annotated[
+        float, typer.Option(metavar="S", help="For the vehicle.", min=1.0, max=600.0)
+    ] = WAIT_S,
+    as_json: AsJson = False,
+) -> None:
+    """Upload a mission and its fence, and verify them by reading them back.
+
+    Nothing is sent to an armed vehicle, and nothing that its firmware is known to refuse.
+    """
+    mission = read_mission_file(file)
+    try:
+        done = asyncio.run(_put(mission, link, wait_s, with_fence=fence, while_armed=while_armed))
+    except TransferError as error:
+        if as_json:
+            answer({"ok": False, "error": str(error)}, (), as_json=True)
+        note(f"error: {error}")
+        raise typer.Exit(FAILED) from error
+    answer({"ok": True, "file": str(file), **asdict(done)}, [_line(file, done)], as_json=as_json)
+    for text in done.left_out:
+        note(f"warning: {FIRMWARES[done.firmware]} does not keep {text}")
+
+
+async def _put(
+    mission: MissionFile, link: str, wait_s: float, *, with_fence: bool, while_armed: bool
+) -> Uploaded:
+    async with connected(link, wait_s=wait_s) as vehicle:
+        return await put(
+            vehicle, mission, while_armed=while_armed, with_fence=with_fence, progress=_Progress()
+        )
+
+
+class _Progress:
+    """Says each quarter of a transfer once, on stderr."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, int] = {}
+
+    def __call__(self, what: What, share: float) -> None:
+        quarter = int(4.0 * share + 1e-6)
+        if quarter != self._said.get(what, 0):
+            self._said[what] = quarter
+            note(f"{what}: {25 * quarter} % sent")
+
+
+def _line(file: Path, done: Uploaded) -> str:
+    fence = f" and {done.fence_items} of its fence" if done.fence_items else ""
+    again = f", at attempt {done.attempts}" if done.attempts > 1 else ""
+    return (
+        f"{file.name}: {done.items} items{fence} are on the vehicle "
+        f"({FIRMWARES[done.firmware]}), read back and the same{again}"
+    )

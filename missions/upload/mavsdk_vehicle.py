@@ -1,0 +1,189 @@
+"""The vehicle as MAVSDK sees it: the only place that imports MAVSDK (extra `mavsdk`)."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import json
+import logging
+from collections.abc import AsyncIterator, Sequence
+from contextlib import aclosing, asynccontextmanager
+from typing import Any
+
+from companion.errors import LinkError
+from companion.link.transport import parse_url
+from missions.errors import UploadError
+from missions.upload.items import Firmware, WireItem
+from missions.upload.transfer import NotNowError, Progress, What
+
+_logger = logging.getLogger(__name__)
+
+MISSION_TYPE: dict[What, int] = {"mission": 0, "fence": 1}
+ARMED_FLAG = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+# An autopilot's heartbeat comes once a second.
+HEARTBEAT_S = 5.0
+AUTOPILOT_COMPONENT = 1
+# Not the vehicle's will but the way there: another attempt may go through.
+PASSING = ("TIMEOUT", "BUSY", "TRANSFER_CANCELLED", "PROTOCOL_ERROR", "INVALID_SEQUENCE", "ERROR")
+REASONS = {
+    "TOO_MANY_MISSION_ITEMS": "it has no room for {count} items; upload one sortie at a time",
+    "UNSUPPORTED": "it does not take an item of it, or no {what} at all",
+    "DENIED": "another ground station is uploading, or its configuration forbids it",
+    "INVALID_ARGUMENT": "an item has a parameter that it does not take",
+}
+
+
+def mavsdk_url(url: str) -> str:
+    """Return a link URL of ours as MAVSDK writes it.
+
+    >>> mavsdk_url("udpin:0.0.0.0:14550"), mavsdk_url("serial:/dev/ttyAMA0:57600")
+    ('udpin://0.0.0.0:14550', 'serial:///dev/ttyAMA0:57600')
+    """
+    parts = parse_url(url)
+    scheme = "tcpout" if parts.kind == "tcp" else parts.kind
+    return f"{scheme}://{parts.place}:{parts.number}"
+
+
+@asynccontextmanager
+async def connected(url: str, *, wait_s: float) -> AsyncIterator[MavsdkVehicle]:
+    """Have the first vehicle on a link.
+
+    Raises:
+        LinkError: there is no MAVSDK, no such link, or no vehicle on it.
+    """
+    target = mavsdk_url(url)
+    if importlib.util.find_spec("mavsdk") is None:
+        raise LinkError("no upload without MAVSDK; install it: pip install 'vrspray[mavsdk]'")
+    from mavsdk import asyncio as mavsdk
+    from mavsdk.exceptions import MavsdkError
+    from mavsdk.logging import log_subscribe
+
+    log_subscribe(_log)
+    kind = mavsdk.ComponentType.GROUND_STATION
+    configuration = mavsdk.Configuration.create_with_component_type(kind)
+    async with mavsdk.Mavsdk(configuration) as client:
+        try:
+            await client.add_any_connection(target)
+        except MavsdkError as error:
+            raise LinkError(f"--link {url}: cannot be opened ({error})") from error
+        system = await client.first_autopilot(wait_s)
+        if system is None:
+            raise LinkError(
+                f"--link {url}: no vehicle within {wait_s:g} s; is it switched on, "
+                "and does another program hold the link?"
+            )
+        yield MavsdkVehicle(system, await _firmware(system, url))
+
+
+def _log(_level: object, text: str, _file: object, _line: int) -> bool:
+    """Keep MAVSDK's own words off the terminal."""
+    _logger.debug("MAVSDK: %s", text)
+    return True
+
+
+async def _firmware(system: Any, url: str) -> Firmware:
+    found = (await system.autopilot_type()).name
+    if found == "ARDUPILOT":
+        return "ardupilot"
+    if found == "PX4":
+        return "px4"
+    raise LinkError(f"--link {url}: the vehicle is neither ArduPilot nor PX4 but {found.lower()}")
+
+
+class MavsdkVehicle:
+    """A `Vehicle` behind MAVSDK."""
+
+    def __init__(self, system: Any, firmware: Firmware) -> None:
+        from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync
+        from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync
+
+        self.firmware: Firmware = firmware
+        self._raw = MissionRawAsync(system)
+        self._direct = MavlinkDirectAsync(system)
+
+    async def is_armed(self) -> bool | None:
+        """Return what the next heartbeat of the autopilot says; None where none comes."""
+        try:
+            async with (
+                asyncio.timeout(HEARTBEAT_S),
+                aclosing(self._direct.subscribe_message("HEARTBEAT")) as beats,
+            ):
+                async for beat in beats:
+                    if beat.component_id == AUTOPILOT_COMPONENT:
+                        return bool(int(json.loads(beat.fields_json)["base_mode"]) & ARMED_FLAG)
+        except TimeoutError:
+            pass
+        return None
+
+    async def send(self, what: What, items: Sequence[WireItem], progress: Progress) -> None:
+        """Upload all items."""
+        from mavsdk.plugins.mission_raw import MissionPlan, MissionRawError
+
+        raw = [_raw(number, item, what) for number, item in enumerate(items)]
+        try:
+            if what == "fence":
+                await self._raw.upload_geofence(raw)
+                progress(what, 1.0)
+                return
+            uploading = self._raw.upload_mission_with_progress(MissionPlan(raw))
+            async with aclosing(uploading) as steps:
+                async for result, data in steps:
+                    progress(what, 1.0 if result.name == "SUCCESS" else float(data.progress))
+        except MissionRawError as error:
+            raise _reason(error.result.name, what, len(items)) from error
+
+    async def read(self, what: What) -> tuple[WireItem, ...]:
+        """Read back what is there."""
+        from mavsdk.plugins.mission_raw import MissionRawError
+
+        try:
+            if what == "fence":
+                found = await self._raw.download_geofence()
+            else:
+                found = await self._raw.download_mission()
+        except MissionRawError as error:
+            if error.result.name == "NO_MISSION_AVAILABLE":
+                return ()
+            raise NotNowError(f"it could not be read back ({error.result.name})") from error
+        return tuple(_item(each) for each in found)
+
+
+def _reason(name: str, what: What, count: int) -> Exception:
+    """Return the error for a result of MAVSDK."""
+    if name in PASSING:
+        return NotNowError(f"the transfer broke off ({name})")
+    reason = REASONS.get(name, name.lower()).format(count=count, what=what)
+    more = "; --no-fence uploads the mission alone" if what == "fence" else ""
+    return UploadError(f"the vehicle refuses the {what}: {reason}{more}")
+
+
+def _raw(number: int, item: WireItem, what: What) -> Any:
+    from mavsdk.plugins.mission_raw import MissionItem
+
+    return MissionItem(
+        seq=number,
+        frame=item.frame,
+        command=item.command,
+        current=int(number == 0 and what == "mission"),
+        autocontinue=int(item.goes_on),
+        param1=item.params[0],
+        param2=item.params[1],
+        param3=item.params[2],
+        param4=item.params[3],
+        x=item.x,
+        y=item.y,
+        z=item.z_m,
+        mission_type=MISSION_TYPE[what],
+    )
+
+
+def _item(raw: Any) -> WireItem:
+    return WireItem(
+        command=int(raw.command),
+        frame=int(raw.frame),
+        params=(raw.param1, raw.param2, raw.param3, raw.param4),
+        x=int(raw.x),
+        y=int(raw.y),
+        z_m=float(raw.z),
+        goes_on=bool(raw.autocontinue),
+    )

@@ -1,0 +1,123 @@
+"""A mission and its fence onto a vehicle: asked, sent, read back, compared, and tried again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from missions.errors import UploadError
+from missions.upload.checks import FIRMWARES, Compared, compare, refusal
+from missions.upload.items import Firmware, MissionFile, WireItem
+
+What = Literal["mission", "fence"]
+Progress = Callable[[What, float], None]
+ATTEMPTS = 3
+
+
+class TransferError(UploadError):
+    """The work failed: nothing was wrong with what was asked."""
+
+
+class NotNowError(Exception):
+    """A transfer broke off; it may go through when it is tried again."""
+
+
+class Vehicle(Protocol):
+    """A vehicle on a link.
+
+    `send` and `read` raise `NotNowError` where another attempt may help, and `UploadError` where
+    the vehicle says no.
+    """
+
+    firmware: Firmware
+
+    async def is_armed(self) -> bool | None:
+        """Return what its newest heartbeat says; None where there is none."""
+
+    async def send(self, what: What, items: Sequence[WireItem], progress: Progress) -> None:
+        """Upload all items."""
+
+    async def read(self, what: What) -> tuple[WireItem, ...]:
+        """Read back what is there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Uploaded:
+    """What is on the vehicle now; `left_out` is what it does not keep."""
+
+    firmware: Firmware
+    items: int
+    fence_items: int
+    attempts: int
+    left_out: tuple[str, ...]
+
+
+async def put(
+    vehicle: Vehicle,
+    file: MissionFile,
+    *,
+    while_armed: bool = False,
+    with_fence: bool = True,
+    progress: Progress,
+) -> Uploaded:
+    """Upload fence and mission, and prove by reading back that they are there.
+
+    The fence goes first: where it is refused, the vehicle keeps the mission that it had.
+
+    Raises:
+        UploadError: the vehicle will not have it, or must not be given it now.
+        TransferError: it did not get there, or is not what was sent.
+    """
+    reason = refusal(file, vehicle.firmware)
+    if reason is not None:
+        raise UploadError(reason)
+    fence = file.fence if with_fence else ()
+    parts: tuple[tuple[What, tuple[WireItem, ...]], ...] = (
+        ("fence", fence),
+        ("mission", file.items_for(vehicle.firmware)),
+    )
+    attempts, left_out = 0, list[str]()
+    for what, items in parts:
+        if items:
+            await _refuse_armed(vehicle, while_armed=while_armed)
+            tried, compared = await _put_one(vehicle, what, items, progress)
+            attempts = max(attempts, tried)
+            left_out += compared.left_out
+    return Uploaded(
+        firmware=vehicle.firmware, items=len(file.items), fence_items=len(fence),
+        attempts=attempts, left_out=tuple(left_out),
+    )  # fmt: skip
+
+
+async def _refuse_armed(vehicle: Vehicle, *, while_armed: bool) -> None:
+    armed = await vehicle.is_armed()
+    if armed is None:
+        raise TransferError("the vehicle fell silent; nothing more was sent to it")
+    if armed and not while_armed:
+        raise UploadError(
+            "the vehicle is armed; disarm it, or say --while-armed to change the mission under it"
+        )
+
+
+async def _put_one(
+    vehicle: Vehicle, what: What, items: Sequence[WireItem], progress: Progress
+) -> tuple[int, Compared]:
+    """Return how many attempts it took, and what the vehicle leaves out."""
+    reason = ""
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            await vehicle.send(what, items, progress)
+            compared = compare(items, await vehicle.read(what), vehicle.firmware)
+        except NotNowError as error:
+            reason = str(error)
+            continue
+        if not compared.differences:
+            return attempt, compared
+        more = len(compared.differences) - 1
+        reason = compared.differences[0] + (f", and {more} more" if more else "")
+    name = FIRMWARES[vehicle.firmware]
+    raise TransferError(
+        f"the {what} is not on the vehicle ({name}) after {ATTEMPTS} attempts: {reason}; "
+        "do not fly it, and upload it again"
+    )

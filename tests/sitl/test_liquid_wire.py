@@ -1,0 +1,109 @@
+"""A valve sticks in real time: `run` sees it in the autopilot's meter, names it and closes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from companion.record.reader import read_journal
+from tests.sitl.wire_peer import free_port
+
+pytestmark = [pytest.mark.sitl, pytest.mark.timeout(120)]
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang"
+FOUND_MAX_S = 3.0
+# The order to close leaves with the plan of the step that found it.
+CLOSED_MAX_S = 0.15
+
+
+@asynccontextmanager
+async def process(*command: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    pipe = asyncio.subprocess.PIPE
+    started = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "companion", *command, stdout=pipe, stderr=pipe
+    )
+    try:
+        yield started
+    finally:
+        if started.returncode is None:
+            started.kill()
+        await started.communicate()
+
+
+async def until_said(process: asyncio.subprocess.Process, text: str) -> None:
+    assert process.stderr is not None
+    said = []
+    async with asyncio.timeout(90.0):
+        while line := (await process.stderr.readline()).decode():
+            said.append(line)
+            if text in line:
+                return
+    pytest.fail(f"it never said {text!r}: {said}")
+
+
+async def test_a_stuck_valve_is_found_within_three_seconds_and_closes(tmp_path: Path) -> None:
+    port, out = free_port(), tmp_path / "truth"
+    folder = tmp_path / "field"
+    shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("flights"))
+    scenario = tmp_path / "stuck.toml"
+    scenario.write_text(
+        "[sensors]\nmeter_battery = 1\n"
+        '[[liquid]]\nkind = "stuck-open"\nsince = "spraying"\nat_s = 3.0\nvalve = 3\n'
+    )
+    sensors = tmp_path / "iio"
+    serve = (
+        *("sitl", "serve", "--json", "--link", f"udpout:127.0.0.1:{port}"),
+        *("--scenario", str(scenario), "--sensors", str(sensors), "--out", str(out)),
+    )
+    settings = (
+        f"link.url=udpin:127.0.0.1:{port}",
+        "flow_meter.source=autopilot",
+        "pressure.source=iio",
+        f"pressure.device={sensors}",
+        "detection.enabled=true",
+    )
+    options = [word for setting in settings for word in ("--set", setting)]
+    async with process(*serve) as vehicle:
+        await until_said(vehicle, "waiting for a companion")
+        async with process("run", "--config", str(folder / "config.toml"), *options) as companion:
+            await until_said(vehicle, "Spray: closed: valve-stuck-open")
+            # A few positions more: it stays closed where the map asks for liquid.
+            await until_said(vehicle, "flying: ")
+            vehicle.send_signal(signal.SIGTERM)
+            async with asyncio.timeout(20.0):
+                stdout, _ = await vehicle.communicate()
+            companion.terminate()
+            async with asyncio.timeout(20.0):
+                _, told = await companion.communicate()
+            assert companion.returncode == 0, told.decode()
+    summary = json.loads(stdout)
+    assert [one["fault"] for one in summary["liquid"]] == ["stuck-open, valve 3"]
+    fault_s = summary["liquid"][0]["from_s"]
+    (path,) = (folder / "flights").glob("*.gpkg")
+    found = [event for event in read_journal(path).events if event.kind.startswith("fault-")]
+    assert found
+    assert found[0].kind == "fault-stuck-open"
+    found_s = found[0].at_s
+    assert 0.0 < found_s - fault_s <= FOUND_MAX_S
+    check_closed(out, found_s)
+
+
+def check_closed(out: Path, found_s: float) -> None:
+    """Every order after the finding closes, and each valve got one at once."""
+    truth = np.load(out / "truth.npz")
+    at_s, valve = truth["order_time_s"], truth["order_valve"]
+    pulse_us = truth["order_pulse_us"]
+    soon = (at_s >= found_s - CLOSED_MAX_S) & (at_s <= found_s + CLOSED_MAX_S)
+    for each in range(6):
+        assert 1000 in pulse_us[soon & (valve == each)]
+    assert set(pulse_us[at_s > found_s + CLOSED_MAX_S]) == {1000}
+    assert (at_s > found_s + CLOSED_MAX_S).any()

@@ -1,0 +1,38 @@
+"""A plan's litres are those that the twin sprays on its lines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import shapely
+from shapely import Polygon, box
+
+from tests.bench.missions import to_degrees
+from tests.bench.plan_twin import compared, config_for, flown, planned
+
+
+def features(path: Path, areas: list[tuple[Polygon, dict[str, float]]]) -> Path:
+    found = [
+        {"type": "Feature", "properties": properties,
+         "geometry": json.loads(shapely.to_geojson(to_degrees(area)))}
+        for area, properties in areas
+    ]  # fmt: skip
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": found}))
+    return path
+
+
+def test_litres_of_every_sortie_agree_with_the_twin_within_one_percent(tmp_path: Path) -> None:
+    whole = Polygon([(0, 0), (38, 5), (44, 70), (6, 76)])
+    rates = [
+        (whole & box(-9, -9, 99, 25), {"rate": 180.0}),
+        (whole & box(-9, 25, 99, 48), {"rate": 0.0}),
+        (whole & box(-9, 48, 99, 199), {"rate": 120.0}),
+    ]
+    map_file = features(tmp_path / "rates.geojson", rates)  # type: ignore[arg-type]
+    boundary = features(tmp_path / "field.geojson", [(whole, {})])
+    config = config_for(tmp_path, map_file, boundary)
+    plan = planned(config, boundary, moves=2_000, tank_l=13.0)
+    assert len(plan.sorties) >= 2
+    found = compared([flown(plan, sortie, config, seed=1) for sortie in plan.sorties])
+    assert found["worst_percent"] < 1.0, found

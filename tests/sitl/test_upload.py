@@ -1,0 +1,145 @@
+"""`vrspray upload`: by MAVSDK over a real socket to both personalities of the stub."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import sys
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from missions.errors import UploadError
+from missions.upload.reading import read_mission_file
+from missions.upload.transfer import put
+from sitl.stub.mission_file import read_mission
+from sitl.stub.mission_items import MissionItem
+from tests.sitl.upload_bench import sorties, stub_on_a_port
+from tests.sitl.wire_peer import free_port
+
+pytest.importorskip("mavsdk.asyncio")
+pytestmark = pytest.mark.sitl
+both = pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+
+
+def without_yaw(items: Iterable[MissionItem]) -> list[MissionItem]:
+    """The reader of the stub takes a yaw that is left open for 0."""
+    return [replace(item, param4=0.0) for item in items]
+
+
+async def upload(file: Path, url: str, **options: Any) -> Any:
+    from missions.upload.mavsdk_vehicle import connected
+
+    async with asyncio.timeout(60.0), connected(url, wait_s=20.0) as vehicle:
+        return await put(
+            vehicle, read_mission_file(file), progress=lambda _what, _share: None, **options
+        )
+
+
+@both
+async def test_mission_and_fence_are_on_the_vehicle_as_the_file_has_them(
+    autopilot: str, tmp_path: Path
+) -> None:
+    file = sorties(tmp_path, 1)[0]
+    async with stub_on_a_port(autopilot) as (server, url):
+        done = await upload(file, url)
+        kept = server.autopilot
+    items = read_mission(file)
+    assert without_yaw(kept.flight.items[1:]) == without_yaw(items[1:])
+    assert math.isnan(kept.flight.items[1].param4)
+    assert (done.items, done.firmware, done.attempts) == (len(items) - 1, autopilot, 1)
+    polygons = json.loads(file.read_text())["geoFence"]["polygons"]
+    corners = [(5001 if each["inclusion"] else 5002, len(each["polygon"]), *place)
+               for each in polygons for place in each["polygon"]]  # fmt: skip
+    assert {each["inclusion"] for each in polygons} == {True, False}
+    assert [(i.command, i.param1, i.latitude_deg, i.longitude_deg) for i in kept.fence] == [
+        pytest.approx(corner, abs=1e-7) for corner in corners
+    ]
+    assert done.fence_items == len(corners)
+
+
+async def test_sorties_in_a_row_each_replace_the_one_before(tmp_path: Path) -> None:
+    files = sorties(tmp_path, 5, suffix=".waypoints")
+    assert len(files) == 5
+    from missions.upload.mavsdk_vehicle import connected
+
+    async with (
+        stub_on_a_port("ardupilot") as (server, url),
+        connected(url, wait_s=20.0) as vehicle,
+    ):
+        for file in files:
+            shares: list[float] = []
+            mission = read_mission_file(file)
+            await put(vehicle, mission, progress=lambda _what, share: shares.append(share))  # noqa: B023
+            assert server.autopilot.flight.items[1:] == read_mission(file)[1:]
+            assert shares == sorted(shares)
+            assert shares[-1] == 1.0
+
+
+async def test_an_armed_vehicle_keeps_its_mission_unless_told(tmp_path: Path) -> None:
+    file = sorties(tmp_path, 1)[0]
+    async with stub_on_a_port("px4") as (server, url):
+        before = server.autopilot.flight.items
+        server.autopilot.flight.armed = True
+        with pytest.raises(UploadError, match="--while-armed"):
+            await upload(file, url)
+        assert server.autopilot.flight.items == before
+        assert server.autopilot.fence == ()
+        done = await upload(file, url, while_armed=True, with_fence=False)
+        assert done.items == len(server.autopilot.flight.items) - 1
+
+
+async def test_a_fence_beyond_the_vehicles_room_leaves_its_mission_alone(tmp_path: Path) -> None:
+    file = sorties(tmp_path, 1)[0]
+    content = json.loads(file.read_text())
+    ring = [[48.0 + number * 1e-5, 11.0 + number**2 * 1e-6] for number in range(65)]
+    content["geoFence"]["polygons"] = [{"inclusion": True, "polygon": ring, "version": 1}]
+    file.write_text(json.dumps(content))
+    async with stub_on_a_port("ardupilot") as (server, url):
+        before = server.autopilot.flight.items
+        with pytest.raises(UploadError, match=r"no room for 65 items.*--no-fence"):
+            await upload(file, url)
+        assert server.autopilot.flight.items == before
+
+
+async def test_a_mission_with_too_many_items_is_refused_by_the_vehicle(tmp_path: Path) -> None:
+    file = tmp_path / "m.waypoints"
+    row = "{}\t0\t3\t16\t0\t0\t0\t0\t48.0\t11.0\t3.5\t1"
+    file.write_text("\n".join(["QGC WPL 110", *(row.format(n) for n in range(2002))]) + "\n")
+    async with stub_on_a_port("px4") as (_, url):
+        with pytest.raises(UploadError, match="no room for 2001 items"):
+            await upload(file, url)
+
+
+async def typed(*words: str) -> tuple[int, str, str]:
+    """Run `vrspray upload` in a process of its own."""
+    pipe = asyncio.subprocess.PIPE
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "companion", "upload", *words, stdout=pipe, stderr=pipe
+    )
+    out, err = await process.communicate()
+    return process.returncode or 0, out.decode(), err.decode()
+
+
+async def test_the_command_prints_one_object_and_its_progress_apart(tmp_path: Path) -> None:
+    file = sorties(tmp_path, 1)[0]
+    async with stub_on_a_port("px4") as (_, url):
+        code, out, err = await typed(str(file), "--link", url, "--json")
+    found = json.loads(out)
+    assert (code, found["ok"], found["firmware"]) == (0, True, "px4")
+    assert found["items"] == len(read_mission(file)) - 1
+    assert err.splitlines()[0] == "fence: 100 % sent"
+    assert err.splitlines()[-1] == "mission: 100 % sent"
+
+
+async def test_a_link_without_a_vehicle_is_one_line(tmp_path: Path) -> None:
+    file = sorties(tmp_path, 1)[0]
+    link = f"udpin:127.0.0.1:{free_port()}"
+    code, out, err = await typed(str(file), "--link", link, "--wait-s", "1")
+    assert (code, out) == (2, "")
+    assert err.startswith(f"error: --link {link}: no vehicle within 1 s")
+    assert len(err.splitlines()) == 1

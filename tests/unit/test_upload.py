@@ -1,0 +1,240 @@
+"""Mission files for upload, what firmwares refuse, and what counts as the same on the vehicle."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from companion.cli.app import execute
+from missions.errors import UploadError
+from missions.upload.checks import compare, refusal
+from missions.upload.items import Firmware, MissionFile, WireItem
+from missions.upload.reading import read_mission_file
+from missions.upload.transfer import NotNowError, Progress, TransferError, What, put
+
+HOME = WireItem(command=16, frame=0, x=480_000_000, y=110_000_000)
+OPEN = math.nan
+ITEMS = (
+    WireItem(command=22, frame=3, params=(0, 0, 0, OPEN), x=480_000_000, y=110_000_000, z_m=3.5),
+    WireItem(command=178, frame=2, params=(1, 6, -1, 0)),
+    WireItem(command=16, frame=3, params=(0, 0, 0, 30.0), x=480_001_000, y=110_001_000, z_m=3.5),
+    WireItem(command=20, frame=2),
+)
+CORNERS = tuple(
+    WireItem(command=5001, frame=0, params=(3, 0, 0, 0), x=480_000_000 + n, y=110_000_000)
+    for n in range(3)
+)
+FILE = MissionFile(path=Path("m.plan"), home=HOME, items=ITEMS, fence=CORNERS)
+
+
+def plan_file(tmp_path: Path, **changes: Any) -> Path:
+    simple = {"type": "SimpleItem", "command": 16, "frame": 3, "autoContinue": True,
+              "params": [0, 0, 0, None, 48.0001, 11.0, 3.5]}  # fmt: skip
+    content = {
+        "fileType": "Plan",
+        "mission": {"plannedHomePosition": [48.0, 11.0, 0.0],
+                    "items": [simple | changes.pop("item", {})]},
+        "geoFence": {"polygons": [], "circles": []},
+    }  # fmt: skip
+    path = tmp_path / "m.plan"
+    path.write_text(json.dumps(content | changes))
+    return path
+
+
+def test_a_plan_is_read_with_its_open_parameters_and_all_of_its_fence(tmp_path: Path) -> None:
+    ring = [[48.0, 11.0], [48.0, 11.1], [48.1, 11.1]]
+    fence = {
+        "polygons": [{"inclusion": False, "polygon": ring}],
+        "circles": [{"inclusion": True, "circle": {"center": [48.0, 11.0], "radius": 90.0}}],
+        "breachReturn": [48.0, 11.0, 5.0],
+    }
+    found = read_mission_file(plan_file(tmp_path, geoFence=fence))
+    assert (found.home.x, found.items[0].x, found.items[0].z_m) == (480_000_000, 480_001_000, 3.5)
+    assert math.isnan(found.items[0].params[3])
+    assert [(each.command, each.params[0]) for each in found.fence] == [
+        (5002, 3.0), (5002, 3.0), (5002, 3.0), (5003, 90.0), (5000, 0.0)
+    ]  # fmt: skip
+
+
+def test_numbers_without_a_place_travel_as_they_are(tmp_path: Path) -> None:
+    item = {"frame": 2, "command": 187, "params": [0, 0, 0, 0, 7, 0, 2]}
+    found = read_mission_file(plan_file(tmp_path, item=item)).items[0]
+    assert (found.x, found.z_m) == (7, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"fileType": "Survey"}, "its head: fileType is 'Survey'"),
+        ({"mission": {"items": []}}, "'plannedHomePosition' is missing"),
+        ({"item": {"type": "ComplexItem"}}, "item 1: 'ComplexItem' is not a simple item"),
+        ({"item": {"params": [0, 0, 0]}}, "item 1: 7 parameters are needed, there are 3"),
+        ({"item": {"params": [0, 0, 0, 0, 98.0, 0, 0]}}, "item 1: 98, 0 is no place"),
+        ({"item": {"params": [0, "x", 0, 0, 8.0, 0, 0]}}, "item 1: 'x' is no number"),
+        ({"item": {"params": [0, math.inf, 0, 0, 8.0, 0, 0]}}, "item 1: a parameter is infinite"),
+        ({"item": {"frame": 3000}}, "item 1: command 16 in frame 3000 does not exist"),
+        ({"geoFence": {"polygons": [{"inclusion": True, "polygon": [[0, 0]]}]}}, "has 1 corners"),
+    ],
+)
+def test_a_wrong_plan_is_refused_with_the_place(
+    tmp_path: Path, changes: dict[str, Any], says: str
+) -> None:
+    with pytest.raises(UploadError, match=says):
+        read_mission_file(plan_file(tmp_path, **changes))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "says"),
+    [
+        ("m.kml", "", "only .plan and .waypoints"),
+        ("m.plan", "{", "not a plan"),
+        ("m.plan", "[" * 100_000, "too deep"),
+        ("m.waypoints", "QGC WPL 120\n", "first line is not 'QGC WPL 110'"),
+        ("m.waypoints", "QGC WPL 110\n", "no items"),
+        ("m.waypoints", "QGC WPL 110\n0 1 0 16 0\n", "line 2: 12 columns are needed, there are 5"),
+        ("m.waypoints", "QGC WPL 110\n0 1 0 16 0 0 0 0 1 2 nil 1\n", "line 2: could not convert"),
+    ],
+)
+def test_a_wrong_file_is_one_line_and_exit_2(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, name: str, text: str, says: str
+) -> None:
+    path = tmp_path / name
+    path.write_text(text)
+    assert execute(["upload", str(path), "--link", "udpin:127.0.0.1:14550", "--json"]) == 2
+    out, err = capsys.readouterr()
+    assert says in json.loads(out)["error"]
+    assert len(err.splitlines()) == 1
+
+
+def test_a_wrong_link_is_refused_by_name(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert execute(["upload", str(plan_file(tmp_path)), "--link", "14550"]) == 2
+    assert "write udpin:HOST:PORT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("item", "firmware", "says"),
+    [
+        (WireItem(command=216, frame=2), "px4", "item 5: PX4 takes no DO_SPRAYER; plan without"),
+        (WireItem(command=16, frame=10), "px4", "item 5: PX4 takes no height above terrain"),
+        (WireItem(command=187, frame=2), "ardupilot", "ArduPilot takes no DO_SET_ACTUATOR"),
+        (WireItem(command=216, frame=2), "ardupilot", None),
+        (WireItem(command=16, frame=10), "ardupilot", None),
+    ],
+)
+def test_what_a_firmware_refuses_is_known_before_it_is_asked(
+    item: WireItem, firmware: Firmware, says: str | None
+) -> None:
+    found = refusal(replace(FILE, items=(*ITEMS, item)), firmware)
+    assert found is None if says is None else says in (found or "")
+
+
+def changed(number: int, **changes: Any) -> list[WireItem]:
+    return [replace(item, **changes) if n == number else item for n, item in enumerate(ITEMS)]
+
+
+def test_what_firmwares_round_is_still_the_same() -> None:
+    back = changed(2, x=480_001_002, z_m=3.49, frame=6, params=(OPEN, 0, 0, 390.0))
+    assert compare(ITEMS, back, "px4").differences == ()
+
+
+@pytest.mark.parametrize(
+    ("back", "says"),
+    [
+        (ITEMS[:-1], "4 items were sent, 3 are there"),
+        (changed(2, command=82), "item 3 (WAYPOINT): SPLINE_WAYPOINT is there"),
+        (changed(2, y=110_001_003), "was at 48.0001000 11.0001000"),
+        (changed(2, z_m=3.4), "was 3.5 m high, 3.4 is there"),
+        (changed(2, z_m=OPEN), "was 3.5 m high, nan is there"),
+        (changed(2, frame=0), "was in frame 3, 0 is there"),
+        (changed(1, params=(1, 5, -1, 0)), "item 2 (DO_CHANGE_SPEED): parameter 2 was 6, 5"),
+        (changed(1, params=(1, OPEN, -1, 0)), "parameter 2 was 6, nan"),
+        (changed(2, params=(5, 0, 0, 30)), "parameter 1 was 0, 5"),
+    ],
+)
+def test_another_mission_is_not_the_same(back: Sequence[WireItem], says: str) -> None:
+    assert says in compare(ITEMS, back, "px4").differences[0]
+
+
+def test_a_corner_of_the_fence_has_a_place_and_no_height() -> None:
+    lower = [replace(corner, z_m=9.0) for corner in CORNERS]
+    assert compare(CORNERS, lower, "ardupilot").differences == ()
+    moved = [replace(CORNERS[0], x=0), *CORNERS[1:]]
+    assert "item 1 (command 5001): was at" in compare(CORNERS, moved, "ardupilot").differences[0]
+
+
+class Fake:
+    """A vehicle with faults as fields."""
+
+    def __init__(self, firmware: Firmware = "ardupilot") -> None:
+        self.firmware: Firmware = firmware
+        self.armed: bool | None = False
+        self.breaks = 0
+        self.forgets = 0
+        self.kept: dict[str, tuple[WireItem, ...]] = {}
+
+    async def is_armed(self) -> bool | None:
+        return self.armed
+
+    async def send(self, what: What, items: Sequence[WireItem], progress: Progress) -> None:
+        if self.breaks:
+            self.breaks -= 1
+            raise NotNowError("the transfer broke off (TIMEOUT)")
+        self.kept[what] = tuple(items)
+        progress(what, 1.0)
+
+    async def read(self, what: What) -> tuple[WireItem, ...]:
+        if self.forgets:
+            self.forgets -= 1
+            return self.kept[what][:-1]
+        return self.kept[what]
+
+
+def nothing(_what: What, _share: float) -> None:
+    pass
+
+
+async def test_a_broken_transfer_is_tried_again_and_a_short_one_too() -> None:
+    vehicle = Fake()
+    vehicle.breaks = vehicle.forgets = 1
+    done = await put(vehicle, replace(FILE, fence=()), progress=nothing)
+    assert (done.attempts, done.items) == (3, 4)
+    assert vehicle.kept["mission"] == (HOME, *ITEMS)
+
+
+@pytest.mark.parametrize(("fault", "says"), [("breaks", "TIMEOUT"), ("forgets", "2 are there")])
+async def test_after_three_attempts_it_is_said_not_to_be_there(fault: str, says: str) -> None:
+    vehicle = Fake("px4")
+    setattr(vehicle, fault, 99)
+    with pytest.raises(TransferError, match=f"after 3 attempts: .*{says}.*do not fly it"):
+        await put(vehicle, FILE, progress=nothing)
+    assert "mission" not in vehicle.kept
+
+
+@pytest.mark.parametrize(("armed", "says"), [(True, "is armed"), (None, "fell silent")])
+async def test_nothing_is_sent_to_one_that_is_armed_or_silent(
+    armed: bool | None, says: str
+) -> None:
+    vehicle = Fake()
+    vehicle.armed = armed
+    with pytest.raises(UploadError, match=says):
+        await put(vehicle, FILE, progress=nothing)
+    assert vehicle.kept == {}
+
+
+async def test_a_copters_lost_yaw_is_named_and_is_no_failure() -> None:
+    vehicle = Fake()
+
+    async def read(what: What) -> tuple[WireItem, ...]:
+        return tuple(replace(item, params=(*item.params[:3], 0.0)) for item in vehicle.kept[what])
+
+    vehicle.read = read  # type: ignore[method-assign]
+    done = await put(vehicle, FILE, progress=nothing)
+    assert done.left_out == ("item 3 (WAYPOINT): parameter 4 was 30, 0 is there",)
