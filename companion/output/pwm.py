@@ -94,12 +94,18 @@ class PulseEngine:
         if not self._now_s < plan.lease_until_s:
             self._close_all(self._now_s)
             return True
+        wanted = list(plan.duty)
+        while self._changes and self._changes[0].at_s < self._now_s:
+            # The plan took its time: this is what it has for now. To order the duty of its issue
+            # first would undo, for one minimum time, what the plan before has done already.
+            change = self._changes.popleft()
+            wanted[change.valve] = change.duty
         for train in self._trains:
             train.restart_s = math.inf
-        for change in reversed(plan.changes):
+        for change in reversed(self._changes):
             if change.restart:
                 self._trains[change.valve].restart_s = change.at_s
-        for valve, duty in enumerate(plan.duty):
+        for valve, duty in enumerate(wanted):
             ordered = self._trains[valve].ordered
             if duty != ordered:
                 self._order(valve, duty, at_s=self._now_s, restart=needs_restart(ordered, duty))

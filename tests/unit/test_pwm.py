@@ -237,6 +237,29 @@ def test_what_happened_before_a_newer_plan_came_stays_happened() -> None:
     assert engine.advance(3.0) == [Edge(1.0, 0, True, 1.0)]
 
 
+@pytest.mark.parametrize(("before", "after"), [(0.0, 1.0), (1.0, 0.0), (0.3, 0.8), (0.8, 0.3)])
+def test_a_plan_that_took_its_time_undoes_no_change(before: float, after: float) -> None:
+    """Issued just before a change, it arrives just after it: the change has happened."""
+
+    def edges(late: bool) -> list[Edge]:
+        engine = PulseEngine(PWM, 1, start_s=0.0)
+        coming = change(1.0, after)
+        engine.submit(plan([before], coming, sequence=1, issued_s=0.5), now_s=0.501)
+        if late:
+            again = plan([before], coming, sequence=2, issued_s=0.9995)
+            engine.submit(again, now_s=1.0003)
+        return engine.advance(2.0)
+
+    assert edges(late=True) == edges(late=False)
+
+
+def test_a_change_that_was_due_on_the_way_is_ordered_at_once() -> None:
+    engine = PulseEngine(PWM, 1, start_s=0.0)
+    engine.submit(plan([0.0], sequence=1, issued_s=0.5), now_s=0.501)
+    engine.submit(plan([0.0], change(1.0, 1.0), sequence=2, issued_s=0.9995), now_s=1.0003)
+    assert pulses(engine.advance(2.0), until_s=2.0) == [(1.0003, 2.0)]
+
+
 def test_an_older_plan_is_refused() -> None:
     engine = PulseEngine(PWM, 1, start_s=0.0)
     assert engine.submit(plan([0.0], sequence=5), now_s=0.0)
