@@ -15,7 +15,7 @@ COMPILE = $(BIN)/uv pip compile --universal --python-version 3.11 --generate-has
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format-check ruff mypy imports bench mutants mutants-engine faults test-gpio docs lock clean
+.PHONY: help setup demo test lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio docs lock clean
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-10s %s\n", $$1, $$2}' Makefile
@@ -48,9 +48,9 @@ bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 mutants: $(INSTALLED) ## each known way to break the code makes a test fail (ARGS="lease" for some)
 	$(BIN)/python -m tests.mutations $(ARGS)
 
-mutants-engine: $(INSTALLED) ## everything in the valve engine that may be changed unnoticed (ARGS="schedule" for some)
+mutants-safety: $(INSTALLED) ## what may be changed in interlock, lease and valve engine unnoticed (ARGS="schedule" for some)
 	@test -d .venv/mutmut || $(PIP) install --quiet --target .venv/mutmut mutmut==3.8.1
-	$(BIN)/python -m tests.engine_mutants $(ARGS)
+	$(BIN)/python -m tests.safety_mutants $(ARGS)
 
 faults: $(INSTALLED) ## 200 real flights with faults (ARGS="--only SIGSTOP --flights 10"; ARGS=--page writes the table)
 	$(BIN)/python -m tests.bench.faults --flights 200 --lanes 2 --seed $(or $(SEED),1) $(ARGS)

@@ -9,8 +9,10 @@ from typing import Literal
 
 from companion.core.frame import LocalFrame
 from missions.coverage import Coverage
+from missions.energy import Battery, nose_s, sortie_wh
 from missions.field import Field
 from missions.strips import Floats
+from missions.terrain.ground import Terrain
 from missions.turns import Turn
 
 Place = tuple[float, float]
@@ -24,6 +26,8 @@ class Settings:
     `flow_l_min` is the least and the largest flow of the whole boom, `speeds_m_s` the least and
     the highest speed that a leg may have, `settle_s` how long a rate must last to be there.
     `border_buffer_m` is what the companion keeps its valves' strips off the border, if it does.
+    `refill_s` and `swap_s` (of a battery) are on the ground; several aircraft keep
+    `aircraft_gap_m` between them. `nose_rate_deg_s` is how fast the nose turns at a stop.
     """
 
     swath_width_m: float
@@ -41,6 +45,12 @@ class Settings:
     speeds_m_s: tuple[float, float] = (0.0, 0.0)
     settle_s: float = 0.0
     border_buffer_m: float | None = None
+    battery: Battery | None = None
+    refill_s: float = 60.0
+    swap_s: float = 60.0
+    nose_rate_deg_s: float | None = None
+    aircraft: int = 1
+    aircraft_gap_m: float = 20.0
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
@@ -119,6 +129,7 @@ class Plan:
     suggested_depot: bool
     sorties: tuple[Sortie, ...]
     warnings: tuple[str, ...] = ()
+    terrain: Terrain | None = None
 
     @property
     def frame(self) -> LocalFrame:

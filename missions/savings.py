@@ -6,6 +6,7 @@ A sortie is a list of ends at which its pieces are entered: 2 i flies piece i as
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -13,10 +14,20 @@ import numpy as np
 from missions.network import Network
 
 Sortie = list[int]
+Lasts = Callable[[Sortie], bool]
 
 
-def by_savings(network: Network, capacity_l: float, *, every_pair_max: int = 400) -> list[Sortie]:
-    """Return sorties of at most `capacity_l` each, made of pieces that are joined end to end."""
+def by_savings(
+    network: Network,
+    capacity_l: float,
+    *,
+    lasts: Lasts | None = None,
+    every_pair_max: int = 400,
+) -> list[Sortie]:
+    """Return sorties of at most `capacity_l` each, made of pieces that are joined end to end.
+
+    With `lasts` no two are joined for which the battery would not last.
+    """
     litres = network.litres.tolist()
     sorties: dict[int, Sortie] = {piece: [2 * piece] for piece in range(len(litres))}
     load = dict(enumerate(litres))
@@ -29,7 +40,10 @@ def by_savings(network: Network, capacity_l: float, *, every_pair_max: int = 400
         tail = _leaving(sorties[second], other)
         if head is None or tail is None:
             continue
-        sorties[first] = head + turned(tail)
+        whole = head + turned(tail)
+        if lasts is not None and not lasts(whole):
+            continue
+        sorties[first] = whole
         load[first] += load.pop(second)
         for enter in sorties.pop(second):
             sortie_of[enter >> 1] = first

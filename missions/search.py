@@ -11,7 +11,7 @@ import random
 from dataclasses import dataclass, field
 
 from missions.network import Network
-from missions.savings import Sortie, turned
+from missions.savings import Lasts, Sortie, turned
 
 # The first moves may cost some twenty seconds of flight, the last ones next to nothing.
 HOT_S, COLD_S = 20.0, 0.3
@@ -28,6 +28,7 @@ class _State:
     capacity_l: float
     depot: int
     sorties: list[Sortie]
+    lasts: Lasts | None = None
     of: list[int] = field(default_factory=list)
     load: list[float] = field(default_factory=list)
 
@@ -49,11 +50,24 @@ class _State:
         """Return whether a tank holds this."""
         return load_l <= self.capacity_l + 1e-9
 
+    def flies(self, *sorties: Sortie) -> bool:
+        """Return whether a battery lasts for each of these."""
+        return self.lasts is None or all(map(self.lasts, sorties))
+
 
 def improve(
-    network: Network, sorties: list[Sortie], capacity_l: float, *, moves: int, seed: int = 1
+    network: Network,
+    sorties: list[Sortie],
+    capacity_l: float,
+    *,
+    moves: int,
+    seed: int = 1,
+    lasts: Lasts | None = None,
 ) -> list[Sortie]:
-    """Return sorties that take no longer than those given, after so many attempted moves."""
+    """Return sorties that take no longer than those given, after so many attempted moves.
+
+    With `lasts`, for each of which a battery lasts.
+    """
     if moves <= 0 or len(network.litres) < 2:
         return sorties
     state = _State(
@@ -63,6 +77,7 @@ def improve(
         capacity_l=capacity_l,
         depot=network.depot,
         sorties=[list(sortie) for sortie in sorties],
+        lasts=lasts,
     )
     state.fill()
     draw = random.Random(seed)
@@ -121,8 +136,11 @@ def _insert(state: _State, end: int, other: int, allowed: float) -> float:
     cost += between[left][new] + between[new ^ 1][right] - between[left][right]
     if cost >= allowed:
         return 0.0
+    longer = [*into[:place], new, *into[place:]]
+    if not state.flies(longer):
+        return 0.0
     state.sorties[source] = rest
-    state.sorties[goal] = [*into[:place], new, *into[place:]]
+    state.sorties[goal] = longer
     state.note(source)
     state.note(goal)
     return cost
@@ -148,7 +166,10 @@ def _turn_part(state: _State, end: int, other: int, allowed: float) -> float:
     cost = between[left][out] + between[into][right] - between[left][into] - between[out][right]
     if cost >= allowed:
         return 0.0
-    state.sorties[number] = sortie[:start] + turned(sortie[start:stop]) + sortie[stop:]
+    changed = sortie[:start] + turned(sortie[start:stop]) + sortie[stop:]
+    if not state.flies(changed):
+        return 0.0
+    state.sorties[number] = changed
     return cost
 
 
@@ -175,8 +196,10 @@ def _link(state: _State, end: int, other: int, allowed: float) -> float:
     cost -= between[end][onward] + between[back][other]
     if cost >= allowed:
         return 0.0
-    state.sorties[one] = first[:cut] + second[join:]
-    state.sorties[two] = second[:join] + first[cut:]
+    joint, rest = first[:cut] + second[join:], second[:join] + first[cut:]
+    if not state.flies(joint, rest):
+        return 0.0
+    state.sorties[one], state.sorties[two] = joint, rest
     state.note(one)
     state.note(two)
     return cost
@@ -203,6 +226,9 @@ def _exchange(state: _State, end: int, other: int, allowed: float) -> float:
     if cost >= allowed:
         return 0.0
     first[at], second[place] = turn, new
+    if not state.flies(first, second):
+        first[at], second[place] = mine, theirs
+        return 0.0
     state.note(one)
     state.note(two)
     return cost

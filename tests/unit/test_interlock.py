@@ -10,7 +10,15 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
-from companion.core.interlock import Limits, held
+from companion.core.interlock import (
+    HEIGHT_MARGIN_M,
+    HOLD_S,
+    MARGIN_SHARE_MAX,
+    SPEED_MARGIN_M_S,
+    WIND_MARGIN_M_S,
+    Limits,
+    held,
+)
 from companion.core.types import Decision, Fix, Inhibit, VehicleState
 from tests.builders import SPRAYING, flying, setup
 
@@ -130,6 +138,25 @@ def test_what_is_no_number_closes_every_valve(name: str, value: float) -> None:
     decision = decide({name: value})
     assert decision.inhibits
     assert decision.plan.is_off
+
+
+def test_limits_are_those_of_the_contract_unless_others_are_given() -> None:
+    limits = Limits()
+    assert (limits.modes, limits.enable_by) == ({"AUTO"}, {"command", "rc", "web"})
+    assert (limits.position_age_max_s, limits.heartbeat_age_max_s) == (0.8, 2.5)
+    assert (limits.speed_min_m_s, limits.speed_max_m_s) == (1.0, 12.0)
+    assert limits.speed_disagreement_max_m_s == 1.0
+    assert (limits.height_min_m, limits.height_max_m) == (1.0, 10.0)
+    assert (limits.fix, limits.wind_max_m_s, limits.wind_age_max_s) == (Fix.RTK_FLOAT, 6.0, 5.0)
+    assert (limits.distance_max_m, limits.consent_gap_max_s) == (20_000.0, 10.0)
+    assert not (limits.wind_required or limits.speed_check_required or limits.estop_required)
+    assert limits.rc_channel is limits.accuracy_max_m is None
+
+
+def test_hold_and_margins_are_what_the_documents_say() -> None:
+    assert set(HOLD_S.values()) == {1.0}
+    margins = (SPEED_MARGIN_M_S, HEIGHT_MARGIN_M, WIND_MARGIN_M_S, MARGIN_SHARE_MAX)
+    assert margins == (0.1, 0.3, 0.5, 0.1)
 
 
 UNASKED = {

@@ -1,6 +1,6 @@
-"""Mutation testing of what opens valves: the engine's turns and schedule, the pulses, the lease.
+"""Mutation testing of what opens valves: interlock, state, lease, pulses, the engine's turns.
 
-`python -m tests.engine_mutants [part of a mutant's name ...]`, or `make mutants-engine`. `mutmut`
+`python -m tests.safety_mutants [part of a mutant's name ...]`, or `make mutants-safety`. `mutmut`
 changes one thing at a time in a copy of the repository and runs the tests of these files, quick
 ones first. It prints what survived; docs/mutation-testing.md says why some do.
 """
@@ -20,6 +20,8 @@ from tests.mutations import LEFT_OUT, PACKAGES, ROOT
 
 TOOL = ROOT / ".venv" / "mutmut"
 SOURCES = (
+    "companion/core/interlock.py",
+    "companion/core/sprayer_state.py",
     "companion/output/engine/engine.py",
     "companion/output/engine/schedule.py",
     "companion/output/pulse_train.py",
@@ -27,6 +29,9 @@ SOURCES = (
     "companion/output/timed.py",
 )
 TESTS = (
+    "tests/unit/test_interlock.py",
+    "tests/unit/test_caught_core.py",
+    "tests/unit/test_sprayer_state.py",
     "tests/unit/test_engine_turns.py",
     "tests/unit/test_pwm.py",
     "tests/unit/test_timed.py",
@@ -56,7 +61,7 @@ def configuration() -> str:
 def main(patterns: Sequence[str]) -> int:
     """Try the mutants, show the survivors; return 1 if there are any."""
     if not TOOL.exists():
-        sys.stderr.write("no mutmut: make mutants-engine installs it\n")
+        sys.stderr.write("no mutmut: make mutants-safety installs it\n")
         return 2
     with tempfile.TemporaryDirectory(prefix="vrspray-mutmut-") as folder:
         copy = Path(folder) / "copy"
