@@ -1,6 +1,7 @@
 """The border: how far inside it the spray ends and begins, and what fell beyond it.
 
-Exclusions are borders: the field is what may be sprayed.
+Exclusions are borders: the field is what may be sprayed. Where only planned lines may be, their
+ends are borders too, and all that falls between them is beyond.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 from analysis.changes import SPEED_MIN_M_S, Run, bisect
 from analysis.lag import DWELL_MIN_S, Step, Verdict
 from analysis.strips import GRAZE_M, Strip
-from analysis.track import Bools, Floats, Ints, Track, in_field
+from analysis.track import Bools, Floats, Ints, Track
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -182,8 +183,7 @@ def off_target_ml(strips: Sequence[Strip], prescription: Prescription) -> float:
         time_s = 0.5 * (track.time_s[samples] + track.time_s[samples + 1])
         count = int(np.ceil(track.width_m / ELEMENT_M - 1e-9))
         for offset in (np.arange(count) + 0.5) / count - 0.5:
-            east_m, north_m = track.points(time_s, float(offset * track.width_m))
-            outside = ~in_field(prescription, east_m, north_m)
+            outside = ~track.inside(prescription, time_s, float(offset * track.width_m))
             total_ml += float(drops[outside].sum()) / count
     return total_ml
 

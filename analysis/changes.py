@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.track import Bools, Floats, Track, in_field
+from analysis.track import Bools, Floats, Track
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -95,7 +95,7 @@ class _States:
     def at(self, time_s: Floats) -> Ints:
         """Return the number of the state under the strip's centre."""
         east_m, north_m = self.track.points(time_s)
-        inside = in_field(self.prescription, east_m, north_m)
+        inside = self.track.inside(self.prescription, time_s)
         states = np.full(len(time_s), self._number(inside=False, zones=frozenset()))
         index = np.flatnonzero(inside)
         zones = self.prescription.zones_at(east_m[index], north_m[index])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from companion.core.boom import Boom, Valve
 
 if TYPE_CHECKING:
+    from companion.core.lines import Lines
     from companion.core.nozzle import NozzleSet
     from companion.core.prescription import Prescription
     from companion.core.types import TimedChange
@@ -48,7 +49,7 @@ class FlightRecord:
     executed at the output, in order of time; they may be empty. `duty_limits` are the lowest and
     the highest duty of the PWM: a valve held there and still beside its dose is saturated.
     `nozzle_sets` are those that the controller took its duties from: they tell what flow an order
-    asked for; none where that is not known.
+    asked for; none where that is not known. With `lines` only they were to be sprayed.
     """
 
     time_s: Floats
@@ -63,6 +64,7 @@ class FlightRecord:
     meta: FlightMeta
     duty_limits: tuple[float, float] = (0.0, 1.0)
     nozzle_sets: tuple[NozzleSet, ...] = ()
+    lines: Lines | None = None
 
     def __post_init__(self) -> None:
         samples = len(self.time_s)

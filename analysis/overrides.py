@@ -23,6 +23,8 @@ _ALIASES = {
     "prescription.border_buffer_m": "border_buffer_m",
     "prescription.across": "across",
     "output.lease_s": "lease_s",
+    "mission.lines_aside_m": "lines.aside_m",
+    "mission.lines_course_deg": "lines.course_deg",
 }
 _PREFIXES = {"safety.": "limits."}
 _FIXED = ("frame", "prescription")

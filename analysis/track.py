@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from analysis.planned_lines import PlannedLines
 from analysis.smoothing import rise_over
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class Track:
     across_m: Floats
     volume_ml: Floats
     marks: Ints
+    planned: PlannedLines | None = None
 
     @property
     def period_steps(self) -> float:
@@ -81,7 +83,18 @@ class Track:
         ends = np.stack((np.stack(left, axis=-1), np.stack(right, axis=-1)), axis=1)
         shapely.prepare(prescription.field)
         lines = shapely.linestrings(ends)
-        return np.asarray(shapely.contains_properly(prescription.field, lines), dtype=np.bool_)
+        inside = np.asarray(shapely.contains_properly(prescription.field, lines), dtype=np.bool_)
+        return inside & self.on_line(time_s)
+
+    def on_line(self, time_s: Floats) -> Bools:
+        """Return when the strip's centre is on a planned line; always, where there are none."""
+        if self.planned is None:
+            return np.ones(len(time_s), dtype=np.bool_)
+        return self.planned.flown(time_s, *self.points(time_s))
+
+    def inside(self, prescription: Prescription, time_s: Floats, right_m: float = 0.0) -> Bools:
+        """Return when the strip's point `right_m` of its centre is where it may spray."""
+        return in_field(prescription, *self.points(time_s, right_m)) & self.on_line(time_s)
 
 
 def in_field(prescription: Prescription, east_m: Floats, north_m: Floats) -> Bools:
@@ -92,10 +105,11 @@ def in_field(prescription: Prescription, east_m: Floats, north_m: Floats) -> Boo
 
 def tracks_of(record: FlightRecord) -> list[Track]:
     """Return the tracks of all valves, left to right."""
-    return [_track(record, valve) for valve in range(len(record.boom.valves))]
+    planned = None if record.lines is None else PlannedLines(record, record.lines)
+    return [_track(record, valve, planned) for valve in range(len(record.boom.valves))]
 
 
-def _track(record: FlightRecord, number: int) -> Track:
+def _track(record: FlightRecord, number: int, planned: PlannedLines | None) -> Track:
     valve = record.boom.valves[number]
     heading = np.unwrap(np.radians(record.heading_deg))
     sin, cos = np.sin(heading), np.cos(heading)
@@ -126,6 +140,7 @@ def _track(record: FlightRecord, number: int) -> Track:
         across_m=valve.width_m * along,
         volume_ml=np.ascontiguousarray(record.volume_ml[:, number]),
         marks=_marks(travel_m),
+        planned=planned,
     )
 
 

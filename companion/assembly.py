@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
-from shapely import MultiPolygon
+from shapely import LineString, MultiPolygon
 
 from companion.config import Config
 from companion.config.motors import atomisers_of, pump_of
@@ -22,7 +22,10 @@ from companion.core.controller import Setup
 from companion.core.detection import Detection
 from companion.core.flow_trim import FlowTrim
 from companion.core.frame import LocalFrame
+from companion.core.lines import Lines
+from companion.core.liquid_bins import BIN_S
 from companion.core.liquid_law import AutopilotLiquid
+from companion.core.liquid_naming import RESTLESS_SHARE
 from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.prescription import FIELD, Prescription
 from companion.core.rate import flow_for_rate
@@ -30,8 +33,13 @@ from companion.errors import ConfigError, MapError
 from companion.maps.build import build_prescription, frame_for
 from companion.maps.model import MapFile, Problem
 from companion.maps.offset import offset_between
+from companion.maps.plan_lines import read_plan_lines
 from companion.maps.registry import read_area, read_map
 
+# The autopilot tells whole millilitres ten times a second, up to a tenth of a second old: over half
+# a second that is a quarter of the flow, from one bin to the next.
+AUTOPILOT_BIN_S = 0.55
+AUTOPILOT_RESTLESS_SHARE = 0.25
 # More rates than these are named by their range: the line must stay readable.
 RATES_NAMED_MAX = 6
 
@@ -49,9 +57,10 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
     if label is not None:
         raise ConfigError(f"{config.path}: {label.text}; {label.fix}")
     flight_frame = frame if frame is not None else frame_for(map_file)
+    prescription = _prescription(config, table, map_file, flight_frame)
     return Setup(
         frame=flight_frame,
-        prescription=_prescription(config, table, map_file, flight_frame),
+        prescription=prescription,
         boom=config.boom(),
         nozzle_sets=config.nozzle_sets(),
         pwm=config.pwm_limits(),
@@ -73,7 +82,32 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
         ),
         pump=pump_of(config),
         atomisers=atomisers_of(config),
+        lines=_lines(config, flight_frame, prescription),
     )
+
+
+def _lines(config: Config, frame: LocalFrame, ground: Prescription) -> Lines | None:
+    """Return the lines of a plan that alone are sprayed, if there are any."""
+    mission = config.mission
+    if mission is None or mission.lines is None:
+        return None
+    with _naming(config, "mission.lines", mission.lines):
+        polylines = read_plan_lines(config.resolve(mission.lines), frame)
+    if not any(LineString(line).intersects(ground.field) for line in polylines):
+        raise ConfigError(
+            f"{config.path}: mission.lines = {show_value(mission.lines)}: no line comes over the "
+            "map; give files of the same field"
+        )
+    try:
+        return Lines(
+            polylines=polylines,
+            aside_m=mission.lines_aside_m,
+            course_deg=mission.lines_course_deg,
+        )
+    except ValueError as error:
+        raise ConfigError(
+            f"{config.path}: mission.lines = {show_value(mission.lines)}: {error}; plan anew"
+        ) from error
 
 
 def _flow_trim(config: Config) -> FlowTrim | None:
@@ -107,6 +141,7 @@ def _detection(config: Config) -> Detection | None:
     if not table.enabled:
         return None
     has_pressure = pressure.source != "none"
+    by_autopilot = config.flow_meter.source == "autopilot"
     return Detection(
         spread=table.spread,
         closed_share=table.closed_share,
@@ -116,6 +151,8 @@ def _detection(config: Config) -> Detection | None:
         reserve_l=None if config.tank.source == "none" else config.tank.reserve_l,
         meter_required=table.meter_required,
         closed_check=table.closed_check,
+        bin_s=AUTOPILOT_BIN_S if by_autopilot else BIN_S,
+        restless_share=AUTOPILOT_RESTLESS_SHARE if by_autopilot else RESTLESS_SHARE,
     )
 
 

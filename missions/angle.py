@@ -22,8 +22,9 @@ SAME_DEG = 0.05
 # Around the best, in two rounds: a tenth of a degree is a strip more or less on a long field.
 FINE_DEG = (-1.0, -0.7, -0.5, -0.3, -0.2, -0.1, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
 FINEST_DEG = (-0.06, -0.03, 0.03, 0.06)
-# Ground sprayed twice also costs product; a second of flight for a second of product.
-OVERLAP_WEIGHT = 1.0
+# Ground sprayed twice also costs product: of a course a second of flight for a second of product,
+# of the layouts drawn in full, which turn seldom where they overlap, half of one.
+OVERLAP_WEIGHT, LAYOUT_WEIGHT = 1.0, 0.5
 
 
 def edge_angles(ground: BaseGeometry) -> list[float]:
@@ -41,12 +42,19 @@ def edge_angles(ground: BaseGeometry) -> list[float]:
     return longest[:EDGES_MAX]
 
 
-def cost_s(lines: Floats, motion: Motion, width_m: float, inner_m2: float) -> float:
+def cost_s(
+    lines: Floats,
+    motion: Motion,
+    width_m: float,
+    inner_m2: float,
+    *,
+    weight: float = OVERLAP_WEIGHT,
+) -> float:
     """Return the time of these passes with a turn after each, plus that of what is doubled."""
     length_m = lengths_m(lines)
     flown_s = float(motion.legs_s(length_m).sum()) + len(lines) * motion.between_passes_s(width_m)
     doubled_m2 = max(float(length_m.sum()) * width_m - inner_m2, 0.0)
-    return flown_s + OVERLAP_WEIGHT * doubled_m2 / (width_m * motion.speed_m_s)
+    return flown_s + weight * doubled_m2 / (width_m * motion.speed_m_s)
 
 
 def ranked(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
@@ -12,11 +13,15 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 from companion.cli.map_grid import parse_mark
 from companion.config import load
-from missions.files.write import check_suffix, write_plan
+from missions.files.fleet import write_fleet
+from missions.files.write import check_suffix
 from missions.picture import check_picture, draw_plan
 from missions.plan import Plan
 from missions.planner import plan_mission
 from missions.reading import Asked, names_of, read_task
+from missions.reading_fleet import BreakAsked
+from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
+from missions.sheet import sheet, sortie_lines
 
 # Attempted moves of the search: about one second, ten, and a minute on an old laptop.
 MOVES = {"quick": 40_000, "good": 300_000, "best": 2_000_000}
@@ -72,8 +77,35 @@ def plan(
     sprayer: Annotated[
         bool, typer.Option("--sprayer", help="Add DO_SPRAYER at every line; ArduPilot only.")
     ] = False,
+    terrain: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Elevation model to follow: .tif or .hgt.")
+    ] = None,
+    autopilot: Annotated[
+        Autopilot | None, typer.Option(help="That flies the plan; else mission.autopilot.")
+    ] = None,
+    wind: Annotated[
+        str | None, typer.Option(metavar="SPEED,FROM", help="For no-spray buffers: m/s, degrees.")
+    ] = None,
+    run_in_m: Annotated[
+        str | None, typer.Option(metavar="M|auto", help="Before and behind passes, at speed.")
+    ] = None,
     png: Annotated[
         Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
+    ] = None,
+    aircraft: Annotated[
+        int | None, typer.Option(metavar="N", help="That share the field.", min=1, max=20)
+    ] = None,
+    done: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Treated ground: only the rest is planned.")
+    ] = None,
+    resume: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Plan (.geojson) to go on with.")
+    ] = None,
+    stop: Annotated[
+        str | None, typer.Option("--from", metavar="LAT,LON", help="Where the spraying stopped.")
+    ] = None,
+    sortie: Annotated[
+        int | None, typer.Option(metavar="N", help="In which sortie it stopped.", min=1)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -95,9 +127,21 @@ def plan(
         prescription=prescription,
         obstacles=tuple(obstacle or ()),
         no_spray=tuple(no_spray or ()),
-        no_spray_buffer_m=no_spray_buffer_m,
+        ground=GroundAsked(
+            terrain=terrain,
+            autopilot=autopilot,
+            wind=parse_wind(wind),
+            no_spray_buffer_m=no_spray_buffer_m,
+            run_in=parse_run_in(run_in_m),
+        ),
         depots=tuple(parse_mark(text, "--depot") for text in depot or ()),
         rate_l_ha=rate_l_ha,
+        pause=BreakAsked(
+            done=done,
+            resume=resume,
+            stop=None if stop is None else parse_mark(stop, "--from"),
+            sortie=sortie,
+        ),
     )
     changes: dict[str, float | int | None] = {
         "swath_width_m": swath_m,
@@ -106,17 +150,28 @@ def plan(
         "angle_deg": angle_deg,
         "tank_l": tank_l,
         "moves": MOVES[effort],
+        "aircraft": aircraft,
     }
     task = read_task(asked, None if config is None else load(config), changes)
-    planned = plan_mission(task.field, task.settings, task.rates, depots=task.depots)
+    planned = plan_mission(
+        task.field,
+        task.settings,
+        task.rates,
+        depots=task.depots,
+        left=task.left,
+        around=task.around,
+    )
+    planned = replace(planned, warnings=(*task.said, *planned.warnings))
     took_s = perf_counter() - start
-    files = write_plan(planned, out, with_sprayer=sprayer)
+    files, marks = write_fleet(planned, out, with_sprayer=sprayer)
     if png is not None:
         draw_plan(planned, png, title=field.stem)
     warnings = planned.warnings
-    result = planned.summary() | {
+    result = sheet(planned, with_sprayer=sprayer) | {
         "planning_s": took_s,
         "files": [str(path) for path in files],
+        "lines_file": str(marks[0]) if marks else None,
+        "lines_files": [str(path) for path in marks],
     }
     answer(result, _lines(planned, result, files), as_json=as_json)
     for warning in warnings:
@@ -138,19 +193,10 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
         f"ferry {result['ferry_m'] / 1000:.2f} km",
         f"depot     {where}{' (suggested)' if planned.suggested_depot else ''}",
     ]
-    lines += [
-        f"sortie {sortie.number:3}  {sortie.volume_l:7.2f} L  {sortie.flight_s / 60.0:6.1f} min  "
-        f"{sortie.lines} lines, {_speeds(sortie.speeds_m_s)}"
-        for sortie in planned.sorties
-    ]
+    if result["lines_file"] is not None:
+        lines.append(
+            f"lines     {result['lines_file']}: name it as mission.lines in the configuration, and "
+            "only they are sprayed"
+        )
+    lines += sortie_lines(planned, result)
     return lines
-
-
-def _speeds(speeds_m_s: tuple[float, float]) -> str:
-    """Return speeds in words.
-
-    >>> _speeds((6.0, 6.0)), _speeds((4.5, 6.0))
-    ('6 m/s', '4.5 to 6 m/s')
-    """
-    low, high = speeds_m_s
-    return f"{high:g} m/s" if low == high else f"{low:g} to {high:g} m/s"

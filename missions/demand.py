@@ -143,10 +143,27 @@ class Pieces:
         return len(self.ends)
 
 
+def _shorter(need: Demand, cuts_m: Floats, piece_max_m: float) -> tuple[Floats, Floats]:
+    """Return more cuts, evenly between those that there are, and what each piece needs."""
+    counts = np.ceil(np.diff(cuts_m) / piece_max_m - 1e-9).astype(np.int64)
+    parts = [
+        np.linspace(a, b, n, endpoint=False)
+        for a, b, n in zip(cuts_m[:-1], cuts_m[1:], counts, strict=True)
+    ]
+    more: Floats = np.append(np.concatenate(parts), cuts_m[-1])
+    litres: Floats = np.diff(np.interp(more, need.at_m, need.litres))
+    return more, litres
+
+
 def cut(
-    lines: Floats, demand: list[Demand], *, piece_max_l: float, margin_m: float = 0.0
+    lines: Floats,
+    demand: list[Demand],
+    *,
+    piece_max_l: float,
+    piece_max_m: float = math.inf,
+    margin_m: float = 0.0,
 ) -> Pieces:
-    """Return the lines in pieces of at most `piece_max_l`; whole ones that need less.
+    """Return the lines in pieces of at most `piece_max_l` and `piece_max_m`; else whole ones.
 
     Long stretches on which nothing is prescribed are no piece at all, but for `margin_m`.
     """
@@ -156,6 +173,8 @@ def cut(
         for start_m, end_m in stretches(whole.at_m, whole.litres, margin_m=margin_m):
             need = whole.part(start_m, end_m)
             cuts, each_l = need.cuts_m(piece_max_l)
+            if np.diff(cuts).max() > piece_max_m:
+                cuts, each_l = _shorter(need, cuts, piece_max_m)
             places = row[:2] + np.outer(cuts / length_m, row[2:] - row[:2])
             if end_m == length_m:
                 places[-1] = row[2:]

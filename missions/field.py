@@ -17,6 +17,7 @@ from companion.maps.local import Area, as_area, make_valid, polygons_of, project
 from companion.maps.local import places as places_of
 from missions.errors import PlanError
 from missions.strips import Floats
+from missions.wind import WindBuffer
 
 # Coordinates are rounded when they are written, and a long edge is straight in degrees for one
 # program and in metres for another: strips keep this far from the border.
@@ -59,6 +60,7 @@ def build_field(
     no_spray: Sequence[Area] = (),
     obstacle_buffer_m: float = 2.0,
     no_spray_buffer_m: float = 0.0,
+    wind: WindBuffer | None = None,
     swath_width_m: float,
     frame: LocalFrame | None = None,
     offset_m: tuple[float, float] = (0.0, 0.0),
@@ -66,6 +68,7 @@ def build_field(
     """Return the field of a boundary and what lies in it, all in longitude and latitude.
 
     `offset_m` moves all of it: the offset between map and receiver (prescription.offset_east_m).
+    A `wind` widens the buffers of no-spray areas where it blows towards them.
 
     Raises:
         PlanError: where nothing is left that a strip of the swath's width fits on.
@@ -86,8 +89,10 @@ def build_field(
     blocked = shapely.union_all([*holes, *kept])
     flown = outline.difference(shapely.union_all(kept)) if kept else outline
     fly = _ground(flown)
+    off = [translate(local_area(area, frame), *offset_m) for area in no_spray]
     closed = [
-        translate(local_area(area, frame), *offset_m).buffer(no_spray_buffer_m) for area in no_spray
+        area.buffer(no_spray_buffer_m) if wind is None else wind.around(area, no_spray_buffer_m)
+        for area in off
     ]
     spray = fly if not closed else _without(fly, closed)
     if spray is None or fly is None:

@@ -17,8 +17,6 @@ Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 # So many pairs are looked at for free sight; where there are more, each end's nearest ones.
 SIGHTS_MAX = 60_000
 NEAR = 24
-# What one more landing, refill and take-off costs the search: fewer, fuller tanks. No flight time.
-REFILL_S = 60.0
 # Two lines of one border are flown without a stop where they meet this close and this straight:
 # at 15 degrees an arc of 23 m leaves the corner by 0.2 m, and a copter of 2.5 m/s2 flies it at
 # 7.6 m/s.
@@ -30,7 +28,7 @@ class Network:
     """Ends 2 i and 2 i + 1 are start and end of piece i; `home_s` is by depot and end.
 
     `between_s` has a last row and column for the depot that is nearest to the other end, with
-    half of a refill.
+    half of a refill: one more landing costs the search, too, not only its ferry.
     """
 
     between_s: Floats
@@ -44,7 +42,9 @@ class Network:
         return len(self.between_s) - 1
 
 
-def build_network(pieces: Pieces, depots: Floats, space: FreeSpace, motion: Motion) -> Network:
+def build_network(
+    pieces: Pieces, depots: Floats, space: FreeSpace, motion: Motion, *, refill_s: float
+) -> Network:
     """Return the network; of pairs far apart that do not see each other, a lower bound."""
     ends = pieces.ends.reshape(-1, 2)
     count = len(ends)
@@ -75,7 +75,7 @@ def build_network(pieces: Pieces, depots: Floats, space: FreeSpace, motion: Moti
     if not space.is_convex:
         _bend_home(home_m, depots, ends, space)
     home = motion.legs_s(home_m)
-    between[count, :count] = between[:count, count] = home.min(axis=0) + REFILL_S / 2.0
+    between[count, :count] = between[:count, count] = home.min(axis=0) + refill_s / 2.0
     return Network(between_s=between, home_s=home, near=near, litres=pieces.litres)
 
 

@@ -34,12 +34,26 @@ def open_lines(ground: BaseGeometry, width_m: float, angle_deg: float) -> Floats
 
 
 def _of_part(part: Polygon, width_m: float) -> Floats:
-    west, low, east, high = part.bounds
+    _, low, _, high = part.bounds
+    return across_part(part, evenly(low, high, width_m), width_m)
+
+
+def evenly(low: float, high: float, width_m: float) -> Floats:
+    """Return the middles of strips that cover from `low` to `high`, as few as do.
+
+    >>> evenly(0.0, 17.0, 6.0).tolist()
+    [3.0, 8.5, 14.0]
+    """
     count = count_across(high - low, width_m)
     if count == 1:
-        middles = np.array([(low + high) / 2.0])
-    else:
-        middles = np.linspace(low + width_m / 2.0, high - width_m / 2.0, count)
+        return np.array([(low + high) / 2.0])
+    return np.linspace(low + width_m / 2.0, high - width_m / 2.0, count)
+
+
+def across_part(part: Polygon, middles: Floats, width_m: float) -> Floats:
+    """Return lines along the first axis at these places, where their strips lie on the part."""
+    west, _, east, _ = part.bounds
+    count = len(middles)
     half_m = width_m / 2.0 - SLACK_M
     ends = np.full(count, west - 1.0), np.full(count, east + 1.0)
     across = np.column_stack([ends[0], middles, ends[1], middles])

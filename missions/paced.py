@@ -13,6 +13,8 @@ from missions.demand import Rates
 from missions.plan import Leg, Settings, Sortie
 from missions.speeds import Miss, Stretches, between, choices, chosen, misses_of, stretches_of
 from missions.strips import Floats
+from missions.terrain.ground import Terrain
+from missions.terrain.slopes import capped, slowed
 
 # A part of a line shorter than this is no leg of its own.
 PART_MIN_M = 2.0
@@ -26,22 +28,26 @@ class Paced:
     misses: tuple[tuple[int, Miss], ...]
 
 
-def paced(sorties: Sequence[Sortie], rates: Rates, settings: Settings) -> Paced:
-    """Return the sorties, each line at the speeds that its rates need.
+def paced(
+    sorties: Sequence[Sortie], rates: Rates, settings: Settings, terrain: Terrain | None = None
+) -> Paced:
+    """Return the sorties, each line at the speeds that its rates and its slopes need.
 
     A line with several speeds becomes several legs, one after the other without a stop.
     """
-    if settings.flow_l_min is None:
+    if settings.flow_l_min is None and terrain is None:
         return Paced(sorties=tuple(sorties), misses=())
     found, misses = [], []
     for sortie in sorties:
         legs: list[Leg] = []
         for leg in sortie.legs:
             if leg.kind != "spray":
-                legs.append(leg)
+                legs.append(leg if terrain is None else slowed(leg, terrain, settings))
                 continue
             parts = stretches_of(leg, rates, settings)
             taken = chosen(parts, choices(parts, settings), settings.acceleration_m_s2)
+            if terrain is not None:
+                parts, taken = capped(leg, parts, taken, terrain, settings)
             misses += [(sortie.number, m) for m in misses_of(leg, parts, taken, settings)]
             legs += _split(leg, parts, taken, settings)
         found.append(replace(sortie, legs=_joined(legs, settings)))
@@ -106,7 +112,8 @@ def _joined(legs: list[Leg], settings: Settings) -> tuple[Leg, ...]:
                 seconds = leg.length_m / slower - slower / acceleration
                 found[number] = replace(leg, speed_m_s=slower, seconds=seconds)
         elif len(leg.points) == 2 and leg.length_m <= after**2 / acceleration:
-            found[number] = replace(leg, speed_m_s=after)
+            slope_m_s = leg.speed_m_s if leg.speed_m_s < settings.speed_m_s else after
+            found[number] = replace(leg, speed_m_s=min(after, slope_m_s))
     return tuple(found)
 
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
+import numpy as np
+
 from companion.core.frame import LocalFrame
 from missions.coverage import Coverage
-from missions.energy import Battery, nose_s, sortie_wh
+from missions.energy import Battery, nose_s, sortie_wh, vertical_s
 from missions.field import Field
 from missions.strips import Floats
 from missions.terrain.ground import Terrain
@@ -51,6 +53,7 @@ class Settings:
     nose_rate_deg_s: float | None = None
     aircraft: int = 1
     aircraft_gap_m: float = 20.0
+    autopilot: Literal["ardupilot", "px4"] = "ardupilot"
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
@@ -83,11 +86,19 @@ class Leg:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sortie:
-    """What is flown with one tank, from a depot and back."""
+    """What is flown with one tank, from a depot and back, by which aircraft.
+
+    It takes off at `start_s` or later, where `swaps` with a fresh battery.
+    `after` are the sorties of other aircraft that must have landed before this one takes off.
+    """
 
     number: int
     depot: int
     legs: tuple[Leg, ...]
+    aircraft: int = 1
+    start_s: float = 0.0
+    swaps: bool = False
+    after: tuple[int, ...] = ()
 
     def length_m(self, kind: Kind) -> float:
         """Return the length of all legs of one kind."""
@@ -150,10 +161,34 @@ class Plan:
         """Return the time of all sorties."""
         return sum(sortie.flight_s for sortie in self.sorties)
 
+    def nose_s(self, sortie: Sortie) -> float:
+        """Return how long the nose is turned at stops; 0 where `nose_rate_deg_s` is not given."""
+        settings = self.settings
+        return nose_s(sortie.legs, turn=settings.turn, rate_deg_s=settings.nose_rate_deg_s)
+
+    def airborne_s(self, sortie: Sortie) -> float:
+        """Return the time from take-off to landing."""
+        return sortie.flight_s + self.nose_s(sortie) + sum(vertical_s(self.settings.height_m))
+
+    def energy_wh(self, sortie: Sortie) -> float | None:
+        """Return what a sortie draws from the battery; None where no power is given."""
+        settings = self.settings
+        if settings.battery is None:
+            return None
+        return sortie_wh(
+            sortie, settings.battery, height_m=settings.height_m, reserve_l=settings.reserve_l,
+            nose_turn_s=self.nose_s(sortie),
+        )  # fmt: skip
+
     @property
     def turns(self) -> int:
         """Return how often one spray line follows another in the same sortie."""
         return sum(max(sortie.lines - 1, 0) for sortie in self.sorties)
+
+    @property
+    def total_s(self) -> float:
+        """Return the time from the first take-off to the last landing, refills among it."""
+        return max(sortie.start_s + self.airborne_s(sortie) for sortie in self.sorties)
 
     def summary(self) -> dict[str, object]:
         """Return the figures of the plan."""
@@ -173,12 +208,21 @@ class Plan:
             "ferry_m": self.length_m("ferry"),
             "total_m": total_m,
             "flight_s": self.flight_s,
+            "total_s": self.total_s,
             "volume_l": self.volume_l,
             "depots": [list(self.frame.to_geographic(*depot)) for depot in self.depots],
             "depot_suggested": self.suggested_depot,
             "sorties": [self._sortie(sortie) for sortie in self.sorties],
+            "terrain": self._ground(),
             "warnings": list(self.warnings),
         }
+
+    def _ground(self) -> dict[str, object] | None:
+        """Return the ground under all ways, where the plan follows it."""
+        if self.terrain is None:
+            return None
+        legs = [leg for sortie in self.sorties for leg in sortie.legs]
+        return self.terrain.summary(np.array([place for leg in legs for place in leg.points]))
 
     def _sortie(self, sortie: Sortie) -> dict[str, object]:
         return {
@@ -192,4 +236,10 @@ class Plan:
             "total_m": sum(leg.length_m for leg in sortie.legs),
             "flight_s": sortie.flight_s,
             "speeds_m_s": list(sortie.speeds_m_s),
+            "airborne_s": self.airborne_s(sortie),
+            "energy_wh": self.energy_wh(sortie),
+            "aircraft": sortie.aircraft,
+            "start_s": sortie.start_s,
+            "swap": sortie.swaps,
+            "after": list(sortie.after),
         }

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
-from missions.angle import cost_s, ranked
+from missions.angle import LAYOUT_WEIGHT, cost_s, ranked
 from missions.coverage import measure
-from missions.demand import Rates, demands
+from missions.demand import Demand, Rates, demands
 from missions.errors import PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
+from missions.fitted_lines import fitted_lines
+from missions.fleet import fleet_sorties
+from missions.flown import flown
 from missions.open_lines import needed_passes, open_lines
-from missions.paced import paced, range_warnings
+from missions.paced import Paced, range_warnings
 from missions.patches import patches
-from missions.plan import Plan, Settings
+from missions.plan import Plan, Settings, Sortie
+from missions.remaining import Remaining
+from missions.schedule import scheduled
 from missions.short import short_warnings
-from missions.sorties import plan_sorties
 from missions.strips import Floats, joined
+from missions.surroundings import NOTHING_AROUND, Surroundings
 from missions.swaths import border_passes, inner_ground, inner_lines
 from missions.turns import Motion
-from missions.ways import build_ways, suggested_depot
+from missions.ways import Ways, build_ways, suggested_depot
 
 # Of the best courses so many are drawn in full.
 ANGLES_TRIED = 2
@@ -33,14 +40,19 @@ def plan_mission(
     rates: Rates,
     *,
     depots: tuple[tuple[float, float], ...] = (),
+    left: Remaining | None = None,
+    around: Surroundings = NOTHING_AROUND,
 ) -> Plan:
     """Return the mission for a field; depots are (latitude, longitude).
+
+    With `left` its lines are flown, and no others. `around` is the ground that the plan follows,
+    and the room that passes get beyond their ends.
 
     Raises:
         PlanError: where there is none, in one line with what to change.
     """
     try:
-        return _planned(field, settings, rates, depots)
+        return _planned(field, settings, rates, depots, left, around)
     except ShapelyError as error:
         raise PlanError(
             f"the field's geometry cannot be used ({str(error)[:120]}); simplify its outline"
@@ -48,7 +60,12 @@ def plan_mission(
 
 
 def _planned(
-    field: Field, settings: Settings, rates: Rates, depots: tuple[tuple[float, float], ...]
+    field: Field,
+    settings: Settings,
+    rates: Rates,
+    depots: tuple[tuple[float, float], ...],
+    left: Remaining | None,
+    around: Surroundings,
 ) -> Plan:
     width_m = settings.swath_width_m
     motion = Motion(
@@ -56,7 +73,12 @@ def _planned(
         acceleration_m_s2=settings.acceleration_m_s2,
         turn=settings.turn,
     )
-    lines, angle_deg = spray_lines(field, settings, motion)
+    if left is None:
+        lines, angle_deg = spray_lines(field, settings, motion)
+        sprayed = lines
+    else:
+        lines, angle_deg = left.lines, left.angle_deg
+        sprayed = joined([left.done, lines])
     kept_m = settings.border_buffer_m
     extents = None
     if kept_m is not None:
@@ -66,23 +88,39 @@ def _planned(
     if not float(litres.sum()) > 0.0:
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
     given = _depots(field.frame, depots)
-    places = given if len(given) else suggested_depot(field, lines, litres)
-    ways = build_ways(field, places)
-    sorties = paced(plan_sorties(lines, demand, ways, settings, motion), rates, settings)
-    return Plan(
+
+    def one(some: Floats, needs: list[Demand], ways: Ways) -> Paced:
+        def pace(sorties: Sequence[Sortie]) -> Paced:
+            return around.paced(sorties, rates, field, settings)
+
+        around.check(field, ways.depots)
+        return flown(some, needs, ways, settings, motion=motion, rates=rates, pace=pace)
+
+    if settings.aircraft > 1:
+        fleet = fleet_sorties(
+            field, lines, demand, settings, angle_deg=angle_deg, depots=given, one=one
+        )
+        sorties, places = fleet.paced, fleet.depots
+    else:
+        places = given if len(given) else suggested_depot(field, lines, litres)
+        sorties = one(lines, demand, build_ways(field, places))
+    plan = Plan(
         field=field,
         settings=settings,
         angle_deg=angle_deg,
         lines=lines,
-        coverage=measure(lines, field.limit, width_m),
+        coverage=measure(sprayed, field.limit, width_m),
         depots=tuple((float(east_m), float(north_m)) for east_m, north_m in places),
         suggested_depot=not len(given),
         sorties=sorties.sorties,
         warnings=(
             *range_warnings(sorties.misses, field.frame, settings),
             *short_warnings(sorties.sorties, rates, field.frame, settings),
+            *around.warnings(sorties.sorties, places, field.frame, settings),
         ),
+        terrain=around.terrain,
     )
+    return scheduled(plan)
 
 
 def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Floats, float]:
@@ -103,13 +141,17 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
         choices = []
         if number == 0:
             choices.append(joined([passes, inner_lines(inner, width_m, angle_deg)]))
-        straight = open_lines(ground, width_m, angle_deg)
-        if len(straight):
-            more = needed_passes(straight, passes, ground, width_m)
-            choices.append(joined([more, straight]))
+        straights = [open_lines(ground, width_m, angle_deg)]
+        if number == 0:
+            straights.append(fitted_lines(ground, width_m, angle_deg, motion))
+        for straight in straights:
+            if len(straight):
+                more = needed_passes(straight, passes, ground, width_m)
+                choices.append(joined([more, straight]))
         for lines in choices:
             whole = joined([lines, patches(lines, ground, width_m)])
-            tried.append((cost_s(whole, motion, width_m, ground.area), angle_deg, whole))
+            cost = cost_s(whole, motion, width_m, ground.area, weight=LAYOUT_WEIGHT)
+            tried.append((cost, angle_deg, whole))
     _, best_deg, best = min(tried, key=lambda each: each[0])
     return best, best_deg
 

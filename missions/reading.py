@@ -8,25 +8,36 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import shapely
 from shapely import MultiPolygon
 
 from companion.assembly import above_label, flow_range, read_configured_map
 from companion.config import Config
+from companion.config.tables import MissionTable
 from companion.core.frame import LocalFrame
-from companion.errors import MapError
 from companion.maps.build import build_prescription, frame_for
-from companion.maps.cells import grid_of
-from companion.maps.local import Area, as_area, polygons_of
+from companion.maps.local import Area
 from companion.maps.model import MapFile
-from companion.maps.registry import read_area, read_map
+from companion.maps.registry import read_map
 from missions.demand import Rates, Uniform
 from missions.errors import PlanError
 from missions.field import Field, build_field, frame_of
 from missions.map_rates import MapRates
+from missions.nearness import check_near
 from missions.plan import Settings
-from missions.strips import Floats
+from missions.reading_fleet import NO_BREAK, BreakAsked, fleet_settings, left_of, untreated
+from missions.reading_ground import (
+    NOTHING_ASKED,
+    GroundAsked,
+    autopilot_of,
+    no_spray_buffer_m,
+    run_in_of,
+    spacing_m,
+    terrain_of,
+    wind_of,
+)
+from missions.reading_outline import near_area, outline_of
+from missions.remaining import Remaining
+from missions.surroundings import NOTHING_AROUND, Surroundings
 
 # Where no configuration is given.
 DEFAULTS = Settings(swath_width_m=6.0, speed_m_s=6.0)
@@ -41,6 +52,9 @@ class Task:
     settings: Settings
     rates: Rates
     depots: tuple[tuple[float, float], ...]
+    around: Surroundings = NOTHING_AROUND
+    left: Remaining | None = None
+    said: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,10 +65,11 @@ class Asked:
     prescription: Path | None = None
     obstacles: tuple[Path, ...] = ()
     no_spray: tuple[Path, ...] = ()
-    no_spray_buffer_m: float = 0.0
     depots: tuple[tuple[float, float], ...] = ()
     rate_l_ha: float | None = None
     crs: str | None = None
+    ground: GroundAsked = NOTHING_ASKED
+    pause: BreakAsked = NO_BREAK
 
 
 def read_task(asked: Asked, config: Config | None, changes: dict[str, float | int | None]) -> Task:
@@ -63,33 +78,79 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
     Raises:
         PlanError, MapError, ConfigError: in one line, what is wrong and what to do.
     """
-    settings = _settings(config, changes)
+    settings = _spaced(_settings(config, changes), asked, config, changes)
     map_file = _map(asked, config)
-    boundary = _outline(asked, map_file)
+    said: list[str] = []
+    boundary = outline_of(asked.field, map_file, said, crs=asked.crs)
     frame = frame_of(boundary)
     table = None if config is None else config.prescription
     mission = None if config is None else config.mission
     offset_m = (0.0, 0.0) if table is None else (table.offset_east_m, table.offset_north_m)
-    closed = [read_area(path) for path in asked.no_spray]
+    _check_places(asked, mission, map_file, frame)
+    closed = [near_area(path, frame) for path in asked.no_spray]
     if config is not None and table is not None:
-        closed += [read_area(config.resolve(name)) for name in table.exclusions]
-    field = build_field(
+        closed += [near_area(config.resolve(name), frame) for name in table.exclusions]
+    ground = build_field(
         boundary,
-        obstacles=[read_area(path) for path in asked.obstacles],
+        obstacles=[near_area(path, frame) for path in asked.obstacles],
         no_spray=closed,
         obstacle_buffer_m=2.0 if mission is None else mission.obstacle_buffer_m,
-        no_spray_buffer_m=asked.no_spray_buffer_m,
+        no_spray_buffer_m=no_spray_buffer_m(asked.ground, config),
+        wind=wind_of(asked.ground, config),
         swath_width_m=settings.swath_width_m,
         frame=frame,
         offset_m=offset_m,
     )
+    if asked.pause.resume is None and asked.pause.done is not None:
+        ground = untreated(ground, asked.pause.done, settings.swath_width_m, offset_m)
     configured = () if mission is None else mission.depots
     return Task(
-        field=field,
+        field=ground,
         settings=settings,
         rates=_rates(asked, config, map_file, boundary, frame),
         depots=asked.depots or tuple(configured),
+        around=Surroundings(
+            terrain=terrain_of(asked.ground, config, frame),
+            run_in=run_in_of(asked.ground, config, ground, offset_m),
+        ),
+        left=left_of(
+            asked.pause, mission, frame, width_m=settings.swath_width_m, offset_m=offset_m
+        ),
+        said=tuple(said),
     )
+
+
+def _check_places(
+    asked: Asked, mission: MissionTable | None, map_file: MapFile | None, frame: LocalFrame
+) -> None:
+    """Refuse depots and a prescription that lie on another continent."""
+    depots = asked.depots or (() if mission is None else mission.depots)
+    for number, (latitude_deg, longitude_deg) in enumerate(depots, start=1):
+        check_near(f"depot {number}", latitude_deg, longitude_deg, frame)
+    if map_file is not None:
+        middle = frame_for(map_file)
+        name = f"{map_file.path}: the prescription"
+        check_near(name, middle.latitude_deg, middle.longitude_deg, frame)
+
+
+def _spaced(
+    settings: Settings,
+    asked: Asked,
+    config: Config | None,
+    changes: dict[str, float | int | None],
+) -> Settings:
+    """Return the settings with the measured swath as spacing, unless one is given."""
+    autopilot = autopilot_of(asked.ground, config)
+    settings = replace(settings, autopilot=autopilot)
+    if changes.get("swath_width_m") is not None:
+        return settings
+    width_m = spacing_m(
+        config,
+        height_m=settings.height_m,
+        speed_m_s=settings.speed_m_s,
+        boom_m=None if config is None else config.boom_table.width_m,
+    )
+    return settings if width_m is None else replace(settings, swath_width_m=width_m)
 
 
 def _settings(config: Config | None, changes: dict[str, float | int | None]) -> Settings:
@@ -114,6 +175,7 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             speeds_m_s=(config.safety.speed_min_m_s, 0.0),
             settle_s=_settle_s(config),
             border_buffer_m=_kept_m(config),
+            **fleet_settings(mission),
         )
     given: dict[str, Any] = {name: each for name, each in changes.items() if each is not None}
     highest = given.pop("speed_max_m_s", None)
@@ -141,37 +203,6 @@ def _map(asked: Asked, config: Config | None) -> MapFile | None:
     if own:
         return read_configured_map(config)
     return read_map(asked.prescription, unit=table.unit, crs=table.crs)
-
-
-def _outline(asked: Asked, map_file: MapFile | None) -> Area:
-    """Return the field's outline; of a prescription in cells, that of its cells with a rate."""
-    try:
-        return read_area(asked.field, crs=asked.crs)
-    except MapError as error:
-        if error.code != "no-polygon":
-            raise
-        same = map_file is not None and map_file.path.resolve() == asked.field.resolve()
-        cells = map_file if same else read_map(asked.field)
-        if cells is None or cells.cells is None:
-            raise
-        return _of_cells(cells)
-
-
-def _of_cells(map_file: MapFile) -> MultiPolygon | Area:
-    """Return the ground of all cells with a rate, in longitude and latitude."""
-    if map_file.cells is None:
-        raise PlanError(f"{map_file.path}: there are no cells")
-    frame = frame_for(map_file)
-
-    def back(points: Floats) -> Floats:
-        lat, lon = frame.to_geographic_all(points[:, 0].tolist(), points[:, 1].tolist())
-        return np.column_stack([lon, lat])
-
-    local = grid_of(map_file.cells, frame, map_file.path).outline
-    found = as_area(polygons_of(shapely.transform(local, back)))
-    if found is None:
-        raise PlanError(f"{map_file.path}: no cell has a rate")
-    return found
 
 
 def _rates(

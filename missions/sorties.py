@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
+from missions.budget import Budget, build_budget
 from missions.demand import Demand, Pieces, cut
+from missions.energy import J_WH, KG_L
 from missions.errors import PlanError
 from missions.network import JOIN_DEG, JOIN_M, Network, build_network
 from missions.plan import Kind, Leg, Place, Settings, Sortie
 from missions.savings import Sortie as Order
 from missions.savings import by_savings
 from missions.search import improve
-from missions.strips import Floats
+from missions.strips import Floats, lengths_m
 from missions.turns import Motion
 from missions.ways import Ways
 
@@ -25,21 +29,44 @@ TANKS_MAX = 1500
 TOUCH_M = 1e-3
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flying:
+    """How lines are flown: `pace_s_m` is the time of a metre of each line, where rates slow it.
+
+    `battery_share` is how much of what the battery may give a sortie is planned with: the search
+    knows turns and speeds only nearly.
+    """
+
+    motion: Motion
+    pace_s_m: Floats | None = None
+    battery_share: float = 1.0
+
+
 def plan_sorties(
-    lines: Floats, demand: list[Demand], ways: Ways, settings: Settings, motion: Motion
+    lines: Floats, demand: list[Demand], ways: Ways, settings: Settings, flying: Flying
 ) -> tuple[Sortie, ...]:
-    """Return all sorties, each within a tank."""
+    """Return all sorties, each within a tank and a battery."""
+    motion = flying.motion
     run_in_m = settings.speed_m_s**2 / (2.0 * settings.acceleration_m_s2)
-    pieces = cut(lines, demand, piece_max_l=_piece_max_l(demand, settings), margin_m=run_in_m)
+    pieces = cut(
+        lines, demand, piece_max_l=_piece_max_l(demand, settings),
+        piece_max_m=_piece_max_m(demand, settings, flying), margin_m=run_in_m,
+    )  # fmt: skip
     heaviest = float(pieces.litres.max(initial=0.0))
     if not heaviest <= settings.usable_l * (1.0 + 1e-9):
         raise PlanError(
             f"one piece of a line needs {heaviest:.3g} L and the tank has {settings.usable_l:.3g} "
             "L above its reserve; see mission.tank_l"
         )
-    network = build_network(pieces, ways.depots, ways.inside, motion)
-    orders = by_savings(network, settings.usable_l)
-    orders = improve(network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed)
+    network = build_network(pieces, ways.depots, ways.inside, motion, refill_s=settings.refill_s)
+    budget = _budget(network, pieces, settings, flying)
+    lasts = None if budget is None else budget.lasts
+    if budget is not None:
+        _check_reach(budget, pieces, ways, settings)
+    orders = by_savings(network, settings.usable_l, lasts=lasts)
+    orders = improve(
+        network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed, lasts=lasts
+    )
     homes = [_home(network, order) for order in orders]
     ranked = sorted(range(len(orders)), key=lambda at: (homes[at], min(orders[at])))
     drawn = _Drawn(pieces=pieces, ways=ways, motion=motion)
@@ -71,6 +98,48 @@ def _piece_max_l(demand: list[Demand], settings: Settings) -> float:
         if total_l / usable_l * pieces_a_tank <= PIECES_MAX:
             return usable_l / pieces_a_tank
     return usable_l
+
+
+def _piece_max_m(demand: Sequence[Demand], settings: Settings, flying: Flying) -> float:
+    """Return how long one piece may be, so that some fit into what a battery gives."""
+    battery = settings.battery
+    if battery is None or battery.capacity_wh is None:
+        return math.inf
+    length_m = sum(float(need.at_m[-1]) for need in demand)
+    drawn_w = battery.cruise_w + battery.per_kg_w * settings.tank_l * KG_L
+    run_m = battery.usable_wh * J_WH / drawn_w * flying.motion.speed_m_s
+    least_m = length_m / PIECES_MAX
+    return max(run_m / PIECES_A_TANK, least_m, settings.speed_m_s**2 / settings.acceleration_m_s2)
+
+
+def _budget(network: Network, pieces: Pieces, settings: Settings, flying: Flying) -> Budget | None:
+    """Return what a battery lasts for; None without one."""
+    battery = settings.battery
+    if battery is None or battery.capacity_wh is None:
+        return None
+    pace_s_m: Floats | float = 1.0 / flying.motion.speed_m_s
+    if flying.pace_s_m is not None:
+        pace_s_m = flying.pace_s_m[pieces.line]
+    return build_budget(
+        network, battery, flying.motion, cruise_s=lengths_m(pieces.ends) * pace_s_m,
+        height_m=settings.height_m, reserve_l=settings.reserve_l,
+        nose_rate_deg_s=settings.nose_rate_deg_s, refill_s=settings.refill_s,
+        limit_wh=battery.usable_wh * flying.battery_share,
+    )  # fmt: skip
+
+
+def _check_reach(budget: Budget, pieces: Pieces, ways: Ways, settings: Settings) -> None:
+    """Refuse a field with a place to which the battery does not last, there and back."""
+    needed = [budget.wh([2 * piece]) for piece in range(len(pieces))]
+    worst = int(np.argmax(needed))
+    if needed[worst] <= budget.limit_wh or settings.battery is None:
+        return
+    place = ways.field.frame.to_geographic(*pieces.ends[worst, :2].tolist())
+    raise PlanError(
+        f"one piece of a line near {place[0]:.6f}, {place[1]:.6f} and the ferry there and back "
+        f"take {needed[worst]:.4g} Wh, and the battery has {settings.battery.usable_wh:.4g} Wh "
+        "above its reserve; put a depot nearer, or see mission.battery_wh"
+    )
 
 
 def _home(network: Network, order: Order) -> int:

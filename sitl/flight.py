@@ -149,6 +149,7 @@ def fly(
         volume_ml=volume_ml,
         boom=setup.boom,
         prescription=setup.prescription,
+        lines=setup.lines,
         pwm_period_s=profile.pwm.period_s,
         duty_limits=limits,
         nozzle_sets=() if profile.has_sections else setup.nozzle_sets,

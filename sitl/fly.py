@@ -344,6 +344,7 @@ def _flight(
         observer=observe if trace is not None or end_s > SAY_EVERY_S else None,
         on_input=None if trace is None else trace.append,
         disturb=disturb if task.faults else None,
+        mission=_mission(task),
     )
 
 
@@ -380,7 +381,14 @@ def _perfect_flight(task: Task, trajectory: Trajectory, options: FlyOptions) -> 
         drift=None,
     )
     perfect = replace(_flight_options(task, options), noise=False, scatter=False, meter_rate_hz=0.0)
-    return fly(setup, trajectory, profile, perfect, speed_m_s=task.speed_m_s)
+    return fly(
+        setup, trajectory, profile, perfect, speed_m_s=task.speed_m_s, mission=_mission(task)
+    )
+
+
+def _mission(task: Task) -> Route | None:
+    """Return the mission whose legs the companion hears of: it does where lines are followed."""
+    return None if task.setup.lines is None else task.route
 
 
 def _true_set(nozzles: NozzleSet, profile: PlantProfile) -> NozzleSet:

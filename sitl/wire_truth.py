@@ -32,6 +32,7 @@ def evaluate_truth(folder: Path, setup: Setup, *, closed_us: float, full_us: flo
             volume_ml=arrays["volume_ml"],
             boom=setup.boom,
             prescription=setup.prescription,
+            lines=setup.lines,
             pwm_period_s=profile.pwm.period_s,
             duty_limits=(profile.pwm.duty_min, profile.pwm.duty_max),
             nozzle_sets=setup.nozzle_sets,

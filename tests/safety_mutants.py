@@ -40,6 +40,11 @@ TESTS = (
     "tests/property/test_engine_laws.py",
     "tests/property/test_engine_machine.py",
 )
+# The flights of any order of events take minutes where every call is looked at.
+ARGUMENTS = (
+    *("-p", "no:xdist", "-p", "no:cacheprovider"),
+    *("--deselect", "tests/unit/test_sprayer_state.py::TestAnyFlight"),
+)
 
 
 def configuration() -> str:
@@ -51,7 +56,7 @@ def configuration() -> str:
             f"source_paths = {json.dumps([PACKAGES[0]])}",
             f"only_mutate = {json.dumps(SOURCES)}",
             f"pytest_add_cli_args_test_selection = {json.dumps(TESTS)}",
-            'pytest_add_cli_args = ["-p", "no:xdist", "-p", "no:cacheprovider"]',
+            f"pytest_add_cli_args = {json.dumps(ARGUMENTS)}",
             f"also_copy = {json.dumps(copied)}",
             "",
         )

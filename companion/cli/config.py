@@ -11,7 +11,7 @@ import typer
 from companion.assembly import build_setup, deliverable
 from companion.cli.answer import AsJson, Overrides, answer, problem_line, problem_object
 from companion.config import Config, load
-from companion.config.rules import mismatches, without_effect
+from companion.config.rules import mismatches, unbounded, without_effect
 from companion.config.wording import show_value
 from companion.maps.model import Problem
 
@@ -34,9 +34,10 @@ def check(file: File, overrides: Overrides = None, as_json: AsJson = False) -> N
     problems = [problem_object(problem) for problem in problems_of(config)]
     ok = not any(problem["severity"] == "error" for problem in problems)
     verdict = f"{file}: ok" if ok else f"{file}: refused"
+    notes = [f"{found.key}: {found.text}" for found in unbounded(config)]
     answer(
-        {"ok": ok, "path": str(file), "problems": problems},
-        [*map(problem_line, problems), verdict],
+        {"ok": ok, "path": str(file), "problems": problems, "notes": notes},
+        [*map(problem_line, problems), *(f"note: {text}" for text in notes), verdict],
         as_json=as_json,
     )
     raise typer.Exit(0 if ok else 2)

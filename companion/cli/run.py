@@ -21,7 +21,7 @@ from companion.cli.notify import Notifier
 from companion.cli.output_parts import build_outputs, parts_of
 from companion.cli.sensor_parts import build_sensors, follow_refills
 from companion.config import Config
-from companion.config.rules import without_effect
+from companion.config.rules import unbounded, without_effect
 from companion.errors import ActuatorError, LinkError, SensorError
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
@@ -122,7 +122,8 @@ def component_options(
         version=(major, minor, patch),
         closed_us=config.output.closed_us,
         full_us=config.output.full_us,
-        use_mission=config.prediction.use_mission,
+        use_mission=config.prediction.use_mission
+        or (config.mission is not None and config.mission.lines is not None),
         use_battery="autopilot" in (config.flow_meter.source, config.tank.source),
         watch_mission=watch_mission,
         training="" if training == "no" else training,
@@ -136,6 +137,7 @@ def build_executor(config: Config, link: VehicleLink) -> PlanExecutor:
 
 def _warnings(config: Config) -> list[str]:
     found = [f"warning: {found.key}: {found.text}" for found in without_effect(config)]
+    found += [f"note: {found.key}: {found.text}" for found in unbounded(config)]
     if config.output.kind == "servo" and config.output.dither_us:
         baud = serial_baud(config.link.url)
         much = dither_too_much(baud=baud, valves=len(config.valve), every_s=DITHER_S)

@@ -101,6 +101,16 @@ def without_effect(config: Config) -> Rule:
             yield Contradiction(key=key, text="not part of this version, without effect")
 
 
+def unbounded(config: Config) -> Rule:
+    """Yield that no lines are named: then the map alone says where is sprayed."""
+    if config.mission is None or config.mission.lines is None:
+        yield Contradiction(
+            key="mission.lines",
+            text="not set: the whole map is sprayed wherever the aircraft flies, ferries too; "
+            "name the GeoJSON of the plan",
+        )
+
+
 def _near(value_m: float, reference_m: float) -> bool:
     return abs(value_m - reference_m) <= SWATH_TOLERANCE * reference_m + 1e-9
 
@@ -303,3 +313,10 @@ def _mission(config: Config) -> Rule:
             key="mission.reserve_l",
             text=f"not below mission.tank_l = {mission.tank_l:g}; write less",
         )
+    if mission is not None and mission.lines is not None:
+        half_m = 0.5 * mission.swath_width_m
+        if not mission.lines_aside_m <= half_m:
+            yield Contradiction(
+                key="mission.lines_aside_m",
+                text=f"the next line is nearer; write at most half a swath, {half_m:g}",
+            )

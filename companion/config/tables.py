@@ -199,8 +199,16 @@ class SafetyTable(Table):
     )
 
 
+class SwathTable(Table):
+    """One measured swath."""
+
+    height_m: float = Field(ge=0.5, le=120, description="above the crop")
+    speed_m_s: float = Field(ge=0.5, le=50, description="over ground")
+    width_m: Width = Field(description="wet evenly, passes overlapped as they are flown")
+
+
 class MissionTable(Table):
-    """What planning needs."""
+    """What planning needs, and which lines of a plan are sprayed."""
 
     swath_width_m: Width = Field(description="spacing of passes; within 2 % of boom.width_m")
     speed_m_s: float = Field(ge=0.5, le=50, description="in the passes")
@@ -220,6 +228,90 @@ class MissionTable(Table):
         Field(strict=False, max_length=100),
     ] = Field(default=(), description="[[latitude, longitude], ...]; empty: best place on the edge")
     obstacle_buffer_m: float = Field(default=2.0, ge=0, le=100, description="kept from obstacles")
+    refill_s: float = Field(default=60.0, ge=0, le=3600, description="on the ground for one refill")
+    battery_wh: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e6,
+        description="of one battery; absent: sorties end with the tank alone",
+    )
+    battery_reserve_percent: float = Field(
+        default=20.0, ge=0, le=90, description="left in the battery at landing"
+    )
+    power_hover_w: float | None = Field(
+        default=None, gt=0, le=1e6, description="with an empty tank, standing in the air"
+    )
+    power_cruise_w: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e6,
+        description="with an empty tank at speed_m_s; absent: as hovering",
+    )
+    power_per_kg_w: float = Field(
+        default=0.0, ge=0, le=10_000, description="more for each kilogram in the tank"
+    )
+    swap_s: float = Field(
+        default=60.0, ge=0, le=3600, description="on the ground for one change of battery"
+    )
+    nose_rate_deg_s: float | None = Field(
+        default=None, gt=0, le=360, description="turning the nose at a stop; absent: takes no time"
+    )
+    aircraft: int = Field(default=1, ge=1, le=20, description="that share the field")
+    aircraft_gap_m: float = Field(
+        default=20.0, ge=1, le=1000, description="between aircraft in the air"
+    )
+    resume_overlap_m: float = Field(
+        default=3.0, ge=0, le=50, description="of a line sprayed again after a break"
+    )
+    no_spray_buffer_m: float = Field(
+        default=0.0, ge=0, le=1000, description="kept from no-spray areas: the label's, at least"
+    )
+    wind: (
+        tuple[
+            Annotated[FiniteFloat, Field(ge=0, le=50)], Annotated[FiniteFloat, Field(ge=0, le=360)]
+        ]
+        | None
+    ) = Field(
+        default=None, strict=False, description="[m/s, degrees it comes from], for these buffers"
+    )
+    wind_buffer_m_per_m_s: float | None = Field(
+        default=None, ge=0, le=100, description="added to them for each m/s towards the area"
+    )
+    swath: Annotated[tuple[SwathTable, ...], Field(strict=False, max_length=400)] = Field(
+        default=(), description="measured height_m, speed_m_s, width_m: the spacing of passes"
+    )
+    autopilot: Literal["ardupilot", "px4"] = Field(
+        default="ardupilot", description="that flies the plan: each refuses other items"
+    )
+    terrain: Text | None = Field(
+        default=None, description="elevation model (.tif, .hgt) whose ground the plan follows"
+    )
+    terrain_heights: Literal["auto", "vehicle", "file"] = Field(
+        default="auto", description="whose ground: vehicle on ArduPilot, the file's for PX4"
+    )
+    terrain_tolerance_m: float = Field(
+        default=0.5, ge=0.05, le=50, description="height error that adds no point to a way"
+    )
+    climb_max_m_s: float = Field(default=2.5, gt=0, le=20, description="over rising ground")
+    descent_max_m_s: float = Field(default=1.5, gt=0, le=20, description="over falling ground")
+    run_in_m: Annotated[FiniteFloat, Field(ge=0, le=200)] | Literal["auto"] = Field(
+        default=0.0, description="before and behind passes, to fly them at speed; auto: v^2 / 2a"
+    )
+    overrun: Literal["inside", "allowed"] = Field(
+        default="inside", description="allowed: run-ins may lie outside the field"
+    )
+    overrun_areas: Texts = Field(
+        default=(), description="files with ground outside the field on which run-ins may lie"
+    )
+    lines: Text | None = Field(
+        default=None, description="GeoJSON that `plan` writes: sprayed on its spray lines only"
+    )
+    lines_aside_m: float = Field(
+        default=1.0, gt=0, le=50, description="farther aside is off a line; at most half a swath"
+    )
+    lines_course_deg: float = Field(
+        default=20.0, gt=0, le=60, description="a course that is farther from the line's is off it"
+    )
 
 
 class ProductTable(Table):

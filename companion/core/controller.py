@@ -20,6 +20,7 @@ from companion.core.drives import liquid_of, ran, ways, with_drives, with_rates
 from companion.core.flow_trim import FlowTrim, TrimMemory, Trimming
 from companion.core.frame import LocalFrame
 from companion.core.interlock import Held, Limits, closed_plan, guard, inhibits, settled
+from companion.core.lines import Lines
 from companion.core.liquid_law import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.prescription import Prescription
@@ -68,6 +69,7 @@ class Setup:
     mission_braking_m_s2: float | None = None  # None: what the mission says is not used
     pump: Pump | None = None
     atomisers: tuple[Atomiser, ...] = ()
+    lines: Lines | None = None  # None: sprayed wherever the map has a rate
     timing: Timing = field(init=False, repr=False, compare=False)
     pumping: Pumping | None = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)

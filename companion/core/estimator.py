@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from companion.core.clock import Clock, tick
 from companion.core.frozen import Stand, look
-from companion.core.leg import Approach, Leg, approach, learned, leg_of, stop_ahead
+from companion.core.leg import Approach, Leg, approach, learned, leg_of, stop_ahead, way_of
 from companion.core.motion import BRIDGED_MAX_S, Axis
 from companion.core.rate import is_override
 from companion.core.types import (
@@ -40,6 +40,7 @@ from companion.core.types import (
     TankReport,
     Telemetry,
     VehicleState,
+    Way,
     WindReport,
 )
 from companion.core.vehicle_motion import CONFIRM_COUNT, Motion, begun, followed
@@ -84,6 +85,7 @@ class Track:
     pressure: PressureReport | None = None
     tank: TankReport | None = None
     leg: Leg | None = None
+    way: Way | None = None  # only where lines are to be followed
     braking_m_s2: float | None = None  # as seen at the ends of legs so far
     rate_percent: float = 100.0
     enabled: bool = False
@@ -99,7 +101,9 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
     if by_setup is not None:
         return by_setup(track, item, setup)
     if isinstance(item, LegReport):
-        return replace(track, leg=leg_of(item, setup.frame, setup.mission_braking_m_s2))
+        leg = leg_of(item, setup.frame, setup.mission_braking_m_s2)
+        way = None if setup.lines is None else way_of(item, setup.frame)
+        return replace(track, leg=leg, way=way)
     return _KEEP[type(item)](track, item)
 
 
@@ -319,6 +323,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         wind=track.wind if track.wind and track.wind.east_m_s is not None else None,
         rate_percent=track.rate_percent,
         stop_ahead=_stop_ahead(track, east, north, now_s),
+        way=track.way,
     )
 
 

@@ -107,7 +107,7 @@ def in_turn(
 def clicks(count: int, valves: Sequence[int]) -> GroundTask:
     """Return the dry click: each valve in turn opens twice for a fifth of a second.
 
-    >>> clicks(6, range(6)).seconds
+    >>> round(clicks(6, range(6)).seconds, 9)
     4.8
     """
     closed = (0.0,) * count

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from companion.core.frame import LocalFrame
 from companion.core.motion import gained_s
-from companion.core.types import LegReport, StopAhead
+from companion.core.types import LegReport, StopAhead, Way
 
 # The autopilot says at 2 Hz which item it flies to; three seconds without are no news but a loss.
 LEG_AGE_MAX_S = 3.0
@@ -75,6 +75,24 @@ def leg_of(report: LegReport, frame: LocalFrame, braking_m_s2: float | None) -> 
         unit_north=(to_north - north) / length_m,
         length_m=length_m,
         braking_m_s2=braking_m_s2,
+    )
+
+
+def way_of(report: LegReport, frame: LocalFrame) -> Way | None:
+    """Return the way of a leg, whether it ends in a stop or not; None where it is no place."""
+    places = (
+        (report.from_latitude_deg, report.from_longitude_deg),
+        (report.to_latitude_deg, report.to_longitude_deg),
+    )
+    if not all(abs(latitude) <= 90.0 and abs(longitude) <= 180.0 for latitude, longitude in places):
+        return None
+    (east_m, north_m), (to_east_m, to_north_m) = (frame.to_local(*place) for place in places)
+    return Way(
+        received_s=report.received_s,
+        from_east_m=east_m,
+        from_north_m=north_m,
+        to_east_m=to_east_m,
+        to_north_m=to_north_m,
     )
 
 

@@ -61,13 +61,13 @@ class Collecting(NamedTuple):
     pressure_count: int = 0
 
 
-def bin_length_s(period_s: float) -> float:
-    """Return the length of a bin.
+def bin_length_s(period_s: float, wanted_s: float = BIN_S) -> float:
+    """Return the length of a bin: the whole periods nearest to what is wanted.
 
     >>> round(bin_length_s(1.0 / 11.0) * 11.0, 6)
     3.0
     """
-    return max(round(BIN_S / period_s), 1) * period_s
+    return max(round(wanted_s / period_s), 1) * period_s
 
 
 def duties_of(plan: SprayPlan, until_s: float) -> Iterable[tuple[float, tuple[float, ...]]]:

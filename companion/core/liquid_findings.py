@@ -168,6 +168,7 @@ def _evidence(watching: Watching, memory: WatchMemory, count: int) -> Evidence:
         gain=memory.gain,
         pressure_gain=memory.pressure_gain,
         open_ml_s=watching.open_ml_s,
+        restless_share=watching.law.restless_share,
     )
 
 

@@ -8,7 +8,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from companion.core.flow_window import ML_S_PER_L_MIN
-from companion.core.liquid_bins import Order, bin_length_s
+from companion.core.liquid_bins import BIN_S, Order, bin_length_s
+from companion.core.liquid_naming import RESTLESS_SHARE
 from companion.core.types import BatteryReport, FlowReport, TankReport
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ class Detection:
 
     `spread` is one standard deviation of metered over expected flow, `closed_share` of the full
     flow may be metered while all is closed; without `closed_check` that is not looked at, for a
-    meter that also counts what returns to the tank.
+    meter that also counts what returns to the tank. A flow is compared over `bin_s`; one that
+    moves by more than `restless_share` from bin to bin is no liquid.
     """
 
     spread: float = 0.0125
@@ -66,12 +68,18 @@ class Detection:
     reserve_l: float | None = None
     meter_required: bool = False
     closed_check: bool = True
+    bin_s: float = BIN_S
+    restless_share: float = RESTLESS_SHARE
 
     def __post_init__(self) -> None:
         if not 0.001 <= self.spread <= 0.05:
             raise ValueError(f"spread must lie in [0.001, 0.05], got {self.spread}")
         if not 0.001 <= self.closed_share <= 0.5:
             raise ValueError(f"closed_share must lie in [0.001, 0.5], got {self.closed_share}")
+        if not 0.05 <= self.bin_s <= 5.0:
+            raise ValueError(f"bin_s must lie in [0.05, 5], got {self.bin_s}")
+        if not 0.01 <= self.restless_share <= 1.0:
+            raise ValueError(f"restless_share must lie in [0.01, 1], got {self.restless_share}")
         if not 0.0 <= self.meter_minimum_l_min <= 1e4:
             raise ValueError("meter_minimum_l_min must lie in [0, 1e4]")
         if len(self.pressure_duty) != len(self.pressure_kpa) or len(self.pressure_duty) == 1:
@@ -122,7 +130,7 @@ class Watching:
         return cls(
             law=law,
             delay_s=sum(lags) / len(lags) + lag.output_s,
-            bin_s=bin_length_s(pwm.period_s),
+            bin_s=bin_length_s(pwm.period_s, law.bin_s),
             closed_after_s=max(lag.off_end_s, *lags) + lag.output_s + 0.5,
             settle_s=3.0 * max(lags) if max(lags) > SLOW_S else 0.0,
             full_ml_s=full_ml_s,

@@ -41,10 +41,17 @@ class Evidence(NamedTuple):
     flow: float
     pressure: float | None
     open_ml_s: float
+    restless_share: float = RESTLESS_SHARE
 
     @classmethod
     def of(
-        cls, bins: Sequence[Bin], *, gain: float, pressure_gain: float, open_ml_s: float
+        cls,
+        bins: Sequence[Bin],
+        *,
+        gain: float,
+        pressure_gain: float,
+        open_ml_s: float,
+        restless_share: float = RESTLESS_SHARE,
     ) -> Evidence:
         """Return the evidence of some bins; the first of them may lie before the fault."""
         sure = tuple(bins[1:]) or tuple(bins)
@@ -56,6 +63,7 @@ class Evidence(NamedTuple):
             flow=math.fsum(each.metered_ml for each in sure) / expected_ml,
             pressure=_mean(pressures) / pressure_gain if pressures else None,
             open_ml_s=open_ml_s,
+            restless_share=restless_share,
         )
 
     @property
@@ -63,7 +71,7 @@ class Evidence(NamedTuple):
         """Whether the flow jumps from bin to bin, as no liquid does."""
         flows = [each.metered_ml / (self.gain * each.all_ml) for each in self.bins]
         moves = [abs(b - a) for a, b in pairwise(flows)]
-        return len(moves) >= 2 and _mean(moves) > RESTLESS_SHARE
+        return len(moves) >= 2 and _mean(moves) > self.restless_share
 
     @property
     def is_supply(self) -> bool:

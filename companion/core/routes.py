@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from companion.core.crossings import Route, find_routes
 from companion.core.drift import Offset, is_same, offset
+from companion.core.lines import Piece
 from companion.core.paths import STRAIGHT_YAW_RATE_DEG_S
 from companion.core.types import VehicleState
 
@@ -48,8 +49,23 @@ def routes_ahead(
         border_buffer_m=setup.border_buffer_m,
         across=setup.across,
         drift_m=drift_m,
+        flown=_flown(setup, state, memory),
     )
     return routes, state, drift_m
+
+
+def _flown(setup: Setup, state: VehicleState, memory: Memory) -> tuple[Piece, ...] | None:
+    """Return the planned lines that the vehicle is on; None where spraying needs none."""
+    if setup.lines is None:
+        return None
+    was_on_one = any(zone.rate_l_ha is not None for route in memory.routes for zone in route)
+    return setup.lines.flown(
+        state,
+        back_s=setup.back_s,
+        ahead_s=setup.ahead_s,
+        reach_m=setup.boom.reach_m,
+        entering=not was_on_one,
+    )
 
 
 def _shift(

@@ -320,6 +320,17 @@ class LegReport:
     speed_m_s: float | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Way:
+    """The leg of its mission that the vehicle now flies, in the flight's frame."""
+
+    received_s: float
+    from_east_m: float
+    from_north_m: float
+    to_east_m: float
+    to_north_m: float
+
+
 Input = (
     Telemetry
     | SpeedReport
@@ -399,6 +410,7 @@ class VehicleState:
     link_up: bool = True
     estop: bool | None = None  # None: no switch has been heard of
     operator_wishes: int = 0  # how often the operator has enabled anew, or disabled
+    way: Way | None = None  # None: it is not used, or nothing was heard of it
 
 
 # ---------------------------------------------------------------------------------------- plans

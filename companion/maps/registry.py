@@ -92,12 +92,15 @@ def read_map(
     return map_of(found, path, rate_field=rate_field, crs=crs, given=given)
 
 
-def read_area(path: Path, *, crs: str | None = None) -> MultiPolygon:
+def read_area(
+    path: Path, *, crs: str | None = None, repairs: list[str] | None = None
+) -> MultiPolygon:
     """Return the ground that a boundary or exclusion file covers, in longitude and latitude.
 
     Of a file that has an outline of the field beside its zones (ISOXML, a DJI package), that
     outline. Stricter than a prescription: a record that has to be left out, or a ring whose
-    repair moves more than a square metre, could be the ground that must not be sprayed.
+    repair moves more than a square metre, could be the ground that must not be sprayed. Whoever
+    gives `repairs` takes such rings repaired, and finds there what each repair changed.
     """
     path = Path(path)
     layer = _read(path, None)
@@ -112,7 +115,7 @@ def read_area(path: Path, *, crs: str | None = None) -> MultiPolygon:
         )
     used_crs, _ = crs_of(layer, path, crs)
     names = zone_names(layer)
-    ground, repairs = ground_of(layer, used_crs, names, path)
+    ground, repaired = ground_of(layer, used_crs, names, path)
     if layer.skipped:
         index, reason = next(iter(layer.skipped.items()))
         raise map_error(
@@ -121,8 +124,10 @@ def read_area(path: Path, *, crs: str | None = None) -> MultiPolygon:
             fix="draw it as a polygon",
             code="no-polygon",
         )
-    large = [repair for repair in repairs if not repair.change_m2 <= REPAIR_MAX_M2]
-    if large:
+    large = [repair for repair in repaired if not repair.change_m2 <= REPAIR_MAX_M2]
+    if repairs is not None:
+        repairs += [f"{path}: record {repair.zone}: {repair.text}" for repair in large]
+    elif large:
         raise map_error(
             path,
             f"record {large[0].zone}: {large[0].text}",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from missions.files.limits import check_items, check_sprayer
 from missions.plan import Plan, Sortie
 from missions.stops import Stop, waypoints_of
 from missions.terrain.heights import raised
@@ -41,7 +42,11 @@ def items_of(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) -> tuple
 
     Valves follow the map by position; `with_sprayer` adds DO_SPRAYER before and after each line
     as a belt, for ArduPilot, which alone takes it.
+
+    Raises:
+        PlanError: for what the autopilot would refuse.
     """
+    check_sprayer(plan, with_sprayer=with_sprayer)
     stops = waypoints_of(sortie, apart=with_sprayer)
     terrain, height_m = plan.terrain, plan.settings.height_m
     if terrain is not None and not terrain.by_vehicle:
@@ -61,6 +66,7 @@ def items_of(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) -> tuple
     if speed_m_s != plan.settings.speed_m_s:
         items.append(_speed(plan.settings.speed_m_s))
     items.append(Item(command=RETURN_TO_LAUNCH, frame=NO_PLACE, params=(0.0, 0.0, 0.0, 0.0)))
+    check_items(plan, sortie, len(items))
     return tuple(items)
 
 

@@ -8,19 +8,25 @@ simple item has exactly seven parameters, and of `Altitude`, `AltitudeMode` and
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import shapely
+from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
-from missions.files.items import Item, items_of
+from missions.files.items import ABOVE_GROUND, RELATIVE, Item, items_of
+from missions.files.limits import check_content, corners_max
 from missions.plan import Plan, Sortie
 
-ARDUPILOT, PX4 = 3, 12  # MAV_AUTOPILOT
+FIRMWARES = {"ardupilot": 3, "px4": 12}  # MAV_AUTOPILOT
 COPTER = 2  # MAV_TYPE_QUADROTOR
-RELATIVE_TO_HOME = 1
-# Autopilots store few points of a fence; its edge may lie so much outside the field.
-FENCE_OUT_M, FENCE_SIMPLER_M = 2.0, 0.5
+# By frame: heights above home, absolute, and above the ground as the vehicle knows it.
+ALTITUDE_MODES = {RELATIVE: 1, 0: 2, ABOVE_GROUND: 4}
+# The fence lies so much outside the field, at least. Autopilots store few points of it: it is drawn
+# simpler until they have room, obstacles by less than their buffer.
+FENCE_OUT_M, FENCE_SIMPLER_M, OBSTACLE_LESS_M = 1.0, (0.5, 1.0, 2.0, 4.0, 8.0), 1.0
+FERRY_M = 2.0
 DIGITS = 9
 
 
@@ -36,8 +42,8 @@ def plan_text(
         "groundStation": "vrspray",
         "mission": {
             "cruiseSpeed": plan.settings.speed_m_s,
-            "firmwareType": ARDUPILOT,
-            "globalPlanAltitudeMode": RELATIVE_TO_HOME,
+            "firmwareType": FIRMWARES[plan.settings.autopilot],
+            "globalPlanAltitudeMode": _mode_of_all(items),
             "hoverSpeed": plan.settings.speed_m_s,
             "items": [_simple(number, item) for number, item in enumerate(items, start=1)],
             "plannedHomePosition": [*_rounded(home), 0.0],
@@ -50,7 +56,14 @@ def plan_text(
         },
         "version": 1,
     }
+    check_content(plan, sortie, content)
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def _mode_of_all(items: Sequence[Item]) -> int:
+    """Return the one altitude mode of a plan; 0 where they are mixed."""
+    modes = {ALTITUDE_MODES[item.frame] for item in items if item.has_place}
+    return modes.pop() if len(modes) == 1 else 0
 
 
 def _rounded(place: tuple[float, float]) -> list[float]:
@@ -71,7 +84,7 @@ def _simple(number: int, item: Item) -> dict[str, Any]:
         found |= {
             "AMSLAltAboveTerrain": None,
             "Altitude": item.altitude_m,
-            "AltitudeMode": RELATIVE_TO_HOME,
+            "AltitudeMode": ALTITUDE_MODES[item.frame],
         }
     return found
 
@@ -82,24 +95,39 @@ def _no_fence() -> dict[str, Any]:
 
 def _fence(plan: Plan) -> dict[str, Any]:
     """Return where the aircraft must stay: around the field and its depots, off its obstacles."""
-    ferries = [
-        shapely.LineString(leg.points).buffer(FENCE_OUT_M)
+    around = plan.field.outline.buffer(FENCE_SIMPLER_M[0])
+    shapely.prepare(around)
+    outside = [
+        shapely.LineString(leg.points).buffer(FERRY_M)
         for sortie in plan.sorties
         for leg in sortie.legs
-        if leg.kind == "ferry"
+        if leg.kind != "spray" and not shapely.covers(around, shapely.LineString(leg.points))
     ]
-    inside = shapely.union_all([plan.field.outline, *ferries])
-    keep_in = shapely.get_parts(inside.buffer(FENCE_OUT_M).simplify(FENCE_SIMPLER_M))
+    inside = shapely.union_all([plan.field.outline, *outside])
+    polygons: list[dict[str, Any]] = []
+    for simpler_m in FENCE_SIMPLER_M:
+        polygons = _polygons(plan, inside, simpler_m)
+        if sum(len(polygon["polygon"]) for polygon in polygons) <= corners_max(plan):
+            break
+    return {"circles": [], "polygons": polygons, "version": 2}
+
+
+def _polygons(plan: Plan, inside: BaseGeometry, simpler_m: float) -> list[dict[str, Any]]:
+    """Return a fence whose edges are drawn so much simpler: wider outside, obstacles smaller."""
+    # A ring is simplified once along it and once at its start: it moves by twice that at most.
+    wider_m = FENCE_OUT_M + 2.0 * simpler_m
+    keep_in = shapely.get_parts(inside.buffer(wider_m).simplify(simpler_m))
     if len(keep_in) > 1:  # several inclusions would each forbid the others
-        keep_in = shapely.get_parts(inside.convex_hull.buffer(FENCE_OUT_M))
-    blocked = plan.field.blocked.buffer(-FENCE_SIMPLER_M).simplify(FENCE_SIMPLER_M / 2.0)
+        keep_in = shapely.get_parts(inside.convex_hull.buffer(wider_m))
+    less_m = min(simpler_m, OBSTACLE_LESS_M)
+    blocked = plan.field.blocked.buffer(-less_m).simplify(less_m / 2.0)
     polygons = [_polygon(plan, part, inclusion=True) for part in keep_in]
     polygons += [
         _polygon(plan, part, inclusion=False)
         for part in shapely.get_parts(blocked)
         if not part.is_empty
     ]
-    return {"circles": [], "polygons": polygons, "version": 2}
+    return polygons
 
 
 def _polygon(plan: Plan, part: shapely.Polygon, *, inclusion: bool) -> dict[str, Any]:

@@ -39,8 +39,23 @@ def paths_of(out: Path, sorties: int) -> list[Path]:
     return [out, *more]
 
 
+def lines_path(out: Path) -> Path | None:
+    """Return where the lines of a plan are, for `mission.lines`; None for a format to look at.
+
+    >>> lines_path(Path("m.plan")), lines_path(Path("m.kml"))
+    (PosixPath('m.lines.geojson'), None)
+    """
+    suffix = out.suffix.casefold()
+    if suffix == ".geojson":
+        return out
+    return out.with_name(f"{out.stem}.lines.geojson") if suffix in ONE_SORTIE else None
+
+
 def write_plan(plan: Plan, out: Path, *, with_sprayer: bool = False) -> list[Path]:
-    """Write the plan and return the files; all texts are made before the first is written."""
+    """Write the plan and return its files; all texts are made before the first is written.
+
+    The lines, beside missions that have no marks for them, are not among these files.
+    """
     check_suffix(out)
     suffix = out.suffix.casefold()
     if suffix == ".geojson":
@@ -52,6 +67,10 @@ def write_plan(plan: Plan, out: Path, *, with_sprayer: bool = False) -> list[Pat
     else:
         texts = [waypoints_text(plan, each, with_sprayer=with_sprayer) for each in plan.sorties]
     paths = paths_of(out, len(texts))
+    marks = lines_path(out)
+    if marks is not None and marks not in paths:
+        # First: whoever finds a mission finds its lines.
+        write_whole(marks, geojson_text(plan).encode("utf-8"))
     for path, text in zip(paths, texts, strict=True):
         write_whole(path, text.encode("utf-8"))
     return paths

@@ -17,9 +17,7 @@ from missions.terrain.ground import Terrain
 RETURN_LOW_M = 7.5
 
 
-def raised(
-    stops: Sequence[Stop], terrain: Terrain, *, home: Place, height_m: float
-) -> list[Stop]:
+def raised(stops: Sequence[Stop], terrain: Terrain, *, home: Place, height_m: float) -> list[Stop]:
     """Return the stops with heights above home, and more of them where the ground bends."""
     home_m = float(terrain.heights_m(np.array([home]))[0])
     found = [replace(stops[0], height_m=_above(terrain, stops[0].place, home_m) + height_m)]
@@ -66,4 +64,3 @@ def return_warnings(
         f"the ground rises {highest:.0f} m above home on straight ways back: set the height of "
         f"the return (RTL_ALT, PX4: RTL_RETURN_ALT) to {highest + height_m + 5.0:.0f} m or more",
     )
-

@@ -41,9 +41,7 @@ def read_dem(path: Path) -> Dem:
         return _hgt(path)
     if suffix in (".tif", ".tiff"):
         return _geotiff(path)
-    raise PlanError(
-        f"{path}: an elevation model is a GeoTIFF (.tif) or an SRTM tile (.hgt); see mission.terrain"
-    )
+    raise PlanError(f"{path}: an elevation model is a GeoTIFF (.tif) or an SRTM tile (.hgt)")
 
 
 def _hgt(path: Path) -> Dem:
@@ -71,9 +69,9 @@ def _geotiff(path: Path) -> Dem:
     # "Described": a byte raster of heights is no picture to be refused here.
     raster = read_raster(read_bytes(path), path, layer=None, described=True)
     if len(raster.bands) != 1:
-        raise PlanError(f"{path}: an elevation model has one band, this one has {len(raster.bands)}")
+        raise PlanError(f"{path}: an elevation model has one band, not {len(raster.bands)}")
     if raster.crs is None or raster.transform is None:
-        raise PlanError(f"{path}: it does not say where it lies; export it as GeoTIFF with its CRS")
+        raise PlanError(f"{path}: it does not say where it lies; export it with its CRS")
     band = raster.bands[0].band
     unit = (band.unit or raster.unit or "m").strip().casefold()
     if unit not in UNITS_M:
@@ -92,4 +90,3 @@ def _plausible(heights_m: Floats) -> Floats:
     with np.errstate(invalid="ignore"):
         good = (heights_m >= LOWEST_M) & (heights_m <= HIGHEST_M)
     return np.where(good, heights_m, math.nan)
-

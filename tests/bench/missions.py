@@ -90,15 +90,17 @@ def fields() -> dict[str, Field]:
 # --- what others fly --------------------------------------------------------------------------
 
 
-def grid_lines(ground: Area, angle_deg: float, *, in_pairs: bool) -> Floats:
+def grid_lines(
+    ground: Area, angle_deg: float, *, in_pairs: bool, width_m: float = WIDTH_M
+) -> Floats:
     """Return the lines of a grid, serpentine; in pairs of crossings, or from first to last."""
     turned = rotate(ground, angle_deg, origin=(0.0, 0.0))  # north is then along the lines
     west, south, east, north = turned.bounds
-    count = math.ceil((east - west) / WIDTH_M)
-    first = (west + east) / 2.0 - (count - 1) * WIDTH_M / 2.0
+    count = math.ceil((east - west) / width_m)
+    first = (west + east) / 2.0 - (count - 1) * width_m / 2.0
     rows = []
     for number in range(count):
-        x = first + number * WIDTH_M
+        x = first + number * width_m
         cut = shapely.LineString([(x, south - 1.0), (x, north + 1.0)]).intersection(turned)
         spans = sorted(part.bounds[1::2] for part in shapely.get_parts(cut) if part.length > 0.0)
         if not spans:

@@ -1,10 +1,12 @@
 """Litres of sorties as they are planned beside those of the twin, line by line.
 
-    python -m tests.bench.plan_twin [--sorties 12] [--seed 1]
+    python -m tests.bench.plan_twin [--sorties 12] [--seed 1] [--everywhere]
 
 Plans the real map of sample 01 (VRSPRAY_SAMPLES) for the orchard's sprayer and flies sorties,
-evenly chosen, from their first line to their last. What counts is what the twin sprays on the
-lines; what it sprays between them is listed apart.
+evenly chosen, from the depot and back to it, with the plan's file as `mission.lines`. What counts
+is all that the twin sprays, ferries and side steps included; what it sprays while it flies none of
+the lines (`between_l`), and off them (`off_lines_ml`), is listed apart. `--everywhere` leaves the
+key out.
 """
 
 from __future__ import annotations
@@ -21,8 +23,12 @@ from typing import Any
 
 import numpy as np
 
+from analysis.border import off_target_ml
+from analysis.strips import strips_of
 from companion.assembly import build_setup
 from companion.config import Config, load
+from companion.core.controller import Setup
+from missions.files.geojson import geojson_text
 from missions.plan import Plan, Sortie
 from missions.planner import plan_mission
 from missions.reading import Asked, read_task
@@ -53,40 +59,55 @@ def planned(config: Config, boundary: Path, *, moves: int = MOVES, **changes: An
     return plan_mission(task.field, task.settings, task.rates, depots=task.depots)
 
 
-def flown(plan: Plan, sortie: Sortie, config: Config, *, seed: int) -> dict[str, float]:
-    """Return planned litres of a sortie, those of the twin on its lines, and those between."""
-    setup = build_setup(config, frame=plan.frame)
+def with_lines(plan: Plan, config: Config) -> Config:
+    """Return the configuration that sprays on the plan's lines only, its file beside it."""
+    path = config.path.parent / "plan.lines.geojson"
+    path.write_text(geojson_text(plan))
+    return load(config.path, overrides=[f'mission.lines="{path}"'])
+
+
+def route_of(plan: Plan, sortie: Sortie) -> tuple[Route, tuple[bool, ...]]:
+    """Return the whole way of a sortie, and of each of its legs whether it is a spray line."""
     legs: list[Leg] = []
-    for leg in sortie.legs[1:-1]:
+    for leg in sortie.legs:
         kind = "spray" if leg.kind == "spray" else "transit"
         if leg.length_m > 0.01:
             legs += [
                 Leg(east_m=east_m, north_m=north_m, speed_m_s=leg.speed_m_s, kind=kind)  # type: ignore[arg-type]
                 for east_m, north_m in leg.points[1:]
             ]
-    start = sortie.legs[1].points[0]
+    start = sortie.legs[0].points[0]
     route = Route(
         start_east_m=start[0], start_north_m=start[1], legs=tuple(legs),
         height_m=plan.settings.height_m,
     )  # fmt: skip
+    return route, tuple(leg.kind == "spray" for leg in legs)
+
+
+def flown(
+    plan: Plan, sortie: Sortie, setup: Setup, *, seed: int, plant: str = "orchard-180"
+) -> dict[str, float]:
+    """Return planned litres of a sortie, and those of the twin: all, between lines, off them."""
+    route, is_line = route_of(plan, sortie)
     trajectory = Vehicle(
         route, start_s=0.0, seed=seed, acceleration_m_s2=plan.settings.acceleration_m_s2
     ).fly_to_end()
     result = fly(
-        setup, trajectory, load_profile("orchard-180"),
+        setup, trajectory, load_profile(plant),
         FlightOptions(fidelity="averaged", output="servo", seed=seed),
         speed_m_s=plan.settings.speed_m_s,
         mission=route,
     )  # fmt: skip
     record = result.record
-    total_l = record.volume_ml.sum(axis=1) / 1000.0
-    on_line = np.array([leg.kind == "spray" for leg in legs])[trajectory.at(record.time_s).leg]
-    used_l = np.diff(total_l)
+    used_l = np.diff(record.volume_ml.sum(axis=1)) / 1000.0
+    on_line = np.array(is_line)[trajectory.at(record.time_s).leg]
     return {
         "sortie": sortie.number,
         "planned_l": sortie.volume_l,
-        "twin_l": float(used_l[on_line[1:]].sum()),
+        "twin_l": float(used_l.sum()),
         "between_l": float(used_l[~on_line[1:]].sum()),
+        "off_lines_ml": off_target_ml(strips_of(record), record.prescription),
+        "ferry_m": sortie.length_m("ferry") + sortie.length_m("transit"),
         "simulated_s": result.simulated_s,
     }
 
@@ -109,6 +130,7 @@ def main() -> int:
     parser.add_argument("--sorties", type=int, default=12)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--speed-m-s", type=float)
+    parser.add_argument("--everywhere", action="store_true")
     given = parser.parse_args()
     samples = os.environ.get("VRSPRAY_SAMPLES")
     if not samples:
@@ -119,9 +141,11 @@ def main() -> int:
         config = config_for(Path(scratch), folder / "Rx.shp", boundary)
         plan = planned(config, boundary, speed_m_s=given.speed_m_s)
         chosen = np.linspace(0, len(plan.sorties) - 1, given.sorties).round().astype(int).tolist()
+        wanted = config if given.everywhere else with_lines(plan, config)
+        setup = build_setup(wanted, frame=plan.frame)
         rows = []
         for at in chosen:
-            rows.append(flown(plan, plan.sorties[at], config, seed=given.seed))
+            rows.append(flown(plan, plan.sorties[at], setup, seed=given.seed))
             sys.stderr.write(f"{rows[-1]}\n")
     found = compared(rows) | {"of": len(plan.sorties), "volume_l": plan.volume_l}
     sys.stdout.write(json.dumps(found, indent=1) + "\n")

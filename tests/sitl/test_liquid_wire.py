@@ -77,7 +77,8 @@ async def test_a_stuck_valve_is_found_within_three_seconds_and_closes(tmp_path: 
         async with process("run", "--config", str(folder / "config.toml"), *options) as companion:
             await until_said(vehicle, "Spray: closed: valve-stuck-open")
             # A few positions more: it stays closed where the map asks for liquid.
-            await until_said(vehicle, "flying: ")
+            for _ in range(2):
+                await until_said(vehicle, "flying: ")
             vehicle.send_signal(signal.SIGTERM)
             async with asyncio.timeout(20.0):
                 stdout, _ = await vehicle.communicate()

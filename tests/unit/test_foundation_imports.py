@@ -15,7 +15,7 @@ SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob
 # Where each of these may be imported; a folder stands for all below it.
 ALLOWED = {
     "pymavlink": ("companion/link", "sitl/stub"),
-    "mavsdk": ("missions/upload.py",),
+    "mavsdk": ("missions/upload/",),
     "serial": ("companion/link", "sitl/stub"),
     "pydantic": ("companion/config",),
     "shapefile": ("companion/maps",),
@@ -27,7 +27,7 @@ CORE_ALLOWED = {
 }
 PURE = {
     "__future__", "bisect", "collections", "dataclasses", "enum", "functools", "heapq",
-    "itertools", "math", "operator", "typing",
+    "itertools", "math", "operator", "statistics", "typing",
 }  # fmt: skip
 
 

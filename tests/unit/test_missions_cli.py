@@ -121,11 +121,17 @@ BOW_TIE = Polygon([(0, 0), (100, 100), (100, 0), (0, 100)])
 @pytest.mark.parametrize(
     ("ground", "more", "says"),
     [
-        (BOW_TIE, [], "f.geojson"),
         (box(0, 0, 4, 100), [], "nowhere as wide as the swath of 6 m"),
         (box(0, 0, 100, 100), ["--tank-l", "0.5"], "a reserve of 1.0 L"),
         (box(0, 0, 100, 100), ["--tank-l", "1.01"], "mission.tank_l"),
-        (box(0, 0, 100, 100), ["--depot", "-48,11"], "depot 1"),
+        (box(0, 0, 100, 100), ["--depot", "-48,11"], "latitude is of the wrong hemisphere"),
+        (box(0, 0, 100, 100), ["--depot", "48,-11"], "longitude is of the wrong hemisphere"),
+        (box(0, 0, 100, 100), ["--depot", "11,48"], "swapped"),
+        (box(0, 0, 100, 100), ["--prescription", str(ANYANG / "prescription.shp")], "km from"),
+        (box(0, 0, 100, 100), ["--obstacle", str(ANYANG / "boundary.geojson")], "km from"),
+        (box(0, 0, 100, 100), ["--no-spray", str(ANYANG / "boundary.geojson")], "km from"),
+        (box(0, 0, 5, 5), [], "nowhere as wide as the swath of 6 m"),
+        (box(0, 0, 100, 100), ["--autopilot", "px4", "--sprayer"], "PX4 takes no DO_SPRAYER"),
         (box(0, 0, 100, 100), ["--depot", "north"], "--depot"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "0"], "rate above zero"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "nan"], "--rate-l-ha"),
@@ -145,6 +151,61 @@ def test_a_refusal_is_one_line_and_no_file(
     assert says in found["error"]
     assert len(err.strip().splitlines()) == 1
     assert not (tmp_path / "m.plan").exists()
+
+
+def test_an_outline_that_crosses_itself_is_repaired_and_that_is_said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(BOW_TIE, tmp_path / "f.geojson")
+    code, found, err = run(capsys, field, "--out", tmp_path / "m.plan")
+    assert code == 0
+    assert found["area_ha"] == pytest.approx(0.5, abs=0.01)
+    assert "rings cross themselves" in found["warnings"][0]
+    assert "f.geojson" in found["warnings"][0]
+    assert "warning: " in err
+
+
+def test_what_must_not_be_sprayed_is_not_repaired(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(box(0, 0, 200, 200), tmp_path / "f.geojson")
+    garden = written(BOW_TIE, tmp_path / "g.geojson")
+    for option in ("--no-spray", "--obstacle"):
+        code, found, _ = run(capsys, field, option, garden, "--out", tmp_path / "m.plan")
+        assert (code, "g.geojson" in found["error"]) == (2, True)
+        assert not (tmp_path / "m.plan").exists()
+
+
+def test_a_ring_that_is_not_closed_is_closed(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(box(0, 0, 120, 120), tmp_path / "f.geojson")
+    content = json.loads(field.read_text())
+    ring = content["features"][0]["geometry"]["coordinates"][0]
+    del ring[-1]
+    field.write_text(json.dumps(content))
+    code, found, _ = run(capsys, field, "--out", tmp_path / "m.plan")
+    assert code == 0
+    assert found["area_ha"] == pytest.approx(1.44, abs=0.01)
+    content["features"][0]["geometry"] = {"type": "LineString", "coordinates": ring}
+    field.write_text(json.dumps(content))
+    code, found, _ = run(capsys, field, "--out", tmp_path / "n.plan")
+    assert (code, "no polygon" in found["error"]) == (2, True)
+
+
+def test_an_obstacle_across_the_field_leaves_two_parts_and_both_are_planned(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(box(0, 0, 200, 100), tmp_path / "f.geojson")
+    ditch = written(box(90, -10, 110, 110), tmp_path / "o.geojson")
+    code, found, _ = run(capsys, field, "--obstacle", ditch, "--out", tmp_path / "m.geojson")
+    assert code == 0
+    assert found["coverage_percent"] > 99.9
+    lines = [each["geometry"]["coordinates"]
+             for each in json.loads((tmp_path / "m.geojson").read_text())["features"]
+             if each["properties"]["kind"] == "spray"]  # fmt: skip
+    west = [line for line in lines if line[0][0] < 11.00134]
+    assert 0 < len(west) < len(lines)
 
 
 def test_an_unknown_format_is_refused_before_any_work(

@@ -320,4 +320,4 @@ class AnyFlight(RuleBasedStateMachine):
 
 
 TestAnyFlight = AnyFlight.TestCase
-TestAnyFlight.settings = settings(max_examples=40, stateful_step_count=20)
+TestAnyFlight.settings = settings(max_examples=20, stateful_step_count=15)

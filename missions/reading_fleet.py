@@ -1,0 +1,111 @@
+"""Of batteries, several aircraft and a break: from configuration and files to what plans need."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from shapely.affinity import translate
+
+from companion.config.tables import MissionTable
+from companion.core.frame import LocalFrame
+from companion.maps.local import as_area, polygons_of
+from companion.maps.registry import read_area
+from missions.energy import Battery
+from missions.errors import PlanError
+from missions.field import MARGIN_M, Field, local_area
+from missions.remaining import Break, Remaining, read_lines, remaining
+
+OVERLAP_M = 3.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BreakAsked:
+    """What the command line says of a break; `stop` is (latitude, longitude)."""
+
+    done: Path | None = None
+    resume: Path | None = None
+    stop: tuple[float, float] | None = None
+    sortie: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.resume is None and (self.stop is not None or self.sortie is not None):
+            raise PlanError("--from and --sortie need --resume, the .geojson of the plan to go on")
+        if self.resume is not None and self.stop is None and self.done is None:
+            raise PlanError(
+                "--resume needs --from LAT,LON, where the spraying stopped, or --done, "
+                "the treated ground"
+            )
+
+
+NO_BREAK = BreakAsked()
+
+
+def fleet_settings(mission: MissionTable) -> dict[str, Any]:
+    """Return the settings that [mission] gives for power, ground times and several aircraft."""
+    return {
+        "battery": battery_of(mission),
+        "refill_s": mission.refill_s,
+        "swap_s": mission.swap_s,
+        "nose_rate_deg_s": mission.nose_rate_deg_s,
+        "aircraft": mission.aircraft,
+        "aircraft_gap_m": mission.aircraft_gap_m,
+    }
+
+
+def battery_of(mission: MissionTable) -> Battery | None:
+    """Return the battery; None where no power is given."""
+    hover_w = mission.power_hover_w
+    if hover_w is None:
+        if mission.battery_wh is not None or mission.power_cruise_w is not None:
+            raise PlanError("mission.power_hover_w is missing: the power with an empty tank, in W")
+        return None
+    cruise_w = mission.power_cruise_w
+    return Battery(
+        hover_w=hover_w,
+        cruise_w=hover_w if cruise_w is None else cruise_w,
+        per_kg_w=mission.power_per_kg_w,
+        capacity_wh=mission.battery_wh,
+        reserve_percent=mission.battery_reserve_percent,
+    )
+
+
+def left_of(
+    asked: BreakAsked,
+    mission: MissionTable | None,
+    frame: LocalFrame,
+    *,
+    width_m: float,
+    offset_m: tuple[float, float],
+) -> Remaining | None:
+    """Return what a plan that is gone on with leaves; None without one.
+
+    The places of the plan and of the stop are the receiver's; treated ground is moved as the map.
+    """
+    if asked.resume is None:
+        return None
+    treated = None
+    if asked.done is not None:
+        treated = translate(local_area(read_area(asked.done), frame), *offset_m)
+    since = Break(
+        stop=None if asked.stop is None else frame.to_local(*asked.stop),
+        sortie=asked.sortie,
+        overlap_m=OVERLAP_M if mission is None else mission.resume_overlap_m,
+        treated=treated,
+    )
+    return remaining(read_lines(asked.resume, frame), since, width_m=width_m, frame=frame)
+
+
+def untreated(field: Field, done: Path, width_m: float, offset_m: tuple[float, float]) -> Field:
+    """Return the field without the treated ground: it is flown over, and not sprayed again.
+
+    Raises:
+        PlanError: where nothing is left that a strip fits on.
+    """
+    treated = translate(local_area(read_area(done), field.frame), *offset_m)
+    kept = treated.buffer(MARGIN_M, join_style="mitre")
+    spray = as_area(polygons_of(field.spray.difference(kept)))
+    if spray is None or spray.buffer(-width_m / 2.0).is_empty:
+        raise PlanError(f"{done}: it leaves nothing of the field that is as wide as the swath")
+    return replace(field, spray=spray, limit=field.limit.difference(treated))

@@ -1,0 +1,183 @@
+"""What of a task depends on ground, wind and room: read from files and `[mission]`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import shapely
+
+from companion.config import Config
+from companion.config.tables import MissionTable
+from companion.core.frame import LocalFrame
+from companion.maps.registry import read_area
+from missions.errors import PlanError
+from missions.field import Field, local_area
+from missions.run_in import RunIn
+from missions.swath_table import SwathPoint, swath_width_m
+from missions.terrain.ground import Terrain
+from missions.terrain.reading import read_dem
+from missions.wind import WindBuffer
+
+Autopilot = Literal["ardupilot", "px4"]
+# The companion doses for the strips of its valves: passes spaced otherwise get another rate.
+SPACING_SHARE = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundAsked:
+    """What the command line asks for; None leaves it to the configuration."""
+
+    terrain: Path | None = None
+    autopilot: Autopilot | None = None
+    wind: tuple[float, float] | None = None
+    no_spray_buffer_m: float | None = None
+    run_in: Literal["auto"] | float | None = None
+
+
+NOTHING_ASKED = GroundAsked()
+
+
+def _table(config: Config | None) -> MissionTable:
+    """Return the configuration's [mission], or the defaults of its keys."""
+    if config is not None and config.mission is not None:
+        return config.mission
+    return MissionTable(swath_width_m=6.0, speed_m_s=6.0)
+
+
+def autopilot_of(asked: GroundAsked, config: Config | None) -> Autopilot:
+    """Return for whom the files are written."""
+    return asked.autopilot or _table(config).autopilot
+
+
+def terrain_of(asked: GroundAsked, config: Config | None, frame: LocalFrame) -> Terrain | None:
+    """Return the ground that the plan follows, if it follows any.
+
+    Raises:
+        PlanError, MapError: in one line, what is wrong and what to do.
+    """
+    mission = _table(config)
+    path = asked.terrain
+    if path is None and config is not None and mission.terrain is not None:
+        path = config.resolve(mission.terrain)
+    if path is None:
+        return None
+    autopilot, heights = autopilot_of(asked, config), mission.terrain_heights
+    if autopilot == "px4" and heights == "vehicle":
+        raise PlanError(
+            "PX4 takes no heights above terrain: mission.terrain_heights must be file, or auto"
+        )
+    return Terrain(
+        dem=read_dem(path),
+        frame=frame,
+        by_vehicle=heights == "vehicle" or (heights == "auto" and autopilot == "ardupilot"),
+        tolerance_m=mission.terrain_tolerance_m,
+        climb_m_s=mission.climb_max_m_s,
+        descent_m_s=mission.descent_max_m_s,
+    )
+
+
+def wind_of(asked: GroundAsked, config: Config | None) -> WindBuffer | None:
+    """Return the wind that widens buffers, if one is given."""
+    mission = _table(config)
+    wind = asked.wind or mission.wind
+    if wind is None:
+        return None
+    if mission.wind_buffer_m_per_m_s is None:
+        raise PlanError(
+            "with a wind the buffers need mission.wind_buffer_m_per_m_s: the metres that are added "
+            "for each m/s towards a no-spray area, from the label or a drift trial"
+        )
+    try:
+        return WindBuffer(
+            speed_m_s=wind[0], from_deg=wind[1], m_per_m_s=mission.wind_buffer_m_per_m_s
+        )
+    except ValueError as error:
+        raise PlanError(f"--wind: {error}; write SPEED,FROM in m/s and degrees") from None
+
+
+def no_spray_buffer_m(asked: GroundAsked, config: Config | None) -> float:
+    """Return the buffer of no-spray areas: never less than the configuration's."""
+    return max(asked.no_spray_buffer_m or 0.0, _table(config).no_spray_buffer_m)
+
+
+def run_in_of(
+    asked: GroundAsked, config: Config | None, field: Field, offset_m: tuple[float, float]
+) -> RunIn | None:
+    """Return the way before and behind passes, None where none is asked for."""
+    mission = _table(config)
+    wanted = mission.run_in_m if asked.run_in is None else asked.run_in
+    if wanted != "auto" and not wanted > 0.0:
+        return None
+    areas = []
+    if config is not None:
+        areas = [read_area(config.resolve(name)) for name in mission.overrun_areas]
+    outside = [
+        shapely.transform(local_area(area, field.frame), lambda points: points + offset_m)
+        for area in areas
+    ]
+    if mission.overrun == "allowed":
+        outside.append(field.outline.convex_hull.buffer(500.0))
+    ground = None
+    if outside:
+        everything = shapely.union_all([field.fly, *outside])
+        ground = everything.difference(field.blocked) if not field.blocked.is_empty else everything
+    return RunIn(run_m=None if wanted == "auto" else float(wanted), ground=ground)
+
+
+def parse_wind(text: str | None) -> tuple[float, float] | None:
+    """Return speed and origin of the wind as it is typed.
+
+    >>> parse_wind("4,270"), parse_wind(None)
+    ((4.0, 270.0), None)
+    """
+    if text is None:
+        return None
+    try:
+        speed, origin = (float(part) for part in text.split(","))
+    except ValueError:
+        raise PlanError(f"--wind {text!r:.40}: write SPEED,FROM, such as 4,270") from None
+    return speed, origin
+
+
+def parse_run_in(text: str | None) -> Literal["auto"] | float | None:
+    """Return a run-in as it is typed.
+
+    >>> parse_run_in("auto"), parse_run_in("7.5"), parse_run_in(None)
+    ('auto', 7.5, None)
+    """
+    if text is None or text == "auto":
+        return "auto" if text == "auto" else None
+    try:
+        length_m = float(text)
+    except ValueError:
+        length_m = -1.0
+    if not 0.0 <= length_m <= 200.0:
+        raise PlanError(f"--run-in-m {text!r:.40}: write metres up to 200, or auto")
+    return length_m
+
+
+def spacing_m(
+    config: Config | None, *, height_m: float, speed_m_s: float, boom_m: float | None
+) -> float | None:
+    """Return the spacing of passes by the measured swath; None without measurements.
+
+    Raises:
+        PlanError: outside of the table, and where the boom is configured for another swath.
+    """
+    rows: Sequence[SwathPoint] = [
+        SwathPoint(height_m=row.height_m, speed_m_s=row.speed_m_s, width_m=row.width_m)
+        for row in _table(config).swath
+    ]
+    if not rows:
+        return None
+    width_m = swath_width_m(rows, height_m=height_m, speed_m_s=speed_m_s)
+    if boom_m is not None and not abs(width_m - boom_m) <= SPACING_SHARE * boom_m:
+        raise PlanError(
+            f"mission.swath has {width_m:.2f} m at {height_m:g} m and {speed_m_s:g} m/s, and the "
+            f"companion doses for boom.width_m = {boom_m:g} m: rates would be "
+            f"{100.0 * (boom_m / width_m - 1.0):+.0f} % off; make boom and valves as wide"
+        )
+    return width_m

@@ -1,0 +1,67 @@
+"""Outlines from files: repaired where their rings cross, and near the field they are meant for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import shapely
+from shapely import MultiPolygon
+
+from companion.core.frame import LocalFrame
+from companion.errors import MapError
+from companion.maps.build import frame_for
+from companion.maps.cells import grid_of
+from companion.maps.local import Area, as_area, polygons_of
+from companion.maps.model import MapFile
+from companion.maps.registry import read_area, read_map
+from missions.errors import PlanError
+from missions.nearness import check_near
+from missions.strips import Floats
+
+
+def outline_of(
+    path: Path, map_file: MapFile | None, said: list[str], *, crs: str | None = None
+) -> Area:
+    """Return the field's outline; of a prescription in cells, that of its cells with a rate.
+
+    Rings that cross themselves are repaired, and what that changes is added to `said`.
+    """
+    try:
+        return read_area(path, crs=crs, repairs=said)
+    except MapError as error:
+        if error.code != "no-polygon":
+            raise
+        same = map_file is not None and map_file.path.resolve() == path.resolve()
+        try:
+            cells = map_file if same else read_map(path)
+        except MapError:
+            raise error from None  # no map of cells either: what is missing is an outline
+        if cells is None or cells.cells is None:
+            raise
+        return _of_cells(cells)
+
+
+def _of_cells(map_file: MapFile) -> MultiPolygon | Area:
+    """Return the ground of all cells with a rate, in longitude and latitude."""
+    if map_file.cells is None:
+        raise PlanError(f"{map_file.path}: there are no cells")
+    frame = frame_for(map_file)
+
+    def back(points: Floats) -> Floats:
+        lat, lon = frame.to_geographic_all(points[:, 0].tolist(), points[:, 1].tolist())
+        return np.column_stack([lon, lat])
+
+    local = grid_of(map_file.cells, frame, map_file.path).outline
+    found = as_area(polygons_of(shapely.transform(local, back)))
+    if found is None:
+        raise PlanError(f"{map_file.path}: no cell has a rate")
+    return found
+
+
+def near_area(path: Path, frame: LocalFrame) -> MultiPolygon:
+    """Return the ground of a file, which must lie near the field to mean anything for it."""
+    area = read_area(path)
+    west, south, east, north = area.bounds
+    check_near(str(path), (south + north) / 2.0, (west + east) / 2.0, frame)
+    return area

@@ -1,0 +1,179 @@
+"""What an earlier plan leaves after a break: the rest of its lines, from where it stopped."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely import LineString, Point
+from shapely.geometry.base import BaseGeometry
+
+from companion.core.frame import LocalFrame
+from missions.errors import PlanError
+from missions.strips import Floats, directions, lengths_m
+from missions.swaths import LINE_MIN_M
+
+# Legs of one line at several speeds: they touch, and go on straight.
+TOUCH_M, STRAIGHT_DEG = 0.01, 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Remaining:
+    """The lines still to be flown, the course of most of them, and those that are done."""
+
+    lines: Floats
+    done: Floats
+    angle_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Break:
+    """Where the flight stopped (east, north) and in which sortie, and what ground is treated.
+
+    `overlap_m` is how much before the place the line is begun again.
+    """
+
+    stop: tuple[float, float] | None = None
+    sortie: int | None = None
+    overlap_m: float = 3.0
+    treated: BaseGeometry | None = None
+
+
+def read_lines(path: Path, frame: LocalFrame) -> list[tuple[int, Floats]]:
+    """Return the spray lines of a plan as `vrspray plan --out plan.geojson` writes it, in order.
+
+    Raises:
+        PlanError: where the file is none.
+    """
+    try:
+        features = json.loads(path.read_text(encoding="utf-8"))["features"]
+        found = [
+            (int(known["sortie"]), int(known["sequence"]), each["geometry"]["coordinates"])
+            for each in features
+            if (known := each["properties"]).get("kind") == "spray"
+        ]
+        rows = [(sortie, _local(points, frame)) for sortie, _, points in sorted(found)]
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise PlanError(
+            f"{path}: this is no plan to go on with ({error}); take the .geojson of vrspray plan"
+        ) from error
+    if not rows or not np.isfinite(np.array([row for _, row in rows])).all():
+        raise PlanError(f"{path}: there is no spray line in it; take the .geojson of vrspray plan")
+    return _merged(rows)
+
+
+def _local(points: list[Any], frame: LocalFrame) -> Floats:
+    (first_lon, first_lat), (last_lon, last_lat) = points[0][:2], points[-1][:2]
+    start = frame.to_local(float(first_lat), float(first_lon))
+    end = frame.to_local(float(last_lat), float(last_lon))
+    return np.array([*start, *end])
+
+
+def _merged(rows: list[tuple[int, Floats]]) -> list[tuple[int, Floats]]:
+    """Return lines; legs that follow each other straight on are one."""
+    found: list[tuple[int, Floats]] = []
+    for sortie, row in rows:
+        if lengths_m(row[None, :])[0] < 1e-3:
+            continue
+        if found and found[-1][0] == sortie and _goes_on(found[-1][1], row):
+            found[-1] = (sortie, np.concatenate([found[-1][1][:2], row[2:]]))
+        else:
+            found.append((sortie, row))
+    return found
+
+
+def _goes_on(first: Floats, second: Floats) -> bool:
+    if math.dist(first[2:].tolist(), second[:2].tolist()) > TOUCH_M:
+        return False
+    one, other = directions(np.array([first, second]))
+    return float(one @ other) > math.cos(math.radians(STRAIGHT_DEG))
+
+
+def remaining(
+    rows: list[tuple[int, Floats]], since: Break, *, width_m: float, frame: LocalFrame
+) -> Remaining:
+    """Return what is left of the lines of a plan.
+
+    Raises:
+        PlanError: where the stop is not on a line of the plan, or nothing is left.
+    """
+    done: list[Floats] = []
+    left = rows
+    if since.stop is not None:
+        done, left = _from_stop(rows, since, since.stop, width_m=width_m, frame=frame)
+    lines = [row for _, row in left]
+    if since.treated is not None:
+        parts = [_untreated(row, since.treated) for row in lines]
+        done += [row for row in lines if since.treated.intersects(_line(row))]
+        lines = [row for some in parts for row in some]
+    if not lines:
+        raise PlanError("nothing of the plan is left: all of its lines are done")
+    known = np.array(lines)
+    return Remaining(
+        lines=known,
+        done=np.array(done) if done else np.empty((0, 4)),
+        angle_deg=course_deg(np.array([row for _, row in rows])),
+    )
+
+
+def _from_stop(
+    rows: list[tuple[int, Floats]],
+    since: Break,
+    stop: tuple[float, float],
+    *,
+    width_m: float,
+    frame: LocalFrame,
+) -> tuple[list[Floats], list[tuple[int, Floats]]]:
+    place = Point(stop)
+    far_m = [
+        _line(row).distance(place) if since.sortie in (None, sortie) else math.inf
+        for sortie, row in rows
+    ]
+    at = int(np.argmin(far_m))
+    if not far_m[at] <= width_m / 2.0:
+        where = frame.to_geographic(*stop)
+        which = "the plan" if since.sortie is None else f"sortie {since.sortie}"
+        raise PlanError(
+            f"--from {where[0]:.6f},{where[1]:.6f} lies {far_m[at]:.3g} m from the next line of "
+            f"{which}; give the place where the spraying stopped, and --sortie"
+        )
+    sortie, row = rows[at]
+    line = _line(row)
+    again_m = max(line.project(place) - since.overlap_m, 0.0)
+    begin = line.interpolate(again_m)
+    rest = np.array([begin.x, begin.y, *row[2:]])
+    flown = np.array([*row[:2], begin.x, begin.y])
+    done = [each for _, each in rows[:at]] + ([flown] if again_m > 0.0 else [])
+    left = [(sortie, rest)] if line.length - again_m >= LINE_MIN_M else []
+    return done, left + rows[at + 1 :]
+
+
+def _untreated(row: Floats, treated: BaseGeometry) -> list[Floats]:
+    """Return the parts of a line whose middle lies off the treated ground."""
+    parts = shapely.get_parts(_line(row).difference(treated))
+    return [
+        np.array([*part.coords[0], *part.coords[-1]]) for part in parts if part.length >= LINE_MIN_M
+    ]
+
+
+def _line(row: Floats) -> LineString:
+    return LineString([row[:2], row[2:]])
+
+
+def course_deg(lines: Floats) -> float:
+    """Return the course of most metres of lines, 0 to 180.
+
+    >>> course_deg(np.array([[0.0, 0.0, 0.0, 9.0], [0.0, 9.0, 3.0, 9.0], [3.0, 9.0, 3.0, 0.0]]))
+    0.0
+    """
+    courses = np.degrees(np.arctan2(lines[:, 2] - lines[:, 0], lines[:, 3] - lines[:, 1])) % 180.0
+    keys = np.round(courses, 1) % 180.0
+    each, which = np.unique(keys, return_inverse=True)
+    best = int(np.argmax(np.bincount(which.ravel(), weights=lengths_m(lines))))
+    longest = np.flatnonzero(keys == each[best])
+    return float(courses[longest[int(np.argmax(lengths_m(lines)[longest]))]])

@@ -1,0 +1,203 @@
+"""Run-in and run-out: passes that begin and end at speed, where there is room beyond their ends.
+
+From rest to a speed v takes v^2 / 2a of way. Where the ground beyond the end of a line may be
+flown over, the aircraft starts that far before it and brakes that far behind it; where it may
+not, the pass begins as fast as the room allows, and that is said.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from companion.core.frame import LocalFrame
+from missions.field import Field
+from missions.plan import Leg, Place, Settings, Sortie
+from missions.turns import Motion
+
+# Less room is not worth a waypoint: at 2.5 m/s2 it is 1.6 m/s.
+ROOM_MIN_M = 0.5
+TOUCH_M = 1e-6
+# A pass that begins at so much of its speed is not worth a word.
+NEARLY = 0.95
+# Cosine of what counts as straight into a line.
+STRAIGHT = 1.0 - 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunIn:
+    """How much way passes get beyond their ends, at most; None takes what the speed needs.
+
+    `ground` is where it may lie; None is the field that may be flown over.
+    """
+
+    run_m: float | None = None
+    ground: BaseGeometry | None = None
+
+    def wanted_m(self, speed_m_s: float, acceleration_m_s2: float) -> float:
+        """Return the way from rest to a speed, or what is asked for.
+
+        >>> RunIn().wanted_m(6.0, 2.5), RunIn(run_m=4.0).wanted_m(6.0, 2.5)
+        (7.2, 4.0)
+        """
+        needed_m = speed_m_s**2 / (2.0 * acceleration_m_s2)
+        return needed_m if self.run_m is None else min(self.run_m, needed_m)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _End:
+    """One end of a pass with its room: `beyond` is where the run begins or ends."""
+
+    at: Place
+    beyond: Place
+    speed_m_s: float
+
+
+def with_run_ins(
+    sorties: Sequence[Sortie], field: Field, settings: Settings, run_in: RunIn
+) -> tuple[Sortie, ...]:
+    """Return the sorties with run-ins and run-outs, as far as there is room for them."""
+    ground = field.fly if run_in.ground is None else run_in.ground
+    space = ground.buffer(TOUCH_M, join_style="mitre")
+    shapely.prepare(space)
+    drawn = _Drawn(space=space, settings=settings, run_in=run_in)
+    return tuple(replace(sortie, legs=drawn.legs(sortie.legs)) for sortie in sorties)
+
+
+def slow_starts(
+    sorties: Sequence[Sortie], frame: LocalFrame, settings: Settings
+) -> tuple[str, ...]:
+    """Return how many passes begin below their speed, and where the slowest does."""
+    starts = [
+        (_start_m_s(before, line, settings.acceleration_m_s2), line.speed_m_s, line.points[0])
+        for sortie in sorties
+        for before, line in pairwise(sortie.legs)
+        if line.kind == "spray" and before.kind != "spray" and not _is_through(before)
+    ]
+    slow = [each for each in starts if each[0] < NEARLY * each[1]]
+    if not slow:
+        return ()
+    speed, wanted, at = min(slow, key=lambda each: (each[0] - each[1], each[2]))
+    latitude_deg, longitude_deg = frame.to_geographic(*at)
+    return (
+        f"{len(slow)} of {len(starts)} passes begin below their speed for want of room, the "
+        f"slowest at {speed:.1f} instead of {wanted:g} m/s near {latitude_deg:.6f}, "
+        f"{longitude_deg:.6f}; allow ways outside the field (mission.overrun)",
+    )
+
+
+def _is_through(leg: Leg) -> bool:
+    """Return whether a way is flown through without a stop: its time says so."""
+    return leg.seconds < leg.length_m / leg.speed_m_s - 1e-9
+
+
+def _start_m_s(before: Leg, line: Leg, acceleration_m_s2: float) -> float:
+    """Return how fast a line can be begun from the straight part of the way before it."""
+    straight = np.subtract(before.points[-1], before.points[-2])
+    along = np.subtract(line.points[-1], line.points[0])
+    room_m = float(np.hypot(*straight))
+    if not float(straight @ along) > STRAIGHT * room_m * float(np.hypot(*along)):
+        return 0.0
+    return min(line.speed_m_s, math.sqrt(2.0 * acceleration_m_s2 * room_m))
+
+
+class _Drawn:
+    """Legs with more way at the ends of the passes."""
+
+    def __init__(self, *, space: BaseGeometry, settings: Settings, run_in: RunIn) -> None:
+        self._space = space
+        self._settings = settings
+        self._run_in = run_in
+
+    def legs(self, legs: Sequence[Leg]) -> tuple[Leg, ...]:
+        """Return the legs of a sortie; a way that is flown through without a stop stays."""
+        found = list(legs)
+        for number, leg in enumerate(legs):
+            if leg.kind == "spray" or _is_through(leg):
+                continue
+            before = legs[number - 1] if number else None
+            after = legs[number + 1] if number + 1 < len(legs) else None
+            out = None if before is None else self._end(before.points[-1], before, onward=True)
+            into = None if after is None else self._end(after.points[0], after, onward=False)
+            way, out, into = self._way(leg, out, into)
+            found[number] = self._timed(leg, way, out, into)
+            if before is not None and out is not None:
+                found[number - 1] = self._quicker(found[number - 1], out.speed_m_s)
+            if after is not None:
+                speed = into.speed_m_s if into is not None else 0.0
+                found[number + 1] = self._quicker(after, speed)
+        return tuple(found)
+
+    def _end(self, at: Place, line: Leg, *, onward: bool) -> _End | None:
+        """Return how far the ground beyond an end of a pass is free, None without room."""
+        (x0, y0), (x1, y1) = line.points[0], line.points[-1]
+        length_m = math.hypot(x1 - x0, y1 - y0)
+        sign = 1.0 if onward else -1.0
+        along = (sign * (x1 - x0) / length_m, sign * (y1 - y0) / length_m)
+        acceleration = self._settings.acceleration_m_s2
+        room_m = self._room_m(at, along, self._run_in.wanted_m(line.speed_m_s, acceleration))
+        if not room_m >= ROOM_MIN_M:
+            return None
+        return _End(
+            at=at,
+            beyond=(at[0] + along[0] * room_m, at[1] + along[1] * room_m),
+            speed_m_s=min(line.speed_m_s, math.sqrt(2.0 * acceleration * room_m)),
+        )
+
+    def _room_m(self, at: Place, along: Place, wanted_m: float) -> float:
+        ray = shapely.LineString([at, (at[0] + along[0] * wanted_m, at[1] + along[1] * wanted_m)])
+        if shapely.covers(self._space, ray):
+            return wanted_m
+        for part in shapely.get_parts(shapely.intersection(ray, self._space)).tolist():
+            if part.distance(shapely.Point(at)) < 1e-3:
+                return float(part.length) - 2.0 * TOUCH_M
+        return 0.0
+
+    def _way(
+        self, leg: Leg, out: _End | None, into: _End | None
+    ) -> tuple[list[Place], _End | None, _End | None]:
+        """Return the way with as much of both runs as leaves it on free ground."""
+        for one, other in ((out, into), (None, into), (out, None)):
+            way = list(leg.points)
+            if one is not None:
+                way.insert(1, one.beyond)
+            if other is not None:
+                way.insert(len(way) - 1, other.beyond)
+            new = [pair for pair in pairwise(way) if pair not in set(pairwise(leg.points))]
+            if new and bool(shapely.covers(self._space, shapely.linestrings(new)).all()):
+                return way, one, other
+        return list(leg.points), None, None
+
+    def _timed(self, leg: Leg, way: list[Place], out: _End | None, into: _End | None) -> Leg:
+        """Return the leg: braking, from rest to rest between the runs, and speeding up."""
+        if out is None and into is None:
+            return leg
+        acceleration = self._settings.acceleration_m_s2
+        motion = Motion(
+            speed_m_s=leg.speed_m_s, acceleration_m_s2=acceleration, turn=self._settings.turn
+        )
+        middle = way[1 if out is not None else 0 : len(way) - 1 if into is not None else len(way)]
+        parts_m = np.array([math.dist(a, b) for a, b in pairwise(middle)])
+        if leg.kind == "transit" and len(parts_m) == 1:
+            seconds = motion.between_passes_s(float(parts_m[0]))
+        else:
+            seconds = float(motion.legs_s(parts_m).sum())
+        runs_s = sum(end.speed_m_s for end in (out, into) if end is not None) / acceleration
+        return replace(leg, points=tuple(way), seconds=seconds + runs_s)
+
+    def _quicker(self, line: Leg, speed_m_s: float) -> Leg:
+        """Return a pass, one of whose ends is flown at a speed instead of from rest.
+
+        From rest an end costs v / 2a more than flying on, from a speed u (v - u)^2 / 2av.
+        """
+        speed = line.speed_m_s
+        spared_s = (2.0 * speed * speed_m_s - speed_m_s**2) / (
+            2.0 * self._settings.acceleration_m_s2 * speed
+        )
+        return replace(line, seconds=max(line.seconds - spared_s, line.length_m / speed))

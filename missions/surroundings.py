@@ -1,0 +1,67 @@
+"""What lies around a plan: the ground below it, and the room beyond the ends of its passes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from companion.core.frame import LocalFrame
+from missions.demand import Rates
+from missions.field import Field
+from missions.paced import Paced, paced
+from missions.plan import Settings, Sortie
+from missions.run_in import RunIn, slow_starts, with_run_ins
+from missions.strips import Floats
+from missions.terrain.ground import Terrain
+from missions.terrain.heights import return_warnings
+from missions.terrain.slopes import slowed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surroundings:
+    """The ground that is followed and the run-ins that are wanted; None is neither."""
+
+    terrain: Terrain | None = None
+    run_in: RunIn | None = None
+
+    def check(self, field: Field, depots: Floats) -> None:
+        """Refuse an elevation model that does not know all of the field and its depots."""
+        if self.terrain is not None:
+            self.terrain.check_field(field, depots)
+
+    def paced(
+        self, sorties: Sequence[Sortie], rates: Rates, field: Field, settings: Settings
+    ) -> Paced:
+        """Return the sorties at the speeds that rates and slopes need, with their run-ins."""
+        found = paced(sorties, rates, settings, self.terrain)
+        if self.run_in is None:
+            return found
+        longer = with_run_ins(found.sorties, field, settings, self.run_in)
+        if self.terrain is not None:
+            longer = tuple(self._slowed(sortie, settings) for sortie in longer)
+        return replace(found, sorties=longer)
+
+    def _slowed(self, sortie: Sortie, settings: Settings) -> Sortie:
+        """Return a sortie whose new ways keep to the slopes as well."""
+        if self.terrain is None:
+            return sortie
+        legs = [
+            leg if leg.kind == "spray" else slowed(leg, self.terrain, settings)
+            for leg in sortie.legs
+        ]
+        return replace(sortie, legs=tuple(legs))
+
+    def warnings(
+        self, sorties: Sequence[Sortie], depots: Floats, frame: LocalFrame, settings: Settings
+    ) -> tuple[str, ...]:
+        """Return what to say of the way back over hills, and of passes without room."""
+        said: tuple[str, ...] = ()
+        if self.terrain is not None:
+            places = [(float(east_m), float(north_m)) for east_m, north_m in depots]
+            said += return_warnings(sorties, self.terrain, places, settings.height_m)
+        if self.run_in is not None:
+            said += slow_starts(sorties, frame, settings)
+        return said
+
+
+NOTHING_AROUND = Surroundings()

@@ -1,0 +1,136 @@
+"""Batteries: what a sortie draws, and where it ends because of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from shapely import box
+
+from companion.config.tables import MissionTable
+from missions.demand import Uniform
+from missions.energy import Battery, sortie_wh
+from missions.errors import PlanError
+from missions.plan import Leg, Plan, Settings, Sortie
+from missions.planner import plan_mission
+from missions.reading_fleet import battery_of
+from missions.turns import Motion
+from tests.unit.test_missions_plan import field_of, plan_of
+
+DRAWN = Battery(hover_w=4000.0, cruise_w=3500.0, per_kg_w=60.0)
+
+
+def with_battery(capacity_wh: float | None, **changes: float) -> Plan:
+    settings = Settings(
+        swath_width_m=6.0, speed_m_s=6.0, reserve_l=0.0,
+        battery=replace(DRAWN, capacity_wh=capacity_wh),
+        **{"moves": 800, "tank_l": 20.0, **changes},  # type: ignore[arg-type]
+    )  # fmt: skip
+    return plan_mission(field_of(box(0.0, 0.0, 200.0, 300.0)), settings, Uniform(rate_l_ha=20.0))
+
+
+def drawn_wh(plan: Plan) -> list[float]:
+    return [plan.energy_wh(sortie) or math.nan for sortie in plan.sorties]
+
+
+def test_a_sortie_draws_power_for_its_time_and_its_load() -> None:
+    line = Leg(kind="spray", points=((0.0, 0.0), (0.0, 600.0)), speed_m_s=6.0, seconds=102.4,
+               volume_l=10.0)  # fmt: skip
+    sortie = Sortie(number=1, depot=0, legs=(line,))
+    found = sortie_wh(sortie, DRAWN, height_m=5.0, reserve_l=2.0, nose_turn_s=4.0)
+    joules = 100.0 * 3500.0 + 2.4 * 4000.0 + 102.4 * 60.0 * 7.0  # along the line: 7 L on average
+    joules += 2.0 * (4000.0 + 60.0 * 12.0) + 10.0 / 3.0 * (4000.0 + 60.0 * 2.0)
+    joules += 4.0 * (4000.0 + 60.0 * 7.0)
+    assert found == pytest.approx(joules / 3600.0)
+
+
+def test_no_sortie_draws_more_than_the_battery_has_above_its_reserve() -> None:
+    whole = with_battery(None)
+    small = with_battery(300.0)
+    assert max(drawn_wh(whole)) > 240.0
+    assert max(drawn_wh(small)) <= 240.0
+    assert len(small.sorties) > len(whole.sorties)
+    assert small.volume_l == pytest.approx(whole.volume_l)
+    assert small.length_m("spray") == pytest.approx(whole.length_m("spray"))
+
+
+def test_a_battery_that_lasts_changes_nothing() -> None:
+    assert with_battery(None).sorties == plan_of(
+        box(0.0, 0.0, 200.0, 300.0), moves=800, tank_l=20.0
+    ).sorties  # fmt: skip
+    large = with_battery(100_000.0)
+    assert [each.legs for each in large.sorties] == [
+        each.legs for each in with_battery(None).sorties
+    ]
+
+
+def test_one_tank_is_cut_inside_a_line_where_the_battery_ends() -> None:
+    plan = with_battery(170.0, tank_l=40.0)
+    ends = {leg.points[-1] for sortie in plan.sorties for leg in sortie.legs if leg.kind == "spray"}
+    inside = [north_m for _, north_m in ends if 20.0 < north_m < 280.0]
+    assert inside
+    assert max(drawn_wh(plan)) <= 136.0
+
+
+def test_turning_the_nose_takes_time_and_energy_unless_the_aircraft_strafes() -> None:
+    quick, slow = with_battery(None), with_battery(None, nose_rate_deg_s=30.0)
+    sortie = slow.sorties[0]
+    assert slow.airborne_s(sortie) > quick.airborne_s(quick.sorties[0]) + 180.0 / 30.0
+    assert drawn_wh(slow)[0] > drawn_wh(quick)[0]
+    strafing = replace(slow, settings=replace(slow.settings, turn="strafe"))
+    assert strafing.nose_s(sortie) == 0.0
+
+
+def test_a_fresh_battery_is_put_in_only_where_the_old_one_does_not_last() -> None:
+    none, some, each = with_battery(10_000.0), with_battery(900.0), with_battery(300.0)
+    assert not any(sortie.swaps for sortie in none.sorties)
+    assert len({sortie.swaps for sortie in some.sorties[1:]}) == 2
+    left_wh = 720.0
+    for sortie, used_wh in zip(some.sorties, drawn_wh(some), strict=True):
+        assert sortie.swaps == (used_wh > left_wh)
+        left_wh = (720.0 if sortie.swaps else left_wh) - used_wh
+    assert all(sortie.swaps for sortie in each.sorties[1:])
+    later = [b.start_s - (a.start_s + each.airborne_s(a))
+             for a, b in zip(each.sorties, each.sorties[1:], strict=False)]  # fmt: skip
+    assert later == pytest.approx([120.0] * len(later))
+
+
+def test_a_battery_that_does_not_reach_the_field_is_refused_with_the_place() -> None:
+    with pytest.raises(PlanError, match=r"near 48\.\d+, 11\.\d+ .* mission\.battery_wh"):
+        with_battery(20.0)
+
+
+@pytest.mark.parametrize("missing", [{"battery_wh": 500.0}, {"power_cruise_w": 500.0}])
+def test_a_battery_needs_the_power(missing: dict[str, float]) -> None:
+    table = MissionTable.model_validate({"swath_width_m": 6.0, "speed_m_s": 6.0} | missing)
+    with pytest.raises(PlanError, match="power_hover_w is missing"):
+        battery_of(table)
+
+
+def test_without_a_power_in_cruise_that_of_hovering_holds() -> None:
+    table = MissionTable.model_validate(
+        {"swath_width_m": 6.0, "speed_m_s": 6.0, "power_hover_w": 3000.0}
+    )
+    assert battery_of(table) == Battery(hover_w=3000.0, cruise_w=3000.0)
+
+
+@given(
+    seconds=st.floats(0.0, 1e4), cruise=st.floats(0.0, 1.0), litres=st.floats(0.0, 100.0),
+    more=st.floats(0.0, 50.0),
+)  # fmt: skip
+def test_more_load_never_draws_less(
+    seconds: float, cruise: float, litres: float, more: float
+) -> None:
+    split = {"cruise_s": seconds * cruise, "other_s": seconds * (1.0 - cruise)}
+    assert DRAWN.wh(**split, litres=litres) <= DRAWN.wh(**split, litres=litres + more)
+
+
+def test_rounded_turns_are_quickest_and_stops_with_a_slow_nose_are_slowest() -> None:
+    turns = {
+        turn: Motion(speed_m_s=6.0, acceleration_m_s2=2.5, turn=turn).between_passes_s(6.0)
+        for turn in ("stop", "strafe", "rounded")
+    }
+    assert turns["rounded"] < turns["strafe"] == turns["stop"]
