@@ -32,6 +32,13 @@ def fitted_lines(ground: BaseGeometry, width_m: float, angle_deg: float, motion:
     return np.column_stack([lines[:, :2] @ turned_by, lines[:, 2:] @ turned_by])
 
 
+def has_edges_along(ground: BaseGeometry, width_m: float, angle_deg: float) -> bool:
+    """Return whether there is any edge at which the lines could begin anew."""
+    turned_by = axes(angle_deg)
+    turned = shapely.transform(ground, lambda points: points @ turned_by.T)
+    return any(len(edges_along(part, width_m)) > 2 for part in shapely.get_parts(turned))
+
+
 def edges_along(part: Polygon, width_m: float) -> Floats:
     """Return where edges run along the lines, lowest and highest place of the part among them."""
     low, high = part.bounds[1], part.bounds[3]

@@ -14,7 +14,7 @@ from missions.demand import Demand, Rates, demands
 from missions.errors import PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
-from missions.fitted_lines import fitted_lines
+from missions.fitted_lines import fitted_lines, has_edges_along
 from missions.fleet import fleet_sorties
 from missions.flown import flown
 from missions.open_lines import needed_passes, open_lines
@@ -142,7 +142,7 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
         if number == 0:
             choices.append(joined([passes, inner_lines(inner, width_m, angle_deg)]))
         straights = [open_lines(ground, width_m, angle_deg)]
-        if number == 0:
+        if number == 0 and has_edges_along(ground, width_m, angle_deg):
             straights.append(fitted_lines(ground, width_m, angle_deg, motion))
         for straight in straights:
             if len(straight):

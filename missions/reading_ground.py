@@ -24,6 +24,7 @@ from missions.wind import WindBuffer
 Autopilot = Literal["ardupilot", "px4"]
 # The companion doses for the strips of its valves: passes spaced otherwise get another rate.
 SPACING_SHARE = 0.02
+CRACK_M = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,8 +123,10 @@ def run_in_of(
         outside.append(field.outline.convex_hull.buffer(500.0))
     ground = None
     if outside:
-        everything = shapely.union_all([field.fly, *outside])
-        ground = everything.difference(field.blocked) if not field.blocked.is_empty else everything
+        # Ground beside the field is digitised with cracks to it, over which one may fly.
+        everything = shapely.union_all([field.outline, *outside])
+        closed = everything.buffer(CRACK_M, join_style="mitre").buffer(-CRACK_M, join_style="mitre")
+        ground = closed.difference(field.blocked)
     return RunIn(run_m=None if wanted == "auto" else float(wanted), ground=ground)
 
 

@@ -18,6 +18,7 @@ from companion.core.interlock import (
     WIND_MARGIN_M_S,
     Limits,
     held,
+    inhibits,
 )
 from companion.core.types import Decision, Fix, Inhibit, VehicleState
 from tests.builders import SPRAYING, flying, setup
@@ -254,3 +255,56 @@ def test_an_inhibit_closes_a_valve_that_was_open() -> None:
     second, _ = step(given, replace(SPRAYING, armed=False), memory, 10.05)
     assert second.plan.is_off
     assert second.plan.sequence == first.plan.sequence + 1
+
+
+AT_THE_LIMIT: list[dict[str, object]] = [
+    {"heartbeat_received_s": 0.1},
+    {"heartbeat_received_s": -2.5},
+    {"position_received_s": 0.1},
+    {"position_received_s": -0.8},
+    {"wind_received_s": 0.1},
+    {"wind_received_s": -5.0},
+    {"wind_m_s": 0.0},
+    {"wind_m_s": 0.5},
+    {"wind_m_s": 6.0},
+    {"east_m": -20_000.0},
+    {"east_m": 20_048.0},
+    {"north_m": -20_001.0},
+    {"north_m": 20_007.0},
+    {"fix": Fix.RTK_FLOAT},
+    {"horizontal_accuracy_m": 0.0},
+    {"horizontal_accuracy_m": 0.3},
+    {"heading_deg": 360.0},
+    {"heading_deg": -360.0},
+    {"velocity_east_m_s": 1.0, "checked_speed_m_s": 1.0},
+    {"velocity_east_m_s": 12.0, "checked_speed_m_s": 12.0},
+    {"checked_speed_m_s": 6.0},
+    {"checked_speed_m_s": 4.0},
+    {"height_m": 1.0},
+    {"height_m": 10.0},
+]
+
+
+def at_zero(change: dict[str, object]) -> frozenset[Inhibit]:
+    """Return the reasons at the time 0, where differences of times are exact."""
+    young = {"heartbeat_received_s": 0.0, "position_received_s": 0.0, "wind_received_s": 0.0}
+    state: VehicleState = replace(READY, **(young | change))  # type: ignore[arg-type]
+    return inhibits(state, STRICT, field_bounds_m=(0.0, -1.0, 48.0, 7.0), now_s=0.0)
+
+
+@pytest.mark.parametrize("change", AT_THE_LIMIT)
+def test_exactly_at_a_limit_closes_nothing(change: dict[str, object]) -> None:
+    assert at_zero(change) == frozenset()
+
+
+@pytest.mark.parametrize("heading_deg", [360.5, -360.5])
+def test_no_heading_goes_round_more_than_once(heading_deg: float) -> None:
+    assert at_zero({"heading_deg": heading_deg}) == {Inhibit.HEADING_UNKNOWN}
+
+
+def test_a_margin_is_for_its_own_limit_only_and_a_tenth_of_the_room_at_most() -> None:
+    limits = Limits(height_min_m=5.0, height_max_m=6.0)
+    after = held(limits, frozenset({Inhibit.HEIGHT_BELOW_MIN}))
+    assert after == replace(limits, height_min_m=5.1)
+    after = held(limits, frozenset({Inhibit.SPEED_ABOVE_MAX, Inhibit.NOT_ARMED}))
+    assert after == replace(limits, speed_max_m_s=11.9)

@@ -126,4 +126,3 @@ def test_the_sheet_says_who_waits_for_whom() -> None:
 def test_more_aircraft_than_lines_are_refused() -> None:
     with pytest.raises(PlanError, match="5 aircraft need at least as many lines"):
         fleet(box(0.0, 0.0, 12.0, 200.0), 5)
-

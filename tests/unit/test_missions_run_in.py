@@ -13,6 +13,7 @@ import pytest
 import shapely
 from shapely import Polygon, box
 
+from companion.core.frame import LocalFrame
 from missions.demand import Uniform
 from missions.field import Field, build_field
 from missions.files.write import write_plan
@@ -21,7 +22,8 @@ from missions.planner import plan_mission
 from missions.run_in import RunIn
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from tests.bench.missions import FRAME, to_degrees
-from tests.unit.test_missions_cli import ANYANG, run
+from tests.unit.test_missions_cli import ANYANG, run, written
+from tests.unit.test_missions_wind import config_with
 
 GROUND = box(0, 0, 60, 200)
 NEEDED_M = 6.0**2 / (2.0 * 2.5)
@@ -157,3 +159,26 @@ def test_the_command_takes_metres_or_auto(
         assert "--run-in-m" in found["error"]
     else:
         assert any("for want of room" in each for each in found["warnings"]) == warned
+
+
+@pytest.mark.parametrize(
+    ("keys", "slow"),
+    [('overrun = "allowed"', False), ('overrun_areas = ["verge.geojson"]', False), ("", True)],
+)
+def test_the_configuration_says_where_run_ins_may_lie(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, keys: str, slow: bool
+) -> None:
+    config = config_with(tmp_path, f'run_in_m = "auto"\n{keys}')
+    frame = LocalFrame(latitude_deg=48.0, longitude_deg=11.0)
+    field = written(GROUND, tmp_path / "f.geojson")
+    verge = GROUND.buffer(20.0, join_style="mitre").difference(GROUND)
+    path = tmp_path / "verge.geojson"
+    geometry = json.loads(shapely.to_geojson(to_degrees(verge, frame)))
+    features = [{"type": "Feature", "properties": {}, "geometry": geometry}]
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    code, found, _ = run(
+        capsys, field, "--config", config, "--rate-l-ha", "20", "--angle-deg", "0",
+        "--out", tmp_path / "m.plan",
+    )  # fmt: skip
+    assert code == 0
+    assert any("for want of room" in each for each in found["warnings"]) == slow

@@ -196,7 +196,7 @@ def test_a_missing_post_of_a_tile_is_no_height(tmp_path: Path) -> None:
     assert math.isnan(found[1])
 
 
-def geotiff(path: Path, values: Floats, **more: Any) -> Path:
+def geotiff(path: Path, values: Any, **more: Any) -> Path:
     """Write heights around the frame's origin in UTM 32, cells of 10 m."""
     rasterio = pytest.importorskip("rasterio")
     from pyproj import Transformer

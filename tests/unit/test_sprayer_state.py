@@ -68,6 +68,13 @@ def test_a_state_follows_from_the_reasons(
     assert after(*reasons) is state
 
 
+def test_all_that_may_be_missing_at_once_may_be() -> None:
+    assert after(*ENVELOPE) is SprayerState.ARMED
+    before_flight = (Inhibit.NOT_ENABLED, Inhibit.NOT_ARMED, Inhibit.WRONG_MODE,
+                     Inhibit.NOT_IN_AIR, Inhibit.RC_SWITCH)  # fmt: skip
+    assert after(*ENVELOPE, *before_flight) is SprayerState.READY
+
+
 def test_until_the_vehicle_is_heard_it_boots_and_never_again() -> None:
     boot = BOOT
     assert after(Inhibit.NO_POSITION, before=boot) is SprayerState.BOOT
