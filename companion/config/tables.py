@@ -60,7 +60,7 @@ class PrescriptionTable(Table):
     sha256: str | None = Field(
         default=None,
         pattern=r"^[0-9a-f]{8,64}$",
-        description="first digits of the map's hash as `map check` shows it; another map is refused",
+        description="first digits of the hash that `map check` shows; another map is refused",
     )
     rate_field: Text | None = Field(
         default=None, description="where the map has several candidates"

@@ -94,12 +94,7 @@ class PulseEngine:
         if not self._now_s < plan.lease_until_s:
             self._close_all(self._now_s)
             return True
-        wanted = list(plan.duty)
-        while self._changes and self._changes[0].at_s < self._now_s:
-            # The plan took its time: this is what it has for now. To order the duty of its issue
-            # first would undo, for one minimum time, what the plan before has done already.
-            change = self._changes.popleft()
-            wanted[change.valve] = change.duty
+        wanted = self._wanted_now(plan)
         for train in self._trains:
             train.restart_s = math.inf
         for change in reversed(self._changes):
@@ -110,6 +105,18 @@ class PulseEngine:
             if duty != ordered:
                 self._order(valve, duty, at_s=self._now_s, restart=needs_restart(ordered, duty))
         return True
+
+    def _wanted_now(self, plan: SprayPlan) -> list[float]:
+        """Return the duties that a plan has for now, and leave its changes still to come.
+
+        It may have taken its time: to order the duties of its issue first would undo, for one
+        minimum time, what the plan before has done already.
+        """
+        wanted = list(plan.duty)
+        while self._changes and self._changes[0].at_s < self._now_s:
+            change = self._changes.popleft()
+            wanted[change.valve] = change.duty
+        return wanted
 
     def order(self, valve: int, duty: float, *, at_s: float, restart: bool) -> None:
         """Change one valve at `at_s` without a plan and its lease: for a driver board."""
