@@ -48,6 +48,22 @@ def serve(
     mission: Annotated[
         Path | None, typer.Option(help="Mission, .plan or .waypoints; default: the example field.")
     ] = None,
+    wait_mission: Annotated[
+        bool, typer.Option("--wait-mission", help="Wait for a mission to be uploaded, and fly it.")
+    ] = False,
+    home: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE|LAT,LON",
+            help="With --wait-mission: where the vehicle stands; of a mission file its home.",
+        ),
+    ] = None,
+    lines: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Lines of the plan, as `run` has mission.lines: judge by them."
+        ),
+    ] = None,
     scenario: Annotated[
         Path | None, typer.Option(help="Faults by the clock, and how the vehicle is (TOML).")
     ] = None,
@@ -82,13 +98,19 @@ def serve(
 
     Example: vrspray sitl serve --speed 5 --out truth
     """
+    from dataclasses import replace
+
+    from companion.cli.map_grid import parse_mark
     from companion.errors import VrsprayError
     from sitl.serve import ServeOptions
+    from sitl.serve_mission import home_of_file
 
     options = ServeOptions(
         link=link,
         autopilot=autopilot,
         mission=mission,
+        wait_mission=wait_mission,
+        lines=lines,
         scenario=scenario,
         field_config=field_config,
         profile=profile,
@@ -103,6 +125,9 @@ def serve(
         wait_s=wait_s,
     )
     try:
+        if home is not None:
+            place_deg = home_of_file(home) or parse_mark(home, "--home")
+            options = replace(options, place_deg=place_deg)
         result = _run(options)
     except VrsprayError as error:
         _print_error(str(error), as_json=json)

@@ -7,7 +7,7 @@ what truly happened.
 from __future__ import annotations
 
 import asyncio
-import math
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,22 +16,27 @@ from typing import Any
 
 from companion.assembly import build_setup
 from companion.config import Config, load
-from companion.core.frame import LocalFrame, course_deg
+from companion.core.controller import Setup
+from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
-from sitl.anyang import EXAMPLE, anyang_items
+from sitl.anyang import EXAMPLE
+from sitl.serve_mission import (
+    MissionWatch,
+    first_course_deg,
+    home_of,
+    mission_items,
+    waiting_place,
+)
+from sitl.serve_sprayer import sprayer_options
 from sitl.stub.build import StubOptions, build_autopilot, firmware_of
 from sitl.stub.firmware import Firmware
-from sitl.stub.flight_plan import starts_with_take_off
-from sitl.stub.liquid import LiquidOptions, words_of
+from sitl.stub.liquid import words_of
 from sitl.stub.liquid_entries import TAKE_OFF
-from sitl.stub.mission_file import read_mission
-from sitl.stub.mission_items import MissionItem, item_message
+from sitl.stub.mission_items import MissionItem
 from sitl.stub.operator import Operator, Step
-from sitl.stub.parameters import OUTPUT_COUNT
-from sitl.stub.px4 import px4_parameters
 from sitl.stub.scenario import Scenario, load_scenario
 from sitl.stub.server import StubServer
-from sitl.stub.sprayer import BoardKind, Sprayer, SprayerOptions
+from sitl.stub.sprayer import BoardKind, Sprayer
 from sitl.stub.truth import TruthLog
 from sitl.wire_truth import judge
 
@@ -42,6 +47,9 @@ _EPOCH_2015_S = 1_420_070_400  # MAVLink's time stamps count from there, in 10 u
 
 Say = Callable[[str], None]
 
+
+# Where nothing came within --wait-s, the state says what.
+WAITS = {Step.NO_MISSION: "no mission", Step.WAITING: "no companion"}
 
 # How the example is wired: PX4 counts actuators where ArduPilot counts outputs.
 FIELD_CONFIGS = {"ardupilot": "config.toml", "px4": "px4.toml"}
@@ -55,6 +63,9 @@ class ServeOptions:
     link: str = DEFAULT_LINK
     autopilot: str = "ardupilot"
     mission: Path | None = None
+    wait_mission: bool = False
+    place_deg: tuple[float, float] | None = None
+    lines: Path | None = None
     scenario: Path | None = None
     field_config: Path | None = None
     profile: str = "wang-2024"
@@ -94,20 +105,23 @@ class _Run:
             raise ConfigError(f"--wait-s {options.wait_s:g}: give 0 or more seconds")
         if not 0.5 <= options.speed_m_s <= 20.0:
             raise ConfigError(f"--speed {options.speed_m_s}: give 0.5 to 20 m/s")
-        config = self._config = load(
-            options.field_config or EXAMPLE / FIELD_CONFIGS.get(options.autopilot, "config.toml")
-        )
+        if options.wait_mission and options.mission is not None:
+            raise ConfigError("--wait-mission and --mission exclude each other")
+        if options.place_deg is not None and not options.wait_mission:
+            raise ConfigError("--home is for --wait-mission; a mission file has its own home")
+        config = self._config = _config(options)
         scenario = load_scenario(options.scenario) if options.scenario else Scenario()
-        items = _items(options, _firmware(options.autopilot, scenario))
+        # Read before the flight: lines or a map that cannot be used are told now, not after it.
+        self._setup = build_setup(config) if options.wait_mission or options.lines else None
+        home, items = _start(options, scenario, config, self._setup)
         start_s = time.monotonic()
-        home = LocalFrame(items[0].latitude_deg, items[0].longitude_deg)
-        self.sprayer = Sprayer(_sprayer_options(options, config, scenario), start_s=start_s)
+        self.sprayer = Sprayer(sprayer_options(options, config, scenario), start_s=start_s)
         self.autopilot = build_autopilot(
             StubOptions(
                 home=home,
                 autopilot=options.autopilot,
                 items=items,
-                heading_deg=_first_course_deg(items, home),
+                heading_deg=first_course_deg(items, home),
                 speed_m_s=options.speed_m_s,
                 gust_m_s=options.gust_m_s,
                 scenario=scenario,
@@ -119,7 +133,13 @@ class _Run:
         )
         if self.sprayer.liquid is not None:
             self.autopilot.batteries = self.sprayer.liquid.batteries
-        self.operator = Operator(self.autopilot, enable=options.enable)
+        self.mission = MissionWatch(self.autopilot, say)
+        self.operator = Operator(
+            self.autopilot,
+            enable=options.enable,
+            mission_is_there=(lambda: self.mission.is_there) if options.wait_mission else None,
+            start_s=start_s,
+        )
         self.truth = TruthLog(self.autopilot.flight.world, self.sprayer, home)
         self._options = options
         self._say = say
@@ -146,6 +166,7 @@ class _Run:
 
     def tick(self, now_s: float) -> None:
         """Let operator, sprayer and log go on; called after each tick of the stub."""
+        self.mission.tick()
         if not self._options.ground:
             self.operator.tick(now_s)
         take_off_s = self.autopilot.faults.take_off_s
@@ -157,8 +178,8 @@ class _Run:
         if self.operator.step is Step.DONE and now_s >= self.truth.until_s + _AFTER_LANDING_S:
             self._done.set()
         wait_s = self._options.wait_s
-        waiting = self.operator.step is Step.WAITING and not self._options.ground
-        if waiting and wait_s is not None and now_s - self._start_s > wait_s:
+        waiting = self.operator.step in WAITS and not self._options.ground
+        if waiting and wait_s is not None and now_s - self.operator.since_s > wait_s:
             self._gave_up = True
             self._done.set()
 
@@ -166,10 +187,10 @@ class _Run:
         """Return the summary, and write the truth if there is a folder for it."""
         state = "stopped" if cancelled else self.operator.step.value
         summary = {
-            "state": "no companion" if self._gave_up else state,
+            "state": WAITS.get(self.operator.step, state) if self._gave_up else state,
             "enabled": self.operator.enabled,
             "seed": self._options.seed,
-            "speed_m_s": self._options.speed_m_s,
+            **self._of_mission(),
             "late_ms": _spread_ms(self.late_s),
             **self.truth.summary(),
         }
@@ -185,12 +206,22 @@ class _Run:
             summary["out"] = str(self._options.out)
         return summary
 
+    def _of_mission(self) -> dict[str, Any]:
+        """Return the speed of the flight, and how long the mission is that was uploaded."""
+        speed_m_s = self._options.speed_m_s
+        if not self._options.wait_mission:
+            return {"speed_m_s": speed_m_s}
+        return {
+            "speed_m_s": round(self.mission.speed_m_s(speed_m_s), 3),
+            "uploaded_items": self.mission.count,
+        }
+
     def _judge(self, folder: Path) -> dict[str, object]:
         """Return how well the map of the configuration was put on the ground."""
         output = self._config.output
         return judge(
             folder,
-            build_setup(self._config),
+            self._setup if self._setup is not None else build_setup(self._config),
             closed_us=output.closed_us,
             full_us=output.full_us,
         )
@@ -210,6 +241,9 @@ class _Run:
             return
         self._step = self.operator.step
         self._say_due_s = now_s + _SAY_EVERY_S
+        if self._step in WAITS:
+            self._say(self._step.value)
+            return
         pose = self.autopilot.flight.world.pose_at(now_s)
         self._say(
             f"{self._step.value}: {self.truth.distance_m:.0f} m flown, {pose.speed_m_s:.1f} m/s, "
@@ -243,101 +277,21 @@ def _can_be(autopilot: str, scenario: Scenario) -> bool:
     return True
 
 
-def _items(options: ServeOptions, firmware: Firmware) -> tuple[MissionItem, ...]:
-    """Return the mission of the file, or the passes over the example field.
-
-    What the firmware would refuse at an upload is refused here too.
-    """
-    items = _items_of_file(options)
-    for number, item in enumerate(items[1:], start=1):
-        message = item_message(item, number, current=False, to=(0, 0))
-        if firmware.refuses_item(message) is not None:
-            raise ConfigError(
-                f"{options.mission}: item {number}: {firmware.name} takes no command "
-                f"{item.command} in frame {item.frame}"
-            )
-    return items
+def _config(options: ServeOptions) -> Config:
+    """Return the companion's configuration, with the lines that are to be judged by."""
+    path = options.field_config or EXAMPLE / FIELD_CONFIGS.get(options.autopilot, "config.toml")
+    if options.lines is None:
+        return load(path)
+    return load(path, overrides=[f"mission.lines={json.dumps(str(options.lines.resolve()))}"])
 
 
-def _items_of_file(options: ServeOptions) -> tuple[MissionItem, ...]:
-    if options.mission is None:
-        return anyang_items(options.speed_m_s)
-    items = read_mission(options.mission)
-    if not starts_with_take_off(items):
-        raise ConfigError(f"{options.mission}: the first item must be a take-off")
-    if items[0].has_place:
-        return items
-    places = [item for item in items if item.has_place]
-    if not places:
-        raise ConfigError(f"{options.mission}: no item has a place; plan at least one waypoint")
-    return (places[0], *items[1:])
-
-
-def _first_course_deg(items: tuple[MissionItem, ...], home: LocalFrame) -> float:
-    """Return the direction of the first leg, so that the vehicle stands ready for it."""
-    for item in items[1:]:
-        if item.has_place:
-            east_m, north_m = home.to_local(item.latitude_deg, item.longitude_deg)
-            if math.hypot(east_m, north_m) > 1.0:
-                return course_deg(east_m, north_m)
-    return 0.0
-
-
-def _drive_channels(config: Config) -> tuple[int, ...]:
-    """Return the channels of the motors, as the configuration has them."""
-    pump = () if config.pump is None else (config.pump,)
-    motors = (*pump, *config.atomiser)
-    if any(motor.output != "autopilot" for motor in motors):
-        raise ConfigError(
-            f'{config.path}: a motor with output = "pwm" hangs on this computer, where the '
-            "simulated autopilot does not see it; fly it with `vrspray sitl fly`"
-        )
-    return tuple(motor.channel for motor in motors)
-
-
-def _pins(options: ServeOptions, scenario: Scenario, channels: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the output of each channel; PX4's are actuators, which parameters place."""
-    if options.autopilot != "px4":
-        return channels
-    parameters = px4_parameters()
-    for name, value in scenario.parameters.items():
-        if name in parameters:
-            parameters.put(name, value)
-    actuators = {
-        int(parameters[f"PWM_MAIN_FUNC{pin}"]) - 300: pin for pin in range(OUTPUT_COUNT, 0, -1)
-    }
-    # An actuator that no output shows is a valve that nobody opens.
-    return tuple(actuators.get(channel, -channel) for channel in channels)
-
-
-def _liquid(options: ServeOptions, scenario: Scenario) -> LiquidOptions | None:
-    """Return what goes wrong with the liquid and who sees it; None where nothing is asked for."""
-    batteries = (scenario.meter_battery, scenario.tank_battery)
-    if options.autopilot == "px4" and batteries != (None, None):
-        raise ConfigError(
-            f"{scenario.source}: sensors: PX4 has no fuel flow meter; leave meter_battery and "
-            "tank_battery out, or give --autopilot ardupilot"
-        )
-    found = LiquidOptions(
-        entries=scenario.liquid,
-        meter_battery=scenario.meter_battery,
-        tank_battery=scenario.tank_battery,
-        tank_l=scenario.tank_l,
-        pressure_folder=options.sensors,
-    )
-    return None if found == LiquidOptions() else found
-
-
-def _sprayer_options(options: ServeOptions, config: Config, scenario: Scenario) -> SprayerOptions:
-    """Return the sprayer as the configuration wires it."""
-    return SprayerOptions(
-        profile=options.profile,
-        board=options.board,
-        channels=_pins(options, scenario, tuple(valve.channel for valve in config.boom().valves)),
-        closed_us=config.output.closed_us,
-        full_us=config.output.full_us,
-        box_closed_s=scenario.box_closed_s,
-        liquid=_liquid(options, scenario),
-        seed=options.seed,
-        drive_channels=_pins(options, scenario, _drive_channels(config)),
-    )
+def _start(
+    options: ServeOptions, scenario: Scenario, config: Config, setup: Setup | None
+) -> tuple[LocalFrame, tuple[MissionItem, ...]]:
+    """Return where the vehicle stands, and its mission if it has one."""
+    firmware = _firmware(options.autopilot, scenario)
+    if setup is not None and options.wait_mission:
+        is_example = options.field_config is None
+        return waiting_place(options.place_deg, config, setup, is_example=is_example), ()
+    items = mission_items(options.mission, options.speed_m_s, firmware)
+    return home_of(items), items

@@ -1,4 +1,4 @@
-"""The friendly operator: waits for the companion, flies the mission, enables spraying, lands.
+"""The friendly operator: waits for mission and companion, flies, enables spraying, lands.
 
 It holds the stub's transmitter (arming, modes) and a ground station (255/190), from which
 MAV_CMD_DO_SPRAYER goes to the companion over the same link.
@@ -6,6 +6,7 @@ MAV_CMD_DO_SPRAYER goes to the companion over the same link.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import Enum
 
 from sitl.stub.autopilot import Autopilot
@@ -30,6 +31,7 @@ _RETRY_ARMING_S = 5.0
 class Step(Enum):
     """How far the operator has come."""
 
+    NO_MISSION = "waiting for a mission"
     WAITING = "waiting for a companion"
     SETTLING = "companion heard"
     FLYING = "flying"
@@ -38,14 +40,27 @@ class Step(Enum):
 
 
 class Operator:
-    """Acts at each `tick`; `enabled` says whether the companion has taken the enable."""
+    """Acts at each `tick`; `enabled` says whether the companion has taken the enable.
 
-    def __init__(self, autopilot: Autopilot, *, enable: bool = True) -> None:
-        self.step = Step.WAITING
+    With `mission_is_there` it waits for that first, and then for a companion that beats afterwards:
+    what was on the link before may have gone. `since_s` is when it began to wait.
+    """
+
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        *,
+        enable: bool = True,
+        mission_is_there: Callable[[], bool] | None = None,
+        start_s: float = 0.0,
+    ) -> None:
+        self.step = Step.WAITING if mission_is_there is None else Step.NO_MISSION
+        self.since_s = start_s
         self.enabled = False
         self.companion_texts: list[str] = []
         self._autopilot = autopilot
         self._enable = enable
+        self._mission_is_there = mission_is_there
         self._ground = Speaker(GROUND_SYSTEM, GROUND_COMPONENT)
         self._heard_s: float | None = None
         self._due_s = 0.0
@@ -66,7 +81,9 @@ class Operator:
     def tick(self, now_s: float) -> None:
         """Take the step that is due."""
         flight = self._autopilot.flight
-        if self.step is Step.WAITING and self._heard_s is not None:
+        if self.step is Step.NO_MISSION:
+            self._look_for_mission(now_s)
+        elif self.step is Step.WAITING and self._heard_s is not None:
             self.step = Step.SETTLING
         elif self.step is Step.SETTLING and now_s - (self._heard_s or now_s) >= _SETTLE_S:
             self._take_off(now_s)
@@ -74,6 +91,10 @@ class Operator:
             self._attend(now_s)
         elif self.step is Step.LANDING and flight.phase is Phase.GROUND:
             self.step = Step.DONE
+
+    def _look_for_mission(self, now_s: float) -> None:
+        if self._mission_is_there is None or self._mission_is_there():
+            self.step, self.since_s, self._heard_s = Step.WAITING, now_s, None
 
     def _take_off(self, now_s: float) -> None:
         """Arm and start the mission; a refusal is tried again, but not at every tick."""
