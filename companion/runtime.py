@@ -22,7 +22,17 @@ from typing import Any, TypeVar
 
 from companion.core.controller import Memory, Setup, step
 from companion.core.estimator import Track, estimate, observe
-from companion.core.types import Decision, Finding, Input, OutputReport
+from companion.core.types import (
+    Decision,
+    EstopReport,
+    Finding,
+    HeartbeatReport,
+    Input,
+    OperatorCommand,
+    OutputReport,
+    StandstillReport,
+)
+from companion.errors import SensorError
 from companion.ports import PlanExecutor, Recorder, Sensor, VehicleLink
 
 _logger = logging.getLogger(__name__)
@@ -31,9 +41,24 @@ T = TypeVar("T")
 
 SWITCH_S = 0.0002
 
+# Turns are at most STEP_MAX_S apart; this far, and the process was stopped, or the computer slept:
+# longer than any lease's worth of waiting on a busy computer that is still fit to spray.
+STANDSTILL_S = 0.5
+# Of what arrives so soon after it nobody can say how long it has waited: full buffers are read in
+# some tenths of a second.
+DEAF_S = 1.0
+# A start that fails on a sensor waits so long for the vehicle, to have its valves ordered closed:
+# heartbeats come once a second.
+LEAVE_CLOSED_S = 3.0
+
 # Between messages a step follows at the latest after this: often enough for the lease and for the
 # sign of life to the autopilot's watchdog (10 Hz), and not just before a position at 20 Hz.
 STEP_MAX_S = 0.06
+
+
+def boot_time_s() -> float:
+    """Return the time since the start of the computer, its sleep included."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class NoRecorder:
@@ -61,8 +86,12 @@ class ControlLoop:
         recorder: Recorder,
         clock: Callable[[], float],
         sensors: Sequence[Sensor] = (),
+        boot_clock: Callable[[], float] | None = None,
     ) -> None:
         self._setup = setup
+        self._boot_clock = boot_clock or boot_time_s
+        self._turned_boot_s: float | None = None
+        self._deaf_until_s = float("-inf")
         self._link = link
         self._executor = executor
         self._recorder = recorder
@@ -81,11 +110,11 @@ class ControlLoop:
 
     def turn(self) -> Decision | None:
         """Take what came in and decide; without news and before its time, do nothing."""
-        inputs = [*self._link.receive(), *self._output_report()]
-        if not inputs and self._clock() < self.next_step_s:
-            return None
+        inputs = [*self._standstill(), *self._heard(), *self._output_report()]
         for sensor in self._sensors:
             inputs.extend(sensor.read(self._clock()))
+        if not inputs and self._clock() < self.next_step_s:
+            return None
         for item in inputs:
             self._recorder.record_input(item)
             self._track = observe(self._track, item, self._setup)
@@ -97,6 +126,25 @@ class ControlLoop:
         if decision.findings:
             self._tell_findings(decision)
         return decision
+
+    def _standstill(self) -> Iterator[Input]:
+        """Yield that this process stood still, if it did: of sleep only the boot clock knows."""
+        boot_s, before_s = self._boot_clock(), self._turned_boot_s
+        self._turned_boot_s = boot_s
+        if before_s is None or boot_s - before_s <= STANDSTILL_S:
+            return
+        gap_s = boot_s - before_s
+        self._deaf_until_s = boot_s + DEAF_S
+        text = f"stood still for {gap_s:.1f} s"
+        _logger.warning("%s; positions have to be confirmed anew", text)
+        self._link.tell_fault(text)
+        self._recorder.record_event(self._clock(), "standstill", text)
+        yield StandstillReport(received_s=self._clock(), gap_s=gap_s)
+
+    def _heard(self) -> list[Input]:
+        """Return what came in; after a standstill only what closes, and who the vehicle is."""
+        is_deaf = self._turned_boot_s is not None and self._turned_boot_s < self._deaf_until_s
+        return [item for item in self._link.receive() if not is_deaf or _may_have_waited(item)]
 
     def _tell_findings(self, decision: Decision) -> None:
         """Say once of each fault of the liquid what it is; that of a valve again with its name."""
@@ -142,6 +190,13 @@ class ControlLoop:
             link_up=faults[1] is None,
             text=fault or "",
         )
+
+
+def _may_have_waited(item: Input) -> bool:
+    """Whether an input is good however long it has waited for us."""
+    if isinstance(item, OperatorCommand):
+        return not item.enable
+    return isinstance(item, HeartbeatReport | EstopReport)
 
 
 class _Ending:
@@ -193,11 +248,16 @@ async def run(
         try:
             await link.open(ending.wake.set)
             async with contextlib.AsyncExitStack() as opened:
-                for sensor in sensors:
-                    opened.push_async_callback(sensor.close)
-                    await sensor.open(ending.wake.set)
                 try:
+                    # Closed is ordered before anything that may fail.
                     await executor.start()
+                    try:
+                        for sensor in sensors:
+                            opened.push_async_callback(sensor.close)
+                            await sensor.open(ending.wake.set)
+                    except SensorError:
+                        await _leave_closed(link, ending)
+                        raise
                     taken.record_event(clock(), "start", "")
                     control = ControlLoop(
                         setup,
@@ -215,6 +275,18 @@ async def run(
             taken.record_event(clock(), "stop", ending.reason or "failure")
     _logger.info("stopped: %s", ending.reason)
     return 0
+
+
+async def _leave_closed(link: VehicleLink, ending: _Ending) -> None:
+    """Wait for the vehicle: the executor orders all closed as soon as it is met."""
+    loop = asyncio.get_running_loop()
+    until_s = loop.time() + LEAVE_CLOSED_S
+    while ending.reason is None and loop.time() < until_s:
+        link.receive()
+        link.tell(None, loop.time())
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(ending.wake.wait(), STEP_MAX_S)
+        ending.wake.clear()
 
 
 async def _turn_until_the_end(

@@ -36,6 +36,7 @@ from companion.core.types import (
     RateOverride,
     RcReport,
     SpeedReport,
+    StandstillReport,
     StopAhead,
     TankReport,
     Telemetry,
@@ -54,6 +55,8 @@ STATUS_AGE_MAX_S = 5.0
 # Both are asked for at 5 to 10 Hz, of which a slowed-down link leaves a quarter.
 RC_AGE_MAX_S = 2.0
 RANGE_AGE_MAX_S = 1.0
+# A companion that stood still for longer asks the operator again.
+CONSENT_STANDSTILL_S = 2.0
 # ArduPilot's and PX4's names of the mode that flies the mission.
 MISSION_MODES = frozenset({"AUTO", "MISSION"})
 RC_HIGH_US = 1700
@@ -165,6 +168,27 @@ def _observe_estop(track: Track, item: EstopReport, _setup: Setup) -> Track:
     return replace(track, estops=pressed - {item.source})
 
 
+def _observe_standstill(track: Track, item: StandstillReport, _setup: Setup) -> Track:
+    """Forget what was heard: what comes now may have waited as long as we stood still.
+
+    What the sprayer itself says stays, and the consent over a short standstill.
+    """
+    enabled = track.enabled and item.gap_s <= CONSENT_STANDSTILL_S
+    return Track(
+        heartbeat=track.heartbeat if enabled else None,
+        wind=track.wind,
+        output=track.output,
+        flow=track.flow,
+        pressure=track.pressure,
+        tank=track.tank,
+        braking_m_s2=track.braking_m_s2,
+        rate_percent=track.rate_percent,
+        enabled=enabled,
+        operator_wishes=track.operator_wishes,
+        estops=track.estops,
+    )
+
+
 def _wished(track: Track, enabled: bool) -> Track:
     """Return the track after a wish; to repeat that one may spray is no new wish."""
     is_new = not (enabled and track.enabled)
@@ -198,6 +222,7 @@ _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
     HeartbeatReport: _observe_heartbeat,
     OperatorCommand: _observe_operator,
     EstopReport: _observe_estop,
+    StandstillReport: _observe_standstill,
     RcReport: _observe_rc,
     BatteryReport: _observe_battery,
 }
@@ -307,6 +332,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         ),
         heartbeat_received_s=None if heartbeat is None else heartbeat.received_s,
         armed=heartbeat is not None and heartbeat.armed,
+        active=heartbeat is not None and heartbeat.active,
         mode=None if heartbeat is None else heartbeat.mode,
         in_air=track.landed.in_air if track.landed and _young(track.landed, now_s) else None,
         wind_m_s=track.wind.speed_m_s if track.wind else None,

@@ -136,6 +136,8 @@ def _vehicle(state: VehicleState, limits: Limits, now_s: float) -> list[Inhibit]
         found.append(Inhibit.STALE_HEARTBEAT)
     if not state.armed:
         found.append(Inhibit.NOT_ARMED)
+    if not state.active:
+        found.append(Inhibit.NOT_ACTIVE)
     if not limits.allows(state.mode):
         found.append(Inhibit.WRONG_MODE)
     if state.in_air is not True:

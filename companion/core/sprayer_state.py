@@ -39,6 +39,7 @@ ENVELOPE = frozenset(
 _BEFORE_FLIGHT = ENVELOPE | {
     Inhibit.NOT_ENABLED,
     Inhibit.NOT_ARMED,
+    Inhibit.NOT_ACTIVE,
     Inhibit.WRONG_MODE,
     Inhibit.NOT_IN_AIR,
     Inhibit.RC_SWITCH,

@@ -45,6 +45,7 @@ class Inhibit(StrEnum):
     NO_HEARTBEAT = "no-heartbeat"
     STALE_HEARTBEAT = "stale-heartbeat"
     NOT_ARMED = "not-armed"
+    NOT_ACTIVE = "not-active"
     WRONG_MODE = "wrong-mode"
     NOT_IN_AIR = "not-in-air"
     FIX_TOO_LOW = "fix-too-low"
@@ -167,6 +168,7 @@ class HeartbeatReport:
     autopilot: str
     armed: bool
     mode: str
+    active: bool = True  # MAV_STATE_ACTIVE: no failsafe, no emergency
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,6 +229,14 @@ class OutputReport:
     healthy: bool
     text: str = ""
     link_up: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StandstillReport:
+    """The companion itself stood still: a stopped process, a computer that slept."""
+
+    received_s: float
+    gap_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -344,6 +354,7 @@ Input = (
     | OperatorCommand
     | OutputReport
     | EstopReport
+    | StandstillReport
     | FlowReport
     | PressureReport
     | TankReport
@@ -409,6 +420,7 @@ class VehicleState:
     horizontal_accuracy_m: float | None = None  # None: the receiver does not tell
     link_up: bool = True
     estop: bool | None = None  # None: no switch has been heard of
+    active: bool = True
     operator_wishes: int = 0  # how often the operator has enabled anew, or disabled
     way: Way | None = None  # None: it is not used, or nothing was heard of it
 

@@ -39,6 +39,7 @@ from companion.link.mission_messages import CURRENT, TRANSFERS
 from companion.link.modes import autopilot_name, mode_name
 
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
+_ACTIVE = 4  # MAV_STATE: 3 is standby, 5 and above critical, emergency and the like
 _LOOKS_DOWN = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _INT16_LIMIT = 32767
 _HEADING_MAX_CDEG = 36_000  # UINT16_MAX is not known, and so is any other above a circle
@@ -110,6 +111,7 @@ def _heartbeat(m: Any, received_s: float) -> HeartbeatReport:
         received_s=received_s,
         autopilot=autopilot_name(m.autopilot),
         armed=bool(m.base_mode & ARMED),
+        active=m.system_status == _ACTIVE,
         mode=mode_name(m.autopilot, m.type, m.custom_mode),
     )
 

@@ -20,7 +20,7 @@ class LevelSource(Protocol):
         """Take the line, or raise `SensorError`."""
 
     def is_high(self) -> bool:
-        """Return the level now; OSError where it cannot be read."""
+        """Return whether it is high or has been since the last look; OSError where unknown."""
 
     def fileno(self) -> int | None:
         """Return a file that becomes readable when the level changes; None where there is none."""

@@ -18,6 +18,7 @@ class GpiodLevel:
         self._chip, self._line, self._key = chip, line, key
         self._request: Any = None
         self._high: Any = None
+        self._rising: Any = None
 
     def open(self) -> None:
         """Take the line: SensorError where the module, the chip or the line is not to be had."""
@@ -28,6 +29,7 @@ class GpiodLevel:
             bias=gpiod.line.Bias.PULL_UP,
         )
         self._high = gpiod.line.Value.ACTIVE
+        self._rising = gpiod.EdgeEvent.Type.RISING_EDGE
         try:
             self._request = gpiod.request_lines(
                 find_chip(gpiod, self._chip, SensorError),
@@ -41,13 +43,14 @@ class GpiodLevel:
             ) from error
 
     def is_high(self) -> bool:
-        """Return the level now; OSError where it cannot be read."""
+        """Return whether the level is high or has been since the last look; OSError if unknown."""
         if self._request is None:
             raise OSError("the line is not open")
-        # Events only wake; left unread they would wake for ever.
+        has_risen = False
         while self._request.wait_edge_events(_NO_WAIT):
-            self._request.read_edge_events()
-        return bool(self._request.get_value(self._line) == self._high)
+            events = self._request.read_edge_events()
+            has_risen = has_risen or any(event.event_type == self._rising for event in events)
+        return has_risen or bool(self._request.get_value(self._line) == self._high)
 
     def fileno(self) -> int | None:
         """Return the request's file, readable when the level has changed."""

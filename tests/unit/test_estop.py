@@ -90,18 +90,18 @@ async def test_a_change_wakes_the_loop_and_closing_lets_go() -> None:
 class FakeRequest:
     """What `gpiod` 2 gives for one input line."""
 
-    events: int = 0
+    events: list[str] = field(default_factory=list)
     value: str = "inactive"
     fd: int = 7
     released: int = 0
     config: dict[str, Any] = field(default_factory=dict)
 
     def wait_edge_events(self, _timeout: object) -> bool:
-        return self.events > 0
+        return bool(self.events)
 
     def read_edge_events(self) -> list[object]:
-        self.events = 0
-        return []
+        events, self.events = self.events, []
+        return [SimpleNamespace(event_type=event) for event in events]
 
     def get_value(self, _line: int) -> str:
         return self.value
@@ -121,6 +121,7 @@ def fake_module(request: FakeRequest | OSError) -> SimpleNamespace:
         __version__="2.5.0",
         request_lines=request_lines,
         LineSettings=lambda **given: given,
+        EdgeEvent=SimpleNamespace(Type=SimpleNamespace(RISING_EDGE="rising")),
         line=SimpleNamespace(
             Direction=SimpleNamespace(INPUT="input"),
             Edge=SimpleNamespace(BOTH="both"),
@@ -131,7 +132,7 @@ def fake_module(request: FakeRequest | OSError) -> SimpleNamespace:
 
 
 def test_a_line_of_gpiod_is_an_input_with_its_pull_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    request = FakeRequest(events=2)
+    request = FakeRequest(events=["falling"])
     monkeypatch.setitem(__import__("sys").modules, "gpiod", fake_module(request))
     line = GpiodLevel("/dev/null", 5, key="safety.estop_line")
     with pytest.raises(OSError, match="not open"):
@@ -142,7 +143,10 @@ def test_a_line_of_gpiod_is_an_input_with_its_pull_up(monkeypatch: pytest.Monkey
     }
     assert line.fileno() == 7
     assert not line.is_high()
-    assert request.events == 0  # left unread they would wake for ever
+    assert not request.events  # left unread they would wake for ever
+    request.events = ["rising", "falling"]
+    assert line.is_high()  # pressed and released between two looks
+    assert not line.is_high()
     request.value = "active"
     assert line.is_high()
     line.close()

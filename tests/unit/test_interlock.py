@@ -42,6 +42,7 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
     Inhibit.NO_HEARTBEAT: [{"heartbeat_received_s": None}],
     Inhibit.STALE_HEARTBEAT: [{"heartbeat_received_s": 7.49}, {"heartbeat_received_s": NAN}],
     Inhibit.NOT_ARMED: [{"armed": False}],
+    Inhibit.NOT_ACTIVE: [{"active": False}],
     Inhibit.WRONG_MODE: [{"mode": "LOITER"}, {"mode": None}],
     Inhibit.NOT_IN_AIR: [{"in_air": False}, {"in_air": None}],
     Inhibit.FIX_TOO_LOW: [{"fix": Fix.DGPS}, {"fix": None}],

@@ -43,6 +43,7 @@ from companion.core.types import (
     RateOverride,
     RcReport,
     SpeedReport,
+    StandstillReport,
     TankReport,
     Telemetry,
     WindReport,
@@ -80,6 +81,7 @@ INPUTS: list[Input] = [
     OperatorCommand(received_s=NAN, enable=True, source="web"),
     OutputReport(received_s=1.8, healthy=False, text="änderung"),
     EstopReport(received_s=1.85, pressed=True, source="line"),
+    StandstillReport(received_s=1.86, gap_s=NAN),
     FlowReport(received_s=1.9, volume_ml=0.1 + 0.2),
     ClockReport(received_s=2.1, offset_s=-1 / 3, round_trip_s=NAN),
     LegReport(

@@ -29,6 +29,7 @@ from companion.core.types import (
     RcReport,
     SpeedReport,
     SprayerState,
+    StandstillReport,
     VehicleState,
 )
 from tests.builders import SPRAYING, position, setup
@@ -258,6 +259,19 @@ def test_heartbeats_that_stay_away_take_the_consent_along(away_s: float, comes_b
     sprayer = spraying()
     assert sprayer.fly(away_s, heartbeats=False).inhibits == {Inhibit.STALE_HEARTBEAT}
     assert sprayer.fly(0.5).inhibits == (frozenset() if comes_back else {Inhibit.NOT_ENABLED})
+
+
+@pytest.mark.parametrize(("gap_s", "keeps"), [(1.9, True), (2.1, False), (math.nan, False)])
+def test_after_a_standstill_positions_are_confirmed_anew(gap_s: float, keeps: bool) -> None:
+    sprayer = spraying()
+    sprayer.now_s += 2.0
+    sprayer.hear(StandstillReport(received_s=sprayer.now_s, gap_s=gap_s))
+    closed = sprayer.step()
+    assert closed.plan.is_off
+    assert closed.inhibits == {Inhibit.NO_POSITION}
+    assert Inhibit.INVALID_POSITION in sprayer.fly(0.2).inhibits
+    last = sprayer.fly(1.5)
+    assert last.inhibits == (frozenset() if keeps else {Inhibit.NOT_ENABLED})
 
 
 def test_the_switch_is_a_wish_too() -> None:
