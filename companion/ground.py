@@ -14,6 +14,7 @@ from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
 from typing import Protocol
 
+from companion.core.ground_hold import Hold
 from companion.core.ground_state import GroundState, observe_ground
 from companion.core.ground_task import GroundTask
 from companion.core.ground_work import (
@@ -22,7 +23,6 @@ from companion.core.ground_work import (
     GroundOrder,
     GroundReason,
     GroundSetup,
-    Hold,
     ground_reasons,
     ground_step,
 )

@@ -205,13 +205,20 @@ def _ask(piece: Piece, config: Config, descriptor: int) -> None:
     word = "click" if piece.task.kind is GroundKind.CLICK else "spray"
     note(plan_line(piece))
     if piece.task.kind is not GroundKind.CLICK:
-        pump = "The pump has to run." if config.pump is None else "The pump will run."
-        note(f"Everybody away from the nozzles. {pump}")
+        note(_warning(config))
     if needs_autopilot(config):
         note("The flight controller's safety switch must be off, or nothing opens.")
     note(f"Type {word} and Enter to go on:")
     if read_line(descriptor) != word:
         raise GroundOptionError(f"ground: the word was not {word}; nothing was opened")
+
+
+def _warning(config: Config) -> str:
+    """Return what has to be so before liquid comes, or that none will."""
+    if training_mark(config) == "dry":
+        return "A dry run: no outputs are configured, nothing will open."
+    pump = "The pump has to run." if config.pump is None else "The pump will run."
+    return f"Everybody away from the nozzles. {pump}"
 
 
 def _perform(config: Config, given: tuple[str, ...], piece: Piece, hand: Hand) -> GroundOutcome:
@@ -229,7 +236,7 @@ def _perform(config: Config, given: tuple[str, ...], piece: Piece, hand: Hand) -
                 executor=executor,
                 hand=hand,
                 sensors=stops,
-                on_ready=lambda: note("Hold the space bar; any other key closes."),
+                on_ready=lambda: note(hand.invitation),
             )
 
     return runtime.execute(main)

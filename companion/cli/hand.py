@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from companion.core.ground_work import Hold
+from companion.core.ground_hold import HOLD_S, Hold
 
 KEY, ENDED, INTERRUPTED = "another-key", "stdin-ended", "interrupted"
 # Ctrl-Z and Ctrl-\\ too: a process that stands still or dies orders nothing closed. SIGHUP is a
@@ -27,6 +27,8 @@ _SIGNALS = {
     signal.SIGQUIT: INTERRUPTED,
     signal.SIGTSTP: KEY,
 }
+# A line that is longer is no line.
+_LINE_MAX = 4096
 _INPUT_FLAGS, _LOCAL_FLAGS, _CHARACTERS = 0, 3, 6
 
 
@@ -41,8 +43,18 @@ class Hand:
         self._clock = clock
         self._before: list[Any] | None = None
         self._listens = False
+        self._line = b""
         self.hold = Hold()
         self.stopped: str | None = None
+
+    @property
+    def invitation(self) -> str:
+        """Return what the operator, or the script, is told to do now."""
+        if self._is_lines:
+            return (
+                f"Lines hold, one at least every {HOLD_S:g} s; stop, or the end of stdin, closes."
+            )
+        return "Hold the space bar; any other key closes."
 
     @contextmanager
     def attending(self) -> Iterator[None]:
@@ -93,9 +105,12 @@ class Hand:
             self.hold = self.hold.renewed(self._clock())
 
     def _take_lines(self, data: bytes) -> None:
-        if b"stop" in data:
+        """Take whole lines, however they come in; the word to stop counts before its line ends."""
+        text = self._line + data
+        _, found, self._line = text.rpartition(b"\n")
+        if b"stop" in text or len(self._line) > _LINE_MAX:
             self._stop(KEY)
-        elif b"\n" in data:
+        elif found:
             self.hold = self.hold.renewed(self._clock())
 
     def _stop(self, reason: str) -> None:

@@ -35,6 +35,7 @@ def motor_contradictions(config: Config) -> Found:
     for number, table in enumerate(config.atomiser):
         yield from _atomiser(config, table, f"atomiser[{number}]")
     yield from _outputs(config)
+    yield from _closed_pulse(config)
 
 
 def motor_warnings(config: Config) -> Found:
@@ -208,13 +209,43 @@ def _rpm(config: Config, table: AtomiserTable, boom_flow_l_min: float) -> float:
     return atomiser.law.rpm_for(atomiser.droplet_um, flow_l_min) if flow_l_min > 0.0 else 0.0
 
 
-def _outputs(config: Config) -> Found:
-    """Yield outputs that are none, or that two share."""
-    every: dict[str, PumpTable | AtomiserTable] = {
-        f"atomiser[{number}]": table for number, table in enumerate(config.atomiser)
-    }
+def _every(config: Config) -> dict[str, PumpTable | AtomiserTable]:
+    """Return all motors by their keys, the pump first."""
+    every: dict[str, PumpTable | AtomiserTable] = {}
     if config.pump is not None:
         every["pump"] = config.pump
+    every |= {f"atomiser[{number}]": table for number, table in enumerate(config.atomiser)}
+    return every
+
+
+def _closed_pulse(config: Config) -> Found:
+    """Yield a closed pulse at which a motor runs.
+
+    The watchdog script has one pulse for all outputs that it guards. When this computer is dead,
+    what closes the valves has to stop the motors too.
+    """
+    output = config.output
+    for key, table in _every(config).items():
+        if table.output != "autopilot":
+            continue
+        if not output.closed_us <= table.stop_us:
+            yield (
+                "output.closed_us",
+                f"above {key}.stop_us = {table.stop_us}: the watchdog script would run that motor "
+                f"with it; write at most {table.stop_us}",
+            )
+        if not output.full_us > output.closed_us:
+            yield (
+                "output.full_us",
+                f"not above output.closed_us = {output.closed_us}: with {key} on the autopilot "
+                f"pulses must open as they grow; turn the valves' driver, or write {key}.output "
+                '= "pwm"',
+            )
+
+
+def _outputs(config: Config) -> Found:
+    """Yield outputs that are none, or that two share."""
+    every = _every(config)
     found: dict[str, tuple[str, int, int]] = {}
     for key, table in every.items():
         if table.output == "autopilot" and table.channel < 1:

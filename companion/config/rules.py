@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
+from companion.config.line_rules import line_contradictions, line_warnings
 from companion.config.motor_rules import motor_contradictions, motor_warnings
 from companion.config.motors import makes_flow
 from companion.config.sensor_rules import sensor_contradictions
@@ -49,7 +50,9 @@ def contradictions(config: Config) -> Rule:
     )  # fmt: skip
     for rule in rules:
         yield from rule(config)
-    for key, text in chain(motor_contradictions(config), sensor_contradictions(config)):
+    for key, text in chain(
+        line_contradictions(config), motor_contradictions(config), sensor_contradictions(config)
+    ):
         yield Contradiction(key=key, text=text)
 
 
@@ -85,13 +88,13 @@ def mismatches(config: Config) -> Rule:
 
 
 def without_effect(config: Config) -> Rule:
-    """Yield settings that this version accepts and does not act on: silence would deceive."""
+    """Yield settings that are not acted on, or work and are unwise: silence would deceive."""
     if config.flow_trim.enabled and config.flow_meter.source == "none":
         yield Contradiction(
             key="flow_trim.enabled",
             text="no flow meter is configured (flow_meter.source): the trim stays 1",
         )
-    for key, text in motor_warnings(config):
+    for key, text in chain(line_warnings(config), motor_warnings(config)):
         yield Contradiction(key=key, text=text)
     settings = {
         "web.enabled": config.web.enabled,

@@ -35,13 +35,6 @@ def _meter(config: Config) -> Found:
             "flow_meter.pulses_per_l",
             "missing; write the pulses of a litre, measured with a bucket",
         )
-    lines = {
-        valve.channel
-        for valve in config.valve
-        if config.output.kind == "gpio" and valve.channel is not None
-    }
-    if table.line in lines and table.chip == config.output.chip:
-        yield "flow_meter.line", "a valve has this line; give the meter its own"
 
 
 def _pressure(config: Config) -> Found:

@@ -89,6 +89,7 @@ class Track:
     tank: TankReport | None = None
     leg: Leg | None = None
     way: Way | None = None  # only where lines are to be followed
+    way_before: Way | None = None
     braking_m_s2: float | None = None  # as seen at the ends of legs so far
     rate_percent: float = 100.0
     enabled: bool = False
@@ -106,8 +107,14 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
     if isinstance(item, LegReport):
         leg = leg_of(item, setup.frame, setup.mission_braking_m_s2)
         way = None if setup.lines is None else way_of(item, setup.frame)
-        return replace(track, leg=leg, way=way)
+        before = track.way if _is_new_way(track.way, way) else track.way_before
+        return replace(track, leg=leg, way=way, way_before=before)
     return _KEEP[type(item)](track, item)
+
+
+def _is_new_way(before: Way | None, now: Way | None) -> bool:
+    """Return whether another leg is flown than before."""
+    return now is None or before is None or replace(before, received_s=now.received_s) != now
 
 
 # Reports of which only the last one counts.
@@ -350,6 +357,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         rate_percent=track.rate_percent,
         stop_ahead=_stop_ahead(track, east, north, now_s),
         way=track.way,
+        way_before=track.way_before,
     )
 
 

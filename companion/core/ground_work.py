@@ -12,18 +12,16 @@ import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from companion.core.ground_hold import EARLY_S, HOLD_S, Hold
 from companion.core.ground_state import GroundState
 from companion.core.ground_task import PIECE_MAX_S, GroundTask
 from companion.core.types import DrivePlan, SprayPlan, TimedChange
 
-# A key that is held repeats 10 to 30 times a second; this is what may lie between two repeats.
-HOLD_S = 0.5
 # EXTENDED_SYS_STATE is asked for at 2 Hz.
 LANDED_AGE_MAX_S = 2.5
 # Whoever has started has this long to begin holding; then it needs a new start.
 START_MAX_S = 30.0
 MISSION_MODES = frozenset({"AUTO", "MISSION"})
-_EARLY_S = -0.1
 # Sums of times are right to far better than this, and no valve is faster.
 _BIT_S = 1e-6
 
@@ -67,26 +65,6 @@ class GroundSetup:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Hold:
-    """The dead-man: a key that repeats. One stroke is no hold, two within `HOLD_S` are."""
-
-    first_s: float = -math.inf
-    last_s: float = -math.inf
-
-    def renewed(self, now_s: float) -> Hold:
-        """Return the hold after one more stroke; after a gap it begins anew."""
-        if not self.last_s < now_s < math.inf:
-            return self
-        is_kept = now_s < self.last_s + HOLD_S
-        return Hold(first_s=self.first_s if is_kept else now_s, last_s=now_s)
-
-    def is_held(self, now_s: float) -> bool:
-        """Whether the key is down now."""
-        young = now_s < self.last_s + HOLD_S and now_s - self.last_s >= _EARLY_S
-        return young and self.first_s < self.last_s
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class GroundOrder:
     """A deliberate start of a piece of work, and the key that is held since."""
 
@@ -101,6 +79,8 @@ class GroundMemory:
 
     sequence: int = 0
     started_s: float = -math.inf
+    stepped_s: float | None = None  # the step before
+    anew_s: float = -math.inf  # the end of this process's last standstill
     began_s: float | None = None  # first opening of this piece
     since_s: float | None = None  # open without a break since
     done_s: float = 0.0  # of the work, before `since_s`
@@ -129,13 +109,18 @@ def ground_step(
     valve_count: int,
 ) -> tuple[GroundDecision, GroundMemory]:
     """Return what to do from `now_s` on, and what the next step has to know."""
-    memory = _counted(memory, now_s)
+    memory = _watched(_counted(memory, now_s), now_s)
     reasons = ground_reasons(setup, state, now_s)
     if order is None or order.task.valve_count != valve_count:
         closed = reasons | {GroundReason.NO_ORDER}
         return _closed(setup, closed, memory, now_s, valve_count, is_over=False)
     if order.started_s > memory.started_s:
-        memory = GroundMemory(sequence=memory.sequence, started_s=order.started_s)
+        memory = GroundMemory(
+            sequence=memory.sequence,
+            started_s=order.started_s,
+            stepped_s=memory.stepped_s,
+            anew_s=memory.anew_s,
+        )
     reasons |= memory.over | _of_order(order, memory, now_s)
     if reasons:
         ends = memory.over or memory.began_s is not None or bool(reasons & _END_AT_ONCE)
@@ -166,7 +151,7 @@ def _of_heartbeat(setup: GroundSetup, state: GroundState, now_s: float) -> list[
     if heartbeat is None:
         return [GroundReason.NO_HEARTBEAT]
     found = []
-    if not _EARLY_S <= now_s - heartbeat.received_s <= setup.heartbeat_age_max_s:
+    if not EARLY_S <= now_s - heartbeat.received_s <= setup.heartbeat_age_max_s:
         found.append(GroundReason.STALE_HEARTBEAT)
     if heartbeat.armed is not False:
         found.append(GroundReason.ARMED)
@@ -180,14 +165,16 @@ def _of_heartbeat(setup: GroundSetup, state: GroundState, now_s: float) -> list[
 
 def _of_landed(state: GroundState, now_s: float) -> list[GroundReason]:
     landed = state.landed
-    if landed is None or not _EARLY_S <= now_s - landed.received_s <= LANDED_AGE_MAX_S:
+    if landed is None or not EARLY_S <= now_s - landed.received_s <= LANDED_AGE_MAX_S:
         return [GroundReason.LANDED_UNKNOWN]
     return [] if landed.on_ground is True else [GroundReason.NOT_LANDED]
 
 
 def _of_order(order: GroundOrder, memory: GroundMemory, now_s: float) -> frozenset[GroundReason]:
     found = []
-    if not order.hold.is_held(now_s) or not order.hold.first_s >= order.started_s:
+    hold = order.hold
+    is_fresh = hold.first_s >= order.started_s and hold.first_s >= memory.anew_s
+    if not hold.is_held(now_s) or not is_fresh:
         found.append(GroundReason.NOT_HELD)
     began_s = memory.began_s
     until_s = order.started_s + START_MAX_S if began_s is None else began_s + PIECE_MAX_S
@@ -206,6 +193,13 @@ def _counted(memory: GroundMemory, now_s: float) -> GroundMemory:
         return memory
     done_s = memory.done_s + memory.lease_until_s - memory.since_s
     return replace(memory, since_s=None, done_s=done_s)
+
+
+def _watched(memory: GroundMemory, now_s: float) -> GroundMemory:
+    """Return the memory after a step that came too late: what was pressed before is void."""
+    if memory.stepped_s is not None and not now_s - memory.stepped_s <= HOLD_S:
+        memory = replace(memory, anew_s=now_s)
+    return replace(memory, stepped_s=now_s)
 
 
 def _done_s(memory: GroundMemory, now_s: float) -> float:

@@ -19,7 +19,6 @@ import numpy as np
 
 from companion.core.boom import Boom
 from companion.core.border import Intervals
-from companion.core.leg import LEG_AGE_MAX_S
 from companion.core.paths import Floats, Paths, time_on_chord
 from companion.core.types import VehicleState, Way
 
@@ -43,6 +42,10 @@ MOVING_M_S = 0.3
 SPEED_MAX_M_S = 100.0
 # Places of a mission are exact to some centimetres; two that are nearer than 0.6 m may be one.
 WAY_ASIDE_M = 0.5
+# ArduPilot says twice a second which leg is flown, PX4 at a change and every ten seconds.
+WAY_AGE_MAX_S = 11.0
+# So long a leg that was left for the next one may still be on its last metres: they brake.
+WAY_ENDS_S = 12.0
 # A leg over a line begins and ends so near to its ends: the longest run-in (12 m/s, 2.5 m/s2).
 WAY_BEYOND_M = 30.0
 # The modes that fly the mission, as ArduPilot and PX4 call them.
@@ -109,7 +112,7 @@ class Lines:
         aside = self.aside_m * (ENTRY_SHARE if entering else 1.0)
         course = math.cos(math.radians(self.course_deg))
         least = speed * course
-        way = _way(state)
+        ways = _ways(state)
         behind, beyond = speed * back_s + reach_m, speed * ahead_s + reach_m
         nearest: dict[int, tuple[float, float, Piece]] = {}
         for piece in self._around(state, behind, beyond):
@@ -126,7 +129,7 @@ class Lines:
                 continue
             left = length - along if is_forth else along
             later = across + (ux * vn - uy * ve) * min(STAYS_S, max(left, 0.0) / abs(pace))
-            if not (abs(later) <= aside and (way is None or _is_along(piece, way, course))):
+            if not (abs(later) <= aside and _is_told(piece, ways, course)):
                 continue
             gap = math.hypot(max(-along, along - length, 0.0), across)
             if piece.line not in nearest or gap < nearest[piece.line][0]:
@@ -152,12 +155,27 @@ class Lines:
         return found
 
 
-def _way(state: VehicleState) -> Way | None:
-    """Return the leg that is flown; None where the mission is not flown, or says nothing."""
-    way = state.way
+def _ways(state: VehicleState) -> tuple[Way, ...]:
+    """Return the leg that is flown, and the one before while the vehicle still flies its way.
+
+    Autopilots go on to the next item some metres before the end of a leg. None where the mission
+    is not flown, or says nothing.
+    """
+    way, before = state.way, state.way_before
     if way is None or state.mode not in MISSION_MODES:
-        return None
-    return way if 0.0 <= state.time_s - way.received_s <= LEG_AGE_MAX_S else None
+        return ()
+    if not 0.0 <= state.time_s - way.received_s <= WAY_AGE_MAX_S:
+        return ()
+    if before is None or not 0.0 <= state.time_s - before.received_s <= WAY_ENDS_S:
+        return (way,)
+    east, north = before.to_east_m - before.from_east_m, before.to_north_m - before.from_north_m
+    is_onwards = state.velocity_east_m_s * east + state.velocity_north_m_s * north > 0.0
+    return (way, before) if is_onwards else (way,)
+
+
+def _is_told(piece: Piece, ways: tuple[Way, ...], course: float) -> bool:
+    """Return whether a leg that is flown lies along a piece; where no leg is known, any does."""
+    return not ways or any(_is_along(piece, way, course) for way in ways)
 
 
 def _is_along(piece: Piece, way: Way, course: float) -> bool:

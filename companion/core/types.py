@@ -423,6 +423,7 @@ class VehicleState:
     active: bool = True
     operator_wishes: int = 0  # how often the operator has enabled anew, or disabled
     way: Way | None = None  # None: it is not used, or nothing was heard of it
+    way_before: Way | None = None  # the one that it was before, last heard of then
 
 
 # ---------------------------------------------------------------------------------------- plans

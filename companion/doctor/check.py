@@ -18,12 +18,16 @@ class Status(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Check:
-    """A check by its name. What is not in order says in one line how it is put in order."""
+    """A check by its name. What is not in order says in one line how it is put in order.
+
+    `is_open` where a flight depends on an answer that nobody has given: that is not ready either.
+    """
 
     name: str
     status: Status
     text: str
     fix: str = ""
+    is_open: bool = False
 
     def __post_init__(self) -> None:
         if self.status in (Status.WARN, Status.FAIL) and not self.fix:
@@ -73,12 +77,12 @@ def not_applicable(name: str, why: str) -> Check:
 
 
 def is_ready(checks: Iterable[Check]) -> bool:
-    """Return whether no check failed.
+    """Return whether no check failed, and none waits for an answer.
 
     >>> is_ready([ok("map", "9 zones"), warn("clock", "not synchronised", "wait")])
     True
     """
-    return all(check.status is not Status.FAIL for check in checks)
+    return all(check.status is not Status.FAIL and not check.is_open for check in checks)
 
 
 def split_advice(line: str, otherwise: str) -> tuple[str, str]:

@@ -7,15 +7,16 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from companion.core.ground_work import Hold
+from companion.core.ground_hold import STROKES_OVER_S, Hold
 from companion.core.liquid_clicks import ClickFlow
 from companion.core.liquid_law import AutopilotLiquid
 from companion.core.types import BatteryReport, Decision, FlowReport, Input
 from companion.ground import GroundLink, HandHold
 from companion.ports import Sensor
 
-# A hold is two strokes within half a second; a step comes every 0.05 s.
+# A step comes every 0.05 s, and a hold begins with strokes over some time.
 _STROKE_S = 0.1
+_BEGIN_S = STROKES_OVER_S + 2.0 * _STROKE_S
 
 
 @dataclass(slots=True)
@@ -159,7 +160,7 @@ class ShortHand:
     def begin(self) -> None:
         """Begin to hold."""
         self._hand.begin()
-        self._until_s = self._clock() + self._seconds + 2.0 * _STROKE_S
+        self._until_s = self._clock() + self._seconds + _BEGIN_S
 
     @property
     def hold(self) -> Hold:

@@ -116,7 +116,7 @@ class Ear:
 
 
 def rest_pulses(options: ServoOptions) -> dict[int, int]:
-    """Return the pulses of the safe state: valves closed, a return valve open.
+    """Return the pulses of the safe state: valves closed, a return valve open, motors stopped.
 
     >>> rest_pulses(ServoOptions(channels=(9, 10), return_channel=15))
     {9: 1000, 10: 1000, 15: 2000}
@@ -124,7 +124,7 @@ def rest_pulses(options: ServoOptions) -> dict[int, int]:
     pulses = dict.fromkeys(options.channels, options.closed_us)
     if options.return_channel is not None:
         pulses[options.return_channel] = options.full_us
-    return pulses
+    return pulses | {drive.channel: drive.stop_us for drive in options.drives}
 
 
 async def listen(

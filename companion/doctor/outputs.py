@@ -14,6 +14,11 @@ from companion.output.autopilot_options import ServoOptions
 
 _NAMES = ("output-parameters", "disarmed-values", "watchdog-script", "closed-order")
 _MASK_OUTPUTS = 16
+_BOARD = (
+    "fit a driver board that closes when its orders stand still (output.dither_us = 8, "
+    "docs/driver-board.md)"
+)
+_RELAY = "fit a relay that cuts the pump when this computer fails (docs/pump.md)"
 Known = Mapping[str, float | None]
 
 
@@ -73,15 +78,8 @@ def _of(found: list[Finding], name: str, good: str) -> Check:
 def _watchdog(heard: Heard, options: ServoOptions) -> Check:
     """Check what closes the valves when this computer falls silent."""
     name = "watchdog-script"
-    board = (
-        "fit a driver board that closes when its orders stand still (output.dither_us = 8, "
-        "docs/driver-board.md)"
-    )
     if heard.is_px4:
-        if options.dither_us:
-            return not_applicable(name, "PX4 has none: the driver board is the watchdog")
-        text = "PX4 holds the last order of a dead companion until disarmed"
-        return fail(name, text, board)
+        return _board_alone(name, options)
     known = heard.parameters
     if known is None:
         return warn(name, "its parameters were not read in time", "ask again, longer: --wait-s")
@@ -89,9 +87,21 @@ def _watchdog(heard: Heard, options: ServoOptions) -> Check:
     if trouble is None:
         return ok(name, "runs, and knows these outputs")
     text, fix = trouble
-    if options.dither_us:
+    # A board closes valves only: orders to motors are not dithered.
+    if options.dither_us and not options.drives:
         return warn(name, f"{text}: only the driver board's alive dither closes", fix)
     return fail(name, text, fix)
+
+
+def _board_alone(name: str, options: ServoOptions) -> Check:
+    """Check what PX4 leaves, which has no script: a board closes valves, and no motor."""
+    if not options.dither_us:
+        text = "PX4 holds the last order of a dead companion until disarmed"
+        return fail(name, text, _BOARD)
+    if options.drives:
+        text = f"nothing stops the motor at output {options.drives[0].channel} but disarming"
+        return warn(name, f"PX4 has none: {text}", _RELAY)
+    return not_applicable(name, "PX4 has none: the driver board is the watchdog")
 
 
 def watchdog_trouble(known: Known, options: ServoOptions) -> tuple[str, str] | None:
@@ -108,19 +118,38 @@ def watchdog_trouble(known: Known, options: ServoOptions) -> tuple[str, str] | N
         )
     if enable != 1.0:
         return f"SPRW_ENABLE is {enable:g}: the script does nothing", "set SPRW_ENABLE to 1"
-    missing = [channel for channel in options.channels if not _guards(known, channel)]
+    guarded = (*options.channels, *(drive.channel for drive in options.drives))
+    missing = [channel for channel in guarded if not _guards(known, channel)]
     if missing:
         return (
             f"output {missing[0]} is not among those that it closes",
-            "set SPRW_FIRST and SPRW_LAST to the valves' outputs, SPRW_MASK to those besides",
+            "set SPRW_FIRST and SPRW_LAST to the outputs of valves and motors, SPRW_MASK to those "
+            "besides",
         )
-    closed = known.get("SPRW_CLOSED_US")
-    if closed is not None and closed != options.closed_us:
-        fix = f"set SPRW_CLOSED_US to {options.closed_us}"
-        return f"SPRW_CLOSED_US is {closed:g}, not output.closed_us", fix
+    wrong = _closed_pulse_trouble(known.get("SPRW_CLOSED_US"), options)
+    if wrong is not None:
+        return wrong
     if options.return_channel is not None and known.get("SPRW_RET_CH") != options.return_channel:
         fix = f"set SPRW_RET_CH to {options.return_channel}"
         return "SPRW_RET_CH is not output.return_channel", fix
+    return None
+
+
+def _closed_pulse_trouble(closed_us: float | None, options: ServoOptions) -> tuple[str, str] | None:
+    """Return what is wrong with the script's one pulse: it closes valves and stops motors."""
+    fix = f"set SPRW_CLOSED_US to {options.closed_us}"
+    if closed_us is None:
+        return "SPRW_CLOSED_US does not answer", "ask again, longer: --wait-s"
+    # NaN is not equal to anything, nor at most anything.
+    if closed_us != options.closed_us:
+        return f"SPRW_CLOSED_US is {closed_us:g}, not output.closed_us", fix
+    running = [drive for drive in options.drives if not closed_us <= drive.stop_us]
+    if running:
+        first = running[0]
+        return (
+            f"at SPRW_CLOSED_US = {closed_us:g} the motor at output {first.channel} runs",
+            f"set output.closed_us and SPRW_CLOSED_US to {first.stop_us} or less",
+        )
     return None
 
 

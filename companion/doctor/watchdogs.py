@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from companion.doctor.check import Check, fail, not_applicable, ok, warn
+from companion.doctor.check import Check, Status, fail, not_applicable, ok, warn
 from companion.doctor.computer import WATCHDOG_MAX_S
 from companion.doctor.engine_trial import EngineTrial
 from companion.doctor.script_trial import ScriptTrial
@@ -207,7 +207,14 @@ def asked_check(question: Question, said: bool | None, *, why: str = "not answer
     if not question.applies:
         return not_applicable(question.name, question.otherwise)
     if said is None:
-        return not_applicable(question.name, why)
+        # Nobody has looked: whether it works is as unknown as before.
+        return Check(
+            name=question.name,
+            status=Status.WARN,
+            text=why,
+            fix=f"try it, and answer at a terminal: {question.text}?",
+            is_open=True,
+        )
     if said:
         return ok(question.name, "the operator has seen it")
     return fail(question.name, "the operator has not seen it", question.fix)

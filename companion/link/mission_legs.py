@@ -14,7 +14,7 @@ from companion.link.mission_messages import MissionItem
 
 # MAV_CMD. Numbers below 95 are flown to or waited at, the rest is done on the way.
 _WAYPOINT, _LOITER_UNLIMITED, _LOITER_TIME, _LAND, _TAKE_OFF = 16, 17, 19, 21, 22
-_SPLINE_WAYPOINT = 82
+_HOME, _SPLINE_WAYPOINT = 20, 82
 _NAVIGATION_END = 95
 _CHANGE_SPEED, _JUMP = 178, 177
 _STRAIGHT_TO = frozenset({_WAYPOINT, _LOITER_UNLIMITED, _LOITER_TIME, _LAND})
@@ -27,9 +27,13 @@ _STOPS_FROM_DEG = 60.0
 def leg_report(items: Sequence[MissionItem], sequence: int, received_s: float) -> LegReport | None:
     """Return the straight leg to item `sequence`; None where there is none, or none is known."""
     number = _next_flown(items, sequence)
-    if number is None or items[number].command not in _STRAIGHT_TO:
+    if number is None:
         return None
     before = _flown_before(items, number)
+    if items[number].command == _HOME and before is not None:
+        return _homewards(items[before].place, received_s)
+    if items[number].command not in _STRAIGHT_TO:
+        return None
     start, end = (None if before is None else items[before].place), items[number].place
     if start is None or end is None:
         return None
@@ -41,6 +45,20 @@ def leg_report(items: Sequence[MissionItem], sequence: int, received_s: float) -
         to_longitude_deg=end[1],
         stops=_stops(items, number, start, end),
         speed_m_s=_speed_m_s(items, number),
+    )
+
+
+def _homewards(place: tuple[float, float] | None, received_s: float) -> LegReport | None:
+    """Return a leg without length where the way home begins: no line of the mission is flown."""
+    if place is None:
+        return None
+    return LegReport(
+        received_s=received_s,
+        from_latitude_deg=place[0],
+        from_longitude_deg=place[1],
+        to_latitude_deg=place[0],
+        to_longitude_deg=place[1],
+        stops=False,
     )
 
 

@@ -7,6 +7,7 @@ itself at the end of the lease.
 from __future__ import annotations
 
 import asyncio
+import logging
 from abc import abstractmethod
 from collections import deque
 from dataclasses import dataclass, field
@@ -18,6 +19,7 @@ from companion.output.return_valve import ReturnValve
 # Clocks that disagree by less than this agree: a timer may wake early by the loop's resolution.
 _EARLY_S = 1e-6
 _KEPT = 4096
+_logger = logging.getLogger(__name__)
 
 
 def duties_at(plan: SprayPlan, now_s: float) -> tuple[float, ...]:
@@ -93,8 +95,10 @@ class TimedExecutor:
         self._plan: SprayPlan | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._is_running = False
+        self._sequence: int | None = None
         self.lateness = Lateness()
         self.lease_end_count = 0
+        self.rejected_count = 0
 
     @property
     def fault(self) -> str | None:
@@ -108,7 +112,14 @@ class TimedExecutor:
         self._arm(asyncio.get_running_loop().time())
 
     def submit(self, plan: SprayPlan) -> None:
-        """Replace what has not happened yet; an older plan changes nothing, a late one closes."""
+        """Replace what has not happened yet.
+
+        A plan that is older than the last one or whose lease is over is refused whole and counted:
+        the last one goes on until its own lease ends. One that only closes is always taken.
+
+        Raises:
+            ValueError: a plan for other outputs, which is a mistake of the program.
+        """
         if not self._is_running:
             return
         if len(plan.duty) != self._count:
@@ -117,9 +128,15 @@ class TimedExecutor:
             raise ValueError(
                 f"plan for {len(plan.drives)} drives, executor has {self._drive_count}"
             )
-        if self._plan is not None and plan.sequence <= self._plan.sequence:
-            return
         now_s = asyncio.get_running_loop().time()
+        is_newer = self._sequence is None or plan.sequence > self._sequence
+        if not (plan.is_off or (is_newer and now_s < plan.lease_until_s)):
+            self.rejected_count += 1
+            if self.rejected_count == 1:
+                _logger.warning("refused a plan that came late or out of order; counting from now")
+            return
+        # A plan of before that closes brings none of its time back.
+        self._sequence = plan.sequence if is_newer else self._sequence
         before, self._plan = self._plan, plan
         if self._return is not None:
             self._return.submit(plan, now_s + _EARLY_S)
@@ -129,7 +146,7 @@ class TimedExecutor:
     async def stop(self) -> None:
         """Order all outputs closed and let go."""
         self._is_running = False
-        self._plan = None
+        self._plan = self._sequence = None
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

@@ -23,10 +23,10 @@ local DEFAULTS = {
    {"ENABLE", 1}, -- 0: the script does nothing; taken while disarmed only
    {"COMPID", 191}, -- MAVLink component of the companion: link.component_id
    {"SYSID", 0}, -- its MAVLink system; 0: the vehicle's own, which is what vrspray uses
-   {"FIRST", 0}, -- outputs FIRST to LAST are valves, counted from 1; 0: none
+   {"FIRST", 0}, -- outputs FIRST to LAST are valves or motors, counted from 1; 0: none
    {"LAST", 0},
    {"MASK", 0}, -- and of outputs 1 to 16 those whose bit is set (bit 0 is output 1)
-   {"CLOSED_US", 1000}, -- output.closed_us
+   {"CLOSED_US", 1000}, -- output.closed_us; it must stop a pump or atomiser too
    {"TIMEOUT_MS", 300}, -- held to 200 to 1000
    {"RET_CH", 0}, -- output of a return valve; 0: none
    {"RET_US", 2000}, -- its open pulse
@@ -46,7 +46,7 @@ local MESSAGE_IDS = 10
 local WARNING, INFO = 4, 6 -- MAV_SEVERITY
 
 local settings = {} -- name to Parameter
-local channels = {} -- outputs of valves, counted from 1
+local channels = {} -- outputs of valves and motors, counted from 1
 local wanted = {} -- the same before SERVOn_FUNCTION was looked at
 local closed_us = nil -- the last one that could be used; without one there is no pulse
 local return_channel, return_us = nil, nil

@@ -197,6 +197,19 @@ async def test_a_renewed_lease_goes_on(bench: Bench) -> None:
     assert sorted(held) == [0.2, 0.5, 1.0]
 
 
+async def test_late_and_older_plans_leave_the_last_one_until_its_lease_ends(bench: Bench) -> None:
+    bench.executor.submit(plan(5, 0.2, 0.5, 1.0, lease_s=0.5))
+    await bench.shows(0.2, 0.5, 1.0)
+    late = plan(6, 1.0, 1.0, 0.2, lease_s=0.001)
+    await asyncio.sleep(0.01)
+    bench.executor.submit(late)
+    bench.executor.submit(plan(4, 1.0, 1.0, 0.2))
+    await asyncio.sleep(0.05 + bench.reports_s)
+    await bench.shows(0.2, 0.5, 1.0)
+    await asyncio.sleep(0.45)
+    await bench.shows(0.0, 0.0, 0.0)
+
+
 async def test_a_closed_plan_closes_at_once(bench: Bench) -> None:
     late = TimedChange(at_s=now() + 0.02, valve=0, duty=1.0)
     bench.executor.submit(plan(1, 0.2, 0.5, 1.0, changes=(late,)))

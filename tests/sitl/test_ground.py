@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from companion.cli.ground_words import in_words
+from companion.core.ground_hold import Hold
 from companion.core.ground_task import GroundKind, clicks, together
-from companion.core.ground_work import GroundSetup, Hold
+from companion.core.ground_work import GroundSetup
 from companion.ground import GroundOutcome, perform
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
@@ -76,7 +77,7 @@ async def test_lines_of_a_script_catch_for_an_exact_time(tmp_path: Path) -> None
     arguments = ("catch", "--duty", "0.5", "--seconds", "1.5", "--valve", "2", "--valve", "3")
     async with session(example(tmp_path), *arguments, by_lines=True) as work:
         work.press(b"spray\n")
-        await work.until_told("Hold the space bar")
+        await work.until_told("Lines hold")
         work.hold(b"hold\n")
         code, result = await work.ended()
     assert code == 0, work.told.decode()

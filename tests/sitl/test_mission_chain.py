@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import json
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
 import pytest
 
 from tests.bench.wire import RTK, start
-from tests.sitl.client_bench import PLOT_M, RATES_L_HA, prescribed_l, write_field
+from tests.sitl import client_bench
 from tests.sitl.wire_peer import free_port
 from tests.unit.stub_bench import HOME
 
@@ -19,7 +20,27 @@ pytestmark = pytest.mark.sitl
 
 # Beside the field: the way home then crosses it at an angle.
 DEPOT = "{:.7f},{:.7f}".format(*HOME.to_geographic(12.0, 0.0))
-LENGTH_M = PLOT_M * len(RATES_L_HA)
+RATES_L_HA, PLOT_M, FIRST_M = (15.0, 25.0), 8.0, 9.0
+# One pass of 6 m: strips lie wholly in the field, 2.5 mm from its border.
+WIDTH_M = 6.006
+
+
+def write_field(folder: Path, autopilot: Literal["ardupilot", "px4"]) -> Path:
+    """Write two plots, a pass wide, with a configuration for them; return that."""
+    config = client_bench.write_field(folder, autopilot)
+    ends_m = [FIRST_M + number * PLOT_M for number in range(len(RATES_L_HA) + 1)]
+    plots = [
+        (client_bench._ring(south, north, 0.5 * WIDTH_M), {"rate": rate})
+        for (south, north), rate in zip(pairwise(ends_m), RATES_L_HA, strict=True)
+    ]
+    # Wider than the field: the border rule shall not cost the outer valves their plots.
+    outline = client_bench._ring(ends_m[0], ends_m[-1], 0.5 * WIDTH_M + 0.6)
+    (folder / "field.geojson").write_text(client_bench._features(*plots))
+    (folder / "boundary.geojson").write_text(client_bench._features((outline, {})))
+    # No buffer, as in the plan: the field is as wide as the boom.
+    text = config.read_text().replace('"inside"', '"inside"\nborder_buffer_m = 0.0')
+    config.write_text(text)
+    return config
 
 
 async def done(*command: str) -> dict[str, Any]:
@@ -72,8 +93,6 @@ async def test_what_was_planned_is_uploaded_flown_and_sprayed_on_its_lines(
     tmp_path: Path, autopilot: Literal["ardupilot", "px4"]
 ) -> None:
     config = write_field(tmp_path, autopilot)
-    if autopilot == "px4":
-        config.write_text(config.read_text().replace("[mission]", '[mission]\nautopilot = "px4"'))
     scenario = tmp_path / "rtk.toml"
     scenario.write_text(RTK)
     plan, upload, flight = await flown(
@@ -81,9 +100,9 @@ async def test_what_was_planned_is_uploaded_flown_and_sprayed_on_its_lines(
         ("--autopilot", autopilot, "--scenario", str(scenario), "--out", str(tmp_path / "truth")),
         free_port(),
     )
-    assert plan["volume_l"] == pytest.approx(prescribed_l(), rel=0.01)
+    asked_l = sum(RATES_L_HA) * PLOT_M * WIDTH_M / 10_000.0
+    assert plan["volume_l"] == pytest.approx(asked_l, rel=0.02)
     assert (upload["ok"], upload["firmware"]) == (True, autopilot)
-    # An uploaded mission of PX4 has no home, and the stub puts its own before it.
     assert flight["uploaded_items"] == upload["items"]
     assert (flight["state"], flight["enabled"], flight["speed_m_s"]) == ("landed", True, 5.0)
     metrics = json.loads((tmp_path / "truth" / "truth.json").read_text())["metrics"]

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from companion.core.ground_work import Hold
+from companion.core.ground_hold import Hold
 from companion.core.liquid_clicks import ClickFinding, ClickJudgement
 from companion.core.liquid_law import AutopilotLiquid
 from companion.core.types import BatteryReport, FaultKind, FlowReport
@@ -162,9 +162,10 @@ def test_a_short_hand_holds_for_its_time_and_no_longer() -> None:
     for _ in range(40):
         now_s += 0.05
         held.append(hand.hold.is_held(now_s))
-    # From the second look on; the last stroke holds for half a second.
-    assert held[1:16] == [True] * 15
-    assert not any(held[30:])
+    # After three tenths; it is held as long as the click takes, and half a second after.
+    assert not any(held[:6])
+    assert held[7:23] == [True] * 16
+    assert not any(held[36:])
     key.stopped = "another-key"
     assert hand.stopped == "another-key"
 

@@ -19,7 +19,7 @@ from companion.doctor.outputs import output_checks, watchdog_trouble
 from companion.doctor.serial_device import Device, read_device, serial_check
 from companion.doctor.vehicle import link_checks, no_link
 from companion.doctor.vehicle_facts import Heard, Position, Rate
-from companion.output.autopilot_options import ServoOptions
+from companion.output.autopilot_options import DriveOutput, ServoOptions
 from companion.output.engine.wiring import Wiring
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"
@@ -163,6 +163,8 @@ def known(**changes: float | None) -> Heard:
         (known(SPRW_LAST=13.0, SPRW_MASK=float(1 << 13)), "watchdog-script", Status.OK),
         (known(SPRW_LAST=NAN, SPRW_MASK=NAN), "watchdog-script", Status.FAIL),
         (known(SPRW_CLOSED_US=1100.0), "watchdog-script", Status.FAIL),
+        (known(SPRW_CLOSED_US=NAN), "watchdog-script", Status.FAIL),
+        (known(SPRW_CLOSED_US=None), "watchdog-script", Status.FAIL),
         (replace(GOOD, is_closed_ordered=False), "closed-order", Status.NOT_APPLICABLE),
         (replace(GOOD, order_results=(0, 4)), "closed-order", Status.FAIL),
         (replace(GOOD, outputs_us={}), "closed-order", Status.WARN),
@@ -191,6 +193,64 @@ def test_a_board_with_alive_dither_takes_the_place_of_the_script() -> None:
     options = replace(OPTIONS, dither_us=8)
     checks = {check.name: check for check in output_checks(known(SPRW_ENABLE=None), options)}
     assert checks["watchdog-script"].status is Status.WARN
+
+
+SECTIONS = servo_options(load(EXAMPLE.parent / "pump-sections" / "config.toml"))
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ({}, "output 15 is not among those that it closes"),
+        ({"SPRW_MASK": float(1 << 13)}, "output 15 is not among"),
+        ({"SPRW_MASK": NAN}, "output 15 is not among"),
+        ({"SPRW_MASK": float(1 << 14)}, None),
+        ({"SPRW_LAST": 15.0}, None),
+        ({"SPRW_LAST": 15.0, "SPRW_CLOSED_US": 1200.0}, "not output.closed_us"),
+    ],
+)
+def test_a_pump_must_be_among_the_outputs_that_the_script_guards(
+    script: dict[str, float | None], words: str | None
+) -> None:
+    assert SECTIONS is not None
+    assert [drive.channel for drive in SECTIONS.drives] == [15]
+    returns = {"SPRW_RET_CH": SECTIONS.return_channel or 0.0}
+    trouble = watchdog_trouble({**PARAMETERS, **returns, **script}, SECTIONS)
+    if words is None:
+        assert trouble is None
+    else:
+        assert trouble is not None
+        assert words in trouble[0]
+
+
+def test_the_closed_pulse_of_the_script_must_stop_each_motor() -> None:
+    for stop_us, is_good in ((1000, True), (999, False)):
+        options = replace(OPTIONS, drives=(DriveOutput(channel=15, stop_us=stop_us),))
+        trouble = watchdog_trouble({**PARAMETERS, "SPRW_LAST": 15.0}, options)
+        assert (trouble is None) == is_good, trouble
+    # A pump alone, its valves on other outputs.
+    alone = ServoOptions(channels=(), drives=(DriveOutput(channel=20, stop_us=1000),))
+    wired = {"SPRW_FIRST": 20.0, "SPRW_LAST": 20.0}
+    assert watchdog_trouble({**PARAMETERS, **wired}, alone) is None
+    assert watchdog_trouble(PARAMETERS, alone) is not None
+
+
+def test_no_board_takes_the_place_of_the_script_for_a_motor() -> None:
+    options = replace(OPTIONS, dither_us=8, drives=(DriveOutput(channel=15),))
+    checks = {check.name: check for check in output_checks(known(SPRW_ENABLE=None), options)}
+    assert checks["watchdog-script"].status is Status.FAIL
+    on_px4 = replace(options, channels=(1, 2), drives=(DriveOutput(channel=3),))
+    check = {check.name: check for check in output_checks(px4(), on_px4)}["watchdog-script"]
+    assert check.status is Status.WARN
+    assert "nothing stops the motor at output 3 but disarming" in check.text
+
+
+def test_a_motor_is_ordered_to_stop_and_must_read_so() -> None:
+    options = replace(OPTIONS, drives=(DriveOutput(channel=15, stop_us=1050),))
+    for pulse_us, status in ((1050, Status.OK), (1900, Status.FAIL)):
+        heard = replace(GOOD, outputs_us=dict.fromkeys(CHANNELS, 1000) | {15: pulse_us})
+        checks = {check.name: check for check in output_checks(heard, options)}
+        assert checks["closed-order"].status is status
 
 
 def test_the_return_valve_must_be_known_to_the_script_and_rests_open() -> None:

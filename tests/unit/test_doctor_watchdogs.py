@@ -13,7 +13,7 @@ from companion.core.ground_work import GroundSetup
 from companion.core.nozzle import PwmLimits
 from companion.core.types import HeartbeatReport, Input, LandedReport, SprayPlan
 from companion.doctor import engine_trial
-from companion.doctor.check import Check, Status
+from companion.doctor.check import Check, Status, is_ready
 from companion.doctor.engine_trial import EngineTrial, try_engine
 from companion.doctor.script_trial import ScriptTrial, try_script
 from companion.doctor.watchdogs import (
@@ -225,6 +225,9 @@ def test_only_what_is_fitted_is_asked_for() -> None:
     assert {asked_check(question, True).status for question in nothing} == {Status.NOT_APPLICABLE}
     assert {asked_check(question, True).status for question in everything} == {Status.OK}
     assert {asked_check(question, False).status for question in everything} == {Status.FAIL}
-    assert {asked_check(question, None).status for question in everything} == {
-        Status.NOT_APPLICABLE
-    }
+    for question in everything:
+        unasked = asked_check(question, None, why="is asked at a terminal only")
+        assert unasked.status is Status.WARN
+        assert not is_ready([unasked]), "what nobody has seen is not ready"
+    assert is_ready([asked_check(question, True) for question in everything])
+    assert is_ready([asked_check(question, None) for question in nothing])

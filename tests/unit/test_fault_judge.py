@@ -13,9 +13,11 @@ from typing import Any
 import pytest
 
 from sitl.stub.protocol import Speaker, dialect
-from tests.bench.faults.__main__ import main
+from tests.bench.faults import __main__ as bench
+from tests.bench.faults.__main__ import Campaign, main
 from tests.bench.faults.cases import PROCESS_KINDS, Case, Draw, Kind, Output, campaign, cases
 from tests.bench.faults.chip import Act, Chip, ChipLines, Row
+from tests.bench.faults.flight import NotFlownError
 from tests.bench.faults.judge import Verdict, judge, outside_ml
 from tests.bench.faults.levels import (
     Level,
@@ -263,6 +265,89 @@ def test_a_full_disk_costs_rows_and_not_the_spraying() -> None:
     )
 
 
+def standstill(kind: Kind, stands_s: float, opens_s: float, output: Output = "gpio") -> Record:
+    """Return a flight whose process stands from 104 s on; something opens `opens_s` after that."""
+    until_s = FAULT_S + stands_s + 3.5
+    path = record(kind, ()).path
+    again = Opening(1, FAULT_S + stands_s + opens_s, FAULT_S + stands_s + opens_s + 0.05)
+    what = "engine" if kind is Kind.CONT_ENGINE else "companion"
+    return record(
+        kind,
+        [Opening(0, 103.5, FAULT_S + 0.2), again],
+        draw=replace(draw(kind, output), share=math.log(stands_s) / math.log(8.0)),
+        sent=healthy(path, until_s),
+        until_s=until_s,
+        struck=(
+            Struck(FAULT_S, f"SIGSTOP {what}"),
+            Struck(FAULT_S + stands_s, f"SIGCONT {what}"),
+        ),
+    )
+
+
+def test_who_goes_on_after_a_stop_opens_with_the_fifth_fresh_position() -> None:
+    kind = Kind.CONT_COMPANION
+    assert judge(standstill(kind, 1.5, 0.26)).wrong == ()
+    assert "SIGSTOP" in judge(standstill(kind, 1.5, 0.0)).wrong[0]
+    assert judge(standstill(kind, 1.5, 0.19)).wrong
+    assert judge(standstill(Kind.CONT_BOTH, 1.5, 0.19)).wrong
+
+
+def test_after_a_long_stop_nothing_opens_and_nothing_after_an_engine_s() -> None:
+    assert judge(standstill(Kind.CONT_COMPANION, 2.2, 3.0)).wrong
+    assert judge(standstill(Kind.CONT_ENGINE, 1.5, 1.0)).wrong
+
+
+def test_what_stood_open_during_a_stop_was_ordered_by_nobody() -> None:
+    flight = standstill(Kind.CONT_COMPANION, 6.0, 1.0, "script")
+    left = flight.draw.field_m(SPEED_M_S)
+    out_s = flight.path.reaches_s(left)
+    one = Opening(0, 103.5, out_s + 1.0)
+    assert judge(replace(flight, own=[one], openings=[one])).ml == 0.0
+    late = Opening(0, out_s + 0.2, out_s + 0.4)
+    assert judge(replace(flight, own=[late], openings=[late])).ml > 1.0
+
+
+def test_a_process_stands_one_to_eight_seconds_and_the_flight_is_watched_longer() -> None:
+    flights = list(campaign(60, 1, only="SIGCONT"))
+    assert {one.case.output for one in flights} == {"gpio", "script", "dither"}
+    assert all(1.0 <= one.stands_s <= 8.0 for one in flights)
+    assert min(one.stands_s for one in flights) < 2.0 < max(one.stands_s for one in flights)
+    assert all(one.watched_s == one.stands_s + 3.5 for one in flights)
+    left = [one.leaves_s - one.stands_s for one in flights if one.leaves_s is not None]
+    assert min(left) < 0.0 < max(left)
+    assert {one.stands_s for one in campaign(5, 1, only="SIGKILL")} == {0.0}
+
+
+@pytest.mark.parametrize(("refusals", "flown"), [(0, True), (2, True), (3, False)])
+async def test_a_busy_computer_s_flight_is_flown_again_twice(
+    monkeypatch: pytest.MonkeyPatch, refusals: int, flown: bool
+) -> None:
+    tries: list[int] = []
+
+    async def fly(each: Draw) -> Record:
+        tries.append(each.number)
+        if len(tries) <= refusals:
+            raise NotFlownError("it did not spray (Spray: outputs: wakes up 6.8 ms late)")
+        return record(Kind.DISABLED, (), sent=told(COMMAND, 216.0, 0.0))
+
+    monkeypatch.setattr(bench, "fly", fly)
+    found = Campaign(campaign(1, 1), 1)
+    await found.lane()
+    assert len(tries) == min(refusals, 2) + 1
+    assert (len(found.verdicts), len(found.not_flown)) == ((1, 0) if flown else (0, 1))
+    assert len(found.repeated) == (refusals > 0)
+
+
+async def test_what_else_did_not_fly_is_not_flown_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def fly(each: Draw) -> Record:
+        raise NotFlownError("it did not spray")
+
+    monkeypatch.setattr(bench, "fly", fly)
+    found = Campaign(campaign(1, 1), 1)
+    await found.lane()
+    assert (len(found.not_flown), found.repeated) == (1, set())
+
+
 def test_what_flows_outside_is_counted_by_the_lags_and_apart_from_what_is_held() -> None:
     flight = record(Kind.KILL_ENGINE, (), draw=draw(Kind.KILL_ENGINE, leaves_s=0.5))
     out_s = flight.path.reaches_s(flight.draw.field_m(SPEED_M_S))
@@ -368,11 +453,12 @@ def test_a_campaign_has_every_kind_and_signals_as_often_as_the_rest() -> None:
 
 def test_the_table_is_written_between_its_markers(tmp_path: Path) -> None:
     verdict = judge(record(Kind.DISABLED, (), sent=told(COMMAND, 216.0, 0.0)))
-    about = {"command": "it", "seed": 1, "lanes": 1, "wall_s": 60.0}
+    about = {"command": "it", "seed": 1, "lanes": 1, "wall_s": 60.0, "repeated": 3}
     found = result([verdict, _worse(verdict)], ["flight 9: no"], about)
     assert (found["flights"], found["ordered_outside_ml"]) == (2, 1.5)
     assert found["wrong"] == ["flight 0, STOP of the operator, gpio: late (2 ms waited for a core)"]
     text = page(json.loads(json.dumps(found)))
+    assert "3 flown again" in text
     assert "| STOP of the operator | GPIO | 2 | 0 | 0.100 s | 0.200 s | 0.15 s | 1.5 mL |" in text
     path = tmp_path / "page.md"
     path.write_text(f"a\n{BEGIN}\nold\n{END}\nb\n")

@@ -90,6 +90,22 @@ def test_a_port_that_a_run_holds_is_one_line_and_exit_two(
     assert "in use" in line
 
 
+@pytest.mark.parametrize(("kind", "words"), [("none", "A dry run"), ("servo", "has to run")])
+def test_a_dry_run_asks_for_no_pump(
+    config: Path, capfd: pytest.CaptureFixture[str], kind: str, words: str
+) -> None:
+    near, far = os.pipe()
+    os.write(far, b"no\n")
+    os.close(far)
+    with os.fdopen(near) as file, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdin", file)
+        settings = ("--hold-lines", "--set", f'output.kind="{kind}"')
+        assert execute(["ground", "prime", *settings, "--config", str(config)]) == 2
+    told = capfd.readouterr().err
+    assert words in told
+    assert ("The pump has to run" in told) == (kind == "servo")
+
+
 def test_a_folder_that_cannot_be_written_is_refused_before_the_word(
     config: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -59,9 +59,25 @@ async def test_a_repeating_space_bar_is_held_and_one_stroke_is_not() -> None:
             hand.begin()
             await strokes(hand, far, clock, 50.0)
             assert not hand.hold.is_held(50.0)
-            await strokes(hand, far, clock, 50.1)
-            assert hand.hold.is_held(50.5)
-            assert not hand.hold.is_held(50.6)
+            await strokes(hand, far, clock, 50.1, 50.2)
+            assert not hand.hold.is_held(50.2)
+            await strokes(hand, far, clock, 50.3)
+            assert hand.hold.is_held(50.7)
+            assert not hand.hold.is_held(50.8)
+
+
+async def test_what_a_stalled_connection_hands_over_at_once_holds_nothing() -> None:
+    async with terminal() as (hand, far, _, clock):
+        with hand.attending():
+            hand.begin()
+            for number in range(8):
+                clock.now_s = 50.0 + 0.003 * number
+                os.write(far, b" " * 30)
+                for _ in range(200):
+                    await asyncio.sleep(0)
+                assert not hand.hold.is_held(clock.now_s)
+    assert hand.hold.strokes <= 3
+    assert hand.hold.last_s >= 50.0
 
 
 @pytest.mark.parametrize("key", [b"x", b"\n", b"\x13", b" x", b"\x04", b"\x1b[A"])
@@ -154,9 +170,11 @@ async def test_lines_hold_and_their_end_ends(pipe: tuple[int, int]) -> None:
         hand.begin()
         await until(lambda: hand.hold.last_s == 50.0)
         assert not hand.hold.is_held(50.0), "what came at once is one stroke"
-        clock.now_s = 50.2
-        os.write(far, b"hold\n")
-        await until(lambda: hand.hold.is_held(50.3))
+        for at_s in (50.2, 50.4, 50.6):
+            clock.now_s = at_s
+            os.write(far, b"hold\n")
+            await until(lambda at_s=at_s: hand.hold.last_s == at_s)  # type: ignore[misc]
+        assert hand.hold.is_held(50.7)
         os.close(far)
         await until(lambda: hand.stopped == "stdin-ended")
 
@@ -168,6 +186,38 @@ async def test_a_line_that_says_stop_ends_it(pipe: tuple[int, int]) -> None:
         os.write(pipe[1], b"stop\n")
         await until(lambda: hand.stopped == "another-key")
     assert not hand.hold.is_held(hand.hold.last_s)
+
+
+async def test_a_stop_in_two_pieces_stops_and_a_piece_holds_nothing(pipe: tuple[int, int]) -> None:
+    clock = Clock()
+    hand = Hand(pipe[0], is_lines=True, clock=clock)
+    with hand.attending():
+        hand.begin()
+        os.write(pipe[1], b"ho")
+        for _ in range(200):
+            await asyncio.sleep(0)
+        assert hand.hold.strokes == 0, "half a line is none"
+        clock.now_s = 50.2
+        os.write(pipe[1], b"ld\nst")
+        await until(lambda: hand.hold.last_s == 50.2)
+        assert hand.stopped is None
+        os.write(pipe[1], b"op")
+        await until(lambda: hand.stopped == "another-key")
+
+
+async def test_a_line_without_an_end_stops(pipe: tuple[int, int]) -> None:
+    hand = Hand(pipe[0], is_lines=True)
+    with hand.attending():
+        hand.begin()
+        os.write(pipe[1], b"x" * 5000)
+        await until(lambda: hand.stopped == "another-key")
+
+
+def test_everybody_is_told_what_holds(pipe: tuple[int, int]) -> None:
+    assert "space bar" in Hand(pipe[0], is_lines=False).invitation
+    lines = Hand(pipe[0], is_lines=True).invitation
+    assert "Lines hold" in lines
+    assert "space" not in lines
 
 
 def test_a_word_without_an_end_is_the_word(pipe: tuple[int, int]) -> None:

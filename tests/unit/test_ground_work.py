@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from companion.core.ground_hold import Hold
 from companion.core.ground_state import GroundState, observe_ground
 from companion.core.ground_task import (
     GroundKind,
@@ -24,7 +25,6 @@ from companion.core.ground_work import (
     GroundOrder,
     GroundReason,
     GroundSetup,
-    Hold,
     ground_step,
 )
 from companion.core.nozzle import FlowCurve, NozzleSet
@@ -82,6 +82,13 @@ class Bench:
             self.setup, state_at(now_s, **change), order, self.memory, now_s, valve_count=3
         )
         return decision
+
+    def pressed(self, *times_s: float) -> Bench:
+        """Begin earlier, with strokes from before the first step."""
+        self.started_s = NOW_S + times_s[0]
+        for at_s in times_s:
+            self.hold = self.hold.renewed(NOW_S + at_s)
+        return self
 
     def run(self, until_s: float, *, step_s: float = 0.05, **kind: object) -> GroundDecision:
         decision = self.step(self.now_s + step_s, **kind)  # type: ignore[arg-type]
@@ -202,14 +209,57 @@ def test_what_ground_work_does_not_need_changes_nothing() -> None:
 # ----------------------------------------------------------------------------------------- hold
 
 
-def test_one_stroke_opens_nothing_and_a_second_in_time_does() -> None:
+def test_it_opens_with_the_fourth_stroke_over_three_tenths_and_not_before() -> None:
     bench = Bench()
-    assert bench.step(NOW_S + 0.1).reasons == {GroundReason.NOT_HELD}
-    assert bench.step(NOW_S + 0.3, stroke=False).plan.is_off
-    assert not bench.step(NOW_S + 0.5).plan.is_off
+    for at_s in (0.1, 0.2, 0.3):
+        assert bench.step(NOW_S + at_s).reasons == {GroundReason.NOT_HELD}
+    assert bench.step(NOW_S + 0.35, stroke=False).plan.is_off
+    assert not bench.step(NOW_S + 0.4).plan.is_off
+    quick = Bench()
+    for number in range(1, 7):
+        assert quick.step(NOW_S + 0.05 * number).plan.is_off
+    assert not quick.step(NOW_S + 0.35).plan.is_off
+
+
+def test_few_strokes_over_a_long_time_are_no_hold() -> None:
+    bench = Bench()
+    for at_s in (0.1, 0.5, 0.9):
+        assert bench.step(NOW_S + at_s).plan.is_off
+    assert not bench.step(NOW_S + 1.3).plan.is_off
     late = Bench()
-    late.step(NOW_S + 0.1)
-    assert late.step(NOW_S + 0.6).plan.is_off, "a stroke half a second later is a first one again"
+    for at_s in (0.1, 0.2, 0.3, 0.8, 0.9, 1.0):
+        assert late.step(NOW_S + at_s).plan.is_off, "after half a second it begins anew"
+    assert not late.step(NOW_S + 1.1).plan.is_off
+
+
+def test_a_burst_of_strokes_is_one_however_long_it_takes() -> None:
+    hold = Hold()
+    for number in range(1000):
+        hold = hold.renewed(NOW_S + 0.001 * number % 0.0095)
+    assert (hold.strokes, hold.last_s) == (1, NOW_S)
+    # A connection that trickles for less than three tenths of a second opens nothing either.
+    for number in range(29):
+        hold = hold.renewed(NOW_S + 0.01 * number)
+        assert not hold.is_held(hold.last_s)
+
+
+def test_after_a_standstill_of_this_process_a_hold_begins_anew() -> None:
+    bench = Bench().opened()
+    for number in range(1, 6):
+        bench.hold = bench.hold.renewed(bench.now_s + 0.1 * number)
+    went_on_s = bench.now_s + 0.51
+    late = bench.step(went_on_s)
+    assert late.reasons == {GroundReason.NOT_HELD}, "strokes came, but nobody was there"
+    assert bench.run(went_on_s + 0.4).plan.is_off, "nor does it help that they go on"
+    bench.run(went_on_s + 1.2, stroke=False)
+    assert not bench.run(went_on_s + 1.8).plan.is_off
+
+
+def test_a_step_half_a_second_after_the_last_is_no_standstill() -> None:
+    bench = Bench().opened()
+    for number in range(1, 5):
+        bench.hold = bench.hold.renewed(bench.now_s + 0.1 * number)
+    assert not bench.step(bench.now_s + 0.49).plan.is_off
 
 
 def test_a_key_that_was_down_before_the_start_does_not_count() -> None:
@@ -230,9 +280,9 @@ def test_silence_closes_half_a_second_after_the_last_stroke_even_without_a_step(
 def test_a_stroke_at_no_time_is_none(wrong_s: float) -> None:
     hold = held(NOW_S + 0.3)
     assert hold.renewed(wrong_s) == hold
-    assert not Hold(first_s=NOW_S, last_s=math.nan).is_held(NOW_S)
-    assert not Hold(first_s=math.nan, last_s=NOW_S).is_held(NOW_S)
-    assert not Hold(first_s=NOW_S, last_s=NOW_S + 9.0).is_held(NOW_S + 1.0)
+    assert not Hold(first_s=NOW_S, last_s=math.nan, strokes=9).is_held(NOW_S)
+    assert not Hold(first_s=math.nan, last_s=NOW_S, strokes=9).is_held(NOW_S)
+    assert not Hold(first_s=NOW_S, last_s=NOW_S + 9.0, strokes=9).is_held(NOW_S + 1.0)
 
 
 def test_priming_goes_on_where_the_key_was_let_go() -> None:
@@ -257,8 +307,8 @@ def test_a_catch_that_is_let_go_is_over() -> None:
 
 def test_a_catch_during_which_the_computer_stood_still_is_over() -> None:
     bench = Bench(CATCH).opened()
-    bench.hold = held(NOW_S + 1.6)
-    decision = bench.step(NOW_S + 1.6)
+    bench.hold = held(NOW_S + 0.95)
+    decision = bench.step(NOW_S + 0.95)
     assert decision.reasons == {GroundReason.STALLED}
     assert decision.is_over
 
@@ -286,7 +336,7 @@ def test_without_an_order_or_with_one_for_another_sprayer_all_is_closed() -> Non
 
 
 def test_the_piece_ends_at_its_time_and_the_lease_with_it() -> None:
-    bench = Bench()
+    bench = Bench().pressed(-0.1, 0.0)
     bench.step(NOW_S + 0.1)
     began = bench.step(NOW_S + 0.2)
     assert not began.plan.is_off
@@ -310,7 +360,7 @@ def test_after_thirty_seconds_in_all_it_needs_a_new_start() -> None:
     bench.started_s = bench.now_s
     assert bench.run(bench.now_s + 0.4).reasons == {GroundReason.NOT_HELD}, "the key must be let go"
     bench.run(bench.now_s + 1.0, stroke=False)
-    assert not bench.run(bench.now_s + 0.3).plan.is_off
+    assert not bench.run(bench.now_s + 0.4).plan.is_off
 
 
 def test_a_start_is_good_for_thirty_seconds_and_an_older_one_for_nothing() -> None:
@@ -328,7 +378,7 @@ def test_a_start_is_good_for_thirty_seconds_and_an_older_one_for_nothing() -> No
 
 
 def test_a_click_opens_each_valve_twice_for_a_fifth_of_a_second() -> None:
-    bench = Bench(clicks(3, (0, 2)))
+    bench = Bench(clicks(3, (0, 2))).pressed(-0.195, -0.095, 0.0)
     edges: dict[int, list[tuple[float, float]]] = {0: [], 1: [], 2: []}
     duty = (0.0,) * 3
     bench.step(NOW_S + 0.1)
@@ -347,6 +397,7 @@ def test_a_click_opens_each_valve_twice_for_a_fifth_of_a_second() -> None:
 
 def test_what_comes_within_the_lease_is_ordered_ahead_at_its_time() -> None:
     bench = Bench(in_turn(GroundKind.FLUSH, 3, (0, 1), duty=1.0, seconds=4.0))
+    bench.pressed(-0.1, 0.0)
     bench.step(NOW_S + 0.1)
     bench.step(NOW_S + 0.2)
     plan = bench.run(NOW_S + 2.0).plan

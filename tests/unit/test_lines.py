@@ -204,9 +204,24 @@ def test_a_run_in_opens_the_line_at_its_start() -> None:
     assert opens(on_lines(), flying(10.0, 10.5, way=run_in))
 
 
+def test_a_leg_that_was_left_counts_to_its_last_metres_but_not_on_the_way_back() -> None:
+    line, ferry = way((12.0, 3.0), (36.0, 3.0)), way((36.0, 3.0), (12.0, 12.0))
+    assert opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=line))
+    assert not opens(on_lines(), flying(10.0, 30.0, way=ferry))
+    back = {"velocity_east_m_s": -5.0, "heading_deg": 270.0}
+    assert not opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=line, **back))
+    old = replace(line, received_s=-2.1)
+    assert not opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=old))
+
+
+def test_a_leg_without_length_is_along_no_line() -> None:
+    assert not opens(on_lines(), flying(10.0, 20.0, way=way((40.0, 3.0), (40.0, 3.0))))
+
+
 def test_an_old_leg_and_one_outside_the_mission_say_nothing() -> None:
     ferry = way((-20.0, 2.0), (60.0, 4.5))
-    assert opens(on_lines(), flying(14.0, 20.0, way=ferry))
+    assert not opens(on_lines(), flying(20.0, 20.0, way=ferry))
+    assert opens(on_lines(), flying(21.0, 20.0, way=ferry))
     limits = replace(setup().limits, modes=frozenset({"AUTO", "GUIDED"}))
     given = on_lines(limits=limits)
     assert opens(given, flying(10.0, 20.0, way=ferry, mode="GUIDED"))

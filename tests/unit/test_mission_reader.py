@@ -78,6 +78,14 @@ def test_what_is_done_on_the_way_is_not_flown_to() -> None:
     assert leg(MISSION, 4) == leg(MISSION, 5)
 
 
+def test_the_way_home_is_a_leg_without_length_where_it_begins() -> None:
+    found = leg((item(WAYPOINT, A), item(RTL)), 1)
+    assert found is not None
+    assert (found.from_latitude_deg, found.from_longitude_deg) == A
+    assert (found.to_latitude_deg, found.to_longitude_deg) == A
+    assert not found.stops
+
+
 @pytest.mark.parametrize(
     "items",
     [
@@ -85,7 +93,6 @@ def test_what_is_done_on_the_way_is_not_flown_to() -> None:
         (item(SPLINE, A), item(WAYPOINT, B)),
         (item(LOITER_TURNS, A), item(WAYPOINT, B)),
         (item(RTL), item(WAYPOINT, B)),
-        (item(WAYPOINT, A), item(RTL)),
         (item(WAYPOINT, A), item(LAND)),
         (item(WAYPOINT, A), item(SERVO)),
         (item(SERVO), item(WAYPOINT, B)),
@@ -196,7 +203,9 @@ def test_the_mission_is_read_once_paced_and_acknowledged() -> None:
 def test_each_current_item_gives_its_leg() -> None:
     bench = known()
     assert bench.current() == (leg_report(MISSION, 5, bench.now_s),)
-    assert bench.current(sequence=6) == ()
+    (homewards,) = bench.current(sequence=6)
+    start = (homewards.from_latitude_deg, homewards.from_longitude_deg)
+    assert start == (homewards.to_latitude_deg, homewards.to_longitude_deg)
     assert bench.current(is_flown=False) == ()
 
 

@@ -130,6 +130,42 @@ def test_a_contradiction_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize(
+    ("overrides", "text"),
+    [
+        (
+            ["output.closed_us=2000", "output.full_us=1000"],
+            "output.closed_us = 2000: above pump.stop_us = 1000: the watchdog script would run",
+        ),
+        (["output.closed_us=1500"], "write at most 1000"),
+        (
+            ["output.closed_us=1050", "pump.stop_us=1100"],
+            "output.closed_us = 1050: above atomiser[0].stop_us = 1000",
+        ),
+        (["output.full_us=900"], "output.full_us = 900: not above output.closed_us = 1000"),
+    ],
+)
+def test_a_closed_pulse_at_which_a_motor_runs_is_refused(
+    tmp_path: Path, overrides: list[str], text: str
+) -> None:
+    with pytest.raises(ConfigError) as refused:
+        config(tmp_path, *overrides)
+    assert text in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_closed_pulse_that_stops_each_motor_is_good_and_one_elsewhere_is_free(
+    tmp_path: Path,
+) -> None:
+    stops = ["pump.stop_us=1100", "pump.us=[1150, 1300, 1500, 1700, 1950]"]
+    assert config(tmp_path, *stops).output.closed_us == 1000
+    # Motors of this computer are no business of the script.
+    local = ['pump.output="pwm"', 'atomiser[0].output="pwm"', "atomiser[0].channel=1"]
+    turned = config(tmp_path, *local, "pump.channel=0", "output.closed_us=2000",
+                    "output.full_us=1000")  # fmt: skip
+    assert turned.output.closed_us == 2000
+
+
+@pytest.mark.parametrize(
     ("without", "text"),
     [
         (r"spin_up_s = 0.30[^\n]*\n", "pump.spin_up_s: missing"),

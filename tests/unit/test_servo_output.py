@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 
 import pytest
 
@@ -144,14 +145,20 @@ async def test_the_end_of_the_lease_closes_every_valve(executor: ServoExecutor, 
     assert executor.lease_end_count == 1
 
 
-async def test_a_plan_that_comes_too_late_closes(executor: ServoExecutor, wire: Wire) -> None:
+async def test_a_plan_that_comes_too_late_is_refused_and_counted(
+    executor: ServoExecutor, wire: Wire
+) -> None:
     executor.submit(plan(1, 0.5, 0.5))
     wire.forget()
     past = SprayPlan(
-        sequence=2, issued_s=now() - 2, duty=(0.5, 0.5), changes=(), lease_until_s=now() - 1
+        sequence=2, issued_s=now() - 2, duty=(0.7, 0.7), changes=(), lease_until_s=now() - 1
     )
     executor.submit(past)
+    assert wire.orders == []
+    assert executor.rejected_count == 1
+    executor.submit(replace(past, duty=(0.0, 0.0)))
     assert wire.orders == CLOSED
+    assert executor.rejected_count == 1
 
 
 async def test_orders_are_refreshed_in_turns(wire: Wire) -> None:

@@ -189,23 +189,52 @@ def test_a_renewed_lease_has_one_timer_and_the_newest_end(loop: Loop) -> None:
     assert outputs.have[0] == 0.0
 
 
-def test_a_plan_that_comes_after_its_lease_closes(loop: Loop) -> None:
+def test_a_plan_that_comes_after_its_lease_is_refused_and_the_last_one_goes_on(
+    loop: Loop, caplog: pytest.LogCaptureFixture
+) -> None:
     outputs = started(loop)
     outputs.submit(plan(1, (0.5, 0.0), lease_s=12.0))
-    loop.now_s = 10.4
-    outputs.submit(plan(2, (1.0, 1.0)))
+    for late_s in (10.3, 10.4):
+        loop.now_s = late_s
+        outputs.submit(plan(2, (1.0, 1.0)))
+        assert outputs.have == {0: 0.5, 1: 0.0}
+        assert loop.waiting() == [12.0]
+    assert outputs.rejected_count == 2
+    assert [record.getMessage()[:14] for record in caplog.records] == ["refused a plan"]
+    # What was refused has no place in the order of plans.
+    outputs.submit(plan(2, (0.6, 0.0), lease_s=12.0))
+    assert outputs.have == {0: 0.6, 1: 0.0}
+    loop.run(12.0)
     assert outputs.have == {0: 0.0, 1: 0.0}
-    assert loop.waiting() == []
+    assert (outputs.rejected_count, outputs.lease_end_count) == (2, 1)
 
 
-def test_an_older_plan_and_the_same_again_change_nothing(loop: Loop) -> None:
-    outputs = started(loop)
-    outputs.submit(plan(5, (0.5, 0.0)))
-    outputs.submit(plan(5, (1.0, 1.0)))
-    outputs.submit(plan(4, (1.0, 1.0)))
-    assert outputs.have == {0: 0.5, 1: 0.0}
-    outputs.submit(plan(6, (1.0, 0.0)))
-    assert outputs.have == {0: 1.0, 1: 0.0}
+def test_a_late_plan_that_opens_later_or_moves_a_drive_is_refused_too(loop: Loop) -> None:
+    outputs = Outputs(loop, drives=1)
+    asyncio.run(outputs.start())
+    outputs.submit(plan(1, (0.5, 0.0), lease_s=12.0))
+    loop.now_s = 10.4
+    outputs.submit(plan(2, (0.0, 0.0), (10.2, 1, 0.4)))
+    outputs.submit(plan(2, drives=(DrivePlan(fraction=0.6),)))
+    assert outputs.rejected_count == 2
+    assert outputs.have == {0: 0.5, 1: 0.0, 2: 0.0}
+
+
+def test_a_plan_that_closes_is_taken_however_late_and_however_old(loop: Loop) -> None:
+    outputs = started(loop, has_return=True)
+    outputs.submit(plan(5, (0.5, 0.0), lease_s=12.0))
+    loop.run(10.4)
+    assert outputs.have == {0: 0.5, 1: 0.0, 2: 0.0}
+    outputs.submit(plan(6))
+    assert outputs.have == {0: 0.0, 1: 0.0, 2: 1.0}
+    outputs.submit(plan(7, (0.5, 0.0), lease_s=12.0))
+    outputs.submit(plan(4, lease_s=12.0))
+    assert outputs.have == {0: 0.0, 1: 0.0, 2: 1.0}
+    assert outputs.rejected_count == 0
+    # It has not set the order of plans back.
+    outputs.submit(plan(7, (1.0, 0.0), lease_s=12.0))
+    assert outputs.have == {0: 0.0, 1: 0.0, 2: 1.0}
+    assert outputs.rejected_count == 1
 
 
 def test_a_plan_for_others_is_refused(loop: Loop) -> None:

@@ -361,6 +361,27 @@ def test_the_mask_adds_outputs_that_are_not_in_a_row() -> None:
     assert one.arming_text is None
 
 
+def test_a_pump_in_the_mask_is_stopped_with_the_valves() -> None:
+    one = autopilot({"SPRW_MASK": 1 << 14})
+    spray(one)
+    one.order(15, 1900)
+    one.run(290)
+    assert one.outputs_us[15] == 1900
+    one.run(CLOSES_MS - 290)
+    assert pulses(one) == CLOSED
+    assert one.outputs_us[15] == 1000
+    assert one.texts[-1] == "Spray watchdog: no sign of life, closed"
+
+
+def test_a_pump_that_alone_runs_on_is_stopped_and_said() -> None:
+    one = autopilot({"SPRW_FIRST": 20, "SPRW_LAST": 20, "SPRW_CLOSED_US": 950})
+    one.on_message(LIVE)
+    one.order(20, 1600)
+    one.run(CLOSES_MS)
+    assert one.outputs_us == {20: 950}
+    assert one.texts[-1] == "Spray watchdog: no sign of life, closed"
+
+
 def test_a_return_valve_opens_while_the_others_are_closed() -> None:
     one = autopilot({"SPRW_RET_CH": 15, "SPRW_RET_US": 1900})
     assert one.outputs_us[15] == 1900

@@ -2,6 +2,7 @@
 
     python -m tests.bench.faults --flights 200 --seed 1 [--only 'SIGKILL'] [--json] [--page]
 
+A flight that the valve engine refuses because the computer is too busy is repeated, twice at most.
 Exit 1 when a limit was broken or a flight did not come to spraying; 130 when interrupted, with the
 result of the flights so far.
 """
@@ -23,10 +24,12 @@ from typing import Any
 from tests.bench.faults.cases import Draw, campaign
 from tests.bench.faults.flight import NotFlownError, fly
 from tests.bench.faults.judge import Verdict, judge
+from tests.bench.faults.record import Record
 from tests.bench.faults.report import result, write_page
 
 INTERRUPTED = 130
 VEHICLE_NICE = -10
+REPEATS_MAX = 2
 
 
 @dataclass(slots=True)
@@ -37,12 +40,13 @@ class Campaign:
     flights: int
     verdicts: list[Verdict] = field(default_factory=list)
     not_flown: list[str] = field(default_factory=list)
+    repeated: set[int] = field(default_factory=set)
 
     async def lane(self) -> None:
         """Fly one flight after the other until there are none left."""
         for draw in self.draws:
             try:
-                verdict = judge(await fly(draw))
+                verdict = judge(await self.flown(draw))
             except NotFlownError as error:
                 self.not_flown.append(f"flight {draw.number}, {draw.case.kind}: {error}")
                 self._say(draw, f"not flown: {error}")
@@ -51,6 +55,18 @@ class Campaign:
             words = f"closed after {verdict.closed_s:.3f} s (limit {verdict.limit_s:g} s)"
             words += f", {1e3 * verdict.waited_s:.0f} ms waited for a core"
             self._say(draw, "; ".join([words, *(f"WRONG: {text}" for text in verdict.wrong)]))
+
+    async def flown(self, draw: Draw) -> Record:
+        """Fly; again where the computer was too busy to begin, and only then."""
+        for _ in range(REPEATS_MAX):
+            try:
+                return await fly(draw)
+            except NotFlownError as error:
+                if not error.is_busy:
+                    raise
+                self.repeated.add(draw.number)
+                self._say(draw, f"flown again: {error}")
+        return await fly(draw)
 
     def _say(self, draw: Draw, text: str) -> None:
         done = len(self.verdicts) + len(self.not_flown)
@@ -105,6 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "command": shlex.join(["python", "-m", "tests.bench.faults", *words]),
         "seed": given.seed,
         "lanes": given.lanes,
+        "repeated": len(flown.repeated),
         "wall_s": round(time.monotonic() - began_s, 1),
     }
     found = result(flown.verdicts, flown.not_flown, about)

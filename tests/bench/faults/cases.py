@@ -7,7 +7,7 @@ another one can be seen, from the death or stop of a process, or of its only way
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -17,6 +17,8 @@ TOLD_S, SEEN_S = 0.15, 0.1
 # So many flights come to the border while they are watched.
 LEAVES_SHARE = 0.5
 GPIO_DEAD_S, SERVO_DEAD_S = 0.35, 0.45
+# A process that goes on after a stop: between these, and both sides of a withdrawn consent (2 s).
+STANDS_MIN_S, STANDS_MAX_S = 1.0, 8.0
 
 Output = Literal["gpio", "script", "dither"]
 LinkKind = Literal["udp", "tcp", "pty"]
@@ -31,6 +33,9 @@ class Kind(StrEnum):
     STOP_COMPANION = "SIGSTOP companion"
     STOP_ENGINE = "SIGSTOP engine"
     STOP_BOTH = "SIGSTOP both"
+    CONT_COMPANION = "SIGSTOP, SIGCONT companion"
+    CONT_ENGINE = "SIGSTOP, SIGCONT engine"
+    CONT_BOTH = "SIGSTOP, SIGCONT both"
     TERM_COMPANION = "SIGTERM companion"
     TERM_ENGINE = "SIGTERM engine"
     TERM_BOTH = "SIGTERM both"
@@ -55,11 +60,19 @@ class Kind(StrEnum):
 
 PROCESS_KINDS = frozenset(kind for kind in Kind if kind.value.startswith("SIG"))
 ENGINE_KINDS = frozenset(k for k in PROCESS_KINDS if not k.value.endswith("companion"))
+CONT_KINDS = frozenset({Kind.CONT_COMPANION, Kind.CONT_ENGINE, Kind.CONT_BOTH})
 LOST_KINDS = frozenset({Kind.LINK_TCP, Kind.LINK_PTY, Kind.CHIP_GONE})
 _GPIO_ONLY = ENGINE_KINDS | {Kind.CHIP_GONE}
 # A flight that is told or shown something does not depend on what watches a dead companion.
 _DITHER = frozenset(
-    {Kind.KILL_COMPANION, Kind.STOP_COMPANION, Kind.TERM_COMPANION, Kind.LINK_TCP, Kind.LINK_PTY}
+    {
+        Kind.KILL_COMPANION,
+        Kind.STOP_COMPANION,
+        Kind.CONT_COMPANION,
+        Kind.TERM_COMPANION,
+        Kind.LINK_TCP,
+        Kind.LINK_PTY,
+    }
 )
 
 
@@ -94,7 +107,9 @@ class Case:
 
     @property
     def watched_s(self) -> float:
-        """Return for how long the flight is watched after the fault."""
+        """Return for how long the flight is watched after the fault, or after its end."""
+        if self.kind in CONT_KINDS:
+            return 3.5
         return {
             Kind.NO_HEARTBEAT: 2.9,
             Kind.SILENCE: 1.3,
@@ -124,9 +139,22 @@ class Draw:
     share: float
     second_share: float
 
+    @property
+    def stands_s(self) -> float:
+        """Return how long a stopped process stands before it goes on; 0 for other faults."""
+        if self.case.kind not in CONT_KINDS:
+            return 0.0
+        # Evenly on a scale of ratios: half of them are short enough to spray on by themselves.
+        return STANDS_MIN_S * (STANDS_MAX_S / STANDS_MIN_S) ** self.share
+
+    @property
+    def watched_s(self) -> float:
+        """Return for how long the flight is watched after the fault."""
+        return self.stands_s + self.case.watched_s
+
     def field_m(self, speed_m_s: float) -> float:
         """Return how long the field is, along the pass."""
-        leaves_s = self.case.watched_s + 0.5 if self.leaves_s is None else self.leaves_s
+        leaves_s = self.watched_s + 0.5 if self.leaves_s is None else self.leaves_s
         return speed_m_s * (self.after_s + leaves_s)
 
 
@@ -156,7 +184,7 @@ def campaign(flights: int, seed: int, *, only: str = "") -> Iterator[Draw]:
         case = queue.pop()
         leaves = rng.random() < LEAVES_SHARE and case.kind is not Kind.DISK_FULL
         leaves_s = float(rng.uniform(0.1, case.watched_s))
-        yield Draw(
+        draw = Draw(
             number=number,
             seed=int(rng.integers(1, 2**31)),
             case=case,
@@ -167,3 +195,8 @@ def campaign(flights: int, seed: int, *, only: str = "") -> Iterator[Draw]:
             share=float(rng.random()),
             second_share=float(rng.random()),
         )
+        if draw.leaves_s is not None:
+            # Anywhere in the time of a standstill and after it.
+            scale = draw.watched_s / case.watched_s
+            draw = replace(draw, leaves_s=draw.leaves_s * scale)
+        yield draw

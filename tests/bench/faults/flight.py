@@ -29,8 +29,17 @@ SETTLE_S = 0.3
 COMPANION_NICE = 0
 
 
+# What the engine's test of itself says on a computer that is too busy for valves.
+BUSY = "wakes up "
+
+
 class NotFlownError(Exception):
     """The flight did not come so far that anything could go wrong in it."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the computer was too busy to fly: no fault of what flies."""
+        return BUSY in str(self)
 
 
 @dataclass(slots=True)
@@ -136,7 +145,7 @@ async def _fly(flight: Flight, said: asyncio.Task[tuple[bytes, bytes]]) -> Recor
     waited_s = _waited_s(flight.pid)
     fault_s = time.monotonic()
     await strike(flight)
-    await asyncio.sleep(max(fault_s + draw.case.watched_s - time.monotonic(), 0.0))
+    await asyncio.sleep(max(fault_s + draw.watched_s - time.monotonic(), 0.0))
     until_s = time.monotonic()
     waited_s = max(_waited_s(flight.pid) - waited_s, 0.0)
     # Later orders are of the ending of the flight, and no fault's.

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from tests.bench.faults.cases import PROCESS_KINDS, Kind
+from tests.bench.faults.cases import CONT_KINDS, PROCESS_KINDS, Kind
 from tests.bench.faults.place import SPEED_M_S, lags
 from tests.bench.faults.reasons import Reason, reasons_of
 from tests.bench.faults.record import Opening, Record
@@ -16,6 +16,8 @@ from tests.bench.faults.strike import jump_of
 FULL_ML_S = 6.096e3 / 60.0 / 6.0
 # Times are those of one clock, read by several processes.
 CLOCK_S = 0.001
+# Orders that were under way when a process was stopped are carried out by then.
+STOPPING_S = 0.05
 # What survives a fault sprays on: some opening begins later than this after it.
 SPRAYS_ON_S = 1.0
 # By then five positions have confirmed a jump, and nothing flows any more from before it.
@@ -85,7 +87,11 @@ def judge(record: Record) -> Verdict:
 def judged(record: Record) -> Sequence[Opening]:
     """Return what the times are judged by: without the ALIVE monostable where it is not needed."""
     case = record.draw.case
-    behind = case.output == "dither" or case.kind in (Kind.STOP_BOTH, Kind.CHIP_GONE)
+    behind = case.output == "dither" or case.kind in (
+        Kind.STOP_BOTH,
+        Kind.CONT_BOTH,
+        Kind.CHIP_GONE,
+    )
     return record.openings if behind else record.own
 
 
@@ -115,7 +121,7 @@ def _wrong_ends(record: Record) -> Iterator[str]:
         yield "the engine lives on without its companion"
     if "Traceback" in record.errors:
         yield f"traceback: {record.errors.strip().splitlines()[-1]}"
-    is_killed = kind in PROCESS_KINDS and not kind.value.endswith("engine")
+    is_killed = kind in PROCESS_KINDS - CONT_KINDS and not kind.value.endswith("engine")
     if not is_killed and record.ended_s is None:
         yield f"the companion ended by itself (exit {record.exit_code})"
     elif not is_killed and record.exit_code != 0:
@@ -130,9 +136,10 @@ def _sprays_on(record: Record, openings: Iterable[Opening]) -> bool:
 
 def split(record: Record, cause_s: float) -> tuple[list[Opening], list[Opening]]:
     """Return what was ordered, and what was held open after the cause by nobody's order."""
+    own = [_as_stopped(record, one, cause_s) for one in record.own]
     ordered = [
         one if one.is_ordered else one._replace(to_s=min(one.to_s, cause_s))
-        for one in record.own
+        for one in own
         if one.is_ordered or one.from_s < cause_s
     ]
     held = [
@@ -141,6 +148,14 @@ def split(record: Record, cause_s: float) -> tuple[list[Opening], list[Opening]]
         if not one.is_ordered and one.to_s > cause_s
     ]
     return ordered, held
+
+
+def _as_stopped(record: Record, one: Opening, cause_s: float) -> Opening:
+    """Return an opening as ordered by nobody that was closed only by who went on after a stop."""
+    case = record.draw.case
+    held = case.kind in CONT_KINDS and (case.output, case.kind) != ("gpio", Kind.CONT_COMPANION)
+    is_held = held and one.from_s < cause_s + STOPPING_S < one.to_s - STOPPING_S
+    return one._replace(is_ordered=False) if is_held else one
 
 
 def outside_ml(record: Record, openings: Iterable[Opening]) -> float:

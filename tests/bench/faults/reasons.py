@@ -11,11 +11,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
-from tests.bench.faults.cases import SEEN_S, TOLD_S
+from tests.bench.faults.cases import SEEN_S, TOLD_S, Kind
 from tests.bench.faults.record import Record
 from tests.bench.faults.wire import COMMAND, HEARTBEAT, LANDED, POSITION, Sent
 
 POSITION_AGE_S, HEARTBEAT_AGE_S = 0.8, 2.5
+# Whoever stood still for longer asks the operator again; clocks are read by two processes.
+CONSENT_S, CLOCKS_S = 2.0, 0.1
 JUMP_M, STUCK_M, CONFIRMED = 2.0, 0.15, 5
 AUTO, IN_AIR, DO_SPRAYER = 3.0, 2.0, 216.0
 _M_PER_DEGREE = 111_000.0
@@ -60,7 +62,22 @@ def _joined(reasons: Iterable[Reason]) -> list[Reason]:
 
 def _struck(record: Record) -> Iterator[Reason]:
     for struck in record.struck[:1]:
-        yield Reason(struck.what, struck.at_s, record.draw.case.limit_s)
+        yield Reason(struck.what, struck.at_s, record.draw.case.limit_s, _goes_on_s(record))
+
+
+def _goes_on_s(record: Record) -> float:
+    """Return until when a fault that was struck closes everything.
+
+    A companion that goes on opens nothing before five positions that left after that, and nothing
+    at all after a long stop. An engine that was stopped for so long has been replaced by nobody.
+    """
+    goes_on = [one.at_s for one in record.struck if one.what.startswith("SIGCONT")]
+    if record.draw.case.kind is Kind.CONT_ENGINE or not goes_on:
+        return math.inf
+    if goes_on[0] - record.struck[0].at_s > CONSENT_S + CLOCKS_S:
+        return math.inf
+    fresh = [one.made_s for one in _of(record.sent, POSITION) if one.made_s > goes_on[0]]
+    return fresh[CONFIRMED - 1] if len(fresh) >= CONFIRMED else math.inf
 
 
 def _of(sent: Sequence[Sent], message: int) -> list[Sent]:

@@ -77,6 +77,7 @@ def page(found: dict[str, Any]) -> str:
         f"{found['lanes']} at a time, {found['wall_s'] / 60.0:.0f} min; "
         f"{wrong or 'no'} limit{'' if wrong == 1 else 's'} broken, "
         f"{not_flown or 'no'} flight{'' if not_flown == 1 else 's'} without spraying, "
+        f"{found['repeated'] or 'none'} flown again as the computer was too busy to begin, "
         f"{found['ordered_outside_ml']:g} mL ordered outside. "
         f"The computer: the vehicle was late by {_ms(found['vehicle_late_median_s'])} at worst in "
         f"the median flight, {_ms(found['vehicle_late_worst_s'])} in the worst; while it was "

@@ -35,18 +35,24 @@ async def strike(flight: Flight) -> None:
 
 
 async def _signal(flight: Flight) -> None:
-    name, _, whom = flight.draw.case.kind.value.partition(" ")
-    number = signal.Signals[name]
+    names, _, whom = flight.draw.case.kind.value.rpartition(" ")
     engine = flight.engine_pid or 0
     pids = {"companion": [flight.pid], "engine": [engine], "both": [flight.pid, engine]}[whom]
     if flight.draw.engine_first:
         pids.reverse()
-    flight.send(pids[0], number)
-    if len(pids) > 1:
-        await asyncio.sleep(flight.draw.apart_s)
-        # The second may be dead already by the first one's end.
-        if pids[1] not in flight.deaths:
-            flight.send(pids[1], number)
+    for name in names.split(", "):
+        if name == "SIGCONT":
+            await asyncio.sleep(flight.draw.stands_s)
+        await _send(flight, pids, signal.Signals[name])
+
+
+async def _send(flight: Flight, pids: list[int], number: signal.Signals) -> None:
+    for place, pid in enumerate(pids):
+        if place > 0:
+            await asyncio.sleep(flight.draw.apart_s)
+        # One may be dead already by the other's end, or by the other's hand.
+        if pid not in flight.deaths:
+            flight.send(pid, number)
 
 
 async def _disable(flight: Flight) -> None:
