@@ -20,7 +20,7 @@ from tests.sitl.wire_peer import free_port
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(120)]
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang"
-# 3 s are for a pulse meter on this computer; the autopilot's counts are compared over bins of 0.55 s.
+# 3 s are for a pulse meter on this computer; the autopilot's counts are compared over 0.55 s.
 FOUND_MAX_S = 5.0
 # The order to close leaves with the plan of the step that found it.
 CLOSED_MAX_S = 0.15
