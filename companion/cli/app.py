@@ -80,7 +80,7 @@ def load_command(name: str, place: Place) -> Command:
     except ModuleNotFoundError as error:
         raise VrsprayError(
             f"vrspray {name}: the module {error.name} is not part of this installation; "
-            "install all of vrspray (pip install vrspray[plot,maps,mavsdk])"
+            "install all of vrspray (pip install vrspray[report,mcap,maps,mavsdk])"
         ) from error
     if (
         callable(found)
