@@ -44,6 +44,11 @@ def measure(profile: PlantProfile, *, output_s: float = 0.0) -> LagModel:
     for seed in SEEDS:
         for kind, lag_s in _rig(profile, seed):
             seen.setdefault(kind, []).append(lag_s)
+    return _lags(seen, output_s)
+
+
+def _lags(seen: dict[str, list[float]], output_s: float) -> LagModel:
+    """Return the lags of what was seen of a flow that is driven."""
     mean = {kind: fmean(values) for kind, values in seen.items()}
     return LagModel(
         on_s=mean["on"],
@@ -62,9 +67,7 @@ def measure(profile: PlantProfile, *, output_s: float = 0.0) -> LagModel:
 def _rig(profile: PlantProfile, seed: int) -> list[tuple[str, float]]:
     """Return the kind and the lag of every change of a few cycles, the first one left out."""
     plant = PumpPlant(profile, seed=seed)
-    orders = [
-        (kind, DWELL_S * (number + 1), duty) for number, (kind, duty) in enumerate(CYCLE * CYCLES)
-    ]
+    orders = _cycles()
     for _, at_s, duty in orders:
         plant.record_change(at_s, 0, duty)
     seen = []
@@ -81,25 +84,13 @@ def measure_sections(profile: PlantProfile, *, output_s: float = 0.0) -> tuple[L
         for seen, found in ((pump, _pump_rig(profile, seed)), (valves, _valve_rig(profile, seed))):
             for kind, lag_s in found:
                 seen.setdefault(kind, []).append(lag_s)
-    mean = {kind: fmean(values) for kind, values in pump.items()}
-    of_valves = {kind: fmean(values) for kind, values in valves.items()}
-    return LagModel(
-        on_s=mean["on"],
-        off_s=mean["off"],
-        up_s=mean["up"],
-        down_s=mean["down"],
-        on_start_s=min(pump["first"]),
-        off_end_s=max(pump["last"]),
-        up_time_s=mean["up time"],
-        down_time_s=mean["down time"],
-        output_s=output_s,
-        position_s=POSITION_S,
-    ), LagModel(
-        on_s=of_valves["on"],
-        off_s=of_valves["off"],
+    on_s, off_s = fmean(valves["on"]), fmean(valves["off"])
+    return _lags(pump, output_s), LagModel(
+        on_s=on_s,
+        off_s=off_s,
         # On-off valves change no flow; what stands here is not used.
-        up_s=of_valves["on"],
-        down_s=of_valves["off"],
+        up_s=on_s,
+        down_s=off_s,
         on_start_s=min(valves["first"]),
         off_end_s=max(valves["last"]),
         output_s=output_s,
@@ -114,9 +105,7 @@ def _pump_rig(profile: PlantProfile, seed: int) -> list[tuple[str, float]]:
     for valve in range(profile.valve_count):
         plant.record_change(0.0, valve, 1.0)
     seen = []
-    orders = [
-        (kind, DWELL_S * (number + 1), part) for number, (kind, part) in enumerate(CYCLE * CYCLES)
-    ]
+    orders = _cycles()
     for _, at_s, part in orders:
         plant.record_pump(at_s, supply.stop_us + part * (supply.max_us - supply.stop_us))
     for kind, at_s, _ in orders[len(CYCLE) :]:
@@ -137,6 +126,13 @@ def _valve_rig(profile: PlantProfile, seed: int) -> list[tuple[str, float]]:
     for kind, at_s in orders:
         seen += _look(lambda times: plant.volume_ml(times).sum(axis=1)[:, None], kind, at_s)
     return seen
+
+
+def _cycles() -> list[tuple[str, float, float]]:
+    """Return kind, time and part of the range of every change ordered."""
+    return [
+        (kind, DWELL_S * (number + 1), part) for number, (kind, part) in enumerate(CYCLE * CYCLES)
+    ]
 
 
 def _look(volume_ml: Callable[[Floats], Floats], kind: str, at_s: float) -> list[tuple[str, float]]:

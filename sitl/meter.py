@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -19,29 +20,34 @@ ROUNDING = 1e-9
 BLOCK = 256
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Metering:
+    """One meter: when it began to count, its noise's period, its delay, pulses per millilitre.
+
+    `factors` gives reading over truth of the first so many periods.
+    """
+
+    start_s: float
+    period_s: float
+    lag_s: float
+    per_ml: float
+    factors: Callable[[int], list[float]]
+
+
 class MeterStream:
     """Counts what all valves together deliver, up to times that do not go back."""
 
-    def __init__(
-        self,
-        *,
-        start_s: float,
-        period_s: float,
-        lag_s: float,
-        per_ml: float,
-        factors: Callable[[int], list[float]],
-    ) -> None:
-        """Make a meter; `factors` gives reading over truth of the first so many periods."""
-        self._start_s, self._period_s = start_s, period_s
-        self._lag_s, self._per_ml = lag_s, per_ml
-        self._all_factors = factors
-        self._factors: list[float] = factors(BLOCK)
+    def __init__(self, metering: Metering) -> None:
+        self._start_s, self._period_s = metering.start_s, metering.period_s
+        self._lag_s, self._per_ml = metering.lag_s, metering.per_ml
+        self._all_factors = metering.factors
+        self._factors: list[float] = metering.factors(BLOCK)
         self._bends: list[tuple[float, float]] = []
-        self._at_s = start_s
+        self._at_s = metering.start_s
         self._flow_ml_s = 0.0
         self._slope_ml_s2 = 0.0
         self._index = 0
-        self._edge_s = start_s + period_s
+        self._edge_s = metering.start_s + metering.period_s
         self._whole_ml = 0.0  # metered, all whole periods so far
         self._part_ml = 0.0  # true, of the period in progress
 
@@ -99,19 +105,8 @@ class _Volume(Protocol):
 class VolumeMeter(MeterStream):
     """The meter of a flow that is no chain of ramps: a pump's."""
 
-    def __init__(
-        self,
-        flow: _Volume,
-        *,
-        start_s: float,
-        period_s: float,
-        lag_s: float,
-        per_ml: float,
-        factors: Callable[[int], list[float]],
-    ) -> None:
-        super().__init__(
-            start_s=start_s, period_s=period_s, lag_s=lag_s, per_ml=per_ml, factors=factors
-        )
+    def __init__(self, flow: _Volume, metering: Metering) -> None:
+        super().__init__(metering)
         self._flow = flow
         self._seen_ml = 0.0
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
-from sitl.meter import MeterStream
+from sitl.meter import Metering, MeterStream
 from sitl.profile import draw_scatter, flow_table
 
 if TYPE_CHECKING:
@@ -228,18 +228,21 @@ class Plant:
         """Return the meter to be read in passing: the same counts, in order of time only."""
         if self._flows is not self._ramps:
             return lambda time_s: int(self.meter_count(np.array([time_s]))[0])
+        stream = self._stream = MeterStream(self._metering())
+        for ramps in self._ramps:
+            for step in ramps.steps:
+                stream.step(*step)
+        return stream.count
+
+    def _metering(self) -> Metering:
         meter, state = self.profile.meter, self._meter
-        stream = self._stream = MeterStream(
+        return Metering(
             start_s=self._start_s,
             period_s=self.profile.pwm.period_s,
             lag_s=meter.lag_s,
             per_ml=meter.pulses_per_l / 1000.0,
             factors=lambda count: state.factors(count, meter.noise).tolist(),
         )
-        for ramps in self._ramps:
-            for step in ramps.steps:
-                stream.step(*step)
-        return stream.count
 
     def meter_flow_l_min(self, times_s: NDArray[np.floating]) -> Floats:
         """Return the metered flow, mean of the PWM period before each time."""

@@ -175,15 +175,7 @@ class PumpPlant(Plant):
 
     def meter_stream(self) -> MeterStream:
         """Return the meter to be read in passing."""
-        meter, state = self.profile.meter, self._meter
-        return VolumeMeter(
-            self._flow,
-            start_s=self._start_s,
-            period_s=self.profile.pwm.period_s,
-            lag_s=meter.lag_s,
-            per_ml=meter.pulses_per_l / 1000.0,
-            factors=lambda count: state.factors(count, meter.noise).tolist(),
-        )
+        return VolumeMeter(self._flow, self._metering())
 
     def record_change(self, at_s: float, valve: int, duty: float) -> None:
         """Take down that the pump is ordered to `duty` from `at_s` on; 0 shuts the boom."""

@@ -113,15 +113,7 @@ class SectionPlant(Plant):
 
     def meter_stream(self) -> MeterStream:
         """Return the meter before the sections, behind the way back to the tank."""
-        meter, state = self.profile.meter, self._meter
-        return VolumeMeter(
-            self._flow,
-            start_s=self._start_s,
-            period_s=self.profile.pwm.period_s,
-            lag_s=meter.lag_s,
-            per_ml=meter.pulses_per_l / 1000.0,
-            factors=lambda count: state.factors(count, meter.noise).tolist(),
-        )
+        return VolumeMeter(self._flow, self._metering())
 
 
 class _Whole:

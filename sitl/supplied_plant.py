@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sitl.approach import Approach
-from sitl.meter import MeterStream
+from sitl.meter import Metering, MeterStream
 from sitl.plant import AveragedPlant, Floats, Plant, PulsedPlant
 
 if TYPE_CHECKING:
@@ -76,19 +76,8 @@ class SuppliedFlow:
 class _SuppliedMeter(MeterStream):
     """The meter of all valves under one pressure."""
 
-    def __init__(
-        self,
-        pressure: Approach,
-        *,
-        start_s: float,
-        period_s: float,
-        lag_s: float,
-        per_ml: float,
-        factors: Callable[[int], list[float]],
-    ) -> None:
-        super().__init__(
-            start_s=start_s, period_s=period_s, lag_s=lag_s, per_ml=per_ml, factors=factors
-        )
+    def __init__(self, pressure: Approach, metering: Metering) -> None:
+        super().__init__(metering)
         self._pressure = pressure
 
     def _go(self, until_s: float) -> None:
@@ -143,15 +132,7 @@ class _Supplied(Plant):
 
     def meter_counter(self) -> Callable[[float], int]:
         """Return the meter to be read in passing: the same counts, in order of time only."""
-        meter, state = self.profile.meter, self._meter
-        stream = self._stream = _SuppliedMeter(
-            self.pressure,
-            start_s=self._start_s,
-            period_s=self.profile.pwm.period_s,
-            lag_s=meter.lag_s,
-            per_ml=meter.pulses_per_l / 1000.0,
-            factors=lambda count: state.factors(count, meter.noise).tolist(),
-        )
+        stream = self._stream = _SuppliedMeter(self.pressure, self._metering())
         for ramps in self._ramps:
             for step in ramps.steps:
                 stream.step(*step)
