@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from companion.cli.map_grid import parse_place
+from companion.cli.options import Option, with_options
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.maps.model import MapFile
@@ -104,41 +102,25 @@ class Reading:
         return file.resolve() == self.config.resolve(table.file).resolve()
 
 
-_OPTIONS: dict[str, Any] = {
-    "rate_field": _RateField,
-    "unit": _Unit,
-    "crs": _Crs,
-    "layer": _Layer,
-    "density_kg_l": _Density,
-    "flow_width_m": _FlowWidth,
-    "flow_speed_m_s": _FlowSpeed,
-    "merge": _Merge,
-    "origin": _Origin,
-    "config_file": _ConfigFile,
+_OPTIONS = {
+    "rate_field": Option(_RateField),
+    "unit": Option(_Unit),
+    "crs": Option(_Crs),
+    "layer": Option(_Layer),
+    "density_kg_l": Option(_Density),
+    "flow_width_m": Option(_FlowWidth),
+    "flow_speed_m_s": Option(_FlowSpeed),
+    "merge": Option(_Merge),
+    "origin": Option(_Origin),
+    "config_file": Option(_ConfigFile),
 }
 
 
-def reading_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command that takes `reading: Reading` one option for each answer instead."""
-    signature = inspect.signature(command, eval_str=True)
-    own = [item for item in signature.parameters.values() if item.name != "reading"]
-    added = [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
-        for name, kind in _OPTIONS.items()
-    ]
+def _reading(*, config_file: Path | None, origin: str | None, **answers: Any) -> Reading:
+    config = None if config_file is None else load(config_file)
+    place = None if origin is None else parse_place(origin, "--origin")
+    return Reading(config=config, origin=place, **answers)
 
-    @wraps(command)
-    def expanded(**given: Any) -> None:
-        answers = {name: given.pop(name) for name in _OPTIONS}
-        file = answers.pop("config_file")
-        config = None if file is None else load(file)
-        if answers["origin"] is not None:
-            answers["origin"] = parse_place(answers["origin"], "--origin")
-        command(reading=Reading(config=config, **answers), **given)
 
-    # Typer reads it; the type of a function does not know it.
-    expanded.__signature__ = signature.replace(  # type: ignore[attr-defined]
-        parameters=[item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in own] + added
-    )
-    expanded.__annotations__ = {item.name: item.annotation for item in [*own, *added]}
-    return expanded
+# Gives a command that takes `reading: Reading` one option for each answer instead.
+reading_options = with_options("reading", _OPTIONS, _reading)

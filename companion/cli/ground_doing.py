@@ -1,0 +1,204 @@
+"""One piece of ground work from the command line: said, asked for, done while the key is held."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from companion import ground, runtime
+from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.ground_tasks import (
+    GroundOptionError,
+    Piece,
+    Wish,
+    csv_line,
+    ground_setup,
+    needs_autopilot,
+    piece_of,
+    plan_line,
+)
+from companion.cli.ground_words import in_words
+from companion.cli.hand import INTERRUPTED, KEY, Hand, read_line
+from companion.cli.link_parts import build_link, load_with_kept
+from companion.cli.options import REQUIRED, Option, with_options
+from companion.cli.run import build_executor, component_options, training_mark
+from companion.cli.sensor_parts import build_sensors
+from companion.config import Config
+from companion.core.ground_task import GroundKind
+from companion.core.ground_work import GroundReason
+from companion.errors import ActuatorError
+from companion.ground import GroundOutcome
+from companion.record import ground_log
+from companion.sensors.estop import EstopSwitch
+
+_ConfigFile = Annotated[
+    Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
+]
+_Lines = Annotated[
+    bool,
+    typer.Option("--hold-lines", help="Lines on stdin hold instead of the space bar: for scripts."),
+]
+# One of these ends work that was begun and of which a part is worth something.
+_GOOD_ENDS: frozenset[str] = frozenset(
+    {GroundReason.DONE, GroundReason.NOT_HELD, GroundReason.TIME_OVER, KEY}
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """What every piece of ground work is asked."""
+
+    config_file: Path
+    is_lines: bool
+    overrides: tuple[str, ...]
+    as_json: bool
+
+
+def _asked(
+    *, config_file: Path, is_lines: bool, overrides: list[str] | None, as_json: bool
+) -> Asked:
+    return Asked(
+        config_file=config_file,
+        is_lines=is_lines,
+        overrides=tuple(overrides or ()),
+        as_json=as_json,
+    )
+
+
+# Gives a command that takes `asked: Asked` these options instead.
+asked_options = with_options(
+    "asked",
+    {
+        "config_file": Option(_ConfigFile, REQUIRED),
+        "is_lines": Option(_Lines, False),
+        "overrides": Option(Overrides),
+        "as_json": Option(AsJson, False),
+    },
+    _asked,
+)
+
+
+def do(asked: Asked, wish: Wish, *, is_water: bool = False) -> None:
+    """Do one piece: say it, ask for the word, wait for the vehicle, and while the key is held."""
+    logging.basicConfig(stream=sys.stderr, level=logging.ERROR, format="%(levelname)s %(message)s")
+    wanted = (*asked.overrides, *(["journal.training=true"] if is_water else []))
+    config, given = load_with_kept(asked.config_file, wanted)
+    piece = piece_of(config, wish)
+    log = ground_log.ready_log(config.resolve(config.journal.folder))
+    descriptor = _stdin(asked.is_lines)
+    _ask(piece, config, descriptor)
+    hand = Hand(descriptor, is_lines=asked.is_lines)
+    outcome = _perform(config, given, piece, hand)
+    result = _result(config, piece, outcome)
+    if outcome.has_begun:
+        trouble = ground_log.append(log, {"ended_utc": datetime.now(UTC).isoformat(), **result})
+        if trouble is not None:
+            note(f"warning: {trouble}")
+    if INTERRUPTED in outcome.reasons:
+        raise KeyboardInterrupt
+    if not outcome.has_begun:
+        raise ActuatorError(f"{wish.kind}: nothing was opened: {result['ended']}")
+    answer(result, _lines(piece, result), as_json=asked.as_json)
+    raise typer.Exit(0 if result["ok"] else 1)
+
+
+def _stdin(is_lines: bool) -> int:
+    """Return where the hand is heard; a script has to say that it is one."""
+    try:
+        descriptor = sys.stdin.fileno()
+    except (OSError, ValueError, AttributeError) as error:
+        raise GroundOptionError("ground: stdin is closed; nobody could hold the key") from error
+    if not is_lines and not os.isatty(descriptor):
+        raise GroundOptionError(
+            "ground: stdin is no terminal, so that no key can be held; give --hold-lines and a "
+            "line at least every 0.5 s"
+        )
+    return descriptor
+
+
+def _ask(piece: Piece, config: Config, descriptor: int) -> None:
+    """Say what will be done and take the deliberate word."""
+    word = "click" if piece.task.kind is GroundKind.CLICK else "spray"
+    note(plan_line(piece))
+    if piece.task.kind is not GroundKind.CLICK:
+        note(_warning(config))
+    if needs_autopilot(config):
+        note("The flight controller's safety switch must be off, or nothing opens.")
+    note(f"Type {word} and Enter to go on:")
+    if read_line(descriptor) != word:
+        raise GroundOptionError(f"ground: the word was not {word}; nothing was opened")
+
+
+def _warning(config: Config) -> str:
+    """Return what has to be so before liquid comes, or that none will."""
+    if training_mark(config) == "dry":
+        return "A dry run: no outputs are configured, nothing will open."
+    pump = "The pump has to run." if config.pump is None else "The pump will run."
+    return f"Everybody away from the nozzles. {pump}"
+
+
+def _perform(config: Config, given: tuple[str, ...], piece: Piece, hand: Hand) -> GroundOutcome:
+    options = component_options(config, training="ground", watch_mission=True)
+    link = build_link(config, given, options)
+    executor = build_executor(config, link)
+    stops = [sensor for sensor in build_sensors(config) if isinstance(sensor, EstopSwitch)]
+
+    async def main() -> GroundOutcome:
+        with hand.attending():
+            return await ground.perform(
+                piece.task,
+                ground_setup(config),
+                link=link,
+                executor=executor,
+                hand=hand,
+                sensors=stops,
+                on_ready=lambda: note(hand.invitation),
+            )
+
+    return runtime.execute(main)
+
+
+def _result(config: Config, piece: Piece, outcome: GroundOutcome) -> dict[str, Any]:
+    """Return what came of it, as it is recorded and answered."""
+    is_catch = piece.task.kind is GroundKind.CATCH
+    is_good = outcome.has_begun and outcome.reasons <= _GOOD_ENDS and not piece.task.is_whole
+    result: dict[str, Any] = {
+        "ok": outcome.is_done or is_good,
+        "kind": str(piece.task.kind),
+        "valves": list(piece.names),
+        "duty": piece.duty,
+        "seconds": piece.task.seconds,
+        "open_s": round(outcome.open_s, 4),
+        "is_done": outcome.is_done,
+        "reasons": sorted(str(reason) for reason in outcome.reasons),
+        "ended": in_words(outcome.reasons, outcome.text),
+        "training": "ground",
+        "liquid": {"dry": "none", "water": "water"}.get(training_mark(config), "product"),
+    }
+    if piece.task.kind is GroundKind.CLICK:
+        result["liquid"] = "none"
+    if is_catch and outcome.is_done:
+        result["expected_ml"] = round(piece.expected_ml(config), 1)
+        result["csv"] = csv_line(piece, piece.task.seconds)
+    return result
+
+
+def _lines(piece: Piece, result: dict[str, Any]) -> list[str]:
+    lines = [f"{piece.task.kind}: {result['ended']}, {result['open_s']:.2f} s"]
+    if "expected_ml" in result:
+        lines += [
+            f"expected by the curve: {result['expected_ml']:.1f} mL of all these valves",
+            "for `vrspray calibrate flow`, with what was measured instead of the ?:",
+            "duty,seconds,millilitres,set",
+            result["csv"],
+        ]
+    elif piece.task.is_whole:
+        lines.append("a catch that was broken off is worth nothing: empty the cups, do it again")
+    return lines
