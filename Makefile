@@ -4,7 +4,7 @@
 PYTHON ?= python3
 SEED ?=
 ARGS ?=
-WORKERS ?= 2
+WORKERS ?= 3
 
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check

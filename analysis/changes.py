@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.track import Bools, Floats, Track
+from analysis.track import Bools, Floats, Track, in_field
+from analysis.zone_lookup import PIECE, lookup_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 Ints = NDArray[np.int64]
 
+# The state outside the field; zones there are nobody's business.
+OUTSIDE = -1
 # From 0.1 m to 0.01 mm.
 BISECTIONS = 14
 # Below this speed nothing is a change: the aircraft turns or hovers.
@@ -85,29 +88,38 @@ def bisect(holds: Callable[[Floats], Bools], low_s: Floats, high_s: Floats) -> F
 
 
 class _States:
-    """Numbers for the pairs (in the field, zones) that occur along a track."""
+    """Numbers for what is under a track: in the field or not, and which zones."""
 
     def __init__(self, track: Track, prescription: Prescription) -> None:
         self.track = track
         self.prescription = prescription
-        self.known: dict[tuple[bool, frozenset[int]], int] = {}
+        self.lookup = lookup_of(prescription)
 
     def at(self, time_s: Floats) -> Ints:
         """Return the number of the state under the strip's centre."""
         east_m, north_m = self.track.points(time_s)
-        inside = self.track.inside(self.prescription, time_s)
-        states = np.full(len(time_s), self._number(inside=False, zones=frozenset()))
+        inside = in_field(self.prescription, east_m, north_m) & self.track.on_line(time_s)
+        states = np.full(len(time_s), OUTSIDE)
         index = np.flatnonzero(inside)
-        zones = self.prescription.zones_at(east_m[index], north_m[index])
-        states[index] = [self._number(inside=True, zones=each) for each in zones]
+        states[index] = self.lookup.keys(east_m[index], north_m[index])
         return states
 
-    def _number(self, *, inside: bool, zones: frozenset[int]) -> int:
-        return self.known.setdefault((inside, zones), len(self.known))
+    def along(self, marks_s: Floats) -> Ints:
+        """Return the states at all marks; where no edge is near, one of a piece says all."""
+        if self.track.planned is not None:
+            return self.at(marks_s)
+        asked = np.ones(len(marks_s), dtype=np.bool_)
+        clear = np.flatnonzero(self.lookup.constant(*self.track.points(marks_s))) * PIECE
+        asked[(clear[:, np.newaxis] + np.arange(1, PIECE)).ravel()] = False
+        which = np.maximum.accumulate(np.where(asked, np.arange(len(marks_s)), 0))
+        places = np.cumsum(asked) - 1
+        found: Ints = self.at(marks_s[asked])[places[which]]
+        return found
 
     def run(self, state: int, start_s: float, end_s: float) -> Run:
         """Return the run of a state between two times."""
-        inside, zones = list(self.known)[state]
+        inside = state != OUTSIDE
+        zones = self.lookup.zones(state) if inside else frozenset()
         rate = self.prescription.rate_of(zones) if inside else None
         return Run(
             start_s=start_s,
@@ -124,7 +136,7 @@ def find_runs(track: Track, prescription: Prescription) -> list[Run]:
     """Return the runs along a track, without gaps between them."""
     states = _States(track, prescription)
     marks_s = track.time_s[track.marks]
-    found = states.at(marks_s)
+    found = states.along(marks_s)
     turns = np.flatnonzero(found[1:] != found[:-1])
     before = found[turns]
     edges_s = bisect(lambda t: states.at(t) == before, marks_s[turns], marks_s[turns + 1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,29 +15,54 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.strips import Strip
+    from analysis.track import Floats
     from companion.core.boom import Boom
     from companion.core.prescription import Prescription
 
 
-def misapplied_percent(strips: Sequence[Strip]) -> float | None:
-    """Return the volume in the wrong place, too much or too little, over the prescribed one.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Misapplied:
+    """Volume in the wrong place, and prescribed volume, at marks of all strips."""
 
-    Both are averaged along the track over one PWM period, every 0.1 m, where the strip is wholly
-    in the field. What falls outside is not in it; see `off_target_ml`.
+    time_s: Floats
+    wrong_ml: Floats
+    asked_ml: Floats
+
+
+def misapplied_parts(strips: Sequence[Strip]) -> Misapplied:
+    """Return what is in the wrong place, too much or too little, mark by mark.
+
+    Applied and prescribed volume are averaged along the track over one PWM period, every 0.1 m,
+    where the strip is wholly in the field. What falls outside is not in it; see `off_target_ml`.
     """
-    wrong_ml = 0.0
-    asked_ml = 0.0
-    for strip in strips:
-        track = strip.track
-        marks, metres = track.marks, np.gradient(track.distance_m[track.marks])
-        run_m = rise_over(track.distance_m, track.period_steps)[marks]
-        given = rise_over(track.volume_ml, track.period_steps)[marks]
-        asked = rise_over(strip.asked_ml, track.period_steps)[marks]
-        counts = strip.grazing & (run_m > SPEED_MIN_M_S * track.period_s)
-        weight = metres[counts] / run_m[counts]
-        wrong_ml += float((np.abs(given - asked)[counts] * weight).sum())
-        asked_ml += float((asked[counts] * weight).sum())
-    return 100.0 * wrong_ml / asked_ml if asked_ml > 0.0 else None
+    parts = [_misapplied(strip) for strip in strips]
+    return Misapplied(
+        time_s=np.concatenate([part.time_s for part in parts]),
+        wrong_ml=np.concatenate([part.wrong_ml for part in parts]),
+        asked_ml=np.concatenate([part.asked_ml for part in parts]),
+    )
+
+
+def _misapplied(strip: Strip) -> Misapplied:
+    track = strip.track
+    marks, metres = track.marks, np.gradient(track.distance_m[track.marks])
+    run_m = rise_over(track.distance_m, track.period_steps)[marks]
+    given = rise_over(track.volume_ml, track.period_steps)[marks]
+    asked = rise_over(strip.asked_ml, track.period_steps)[marks]
+    counts = strip.grazing & (run_m > SPEED_MIN_M_S * track.period_s)
+    weight = metres[counts] / run_m[counts]
+    return Misapplied(
+        time_s=track.time_s[marks][counts],
+        wrong_ml=np.abs(given - asked)[counts] * weight,
+        asked_ml=asked[counts] * weight,
+    )
+
+
+def misapplied_percent(strips: Sequence[Strip]) -> float | None:
+    """Return the volume in the wrong place over the prescribed one."""
+    parts = misapplied_parts(strips)
+    asked_ml = float(parts.asked_ml.sum())
+    return 100.0 * float(parts.wrong_ml.sum()) / asked_ml if asked_ml > 0.0 else None
 
 
 def volume_error_percent(

@@ -7,7 +7,7 @@ this one have one metric each.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ __all__ = [
     "FlightMeta",
     "FlightRecord",
     "evaluate",
+    "evaluate_strips",
     "limit_ratio",
     "whole_boom",
 ]
@@ -121,7 +122,11 @@ class Evaluation:
 
 def evaluate(record: FlightRecord) -> Evaluation:
     """Return every metric of a flight."""
-    strips = strips_of(record)
+    return evaluate_strips(record, strips_of(record))
+
+
+def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation:
+    """Return every metric of a flight whose strips are at hand."""
     steps = [_steps(strip, record) for strip in strips]
     switches = [
         switch

@@ -39,11 +39,15 @@ class FlowAccuracy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlowSamples:
-    """P1's data points: SA_k [%], its time, and the one rate under all strips (else NaN)."""
+    """P1's data points: SA_k [%], its time, and the one rate under all strips (else NaN).
+
+    `undefined` samples in the field had nothing prescribed: Eq. 18 divides by it.
+    """
 
     time_s: Floats
     accuracy_percent: Floats
     rate_l_ha: Floats
+    undefined: int
 
 
 def flow_samples(strips: Sequence[Strip]) -> FlowSamples:
@@ -69,6 +73,7 @@ def flow_samples(strips: Sequence[Strip]) -> FlowSamples:
         time_s=time_s[counts],
         accuracy_percent=100.0 * (1.0 - np.abs(given - asked)[counts] / asked[counts]),
         rate_l_ha=rate_l_ha[counts],
+        undefined=int((inside & moving & ~(asked > 0.0)).sum()),
     )
 
 

@@ -15,8 +15,9 @@ import numpy as np
 
 from analysis.changes import Change, changes_of
 from analysis.lag import SMALLEST_STEP
+from analysis.modelled_flow import flow_of, set_in_force
 from analysis.smoothing import rise_over
-from analysis.track import Bools, Floats, Track
+from analysis.track import Bools, Floats, Ints, Track
 from analysis.transitions import LEVEL_FROM, LEVEL_TO, ML_M_PER_L_HA_M
 
 if TYPE_CHECKING:
@@ -42,7 +43,6 @@ TRIM_S = 0.3
 # 0.42 s, its next poll 0.2 s, and a receiver's speed is 0.03 m/s off (1 sd, either way twice that).
 SPEED_AGE_S = 1.0
 SPEED_ERROR_M_S = 0.06
-ML_S_PER_L_MIN = 1000.0 / 60.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,19 +220,27 @@ def ordered_ml_s(
 
     In force is the smallest set with all valves that are open; each valve gives its share.
     """
+    at_s = np.array([order.at_s for order in orders])
+    valve = np.array([order.valve for order in orders], dtype=np.int64)
+    duty = np.array([order.duty for order in orders])
     by_size = sorted(nozzle_sets, key=lambda each: len(each.valves))
-    shares: list[dict[int, float]] = [dict.fromkeys(each.valves, 0.0) for each in by_size]
-    still_open: set[int] = set()
-    totals = [0.0]
-    for order in orders:
-        (still_open.add if order.duty > 0.0 else still_open.discard)(order.valve)
-        for nozzles, share in zip(by_size, shares, strict=True):
-            if order.valve in share:
-                flow_l_min = nozzles.curve.flow_for(order.duty)
-                share[order.valve] = flow_l_min * ML_S_PER_L_MIN / len(nozzles.valves)
-        fits = (share for share in shares if still_open <= share.keys())
-        totals.append(sum(next(fits, shares[-1]).values()))
-    return np.array([order.at_s for order in orders]), np.array(totals)
+    totals = np.stack([_total_of(nozzles, valve, duty) for nozzles in by_size])
+    number = set_in_force(valve, duty, by_size)
+    total: Floats = totals[number, np.arange(len(number))]
+    return at_s, np.concatenate(([0.0], total))
+
+
+def _total_of(nozzles: NozzleSet, valve: Ints, duty: Floats) -> Floats:
+    """Return the flow of a set's valves after each order, if all of them gave its shares."""
+    share = np.where(np.isin(valve, nozzles.valves), flow_of(nozzles, duty), 0.0)
+    share /= len(nozzles.valves)
+    rise = share.copy()
+    for each in nozzles.valves:
+        its = np.flatnonzero(valve == each)
+        rise[its[1:]] -= share[its[:-1]]
+    # What sums of rises and falls leave where all is closed is rounding.
+    total = np.cumsum(rise)
+    return np.where(np.abs(total) < 1e-9, 0.0, total)
 
 
 def highest(values: Floats, count: int) -> Floats:

@@ -27,6 +27,7 @@ from companion.core.liquid_bins import BIN_S
 from companion.core.liquid_law import AutopilotLiquid
 from companion.core.liquid_naming import RESTLESS_SHARE
 from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.overlap_guard import OverlapGuard
 from companion.core.prescription import FIELD, Prescription
 from companion.core.rate import flow_for_rate
 from companion.errors import ConfigError, MapError
@@ -83,7 +84,18 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
         pump=pump_of(config),
         atomisers=atomisers_of(config),
         lines=_lines(config, flight_frame, prescription),
+        # Without an output nothing is sprayed, whatever the plans say.
+        record_coverage=config.coverage.record and config.output.kind != "none",
+        overlap=_overlap(config),
     )
+
+
+def _overlap(config: Config) -> OverlapGuard | None:
+    """Return what closes valves over treated ground, if anything is to."""
+    percent = config.coverage.switch_off_percent
+    if percent is None or config.output.kind == "none":
+        return None
+    return OverlapGuard(switch_off_percent=percent)
 
 
 def _lines(config: Config, frame: LocalFrame, ground: Prescription) -> Lines | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from companion.core.coverage import Coverage
 from companion.core.types import Decision, Input, SprayPlan
 
 
@@ -72,3 +73,6 @@ class Recorder(Protocol):
 
     def record_event(self, at_s: float, kind: str, text: str) -> None:
         """Take down what happened besides."""
+
+    def record_coverage(self, coverage: Coverage) -> None:
+        """Keep which ground is treated by now; the newest counts."""

@@ -21,7 +21,9 @@ from collections.abc import Callable, Coroutine, Iterator, Sequence
 from typing import Any, TypeVar
 
 from companion.core.controller import Memory, Setup, step
+from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.swath import expected
 from companion.core.types import (
     Decision,
     EstopReport,
@@ -31,6 +33,7 @@ from companion.core.types import (
     OperatorCommand,
     OutputReport,
     StandstillReport,
+    VehicleState,
 )
 from companion.errors import SensorError
 from companion.ports import PlanExecutor, Recorder, Sensor, VehicleLink
@@ -55,6 +58,12 @@ LEAVE_CLOSED_S = 3.0
 # sign of life to the autopilot's watchdog (10 Hz), and not just before a position at 20 Hz.
 STEP_MAX_S = 0.06
 
+# The record gets the treated ground so often while it grows, and commits it once a second: a cut of
+# power comes at any moment until the next commit, in the middle of that second on the mean. What
+# is written is what will be treated by then, so that a flight that goes on errs to both sides.
+COVERAGE_EVERY_S = 0.25
+COVERAGE_AHEAD_S = 0.5 + 0.5 * COVERAGE_EVERY_S
+
 
 def boot_time_s() -> float:
     """Return the time since the start of the computer, its sleep included."""
@@ -71,6 +80,9 @@ class NoRecorder:
         """Forget it."""
 
     def record_event(self, at_s: float, kind: str, text: str) -> None:
+        """Forget it."""
+
+    def record_coverage(self, coverage: Coverage) -> None:
         """Forget it."""
 
 
@@ -102,6 +114,7 @@ class ControlLoop:
         self._told: frozenset[Finding] = frozenset()
         self._reported: tuple[str | None, str | None] | None = None
         self._stepped_s = float("-inf")
+        self._coverage_s = float("-inf")
 
     @property
     def next_step_s(self) -> float:
@@ -123,9 +136,24 @@ class ControlLoop:
         decision, self._memory = step(self._setup, state, self._memory, now_s)
         self._carry_out(decision)
         self._recorder.record_decision(decision)
+        if self._setup.records_coverage and now_s >= self._coverage_s + COVERAGE_EVERY_S:
+            self._keep_coverage(state, now_s, ahead_s=COVERAGE_AHEAD_S)
         if decision.findings:
             self._tell_findings(decision)
         return decision
+
+    def ended(self) -> None:
+        """Leave the record what was treated until now, and not what was to be."""
+        if self._setup.records_coverage:
+            now_s = self._clock()
+            self._keep_coverage(estimate(self._track, now_s), now_s, ahead_s=0.0)
+
+    def _keep_coverage(self, state: VehicleState | None, now_s: float, *, ahead_s: float) -> None:
+        self._coverage_s = now_s
+        cut_s = now_s + ahead_s
+        self._recorder.record_coverage(
+            expected(self._setup, self._memory, state, now_s=now_s, cut_s=cut_s)
+        )
 
     def _standstill(self) -> Iterator[Input]:
         """Yield that this process stood still, if it did: of sleep only the boot clock knows."""
@@ -244,6 +272,7 @@ async def run(
     """
     taken = recorder if recorder is not None else NoRecorder()
     ending = _Ending()
+    control: ControlLoop | None = None
     with _ends_at_signals(ending):
         try:
             await link.open(ending.wake.set)
@@ -270,6 +299,8 @@ async def run(
                     await _turn_until_the_end(control, ending, duration_s, on_step)
                 finally:
                     await executor.stop()
+                    if control is not None:
+                        control.ended()
         finally:
             await link.close()
             taken.record_event(clock(), "stop", ending.reason or "failure")

@@ -16,7 +16,9 @@ import numpy as np
 
 from analysis.flight_record import Fidelity, FlightMeta, FlightRecord, Floats
 from companion.core.controller import Memory, Setup, step
+from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.swath import expected
 from companion.core.types import (
     Decision,
     EstimatorReport,
@@ -28,6 +30,7 @@ from companion.core.types import (
     LandedReport,
     OperatorCommand,
     Telemetry,
+    VehicleState,
 )
 from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.drives import DrivenOutput, DriveTruth, Motors, Ranges
@@ -86,9 +89,11 @@ class FlightResult:
     inhibits: frozenset[Inhibit]
     simulated_s: float
     drives: DriveTruth | None = None
+    coverage: Coverage | None = None
 
 
 Progress = Callable[[float], None]
+OnStep = Callable[[Memory, VehicleState | None, float], None]
 
 
 def fly(
@@ -104,10 +109,12 @@ def fly(
     on_input: Callable[[Input], None] | None = None,
     disturb: Callable[[Iterator[Input]], Iterator[Input]] | None = None,
     mission: Route | None = None,
+    on_step: OnStep | None = None,
 ) -> FlightResult:
     """Fly `trajectory` with our controller, or with P1's where `wang` is given.
 
     With `mission`, the route that the trajectory flies, the controller hears which leg it is.
+    `on_step` gets what each step has left, the state that it was given, and its time.
     """
     if not options.scatter:
         profile = replace(profile, lag_scatter=0.0, flow_scatter=0.0)
@@ -130,7 +137,7 @@ def fly(
             faults=options.liquid_faults,
             seed=options.seed,
         )
-        said = _fly_ours(setup, inputs, output, meter, start_s, observer, on_input)
+        said = _fly_ours(setup, inputs, output, meter, start_s, observer, on_input, on_step)
     output.finish(end_s + TAIL_S / 2)
     sample_s = SAMPLE_S[options.fidelity]
     samples = math.floor((end_s + TAIL_S - start_s) / sample_s) + 1
@@ -172,6 +179,7 @@ def fly(
         drives=(
             output.motors.truth(times, volume_ml) if isinstance(output, DrivenOutput) else None
         ),
+        coverage=said.coverage,
     )
 
 
@@ -244,6 +252,7 @@ class _Said:
     steps: int = 0
     late: int = 0
     unresolved: int = 0
+    coverage: Coverage | None = None
 
 
 def _fly_ours(
@@ -254,6 +263,7 @@ def _fly_ours(
     start_s: float,
     observer: Callable[[Decision], None] | None,
     on_input: Callable[[Input], None] | None,
+    on_step: OnStep | None,
 ) -> _Said:
     """Run the core as the runtime does: at every position, and 20 times a second at least."""
     track, memory, said = Track(), Memory(), _Said(set())
@@ -261,7 +271,8 @@ def _fly_ours(
 
     def decide(now_s: float) -> None:
         nonlocal memory, next_s
-        decision, memory = step(setup, estimate(track, now_s), memory, now_s)
+        state = estimate(track, now_s)
+        decision, memory = step(setup, state, memory, now_s)
         output.submit(decision.plan, now_s=now_s)
         next_s = now_s + STEP_S
         said.steps += 1
@@ -270,6 +281,8 @@ def _fly_ours(
         said.inhibits |= decision.inhibits
         if observer is not None:
             observer(decision)
+        if on_step is not None:
+            on_step(memory, state, now_s)
         for report in meter.read(now_s):
             hear(report)
 
@@ -285,6 +298,9 @@ def _fly_ours(
         hear(item)
         if isinstance(item, Telemetry):
             decide(item.received_s)
+    if setup.records_coverage:
+        state = estimate(track, next_s)
+        said.coverage = expected(setup, memory, state, now_s=next_s, cut_s=next_s)
     return said
 
 

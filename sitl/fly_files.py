@@ -91,6 +91,8 @@ def write_journal(flown: Flown, folder: Path) -> Path:
                 journal.record_decision(item)
             else:
                 journal.record_input(item)
+        if flown.result.coverage is not None:
+            journal.record_coverage(flown.result.coverage)
         return journal.path
 
 

@@ -131,6 +131,7 @@ class _Run:
             start_s=start_s,
             written=self.sprayer.take,
         )
+        self.autopilot.utc_offset_s = time.time() - time.monotonic()
         if self.sprayer.liquid is not None:
             self.autopilot.batteries = self.sprayer.liquid.batteries
         self.mission = MissionWatch(self.autopilot, say)

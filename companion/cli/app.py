@@ -50,7 +50,14 @@ COMMANDS = {
     "calibrate": Place(
         "analysis.calibrate_cli:app", "Measure lags and flow curves; plan the flight for it."
     ),
+    "report": Place(
+        "analysis.report.cli:report", "Evaluate a flight: page, figures, record of application."
+    ),
     "replay": Place("analysis.cli:replay", "Feed a journal to the core and compare decisions."),
+    "export": Place(
+        "analysis.exports.cli:export", "Write a flight as CSV, KML, shapefile, ISOXML and others."
+    ),
+    "wsp": Place("analysis.wsp.cli:wsp", "Coverage and drop sizes on water-sensitive paper."),
 }
 
 

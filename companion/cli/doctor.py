@@ -24,6 +24,7 @@ from companion.cli.servo_parts import servo_options
 from companion.cli.systemd import properties, read_unit, unit_path
 from companion.config import Config
 from companion.core.controller import Setup
+from companion.doctor.application import application_check
 from companion.doctor.check import Check, Status, fail, is_ready, split_advice
 from companion.doctor.computer import computer_checks
 from companion.doctor.computer_facts import read_computer
@@ -96,6 +97,7 @@ def doctor(
 
 def _all(config: Config, given: tuple[str, ...], *, wait_s: float | None) -> Iterator[Check]:
     yield from configuration_checks(config, today=datetime.now(tz=UTC).astimezone().date())
+    yield application_check(config)
     found, setup = map_checks(config)
     yield from found
     yield from _computer(config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import re
@@ -18,16 +19,17 @@ from companion.assembly import build_setup, deliverable
 from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.notify import Notifier
-from companion.cli.output_parts import build_outputs, parts_of
+from companion.cli.output_parts import build_outputs
+from companion.cli.record_parts import follow
 from companion.cli.sensor_parts import build_sensors, follow_refills
 from companion.config import Config
+from companion.config.application_table import missing, told
 from companion.config.rules import unbounded, without_effect
 from companion.errors import ActuatorError, LinkError, SensorError
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_budget import dither_too_much
-from companion.output.gpio import GpioExecutor
 from companion.output.servo import DITHER_S
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
@@ -64,7 +66,7 @@ def run_companion(
     executor = build_executor(config, link)
     sensors = build_sensors(config)
     follow_refills(sensors, link)
-    for line in _warnings(config):
+    for line in (*_warnings(config), *_application_notes(config, training)):
         note(line)
     if config.mission is not None:
         for problem in deliverable(setup, config.mission.speed_m_s):
@@ -73,10 +75,7 @@ def run_companion(
     journal = Journal.create(
         folder, setup=setup, setup_text=_about(config, given), training=training
     )
-    link.on_event(journal.record_event)
-    for part in parts_of(executor):
-        if isinstance(part, GpioExecutor):
-            part.on_event = journal.record_event
+    follow(journal, link, executor)
     notifier = Notifier.from_environment(os.environ, pid=os.getpid())
     try:
         with journal, notifier:
@@ -151,7 +150,22 @@ def _about(config: Config, overrides: Sequence[str]) -> dict[str, str]:
         "config_path": str(config.path),
         "config_toml": config.source_text,
         "config_overrides": "\n".join(overrides),
+        "application_json": json.dumps(told(config)),
     }
+
+
+def _application_notes(config: Config, training: str) -> list[str]:
+    """Return what the legal record of this flight will lack; a training has none."""
+    profile = config.application.profile
+    if profile is None or training != "no":
+        return []
+    absent = missing(profile, told(config))
+    if not absent:
+        return []
+    return [
+        f"note: the {profile} record of this application will be incomplete: missing "
+        f"{', '.join(absent)}; write them now, or give them to `vrspray report`"
+    ]
 
 
 run = typer.main.get_command(app)

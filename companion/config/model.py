@@ -9,7 +9,9 @@ from pydantic import Field, PrivateAttr, model_validator
 from pydantic_core import PydanticCustomError
 
 from companion.config import (
+    application_table,
     correction_tables,
+    coverage_table,
     motor_tables,
     motors,
     sensor_tables,
@@ -61,6 +63,7 @@ class Config(tables.Table):
     safety: tables.SafetyTable = tables.SafetyTable()
     mission: tables.MissionTable | None = None
     product: tables.ProductTable = tables.ProductTable()
+    application: application_table.ApplicationTable = application_table.ApplicationTable()
     flow_trim: correction_tables.FlowTrimTable = correction_tables.FlowTrimTable()
     flow_meter: sensor_tables.FlowMeterTable = sensor_tables.FlowMeterTable()
     pressure: sensor_tables.PressureTable = sensor_tables.PressureTable()
@@ -68,6 +71,7 @@ class Config(tables.Table):
     detection: sensor_tables.DetectionTable = sensor_tables.DetectionTable()
     drift: correction_tables.DriftTable = correction_tables.DriftTable()
     prediction: correction_tables.PredictionTable = correction_tables.PredictionTable()
+    coverage: coverage_table.CoverageTable = coverage_table.CoverageTable()
     journal: tables.JournalTable = tables.JournalTable()
     web: tables.WebTable = tables.WebTable()
 

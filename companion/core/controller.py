@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from companion.core import detection, flow_trim, sprayer_state
+from companion.core import detection, flow_trim, sprayer_state, swath
 from companion.core.atomiser import Atomiser
 from companion.core.boom import Boom
+from companion.core.coverage import Coverage
 from companion.core.crossings import Across, Border, Route
 from companion.core.detection import Detection, Watching, WatchMemory
 from companion.core.dosing import Sprayer, dosing_of, overdrive_of, skew_of, speed_soon
@@ -23,6 +24,7 @@ from companion.core.interlock import Held, Limits, closed_plan, guard, inhibits,
 from companion.core.lines import Lines
 from companion.core.liquid_law import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.overlap_guard import OverlapGuard
 from companion.core.prescription import Prescription
 from companion.core.pump import DRY, Pump, Pumping, PumpMemory, on_off
 from companion.core.rate import flow_for_rate, overridden
@@ -30,6 +32,7 @@ from companion.core.routes import ROUTES_KEPT_S, routes_ahead
 from companion.core.schedule import Dosing, LagModel, Timing, ValveSchedule, schedule
 from companion.core.sets import SetOfRate, dosing_by_valve, sets_ahead
 from companion.core.sprayer_state import BOOT, Machine, shown
+from companion.core.swath import Swath
 from companion.core.types import (
     Decision,
     Finding,
@@ -70,6 +73,10 @@ class Setup:
     pump: Pump | None = None
     atomisers: tuple[Atomiser, ...] = ()
     lines: Lines | None = None  # None: sprayed wherever the map has a rate
+    record_coverage: bool = False
+    overlap: OverlapGuard | None = None  # None: treated ground is sprayed again
+    # What earlier flights treated; not compared by hash: tiles are a mapping.
+    treated: Coverage | None = field(default=None, repr=False, hash=False)
     timing: Timing = field(init=False, repr=False, compare=False)
     pumping: Pumping | None = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
@@ -118,6 +125,11 @@ class Setup:
         )
 
     @property
+    def records_coverage(self) -> bool:
+        """Return whether it is kept which ground was treated: a guard needs it too."""
+        return self.record_coverage or self.overlap is not None
+
+    @property
     def doses(self) -> Sprayer:
         """Return what makes the flow: the valves, or the pump in their place."""
         return self if self.pumping is None else self.pumping
@@ -160,6 +172,7 @@ class Memory:
     held: Held = ()
     machine: Machine = BOOT
     pump: PumpMemory = DRY
+    swath: Swath | None = None
 
 
 def step(
@@ -177,7 +190,11 @@ def step(
     reasons, held = settled(reasons | detection.inhibits_of(memory.watch), memory.held, now_s)
     machine, reasons = sprayer_state.follow(memory.machine, reasons, state)
     memory = replace(
-        memory, held=held, machine=machine, pump=ran(setup, memory.pump, memory.plan, now_s)
+        memory,
+        held=held,
+        machine=machine,
+        pump=ran(setup, memory.pump, memory.plan, now_s),
+        swath=_swept(setup, state, memory, now_s),
     )
     sequence = 1 if memory.plan is None else memory.plan.sequence + 1
     if reasons or state is None:
@@ -250,6 +267,7 @@ def step(
         held=held,
         machine=machine,
         pump=pump_memory,
+        swath=memory.swath,
     )
 
 
@@ -266,6 +284,16 @@ def _watched(setup: Setup, state: VehicleState | None, memory: Memory, now_s: fl
         now_s=now_s,
     )
     return replace(memory, watch=watch)
+
+
+def _swept(setup: Setup, state: VehicleState | None, memory: Memory, now_s: float) -> Swath | None:
+    """Return what was treated until now; None where it is not kept."""
+    if not setup.records_coverage:
+        return None
+    return swath.follow(
+        setup, memory.swath, memory.plan, state,
+        findings=_findings(setup, memory), drift_m=memory.drift_m, now_s=now_s,
+    )  # fmt: skip
 
 
 def _findings(setup: Setup, memory: Memory) -> tuple[Finding, ...]:
@@ -353,6 +381,7 @@ def _closed(
         held=memory.held,
         machine=memory.machine,
         pump=memory.pump._replace(is_early=False),
+        swath=memory.swath,
     )
 
 

@@ -40,6 +40,7 @@ from companion.core.types import (
     StopAhead,
     TankReport,
     Telemetry,
+    UtcReport,
     VehicleState,
     Way,
     WindReport,
@@ -130,6 +131,7 @@ _KEEP: dict[type, Callable[[Track, Any], Track]] = {
     PressureReport: lambda track, item: replace(track, pressure=item),
     TankReport: lambda track, item: replace(track, tank=item),
     ClockReport: lambda track, item: replace(track, clock_report=item),
+    UtcReport: lambda track, _item: track,
     # What is out of bounds, or no number, leaves the rate as it was.
     RateOverride: lambda track, item: (
         replace(track, rate_percent=item.percent) if is_override(item.percent) else track

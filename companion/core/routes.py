@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from companion.core.crossings import Route, find_routes
 from companion.core.drift import Offset, is_same, offset
 from companion.core.lines import Piece
+from companion.core.overlap_guard import guarded
 from companion.core.paths import STRAIGHT_YAW_RATE_DEG_S
 from companion.core.types import VehicleState
 
@@ -51,7 +52,7 @@ def routes_ahead(
         drift_m=drift_m,
         flown=_flown(setup, state, memory),
     )
-    return routes, state, drift_m
+    return guarded(setup, memory, state, routes, now_s, drift_m=drift_m), state, drift_m
 
 
 def _flown(setup: Setup, state: VehicleState, memory: Memory) -> tuple[Piece, ...] | None:

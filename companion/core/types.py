@@ -314,6 +314,14 @@ class ClockReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class UtcReport:
+    """The time of day by the autopilot (SYSTEM_TIME), seconds since 1970; for the record only."""
+
+    received_s: float
+    utc_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LegReport:
     """The leg of its mission that the vehicle now flies: from which place to which.
 
@@ -362,6 +370,7 @@ Input = (
     | RateOverride
     | ClockReport
     | LegReport
+    | UtcReport
 )
 
 

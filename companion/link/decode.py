@@ -21,6 +21,7 @@ from companion.core.types import (
     RcReport,
     SpeedReport,
     Telemetry,
+    UtcReport,
     WindReport,
 )
 from companion.link.messages import (
@@ -44,6 +45,8 @@ _LOOKS_DOWN = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _INT16_LIMIT = 32767
 _HEADING_MAX_CDEG = 36_000  # UINT16_MAX is not known, and so is any other above a circle
 _UINT16_MAX = 65535
+# The time of satellites lies between the beginnings of 2021 and 2100, or it is none yet.
+_UTC_MIN_S, _UTC_MAX_S = 1_609_459_200.0, 4_102_444_800.0
 # EKF_STATUS_FLAGS: what must be set, and what must not. ArduPilot documents that variances below
 # 0.5 are good, 0.5 to 0.8 acceptable and above 1 bad.
 _EKF_NEEDED = 2 | 16  # VELOCITY_HORIZ, POS_HORIZ_ABS
@@ -162,6 +165,13 @@ def _battery(m: Any, received_s: float) -> BatteryReport:
     )
 
 
+def _utc(m: Any, received_s: float) -> UtcReport | None:
+    """Return the time of day; None while the autopilot has none (0, or the day it was built)."""
+    utc_s = m.time_unix_usec / 1e6
+    known = _UTC_MIN_S < utc_s < _UTC_MAX_S
+    return UtcReport(received_s=received_s, utc_s=utc_s) if known else None
+
+
 def _rc(m: Any, received_s: float) -> RcReport:
     raw = (getattr(m, f"chan{channel}_raw") for channel in range(1, 19))
     pulses = tuple(0 if pulse == _UINT16_MAX else pulse for pulse in raw)
@@ -256,6 +266,7 @@ Decoder = Callable[[Any, float], Message | None]
 # By message id. What describes the vehicle counts only when its autopilot sent it.
 FROM_VEHICLE: dict[int, Decoder] = {
     0: _heartbeat,
+    2: _utc,
     22: _param_value,
     24: _gnss,
     33: _position,

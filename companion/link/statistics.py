@@ -56,7 +56,7 @@ class Meter:
         self.bytes_out = 0
         self.frames_out = 0
         self.unsent_frames = 0
-        self._before: tuple[float, int, int, int] | None = None
+        self._before: dict[str, tuple[float, int, int, int]] = {}
 
     def sent(self, size: int, *, has_left: bool) -> None:
         """Count one frame that went out, or could not."""
@@ -71,12 +71,14 @@ class Meter:
         codec: Codec,
         now_s: float,
         *,
+        series: str = "line",
         position_hz: float | None = None,
         round_trip_s: float | None = None,
     ) -> LinkStatistics:
-        """Return the statistics up to now."""
+        """Return the statistics up to now; rates are those since the last of this series."""
         counts = (now_s, codec.frame_count, codec.byte_count, self.bytes_out)
-        before, self._before = self._before, counts
+        before = self._before.get(series)
+        self._before[series] = counts
         rates: list[float | None] = [None] * 3
         if before is not None and now_s > before[0]:
             span_s = now_s - before[0]

@@ -79,6 +79,7 @@ def wanted_streams(
         Stream(message_id=wind, rate_hz=2.0, group=_EXTRA3, optional=True),
         Stream(message_id=132, rate_hz=10.0, group=_EXTRA3, optional=True),  # height above the crop
         # ArduPilot's battery monitors take turns: three of them come 3 times a second each.
+        Stream(message_id=2, rate_hz=1.0, group=_EXTRA3, optional=True),  # time of day
         *([Stream(message_id=147, rate_hz=10.0, group=_EXTRA3)] if with_battery else []),
         *([Stream(message_id=42, rate_hz=2.0, group=_EXTENDED_STATUS)] if with_mission else []),
     )

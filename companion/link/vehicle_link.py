@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 
 from companion.core.types import Decision, Input, OperatorCommand, RateOverride
 from companion.link.component import Component, ComponentOptions
@@ -18,12 +19,15 @@ from companion.link.statistics import LinkStatistics
 from companion.link.transport import Transport, open_transport
 from companion.link.watch import Watch
 
+OnStatistics = Callable[[float, Mapping[str, float | None]], None]
+
 _logger = logging.getLogger(__name__)
 
 # Chunks that wait for the control loop. It empties them within a millisecond; a loop that is
 # behind by this many has other troubles than the oldest bytes.
 _CHUNKS_MAX = 512
 _STATISTICS_S = 60.0
+_SAMPLE_S = 1.0
 
 
 class VehicleLink:
@@ -51,6 +55,8 @@ class VehicleLink:
         self.component = Component(options, self._send, parameters=parameters, signing=signing)
         self.component.on_event = self._event
         self._on_event: OnEvent | None = None
+        self._on_statistics: OnStatistics | None = None
+        self._sampled_s = float("-inf")
         self._watch = Watch(url, self.component, self._event)
         self._statistics_s: float | None = None
         self.statistics: LinkStatistics | None = None
@@ -90,6 +96,10 @@ class VehicleLink:
     def on_event(self, take: OnEvent) -> None:
         """Have what happens on the link given to `take(at_s, kind, text)`, for the record."""
         self._on_event = take
+
+    def on_statistics(self, take: OnStatistics) -> None:
+        """Have how the link does given to `take(at_s, values)` once a second, for the record."""
+        self._on_statistics = take
 
     def receive(self) -> list[Input]:
         """Return what came in since the last call, in its order."""
@@ -197,6 +207,9 @@ class VehicleLink:
         """Write statistics down once a minute, and the signing stamp when it is due."""
         if self._signing is not None:
             self._signing.keep()
+        if self._on_statistics is not None and now_s - self._sampled_s >= _SAMPLE_S:
+            self._sampled_s = now_s
+            self._on_statistics(now_s, asdict(self._read(now_s, "sample")))
         if self._statistics_s is None:
             self._statistics_s = now_s
         elif now_s - self._statistics_s >= _STATISTICS_S:
@@ -204,14 +217,18 @@ class VehicleLink:
             self._count(now_s)
 
     def _count(self, now_s: float) -> None:
+        self.statistics = self._read(now_s, "line")
+        self._event(now_s, "link", self.statistics.line())
+
+    def _read(self, now_s: float, series: str) -> LinkStatistics:
         component = self.component
-        self.statistics = component.meter.read(
+        return component.meter.read(
             component.codec,
             now_s,
+            series=series,
             position_hz=component.position_rate_hz,
             round_trip_s=component.clock.round_trip_s,
         )
-        self._event(now_s, "link", self.statistics.line())
 
 
 def _nothing() -> None:

@@ -33,7 +33,7 @@ from companion.output.engine.wire import (
     status_from,
     unpack,
 )
-from companion.output.timed import Lateness
+from companion.output.timed import Lateness, OnOrder
 
 _logger = logging.getLogger(__name__)
 
@@ -55,8 +55,9 @@ class GpioExecutor:
     """Speaks with the engine by a socket; never waits but in `start` and `stop`.
 
     `issued` holds the last edges with their planned and actual time; `on_issued`, if set, is
-    given them as they come, some twenty times a second. `on_event`, if set, is told of the
-    self-test: `on_event(at_s, kind, text)`.
+    given them as they come, some twenty times a second; `on_order`, if set, is told of each first
+    edge with another duty. `on_event`, if set, is told of the self-test:
+    `on_event(at_s, kind, text)`.
     """
 
     def __init__(
@@ -85,6 +86,8 @@ class GpioExecutor:
         self.unsent_count = 0
         self.issued: deque[Issued] = deque(maxlen=_KEPT)
         self.on_issued: Callable[[Sequence[Issued]], None] | None = None
+        self.on_order: OnOrder | None = None
+        self._told_duty: dict[int, float] = {}
         self.on_event: Callable[[float, str, str], None] | None = None
 
     @property
@@ -212,6 +215,8 @@ class GpioExecutor:
                 self.lateness.add(max(edge.actual_s - edge.planned_s, 0.0))
             if self.on_issued is not None:
                 self.on_issued(edges)
+            if self.on_order is not None:
+                self._tell_orders(self.on_order, edges)
         elif kind is Kind.READY:
             self._take_ready(json.loads(body))
         elif kind is Kind.FAULT:
@@ -219,6 +224,12 @@ class GpioExecutor:
             # Before it is ready: it could not have its lines, and that is its whole self-test.
             self.self_test = self.self_test or SelfTest(fault=text)
             self._fail(f"valve engine: {text}")
+
+    def _tell_orders(self, on_order: OnOrder, edges: Sequence[Issued]) -> None:
+        for edge in edges:
+            if edge.output < self._count and edge.duty != self._told_duty.get(edge.output, 0.0):
+                self._told_duty[edge.output] = edge.duty
+                on_order(edge.output, edge.duty, edge.planned_s, edge.actual_s)
 
     def _take_ready(self, ready: dict[str, Any]) -> None:
         self.warnings = list(ready["warnings"])

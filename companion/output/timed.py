@@ -10,11 +10,15 @@ import asyncio
 import logging
 from abc import abstractmethod
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import chain
 
 from companion.core.types import SprayPlan
 from companion.output.return_valve import ReturnValve
+
+# What is told of an order: valve, duty, when a plan wanted it (None: a fault did), when it left.
+OnOrder = Callable[[int, float, float | None, float], None]
 
 # Clocks that disagree by less than this agree: a timer may wake early by the loop's resolution.
 _EARLY_S = 1e-6
@@ -83,6 +87,8 @@ class Lateness:
 class TimedExecutor:
     """Follows the newest plan by one timer of the event loop; its clock is `time.monotonic`.
 
+    `on_order`, if set, is told of every order that gives a valve another duty, for the record.
+
     With a return valve there is one output more than there are valves: 1 is open, 0 shut. Drives
     come behind that; a plan's drives are nothing to an executor that has none.
     """
@@ -96,6 +102,7 @@ class TimedExecutor:
         self._timer: asyncio.TimerHandle | None = None
         self._is_running = False
         self._sequence: int | None = None
+        self.on_order: OnOrder | None = None
         self.lateness = Lateness()
         self.lease_end_count = 0
         self.rejected_count = 0
@@ -104,6 +111,11 @@ class TimedExecutor:
     def fault(self) -> str | None:
         """Why the outputs cannot be trusted; None while all is well."""
         return None
+
+    @property
+    def valve_count(self) -> int:
+        """Return how many valves it has; 0 where it only drives motors."""
+        return self._count
 
     async def start(self) -> None:
         """Take the outputs and order all of them closed."""
@@ -169,9 +181,12 @@ class TimedExecutor:
             self._apply(self._count, 1.0)
         for drive in range(self._drive_count):
             self._apply(self._first_drive + drive, 0.0)
-        for valve in range(self._count):
-            self._apply(valve, 0.0)
+        given = [valve for valve in range(self._count) if self._apply(valve, 0.0)]
         self._flush()
+        if self.on_order is not None and given:
+            now_s = asyncio.get_running_loop().time()
+            for valve in given:
+                self.on_order(valve, 0.0, None, now_s)
 
     def _next_own_s(self) -> float | None:
         """Return when the executor wants to be woken for its own ends."""
@@ -205,6 +220,9 @@ class TimedExecutor:
         for plan in (self._plan, replaced):
             if plan is not None and given:
                 self._measure(plan, given)
+        if self.on_order is not None:
+            for valve, duty, given_s in given:
+                self.on_order(valve, duty, self._planned_s(valve, duty, given_s, replaced), given_s)
 
     def _drive(self, now_s: float, *, stops: bool) -> None:
         """Stop the drives that are to stand, ahead of the valves; or move the others, behind."""
@@ -234,6 +252,19 @@ class TimedExecutor:
             due_s = due.get((valve, duty))
             if due_s is not None and due_s <= at_s:
                 self.lateness.add(at_s - due_s)
+
+    def _planned_s(
+        self, valve: int, duty: float, given_s: float, replaced: SprayPlan | None
+    ) -> float | None:
+        """Return when a plan wanted what was ordered; None where none did, but a fault."""
+        plan = self._plan
+        if plan is None or self.fault is not None:
+            return None
+        for each in (plan, replaced):
+            for change in reversed(() if each is None else each.changes):
+                if (change.valve, change.duty) == (valve, duty) and change.at_s <= given_s:
+                    return change.at_s
+        return plan.issued_s if given_s < plan.lease_until_s else plan.lease_until_s
 
     def _wake(self) -> None:
         self._timer = None

@@ -12,6 +12,8 @@ from datetime import UTC, datetime
 
 APPLICATION_ID = 0x47504B47  # "GPKG"
 USER_VERSION = 10400
+# Half of SQLite's: a second of a flight fills some pages, and half of the last one stays empty.
+PAGE_BYTES = 2048
 WGS84_ID = 4326
 LOCAL_ID = 100_000  # the flight's own frame: metres east and north of its origin
 _LITTLE_ENDIAN = 0x01
@@ -27,6 +29,7 @@ WGS84_WKT = (
 )
 
 SCHEMA = f"""
+PRAGMA page_size = {PAGE_BYTES};
 PRAGMA application_id = {APPLICATION_ID};
 PRAGMA user_version = {USER_VERSION};
 CREATE TABLE gpkg_spatial_ref_sys (
@@ -62,15 +65,28 @@ CREATE TABLE zones (
     id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY, name TEXT, rate_l_ha DOUBLE
 );
 CREATE TABLE field (id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY);
-CREATE TABLE records (
-    sequence INTEGER PRIMARY KEY NOT NULL, time_s DOUBLE, kind TEXT NOT NULL, body TEXT NOT NULL
+CREATE TABLE blocks (
+    first_sequence INTEGER PRIMARY KEY NOT NULL, last_sequence INTEGER, row_count INTEGER,
+    from_s DOUBLE, until_s DOUBLE, crc32 INTEGER, body BLOB
+);
+CREATE TABLE valve_changes (
+    id INTEGER PRIMARY KEY NOT NULL, planned_us INTEGER, actual_us INTEGER, valve INTEGER,
+    duty_permille INTEGER
+);
+CREATE TABLE link_stats (
+    id INTEGER PRIMARY KEY NOT NULL, time_s DOUBLE, bytes_in INTEGER, bytes_out INTEGER,
+    frames_in INTEGER, frames_out INTEGER, bad_frames INTEGER, refused_frames INTEGER,
+    unsent_frames INTEGER, lost_percent DOUBLE, frames_per_s DOUBLE, bytes_in_per_s DOUBLE,
+    bytes_out_per_s DOUBLE, position_hz DOUBLE, round_trip_s DOUBLE
 );
 CREATE TABLE events (
     sequence INTEGER PRIMARY KEY NOT NULL, time DATETIME, time_s DOUBLE, kind TEXT, text TEXT
 );
 CREATE TABLE meta (id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT);
 INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES
-    ('records', 'attributes', 'records', 'every input and decision, in order'),
+    ('blocks', 'attributes', 'blocks', 'every input and decision, in order, packed'),
+    ('valve_changes', 'attributes', 'valve_changes', 'changes of the valves'),
+    ('link_stats', 'attributes', 'link_stats', 'how the link to the vehicle does'),
     ('events', 'attributes', 'events', 'what happened besides'),
     ('meta', 'attributes', 'meta', 'set-up, versions, state of the file');
 """
@@ -91,6 +107,14 @@ def point_blob(longitude_deg: float, latitude_deg: float) -> bytes:
     return _POINT.pack(
         b"GP", 0, _LITTLE_ENDIAN, WGS84_ID, _LITTLE_ENDIAN, 1, longitude_deg, latitude_deg
     )
+
+
+def place_of(blob: bytes) -> tuple[float, float]:
+    """Return longitude and latitude of a `point_blob`; ValueError for anything else."""
+    if len(blob) != _POINT.size:
+        raise ValueError("no point of this journal")
+    longitude_deg, latitude_deg = _POINT.unpack(blob)[-2:]
+    return longitude_deg, latitude_deg
 
 
 def geometry_blob(wkb: bytes, *, srs_id: int, is_empty: bool) -> bytes:

@@ -21,25 +21,31 @@ from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from companion.core.controller import Setup
 from companion.core.types import Decision, Input
 from companion.errors import JournalError
+from companion.record.coverage_table import write_treated
+from companion.record.events import Event, LinkSample
 from companion.record.geopackage import SCHEMA
 from companion.record.layers import write_layers
-from companion.record.setup_json import setup_to_json
-from companion.record.writer import Event, Writer
+from companion.record.setup_json import calibration_sha256, setup_to_json
+from companion.record.valve_rows import ValveOrder
+from companion.record.versions import JOURNAL_VERSION
+from companion.record.writer import Item, Writer
+
+if TYPE_CHECKING:
+    from companion.core.coverage import Coverage
 
 _logger = logging.getLogger(__name__)
 
-JOURNAL_VERSION = "1"
 COMMIT_EVERY_S = 1.0
 QUEUE_ROWS = 10_000  # a minute of 50 decisions and 100 inputs a second
 CLOSE_WITHIN_S = 30.0
 _LIBRARIES = ("vrspray", "numpy", "shapely", "pyproj")
 
-_Row = tuple[int, Input | Decision | Event]
+_Row = tuple[int, Item]
 
 
 class Journal:
@@ -61,6 +67,7 @@ class Journal:
         self._queue_rows = queue_rows
         self._rows: queue.SimpleQueue[_Row | None] = queue.SimpleQueue()
         self._dropped = 0
+        self._coverage: Coverage | None = None
         self._closing = threading.Event()
         self._writer = Writer(
             connection,
@@ -146,6 +153,25 @@ class Journal:
         """Take down what happened besides."""
         self._put(Event(at_s=at_s, kind=kind, text=text))
 
+    def expect_orders(self) -> None:
+        """Take the valves' changes from `record_order`, not from the plans; before the flight."""
+        self._writer.valves.from_orders = True
+
+    def record_order(
+        self, valve: int, duty: float, planned_s: float | None, given_s: float
+    ) -> None:
+        """Take down that an output was ordered so; the writer leaves out what changes nothing."""
+        order = ValveOrder(valve=valve, duty=duty, planned_s=planned_s, given_s=given_s)
+        self._put(order, is_numbered=False)
+
+    def record_link(self, at_s: float, values: Mapping[str, float | None]) -> None:
+        """Take down how the link to the vehicle does."""
+        self._put(LinkSample(at_s=at_s, values=values), is_numbered=False)
+
+    def record_coverage(self, coverage: Coverage) -> None:
+        """Keep the newest ground that was treated; its changed tiles are in the next commit."""
+        self._coverage = coverage
+
     def close(self) -> None:
         """Write what is left and make one closed file of it; may be called twice."""
         self._closing.set()
@@ -165,8 +191,9 @@ class Journal:
     ) -> None:
         self.close()
 
-    def _put(self, item: Input | Decision | Event) -> None:
-        row = (next(self._sequence), item)
+    def _put(self, item: Item, *, is_numbered: bool = True) -> None:
+        # A gap in the numbers shows where a row is missing; what has none is counted only.
+        row = (next(self._sequence) if is_numbered else 0, item)
         if self._closing.is_set() or not self._has_room():
             self._dropped += 1
         else:
@@ -189,10 +216,10 @@ class Journal:
                 elif self._closing.is_set() and self._rows.empty():
                     break
                 if time.monotonic() >= due_s:
-                    self._writer.commit(lost_before=self._dropped)
+                    self._writer.commit(lost_before=self._dropped, coverage=self._coverage)
                     due_s = time.monotonic() + COMMIT_EVERY_S
         finally:
-            self._writer.finish(lost_before=self._dropped)
+            self._writer.finish(lost_before=self._dropped, coverage=self._coverage)
 
     def _next(self, due_s: float) -> _Row | None:
         """Return the next row; None when the commit is due or the end has come."""
@@ -210,11 +237,15 @@ def _about(setup: Setup, started: datetime, started_s: float) -> dict[str, str]:
         "journal_version": JOURNAL_VERSION,
         "closed": "no",
         "lost": "0",
+        "valve_changes": "plans",
         "started_utc": started.isoformat(),
         "started_s": repr(started_s),
+        "utc_source": "computer",
+        "utc_offset_s": repr(started.timestamp() - started_s),
         "origin_latitude_deg": repr(setup.frame.latitude_deg),
         "origin_longitude_deg": repr(setup.frame.longitude_deg),
         "map_sha256": setup.prescription.sha256,
+        "calibration_sha256": calibration_sha256(setup),
         "method": str(setup.method),
         "platform": platform.platform(),
         "machine": platform.machine(),
@@ -265,6 +296,7 @@ def _write_schema(path: Path, setup: Setup, meta: Mapping[str, str]) -> None:
         connection.execute("PRAGMA journal_mode = MEMORY").fetchall()
         connection.executescript(SCHEMA)
         write_layers(connection, setup.frame, setup.prescription)
+        write_treated(connection, setup.treated)
         connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", meta.items())
     finally:
         connection.close()

@@ -17,7 +17,14 @@ from companion.core.cells import CellGrid
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
 from companion.record.cell_table import read_cells, write_cells
-from companion.record.geopackage import LOCAL_ID, WGS84_ID, geometry_blob, layer_sql, wkb_of
+from companion.record.geopackage import (
+    LOCAL_ID,
+    WGS84_ID,
+    geometry_blob,
+    layer_sql,
+    place_of,
+    wkb_of,
+)
 
 Area = Polygon | MultiPolygon
 # Cells of no more rates than these are drawn as zones too, for whoever looks at the file.
@@ -78,6 +85,18 @@ def set_box(
             "WHERE table_name = ?",
             (*box, table),
         )
+
+
+def box_of_points(
+    connection: sqlite3.Connection, table: str
+) -> tuple[float, float, float, float] | None:
+    """Return the extent of a layer of points; None without any."""
+    rows = connection.execute(f"SELECT geom FROM {table} WHERE geom IS NOT NULL")
+    places = [place_of(blob) for (blob,) in rows]
+    if not places:
+        return None
+    xs, ys = zip(*places, strict=True)
+    return min(xs), min(ys), max(xs), max(ys)
 
 
 def read_ground(connection: sqlite3.Connection) -> Ground:

@@ -8,38 +8,31 @@ import sqlite3
 import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
 from companion.core.controller import Setup
 from companion.core.types import Decision, Input
 from companion.errors import JournalError
+from companion.record.blocks import Entry
 from companion.record.codec import FieldNames, decode
+from companion.record.coverage_table import read_treated
+from companion.record.events import Event
 from companion.record.geopackage import APPLICATION_ID
-from companion.record.journal import JOURNAL_VERSION
 from companion.record.layers import read_ground
 from companion.record.setup_json import field_names_of, setup_from_json
-from companion.record.writer import Event
+from companion.record.versions import check_version, migrated, read_entries
 
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One input or decision as it lies in the file; `kind` is the name of its type."""
-
-    sequence: int
-    kind: str
-    body: str
-
-    @property
-    def is_decision(self) -> bool:
-        """Whether this is a decision, and not an input."""
-        return self.kind == Decision.__name__
+__all__ = ["Entry", "JournalContent", "opened", "read_journal"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JournalContent:
-    """A whole journal: what it says of itself, and all inputs and decisions in their order."""
+    """A whole journal: what it says of itself, and all inputs and decisions in their order.
+
+    `unread` says in a line each what is damaged and left out; empty for a sound file.
+    """
 
     path: Path
     meta: dict[str, str]
@@ -48,11 +41,12 @@ class JournalContent:
     entries: tuple[Entry, ...]
     events: tuple[Event, ...]
     lost: int
+    unread: tuple[str, ...] = ()
 
     @property
     def is_closed(self) -> bool:
         """Whether the flight ended in order; otherwise its last second may be missing."""
-        return self.meta.get("closed") != "no"
+        return self.meta.get("closed") == "yes"
 
     @property
     def training(self) -> str | None:
@@ -74,13 +68,39 @@ class JournalContent:
         return (self.value(entry) for entry in self.entries)
 
 
-def read_journal(path: Path) -> JournalContent:
-    """Return what is in the file; JournalError, in one line, where it cannot be used."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenJournal:
+    """A journal that is open for reading: its tables by SQL, what it says of itself in `meta`."""
+
+    path: Path
+    connection: sqlite3.Connection
+    meta: dict[str, str]
+    version: str
+
+    def setup(self) -> Setup:
+        """Return all that was constant in the flight; ValueError where it is damaged."""
+        setup = setup_from_json(self.meta["setup"], read_ground(self.connection))
+        treated = read_treated(self.connection)
+        return setup if treated is None else replace(setup, treated=treated)
+
+
+def read_journal(path: Path, *, is_lenient: bool = False) -> JournalContent:
+    """Return what is in the file; JournalError, in one line, where it cannot be used.
+
+    `is_lenient` leaves out what is damaged and says so in `unread`.
+    """
+    with opened(path, is_lenient=is_lenient) as journal:
+        return _read(journal, is_lenient=is_lenient)
+
+
+@contextmanager
+def opened(path: Path, *, is_lenient: bool = False) -> Iterator[OpenJournal]:
+    """Open a journal for reading; whatever SQLite finds inside becomes a JournalError."""
     if not path.is_file():
         raise JournalError(f"{path}: there is no such file; give the .gpkg file of a flight")
     try:
         with _connect(path) as connection:
-            return _read(path, connection)
+            yield _checked(path, connection, is_lenient=is_lenient)
     except sqlite3.OperationalError as error:
         if "locked" in str(error):
             raise JournalError(
@@ -116,38 +136,54 @@ def _connect(path: Path) -> Iterator[sqlite3.Connection]:
             yield connection
 
 
-def _read(path: Path, connection: sqlite3.Connection) -> JournalContent:
+def _checked(path: Path, connection: sqlite3.Connection, *, is_lenient: bool) -> OpenJournal:
     # Through SQLite and not by opening the file: closing a file of its own would give up the locks
     # that a writer in the same process holds on it (POSIX).
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise JournalError(f"{path}: is no journal; give the .gpkg file of a flight")
     tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
-    if not {"meta", "records", "events", "zones", "field"} <= tables:
+    if "meta" not in tables:
         raise JournalError(f"{path}: is a GeoPackage, but no journal of a flight")
     meta = dict(connection.execute("SELECT key, value FROM meta").fetchall())
-    if meta.get("journal_version") != JOURNAL_VERSION:
-        raise JournalError(
-            f"{path}: is a journal of version {meta.get('journal_version')}, this program reads "
-            f"version {JOURNAL_VERSION}; use vrspray {meta.get('version_vrspray')}, which wrote it"
-        )
-    (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-    if verdict != "ok":
-        raise ValueError(verdict)
-    rows = connection.execute("SELECT sequence, kind, body FROM records ORDER BY sequence")
-    entries = tuple(Entry(*row) for row in rows)
-    marks = connection.execute("SELECT sequence, time_s, kind, text FROM events ORDER BY sequence")
-    events = marks.fetchall()
-    last = max([entry.sequence for entry in entries[-1:]] + [row[0] for row in events[-1:]] + [0])
-    return JournalContent(
-        path=path,
-        meta=meta,
-        setup=setup_from_json(meta["setup"], read_ground(connection)),
-        field_names=field_names_of(meta["setup"]),
-        entries=entries,
-        events=tuple(
+    version = check_version(path, meta, tables)
+    if not is_lenient:
+        (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+        if verdict != "ok":
+            raise ValueError(verdict)
+    return OpenJournal(path=path, connection=connection, meta=migrated(meta), version=version)
+
+
+def _read(journal: OpenJournal, *, is_lenient: bool) -> JournalContent:
+    unread: list[str] = []
+    entries, events = [], []
+    try:
+        for entry in read_entries(
+            journal.connection, journal.version, unread=unread if is_lenient else None
+        ):
+            entries.append(entry)
+    except sqlite3.DatabaseError as error:
+        if not is_lenient:
+            raise
+        unread.append(f"rows behind {entries[-1].sequence if entries else 0}: {_line(error)}")
+    marks = "SELECT sequence, time_s, kind, text FROM events ORDER BY sequence"
+    last = entries[-1].sequence if entries else 0
+    try:
+        for sequence, at_s, kind, text in journal.connection.execute(marks):
             # SQLite keeps no NaN: a time that was none comes back as missing.
-            Event(at_s=float("nan") if at_s is None else at_s, kind=kind, text=text)
-            for _, at_s, kind, text in events
-        ),
-        lost=max(last - len(entries) - len(events), int(meta["lost"])),
+            time_s = float("nan") if at_s is None else at_s
+            events.append(Event(at_s=time_s, kind=kind, text=text))
+            last = max(last, sequence)
+    except sqlite3.DatabaseError as error:
+        if not is_lenient:
+            raise
+        unread.append(f"events behind the first {len(events)}: {_line(error)}")
+    return JournalContent(
+        path=journal.path,
+        meta=journal.meta,
+        setup=journal.setup(),
+        field_names=field_names_of(journal.meta["setup"]),
+        entries=tuple(entries),
+        events=tuple(events),
+        lost=max(last - len(entries) - len(events), int(journal.meta["lost"])),
+        unread=tuple(unread),
     )

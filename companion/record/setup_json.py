@@ -5,6 +5,7 @@ The ground (zones and field) is not in the text: the journal keeps it as layers,
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import fields
 from typing import Any, cast
@@ -15,6 +16,8 @@ from companion.record.codec import FIELD_NAMES, FieldNames, from_plain, to_plain
 from companion.record.layers import Ground
 
 SETUP_VERSION = 1
+# In tables of their own: the ground as layers, what earlier flights treated as tiles.
+_APART = frozenset({"prescription", "treated"})
 
 
 def setup_to_json(setup: Setup) -> str:
@@ -32,10 +35,17 @@ def setup_to_json(setup: Setup) -> str:
             "setup": {
                 field.name: to_plain(getattr(setup, field.name))
                 for field in fields(setup)
-                if field.init and field.name != "prescription"
+                if field.init and field.name not in _APART
             },
         }
     )
+
+
+def calibration_sha256(setup: Setup) -> str:
+    """Return what changes with anything that was measured of the sprayer, and with nothing else."""
+    measured = (setup.nozzle_sets, setup.lag, setup.pwm)
+    text = json.dumps(to_plain(measured), separators=(",", ":"))
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
 
 
 def field_names_of(text: str) -> FieldNames:

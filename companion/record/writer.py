@@ -6,47 +6,74 @@ this thread: a failure costs the rows of that second, is counted, and the next s
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 import sqlite3
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from companion.core.frame import LocalFrame, course_deg
-from companion.core.types import Decision, Input, VehicleState
+from companion.core.frame import LocalFrame
+from companion.core.types import Decision, Input, UtcReport
+from companion.record.applied_rows import AppliedRows
+from companion.record.blocks import Block
 from companion.record.codec import encode
-from companion.record.geopackage import point_blob, time_text
+from companion.record.coverage_table import write_coverage
+from companion.record.events import Event, LinkSample
+from companion.record.flight_clock import FlightClock
 from companion.record.layers import set_box
+from companion.record.valve_rows import Row, ValveOrder, ValveRows
+
+if TYPE_CHECKING:
+    from companion.core.coverage import Coverage
+
+__all__ = ["Event", "Item", "Writer"]
 
 _logger = logging.getLogger(__name__)
 
-_RECORD = "INSERT INTO records VALUES (?, ?, ?, ?)"
 _EVENT = "INSERT INTO events VALUES (?, ?, ?, ?, ?)"
 _APPLIED = "INSERT INTO applied VALUES (" + ", ".join("?" * 15) + ")"
-_SET_META = (
+_VALVE = (
+    "INSERT INTO valve_changes (planned_us, actual_us, valve, duty_permille) VALUES (?, ?, ?, ?)"
+)
+LINK_COLUMNS = (
+    "bytes_in",
+    "bytes_out",
+    "frames_in",
+    "frames_out",
+    "bad_frames",
+    "refused_frames",
+    "unsent_frames",
+    "lost_percent",
+    "frames_per_s",
+    "bytes_in_per_s",
+    "bytes_out_per_s",
+    "position_hz",
+    "round_trip_s",
+)
+_LINK = (
+    f"INSERT INTO link_stats (time_s, {', '.join(LINK_COLUMNS)}) "
+    f"VALUES ({', '.join('?' * (len(LINK_COLUMNS) + 1))})"
+)
+SET_META = (
     "INSERT INTO meta (key, value) VALUES (?, ?) "
     "ON CONFLICT (key) DO UPDATE SET value = excluded.value"
+)
+# What was written before the autopilot said which time it is gets that time at the end.
+_TIME_AGAIN = (
+    "UPDATE {} SET time = strftime('%Y-%m-%dT%H:%M:%fZ', time_s + ?, 'unixepoch') WHERE time_s < ?"
 )
 _CHECKPOINT_EVERY = 60  # commits
 # A full disk, a removed card, a value that JSON does not know: rows are lost, the flight goes on.
 _FAILURES = (sqlite3.Error, ValueError, TypeError, OverflowError)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Event:
-    """What happened besides inputs and decisions."""
-
-    at_s: float
-    kind: str
-    text: str
+Item = Input | Decision | Event | ValveOrder | LinkSample
 
 
 class Writer:
     """Writes what it is given; never raises for what a disk can do.
 
     `next_sequence` numbers the writer's own events; `utc_offset_s` makes a time since 1970 of the
-    companion's monotonic one.
+    companion's monotonic one, until the autopilot says better.
     """
 
     def __init__(
@@ -57,38 +84,49 @@ class Writer:
         utc_offset_s: float,
         next_sequence: Callable[[], int],
     ) -> None:
-        # A projection of its own: pyproj's are not to be shared between threads.
-        self._frame = LocalFrame(frame.latitude_deg, frame.longitude_deg)
         self._connection = connection
-        self._utc_offset_s = utc_offset_s
+        self._clock = FlightClock(utc_offset_s)
+        self._told_offset_s = utc_offset_s
+        self._told_orders = False
+        self._applied = AppliedRows(frame, self._clock.text)
+        self._block = Block()
+        self.valves = ValveRows()
         self._next_sequence = next_sequence
+        self._coverage: Coverage | None = None
         self._pending = 0
         self._commits = 0
         self._reported = 0
         self._last_s = 0.0
-        self._box: tuple[float, float, float, float] | None = None
         self.committed = 0
         self.lost = 0
         self.fault: str | None = None
 
-    def write(self, sequence: int, item: Input | Decision | Event) -> None:
+    def write(self, sequence: int, item: Item) -> None:
         """Take one row into the open second."""
         try:
-            if not self._connection.in_transaction:
-                self._connection.execute("BEGIN")
-                self._pending = 0
-            self._insert(sequence, item)
-            self._pending += 1
+            self._begin()
+            self._take(sequence, item)
+            if self._block.is_full:
+                self._flush()
         except _FAILURES as error:
             self._fail(error, rows=1)
 
-    def commit(self, *, lost_before: int) -> None:
+    def commit(self, *, lost_before: int, coverage: Coverage | None = None) -> None:
         """Make the open second last; `lost_before` rows never reached this thread."""
         try:
             lost = self.lost + lost_before
             self._report(lost)
+            self._flush()
+            if self.valves.from_orders and not self._told_orders:
+                self._begin()
+                self._connection.execute(SET_META, ("valve_changes", "orders"))
+                self._told_orders = True
+            if coverage is not None and coverage is not self._coverage:
+                self._begin()
+                write_coverage(self._connection, coverage, self._coverage)
             if self._connection.in_transaction:
                 self._connection.execute("COMMIT")
+                self._coverage = coverage or self._coverage
                 self.committed += self._pending
                 self._pending = 0
                 self._reported = lost
@@ -99,18 +137,40 @@ class Writer:
         except _FAILURES as error:
             self._fail(error, rows=0)
 
-    def finish(self, *, lost_before: int) -> None:
+    def finish(self, *, lost_before: int, coverage: Coverage | None = None) -> None:
         """Make one file of it and mark it closed."""
-        self.commit(lost_before=lost_before)
         try:
-            set_box(self._connection, "applied", self._box)
-            self._connection.execute(_SET_META, ("closed", "yes"))
-            self._connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-            self._connection.execute("PRAGMA journal_mode = DELETE").fetchall()
+            self._insert_valves(self.valves.end())
+        except _FAILURES as error:
+            self._fail(error, rows=0)
+        self.commit(lost_before=lost_before, coverage=coverage)
+        try:
+            execute = self._connection.execute
+            if self._clock.known_s is not None:
+                tell_times_again(self._connection, self._clock.offset_s, self._clock.known_s)
+            set_box(self._connection, "applied", self._applied.box)
+            execute(SET_META, ("utc_offset_s", repr(self._clock.offset_s)))
+            execute(SET_META, ("closed", "yes"))
+            execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            execute("PRAGMA journal_mode = DELETE").fetchall()
         except _FAILURES as error:
             self._fail(error, rows=0)
         finally:
             self._connection.close()
+
+    def _begin(self) -> None:
+        if not self._connection.in_transaction:
+            self._connection.execute("BEGIN")
+
+    def _flush(self) -> None:
+        """Write the open block; where that fails for whatever reason, the second is lost."""
+        if not self._block.rows:
+            return
+        self._begin()
+        try:
+            self._block.insert(self._connection)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise sqlite3.DataError(f"rows cannot be packed: {error}") from error
 
     def _fail(self, error: Exception, *, rows: int) -> None:
         """Count what is gone; SQLite rolls back by itself where it must."""
@@ -118,6 +178,7 @@ class Writer:
         if isinstance(error, sqlite3.Error):
             lost += self._pending
             self._pending = 0
+            self._block = Block()
             if self._connection.in_transaction:
                 self._connection.rollback()
         self.lost += lost
@@ -131,58 +192,61 @@ class Writer:
         text = f"{lost - self._reported} rows lost, {lost} in all"
         if self.fault:
             text += f": {self.fault}"
-        if not self._connection.in_transaction:
-            self._connection.execute("BEGIN")
-        self._insert(self._next_sequence(), Event(at_s=self._last_s, kind="rows-lost", text=text))
-        self._connection.execute(_SET_META, ("lost", str(lost)))
+        self._begin()
+        self._insert_event(
+            self._next_sequence(), Event(at_s=self._last_s, kind="rows-lost", text=text)
+        )
+        self._connection.execute(SET_META, ("lost", str(lost)))
 
-    def _insert(self, sequence: int, item: Input | Decision | Event) -> None:
-        execute = self._connection.execute
-        if isinstance(item, Event):
-            execute(_EVENT, (sequence, self._time(item.at_s), item.at_s, item.kind, item.text))
-            return
-        at_s = item.now_s if isinstance(item, Decision) else item.received_s
+    def _take(self, sequence: int, item: Item) -> None:
+        if isinstance(item, ValveOrder):
+            self._insert_valves(self.valves.take_order(item))
+        elif isinstance(item, LinkSample):
+            values = (item.values.get(name) for name in LINK_COLUMNS)
+            self._connection.execute(_LINK, (item.at_s, *values))
+        elif isinstance(item, Event):
+            self._insert_event(sequence, item)
+            self._pending += 1
+        elif isinstance(item, Decision):
+            body = encode(item)
+            row = self._applied.take(sequence, item)
+            if row is not None:
+                self._connection.execute(_APPLIED, row)
+            self._insert_valves(self.valves.take_plan(item.plan))
+            self._add(sequence, item.now_s, body)
+        else:
+            self._add(sequence, item.received_s, encode(item))
+            if isinstance(item, UtcReport):
+                self._take_time(item)
+
+    def _add(self, sequence: int, at_s: float, body: str) -> None:
+        self._block.add(sequence, at_s, body)
         self._last_s = at_s
-        body = encode(item)
-        if isinstance(item, Decision):
-            execute(_APPLIED, self._applied(sequence, item))
-        execute(_RECORD, (sequence, at_s, type(item).__name__, body))
+        self._pending += 1
 
-    def _time(self, at_s: float) -> str | None:
-        return time_text(at_s + self._utc_offset_s)
+    def _insert_valves(self, rows: list[Row]) -> None:
+        if rows:
+            self._begin()
+            self._connection.executemany(_VALVE, rows)
 
-    def _applied(self, sequence: int, decision: Decision) -> tuple[object, ...]:
-        state, duty = decision.state, decision.plan.duty
-        rates = [rate for rate in decision.rate_l_ha if rate is not None]
-        motion: tuple[float | None, ...] = (None, None, None, None)
-        if state is not None:
-            east, north = state.velocity_east_m_s, state.velocity_north_m_s
-            speed_m_s = math.hypot(east, north)
-            motion = (speed_m_s, course_deg(east, north), state.heading_deg, state.height_m)
-        return (
-            sequence,
-            None if state is None else self._point(state),
-            self._time(decision.now_s),
-            decision.now_s,
-            sum(rates) / len(rates) if rates else None,
-            decision.target_flow_l_min,
-            decision.flow_l_min,
-            sum(duty) / len(duty) if duty else 0.0,
-            *motion,
-            " ".join(sorted(decision.inhibits)),
-            json.dumps(decision.rate_l_ha),
-            json.dumps(duty),
-        )
+    def _insert_event(self, sequence: int, event: Event) -> None:
+        time = self._clock.text(event.at_s)
+        self._connection.execute(_EVENT, (sequence, time, event.at_s, event.kind, event.text))
 
-    def _point(self, state: VehicleState) -> bytes | None:
-        latitude, longitude = self._frame.to_geographic(state.east_m, state.north_m)
-        if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
-            return None
-        west, south, east, north = self._box or (longitude, latitude, longitude, latitude)
-        self._box = (
-            min(west, longitude),
-            min(south, latitude),
-            max(east, longitude),
-            max(north, latitude),
-        )
-        return point_blob(longitude, latitude)
+    def _take_time(self, report: UtcReport) -> None:
+        """Keep the autopilot's time of day in `meta`; a jump is an event."""
+        said = self._clock.take(report)
+        if said is not None:
+            event = Event(at_s=report.received_s, kind="clock", text=said)
+            self._insert_event(self._next_sequence(), event)
+            self._pending += 1
+        if said is not None or abs(self._clock.offset_s - self._told_offset_s) > 0.01:
+            self._told_offset_s = self._clock.offset_s
+            self._connection.execute(SET_META, ("utc_source", self._clock.source))
+            self._connection.execute(SET_META, ("utc_offset_s", repr(self._clock.offset_s)))
+
+
+def tell_times_again(connection: sqlite3.Connection, offset_s: float, known_s: float) -> None:
+    """Give what was written before the autopilot told the time of day that time."""
+    for table in ("applied", "events"):
+        connection.execute(_TIME_AGAIN.format(table), (offset_s, known_s))

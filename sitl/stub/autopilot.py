@@ -33,6 +33,8 @@ from sitl.stub.script import SCRIPT_PERIOD_S, Script
 from sitl.stub.strangers import Strangers
 from sitl.stub.world import Pose
 
+UTC_START_S = 1_774_080_000.0  # 2026-03-21 08:00
+
 
 class Autopilot:
     """A flight controller with any number of peers."""
@@ -63,6 +65,8 @@ class Autopilot:
         self._clock_rate = 1.0 + parts.drift_ppm * 1e-6
         self._boot_s = start_s - parts.uptime_s
         self._now_s = start_s
+        # The same day in every flight; a stub in real time is given today's.
+        self.utc_offset_s = UTC_START_S - start_s
         self._script_due_s = start_s
         home = self.home_item()
         kind = self.firmware.heartbeat(self, start_s).autopilot

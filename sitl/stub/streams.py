@@ -165,8 +165,9 @@ def home_position(autopilot: Autopilot, now_s: float) -> Message:
 
 
 def system_time(autopilot: Autopilot, now_s: float) -> Message:
-    """Return SYSTEM_TIME without a date: nothing that is tested hangs on the calendar."""
-    return dialect.MAVLink_system_time_message(0, autopilot.boot_ms(now_s))
+    """Return SYSTEM_TIME."""
+    utc_us = round((now_s + autopilot.utc_offset_s) * 1e6)
+    return dialect.MAVLink_system_time_message(utc_us, autopilot.boot_ms(now_s))
 
 
 def version_word(version: tuple[int, int, int]) -> int:

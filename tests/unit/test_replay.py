@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import random
-import sqlite3
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +30,9 @@ from companion.core.types import (
 )
 from companion.errors import ConfigError, JournalError
 from companion.record.journal import Journal
+from companion.record.reader import Entry
 from tests.builders import setup
+from tests.unit.journal_edit import edit_rows, with_body
 
 
 def inputs_of(step_number: int, given: Setup, chance: random.Random) -> Iterator[Input]:
@@ -84,15 +85,6 @@ def copy(flown: tuple[Path, list[Decision]], tmp_path: Path) -> Path:
     path = tmp_path / "flight.gpkg"
     path.write_bytes(flown[0].read_bytes())
     return path
-
-
-def change(path: Path, sql: str) -> None:
-    connection = sqlite3.connect(path)
-    try:
-        with connection:
-            connection.execute(sql)
-    finally:
-        connection.close()
 
 
 # -------------------------------------------------------------------------------------- the same
@@ -158,15 +150,24 @@ def test_a_difference_in_the_last_bit_is_found_and_named(
 
 
 def test_a_lost_input_is_seen_and_reported(copy: Path) -> None:
-    row = "SELECT sequence FROM records WHERE kind = 'Telemetry' LIMIT 1 OFFSET 100"
-    change(copy, f"DELETE FROM records WHERE sequence = ({row})")
+    def without(entries: list[Entry]) -> list[Entry]:
+        lost = [entry for entry in entries if entry.kind == "Telemetry"][100]
+        return [entry for entry in entries if entry is not lost]
+
+    edit_rows(copy, without)
     result = replay(copy)
     assert result.lost == 1
     assert result.differences > 0
 
 
 def test_inputs_in_another_order_are_another_flight(copy: Path) -> None:
-    change(copy, "UPDATE records SET sequence = 100000 WHERE kind = 'OperatorCommand'")
+    edit_rows(
+        copy,
+        lambda entries: [
+            Entry(100_000, entry.kind, entry.body) if entry.kind == "OperatorCommand" else entry
+            for entry in entries
+        ],
+    )
     assert replay(copy).differences > 100
 
 
@@ -269,6 +270,6 @@ def test_the_command_refuses_what_is_no_journal(
 
 
 def test_a_row_that_is_no_input_is_refused(copy: Path) -> None:
-    change(copy, "UPDATE records SET body = '{}' WHERE sequence = 5")
+    with_body(copy, 5, "{}")
     with pytest.raises(JournalError, match="row 5"):
         replay(copy)

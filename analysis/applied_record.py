@@ -1,0 +1,132 @@
+"""A flown journal as a `FlightRecord`, so that every metric can be had of a real flight.
+
+The path is the autopilot's, the volume is the modelled one of the executed changes: what position,
+lags and curves are wrong by nobody can see from here. docs/evaluation.md says how far that is from
+the truth of simulated flights.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from analysis.flight_record import FlightMeta, FlightRecord
+from analysis.metered import metered
+from analysis.modelled_flow import ordered_s, valve_flows
+from analysis.pumped_flow import pumped_ml
+from companion.core.types import TimedChange
+from companion.errors import VrsprayError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.applied_flight import AppliedFlight, Floats
+
+Source = Literal["model", "meter"]
+STEP_S = 0.01
+SAMPLES_MIN = 3
+
+
+class EvaluationError(VrsprayError):
+    """A flight of which nothing can be evaluated."""
+
+
+def record_of(
+    flight: AppliedFlight, *, step_s: float = STEP_S, source: Source = "model"
+) -> FlightRecord:
+    """Return the flight as the metrics take it; EvaluationError where it never had a position.
+
+    `meter` scales the modelled volume, window by window, to what the flow meter has counted.
+    """
+    if not step_s > 0.0:
+        raise ValueError(f"step_s must be positive, got {step_s}")
+    samples = int(flight.duration_s / step_s + 1e-6) + 1
+    if samples < SAMPLES_MIN:
+        raise EvaluationError(
+            f"{flight.path}: the flight has {len(flight.time_s)} decisions with a position; "
+            "there is nothing to evaluate"
+        )
+    setup = flight.setup
+    time_s = flight.time_s[0] + step_s * np.arange(samples, dtype=np.float64)
+    volume_ml = modelled_ml(flight, time_s)
+    if source == "meter":
+        volume_ml = metered(flight, time_s, volume_ml)
+    makes_flow = setup.pumping is not None
+    limits = (0.0, float("inf")) if makes_flow else (setup.pwm.duty_min, setup.pwm.duty_max)
+    return FlightRecord(
+        time_s=time_s,
+        east_m=np.interp(time_s, flight.time_s, flight.east_m),
+        north_m=np.interp(time_s, flight.time_s, flight.north_m),
+        heading_deg=heading_deg(flight, time_s),
+        volume_ml=volume_ml,
+        boom=setup.boom,
+        prescription=setup.prescription,
+        lines=setup.lines,
+        pwm_period_s=setup.pwm.period_s,
+        duty_limits=limits,
+        nozzle_sets=() if makes_flow else setup.nozzle_sets,
+        orders=executed_orders(flight),
+        meta=_meta(flight),
+    )
+
+
+def modelled_ml(flight: AppliedFlight, time_s: Floats) -> Floats:
+    """Return the modelled cumulative volume, one column a valve."""
+    setup = flight.setup
+    if setup.pumping is not None:
+        return pumped_ml(flight, time_s)
+    changes = flight.changes
+    flows = valve_flows(changes, setup.nozzle_sets, setup.lag, len(setup.boom.valves))
+    return np.stack([flow.volume_ml(time_s) for flow in flows], axis=1)
+
+
+def executed_orders(flight: AppliedFlight) -> tuple[TimedChange, ...]:
+    """Return the changes as the output carried them out, in order of time."""
+    order_s = ordered_s(flight.changes)
+    rows = np.argsort(order_s, kind="stable")
+    return tuple(
+        TimedChange(at_s=at_s, valve=valve, duty=duty)
+        for at_s, valve, duty in zip(
+            order_s[rows].tolist(),
+            flight.changes.valve[rows].tolist(),
+            flight.changes.duty[rows].tolist(),
+            strict=True,
+        )
+    )
+
+
+def heading_deg(flight: AppliedFlight, time_s: Floats) -> Floats:
+    """Return the nose's direction at any times; the course where no heading is known."""
+    known = np.where(np.isfinite(flight.heading_deg), flight.heading_deg, flight.course_deg)
+    # A course is not finite, or anything at all, while the aircraft stands.
+    usable: NDArray[np.bool_] = np.isfinite(known)
+    if not usable.any():
+        return np.zeros(len(time_s))
+    unwrapped = np.unwrap(known[usable], period=360.0)
+    turned: Floats = np.interp(time_s, flight.time_s[usable], unwrapped) % 360.0
+    return turned
+
+
+def _meta(flight: AppliedFlight) -> FlightMeta:
+    flying = flight.speed_m_s[flight.flow_l_min > 0.0]
+    every = flying if len(flying) else flight.speed_m_s
+    meta = FlightMeta(
+        speed_m_s=float(np.median(every)),
+        method=flight.setup.method.value,
+        fidelity="averaged",
+        output=_output(flight),
+        seed=0,
+    )
+    return replace(meta, training=flight.training)
+
+
+def _output(flight: AppliedFlight) -> str:
+    """Return the kind of output that the configuration of the flight named."""
+    try:
+        table = tomllib.loads(flight.meta.get("config_toml", "")).get("output", {})
+    except tomllib.TOMLDecodeError:
+        return "unknown"
+    return str(table.get("kind", "unknown"))

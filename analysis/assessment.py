@@ -1,0 +1,217 @@
+"""Everything that can be said of a flown journal, in one call: what report and exports take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from analysis.applied_record import STEP_S, Source, modelled_ml, record_of
+from analysis.breakdowns import Breakdowns, breakdowns, ways_between
+from analysis.causes import Causes, causes_of
+from analysis.cell_maps import CellMaps, cell_maps
+from analysis.dose import misapplied_parts
+from analysis.evaluation import Evaluation, evaluate_strips
+from analysis.flow_accuracy import flow_samples
+from analysis.intervals import Interval, crossings_of, mean_interval, ratio_interval
+from analysis.modelled_flow import ordered_s
+from analysis.strips import Strip, strips_of
+from analysis.volume_balance import Balance, balance_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from analysis.applied_flight import AppliedFlight, Floats
+    from analysis.flight_record import FlightRecord
+
+# Longer than this between two decisions nobody knows what the sprayer did.
+GAP_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Durations:
+    """Seconds of a flight; a second with several inhibits counts for each, and once in all."""
+
+    recorded_s: float
+    spraying_s: float
+    inhibited_s: float
+    by_inhibit_s: Mapping[str, float]
+    unknown_s: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all figures."""
+        return {
+            "recorded_s": self.recorded_s,
+            "spraying_s": self.spraying_s,
+            "inhibited_s": self.inhibited_s,
+            "by_inhibit_s": dict(self.by_inhibit_s),
+            "unknown_s": self.unknown_s,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Assessment:
+    """A flight judged from its journal.
+
+    `record` and `strips` are what it was computed from. `intervals` has a mean with its 95 %
+    interval for each key of the contract that is a mean.
+    """
+
+    flight: AppliedFlight
+    source: Source
+    record: FlightRecord
+    strips: tuple[Strip, ...]
+    evaluation: Evaluation
+    intervals: Mapping[str, Interval]
+    breakdowns: Breakdowns
+    cells: CellMaps | None
+    causes: Causes
+    balance: Balance
+    durations: Durations
+    counts: Mapping[str, int]
+    notes: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all figures; maps and single changes are arrays and not in it."""
+        flight = self.flight
+        return {
+            "journal": flight.path.name,
+            "is_closed": flight.is_closed,
+            "lost": flight.lost,
+            "training": flight.training,
+            "source": self.source,
+            "utc_source": flight.utc_source,
+            **self.evaluation.as_json(),
+            "intervals": {name: each.as_json() for name, each in self.intervals.items()},
+            "breakdowns": self.breakdowns.as_json(),
+            "cells": None if self.cells is None else self.cells.as_json(),
+            "causes": self.causes.as_json(),
+            "balance": self.balance.as_json(),
+            "durations": self.durations.as_json(),
+            "counts": dict(self.counts),
+            "notes": list(self.notes),
+        }
+
+
+def assess(
+    flight: AppliedFlight,
+    *,
+    source: Source = "model",
+    step_s: float = STEP_S,
+    cell_m: float | None = None,
+) -> Assessment:
+    """Return everything of a flight; EvaluationError where it has nothing to evaluate."""
+    record = record_of(flight, step_s=step_s, source=source)
+    strips = strips_of(record)
+    evaluation = evaluate_strips(record, strips)
+    modelled = evaluation.applied_ml
+    if source != "model":
+        volume_ml = modelled_ml(flight, record.time_s)
+        modelled = float((volume_ml[-1] - volume_ml[0]).sum())
+    return Assessment(
+        flight=flight,
+        source=source,
+        record=record,
+        strips=tuple(strips),
+        evaluation=evaluation,
+        intervals=_intervals(evaluation, strips),
+        breakdowns=breakdowns(evaluation, strips),
+        cells=cell_maps(record, strips, duties_of(flight, record.time_s), cell_m=cell_m),
+        causes=causes_of(flight, record, strips, evaluation.steps),
+        balance=balance_of(flight, strips, modelled),
+        durations=_durations(flight),
+        counts=_counts(flight, evaluation),
+        notes=tuple(_notes(flight, source)),
+    )
+
+
+def duties_of(flight: AppliedFlight, time_s: Floats) -> list[Floats]:
+    """Return the duty of each valve whose flow comes out at each time."""
+    order_s = ordered_s(flight.changes) + flight.setup.lag.output_s + flight.setup.lag.up_s
+    found: list[Floats] = []
+    for valve in range(len(flight.setup.boom.valves)):
+        its = flight.changes.valve == valve
+        duty = np.concatenate(([0.0], flight.changes.duty[its]))
+        found.append(duty[np.searchsorted(order_s[its], time_s, "right")])
+    return found
+
+
+def _intervals(evaluation: Evaluation, strips: Sequence[Strip]) -> dict[str, Interval]:
+    inside = [step for step in evaluation.steps if not step.change.border]
+    lags = [(s.change.time_s, s.lag_distance_m) for s in inside if s.lag_distance_m is not None]
+    settled = [
+        (s.change.time_s, s.lag_distance_m)
+        for s in evaluation.settled_steps
+        if s.lag_distance_m is not None
+    ]
+    margins = [(each.time_s, each.margin_m) for each in evaluation.crossings]
+    samples = flow_samples(strips)
+    ways = ways_between(evaluation, samples.time_s)
+    wrong = misapplied_parts(strips)
+    return {
+        "lag_distance_m": _of(lags),
+        "lag_distance_abs_m": _of((at_s, abs(lag_m)) for at_s, lag_m in lags),
+        "settled_lag_distance_m": _of(settled),
+        "border_margin_m": _of(margins),
+        "spraying_accuracy_percent": mean_interval(samples.accuracy_percent, ways),
+        "misapplied_percent": ratio_interval(
+            100.0 * wrong.wrong_ml, wrong.asked_ml, ways_between(evaluation, wrong.time_s)
+        ),
+    }
+
+
+def _of(pairs: Iterable[tuple[float, float]]) -> Interval:
+    times = np.array(list(pairs), dtype=np.float64).reshape(-1, 2)
+    return mean_interval(times[:, 1], crossings_of(times[:, 0]))
+
+
+def _durations(flight: AppliedFlight) -> Durations:
+    lengths_s = np.diff(flight.time_s, append=flight.time_s[-1])
+    known_s = np.where(lengths_s <= GAP_S, lengths_s, 0.0)
+    by_inhibit: dict[str, float] = {}
+    inhibited_s = 0.0
+    for reasons in set(flight.inhibits) - {""}:
+        its = np.array([each == reasons for each in flight.inhibits], dtype=np.bool_)
+        held_s = float(known_s[its].sum())
+        inhibited_s += held_s
+        for reason in reasons.split():
+            by_inhibit[reason] = by_inhibit.get(reason, 0.0) + held_s
+    return Durations(
+        recorded_s=float(known_s.sum()),
+        spraying_s=float(known_s[flight.flow_l_min > 0.0].sum()),
+        inhibited_s=inhibited_s,
+        by_inhibit_s=dict(sorted(by_inhibit.items())),
+        unknown_s=float((lengths_s - known_s).sum()),
+    )
+
+
+def _counts(flight: AppliedFlight, evaluation: Evaluation) -> dict[str, int]:
+    return {
+        "samples": len(flight.time_s),
+        "valve_changes": len(flight.changes.duty),
+        "actual_times": int(np.isfinite(flight.changes.actual_s).sum()),
+        "changes": sum(not step.change.border for step in evaluation.steps),
+        "border_crossings": len(evaluation.crossings),
+        "switches": len(evaluation.switches),
+        "events": len(flight.events),
+        "lost": flight.lost,
+    }
+
+
+def _notes(flight: AppliedFlight, source: Source) -> Iterable[str]:
+    """Yield what a reader of the figures has to know."""
+    yield (
+        "positions are the autopilot's, flows are modelled from the executed changes: what "
+        "position, lags and flow curves are wrong by is not in these figures"
+    )
+    if source == "meter" and flight.meter_ml is None:
+        yield "there is no flow meter in the journal: the volume is the model's"
+    if flight.setup.pumping is not None:
+        yield "the pump makes the flow: changes are known to the time between two decisions only"
+    if not np.isfinite(flight.changes.actual_s).any():
+        yield "the output did not tell when it gave its orders: planned times are used"
+    if not flight.is_closed:
+        yield "the journal was cut off: its last second may be missing"
+    if flight.lost:
+        yield f"{flight.lost} rows are missing in the journal"

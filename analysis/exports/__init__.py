@@ -1,0 +1,1 @@
+"""What was applied, as files that farms, maps and programs read: one format a file."""

@@ -1,0 +1,106 @@
+"""What every export says of itself: which flight, by whose clock, of what, and whether all of it.
+
+A file travels without the journal it came from. Whoever opens it next year must still see that it
+was water, that the clock was nobody's, or that the record was cut.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import TYPE_CHECKING
+
+from analysis.exports.utc import utc_text
+
+if TYPE_CHECKING:
+    from analysis.applied_flight import AppliedFlight
+
+UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class About:
+    """The facts of a flight that stand in its exports; `training` is `unknown` if nobody said.
+
+    `operator`, `product` and `field_name` are what was asked for before the flight; None without.
+    """
+
+    flight: str
+    journal: str
+    training: str
+    started_utc: str
+    ended_utc: str
+    utc_source: str
+    map_sha256: str
+    calibration_sha256: str | None
+    operator: str | None
+    product: str | None
+    field_name: str | None
+    is_closed: bool
+    lost_rows: int
+    recorded_by: str
+    exported_by: str
+
+    @property
+    def is_training(self) -> bool:
+        """Whether it is known that no product was sprayed."""
+        return self.training not in ("no", UNKNOWN)
+
+    @property
+    def title(self) -> str:
+        """Return the name of the flight, with the mark of a training."""
+        return f"{self.flight} (training: {self.training})" if self.is_training else self.flight
+
+    def as_json(self) -> dict[str, object]:
+        """Return all facts by their names."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+    def as_text(self) -> dict[str, str]:
+        """Return all facts that there are, as text."""
+        return {
+            name: value if isinstance(value, str) else json.dumps(value)
+            for name, value in self.as_json().items()
+            if value is not None
+        }
+
+
+def about(flight: AppliedFlight) -> About:
+    """Return what there is to say of a flight with at least one sample."""
+    meta = flight.meta
+    asked = _asked_before(meta)
+    return About(
+        flight=meta.get("flight_id") or flight.path.stem,
+        journal=flight.path.name,
+        training=flight.training or UNKNOWN,
+        started_utc=utc_text(flight.time_s[:1] + flight.utc_offset_s)[0],
+        ended_utc=utc_text(flight.time_s[-1:] + flight.utc_offset_s)[0],
+        utc_source=flight.utc_source,
+        map_sha256=meta.get("map_sha256") or UNKNOWN,
+        calibration_sha256=meta.get("calibration_sha256"),
+        operator=_text(asked, "operator"),
+        product=_text(asked, "product", "name"),
+        field_name=_text(asked, "field_name"),
+        is_closed=flight.is_closed,
+        lost_rows=flight.lost,
+        recorded_by=f"vrspray {meta.get('version_vrspray', UNKNOWN)}",
+        exported_by=f"vrspray {version('vrspray')}",
+    )
+
+
+def _asked_before(meta: Mapping[str, str]) -> Mapping[str, object]:
+    """Return what was asked for before the flight; nothing where that cannot be read."""
+    try:
+        found = json.loads(meta.get("application_json") or "{}")
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _text(values: Mapping[str, object], *path: str) -> str | None:
+    """Return a text at a path of keys, on one line; None where there is none."""
+    found: object = values
+    for key in path:
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return (" ".join(found.split()) or None) if isinstance(found, str) else None

@@ -1,0 +1,161 @@
+"""Command line of the exports: a journal in, a file that others read out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from companion.cli.answer import AsJson, answer, note
+
+if TYPE_CHECKING:
+    from analysis.applied_flight import AppliedFlight
+    from analysis.exports.registry import Format
+    from analysis.exports.source import Shape, Source
+    from analysis.exports.units import System
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+RATE_HZ_MAX = 1000.0
+
+
+@app.command(epilog="Example: vrspray export flights/flight-0001.gpkg --out flight-0001.geojson")
+def export_journal(
+    journal: Annotated[Path, typer.Argument(help="File of a flight, such as flight-0001.gpkg.")],
+    out: Annotated[Path, typer.Option(help="What to write; its end says the format.")],
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            help="csv, csv-samples, geojson, geojsonl, kml, shapefile, isoxml, geoparquet, "
+            "adapt, mcap; default: by the end of OUT.",
+        ),
+    ] = None,
+    shape: Annotated[
+        str | None,
+        typer.Option("--geometry", help="points (of the path) or swaths (ground, a valve each)."),
+    ] = None,
+    rate_hz: Annotated[
+        float | None,
+        typer.Option("--rate-hz", help="Points a second; default: all of the journal."),
+    ] = None,
+    units: Annotated[str, typer.Option(help="metric or us; not for formats with their own.")] = (
+        "metric"
+    ),
+    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write what was applied for farms, maps and other programs.
+
+    Exit 0: all of the flight; 1: the journal was cut or lacks rows, what there is was written;
+    2: the journal, an option or OUT cannot be used.
+    """
+    from analysis.exports.registry import format_for
+    from analysis.exports.source import Source
+
+    form = format_for(out, name)
+    system = _system(form, units)
+    chosen = _shape(form, shape)
+    _check_rate(form, rate_hz)
+    _check_free(out, force=force)
+    form.maker()  # what is not installed is said before the work
+    note(f"reading {journal}")
+    flight = _read(journal)
+    note(f"writing {out} ({form.name})")
+    source = Source(flight=flight, shape=chosen, system=system, rate_hz=rate_hz)
+    size = _write(source, form, out, force=force)
+    warnings = _warnings(flight)
+    result = {
+        "out": str(out),
+        "format": form.name,
+        "geometry": source.shape,
+        "units": system,
+        "bytes": size,
+        **{key: value for key, value in source.facts().items() if key != "units"},
+        "warnings": warnings,
+    }
+    answer(result, [_sentence(result)], as_json=as_json)
+    for warning in warnings:
+        note(f"warning: {warning}")
+    raise typer.Exit(1 if warnings else 0)
+
+
+def _read(journal: Path) -> AppliedFlight:
+    from analysis.exports.output import ExportError
+    from analysis.read_applied import read_applied
+
+    flight = read_applied(journal)
+    if not len(flight.time_s):
+        raise ExportError(f"{journal}: the flight never had a position; there is nothing to export")
+    return flight
+
+
+def _write(source: Source, form: Format, out: Path, *, force: bool) -> int:
+    from analysis.exports.output import write_beside, write_folder
+
+    content = form.maker()(source, out)
+    is_folder = out.name not in content
+    return (write_folder if is_folder else write_beside)(out, content, force=force)
+
+
+def _system(form: Format, units: str) -> System:
+    from analysis.exports.output import ExportError
+    from analysis.exports.units import SYSTEMS
+
+    found = next((each for each in SYSTEMS if each == units), None)
+    if found is None:
+        raise ExportError(f"--units {units}: there are {' and '.join(SYSTEMS)}")
+    if found != "metric" and not form.has_units:
+        raise ExportError(f"--units {units}: {form.name} has units of its own; leave it out")
+    return found
+
+
+def _shape(form: Format, shape: str | None) -> Shape:
+    from analysis.exports.output import ExportError
+
+    if shape is None:
+        return form.shapes[0]
+    found = next((each for each in form.shapes if each == shape), None)
+    if found is None:
+        raise ExportError(f"--geometry {shape}: {form.name} has {' or '.join(form.shapes)}")
+    return found
+
+
+def _check_rate(form: Format, rate_hz: float | None) -> None:
+    from analysis.exports.output import ExportError
+
+    if rate_hz is None:
+        return
+    if not 0.0 < rate_hz <= RATE_HZ_MAX:
+        raise ExportError(f"--rate-hz {rate_hz:g}: must lie in (0, {RATE_HZ_MAX:g}]")
+    if not form.has_rate:
+        raise ExportError(f"--rate-hz {rate_hz:g}: {form.name} has no points to thin; leave it out")
+
+
+def _check_free(out: Path, *, force: bool) -> None:
+    """Refuse before reading what would be refused after it."""
+    from analysis.exports.output import check_free
+
+    check_free(out, [out.name], force=force)
+
+
+def _warnings(flight: AppliedFlight) -> list[str]:
+    found = []
+    if not flight.is_closed:
+        found.append("the flight was cut off: its last second may be missing")
+    if flight.lost:
+        found.append(f"{flight.lost} rows are missing in the journal")
+    return found
+
+
+def _sentence(result: dict[str, object]) -> str:
+    rows = {"points": "points", "swaths": "polygons", "steps": "rows"}[str(result["geometry"])]
+    mark = "" if result["training"] in ("no", "unknown") else f", training: {result['training']}"
+    return (
+        f"{result['out']}: {result['rows']} {rows}, {result['volume_l']:.3f} L, "
+        f"{result['bytes']} bytes{mark}"
+    )
+
+
+# What the program's own command line takes in: one command of the kind that Typer makes.
+export = typer.main.get_command(app)

@@ -1,0 +1,181 @@
+"""The columns of tables: their names, units, and values as numbers or text.
+
+`name` has the unit at its end and is used where names may be long; `short` has at most ten
+characters, as a dBASE table has them, and follows the names of John Deere's exports where these
+have one. What a program does not know it passes over, so the facts of the flight are columns too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from analysis.exports.units import Unit
+from analysis.exports.utc import utc_text
+
+if TYPE_CHECKING:
+    from analysis.exports.about import About
+    from analysis.exports.samples import Samples
+    from analysis.exports.swaths import Swaths
+
+Floats = NDArray[np.float64]
+Value = float | str | None
+
+# As many digits of the map's hash as tell maps apart by eye; the whole one is in the metadata.
+_HASH_DIGITS = 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """One column; `unit` is None for text, `values` are numbers (NaN: nothing) or text."""
+
+    name: str
+    short: str
+    description: str
+    unit: Unit | None
+    values: Floats | Sequence[str]
+
+    def python(self) -> list[Value]:
+        """Return the values as numbers rounded to what they mean, or text; None for nothing."""
+        if self.unit is None or not isinstance(self.values, np.ndarray):
+            return [value or None for value in self.values]
+        rounded = np.round(self.values, self.unit.decimals)
+        known = np.isfinite(rounded)
+        found: list[Value] = rounded.tolist()
+        return (
+            found
+            if known.all()
+            else [
+                value if there else None for value, there in zip(found, known.tolist(), strict=True)
+            ]
+        )
+
+    def texts(self) -> list[str]:
+        """Return the values as text; "" for nothing."""
+        if self.unit is None or not isinstance(self.values, np.ndarray):
+            return [str(value) for value in self.values]
+        form = f"%.{self.unit.decimals}f"
+        return [form % value if value == value else "" for value in self.values.tolist()]
+
+
+Of = Callable[[str, str, str, str, Floats], Column]
+
+
+def column_in(units: dict[str, Unit]) -> Of:
+    """Return what makes columns: name without unit, short name, quantity, meaning, values."""
+
+    def of(name: str, short: str, quantity: str, description: str, values: Floats) -> Column:
+        unit = units[quantity]
+        return Column(
+            name=f"{name}_{unit.suffix}" if unit.suffix else name,
+            short=short,
+            description=description,
+            unit=unit,
+            values=values * unit.factor,
+        )
+
+    return of
+
+
+def text_column(name: str, short: str, description: str, values: Sequence[str]) -> Column:
+    """Return a column of text."""
+    return Column(name=name, short=short, description=description, unit=None, values=values)
+
+
+def point_columns(samples: Samples, about: About, units: dict[str, Unit]) -> list[Column]:
+    """Return the columns of points, without their place; the facts of the flight come last."""
+    of = column_in(units)
+    columns = [
+        text_column("time_utc", "IsoTime", "UTC, ISO 8601", utc_text(samples.utc_s)),
+        of("time", "FlightTime", "time", "monotonic clock of the companion", samples.time_s),
+        of("height", "Height", "length", "above the take-off place", samples.height_m),
+        of("speed", "VEHICLSPEE", "speed", "over ground", samples.speed_m_s),
+        of("course", "Course", "angle", "of motion, from north", samples.course_deg),
+        of("heading", "Heading", "angle", "of the nose, from north", samples.heading_deg),
+        of("target_rate", "TargetRate", "rate", "prescribed", samples.rate_l_ha),
+        of("applied_rate", "AppliedRat", "rate", "over the open valves", samples.applied_l_ha),
+        of("target_flow", "TargetFlow", "flow", "asked for", samples.target_flow_l_min),
+        of("flow", "Flow", "flow", "of all valves, by the model", samples.flow_l_min),
+        of("volume", "Volume", "volume", "in the time of this row", samples.volume_ml),
+        of("distance", "DISTANCE", "length", "in the time of this row", samples.distance_m),
+        of("width", "SWATHWIDTH", "length", "of the open valves", samples.width_m),
+        of("area", "Area", "area", "covered in the time of this row", samples.area_m2),
+        of("duty", "Duty", "duty", "mean of the open valves, 0 to 1", samples.duty),
+    ]
+    if samples.pressure_kpa is not None:
+        columns.append(
+            of("pressure", "Pressure", "pressure", "of the liquid", samples.pressure_kpa)
+        )
+    columns.append(text_column("inhibits", "Inhibits", "reasons not to spray", samples.inhibits))
+    return columns + _facts(about, len(samples))
+
+
+def valve_columns(samples: Samples, names: Iterable[str], units: dict[str, Unit]) -> list[Column]:
+    """Return what each valve did: what was prescribed under it, its flow and its duty."""
+    of = column_in(units)
+    columns = []
+    for valve, name in enumerate(plain_names(names)):
+        columns += [
+            of(f"target_rate_{name}", "", "rate", "prescribed", samples.valve_rate_l_ha[:, valve]),
+            of(f"flow_{name}", "", "flow", "by the model", samples.valve_flow_l_min[:, valve]),
+            of(f"duty_{name}", "", "duty", "ordered, 0 to 1", samples.valve_duty[:, valve]),
+        ]
+    return columns
+
+
+def swath_columns(
+    swaths: Swaths, about: About, units: dict[str, Unit], names: Sequence[str]
+) -> list[Column]:
+    """Return the columns of polygons, without their shape; the facts of the flight come last."""
+    of = column_in(units)
+    start_s, end_s = (each + swaths.utc_offset_s for each in (swaths.start_s, swaths.end_s))
+    valves = [names[valve] for valve in swaths.valve.tolist()]
+    return [
+        text_column("time_utc", "IsoTime", "begin, UTC, ISO 8601", utc_text(start_s)),
+        text_column("end_utc", "IsoTimeEnd", "end, UTC, ISO 8601", utc_text(end_s)),
+        of("time", "FlightTime", "time", "begin, monotonic clock", swaths.start_s),
+        text_column("valve", "SECTIONID", "name of the valve", valves),
+        of("height", "Height", "length", "above the take-off place", swaths.height_m),
+        of("speed", "VEHICLSPEE", "speed", "over ground, mean", swaths.speed_m_s),
+        of("heading", "Heading", "angle", "of the nose, from north", swaths.heading_deg),
+        of("target_rate", "TargetRate", "rate", "prescribed", swaths.rate_l_ha),
+        of("applied_rate", "AppliedRat", "rate", "mean over the polygon", swaths.applied_l_ha),
+        of("volume", "Volume", "volume", "on this polygon", swaths.volume_ml),
+        of("area", "Area", "area", "swept", swaths.area_m2),
+        of("distance", "DISTANCE", "length", "flown", swaths.distance_m),
+        of("width", "SWATHWIDTH", "length", "of the strip", swaths.width_m),
+        of("duty", "Duty", "duty", "ordered at the middle, 0 to 1", swaths.duty),
+        *_facts(about, len(swaths)),
+    ]
+
+
+def plain_names(names: Iterable[str]) -> list[str]:
+    """Return names of valves as they may stand in the name of a column, all different.
+
+    >>> plain_names(["left 1", "left-1", "4"])
+    ['left_1', 'left_1_2', 'v4']
+    """
+    found: list[str] = []
+    for number, name in enumerate(names, start=1):
+        plain = re.sub(r"\W+", "_", name, flags=re.ASCII).strip("_") or f"v{number}"
+        plain = f"v{plain}" if plain[0].isdigit() else plain
+        found.append(plain if plain not in found else f"{plain}_{number}")
+    return found
+
+
+def _facts(about: About, count: int) -> list[Column]:
+    """Return the facts that must not be lost with a file beside."""
+    return [
+        text_column(name, short, description, [value] * count)
+        for name, short, description, value in (
+            ("flight", "Flight", "name of the record", about.flight),
+            ("training", "Training", "water, dry, no (a product) or unknown", about.training),
+            ("utc_source", "UtcSource", "whose clock", about.utc_source),
+            ("map", "MapHash", "begin of the map's SHA-256", about.map_sha256[:_HASH_DIGITS]),
+        )
+    ]

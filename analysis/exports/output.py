@@ -1,0 +1,103 @@
+"""An export appears whole or not at all, and never in the place of something else.
+
+Everything is written into a folder beside its destination, which goes away whatever happens, and
+is moved from there when it is complete.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import Iterable, Mapping
+from io import BytesIO
+from pathlib import Path
+
+from companion.errors import VrsprayError
+
+# Content of files by their names, in the order in which they are moved: what makes the others
+# worth reading comes last.
+Content = Mapping[str, Iterable[bytes]]
+
+# A zip has times of its members; the earliest it can hold makes the same bytes every time.
+_NO_TIME = (1980, 1, 1, 0, 0, 0)
+_READ_BY_ALL = 0o644 << 16
+
+
+class ExportError(VrsprayError):
+    """An export cannot be made."""
+
+
+def check_free(out: Path, names: Iterable[str], *, force: bool) -> None:
+    """Refuse a destination that is there already, or whose folder is not."""
+    if not out.parent.is_dir():
+        raise ExportError(f"{out.parent}: there is no such folder; make it first")
+    there = next((name for name in names if (out.parent / name).exists()), None)
+    if there is not None and not force:
+        raise ExportError(f"{out.parent / there}: is there already; give --force to replace it")
+
+
+def write_beside(out: Path, content: Content, *, force: bool) -> int:
+    """Write files into the folder of `out`; return how many bytes."""
+    check_free(out, content, force=force)
+    for name in content:
+        if (out.parent / name).is_dir():
+            raise ExportError(f"{out.parent / name}: is a folder; give another name")
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
+            size = _write(Path(folder), content)
+            for name in content:
+                (Path(folder) / name).replace(out.parent / name)
+    except OSError as error:
+        raise _not_written(out, error) from None
+    return size
+
+
+def write_folder(out: Path, content: Content, *, force: bool) -> int:
+    """Write files into a folder of their own, `out`; return how many bytes."""
+    check_free(out, [out.name], force=force)
+    if out.exists() and not _is_ours(out, content):
+        raise ExportError(f"{out}: holds other files; give a folder that is not there yet")
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
+            fresh = Path(folder) / "fresh"
+            fresh.mkdir()
+            size = _write(fresh, content)
+            if out.exists():
+                out.rename(Path(folder) / "replaced")
+            fresh.rename(out)
+    except OSError as error:
+        raise _not_written(out, error) from None
+    return size
+
+
+def zipped(members: Mapping[str, bytes]) -> bytes:
+    """Return a zip of files."""
+    packed = BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        for name, content in members.items():
+            member = zipfile.ZipInfo(name, _NO_TIME)
+            member.external_attr = _READ_BY_ALL
+            member.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(member, content)
+    return packed.getvalue()
+
+
+def _is_ours(out: Path, content: Content) -> bool:
+    """Whether a folder has nothing in it but files of the same names."""
+    return out.is_dir() and all(each.is_file() and each.name in content for each in out.iterdir())
+
+
+def _write(folder: Path, content: Content) -> int:
+    size = 0
+    for name, chunks in content.items():
+        with (folder / name).open("wb") as file:
+            for chunk in chunks:
+                file.write(chunk)
+                size += len(chunk)
+    return size
+
+
+def _not_written(out: Path, error: OSError) -> ExportError:
+    return ExportError(
+        f"{out}: cannot be written ({error.strerror or error}); check folder, rights and space"
+    )

@@ -1,0 +1,91 @@
+"""What a format is given: the flight and, made when first asked for, its samples and its ground."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+from analysis.applied_flight import AppliedFlight
+from analysis.applied_record import record_of
+from analysis.exports.about import About, about
+from analysis.exports.columns import Column, point_columns, swath_columns
+from analysis.exports.samples import Samples, samples_of
+from analysis.exports.swaths import Swaths, swaths_of
+from analysis.exports.units import System, Unit, units_of
+from analysis.flight_record import FlightRecord
+
+Shape = Literal["points", "swaths", "steps"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Source:
+    """A flight and how it is wanted: `shape` is what a row is (`steps`: 10 ms).
+
+    `rate_hz` thins points.
+    """
+
+    flight: AppliedFlight
+    shape: Shape
+    system: System = "metric"
+    rate_hz: float | None = None
+
+    @cached_property
+    def record(self) -> FlightRecord:
+        """Return path and modelled flow every 10 ms."""
+        return record_of(self.flight)
+
+    @cached_property
+    def samples(self) -> Samples:
+        """Return the rows of points."""
+        return samples_of(self.flight, self.record, rate_hz=self.rate_hz)
+
+    @cached_property
+    def swaths(self) -> Swaths:
+        """Return the polygons of what was treated."""
+        return swaths_of(self.flight, self.record)
+
+    @cached_property
+    def about(self) -> About:
+        """Return the facts of the flight."""
+        return about(self.flight)
+
+    @property
+    def units(self) -> dict[str, Unit]:
+        """Return the unit of each quantity."""
+        return units_of(self.system)
+
+    @property
+    def valve_names(self) -> tuple[str, ...]:
+        """Return the names of the valves, left to right."""
+        return tuple(valve.name for valve in self.flight.setup.boom.valves)
+
+    @property
+    def volume_l(self) -> float:
+        """Return what was sprayed in all, by the model."""
+        return float(self.record.volume_ml[-1].sum()) / 1000.0
+
+    @property
+    def rows(self) -> int:
+        """Return how many rows an export of this shape has."""
+        if self.shape == "steps":
+            return len(self.record.time_s)
+        return len(self.samples) if self.shape == "points" else len(self.swaths)
+
+    def columns(self) -> list[Column]:
+        """Return the columns of a row, without its place."""
+        if self.shape == "points":
+            return point_columns(self.samples, self.about, self.units)
+        if self.shape == "steps":
+            return []
+        return swath_columns(self.swaths, self.about, self.units, self.valve_names)
+
+    def facts(self) -> dict[str, object]:
+        """Return what is said of an export once: the flight, and the units of the columns."""
+        facts = self.about.as_json() | {"volume_l": round(self.volume_l, 6), "rows": self.rows}
+        if self.shape == "swaths":
+            facts["unmapped_ml"] = round(self.swaths.unmapped_ml, 6)
+        facts["units"] = {
+            each.name: each.unit.label for each in self.columns() if each.unit is not None
+        }
+        return facts

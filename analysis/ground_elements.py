@@ -1,0 +1,131 @@
+"""Small pieces of ground under the strips of a flight, for rasters of what fell where."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from analysis.strips import Strip
+    from analysis.track import Floats, Ints, Track
+
+
+class Grid(Protocol):
+    """Cells of ground, in rows and columns."""
+
+    @property
+    def rows(self) -> int: ...  # noqa: D102
+    @property
+    def columns(self) -> int: ...  # noqa: D102
+
+    def cells_of(self, east_m: Floats, north_m: Floats) -> Ints:
+        """Return the number of each point's cell, row by row; rows x columns beside the grid."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SquareGrid:
+    """Square cells along east and north: rows from the south, columns from the west."""
+
+    west_m: float
+    south_m: float
+    cell_m: float
+    rows: int
+    columns: int
+
+    @staticmethod
+    def over(bounds_m: tuple[float, float, float, float], cell_m: float) -> SquareGrid:
+        """Return the cells over a box (west, south, east, north), on whole multiples of a cell."""
+        west, south, east, north = (value / cell_m for value in bounds_m)
+        column, row = math.floor(west), math.floor(south)
+        return SquareGrid(
+            west_m=column * cell_m,
+            south_m=row * cell_m,
+            cell_m=cell_m,
+            rows=max(math.ceil(north) - row, 1),
+            columns=max(math.ceil(east) - column, 1),
+        )
+
+    def cells_of(self, east_m: Floats, north_m: Floats) -> Ints:
+        """Return the number of each point's cell; rows x columns beside the grid."""
+        column = np.floor((east_m - self.west_m) / self.cell_m).astype(np.int64)
+        row = np.floor((north_m - self.south_m) / self.cell_m).astype(np.int64)
+        inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
+        return np.where(inside, row * self.columns + column, self.rows * self.columns)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Slices:
+    """One strip cut across into slices of ground, one after the other along its way.
+
+    `given_ml` and `asked_ml` fell and should have fallen on each, `area_m2` is its ground.
+    """
+
+    track: Track
+    time_s: Floats
+    area_m2: Floats
+    given_ml: Floats
+    asked_ml: Floats
+
+    def pieces(self, size_m: float, chosen: Ints) -> Iterator[tuple[Floats, Floats]]:
+        """Yield east and north of the slices' pieces, each time one piece of every slice.
+
+        A slice has so many that none is wider than `size_m`; they are of equal area.
+        """
+        count = self.count(size_m)
+        time_s, track = self.time_s[chosen], self.track
+        heading = track.at(track.heading_rad, time_s)
+        east_m, north_m = track.at(track.east_m, time_s), track.at(track.north_m, time_s)
+        cos, sin = np.cos(heading), np.sin(heading)
+        for part in (np.arange(count) + 0.5) / count - 0.5:
+            right_m = part * track.width_m
+            yield east_m + cos * right_m, north_m - sin * right_m
+
+    def count(self, size_m: float) -> int:
+        """Return how many pieces a slice has."""
+        return max(1, math.ceil(self.track.width_m / size_m - 1e-9))
+
+
+def slices_of(strip: Strip, length_m: float) -> Slices:
+    """Return the slices of a strip, none longer than `length_m` where the samples allow it."""
+    track = strip.track
+    wanted = np.arange(track.distance_m[0], track.distance_m[-1], length_m)
+    ends = np.unique(
+        np.concatenate(
+            ([0], np.searchsorted(track.distance_m, wanted), [len(track.distance_m) - 1])
+        )
+    )
+    metres = np.diff(track.distance_m[ends])
+    kept = metres > 0.0
+    middle_s = 0.5 * (track.time_s[ends[1:]] + track.time_s[ends[:-1]])
+    across_m = track.at(track.across_m, middle_s)
+    return Slices(
+        track=track,
+        time_s=middle_s[kept],
+        area_m2=(across_m * metres)[kept],
+        given_ml=np.diff(track.volume_ml[ends])[kept],
+        asked_ml=np.diff(strip.asked_ml[ends])[kept],
+    )
+
+
+def summed(
+    grid: Grid, slices: Slices, size_m: float, values: Sequence[Floats], chosen: Ints
+) -> list[Floats]:
+    """Return the sums of values of slices by cell, spread evenly over each slice's ground."""
+    count, cells = slices.count(size_m), grid.rows * grid.columns
+    sums = [np.zeros(cells + 1) for _ in values]
+    parts = [value[chosen] / count for value in values]
+    places = np.stack([grid.cells_of(*place) for place in slices.pieces(size_m, chosen)])
+    low, high = int(places.min(initial=cells)), int(places.max(initial=0))
+    if low > high:
+        return sums
+    for total, part in zip(sums, parts, strict=True):
+        weights = np.broadcast_to(part, places.shape).ravel()
+        total[low : high + 1] += np.bincount(
+            places.ravel() - low, weights=weights, minlength=high - low + 1
+        )
+    return sums

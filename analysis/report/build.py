@@ -1,0 +1,172 @@
+"""From a journal to the files of its report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from analysis.applied_record import EvaluationError
+from analysis.assessment import Assessment, assess
+from analysis.read_applied import read_applied
+from analysis.report.clock import Clock, clock_of
+from analysis.report.contents import contents_of
+from analysis.report.facts import facts_of
+from analysis.report.legal import LegalRecord, legal_record
+from analysis.report.page import page_of, picture
+from analysis.report.record_files import record_csv, record_json
+from analysis.report.told import Told, told_with
+from analysis.report.treated import Treated, treated_of
+from companion.config.application_table import PROFILES, Profile
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from analysis.applied_flight import AppliedFlight
+    from analysis.report.figures.style import Drawn
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportOptions:
+    """What is asked of a report; without profiles the journal's own, else the generic one."""
+
+    profiles: tuple[Profile, ...] = ()
+    time_zone: str | None = None
+    application_file: Path | None = None
+    changes: tuple[str, ...] = ()
+    with_figures: bool = True
+    with_pdf: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """The files of a report by name, and what they say."""
+
+    contents: Mapping[str, Any]
+    files: Mapping[str, bytes]
+
+    @property
+    def is_whole(self) -> bool:
+        """Return whether the journal had all that a flight leaves behind."""
+        flight = self.contents["flight"]
+        return bool(flight["is_closed"] and not flight["lost"])
+
+
+def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: None) -> Report:
+    """Return the report of one journal; nothing is written.
+
+    Raises:
+        JournalError: where the file is no journal, or one that cannot be read.
+        ConfigError: where an entry of the record or the time zone is none.
+    """
+    say(f"reading {journal.name}")
+    flight = read_applied(journal)
+    told = told_with(flight.meta, file=options.application_file, changes=options.changes)
+    say("evaluating")
+    assessment, why_not = _assessed(flight)
+    treated = treated_of(flight)
+    clock = _clock(flight, told, treated, options.time_zone)
+    facts = facts_of(flight, treated, clock, **_volumes(assessment))
+    records = [legal_record(each, told, facts) for each in _profiles(options, told)]
+    contents = contents_of(
+        flight,
+        assessment,
+        treated=treated,
+        clock=clock,
+        told=told,
+        records=records,
+        why_not_evaluated=why_not,
+    )
+    say("drawing")
+    return _with_files(contents, records, assessment, clock, options)
+
+
+def _assessed(flight: AppliedFlight) -> tuple[Assessment | None, str]:
+    try:
+        return assess(flight), ""
+    except EvaluationError as error:
+        return None, str(error).removeprefix(f"{flight.path}: ")
+
+
+def _clock(flight: AppliedFlight, told: Told, treated: Treated, time_zone: str | None) -> Clock:
+    """Return the clock; the operator's start of spraying stands for a clock that was not right."""
+    clock = clock_of(flight, time_zone or told.values.get("application.time_zone"))
+    start_time = told.values.get("application.start_time")
+    return clock if start_time is None else clock.moved_to(start_time, treated.first_s)
+
+
+def _volumes(assessment: Assessment | None) -> dict[str, Any]:
+    """Return the litres of the record: counted by a meter where there is one, else modelled."""
+    if assessment is None:
+        return {"volume_l": 0.0, "volume_by": "nothing", "prescribed_l": None}
+    balance = assessment.balance
+    metered = balance.meter_l is not None
+    return {
+        "volume_l": balance.meter_l if metered else balance.model_l,
+        "volume_by": "flow meter" if metered else "model of the executed changes",
+        "prescribed_l": balance.prescribed_l,
+    }
+
+
+def _profiles(options: ReportOptions, told: Told) -> tuple[Profile, ...]:
+    if options.profiles:
+        return tuple(dict.fromkeys(options.profiles))
+    own = told.values.get("application.profile")
+    return (own,) if own in PROFILES else ("generic",)
+
+
+def _with_files(
+    contents: dict[str, Any],
+    records: list[LegalRecord],
+    assessment: Assessment | None,
+    clock: Clock,
+    options: ReportOptions,
+) -> Report:
+    files: dict[str, bytes] = {}
+    figures: dict[str, dict[str, str]] = {}
+    if options.with_figures and assessment is not None:
+        files, figures = _figures(contents, assessment, clock, with_pdf=options.with_pdf)
+    elif options.with_pdf:
+        from analysis.report.pdf import pdf_of
+
+        files["report.pdf"] = pdf_of(contents, ())
+    contents["figures"] = [name for name in files if name.startswith("figures/")]
+    for record in records:
+        files[f"application-{record.profile}.json"] = record_json(record)
+        files[f"application-{record.profile}.csv"] = record_csv(record)
+    files["report.json"] = (json.dumps(contents, indent=1, allow_nan=False) + "\n").encode()
+    files["report.html"] = page_of(contents, figures).encode()
+    return Report(contents=contents, files=files)
+
+
+def _figures(
+    contents: Mapping[str, Any], assessment: Assessment, clock: Clock, *, with_pdf: bool
+) -> tuple[dict[str, bytes], dict[str, dict[str, str]]]:
+    """Return the files of all figures, and how they stand in the page."""
+    from analysis.report.drawing import drawn_of
+    from analysis.report.figures.style import inline_svg, laid_out, png_of, styled, svg_of
+
+    files: dict[str, bytes] = {}
+    figures: dict[str, dict[str, str]] = {}
+    drawn: list[Drawn] = []
+    with styled():
+        for each in map(laid_out, drawn_of(assessment, clock)):
+            png, svg = png_of(each), svg_of(each)
+            files[f"figures/{each.name}.png"] = png
+            files[f"figures/{each.name}.svg"] = svg.encode()
+            is_map = each.kind == "map"
+            figures[each.name] = {
+                "title": each.title,
+                "caption": each.caption,
+                "markup": picture(png, each.alt, each.width) if is_map else inline_svg(each, svg),
+            }
+            drawn.append(each)
+        if with_pdf:
+            from analysis.report.pdf import pdf_of
+
+            files["report.pdf"] = pdf_of(contents, drawn)
+    return files, figures

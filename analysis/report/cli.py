@@ -1,0 +1,89 @@
+"""Command line of the report: `vrspray report`."""
+
+from __future__ import annotations
+
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from companion.cli.answer import AsJson, answer, note
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None)
+
+
+class Law(StrEnum):
+    """Whose record of the application; the values are the configuration's profiles."""
+
+    EU = "eu"
+    US = "us"
+    GENERIC = "generic"
+
+
+@app.command(epilog="Example: vrspray report flights/flight-0001.gpkg --out report --profile eu")
+def report_flight(
+    journal: Annotated[Path, typer.Argument(help="File of a flight, such as flight-0001.gpkg.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files of the report.")],
+    profile: Annotated[
+        list[Law] | None,
+        typer.Option(
+            help="Legal record: eu, us, generic; may be repeated. Default: the journal's."
+        ),
+    ] = None,
+    time_zone: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Of all times, such as Europe/Madrid. Default: UTC."),
+    ] = None,
+    application: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="TOML with [application] and [product], said after the flight."
+        ),
+    ] = None,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="An entry of the record, said after the flight."
+        ),
+    ] = None,
+    is_pdf: Annotated[bool, typer.Option("--pdf", help="Also report.pdf.")] = False,
+    is_plain: Annotated[bool, typer.Option("--no-figures", help="Leave out all figures.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Evaluate a flight and write its report, with every number and the record of the application.
+
+    Exit 0: written; 1: written, of a journal that was cut or has lost rows; 2: the journal or an
+    option cannot be used, or DIR cannot be written.
+    """
+    from analysis.report.build import ReportOptions, build_report
+    from analysis.report.folder import check_folder, write_files
+
+    began_s = time.perf_counter()
+    check_folder(out)
+    options = ReportOptions(
+        profiles=tuple(law.value for law in profile or ()),
+        time_zone=time_zone,
+        application_file=application,
+        changes=tuple(changes or ()),
+        with_figures=not is_plain,
+        with_pdf=is_pdf,
+    )
+    report = build_report(journal, options, say=note)
+    write_files(out, report.files)
+    contents = report.contents
+    for warning in contents["warnings"]:
+        if warning["severity"] != "note":
+            note(f"{warning['severity']}: {warning['text']}")
+    answer(
+        {**contents, "files": [str(out / name) for name in report.files],
+         "wall_s": time.perf_counter() - began_s},
+        [contents["verdict"]["sentence"], f"report: {out / 'report.html'}"],
+        as_json=as_json,
+    )  # fmt: skip
+    raise typer.Exit(0 if report.is_whole else 1)
+
+
+# What the program's own command line takes in: one command of the kind that Typer makes.
+report = typer.main.get_command(app)

@@ -1,0 +1,1 @@
+"""The figures of a report, one kind a file; every function returns a `Drawn`."""

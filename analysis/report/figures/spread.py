@@ -1,0 +1,84 @@
+"""How far the ground is from what was asked: a histogram; and what the off-rate area is due to."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from analysis.report.figures.style import BLUE, FAINT, GRID, INK, RED, Drawn, new_figure
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from matplotlib.axes import Axes
+
+    from analysis.cell_maps import Histogram
+
+
+def histogram(found: Sequence[Histogram]) -> Drawn | None:
+    """Draw how often cells deviate by how much, a panel a unit; None without any cell."""
+    if not found:
+        return None
+    figure = new_figure(3.2)
+    panels = figure.subplots(1, len(found), squeeze=False)[0]
+    for panel, each in zip(panels, found, strict=True):
+        _bars(panel, each)
+    panels[0].set_ylabel("cells")
+    return Drawn(
+        name="histogram",
+        title="Deviation of the cells",
+        caption="Applied less prescribed of every cell that was flown over; left of 0: too little. "
+        "The line is the mean, the band one standard deviation to each side.",
+        alt="Histograms of applied less prescribed of every cell: "
+        + "; ".join(f"mean {each.mean:+.2f}, sd {each.sd:.2f} {each.unit}" for each in found)
+        + ".",
+        kind="chart",
+        figure=figure,
+    )
+
+
+def causes(shares: Mapping[str, float]) -> Drawn | None:
+    """Draw the off-rate area [m2] by its cause, largest first; None where there is none."""
+    named = sorted(
+        ((name, area) for name, area in shares.items() if area > 0.0), key=lambda item: item[1]
+    )
+    if not named:
+        return None
+    figure = new_figure(0.8 + 0.3 * len(named))
+    panel = figure.subplots()
+    areas = [area for _, area in named]
+    whole = sum(areas)
+    panel.barh([name for name, _ in named], areas, color=BLUE, height=0.65)
+    for row, area in enumerate(areas):
+        text = f" {area:,.1f} m\u00b2, {100.0 * area / whole:.0f} %"
+        panel.text(area, row, text, va="center", color=INK, size=8.5)
+    panel.set_xlim(0.0, 1.25 * max(areas))
+    panel.set_ylim(-0.6, len(named) - 0.4)
+    panel.set_xlabel("area that is off by more than 10 % [m\u00b2]")
+    panel.tick_params(axis="y", length=0)
+    return Drawn(
+        name="causes",
+        title="Why ground is off its rate",
+        caption="Area whose applied rate is more than 10 % from the prescribed one, each square "
+        "metre put to one cause.",
+        alt="Bar chart of the area that is more than 10 per cent off its rate, by cause: "
+        + "; ".join(f"{name} {area:.1f} square metres" for name, area in reversed(named))
+        + ".",
+        kind="chart",
+        figure=figure,
+    )
+
+
+def _bars(panel: Axes, found: Histogram) -> None:
+    panel.axvspan(found.mean - found.sd, found.mean + found.sd, color="#F1E3D8", lw=0, zorder=0)
+    panel.bar(
+        found.edges[:-1], found.counts, width=found.edges[1:] - found.edges[:-1], align="edge",
+        color=BLUE,
+    )  # fmt: skip
+    panel.axvline(0.0, color=FAINT, lw=0.8)
+    panel.axvline(found.mean, color=RED, lw=1.4)
+    panel.set_title(
+        f"mean {found.mean:+.2f}, sd {found.sd:.2f} {found.unit}, {found.cells:,} cells"
+    )
+    panel.set_xlabel(f"applied less prescribed [{found.unit}]")
+    panel.grid(axis="y", color=GRID, lw=0.7)
+    panel.set_axisbelow(True)

@@ -1,0 +1,191 @@
+"""The legal record of an application, by profile: what a law asks for, and what is missing of it.
+
+A record is complete only when every field of its profile has a value, and then only if the flight
+was an application at all. Who said what, and when, stands beside each value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from analysis.report.legal_fields import FIELDS, LABELS, Facts, label_of
+from companion.config.application_table import ASKED, Profile, is_told, missing
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from analysis.report.told import Told
+
+LAWS: dict[Profile, str] = {
+    "eu": "Commission Implementing Regulation (EU) 2023/564, with Article 67(1) of Regulation (EC) "
+    "No 1107/2009",
+    "us": "14 CFR 137.71, records of a commercial agricultural aircraft operator",
+    "generic": "no law's own form: what labels, authorities and buyers commonly ask for",
+}
+KEEP: dict[Profile, str] = {
+    "eu": "keep it for at least three years (Article 67(1) of Regulation (EC) No 1107/2009)",
+    "us": "keep it for at least 12 months (14 CFR 137.71(b))",
+    "generic": "keep it for as long as your authority asks, commonly two or three years",
+}
+BEFORE, AFTER, FLIGHT = "before the flight", "after the flight", "flight"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """One field of a record; `said` is who says so: the operator before or after, or the flight."""
+
+    name: str
+    label: str
+    value: Any
+    unit: str
+    said: str
+    replaced: Any = None
+    is_optional: bool = False
+
+    @property
+    def is_missing(self) -> bool:
+        """Return whether the record cannot be complete for want of this one."""
+        return not (self.is_optional or is_told(self.value))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LegalRecord:
+    """A record of one profile, complete or not; `why_not` has reasons beside empty fields."""
+
+    profile: Profile
+    entries: tuple[Entry, ...]
+    why_not: tuple[str, ...]
+    remarks: tuple[str, ...]
+    treated_area: dict[str, Any]
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Return the names of empty fields, and what else keeps the record from being complete."""
+        return (*(entry.name for entry in self.entries if entry.is_missing), *self.why_not)
+
+    @property
+    def is_complete(self) -> bool:
+        """Return whether nothing is missing."""
+        return not self.missing
+
+    @property
+    def added_after_flight(self) -> tuple[str, ...]:
+        """Return the names of the fields that were said after the flight."""
+        return tuple(entry.name for entry in self.entries if entry.said == AFTER)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the record as its JSON file has it."""
+        return {
+            "profile": self.profile,
+            "law": LAWS[self.profile],
+            "retention": KEEP[self.profile],
+            "complete": self.is_complete,
+            "missing": list(self.missing),
+            "added_after_flight": list(self.added_after_flight),
+            "fields": {
+                entry.name: {
+                    "label": entry.label,
+                    "value": entry.value,
+                    "unit": entry.unit,
+                    "said": entry.said,
+                    **({} if entry.replaced is None else {"replaced": entry.replaced}),
+                }
+                for entry in self.entries
+            },
+            "remarks": list(self.remarks),
+            "treated_area": self.treated_area,
+        }
+
+
+def legal_record(profile: Profile, told: Told, facts: Facts) -> LegalRecord:
+    """Return the record of a flight as a profile asks for it."""
+    entries = (
+        *_said(profile, told, facts),
+        *_flown(profile, told, facts),
+        *_also_said(profile, told),
+    )
+    return LegalRecord(
+        profile=profile,
+        entries=entries,
+        why_not=tuple(_why_not(facts)),
+        remarks=tuple(_remarks(told, facts)),
+        treated_area=facts.treated_area,
+    )
+
+
+def _said(profile: Profile, told: Told, facts: Facts) -> Iterator[Entry]:
+    """Yield what the operator says; wind that the flight measured needs no saying."""
+    absent = missing(profile, told.values)
+    for key in ASKED[profile]:
+        if key == "application.wind_m_s" and key in absent and facts.wind_m_s is not None:
+            label, unit = label_of(key)
+            yield Entry(
+                name="wind_m_s",
+                label=f"{label}, mean in flight",
+                value=round(facts.wind_m_s, 1),
+                unit=unit,
+                said=FLIGHT,
+            )
+        else:
+            yield _entry(key, told)
+
+
+def _also_said(profile: Profile, told: Told) -> Iterator[Entry]:
+    """Yield what this profile does not ask for and was said all the same."""
+    for key in LABELS:
+        if key in told.values and key not in ASKED[profile]:
+            yield replace(_entry(key, told), is_optional=True)
+
+
+def _entry(key: str, told: Told) -> Entry:
+    table, _, name = key.partition(".")
+    label, unit = label_of(key)
+    value = told.values.get(key)
+    said = "" if value is None else AFTER if key in told.after else BEFORE
+    return Entry(
+        name=name if table == "application" else f"{table}_{name}",
+        label=label,
+        value=value,
+        unit=unit,
+        said=said,
+        replaced=told.before.get(key),
+    )
+
+
+def _flown(profile: Profile, told: Told, facts: Facts) -> Iterator[Entry]:
+    for field in FIELDS[profile]:
+        value = field.value(facts, told)
+        said = facts.time_said if field.is_time else FLIGHT
+        yield Entry(
+            name=field.name,
+            label=field.label,
+            value=value,
+            unit=field.unit(told),
+            said=said if is_told(value) else "",
+            is_optional=field.is_optional,
+        )
+
+
+def _why_not(facts: Facts) -> Iterator[str]:
+    if facts.training in ("water", "dry"):
+        yield f"a product: this was training ({facts.training})"
+    elif not facts.area_ha > 0.0:
+        yield "an application: nothing was sprayed"
+    if facts.ends_spraying:
+        yield "the end of the spraying: the journal was cut while valves were open"
+    if facts.lost_rows:
+        yield f"{facts.lost_rows} rows of the journal"
+
+
+def _remarks(told: Told, facts: Facts) -> Iterator[str]:
+    if facts.clock_source == "computer":
+        yield "times are by the clock of the companion, not verified"
+    if facts.clock_source == "operator":
+        yield "times are as the operator gave them"
+    if not facts.is_closed:
+        yield "the journal was cut; up to its last second may be missing"
+    if facts.training is None:
+        yield "whether product or water was sprayed is not in the journal"
+    if is_told(told.values.get("application.remarks")):
+        yield str(told.values["application.remarks"])

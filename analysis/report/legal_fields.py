@@ -1,0 +1,253 @@
+"""What the flight itself tells for a legal record: area, place, times, quantities, equipment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from companion.config.application_table import Profile, is_told
+
+if TYPE_CHECKING:
+    from analysis.report.told import Told
+
+# The US liquid gallon, exact by definition (231 cubic inches).
+LITRES_PER_GALLON = 3.785411784
+ACRES_PER_HA = 2.4710538
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What the journal says, as the records need it; None where it says nothing.
+
+    `time_said` tells whose clock the times are by. `ends_spraying`: the journal ends with valves
+    open, so that area and quantity are not all.
+    """
+
+    date: str | None
+    start_time: str | None
+    end_time: str | None
+    time_zone: str
+    time_said: str
+    clock_source: str
+    latitude_deg: float | None
+    longitude_deg: float | None
+    area_ha: float
+    volume_l: float
+    volume_by: str
+    mean_rate_l_ha: float | None
+    asked_rate_l_ha: float | None
+    boom_width_m: float
+    height_m: float | None
+    speed_m_s: float | None
+    wind_m_s: float | None
+    training: str | None
+    is_closed: bool
+    lost_rows: int
+    ends_spraying: bool
+    map_sha256: str
+    treated_area: dict[str, Any]
+
+    @property
+    def has_area(self) -> bool:
+        """Return whether anything was sprayed."""
+        return self.area_ha > 0.0
+
+
+def _no_unit(_: Told) -> str:
+    return ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Field:
+    """A field that is computed; `value` gives None where it cannot be, which some may be."""
+
+    name: str
+    label: str
+    value: Callable[[Facts, Told], Any]
+    unit: Callable[[Told], str] = _no_unit
+    is_time: bool = False
+    is_optional: bool = False
+
+
+def _in(unit: str) -> Callable[[Told], str]:
+    return lambda _: unit
+
+
+def _product_unit(told: Told) -> str:
+    return str(told.values.get("application.product_unit") or "")
+
+
+def _product(facts: Facts, told: Told) -> float | None:
+    """Return the product in what was sprayed, in its own unit."""
+    per_l = told.values.get("application.product_per_l")
+    if not is_told(per_l) or not _product_unit(told) or not facts.has_area:
+        return None
+    return round(facts.volume_l * float(per_l), 4)  # type: ignore[arg-type] # checked when told
+
+
+def _dose(facts: Facts, told: Told) -> float | None:
+    product = _product(facts, told)
+    return None if product is None else round(product / facts.area_ha, 3)
+
+
+def _place(facts: Facts, _: Told) -> str | None:
+    if facts.latitude_deg is None or facts.longitude_deg is None:
+        return None
+    return f"{facts.latitude_deg:.6f}, {facts.longitude_deg:.6f}"
+
+
+def _rounded(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
+
+
+def _volume(facts: Facts, _: Told) -> float | None:
+    return round(facts.volume_l, 3) if facts.has_area else None
+
+
+def _area(facts: Facts, _: Told) -> float | None:
+    return round(facts.area_ha, 4) if facts.has_area else None
+
+
+DATE = Field(name="date", label="Date", value=lambda f, _: f.date, is_time=True)
+START = Field(
+    name="start_time", label="Start of spraying", value=lambda f, _: f.start_time, is_time=True
+)
+END = Field(name="end_time", label="End of spraying", value=lambda f, _: f.end_time, is_time=True)
+PLACE = Field(name="location", label="Place (latitude, longitude, WGS84)", value=_place)
+AREA = Field(name="treated_area_ha", label="Treated area", value=_area, unit=_in("ha"))
+VOLUME = Field(name="volume_l", label="Spray mixture applied", value=_volume, unit=_in("L"))
+PRODUCT = Field(
+    name="product_quantity",
+    label="Product in it",
+    value=_product,
+    unit=_product_unit,
+    is_optional=True,
+)
+RATE = Field(
+    name="mean_rate_l_ha",
+    label="Mixture applied, mean",
+    value=lambda f, _: _rounded(f.mean_rate_l_ha, 2),
+    unit=_in("L/ha"),
+)
+
+FIELDS: dict[Profile, tuple[Field, ...]] = {
+    "eu": (
+        Field(
+            name="type_of_use",
+            label="Type of use",
+            value=lambda f, _: "treatment of a surface area, outdoors" if f.has_area else None,
+        ),
+        DATE,
+        START,
+        END,
+        Field(
+            name="dose",
+            label="Dose of the product, mean",
+            value=_dose,
+            unit=lambda told: f"{_product_unit(told)}/ha" if _product_unit(told) else "",
+        ),
+        AREA,
+        PLACE,
+        Field(
+            name="geodata",
+            label="Treated area as geodata",
+            value=lambda f, _: "treated_area in the JSON, WGS84" if f.has_area else None,
+        ),
+        PRODUCT,
+        VOLUME,
+        RATE,
+    ),
+    "us": (
+        DATE,
+        START,
+        END,
+        Field(
+            name="quantity_gal",
+            label="Quantity of material dispensed, as sprayed",
+            value=lambda f, _: round(f.volume_l / LITRES_PER_GALLON, 3) if f.has_area else None,
+            unit=_in("US gal"),
+        ),
+        VOLUME,
+        PRODUCT,
+        Field(
+            name="treated_area_ac",
+            label="Treated area",
+            value=lambda f, _: round(f.area_ha * ACRES_PER_HA, 3) if f.has_area else None,
+            unit=_in("acre"),
+        ),
+        PLACE,
+    ),
+    "generic": (
+        DATE,
+        START,
+        END,
+        PLACE,
+        AREA,
+        VOLUME,
+        PRODUCT,
+        RATE,
+        Field(
+            name="asked_rate_l_ha",
+            label="Mixture prescribed, mean",
+            value=lambda f, _: _rounded(f.asked_rate_l_ha, 2),
+            unit=_in("L/ha"),
+        ),
+        Field(
+            name="boom_width_m",
+            label="Effective width of the boom",
+            value=lambda f, _: _rounded(f.boom_width_m, 2),
+            unit=_in("m"),
+        ),
+        Field(
+            name="height_m",
+            label="Height while spraying, mean",
+            value=lambda f, _: _rounded(f.height_m, 1),
+            unit=_in("m"),
+        ),
+        Field(
+            name="speed_m_s",
+            label="Speed while spraying, mean",
+            value=lambda f, _: _rounded(f.speed_m_s, 1),
+            unit=_in("m/s"),
+        ),
+        Field(
+            name="map_sha256",
+            label="Prescription map, SHA-256",
+            value=lambda f, _: f.map_sha256 or None,
+            is_optional=True,
+        ),
+    ),
+}
+
+LABELS: dict[str, tuple[str, str]] = {
+    "application.operator": ("Applied by (professional user)", ""),
+    "application.licence": ("Licence of the operator", ""),
+    "application.customer": ("Customer", ""),
+    "application.customer_address": ("Address of the customer", ""),
+    "application.pilot": ("Pilot", ""),
+    "application.pilot_address": ("Address of the pilot", ""),
+    "application.pilot_certificate": ("Certificate of the pilot", ""),
+    "application.pilot_skills_date": ("Knowledge and skill met, 137.19(e)", ""),
+    "application.field_name": ("Field", ""),
+    "application.parcel": ("Parcel", ""),
+    "application.crop": ("Crop", ""),
+    "application.crop_eppo": ("Crop, EPPO code", ""),
+    "application.growth_stage_bbch": ("Growth stage, BBCH", ""),
+    "application.product_per_l": ("Product in one litre of mixture", ""),
+    "application.product_unit": ("Unit of the product", ""),
+    "application.aircraft": ("Aircraft", ""),
+    "application.nozzles": ("Nozzles", ""),
+    "application.wind_m_s": ("Wind speed", "m/s"),
+    "application.wind_from_deg": ("Wind from", "deg"),
+    "application.temperature_c": ("Temperature", "deg C"),
+    "application.humidity_percent": ("Relative humidity", "%"),
+    "product.name": ("Product", ""),
+    "product.registration": ("Authorisation or registration number", ""),
+    "product.droplet_class": ("Droplet class", ""),
+}
+
+
+def label_of(key: str) -> tuple[str, str]:
+    """Return label and unit of what an operator says."""
+    return LABELS[key]

@@ -1,0 +1,106 @@
+"""The report on paper: pages of text, then the figures; matplotlib makes it, nothing else needed.
+
+Short on purpose: the page prints better, and a PDF of it is one `print` away. This one is for where
+there is no browser.
+"""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from matplotlib.backends.backend_pdf import PdfPages
+
+from analysis.report.figures.style import INK, QUIET, RED, new_figure, styled
+
+if TYPE_CHECKING:
+    from analysis.report.figures.style import Drawn
+
+# Fits A4 and Letter, each of which is a little more in one direction.
+PAGE_IN = (8.27, 11.0)
+LINES, COLUMNS = 66, 92
+TOP, LEFT, LINE = 0.95, 0.08, 0.0135
+
+_Line = tuple[str, str]  # style, text
+
+
+def pdf_of(contents: Mapping[str, Any], figures: Iterable[Drawn]) -> bytes:
+    """Return the report as PDF."""
+    file = io.BytesIO()
+    with styled(), PdfPages(file, metadata={"Creator": "vrspray", "CreationDate": None}) as pages:
+        lines = [*_lines(contents)]
+        for start in range(0, len(lines), LINES):
+            page = new_figure(PAGE_IN[1], PAGE_IN[0])
+            for row, (style, text) in enumerate(lines[start : start + LINES]):
+                page.text(LEFT, TOP - LINE * row, text, va="top", **STYLES[style])
+            pages.savefig(page)
+        for drawn in figures:
+            pages.savefig(drawn.figure)
+    return file.getvalue()
+
+
+STYLES: dict[str, dict[str, Any]] = {
+    "title": {"size": 15, "weight": "bold", "color": INK},
+    "head": {"size": 10, "weight": "bold", "color": INK},
+    "mark": {"size": 13, "weight": "bold", "color": RED},
+    "text": {"size": 8.5, "color": INK},
+    "quiet": {"size": 8, "color": QUIET},
+}
+
+
+def _lines(contents: Mapping[str, Any]) -> Iterator[_Line]:
+    flight = contents["flight"]
+    yield "title", "Spray report"
+    yield "text", ""
+    yield "quiet", f"{flight['file']}, SHA-256 {flight['sha256'][:32]}..."
+    for each in contents["warnings"]:
+        if each["severity"] == "mark":
+            yield "mark", each["text"]
+    yield from _wrapped("head", contents["verdict"]["sentence"])
+    yield "text", ""
+    when = f"{flight['spraying_from'] or flight['started'] or 'time not known'}"
+    yield from _wrapped("text", f"{when}, time zone {flight['time_zone']}, {flight['clock']}")
+    place = f"{flight['latitude_deg']:.6f}, {flight['longitude_deg']:.6f} (WGS84)"
+    yield "text", f"{place}, {flight['treated_area_ha']:.4f} ha treated"
+    for each in contents["warnings"]:
+        if each["severity"] != "mark":
+            yield from _wrapped("text", f"{each['severity'].upper()}: {each['text']}")
+    yield from _metrics(contents)
+    for record in contents["application"].values():
+        yield from _record(record)
+
+
+def _metrics(contents: Mapping[str, Any]) -> Iterator[_Line]:
+    yield "text", ""
+    yield "head", "Figures"
+    for key, definition in contents["definitions"].items():
+        value = contents.get(key)
+        if isinstance(value, Mapping):
+            value = value["mean_abs"]
+        if value is not None:
+            shown = f"{value:.3f}" if isinstance(value, float) else f"{value}"
+            text = f"{definition['name']}: {shown} {definition['unit']} - {definition['text']}"
+            yield from _wrapped("text", text)
+
+
+def _record(record: Mapping[str, Any]) -> Iterator[_Line]:
+    yield "text", ""
+    yield from _wrapped("head", f"Record of the application: {record['law']}")
+    if record["complete"]:
+        yield "text", "Complete."
+    else:
+        yield from _wrapped("mark", f"INCOMPLETE: {', '.join(record['missing'])}", 60)
+    for entry in record["fields"].values():
+        value = "-" if entry["value"] is None else f"{entry['value']} {entry['unit']}".strip()
+        said = f" ({entry['said']})" if entry["said"] else ""
+        yield from _wrapped("text", f"{entry['label']}: {value}{said}")
+    for remark in record["remarks"]:
+        yield from _wrapped("quiet", f"Remark: {remark}")
+
+
+def _wrapped(style: str, text: str, columns: int = COLUMNS) -> Iterator[_Line]:
+    # A text of the operator is no mathematics: a dollar sign is one.
+    for line in textwrap.wrap(text, columns) or [""]:
+        yield style, line.replace("$", r"\$")

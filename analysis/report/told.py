@@ -1,0 +1,138 @@
+"""What people said for the record: before the flight by the configuration, after it by options.
+
+What is said afterwards is marked so for good: an inspector sees which entries are as old as the
+flight and which are not.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from companion.config.application_table import ApplicationTable, is_told
+from companion.config.tables import ProductTable, Table
+from companion.config.wording import say
+from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+TABLES = ("application", "product")
+SIZE_MAX_BYTES = 1_000_000
+
+
+class _Tables(Table):
+    """The two tables of the configuration that a record is made of."""
+
+    application: ApplicationTable = ApplicationTable()
+    product: ProductTable = ProductTable()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """Values by dotted key, such as `application.customer`; `after` names those said afterwards.
+
+    `before` has what the journal said instead, of those that were corrected.
+    """
+
+    values: Mapping[str, Any]
+    after: frozenset[str]
+    before: Mapping[str, Any]
+
+
+def told_in(meta: Mapping[str, str]) -> dict[str, Any]:
+    """Return what the journal itself says; of older ones, what its configuration's text says."""
+    try:
+        if "application_json" in meta:
+            found = json.loads(meta["application_json"])
+        else:
+            found = _flat(tomllib.loads(meta.get("config_toml", "")))
+    except ValueError:  # a damaged text: nothing was said
+        return {}
+    if not isinstance(found, dict):
+        return {}
+    return {key: value for key, value in found.items() if is_told(value)}
+
+
+def told_with(
+    meta: Mapping[str, str], *, file: Path | None = None, changes: Sequence[str] = ()
+) -> Told:
+    """Return what was said in all; ConfigError, in one line, for what cannot be an entry."""
+    before = told_in(meta)
+    later = {} if file is None else _read(file)
+    later |= dict(_parsed(change) for change in changes)
+    values = {**before, **later}
+    _check({**{key: value for key, value in before.items() if key in _known()}, **later})
+    after = {key for key, value in later.items() if before.get(key) != value}
+    return Told(
+        values={key: value for key, value in values.items() if is_told(value)},
+        after=frozenset(after),
+        before={key: before[key] for key in after & before.keys()},
+    )
+
+
+def _known() -> set[str]:
+    fields = {"application": ApplicationTable.model_fields, "product": ProductTable.model_fields}
+    return {f"{table}.{key}" for table, keys in fields.items() for key in keys}
+
+
+def _check(values: Mapping[str, Any]) -> None:
+    nested: dict[str, dict[str, Any]] = {}
+    for key, value in values.items():
+        table, _, name = key.partition(".")
+        nested.setdefault(table, {})[name] = value
+    try:
+        _Tables.model_validate(nested)
+    except ValidationError as error:
+        raise ConfigError(f"entry of the record: {say(error.errors(), nested, _Tables)}") from error
+
+
+def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        f"{table}.{key}": value
+        for table in TABLES
+        if isinstance(document.get(table), dict)
+        for key, value in document[table].items()
+    }
+
+
+def _read(file: Path) -> dict[str, Any]:
+    """Return the entries of a TOML file with the tables [application] and [product]."""
+    try:
+        if file.stat().st_size > SIZE_MAX_BYTES:
+            raise ConfigError(f"{file}: too large; give a .toml file with [application]")
+        document = tomllib.loads(file.read_bytes().decode("utf-8-sig"))
+    except OSError as error:
+        reason = (error.strerror or "cannot be read").lower()
+        raise ConfigError(f"{file}: {reason}; give a .toml file with [application]") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{file}: is no TOML file: {' '.join(str(error).split())}") from error
+    found = _flat(document)
+    if not found:
+        raise ConfigError(f"{file}: has neither [application] nor [product]")
+    return found
+
+
+def _parsed(change: str) -> tuple[str, Any]:
+    """Return key and value of KEY=VALUE; what TOML does not know is text.
+
+    >>> _parsed('application.customer="A. Farmer"'), _parsed("application.crop_eppo=TRZAW")
+    (('application.customer', 'A. Farmer'), ('application.crop_eppo', 'TRZAW'))
+    """
+    key, equals, text = change.partition("=")
+    key = key.strip()
+    if not equals or key not in _known():
+        raise ConfigError(
+            f"--set {change}: no entry of the record; write one such as application.customer=NAME "
+            "or product.name=NAME"
+        )
+    try:
+        parsed = tomllib.loads(f"value = {text.strip()}")
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return key, text.strip()
+    return key, parsed["value"] if list(parsed) == ["value"] else text.strip()

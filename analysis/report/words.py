@@ -1,0 +1,197 @@
+"""What the report says in sentences: the verdict, and what a reader must know before any figure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from analysis.report.clock import duration_text
+from companion.core.types import Inhibit
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from analysis.applied_flight import AppliedFlight
+    from analysis.assessment import Assessment
+    from analysis.report.clock import Clock
+    from analysis.report.legal import LegalRecord
+    from analysis.report.treated import Treated
+
+Severity = Literal["mark", "warning", "note"]
+
+# Reasons that speak of the position, and those that a person had to answer.
+POSITION = frozenset(
+    {
+        Inhibit.NO_POSITION, Inhibit.STALE_POSITION, Inhibit.INVALID_POSITION,
+        Inhibit.POSITION_FROZEN, Inhibit.FIX_TOO_LOW, Inhibit.ACCURACY_TOO_LOW,
+        Inhibit.ESTIMATOR_UNHEALTHY,
+    }
+)  # fmt: skip
+LATCHED = frozenset(
+    {
+        Inhibit.ESTOP, Inhibit.REARM_NEEDED, Inhibit.OUTPUT_FAULT, Inhibit.LEAK,
+        Inhibit.VALVE_STUCK_OPEN, Inhibit.NO_FLOW, Inhibit.TANK_EMPTY, Inhibit.FLOW_FAULT,
+    }
+)  # fmt: skip
+# A meter of 3 % and a curve of a few percent may differ by this much and be sound.
+METER_OFF_PERCENT = 6.0
+# Less than this is a moment at the start, while the first messages come in.
+MOMENT_S = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Caution:
+    """One thing to know; a `mark` stands large above all."""
+
+    severity: Severity
+    code: str
+    text: str
+
+    def as_json(self) -> dict[str, str]:
+        """Return it as a JSON object."""
+        return {"severity": self.severity, "code": self.code, "text": self.text}
+
+
+def verdict_of(assessment: Assessment | None, treated: Treated) -> dict[str, Any]:
+    """Return the figures of the verdict, and the verdict in one sentence."""
+    if assessment is None or assessment.evaluation.applied_ml <= 0.0:
+        return {
+            "sentence": "Nothing was sprayed in this flight.",
+            "applied_l": 0.0,
+            "prescribed_l": None,
+            "area_ha": treated.area_ha,
+            "within_10_percent": None,
+            "worst_lag_distance_m": None,
+            "outside_ml": None,
+        }
+    evaluation, balance = assessment.evaluation, assessment.balance
+    figures = {
+        "applied_l": balance.model_l,
+        "prescribed_l": balance.prescribed_l,
+        "area_ha": treated.area_ha,
+        "within_10_percent": assessment.causes.within_percent,
+        "worst_lag_distance_m": evaluation.lag_distance_m.max_abs,
+        "outside_ml": evaluation.off_target_ml,
+    }
+    return {"sentence": _sentence(figures), **figures}
+
+
+def _sentence(figures: Mapping[str, Any]) -> str:
+    applied_l, prescribed_l = figures["applied_l"], figures["prescribed_l"]
+    parts = [f"{applied_l:.2f} L applied on {figures['area_ha']:.2f} ha"]
+    if prescribed_l:
+        off = 100.0 * (applied_l - prescribed_l) / prescribed_l
+        parts[0] += f", {prescribed_l:.2f} L prescribed ({off:+.1f} %)"
+    if figures["within_10_percent"] is not None:
+        parts.append(f"{figures['within_10_percent']:.1f} % of the ground within 10 % of its rate")
+    if figures["worst_lag_distance_m"] is not None:
+        parts.append(f"worst change {figures['worst_lag_distance_m']:.2f} m from its boundary")
+    parts.append(f"{figures['outside_ml']:.1f} mL outside the border")
+    return "; ".join(parts) + "."
+
+
+def warnings_of(
+    flight: AppliedFlight,
+    assessment: Assessment | None,
+    clock: Clock,
+    records: Sequence[LegalRecord],
+    why_not_evaluated: str,
+) -> list[Caution]:
+    """Return what must be known, the gravest first."""
+    found = [
+        *_training(flight),
+        *_journal(flight, clock),
+        *_inhibited(flight, assessment),
+        *_flow(assessment, why_not_evaluated),
+        *_records(records),
+    ]
+    order = ("mark", "warning", "note")
+    return sorted(found, key=lambda each: order.index(each.severity))
+
+
+def _mark(code: str, text: str) -> Caution:
+    return Caution(severity="mark", code=code, text=text)
+
+
+def _warning(code: str, text: str) -> Caution:
+    return Caution(severity="warning", code=code, text=text)
+
+
+def _note(code: str, text: str) -> Caution:
+    return Caution(severity="note", code=code, text=text)
+
+
+def _training(flight: AppliedFlight) -> Iterator[Caution]:
+    if flight.training == "water":
+        yield _mark("training", "TRAINING WITH WATER: no product was applied")
+    elif flight.training == "dry":
+        yield _mark("training", "DRY RUN: no valve was opened, nothing was applied")
+    elif flight.training is None:
+        yield _note(
+            "training-unknown",
+            "The journal does not say whether a product was sprayed: a simulation, or an old one.",
+        )
+
+
+def _journal(flight: AppliedFlight, clock: Clock) -> Iterator[Caution]:
+    if not flight.is_closed:
+        yield _warning("cut", "The journal was cut: up to its last second is missing.")
+    if flight.lost:
+        yield _warning("rows-lost", f"{flight.lost} rows of the journal are lost.")
+    if not clock.is_verified:
+        yield _warning("clock", "Times are by the clock of the companion, which nobody verified.")
+
+
+def _inhibited(flight: AppliedFlight, assessment: Assessment | None) -> Iterator[Caution]:
+    if assessment is not None:
+        held_s = assessment.durations.by_inhibit_s
+        position = {key: held_s[key] for key in sorted(POSITION & held_s.keys())}
+        if sum(position.values()) > MOMENT_S:
+            text = ", ".join(f"{key} {value:.1f} s" for key, value in position.items())
+            yield _warning("position", f"Position not good enough, valves held closed: {text}.")
+        latched = {key: held_s[key] for key in sorted(LATCHED & held_s.keys())}
+        if latched:
+            text = ", ".join(f"{key} {value:.1f} s" for key, value in latched.items())
+            yield _warning("fault", f"Faults or stops held the valves closed: {text}.")
+        if assessment.durations.unknown_s > 0.0:
+            gap = duration_text(assessment.durations.unknown_s)
+            yield _warning("gap", f"For {gap} the journal does not say what the sprayer did.")
+    yield from _faults(event.text or event.kind for event in flight.events if _is_fault(event.kind))
+
+
+def _is_fault(kind: str) -> bool:
+    return kind.startswith("fault-") or kind == "standstill"
+
+
+def _faults(texts: Iterable[str]) -> Iterator[Caution]:
+    for text in dict.fromkeys(texts):
+        yield _warning("fault", f"Fault in flight: {text}.")
+
+
+def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
+    if assessment is None:
+        yield _warning("not-evaluated", f"No metric can be computed: {why_not}.")
+        return
+    evaluation, balance = assessment.evaluation, assessment.balance
+    off = balance.meter_to_model_percent
+    if off is not None and not abs(off) <= METER_OFF_PERCENT:
+        yield _warning(
+            "meter",
+            f"The flow meter counted {off:+.1f} % against what the calibrated curves stand for: "
+            "one of them is wrong.",
+        )
+    if evaluation.missed:
+        yield _warning("missed", f"{evaluation.missed} changes of rate never happened.")
+    if evaluation.off_target_ml > 1.0:
+        yield _warning("outside", f"{evaluation.off_target_ml:.1f} mL fell outside the border.")
+
+
+def _records(records: Sequence[LegalRecord]) -> Iterator[Caution]:
+    for record in records:
+        if not record.is_complete:
+            yield _warning(
+                "record",
+                f"The {record.profile} record of the application is INCOMPLETE; missing: "
+                f"{', '.join(record.missing)}.",
+            )

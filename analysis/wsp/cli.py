@@ -1,0 +1,243 @@
+"""Command line of water-sensitive paper: scans in, figures, table and pictures out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from analysis.wsp.card import INSET_MM, Method
+from analysis.wsp.flight_ties import Ties, tie, tie_lines
+from analysis.wsp.image import LEAST_DPI, MOST_DPI, ImageError, sheets_of
+from analysis.wsp.picture import draw_distributions, draw_sheet
+from analysis.wsp.positions import Position, placed, read_positions
+from analysis.wsp.results import (
+    Numbered,
+    Row,
+    card_row,
+    csv_text,
+    method_row,
+    numbered,
+    sheet_row,
+    summary,
+    table_lines,
+)
+from analysis.wsp.sheet import CARD_WIDTH_MM, Reading, SheetResult, read_sheet
+from analysis.wsp.spread import SPREADS, spread_of
+from analysis.wsp.stains import THRESHOLD, Threshold
+from companion.cli.answer import AsJson, answer, note
+from companion.errors import ConfigError
+
+FIGURE = "distributions.png"
+
+app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+@app.command(epilog="Example: vrspray wsp scan.png --out paper --spread usda")
+def measure_cards(
+    images: Annotated[list[Path], typer.Argument(help="Scans: PNG, TIFF, JPEG, BMP, WebP.")],
+    out: Annotated[Path, typer.Option(help="Folder for wsp.json, wsp.csv and the pictures.")],
+    dpi: Annotated[
+        float | None, typer.Option(help="Resolution; without it the file's, or the card's width.")
+    ] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Each image is one card, nothing is looked for.")
+    ] = False,
+    spread: Annotated[
+        str, typer.Option(help=f"Spread factor: {', '.join(SPREADS)}, user:A,B (D = A d^B).")
+    ] = "depositscan",
+    threshold: Annotated[
+        str, typer.Option(help="Grey level of the darkest paper, 1 to 254, or auto.")
+    ] = str(THRESHOLD),
+    inset_mm: Annotated[
+        float | None, typer.Option(help=f"Edge left out; {INSET_MM:g}, with --whole 0.")
+    ] = None,
+    card_width_mm: Annotated[
+        float, typer.Option(help="Short side of the cards, where it has to tell the resolution.")
+    ] = CARD_WIDTH_MM,
+    positions: Annotated[
+        Path | None, typer.Option(help="CSV: card, latitude, longitude[, height, note].")
+    ] = None,
+    journal: Annotated[
+        Path | None, typer.Option(help="Flight that sprayed the cards; needs --positions.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure coverage, deposits and drop sizes on scans of water-sensitive paper.
+
+    Exit 0: measured; 1: no card found, or an image could not be read; 2: wrong options or input.
+    """
+    if journal is not None and positions is None:
+        raise ConfigError("--journal: give --positions too, where the cards lay")
+    reading = Reading(
+        method=Method(
+            threshold=_threshold(threshold),
+            spread=spread_of(spread),
+            inset_mm=_inset_mm(inset_mm, whole=whole),
+        ),
+        whole=whole,
+        dpi=_within("--dpi", dpi, LEAST_DPI, MOST_DPI),
+        card_width_mm=_within("--card-width-mm", card_width_mm, 5.0, 200.0) or CARD_WIDTH_MM,
+    )
+    places = [] if positions is None else read_positions(positions)
+    _make(out)
+    sheets, pictures, refused = _read_all(images, reading, out)
+    cards = numbered(sheets)
+    ties, notes = _ties(cards, places, journal)
+    rows = [_joined(each, ties, places, cards) for each in cards]
+    result = _result(reading, sheets, pictures, cards, rows) | {
+        "boundaries": ties.boundaries if ties else [],
+        "notes": notes,
+        "refused": refused,
+        "files": [*pictures, "wsp.json", "wsp.csv"],
+    }
+    if cards and _figure(cards, out):
+        result["files"].append(FIGURE)
+    _write(out / "wsp.csv", csv_text(rows))
+    _write(out / "wsp.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    for line in notes:
+        note(line)
+    lines = [*table_lines(cards, reading.method), *(tie_lines(ties) if ties else [])]
+    answer(result, [*lines, "", f"written to {out}: {', '.join(result['files'])}"], as_json=as_json)
+    if refused or not cards:
+        raise typer.Exit(1)
+
+
+def _read_all(
+    images: Sequence[Path], reading: Reading, out: Path
+) -> tuple[list[SheetResult], list[str], list[Row]]:
+    """Return all sheets and the names of their pictures, and the files that were refused."""
+    sheets: list[SheetResult] = []
+    pictures: list[str] = []
+    refused: list[Row] = []
+    for path in images:
+        try:
+            for sheet in sheets_of(path):
+                note(f"{sheet.name}: {sheet.pixels.shape[1]} x {sheet.pixels.shape[0]} pixels")
+                found = read_sheet(sheet, reading)
+                picture = f"sheet-{len(sheets) + 1:02d}-{path.stem}.jpg"
+                first = sum(len(each.cards) for each in sheets) + 1
+                _saved(out / picture, sheet.pixels, found, first)
+                sheets.append(found)
+                pictures.append(picture)
+                for line in found.notes:
+                    note(f"{sheet.name}: {line}")
+        except ImageError as error:
+            if len(images) == 1:
+                raise
+            refused.append({"file": str(path), "error": str(error)})
+            note(f"error: {error}")
+    if not sheets:
+        raise ImageError(f"none of the {len(images)} files is an image that can be read")
+    return sheets, pictures, refused
+
+
+def _saved(path: Path, pixels: Any, found: SheetResult, first: int) -> None:
+    try:
+        draw_sheet(pixels, list(enumerate(found.cards, start=first)), path)
+    except OSError as error:
+        raise ConfigError(f"--out: {path} cannot be written ({error.strerror or error})") from error
+
+
+def _ties(
+    cards: Sequence[Numbered], places: Sequence[Position], journal: Path | None
+) -> tuple[Ties | None, list[str]]:
+    if not places:
+        return None, []
+    by_number, notes = placed(cards, places)
+    if journal is None:
+        return None, notes
+    from analysis.read_applied import read_applied
+
+    flight = read_applied(journal)
+    if flight.training not in (None, "no"):
+        notes.append(f"{journal.name}: training: {flight.training}")
+    return tie(flight, cards, by_number), notes
+
+
+def _joined(
+    each: Numbered, ties: Ties | None, places: Sequence[Position], cards: Sequence[Numbered]
+) -> Row:
+    """Return a card's row with its place and what the flight says of it."""
+    row = card_row(each)
+    place = placed(cards, places)[0].get(each.number)
+    if place is not None:
+        row["position"] = {
+            "latitude_deg": place.latitude_deg,
+            "longitude_deg": place.longitude_deg,
+            "height_m": place.height_m,
+            "note": place.note,
+        }
+    if ties is not None and each.number in ties.rows:
+        row["flight"] = ties.rows[each.number]
+    return row
+
+
+def _result(
+    reading: Reading,
+    sheets: Sequence[SheetResult],
+    pictures: Sequence[str],
+    cards: Sequence[Numbered],
+    rows: Sequence[Row],
+) -> Row:
+    return {
+        "method": method_row(reading.method),
+        "sheets": [
+            sheet_row(sheet, cards, picture)
+            for sheet, picture in zip(sheets, pictures, strict=True)
+        ],
+        "summary": summary(cards),
+        "cards": list(rows),
+    }
+
+
+def _figure(cards: Sequence[Numbered], out: Path) -> bool:
+    try:
+        draw_distributions(cards, out / FIGURE)
+    except ImportError:
+        note("no figure: matplotlib is not installed (pip install vrspray[plot])")
+        return False
+    return True
+
+
+def _threshold(text: str) -> Threshold:
+    if text == "auto":
+        return "auto"
+    if not (text.isascii() and text.isdigit() and 1 <= int(text) <= 254):
+        raise ConfigError(f"--threshold {text[:40]}: give 1 to 254, or auto")
+    return int(text)
+
+
+def _inset_mm(given: float | None, *, whole: bool) -> float:
+    if given is None:
+        return 0.0 if whole else INSET_MM
+    if not 0.0 <= given <= 10.0:
+        raise ConfigError(f"--inset-mm {given:g}: give 0 to 10 mm")
+    return given
+
+
+def _within(name: str, value: float | None, low: float, high: float) -> float | None:
+    if value is not None and not low <= value <= high:
+        raise ConfigError(f"{name} {value:g}: give {low:g} to {high:g}")
+    return value
+
+
+def _make(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--out {out}: cannot be made ({error.strerror or error})") from error
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--out: {path} cannot be written ({error.strerror or error})") from error
+
+
+# What the program's own command line takes in: one command of the kind that Typer makes.
+wsp = typer.main.get_command(app)

@@ -1,0 +1,156 @@
+"""The table of the legal record: who, for whom, what, on which crop, in which weather.
+
+Nothing of it moves a valve. It is asked for before the flight, because afterwards nobody remembers;
+the journal keeps it, and the report makes the record of it (docs/application-record.md). Which law
+asks for what stands here, so that `run` and `doctor` can name what is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+
+from pydantic import Field, FiniteFloat
+
+from companion.config.tables import Table, Text
+
+if TYPE_CHECKING:
+    from companion.config.model import Config
+
+Profile = Literal["eu", "us", "generic"]
+PROFILES: tuple[Profile, ...] = get_args(Profile)
+
+_DAY = r"^\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])$"
+# Whole minutes or seconds, and always with an offset from UTC: a time without one is two times.
+_MOMENT = _DAY[:-1] + r"T([01]\d|2[0-3]):[0-5]\d(:[0-5]\d)?(Z|[+-](0\d|1[0-4]):[0-5]\d)$"
+
+
+class ApplicationTable(Table):
+    """What the law wants to know of an application and no sensor can tell."""
+
+    profile: Profile | None = Field(
+        default=None,
+        description="whose record: eu (2023/564), us (14 CFR 137.71), generic; absent: none",
+    )
+    time_zone: Text | None = Field(
+        default=None, description="of the times in record and report, such as Europe/Madrid"
+    )
+    operator: Text | None = Field(
+        default=None, description="who applies it: the professional user, by name"
+    )
+    licence: Text | None = Field(default=None, description="of the operator, number")
+    customer: Text | None = Field(default=None, description="for whom it is applied, by name")
+    customer_address: Text | None = Field(default=None, description="of the customer")
+    pilot: Text | None = Field(default=None, description="in command, by name")
+    pilot_address: Text | None = Field(default=None, description="of the pilot")
+    pilot_certificate: Text | None = Field(default=None, description="of the pilot, number")
+    pilot_skills_date: str | None = Field(
+        default=None,
+        pattern=_DAY,
+        description="day on which the pilot met the requirements of 137.19(e), YYYY-MM-DD",
+    )
+    field_name: Text | None = Field(default=None, description="what the farm calls the field")
+    parcel: Text | None = Field(
+        default=None, description="the parcel's number in the register of the aid application"
+    )
+    crop: Text | None = Field(default=None, description="by its name")
+    crop_eppo: str | None = Field(
+        default=None, pattern=r"^[A-Z0-9]{5,6}$", description="its EPPO code, such as TRZAW"
+    )
+    growth_stage_bbch: str | None = Field(
+        default=None,
+        pattern=r"^(\d{2}(-\d{2})?|not-required)$",
+        description="BBCH stage: 31, or 31-33; not-required where the label sets no stage",
+    )
+    product_per_l: float | None = Field(
+        default=None, gt=0, le=10, description="product in one litre of what is sprayed"
+    )
+    product_unit: Literal["L", "kg"] | None = Field(
+        default=None, description="unit of product_per_l, and of the dose for each hectare"
+    )
+    aircraft: Text | None = Field(default=None, description="make and registration")
+    nozzles: Text | None = Field(default=None, description="make and size")
+    wind_m_s: Annotated[FiniteFloat, Field(ge=0, le=60)] | None = Field(
+        default=None, description="measured on the ground before the flight"
+    )
+    wind_from_deg: Annotated[FiniteFloat, Field(ge=0, le=360)] | None = Field(
+        default=None, description="where it comes from, clockwise from north"
+    )
+    temperature_c: Annotated[FiniteFloat, Field(ge=-40, le=60)] | None = Field(
+        default=None, description="of the air"
+    )
+    humidity_percent: Annotated[FiniteFloat, Field(ge=0, le=100)] | None = Field(
+        default=None, description="of the air, relative"
+    )
+    start_time: str | None = Field(
+        default=None,
+        pattern=_MOMENT,
+        description="only where no clock was right: start of spraying, 2026-05-01T06:30:00+02:00",
+    )
+    remarks: Text | None = Field(default=None, description="for the record")
+
+
+# What each law wants from the operator, as keys of the configuration; what the flight itself tells
+# (area, place, times, quantity) is added by the report. Sources: docs/application-record.md.
+ASKED: dict[Profile, tuple[str, ...]] = {
+    "eu": (
+        "application.operator",
+        "application.parcel",
+        "application.crop_eppo",
+        "application.growth_stage_bbch",
+        "product.name",
+        "product.registration",
+        "application.product_per_l",
+        "application.product_unit",
+    ),
+    "us": (
+        "application.customer",
+        "application.customer_address",
+        "product.name",
+        "application.pilot",
+        "application.pilot_address",
+        "application.pilot_certificate",
+        "application.pilot_skills_date",
+    ),
+    "generic": (
+        "application.operator",
+        "application.licence",
+        "application.customer",
+        "application.field_name",
+        "application.crop",
+        "product.name",
+        "product.registration",
+        "product.droplet_class",
+        "application.nozzles",
+        "application.aircraft",
+        "application.wind_m_s",
+        "application.wind_from_deg",
+        "application.temperature_c",
+        "application.humidity_percent",
+    ),
+}
+
+
+def told(config: Config) -> dict[str, Any]:
+    """Return what the configuration says for the record, by dotted key; what it does not, not."""
+    tables = {"application": config.application, "product": config.product}
+    return {
+        f"{name}.{key}": value
+        for name, table in tables.items()
+        for key, value in table.model_dump(mode="json").items()
+        if is_told(value)
+    }
+
+
+def is_told(value: object) -> bool:
+    """Return whether a value says anything.
+
+    >>> is_told(0.0), is_told("  "), is_told(None)
+    (True, False, False)
+    """
+    return value is not None and str(value).strip() != ""
+
+
+def missing(profile: Profile, values: Mapping[str, object]) -> tuple[str, ...]:
+    """Return the keys that a profile asks the operator for and `values` does not have."""
+    return tuple(key for key in ASKED[profile] if not is_told(values.get(key)))

@@ -1,0 +1,450 @@
+"""What the valves sweep: from orders and states to treated ground, by what a valve really does.
+
+An order to open or close takes effect on the liquid after its lag. It is the volume-equivalent
+one: a sharp edge there carries the same volume as the rise or fall, so ground that a later flight
+begins at this edge gets its dose, neither more nor less on the mean. What the schedule only meant
+to do is not looked at. A valve is open by the changes that a plan has brought about in its time; an
+inhibit has made a plan without any. What flow, pressure and tank say of the liquid goes before it.
+
+The way since the last stamp is kept as a few states and stamped every other second, in pieces as
+long as they are straight: a step stays cheap.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from companion.core.coverage import Coverage, Place, Quad
+from companion.core.drives import liquid_of
+from companion.core.types import FaultKind, Finding, SprayPlan, VehicleState
+
+if TYPE_CHECKING:
+    from companion.core.boom import Boom
+    from companion.core.controller import Memory, Setup
+    from companion.core.drift import Offset
+    from companion.core.schedule import LagModel
+
+# The way is stamped after this time: a swath of 10 m at 5 m/s is one look at some 2000 cells.
+STAMP_EVERY_S = 2.0
+# States nearer than this add nothing to the way between them: within 0.2 s of braking by 2.5 m/s2
+# a place between two is off by a centimetre.
+FRONT_STEP_M = 0.8
+# So far a tip of the boom may be off a straight piece: below the noise of an RTK position.
+STRAIGHT_M = 0.03
+NEAR_M = 1e-6
+# States farther apart than these are a gap or a jump: nothing is known of the way between.
+GAP_MAX_S = 1.0
+JUMP_MAX_M = 25.0
+# Strips of neighbours that touch to this are one.
+TOUCH_M = 0.01
+# Snapshots that are kept for whoever wants to know what was treated some time ago.
+SNAPSHOTS_MAX = 8
+
+# Found in the liquid: nothing, or not what was ordered, comes out.
+NO_LIQUID = frozenset({FaultKind.NO_FLOW, FaultKind.PUMP_OFF, FaultKind.TANK_EMPTY, FaultKind.AIR})
+
+
+class Front(NamedTuple):
+    """Where the boom was, the liquid's offset by the wind in it."""
+
+    time_s: float
+    east_m: float
+    north_m: float
+    heading_deg: float
+
+
+class Toggle(NamedTuple):
+    """From `at_s` on liquid comes out of a valve, or none does."""
+
+    at_s: float
+    valve: int
+    opens: bool
+
+
+class Swath(NamedTuple):
+    """What has been treated, and the way that is not yet stamped.
+
+    `fronts` begin with the last stamp, `is_open` holds there; `toggles` come later, in the order of
+    their orders. `ordered` is what was ordered last. `older` are coverages and until when each
+    tells all that was treated.
+    """
+
+    coverage: Coverage
+    older: tuple[tuple[float, Coverage], ...] = ()
+    fronts: tuple[Front, ...] = ()
+    is_open: tuple[bool, ...] = ()
+    ordered: tuple[bool, ...] = ()
+    toggles: tuple[Toggle, ...] = ()
+
+    def before(self, at_s: float) -> Coverage | None:
+        """Return what had been treated by some time before `at_s`, the newest that is known."""
+        found = None
+        for until_s, coverage in self.older:
+            if until_s <= at_s:
+                found = coverage
+        return found
+
+
+def begin(setup: Setup) -> Swath:
+    """Return the swath of a flight that has not sprayed yet."""
+    treated = setup.treated or Coverage()
+    shut = (False,) * len(setup.boom.valves)
+    return Swath(treated, ((-math.inf, treated),), (), shut, shut)
+
+
+def follow(
+    setup: Setup,
+    swath: Swath | None,
+    plan: SprayPlan | None,
+    state: VehicleState | None,
+    *,
+    findings: tuple[Finding, ...],
+    drift_m: Offset | None,
+    now_s: float,
+) -> Swath | None:
+    """Return the swath until `now_s`, where `plan` was the one in force; None without a record."""
+    if not setup.records_coverage:
+        return None
+    if swath is None:
+        swath = begin(setup)
+    if not (findings or setup.pumping is not None) and _stays_so(swath, plan, state, now_s):
+        return swath
+    swath = _ordered(setup, swath, plan, findings, now_s)
+    is_at_work = any(swath.is_open) or any(swath.ordered) or bool(swath.toggles)
+    if not (is_at_work or (plan is not None and plan.opens)):
+        return swath._replace(fronts=()) if swath.fronts else swath
+    front = _front(state, drift_m)
+    if front is None or not swath.fronts:
+        return _broken_off(setup, swath, front, now_s)
+    if not is_at_work:
+        return swath._replace(fronts=(front,))
+    return _moved(setup, swath, front, now_s)
+
+
+def _stays_so(
+    swath: Swath, plan: SprayPlan | None, state: VehicleState | None, now_s: float
+) -> bool:
+    """Return whether nothing has to be noted yet: the usual step, told apart at little cost."""
+    if plan is None or state is None or not now_s < plan.lease_until_s:
+        return False
+    if not swath.fronts:
+        return not (plan.opens or swath.toggles or any(swath.ordered) or any(swath.is_open))
+    if not 0.0 <= now_s - swath.fronts[0].time_s < STAMP_EVERY_S:
+        return False
+    ordered = swath.ordered
+    for duty, is_open in zip(plan.duty, ordered, strict=True):
+        if (duty > 0.0) is not is_open:
+            return False
+    for change in plan.changes:
+        if change.at_s <= now_s and (change.duty > 0.0) is not ordered[change.valve]:
+            return False
+    # With a wind's offset that moved meanwhile this is a little off, and no more than that.
+    _, east_m, north_m, _ = swath.fronts[-1]
+    away_m = abs(state.east_m - east_m) + abs(state.north_m - north_m)
+    return away_m < FRONT_STEP_M
+
+
+def _moved(setup: Setup, swath: Swath, front: Front, now_s: float) -> Swath:
+    last = swath.fronts[-1]
+    moved_m = math.hypot(front.east_m - last.east_m, front.north_m - last.north_m)
+    if not (0.0 <= front.time_s - last.time_s <= GAP_MAX_S and moved_m <= JUMP_MAX_M):
+        return _broken_off(setup, swath, front, now_s)
+    if now_s - swath.fronts[0].time_s >= STAMP_EVERY_S:
+        return _stamped(setup.boom, swath, front)
+    return swath._replace(fronts=(*swath.fronts, front)) if moved_m >= FRONT_STEP_M else swath
+
+
+def expected(
+    setup: Setup, memory: Memory, state: VehicleState | None, *, now_s: float, cut_s: float
+) -> Coverage:
+    """Return the coverage as it will be if all goes on until `cut_s` and every valve closes then.
+
+    With `cut_s` at `now_s` it is that of a flight that ends now. `memory` is what the step of
+    `now_s` has left.
+    """
+    swath = memory.swath or begin(setup)
+    front = _front(state, memory.drift_m)
+    if front is None or state is None or not swath.fronts:
+        return swath.coverage
+    ahead = _ordered(setup, swath, memory.plan, _found(memory), max(cut_s, now_s), lapses=False)
+    closes_s = cut_s + max(setup.lag.off_s, setup.doses.lag.off_s) + setup.lag.output_s
+    toggles = [toggle for toggle in ahead.toggles if toggle.opens is False or toggle.at_s <= cut_s]
+    for valve, is_open in enumerate(ahead.ordered):
+        if is_open:
+            toggles.append(Toggle(closes_s, valve, opens=False))
+    last_s = max((toggle.at_s for toggle in toggles), default=now_s)
+    carried_s = max(min(last_s - now_s, GAP_MAX_S + 1.0), 0.0)
+    fronts = [*swath.fronts]
+    if front.time_s > fronts[-1].time_s:
+        fronts.append(front)
+    end = Front(
+        front.time_s + carried_s,
+        front.east_m + state.velocity_east_m_s * carried_s,
+        front.north_m + state.velocity_north_m_s * carried_s,
+        front.heading_deg + state.yaw_rate_deg_s * carried_s,
+    )
+    ahead = ahead._replace(fronts=tuple(fronts), toggles=tuple(toggles))
+    made = _stamped(setup.boom, ahead, end).coverage
+    return Coverage(tiles=made.tiles, ahead_s=max(cut_s - now_s, 0.0))
+
+
+def _found(memory: Memory) -> tuple[Finding, ...]:
+    return () if memory.watch is None else memory.watch.findings
+
+
+def _front(state: VehicleState | None, drift_m: Offset | None) -> Front | None:
+    if state is None or state.heading_deg is None:
+        return None
+    east_m, north_m = state.east_m, state.north_m
+    if drift_m is not None:
+        east_m, north_m = east_m + drift_m[0], north_m + drift_m[1]
+    front = Front(state.time_s, east_m, north_m, state.heading_deg)
+    return front if all(map(math.isfinite, front)) else None
+
+
+# ------------------------------------------------------------------------------ orders to liquid
+
+
+def _ordered(
+    setup: Setup,
+    swath: Swath,
+    plan: SprayPlan | None,
+    findings: tuple[Finding, ...],
+    now_s: float,
+    *,
+    lapses: bool = True,
+) -> Swath:
+    """Return the swath with the orders until `now_s` and what becomes of them.
+
+    With `lapses` a plan ends with its lease, as an executor has it.
+    """
+    ordered, toggles = swath.ordered, swath.toggles
+    for at_s, opened, lag in _openings(setup, plan, now_s, lapses=lapses):
+        wanted = _real(opened, findings) if findings else opened
+        if wanted == ordered:
+            continue
+        for valve, (was, opens) in enumerate(zip(ordered, wanted, strict=True)):
+            if was != opens:
+                lag_s = (lag.on_s if opens else lag.off_s) + setup.lag.output_s
+                toggles = _toggled(toggles, Toggle(at_s + lag_s, valve, opens))
+        ordered = wanted
+    if ordered is swath.ordered:
+        return swath
+    return swath._replace(ordered=ordered, toggles=toggles)
+
+
+def _openings(
+    setup: Setup, plan: SprayPlan | None, now_s: float, *, lapses: bool
+) -> list[tuple[float, tuple[bool, ...], LagModel]]:
+    """Return which valves let liquid out, from when on, and by the lag of what."""
+    if plan is None:
+        return []
+    duty = [each > 0.0 for each in plan.duty]
+    until_s = min(now_s, plan.lease_until_s) if lapses else now_s
+    pumped = None if setup.pumping is None else liquid_of(setup, plan)
+    runs = pumped is None or pumped.duty[0] > 0.0
+    lag = setup.lag
+    found = [(plan.issued_s, tuple(each and runs for each in duty), lag)]
+    changes = [(change.at_s, change.valve, change.duty > 0.0) for change in plan.changes]
+    if pumped is not None:
+        changes += [(change.at_s, -1, change.duty > 0.0) for change in pumped.changes]
+        changes.sort()
+    for at_s, valve, opens in changes:
+        if not at_s <= until_s:
+            break
+        if valve < 0:
+            runs = opens
+        else:
+            duty[valve] = opens
+        lag = setup.doses.lag if valve < 0 else setup.lag
+        found.append((at_s, tuple(each and runs for each in duty), lag))
+    if lapses and not now_s < plan.lease_until_s:
+        found.append((plan.lease_until_s, (False,) * len(duty), setup.lag))
+    return found
+
+
+def _real(opened: tuple[bool, ...], findings: tuple[Finding, ...]) -> tuple[bool, ...]:
+    """Return which valves let liquid out, after all that was found."""
+    kinds = {finding.kind for finding in findings}
+    shut = {each.valve for each in findings if each.kind is FaultKind.STUCK_CLOSED}
+    stuck = {each.valve for each in findings if each.kind is FaultKind.STUCK_OPEN}
+    flows = not kinds & NO_LIQUID
+    return tuple(
+        flows and ((is_open and valve not in shut) or valve in stuck)
+        for valve, is_open in enumerate(opened)
+    )
+
+
+def _toggled(toggles: tuple[Toggle, ...], new: Toggle) -> tuple[Toggle, ...]:
+    """Return the toggles with one more; one that comes before the last of its valve undoes it."""
+    for number in range(len(toggles) - 1, -1, -1):
+        if toggles[number].valve == new.valve:
+            if toggles[number].at_s >= new.at_s:
+                return toggles[:number] + toggles[number + 1 :]
+            break
+    return (*toggles, new)
+
+
+# ------------------------------------------------------------------------------ liquid to ground
+
+
+def _broken_off(setup: Setup, swath: Swath, front: Front | None, now_s: float) -> Swath:
+    """Return the swath stamped as far as its way is known, and begun anew at `front`."""
+    if len(swath.fronts) > 1:
+        swath = _stamped(setup.boom, swath._replace(fronts=swath.fronts[:-1]), swath.fronts[-1])
+    is_open, toggles = _open_at(swath.is_open, swath.toggles, now_s)
+    fronts = () if front is None else (front,)
+    return swath._replace(fronts=fronts, is_open=is_open, toggles=toggles)
+
+
+def _open_at(
+    is_open: tuple[bool, ...], toggles: tuple[Toggle, ...], at_s: float
+) -> tuple[tuple[bool, ...], tuple[Toggle, ...]]:
+    """Return which valves are open at a time, and what follows later."""
+    now = list(is_open)
+    for toggle in toggles:
+        if toggle.at_s <= at_s:
+            now[toggle.valve] = toggle.opens
+    return tuple(now), tuple(toggle for toggle in toggles if toggle.at_s > at_s)
+
+
+def _stamped(boom: Boom, swath: Swath, front: Front) -> Swath:
+    """Return the swath with its way to `front` stamped."""
+    fronts = (*swath.fronts, front) if front.time_s > swath.fronts[-1].time_s else swath.fronts
+    end_s = fronts[-1].time_s
+    is_open, later = _open_at(swath.is_open, swath.toggles, end_s)
+    coverage = swath.coverage
+    if len(fronts) > 1 and (any(swath.is_open) or len(later) < len(swath.toggles)):
+        way = _Way(boom, fronts)
+        stays = _stays(swath, fronts[0].time_s, end_s)
+        quads = [quad for strip in _strips(boom, stays) for quad in way.quads(*strip)]
+        coverage = coverage.stamped(quads)
+    return Swath(
+        coverage=coverage,
+        older=(*swath.older, (end_s, coverage))[-SNAPSHOTS_MAX:],
+        fronts=fronts[-1:],
+        is_open=is_open,
+        ordered=swath.ordered,
+        toggles=later,
+    )
+
+
+# From when until when liquid comes out of one valve.
+_Stays = tuple[tuple[float, float], ...]
+
+
+def _stays(swath: Swath, start_s: float, end_s: float) -> list[_Stays]:
+    """Return when each valve is open between two times."""
+    found: list[_Stays] = []
+    for valve, is_open in enumerate(swath.is_open):
+        stays = []
+        since_s = start_s
+        for toggle in swath.toggles:
+            if toggle.valve != valve or toggle.at_s > end_s or toggle.opens is is_open:
+                continue
+            if is_open:
+                stays.append((since_s, toggle.at_s))
+            is_open, since_s = toggle.opens, max(toggle.at_s, start_s)
+        if is_open:
+            stays.append((since_s, end_s))
+        found.append(tuple(stay for stay in stays if stay[1] > stay[0]))
+    return found
+
+
+# Left and right end, place ahead, and when it is open: of valves side by side that are so together.
+_Strip = tuple[float, float, float, _Stays]
+
+
+def _strips(boom: Boom, stays: list[_Stays]) -> list[_Strip]:
+    found: list[_Strip] = []
+    for right_m, forward_m, half_m, own in zip(
+        boom.right_m.tolist(),
+        boom.forward_m.tolist(),
+        boom.half_width_m.tolist(),
+        stays,
+        strict=True,
+    ):
+        left_m = right_m - half_m
+        if found and found[-1][2:] == (forward_m, own) and abs(found[-1][1] - left_m) <= TOUCH_M:
+            left_m = found.pop()[0]
+        found.append((left_m, right_m + half_m, forward_m, own))
+    return found
+
+
+class _Way:
+    """The way of the boom through its fronts, in as few straight pieces as it allows.
+
+    Plain numbers: for some ten fronts that is several times as fast as arrays are.
+    """
+
+    def __init__(self, boom: Boom, fronts: tuple[Front, ...]) -> None:
+        self._fronts = fronts
+        reach_m = float((np.abs(boom.right_m) + boom.half_width_m).max())
+        tips = []
+        for _, east_m, north_m, heading_deg in fronts:
+            angle = math.radians(heading_deg)
+            sin, cos = reach_m * math.sin(angle), reach_m * math.cos(angle)
+            tips.append((east_m - cos, north_m + sin, east_m + cos, north_m - sin))
+        self._knots_s = [fronts[bend].time_s for bend in _bends(tips, 0, len(tips) - 1)]
+
+    def quads(self, left_m: float, right_m: float, forward_m: float, stays: _Stays) -> list[Quad]:
+        """Return the quadrilaterals that a strip sweeps while it is open."""
+        found: list[Quad] = []
+        for begin_s, end_s in stays:
+            inner = [knot_s for knot_s in self._knots_s if begin_s < knot_s < end_s]
+            ends = [
+                self._ends(at_s, left_m, right_m, forward_m) for at_s in (begin_s, *inner, end_s)
+            ]
+            found.extend(
+                (left, right, next_right, next_left)
+                for (left, right), (next_left, next_right) in pairwise(ends)
+            )
+        return found
+
+    def _ends(
+        self, at_s: float, left_m: float, right_m: float, forward_m: float
+    ) -> tuple[Place, Place]:
+        """Return where the ends of a strip are at a time."""
+        number = bisect_right(self._fronts, at_s, key=_time) - 1
+        number = min(max(number, 0), len(self._fronts) - 2)
+        first, last = self._fronts[number : number + 2]
+        share = min(max((at_s - first.time_s) / (last.time_s - first.time_s), 0.0), 1.0)
+        turned_deg = (last.heading_deg - first.heading_deg + 180.0) % 360.0 - 180.0
+        angle = math.radians(first.heading_deg + share * turned_deg)
+        sin, cos = math.sin(angle), math.cos(angle)
+        east_m = first.east_m + share * (last.east_m - first.east_m) + forward_m * sin
+        north_m = first.north_m + share * (last.north_m - first.north_m) + forward_m * cos
+        return (
+            (east_m + left_m * cos, north_m - left_m * sin),
+            (east_m + right_m * cos, north_m - right_m * sin),
+        )
+
+
+def _time(front: Front) -> float:
+    return front.time_s
+
+
+def _bends(tips: list[tuple[float, float, float, float]], first: int, last: int) -> list[int]:
+    """Return the indices between which both tips go straight (as Douglas and Peucker have it)."""
+    x0, y0, x1, y1 = tips[first]
+    x2, y2, x3, y3 = tips[last]
+    dx, dy, ex, ey = x2 - x0, y2 - y0, x3 - x1, y3 - y1
+    left, right = math.hypot(dx, dy), math.hypot(ex, ey)
+    worst, worst_m = 0, STRAIGHT_M
+    for number in range(first + 1, last):
+        xa, ya, xb, yb = tips[number]
+        xa, ya, xb, yb = xa - x0, ya - y0, xb - x1, yb - y1
+        off_m = max(
+            abs(xa * dy - ya * dx) / left if left > NEAR_M else math.hypot(xa, ya),
+            abs(xb * ey - yb * ex) / right if right > NEAR_M else math.hypot(xb, yb),
+        )
+        if off_m > worst_m:
+            worst, worst_m = number, off_m
+    if not worst:
+        return []
+    return [*_bends(tips, first, worst), worst, *_bends(tips, worst, last)]
