@@ -7,14 +7,14 @@ ends are borders too, and all that falls between them is beyond.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
 from analysis.changes import SPEED_MIN_M_S, Run, bisect
 from analysis.lag import DWELL_MIN_S, Step, Verdict
 from analysis.strips import GRAZE_M, Strip
-from analysis.track import Bools, Floats, Ints, Track
+from analysis.track import TOUCH_M, Bools, Floats, Ints, Track
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -50,27 +50,48 @@ class BorderCrossing:
     margin_m: float
 
 
+class _Candidate(NamedTuple):
+    """A crossing that may count: from a time well inside over the crossing to one well outside."""
+
+    kind: Literal["opening", "closing"]
+    near_s: float
+    cross_s: float
+    far_s: float
+
+
 def border_crossings(strip: Strip, prescription: Prescription) -> list[BorderCrossing]:
     """Return the margins of one strip at every border that it sprayed up to or from."""
+    track = strip.track
+    candidates = list(_candidates(strip))
+    contacts_s = _contacts_s(strip, prescription, candidates)
     found: list[BorderCrossing] = []
+    for candidate, contact_s in zip(candidates, contacts_s.tolist(), strict=True):
+        flow_s = _flow_end_s(track, candidate.near_s, candidate.far_s)
+        if flow_s is None or not contact_s < np.inf:  # it did not spray, or never was inside
+            continue
+        margin_m = track.value(track.distance_m, contact_s)
+        margin_m -= track.value(track.distance_m, flow_s)
+        found.append(
+            BorderCrossing(
+                valve=track.valve,
+                kind=candidate.kind,
+                time_s=candidate.cross_s,
+                margin_m=-margin_m if candidate.kind == "opening" else margin_m,
+            )
+        )
+    return found
+
+
+def _candidates(strip: Strip) -> Iterator[_Candidate]:
+    """Yield both ends of every visit to the field, where the strip is to spray there."""
     for first, last, early_s, late_s in _passes(strip.stretches):
         if not min(first.dwell_s, last.dwell_s) >= DWELL_MIN_S:
             continue
-        kinds: tuple[tuple[Literal["opening", "closing"], Run, float, float], ...] = (
-            ("opening", first, first.start_s, early_s),
-            ("closing", last, last.end_s, late_s),
-        )
-        for kind, stretch, cross_s, far_s in kinds:
-            if not stretch.rate_l_ha > 0.0 or not _crosses(strip.track, cross_s):
-                continue
-            margin_m = _margin_m(strip, prescription, stretch, cross_s, far_s)
-            if margin_m is not None:
-                found.append(
-                    BorderCrossing(
-                        valve=strip.track.valve, kind=kind, time_s=cross_s, margin_m=margin_m
-                    )
-                )
-    return found
+        opening = _Candidate("opening", first.end_s, first.start_s, early_s)
+        closing = _Candidate("closing", last.start_s, last.end_s, late_s)
+        for stretch, each in ((first, opening), (last, closing)):
+            if stretch.rate_l_ha > 0.0 and _crosses(strip.track, each.cross_s):
+                yield each
 
 
 def _passes(stretches: Sequence[Run]) -> Iterator[tuple[Run, Run, float, float]]:
@@ -100,22 +121,6 @@ def _crosses(track: Track, time_s: float) -> bool:
     return bool(within and track.value(track.speed_m_s, time_s) > SPEED_MIN_M_S)
 
 
-def _margin_m(
-    strip: Strip, prescription: Prescription, stretch: Run, cross_s: float, far_s: float
-) -> float | None:
-    """Return the margin at one border; None where the strip did not spray or never was inside."""
-    track = strip.track
-    opening = far_s < cross_s
-    near_s = stretch.end_s if opening else stretch.start_s
-    flow_s = _flow_end_s(track, near_s, far_s)
-    contact_s = _contact_s(strip, prescription, near_s, cross_s)
-    if flow_s is None or contact_s is None:
-        return None
-    flow_m = track.value(track.distance_m, flow_s)
-    contact_m = track.value(track.distance_m, contact_s)
-    return flow_m - contact_m if opening else contact_m - flow_m
-
-
 def _flow_end_s(track: Track, near_s: float, far_s: float) -> float | None:
     """Return the outermost time with flow between a time inside and a time outside."""
     first, last = track.sample(min(near_s, far_s)), track.sample(max(near_s, far_s)) + 1
@@ -128,42 +133,51 @@ def _flow_end_s(track: Track, near_s: float, far_s: float) -> float | None:
     return float(track.time_s[first + index])
 
 
-def _contact_s(
-    strip: Strip, prescription: Prescription, near_s: float, cross_s: float
-) -> float | None:
-    """Return when the strip first touches the outside (or last does) around a crossing."""
-    grazing_s = _edge_s(strip, prescription, (near_s, cross_s), widen_m=-GRAZE_M)
-    exact_s = _edge_s(strip, prescription, (near_s, cross_s), widen_m=None)
-    if grazing_s is None or exact_s is None:
-        return grazing_s
+def _contacts_s(
+    strip: Strip, prescription: Prescription, candidates: Sequence[_Candidate]
+) -> Floats:
+    """Return when the strip first touches the outside (or last does); NaN where never inside."""
+    grazing_s = _edges_s(strip, prescription, candidates, strip.grazing, -GRAZE_M)
+    exact_s = _edges_s(strip, prescription, candidates, strip.whole, -TOUCH_M)
+    both = np.flatnonzero(np.isfinite(grazing_s) & np.isfinite(exact_s))
     # At an oblique border the strip's end goes over by ever more between the two; along a border
     # it stays where it is until the crossing.
-    nearly_s = np.array([exact_s + 0.9 * (grazing_s - exact_s)])
-    oblique = not strip.track.wholly_inside(prescription, nearly_s, widen_m=-0.8 * GRAZE_M)[0]
-    return exact_s if oblique else grazing_s
+    nearly_s = exact_s[both] + 0.9 * (grazing_s[both] - exact_s[both])
+    along = strip.track.wholly_inside(prescription, nearly_s, widen_m=-0.8 * GRAZE_M)
+    contacts_s = grazing_s.copy()
+    contacts_s[both] = np.where(along, grazing_s[both], exact_s[both])
+    return contacts_s
 
 
-def _edge_s(
-    strip: Strip, prescription: Prescription, span_s: tuple[float, float], *, widen_m: float | None
-) -> float | None:
-    """Return the time next to the crossing at which the strip is wholly inside, to 0.01 mm."""
-    near_s, cross_s = span_s
-    track = strip.track
-    whole = strip.whole if widen_m is None else strip.grazing
-    marks_s = track.time_s[track.marks]
-    low_s, high_s = min(span_s), max(span_s)
-    inside = np.flatnonzero(whole & (marks_s > low_s) & (marks_s < high_s))
-    if not len(inside):
-        return None
-    mark = inside[-1] if cross_s > near_s else inside[0]
-    beyond = marks_s[mark + 1] if cross_s > near_s else marks_s[mark - 1]
-    options = {} if widen_m is None else {"widen_m": widen_m}
-    edge = bisect(
-        lambda t: track.wholly_inside(prescription, t, **options),
-        np.array([marks_s[mark]]),
-        np.array([beyond]),
+def _edges_s(
+    strip: Strip,
+    prescription: Prescription,
+    candidates: Sequence[_Candidate],
+    inside: Bools,
+    widen_m: float,
+) -> Floats:
+    """Return the times next to the crossings at which the strip is wholly inside, to 0.01 mm."""
+    marks_s = strip.track.time_s[strip.track.marks]
+    within = np.flatnonzero(inside)
+    within_s = marks_s[within]
+    found = np.full(len(candidates), np.nan)
+    rows, marks, beyond = [], [], []
+    for row, each in enumerate(candidates):
+        low_s, high_s = min(each.near_s, each.cross_s), max(each.near_s, each.cross_s)
+        first = int(np.searchsorted(within_s, low_s, "right"))
+        end = int(np.searchsorted(within_s, high_s, "left"))
+        if first < end:
+            ahead = each.kind == "closing"
+            mark = int(within[end - 1] if ahead else within[first])
+            rows.append(row)
+            marks.append(mark)
+            beyond.append(mark + 1 if ahead else mark - 1)
+    found[rows] = bisect(
+        lambda t: strip.track.wholly_inside(prescription, t, widen_m=widen_m),
+        marks_s[np.array(marks, dtype=np.int64)],
+        marks_s[np.array(beyond, dtype=np.int64)],
     )
-    return float(edge[0])
+    return found
 
 
 def off_target_ml(strips: Sequence[Strip], prescription: Prescription) -> float:
@@ -196,16 +210,6 @@ def _doubtful(strip: Strip) -> Ints:
     return np.flatnonzero(doubtful).astype(np.int64)
 
 
-def _in_two_stretches(strip: Strip, change_s: float, marks_s: Floats) -> Bools:
-    """Return which marks lie in the stretch that a change ends or in the one that it begins."""
-    starts_s = np.array([stretch.start_s for stretch in strip.stretches])
-    after = int(np.argmin(np.abs(starts_s - change_s)))
-    first_s = starts_s[max(after - 1, 0)]
-    last_s = starts_s[after + 1] if after + 1 < len(starts_s) else np.inf
-    inside: Bools = (marks_s >= first_s) & (marks_s < last_s)
-    return inside
-
-
 def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Step]) -> list[Step]:
     """Return the steps with those apart where the strip reaches over the border.
 
@@ -213,18 +217,27 @@ def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Ste
     valve that stays closed misses a change only where its strip keeps clear of the border.
     """
     marks_s = strip.track.time_s[strip.track.marks]
+    over = np.concatenate(([0], np.cumsum(~strip.grazing)))
+    starts_s = np.array([stretch.start_s for stretch in strip.stretches])
+    times_s = np.array([step.change.time_s for step in steps])
+    # Looked at all at once: most changes have no border within reach of what they were measured on.
+    last = over[np.searchsorted(marks_s, times_s + WINDOWS_S, "right")]
+    is_near = (last > over[np.searchsorted(marks_s, times_s - WINDOWS_S)]).tolist()
     found: list[Step] = []
-    for step in steps:
+    for step, near in zip(steps, is_near, strict=True):
         change = step.change
         missed = step.verdict is Verdict.MISSED
-        if not (missed or (step.verdict is Verdict.MEASURED and not change.border)):
+        if not missed and (step.verdict is not Verdict.MEASURED or change.border or not near):
             found.append(step)
             continue
         around_s = AROUND_S if change.border else np.inf if missed else WINDOWS_S
-        index = np.flatnonzero(np.abs(marks_s - change.time_s) <= around_s)
+        span_s = (change.time_s - around_s, change.time_s + around_s)
         if not change.border:
-            index = index[_in_two_stretches(strip, change.time_s, marks_s[index])]
-        else:
+            span_s = _in_two_stretches(starts_s, change.time_s, span_s)
+        first = int(np.searchsorted(marks_s, span_s[0], "left"))
+        end = int(np.searchsorted(marks_s, span_s[1], "right" if change.border else "left"))
+        index = np.arange(first, end)
+        if change.border:
             index = index[strip.rates_at(marks_s[index]) > 0.0]
         clear = strip.grazing[index].all()
         if clear and missed and step.dry:
@@ -236,3 +249,16 @@ def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Ste
         held = replace(step, verdict=Verdict.BORDER, lag_distance_m=None)
         found.append(step if clear else held)
     return found
+
+
+def _in_two_stretches(
+    starts_s: Floats, change_s: float, span_s: tuple[float, float]
+) -> tuple[float, float]:
+    """Return a span within the stretch that a change ends and the one that it begins."""
+    after = int(np.argmin(np.abs(starts_s - change_s)))
+    last_s = float(starts_s[after + 1]) if after + 1 < len(starts_s) else np.inf
+    # The span's own end counts, that of a stretch does not.
+    return (
+        max(span_s[0], float(starts_s[max(after - 1, 0)])),
+        min(float(np.nextafter(span_s[1], np.inf)), last_s),
+    )

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from analysis.strips import Strip
     from analysis.track import Bools, Floats
     from companion.core.controller import Setup
+    from companion.core.prescription import Prescription
 
 # Where nothing is prescribed, this part of a usual dose is nothing either.
 NOTHING = 0.02
@@ -40,6 +41,11 @@ class Marks:
     asked_ml_m: Floats
     usual: float
     at_border: Bools
+
+    @property
+    def prescription(self) -> Prescription:
+        """Return what was prescribed."""
+        return self.setup.prescription
 
     def is_inhibited(self, flight: AppliedFlight) -> Bools:
         """Return where a reason not to spray held the valve, or had until a moment ago."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.border import CLEAR_M
 from analysis.cause_marks import samples_at
 from analysis.lag import Verdict
 from analysis.modelled_flow import ML_S_PER_L_MIN
@@ -38,6 +39,20 @@ def in_edge(marks: Marks, steps: Sequence[Step]) -> Bools:
             margin_m = margin_s * step.change.speed_m_s + marks.setup.border_buffer_m
             margin_m += 0.5 * marks.strip.track.width_m  # of a border that is met at an angle
             found |= np.abs(marks.distance_m - step.change.distance_m) <= margin_m
+    return found
+
+
+def beside_border(marks: Marks, closed: Bools) -> Bools:
+    """Return which closed marks have the border so near to the strip's end that it may be why."""
+    index = np.flatnonzero(closed)
+    found = np.zeros(len(closed), dtype=np.bool_)
+    if len(index):
+        strip = marks.strip
+        found[index] = ~strip.track.wholly_inside(
+            marks.prescription,
+            marks.time_s[index],
+            widen_m=max(CLEAR_M, marks.setup.border_buffer_m),
+        )
     return found
 
 

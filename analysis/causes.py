@@ -15,6 +15,7 @@ import numpy as np
 
 from analysis.cause_marks import Marks, marks_of
 from analysis.cause_rules import (
+    beside_border,
     by_inhibit,
     in_acceleration,
     in_change,
@@ -134,13 +135,14 @@ def _sorted(
 ) -> list[tuple[Cause, Bools]]:
     """Return where each cause is to blame; no mark has two."""
     short = marks.given_ml_m < marks.asked_ml_m
+    closed = off & (marks.given_ml_m < SKIPPED_BELOW * marks.asked_ml_m)
     rules = (
         (Cause.INHIBIT, marks.is_inhibited(flight) & short),
-        (Cause.EDGE, in_edge(marks, steps)),
+        (Cause.EDGE, in_edge(marks, steps) | beside_border(marks, closed)),
         (Cause.CHANGE, in_change(marks, steps)),
         (Cause.SATURATION, in_saturation(marks)),
         (Cause.ACCELERATION, in_acceleration(marks)),
-        (Cause.SKIP, marks.given_ml_m < SKIPPED_BELOW * marks.asked_ml_m),
+        (Cause.SKIP, closed),
     )
     left, found = off.copy(), []
     for cause, where in rules:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,6 +12,8 @@ import typer
 
 if TYPE_CHECKING:
     from analysis.replay import ReplayResult
+
+ZONES_SHOWN = 10
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -26,12 +29,18 @@ def replay_journal(
 ) -> None:
     """Feed a flight's recorded inputs to the core and compare every decision.
 
+    With --set: what would have been sprayed. The ground cannot react: the aircraft flies as it
+    flew, and the sprayer stays what the recorded set-up says of it.
+
     Exit 0: all the same; 1: at least one differs; 2: the file or an option cannot be used.
     """
     from analysis.replay import replay as run
 
-    result = run(journal, overrides=changes or ())
+    result = run(journal, overrides=changes or (), say=lambda line: typer.echo(line, err=True))
     typer.echo(json.dumps(asdict(result)) if as_json else _sentence(result))
+    if not as_json:
+        for line in _what_if(result):
+            typer.echo(line)
     for note in _notes(result):
         typer.echo(note, err=True)
     raise typer.Exit(1 if result.differences else 0)
@@ -41,6 +50,38 @@ def _sentence(result: ReplayResult) -> str:
     return (
         f"{result.decisions} decisions from {result.inputs} inputs, {result.differences} different"
     )
+
+
+def _what_if(result: ReplayResult) -> Iterator[str]:
+    """Yield what the recorded decisions sprayed and what the others would have."""
+    was, now, moved = result.recorded, result.what_if, result.moved_m
+    if was is None or now is None or moved is None:
+        return
+    yield f"{'':24}{'recorded':>12}{'what-if':>12}"
+    rows = (
+        ("sprayed, L", was.volume_l, now.volume_l),
+        ("misapplied, %", was.misapplied_percent, now.misapplied_percent),
+        ("lag distance, mean, m", was.lag_distance_m.mean, now.lag_distance_m.mean),
+        ("  mean of absolutes, m", was.lag_distance_m.mean_abs, now.lag_distance_m.mean_abs),
+        ("border margin, least, m", was.border_margin_m.min, now.border_margin_m.min),
+        ("outside the field, mL", was.off_target_ml, now.off_target_ml),
+    )
+    for name, *values in rows:
+        yield f"{name:24}" + "".join(
+            f"{'-':>12}" if value is None else f"{value:12.3f}" for value in values
+        )
+    if moved.mean is not None:
+        yield (
+            f"{moved.count} changes moved by {moved.mean:+.3f} m in the mean, "
+            f"{moved.max_abs:.3f} m at most (+ is later)"
+        )
+    zones = sorted(was.zones.keys() | now.zones.keys())
+    litres = [(zone, was.zones.get(zone, 0.0), now.zones.get(zone, 0.0)) for zone in zones]
+    litres.sort(key=lambda row: -abs(row[2] - row[1]))
+    for zone, before, after in litres[:ZONES_SHOWN]:
+        yield f"{'zone ' + zone:24}{before:12.4f}{after:12.4f}"
+    if len(litres) > ZONES_SHOWN:
+        yield f"{len(litres) - ZONES_SHOWN} zones that differ less: --json has them"
 
 
 def _notes(result: ReplayResult) -> list[str]:

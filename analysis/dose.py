@@ -65,13 +65,18 @@ def misapplied_percent(strips: Sequence[Strip]) -> float | None:
     return 100.0 * float(parts.wrong_ml.sum()) / asked_ml if asked_ml > 0.0 else None
 
 
-def volume_error_percent(
-    strips: Sequence[Strip], prescription: Prescription
-) -> tuple[float | None, dict[str, float]]:
-    """Return applied against prescribed volume, in all and by zone, along what was flown.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZoneVolume:
+    """What fell on a zone, and what was prescribed along what was flown of it."""
 
-    A zone is where the strips' centres are; where zones overlap, their names are joined. Zones
-    that nothing is prescribed for have no error in percent.
+    given_ml: float
+    asked_ml: float
+
+
+def zone_volumes(strips: Sequence[Strip], prescription: Prescription) -> dict[str, ZoneVolume]:
+    """Return the volumes of every zone that a strip's centre came over.
+
+    Where zones overlap, their names are joined; ground of the field without a zone has none.
     """
     given_ml: dict[frozenset[int], float] = defaultdict(float)
     asked_ml: dict[frozenset[int], float] = defaultdict(float)
@@ -82,16 +87,30 @@ def volume_error_percent(
             volumes = np.diff(strip.track.at(values, ends_s), axis=1)[:, 0]
             for run, volume_ml in zip(inside, volumes.tolist(), strict=True):
                 totals[run.zones] += volume_ml
-    by_zone = {
-        "+".join(prescription.zone_name(zone) for zone in sorted(zones)): _error_percent(
-            given_ml[zones], asked
+    return {
+        "+".join(prescription.zone_name(zone) for zone in sorted(zones)): ZoneVolume(
+            given_ml=given_ml[zones], asked_ml=asked
         )
         for zones, asked in asked_ml.items()
-        if asked > 0.0
     }
-    asked_all = sum(asked_ml.values())
-    overall = _error_percent(sum(given_ml.values()), asked_all) if asked_all > 0.0 else None
-    return overall, by_zone
+
+
+def volume_error_percent(
+    strips: Sequence[Strip], prescription: Prescription
+) -> tuple[float | None, dict[str, float]]:
+    """Return applied against prescribed volume, in all and by zone, along what was flown.
+
+    Zones that nothing is prescribed for have no error in percent.
+    """
+    zones = zone_volumes(strips, prescription)
+    by_zone = {
+        name: _error_percent(zone.given_ml, zone.asked_ml)
+        for name, zone in zones.items()
+        if zone.asked_ml > 0.0
+    }
+    asked_all = sum(zone.asked_ml for zone in zones.values())
+    given_all = sum(zone.given_ml for zone in zones.values())
+    return (_error_percent(given_all, asked_all) if asked_all > 0.0 else None), by_zone
 
 
 def section_error_percent(strips: Sequence[Strip], boom: Boom) -> dict[str, float]:

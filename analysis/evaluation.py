@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from analysis.border import BorderCrossing, border_crossings, held_by_border, off_target_ml
+from analysis.changes import find_runs, stretches_of
 from analysis.dose import misapplied_percent, section_error_percent, volume_error_percent
 from analysis.flight_record import FlightMeta, FlightRecord, whole_boom
 from analysis.flow_accuracy import flow_accuracy
@@ -21,6 +22,7 @@ from analysis.published import P1_RESULTS
 from analysis.settled import SettledStep, measure_settled
 from analysis.strips import Strip, strips_of
 from analysis.switches import Switch, switches_of
+from analysis.track import tracks_of
 
 __all__ = [
     "P1_RESULTS",
@@ -134,8 +136,9 @@ def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation
         for switch in switches_of(strip, each)
     ]
     crossings = [c for strip in strips for c in border_crossings(strip, record.prescription)]
-    whole = strips_of(whole_boom(record))[0]
-    settled = measure_settled(whole.track, whole.stretches, record.orders, record.nozzle_sets)
+    whole = tracks_of(whole_boom(record))[0]
+    stretches = stretches_of(find_runs(whole, record.prescription))
+    settled = measure_settled(whole, stretches, record.orders, record.nozzle_sets)
     accuracy = flow_accuracy(strips)
     volume_error, zone_errors = volume_error_percent(strips, record.prescription)
     all_steps = [step for each in steps for step in each]

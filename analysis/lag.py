@@ -92,10 +92,8 @@ def measure_steps(
         if change is None:
             continue
         transition, pair = transitions[i], (stretches[i], stretches[i + 1])
-        asked = (
-            prescribed_dose_ml_m(track, change.before_l_ha, change.time_s),
-            prescribed_dose_ml_m(track, change.after_l_ha, change.time_s),
-        )
+        per_rate = prescribed_dose_ml_m(track, 1.0, change.time_s)
+        asked = (per_rate * change.before_l_ha, per_rate * change.after_l_ha)
         dry = any(
             given < DRY_BELOW * dose
             for given, dose in zip(transition.levels_ml_m, asked, strict=True)

@@ -26,7 +26,7 @@ Ints = NDArray[np.int64]
 ML_S_PER_L_MIN = 1000.0 / 60.0
 # Shorter ramps are steps: the sum below divides by their length.
 RAMP_MIN_S = 1e-3
-# Curves are read at so many duties, between them along straight lines: 1e-6 of the flow.
+# Curves are read at so many flows, between them along straight lines: 0.05 % of the flow at worst.
 TABLE_POINTS = 2001
 
 
@@ -93,11 +93,17 @@ def levels_ml_s(changes: ValveChanges, nozzle_sets: Sequence[NozzleSet]) -> Floa
 def flow_of(nozzles: NozzleSet, duty: Floats) -> Floats:
     """Return the flow [mL/s] of a whole set at many duties."""
     curve = nozzles.curve
-    grid = np.union1d(np.linspace(0.0, 1.0, TABLE_POINTS), curve.duty)
     if len(duty) < TABLE_POINTS:
-        grid = np.unique(duty)
-    table = np.array([curve.flow_for(value) for value in grid.tolist()])
-    return np.interp(duty, grid, table) * ML_S_PER_L_MIN if len(duty) else np.zeros(0)
+        different, place = np.unique(duty, return_inverse=True)
+        flows = np.array([curve.flow_for(value) for value in different.tolist()], dtype=np.float64)
+        return flows[place] * ML_S_PER_L_MIN
+    # Even steps of the flow: where a curve begins, it is steep.
+    flows = np.linspace(curve.flow_l_min[0], curve.flow_l_min[-1], TABLE_POINTS)
+    duties = [curve.duty_for(flow) for flow in flows.tolist()]
+    if duties[0] > 0.0:
+        flows, duties = np.concatenate(([0.0], flows)), [0.0, *duties]
+    found: Floats = np.interp(duty, duties, flows) * ML_S_PER_L_MIN
+    return np.where(duty > 0.0, found, 0.0)
 
 
 def set_in_force(valve: Ints, duty: Floats, by_size: Sequence[NozzleSet]) -> Ints:

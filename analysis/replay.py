@@ -2,7 +2,8 @@
 
 The core is a function of set-up, inputs and times, and the journal has all three; so the same
 program must decide the same, to the last bit. A difference means that the core has changed, that
-rows are missing, or, with overrides, what would have been decided otherwise.
+rows are missing, or, with overrides, what would have been decided otherwise. What that would have
+put on the ground is in `what_if.py`.
 """
 
 from __future__ import annotations
@@ -15,11 +16,15 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from analysis.overrides import override
+from analysis.read_applied import read_applied
+from analysis.what_if import Moved, Orders, Sprayed, compared
 from companion.core.controller import Memory, Setup, step
 from companion.core.estimator import Track, estimate, observe
 from companion.core.types import Decision, Input
 from companion.record.codec import FIELD_NAMES, FieldNames, encode
 from companion.record.reader import Entry, JournalContent, read_journal
+
+SAY_EVERY = 5000
 
 
 class Core(Protocol):
@@ -63,6 +68,9 @@ class ReplayResult:
     is_closed: bool
     is_what_if: bool
     training: str | None = None
+    recorded: Sprayed | None = None
+    what_if: Sprayed | None = None
+    moved_m: Moved | None = None
 
 
 def replay(
@@ -70,14 +78,17 @@ def replay(
     *,
     overrides: Sequence[str] = (),
     core: Callable[[Setup], Core] = FlownCore,
+    say: Callable[[str], None] = lambda _: None,
 ) -> ReplayResult:
     """Return what the core decides today on the inputs of `path`.
 
-    `overrides` ("lag.on_s=0.12") change the set-up first: a what-if, whose differences are its
-    result. JournalError for a file that cannot be used, ConfigError for a wrong override.
+    `overrides` ("lag.on_s=0.12") change the set-up first: a what-if, whose result is what would
+    have been sprayed. JournalError for a file that cannot be used, ConfigError for a wrong
+    override.
     """
     content = read_journal(path)
     flown = core(override(content.setup, overrides))
+    ways = (Orders(), Orders()) if overrides else None
     inputs = decisions = differences = 0
     first: str | None = None
     for entry in content.entries:
@@ -88,10 +99,17 @@ def replay(
             inputs += 1
             continue
         decisions += 1
-        difference = _difference(content, entry, flown)
+        if not decisions % SAY_EVERY:
+            say(f"{decisions} decisions, {differences} different")
+        recorded, decided = _both(content, entry, flown)
+        if ways is not None and recorded is not None and decided is not None:
+            ways[0].take(recorded)
+            ways[1].take(decided)
+        difference = _difference(content, entry, decided)
         if difference is not None:
             differences += 1
             first = first or f"decision {decisions}: {difference}"
+    what_if = None if ways is None else compared(read_applied(path), *ways)
     return ReplayResult(
         inputs=inputs,
         decisions=decisions,
@@ -101,20 +119,32 @@ def replay(
         is_closed=content.is_closed,
         is_what_if=bool(overrides),
         training=content.training,
+        recorded=None if what_if is None else what_if.recorded,
+        what_if=None if what_if is None else what_if.what_if,
+        moved_m=None if what_if is None else what_if.moved_m,
     )
 
 
-def _difference(content: JournalContent, entry: Entry, core: Core) -> str | None:
-    """Return where the decision made now differs from the recorded one; None where it does not."""
+def _both(
+    content: JournalContent, entry: Entry, core: Core
+) -> tuple[Decision | None, Decision | None]:
+    """Return the recorded decision and the one made now."""
     recorded = content.value(entry)
     if not isinstance(recorded, Decision):
+        return None, None
+    return recorded, core.decide(recorded.now_s)
+
+
+def _difference(content: JournalContent, entry: Entry, decided: Decision | None) -> str | None:
+    """Return where the decision made now differs from the recorded one; None where it does not."""
+    if decided is None:
         return "is no decision"
-    decided = encode(core.decide(recorded.now_s))
-    if decided == entry.body:
+    text = encode(decided)
+    if text == entry.body:
         return None
     was = _named(json.loads(entry.body), content.field_names)
-    found = first_difference(was, _named(json.loads(decided), FIELD_NAMES))
-    return None if found is None else f"at {recorded.now_s!r} s, {found}"
+    found = first_difference(was, _named(json.loads(text), FIELD_NAMES))
+    return None if found is None else f"at {decided.now_s!r} s, {found}"
 
 
 def _named(plain: Any, names: FieldNames) -> Any:

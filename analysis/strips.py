@@ -54,10 +54,16 @@ class Strip:
 
 def strips_of(record: FlightRecord) -> list[Strip]:
     """Return the strips of all valves, left to right."""
-    return [_strip(track, record) for track in tracks_of(record)]
+    orders: list[list[TimedChange]] = [[] for _ in record.boom.valves]
+    for order in record.orders:
+        if order.valve < len(orders):
+            orders[order.valve].append(order)
+    return [
+        _strip(track, record, its) for track, its in zip(tracks_of(record), orders, strict=True)
+    ]
 
 
-def _strip(track: Track, record: FlightRecord) -> Strip:
+def _strip(track: Track, record: FlightRecord, orders: list[TimedChange]) -> Strip:
     runs = find_runs(track, record.prescription)
     stretches = stretches_of(runs)
     whole, grazing = _inside(track, record.prescription)
@@ -65,7 +71,7 @@ def _strip(track: Track, record: FlightRecord) -> Strip:
         track=track,
         runs=tuple(runs),
         stretches=tuple(stretches),
-        orders=tuple(order for order in record.orders if order.valve == track.valve),
+        orders=tuple(orders),
         whole=whole,
         grazing=grazing,
         asked_ml=_asked_ml(track, stretches),
@@ -85,7 +91,7 @@ def _asked_ml(track: Track, stretches: list[Run]) -> Floats:
     """Return the cumulative prescribed volume at every sample; exact across boundaries."""
     starts_s = np.array([run.start_s for run in stretches])
     rates = np.array([run.rate_l_ha for run in stretches])
-    knots_s = np.union1d(track.time_s, starts_s)
+    knots_s = np.sort(np.concatenate((track.time_s, starts_s)))
     middle_s = 0.5 * (knots_s[1:] + knots_s[:-1])
     rate = rates[np.clip(np.searchsorted(starts_s, middle_s, "right") - 1, 0, None)]
     metres = np.diff(track.at(track.distance_m, knots_s))

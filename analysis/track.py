@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import shapely
@@ -59,9 +60,11 @@ class Track:
 
     def value(self, values: Floats, time_s: float) -> float:
         """Return one of the arrays at one time."""
-        where = min(max((time_s - self.time_s[0]) / self.step_s, 0.0), len(values) - 1.0)
-        i = min(int(where), len(values) - 2)
-        return float(values[i] + (values[i + 1] - values[i]) * (where - i))
+        last = len(values) - 1
+        where = min(max((time_s - self.time_s.item(0)) / self.step_s, 0.0), float(last))
+        i = min(int(where), last - 1)
+        low = values.item(i)
+        return low + (values.item(i + 1) - low) * (where - i)
 
     def sample(self, time_s: float) -> int:
         """Return the sample at or just before a time."""
@@ -79,11 +82,18 @@ class Track:
     ) -> Bools:
         """Return where the whole strip, widened at both ends, lies in the field."""
         half_m = max(0.5 * self.width_m + widen_m, 0.25 * self.width_m)
-        left, right = self.points(time_s, -half_m), self.points(time_s, half_m)
-        ends = np.stack((np.stack(left, axis=-1), np.stack(right, axis=-1)), axis=1)
-        shapely.prepare(prescription.field)
-        lines = shapely.linestrings(ends)
-        inside = np.asarray(shapely.contains_properly(prescription.field, lines), dtype=np.bool_)
+        east_m, north_m = self.at(self.east_m, time_s), self.at(self.north_m, time_s)
+        deep = sure_field(prescription, half_m)
+        inside = np.asarray(shapely.contains_xy(deep, east_m, north_m), dtype=np.bool_)
+        doubtful = np.flatnonzero(~inside)
+        if len(doubtful):
+            near_s = time_s[doubtful]
+            left, right = self.points(near_s, -half_m), self.points(near_s, half_m)
+            ends = np.stack((np.stack(left, axis=-1), np.stack(right, axis=-1)), axis=1)
+            shapely.prepare(prescription.field)
+            inside[doubtful] = shapely.contains_properly(
+                prescription.field, shapely.linestrings(ends)
+            )
         return inside & self.on_line(time_s)
 
     def on_line(self, time_s: Floats) -> Bools:
@@ -97,6 +107,22 @@ class Track:
         return in_field(prescription, *self.points(time_s, right_m)) & self.on_line(time_s)
 
 
+_SURE: WeakKeyDictionary[Prescription, dict[float, shapely.Geometry]] = WeakKeyDictionary()
+
+
+def sure_field(prescription: Prescription, half_m: float) -> shapely.Geometry:
+    """Return ground on which a strip of half that width lies in the field, however it is turned.
+
+    Somewhat less than all of it: arcs are made of chords.
+    """
+    known = _SURE.setdefault(prescription, {})
+    found = known.get(half_m)
+    if found is None:
+        found = known[half_m] = shapely.buffer(prescription.field, -1.01 * half_m - 0.005)
+        shapely.prepare(found)
+    return found
+
+
 def in_field(prescription: Prescription, east_m: Floats, north_m: Floats) -> Bools:
     """Return which points lie in the field; fast on very many."""
     shapely.prepare(prescription.field)
@@ -106,13 +132,19 @@ def in_field(prescription: Prescription, east_m: Floats, north_m: Floats) -> Boo
 def tracks_of(record: FlightRecord) -> list[Track]:
     """Return the tracks of all valves, left to right."""
     planned = None if record.lines is None else PlannedLines(record, record.lines)
-    return [_track(record, valve, planned) for valve in range(len(record.boom.valves))]
-
-
-def _track(record: FlightRecord, number: int, planned: PlannedLines | None) -> Track:
-    valve = record.boom.valves[number]
     heading = np.unwrap(np.radians(record.heading_deg))
-    sin, cos = np.sin(heading), np.cos(heading)
+    axes = (heading, np.sin(heading), np.cos(heading))
+    return [_track(record, valve, axes, planned) for valve in range(len(record.boom.valves))]
+
+
+def _track(
+    record: FlightRecord,
+    number: int,
+    axes: tuple[Floats, Floats, Floats],
+    planned: PlannedLines | None,
+) -> Track:
+    valve = record.boom.valves[number]
+    heading, sin, cos = axes
     east_m = record.east_m + sin * valve.forward_m + cos * valve.right_m
     north_m = record.north_m + cos * valve.forward_m - sin * valve.right_m
     move_e, move_n = np.diff(east_m), np.diff(north_m)
@@ -148,4 +180,5 @@ def _marks(travel_m: Floats) -> Ints:
     """Return samples at most `MARK_SPACING_M` and one step apart, both ends among them."""
     wanted = np.arange(0.0, travel_m[-1], MARK_SPACING_M)
     marks = np.searchsorted(travel_m, wanted)
-    return np.unique(np.concatenate(([0], marks, [len(travel_m) - 1]))).astype(np.int64)
+    both = np.concatenate(([0], marks, [len(travel_m) - 1]))
+    return both[np.diff(both, prepend=-1) > 0].astype(np.int64)

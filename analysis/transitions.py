@@ -33,6 +33,8 @@ SEARCH_BEFORE_S = 2.0
 # A sharp step, smoothed by three means over one period, passes a quarter and three quarters of
 # its height this many periods from each other, and lies in the middle between.
 SHARP_QUARTERS_PERIODS = 0.68
+# Over less than this a strip stands, and has no dose.
+MOVED_M = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,16 +73,21 @@ class SmoothTrack:
     def dose_between(self, start_s: float, end_s: float) -> float:
         """Return the mean dose between two times; 0 where the strip stands."""
         (start_m, start_ml), (end_m, end_ml) = self.at(start_s), self.at(end_s)
-        return (end_ml - start_ml) / (end_m - start_m) if end_m - start_m > 0.01 else 0.0
+        return (end_ml - start_ml) / (end_m - start_m) if end_m - start_m > MOVED_M else 0.0
 
 
-def level_of(smooth: SmoothTrack, stretch: Run) -> float:
-    """Return the dose [mL/m] that the flow had in a stretch; outside the field it is 0."""
-    if not stretch.inside:
-        return 0.0
-    return smooth.dose_between(
-        stretch.start_s + LEVEL_FROM * stretch.dwell_s, stretch.start_s + LEVEL_TO * stretch.dwell_s
+def levels_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
+    """Return the dose [mL/m] that the flow had in each stretch; outside the field it is 0."""
+    starts_s = np.array([stretch.start_s for stretch in stretches])
+    dwells_s = np.array([stretch.dwell_s for stretch in stretches])
+    ends_s = np.stack((starts_s + LEVEL_FROM * dwells_s, starts_s + LEVEL_TO * dwells_s))
+    metres, volumes_ml = (
+        np.diff(smooth.track.at(values, ends_s), axis=0)[0]
+        for values in (smooth.distance_m, smooth.volume_ml)
     )
+    counts = np.array([stretch.inside for stretch in stretches]) & (metres > MOVED_M)
+    found = np.divide(volumes_ml, metres, out=np.zeros(len(metres)), where=counts)
+    return [float(level) for level in found]
 
 
 def prescribed_dose_ml_m(track: Track, rate_l_ha: float, time_s: float) -> float:
@@ -92,7 +99,7 @@ def find_transitions(
     smooth: SmoothTrack, stretches: Sequence[Run], changes: Sequence[Change | None]
 ) -> list[Transition]:
     """Return the transition of each pair of neighbouring stretches."""
-    levels = [level_of(smooth, stretch) for stretch in stretches]
+    levels = levels_of(smooth, stretches)
     found: list[Transition] = []
     for i, change in enumerate(changes):
         before, after = stretches[i], stretches[i + 1]
@@ -104,8 +111,8 @@ def find_transitions(
         if change is None:
             found.append(_nominal(smooth.track, after.start_s, 0.0, pair))
             continue
-        asked = prescribed_dose_ml_m(smooth.track, after.rate_l_ha, after.start_s)
-        asked -= prescribed_dose_ml_m(smooth.track, before.rate_l_ha, after.start_s)
+        asked = prescribed_dose_ml_m(smooth.track, 1.0, after.start_s)
+        asked *= after.rate_l_ha - before.rate_l_ha
         progress = (levels[i + 1] - levels[i]) / asked
         if progress > 0.0 and late_s - early_s > smooth.track.step_s:
             found.append(_located(smooth, pair, early_s, late_s, progress=progress))

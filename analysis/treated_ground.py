@@ -13,13 +13,14 @@ import numpy as np
 
 from analysis.ground_elements import SquareGrid, slices_of, summed
 from analysis.track import in_field
+from analysis.zone_lookup import lookup_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.flight_record import FlightRecord
     from analysis.strips import Strip
-    from analysis.track import Bools, Floats
+    from analysis.track import Bools, Floats, Ints
 
 CELL_M = 0.5
 PIECE_M = 0.125
@@ -63,8 +64,7 @@ def treated_ground(record: FlightRecord, strips: Sequence[Strip]) -> TreatedGrou
     area = cell_m * cell_m
     times = covered[:-1].reshape(shape) / area
     under = passed[:-1].reshape(shape) / area
-    rated = _rated(record, grid)
-    open_ground = rated & (times < LEFT_OUT_BELOW)
+    open_ground = _rated(record, grid, times < LEFT_OUT_BELOW)
     # What a strip passed with its valve closed is judged along the strip.
     missed = open_ground & (times + under < LEFT_OUT_BELOW)
     closed = _closed(times + under >= LEFT_OUT_BELOW, record.boom.width_m / cell_m)
@@ -76,19 +76,21 @@ def treated_ground(record: FlightRecord, strips: Sequence[Strip]) -> TreatedGrou
     )
 
 
-def _rated(record: FlightRecord, grid: SquareGrid) -> Bools:
-    """Return the squares in whose middle something is prescribed."""
-    north_m, east_m = np.meshgrid(
-        grid.south_m + grid.cell_m * (np.arange(grid.rows) + 0.5),
-        grid.west_m + grid.cell_m * (np.arange(grid.columns) + 0.5),
-        indexing="ij",
-    )
-    east, north = east_m.ravel(), north_m.ravel()
-    found = in_field(record.prescription, east, north)
-    index = np.flatnonzero(found)
-    rates = record.prescription.rates_at(east[index], north[index])
-    found[index] = rates > 0.0
-    return found.reshape(grid.rows, grid.columns)
+def _rated(record: FlightRecord, grid: SquareGrid, asked: Bools) -> Bools:
+    """Return which of some squares have something prescribed in their middle."""
+    row, column = np.nonzero(asked)
+    east: Floats = grid.west_m + grid.cell_m * (column.astype(np.float64) + 0.5)
+    north: Floats = grid.south_m + grid.cell_m * (row.astype(np.float64) + 0.5)
+    prescription = record.prescription
+    index = np.flatnonzero(in_field(prescription, east, north))
+    lookup = lookup_of(prescription)
+    under: Ints = lookup.keys(east[index], north[index])
+    keys, place = np.unique(under, return_inverse=True)
+    rates = [prescription.rate_of(lookup.zones(key)) for key in keys.tolist()]
+    is_rated = np.array([rate is not None and rate > 0.0 for rate in rates], dtype=np.bool_)
+    found = np.zeros(asked.shape, dtype=np.bool_)
+    found[row[index], column[index]] = is_rated[place]
+    return found
 
 
 def _closed(treated: Bools, width: float) -> Bools:

@@ -36,15 +36,13 @@ class ZoneLookup:
         self._edges = prescription.edges
         self._count = prescription.zone_count
         self._several: dict[frozenset[int], int] = {}
-        if self._cells is None:
-            polygons = np.array([zone.polygon for zone in prescription.zones], dtype=object)
-            self._parts, self._owner = (
-                shapely.get_parts(polygons, return_index=True)
-                if len(polygons)
-                else (np.empty(0, dtype=object), np.empty(0, dtype=np.int64))
-            )
-            shapely.prepare(self._parts)
-            self._tree = STRtree(self._parts)
+        zones = () if self._cells is not None else prescription.zones
+        # A list of no polygons would be one of numbers.
+        polygons = np.empty(len(zones), dtype=object)
+        polygons[:] = [zone.polygon for zone in zones]
+        self._parts, self._owner = shapely.get_parts(polygons, return_index=True)
+        shapely.prepare(self._parts)
+        self._tree = STRtree(self._parts)
 
     def keys(self, east_m: Floats, north_m: Floats) -> Ints:
         """Return the number of the zones at each point."""
@@ -82,7 +80,7 @@ class ZoneLookup:
             return np.zeros(max(pieces, 0), dtype=np.bool_)
         ends = np.arange(pieces + 1) * PIECE
         way_m = np.concatenate(([0.0], np.cumsum(np.hypot(np.diff(east_m), np.diff(north_m)))))
-        chords = np.stack((np.column_stack((east_m, north_m))[ends],), axis=0)[0]
+        chords = np.column_stack((east_m, north_m))[ends]
         chord_m = np.hypot(*(chords[1:] - chords[:-1]).T)
         length_m = np.diff(way_m[ends])
         # A point of a piece is no farther from its chord than at the top of the tightest arch.

@@ -32,6 +32,7 @@ from companion.core.types import (
     Input,
     OperatorCommand,
     OutputReport,
+    SprayerState,
     StandstillReport,
     VehicleState,
 )
@@ -61,7 +62,7 @@ STEP_MAX_S = 0.06
 # The record gets the treated ground so often while it grows, and commits it once a second: a cut of
 # power comes at any moment until the next commit, in the middle of that second on the mean. What
 # is written is what will be treated by then, so that a flight that goes on errs to both sides.
-COVERAGE_EVERY_S = 0.25
+COVERAGE_EVERY_S = 0.1
 COVERAGE_AHEAD_S = 0.5 + 0.5 * COVERAGE_EVERY_S
 
 
@@ -99,6 +100,7 @@ class ControlLoop:
         clock: Callable[[], float],
         sensors: Sequence[Sensor] = (),
         boot_clock: Callable[[], float] | None = None,
+        record_fault: Callable[[], str | None] | None = None,
     ) -> None:
         self._setup = setup
         self._boot_clock = boot_clock or boot_time_s
@@ -107,6 +109,8 @@ class ControlLoop:
         self._link = link
         self._executor = executor
         self._recorder = recorder
+        self._record_fault = record_fault
+        self._has_begun = False
         self._clock = clock
         self._track = Track()
         self._memory = Memory()
@@ -135,6 +139,7 @@ class ControlLoop:
         state = estimate(self._track, now_s)
         decision, self._memory = step(self._setup, state, self._memory, now_s)
         self._carry_out(decision)
+        self._note_begin(decision)
         self._recorder.record_decision(decision)
         if self._setup.records_coverage and now_s >= self._coverage_s + COVERAGE_EVERY_S:
             self._keep_coverage(state, now_s, ahead_s=COVERAGE_AHEAD_S)
@@ -199,9 +204,27 @@ class ControlLoop:
             self._link.tell(decision, decision.now_s)
             self._executor.submit(decision.plan)
 
+    def _note_begin(self, decision: Decision) -> None:
+        """Take when spraying may have begun, and when the vehicle is disarmed again."""
+        if decision.sprayer in (SprayerState.ARMED, SprayerState.SPRAYING):
+            self._has_begun = True
+        elif decision.state is not None and not decision.state.armed:
+            self._has_begun = False
+
+    def _missing_record(self) -> str | None:
+        """Return why nothing may begin without its record; None once it has begun.
+
+        A valve that closes in the middle of a field because a disk is full does more harm than a
+        gap in the record, which is counted and told.
+        """
+        if self._record_fault is None or self._has_begun:
+            return None
+        fault = self._record_fault()
+        return None if fault is None else f"journal: {fault}"
+
     def _output_report(self) -> Iterator[Input]:
         """Yield what changed in the way to the valves: the link to the vehicle, or the outputs."""
-        faults = (self._executor.fault, self._link.fault)
+        faults = (self._executor.fault or self._missing_record(), self._link.fault)
         if self._reported == faults:
             return
         first, self._reported = self._reported is None, faults
@@ -260,11 +283,13 @@ async def run(
     duration_s: float | None = None,
     clock: Callable[[], float] = time.monotonic,
     on_step: Callable[[], None] | None = None,
+    record_fault: Callable[[], str | None] | None = None,
 ) -> int:
     """Spray until a signal comes or `duration_s` is over; return 0 then.
 
     `on_step` is called after each step that was carried out, and at no other time: a watchdog that
-    it feeds sees a loop that stands still.
+    it feeds sees a loop that stands still. `record_fault`, if given, says why the record cannot be
+    kept: a flight then does not begin to spray; one that has begun goes on.
 
     Raises what went wrong otherwise, a `LinkError` for a link that cannot be opened, a
     `SensorError` for a sensor. The valves are closed before any sensor is let go. A link that
@@ -295,6 +320,7 @@ async def run(
                         recorder=taken,
                         clock=clock,
                         sensors=sensors,
+                        record_fault=record_fault,
                     )
                     await _turn_until_the_end(control, ending, duration_s, on_step)
                 finally:

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from shapely import MultiPolygon
 from shapely.affinity import translate
+from shapely.geometry.base import BaseGeometry
 
 from companion.config.tables import MissionTable
 from companion.core.frame import LocalFrame
 from companion.maps.local import as_area, polygons_of
 from companion.maps.registry import read_area
+from companion.record.continuing import is_journal, read_treated_ground, rest_of
+from companion.record.coverage_area import carried, carried_places
 from missions.energy import Battery
 from missions.errors import PlanError
 from missions.field import MARGIN_M, Field, local_area
 from missions.remaining import Break, Remaining, read_lines, remaining
+from missions.strips import Floats
 
 OVERLAP_M = 3.0
+# How rough the edge of treated ground is: gusts of 0.3 m.
+EDGE_M = 0.3
+# In squares as wide as a swath.
+SMALL_SWATHS = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +43,9 @@ class BreakAsked:
     def __post_init__(self) -> None:
         if self.resume is None and (self.stop is not None or self.sortie is not None):
             raise PlanError("--from and --sortie need --resume, the .geojson of the plan to go on")
-        if self.resume is not None and self.stop is None and self.done is None:
+        if self.resume is None or is_journal(self.resume):
+            return
+        if self.stop is None and self.done is None:
             raise PlanError(
                 "--resume needs --from LAT,LON, where the spraying stopped, or --done, "
                 "the treated ground"
@@ -85,16 +98,54 @@ def left_of(
     """
     if asked.resume is None:
         return None
-    treated = None
-    if asked.done is not None:
-        treated = translate(local_area(read_area(asked.done), frame), *offset_m)
+    is_flown = is_journal(asked.resume)
+    rows = _flown_lines(asked.resume, frame) if is_flown else read_lines(asked.resume, frame)
+    done = asked.resume if asked.done is None and is_flown else asked.done
+    treated = None if done is None else treated_area(done, frame, width_m, offset_m)
     since = Break(
         stop=None if asked.stop is None else frame.to_local(*asked.stop),
         sortie=asked.sortie,
         overlap_m=OVERLAP_M if mission is None else mission.resume_overlap_m,
         treated=treated,
     )
-    return remaining(read_lines(asked.resume, frame), since, width_m=width_m, frame=frame)
+    return remaining(rows, since, width_m=width_m, frame=frame)
+
+
+def _flown_lines(journal: Path, frame: LocalFrame) -> list[tuple[int, Floats]]:
+    """Return the planned lines that a flight had to keep to, straight piece by straight piece.
+
+    Raises:
+        PlanError: where it had none.
+    """
+    found = read_treated_ground(journal)
+    if found.setup.lines is None:
+        raise PlanError(
+            f"{journal}: its flight had no planned lines; give the plan's .geojson to --resume and "
+            "the journal to --done"
+        )
+    pieces = [piece for line in found.setup.lines.polylines for piece in pairwise(line)]
+    places = np.array(pieces, dtype=np.float64).reshape(-1, 2)
+    return [(1, row) for row in carried_places(places, found.frame, frame).reshape(-1, 4)]
+
+
+def treated_area(
+    done: Path, frame: LocalFrame, width_m: float, offset_m: tuple[float, float]
+) -> BaseGeometry:
+    """Return the treated ground of a file; of a journal all that is not left of its own field.
+
+    A journal's places are the receiver's, as the plan's are; an area is moved as the map. Its edge
+    is as rough as the flight was: swaths may overlap it a little, the guard of a flight that goes
+    on closes what is too much. Nobody flies for pieces much smaller than a swath is wide.
+    """
+    if not is_journal(done):
+        return translate(local_area(read_area(done), frame), *offset_m)
+    found = read_treated_ground(done)
+    field = found.setup.prescription.field
+    left = rest_of(field, found.coverage, found.strip_m)
+    small_m2 = SMALL_SWATHS * width_m**2
+    flown = [piece for piece in left.geoms if piece.area >= small_m2]
+    edge = field.difference(MultiPolygon(flown)).buffer(-EDGE_M).simplify(EDGE_M)
+    return carried(edge, found.frame, frame)
 
 
 def untreated(field: Field, done: Path, width_m: float, offset_m: tuple[float, float]) -> Field:
@@ -103,7 +154,7 @@ def untreated(field: Field, done: Path, width_m: float, offset_m: tuple[float, f
     Raises:
         PlanError: where nothing is left that a strip fits on.
     """
-    treated = translate(local_area(read_area(done), field.frame), *offset_m)
+    treated = treated_area(done, field.frame, width_m, offset_m)
     kept = treated.buffer(MARGIN_M, join_style="mitre")
     spray = as_area(polygons_of(field.spray.difference(kept)))
     if spray is None or spray.buffer(-width_m / 2.0).is_empty:

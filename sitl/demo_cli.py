@@ -24,13 +24,16 @@ from rich.table import Table
 
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError
+from sitl.demo_report import can_report, write_report
 
 if TYPE_CHECKING:
     from sitl.demo import DemoOptions, DemoResult
 
 JOURNAL = "flight-0001.gpkg"
 PICTURES = ("map.png", "lags.png", "flow.png")
-FILES = ("demo.json", "report.html", JOURNAL, *PICTURES)
+# The report of the journal's flight; a folder.
+FLIGHT_REPORT = "flight-report"
+FILES = ("demo.json", "report.html", JOURNAL, *PICTURES, FLIGHT_REPORT)
 # The table where the output is no terminal.
 WIDTH = 110
 # From here on there is room between the columns.
@@ -158,6 +161,10 @@ def _write(result: DemoResult, found: dict[str, Any], stage: Path) -> list[str]:
     (stage / "demo.json").write_text(text + "\n", encoding="utf-8")
     document = page(result, [stage / name for name in pictures])
     (stage / "report.html").write_text(document, encoding="utf-8")
+    if can_report():
+        write_report(stage / JOURNAL, stage / FLIGHT_REPORT)
+    else:
+        note("no report of the flight: pip install vrspray[report]")
     return [name for name in FILES if (stage / name).exists()]
 
 
@@ -165,6 +172,8 @@ def _move(names: Sequence[str], stage: Path, out: Path) -> None:
     """Put the files in their place, and take away those of an earlier demo that have no new one."""
     try:
         for name in FILES:
+            if name == FLIGHT_REPORT and (out / name).is_dir():
+                shutil.rmtree(out / name)
             if name in names:
                 (stage / name).replace(out / name)
             else:

@@ -79,9 +79,9 @@ def about(flight: AppliedFlight) -> About:
         utc_source=flight.utc_source,
         map_sha256=meta.get("map_sha256") or UNKNOWN,
         calibration_sha256=meta.get("calibration_sha256"),
-        operator=_text(asked, "operator"),
-        product=_text(asked, "product", "name"),
-        field_name=_text(asked, "field_name"),
+        operator=_text(asked, "application.operator"),
+        product=_text(asked, "product.name"),
+        field_name=_text(asked, "application.field_name"),
         is_closed=flight.is_closed,
         lost_rows=flight.lost,
         recorded_by=f"vrspray {meta.get('version_vrspray', UNKNOWN)}",
@@ -90,7 +90,7 @@ def about(flight: AppliedFlight) -> About:
 
 
 def _asked_before(meta: Mapping[str, str]) -> Mapping[str, object]:
-    """Return what was asked for before the flight; nothing where that cannot be read."""
+    """Return what was told before the flight, by dotted key; nothing where it cannot be read."""
     try:
         found = json.loads(meta.get("application_json") or "{}")
     except ValueError:
@@ -98,9 +98,7 @@ def _asked_before(meta: Mapping[str, str]) -> Mapping[str, object]:
     return found if isinstance(found, dict) else {}
 
 
-def _text(values: Mapping[str, object], *path: str) -> str | None:
-    """Return a text at a path of keys, on one line; None where there is none."""
-    found: object = values
-    for key in path:
-        found = found.get(key) if isinstance(found, Mapping) else None
+def _text(values: Mapping[str, object], key: str) -> str | None:
+    """Return a text on one line; None where there is none."""
+    found = values.get(key)
     return (" ".join(found.split()) or None) if isinstance(found, str) else None

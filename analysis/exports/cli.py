@@ -47,8 +47,8 @@ def export_journal(
 ) -> None:
     """Write what was applied for farms, maps and other programs.
 
-    Exit 0: all of the flight; 1: the journal was cut or lacks rows, what there is was written;
-    2: the journal, an option or OUT cannot be used.
+    Exit 0: all of the flight; 1: the journal was cut, is damaged or lacks rows, and what there is
+    was written; 2: the journal, an option or OUT cannot be used.
     """
     from analysis.exports.registry import format_for
     from analysis.exports.source import Source
@@ -60,11 +60,14 @@ def export_journal(
     _check_free(out, force=force)
     form.maker()  # what is not installed is said before the work
     note(f"reading {journal}")
-    flight = _read(journal)
+    unread: list[str] = []
+    flight = _read(journal, unread)
     note(f"writing {out} ({form.name})")
-    source = Source(flight=flight, shape=chosen, system=system, rate_hz=rate_hz)
+    source = Source(
+        flight=flight, shape=chosen, system=system, rate_hz=rate_hz, unread=tuple(unread)
+    )
     size = _write(source, form, out, force=force)
-    warnings = _warnings(flight)
+    warnings = [*_warnings(flight), *(f"not read: {each}" for each in unread)]
     result = {
         "out": str(out),
         "format": form.name,
@@ -80,11 +83,12 @@ def export_journal(
     raise typer.Exit(1 if warnings else 0)
 
 
-def _read(journal: Path) -> AppliedFlight:
+def _read(journal: Path, unread: list[str]) -> AppliedFlight:
+    """Return the flight; what of it is damaged is left out and said in `unread`."""
     from analysis.exports.output import ExportError
     from analysis.read_applied import read_applied
 
-    flight = read_applied(journal)
+    flight = read_applied(journal, unread=unread)
     if not len(flight.time_s):
         raise ExportError(f"{journal}: the flight never had a position; there is nothing to export")
     return flight

@@ -32,7 +32,7 @@ _BLOCK = 10_000
 def make(source: Source, out: Path) -> Content:
     """Return the table and what is to say about it."""
     samples = source.samples
-    columns = source.columns()
+    columns = list(source.columns)
     columns[1:1] = [
         _degrees("latitude_deg", samples.latitude_deg),
         _degrees("longitude_deg", samples.longitude_deg),

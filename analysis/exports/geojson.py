@@ -53,7 +53,7 @@ def _blocks(features: Iterable[str], *, between: str, end: str) -> Iterator[byte
 
 
 def _features(source: Source) -> Iterator[str]:
-    columns = source.columns()
+    columns = source.columns
     names = [each.name for each in columns]
     rows = zip(*(each.python() for each in columns), strict=True)
     for place, row in zip(_geometries(source), rows, strict=True):
@@ -70,5 +70,4 @@ def _geometries(source: Source) -> Iterator[str]:
     rounded = shapely.transform(
         np.array(source.swaths.polygons, dtype=object), lambda at: np.round(at, DEGREE_DECIMALS)
     )
-    # Not `to_geojson`: it writes seventeen digits.
-    return (json.dumps(shapely.geometry.mapping(each)) for each in rounded)
+    return iter(shapely.to_geojson(rounded).tolist())

@@ -32,6 +32,10 @@ _ADAPT_JSON = "adapt.json"
 _SCHEMA_VERSION = "2.0.0"
 _PRODUCT, _FIELD = "product-1", "field-1"
 _SECONDS_A_MINUTE = 60.0
+_OF_PRODUCT = (
+    "AppliedVolumePerAreaTarget", "AppliedVolumePerAreaActual", "AppliedVolumePerTime",
+    "AppliedTotalVolume",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,7 +181,7 @@ def _adapt_json(source: Source, fields: Sequence[_Field], table: str) -> bytes:
             "id": {"referenceId": f"variable-{number}"},
             "name": field.name,
             "definitionCode": field.code,
-            **({} if field.name == "timestamp" else {"productId": _PRODUCT}),
+            **({"productId": _PRODUCT} if field.code in _OF_PRODUCT else {}),
             "geoParquetColumnName": field.name,
         }
         for number, field in enumerate(fields, start=1)

@@ -7,7 +7,7 @@ that can be switched off.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,7 +52,7 @@ def make(source: Source, out: Path) -> Content:
 
 
 def _document(source: Source) -> Iterator[str]:
-    columns = source.columns()
+    columns = source.columns
     unit = source.units["rate"]
     rates = source.swaths.applied_l_ha * unit.factor
     limits = _limits(rates)
@@ -109,7 +109,9 @@ def _styles() -> Iterator[str]:
     yield "</Style>\n"
 
 
-def _applied(source: Source, columns: list[Column], classes: NDArray[np.int64]) -> Iterator[str]:
+def _applied(
+    source: Source, columns: Sequence[Column], classes: NDArray[np.int64]
+) -> Iterator[str]:
     # A document in the document: a schema belongs to one (section 9.7), and GDAL looks for the
     # schema of a layer nowhere else.
     yield '<Document>\n<name>applied</name>\n<Schema name="applied" id="applied">\n'

@@ -45,6 +45,8 @@ def write_beside(out: Path, content: Content, *, force: bool) -> int:
     try:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
             size = _write(Path(folder), content)
+            # Old parts under a new name would be taken for one set: the last goes first.
+            (out.parent / list(content)[-1]).unlink(missing_ok=True)
             for name in content:
                 (Path(folder) / name).replace(out.parent / name)
     except OSError as error:

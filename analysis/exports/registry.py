@@ -108,7 +108,7 @@ def format_for(out: Path, name: str | None) -> Format:
         found = next((each for each in FORMATS if suffix in each.suffixes), None)
         if found is None:
             raise ExportError(
-                f"{out}: no format is known by {suffix or 'a name without an end'!r}; there are "
+                f"{out}: no format is known by {suffix or 'a name without an end'}; there are "
                 f"{', '.join(_ends())}, a folder TASKDATA, or --format "
                 f"{', '.join(each.name for each in FORMATS)}"
             )

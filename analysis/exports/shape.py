@@ -40,7 +40,7 @@ _DATE = bytes((100, 1, 1))
 
 def make(source: Source, out: Path) -> Content:
     """Return the files of the set side by side, or in one zip; the `.shp` comes last."""
-    columns = [each for each in source.columns() if each.short not in _LEFT_OUT]
+    columns = [each for each in source.columns if each.short not in _LEFT_OUT]
     files = _table(source, columns) | {"-Deere-Metadata.json": _metadata(source, columns)}
     names = {
         f"{out.stem}{end}": content

@@ -22,13 +22,14 @@ Shape = Literal["points", "swaths", "steps"]
 class Source:
     """A flight and how it is wanted: `shape` is what a row is (`steps`: 10 ms).
 
-    `rate_hz` thins points.
+    `rate_hz` thins points; `unread` says what of the journal could not be read.
     """
 
     flight: AppliedFlight
     shape: Shape
     system: System = "metric"
     rate_hz: float | None = None
+    unread: tuple[str, ...] = ()
 
     @cached_property
     def record(self) -> FlightRecord:
@@ -72,20 +73,23 @@ class Source:
             return len(self.record.time_s)
         return len(self.samples) if self.shape == "points" else len(self.swaths)
 
-    def columns(self) -> list[Column]:
+    @cached_property
+    def columns(self) -> tuple[Column, ...]:
         """Return the columns of a row, without its place."""
         if self.shape == "points":
-            return point_columns(self.samples, self.about, self.units)
+            return tuple(point_columns(self.samples, self.about, self.units))
         if self.shape == "steps":
-            return []
-        return swath_columns(self.swaths, self.about, self.units, self.valve_names)
+            return ()
+        return tuple(swath_columns(self.swaths, self.about, self.units, self.valve_names))
 
     def facts(self) -> dict[str, object]:
         """Return what is said of an export once: the flight, and the units of the columns."""
         facts = self.about.as_json() | {"volume_l": round(self.volume_l, 6), "rows": self.rows}
+        if self.unread:
+            facts["unread"] = list(self.unread)
         if self.shape == "swaths":
             facts["unmapped_ml"] = round(self.swaths.unmapped_ml, 6)
         facts["units"] = {
-            each.name: each.unit.label for each in self.columns() if each.unit is not None
+            each.name: each.unit.label for each in self.columns if each.unit is not None
         }
         return facts

@@ -11,15 +11,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
-from shapely import MultiPoint, MultiPolygon, Polygon
 
 from analysis.exports.ground import geographic
+from analysis.exports.outlines import outlines
 from analysis.exports.samples import FLOW_MIN_L_MIN, duty_at
 from analysis.strips import Strip, strips_of
 
 if TYPE_CHECKING:
+    from shapely import MultiPolygon, Polygon
+
     from analysis.applied_flight import AppliedFlight
     from analysis.flight_record import FlightRecord
 
@@ -27,11 +28,6 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 LENGTH_M = 10.0
-# Corners of the edges lie so far apart at most; what is straighter than a centimetre loses them.
-_CORNER_M = 0.5
-_STRAIGHT_M = 0.01
-# What is no area at all is given this much, so that it can be drawn.
-_HAIR_M = 0.001
 # Less ground than this is a valve open over one spot: no polygon, its volume is said in `unmapped`.
 _AREA_MIN_M2 = 0.01
 
@@ -88,21 +84,15 @@ def swaths_of(flight: AppliedFlight, record: FlightRecord) -> Swaths:
     mapped = order[found.area_m2[order] >= _AREA_MIN_M2]
     strip, first, last = found.strip[mapped], found.first[mapped], found.last[mapped]
     area_m2, volume_ml = found.area_m2[mapped], found.volume_ml[mapped]
-    rings = [
-        _outline(strips[number], begin, end)
-        for number, begin, end in zip(strip.tolist(), first.tolist(), last.tolist(), strict=True)
-    ]
+    rings = np.empty(len(strip), dtype=object)
+    distance_m = np.zeros(len(strip))
+    for number, each in enumerate(strips):
+        its = np.flatnonzero(strip == number)
+        rings[its] = outlines(each.track, first[its], last[its])
+        distance_m[its] = each.track.distance_m[last[its]] - each.track.distance_m[first[its]]
     middle = (first + last) // 2
     start_s, end_s = record.time_s[first], record.time_s[last]
     middle_s = 0.5 * (start_s + end_s)
-    distance_m = np.array(
-        [
-            strips[number].track.distance_m[end] - strips[number].track.distance_m[begin]
-            for number, begin, end in zip(
-                strip.tolist(), first.tolist(), last.tolist(), strict=True
-            )
-        ]
-    )
     centre_m = np.array(
         [
             (strips[number].track.east_m[at], strips[number].track.north_m[at])
@@ -112,7 +102,7 @@ def swaths_of(flight: AppliedFlight, record: FlightRecord) -> Swaths:
     latitude_deg, longitude_deg = flight.setup.frame.to_geographic_all(*centre_m.T.tolist())
     duty = duty_at(flight.changes, middle_s, len(strips))
     return Swaths(
-        polygons=tuple(geographic(rings, flight.setup.frame)),
+        polygons=tuple(geographic(rings.tolist(), flight.setup.frame)),
         valve=strip,
         start_s=start_s,
         end_s=end_s,
@@ -170,34 +160,3 @@ def _stretches(strip: Strip, number: int) -> _Stretches:
         area_m2=swept_m2[last] - swept_m2[first],
         volume_ml=track.volume_ml[last] - track.volume_ml[first],
     )
-
-
-def _outline(strip: Strip, first: int, last: int) -> Polygon | MultiPolygon:
-    """Return the ground between two samples, in metres: left edge there, right edge back."""
-    track = strip.track
-    corners = np.floor((track.distance_m[first : last + 1] - track.distance_m[first]) / _CORNER_M)
-    at = first + np.unique(corners, return_index=True)[1]
-    if at[-1] != last:
-        at = np.append(at, last)
-    east_m, north_m = track.east_m[at], track.north_m[at]
-    half_m = 0.5 * track.width_m
-    right_e, right_n = (
-        half_m * np.cos(track.heading_rad[at]),
-        -half_m * np.sin(track.heading_rad[at]),
-    )
-    left = np.stack((east_m - right_e, north_m - right_n), axis=1)
-    right = np.stack((east_m + right_e, north_m + right_n), axis=1)
-    ring = Polygon(np.concatenate((left, right[::-1]))).simplify(_STRAIGHT_M)
-    if isinstance(ring, Polygon) and ring.is_valid and not ring.is_empty:
-        return ring
-    return _of_pieces(left, right)
-
-
-def _of_pieces(left: Floats, right: Floats) -> Polygon | MultiPolygon:
-    """Return the ground of an edge that crosses itself: all pieces between corners, as one."""
-    corners = np.stack((left[:-1], left[1:], right[1:], right[:-1]), axis=1)
-    pieces = [MultiPoint(each).convex_hull for each in corners]
-    found = shapely.union_all([each for each in pieces if isinstance(each, Polygon)])
-    if isinstance(found, Polygon | MultiPolygon) and not found.is_empty:
-        return found
-    return MultiPoint(np.concatenate((left, right))).convex_hull.buffer(_HAIR_M)

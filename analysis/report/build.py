@@ -53,7 +53,7 @@ class Report:
     def is_whole(self) -> bool:
         """Return whether the journal had all that a flight leaves behind."""
         flight = self.contents["flight"]
-        return bool(flight["is_closed"] and not flight["lost"])
+        return bool(flight["is_closed"] and not flight["lost"] and not flight["unread"])
 
 
 def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: None) -> Report:
@@ -64,13 +64,14 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
         ConfigError: where an entry of the record or the time zone is none.
     """
     say(f"reading {journal.name}")
-    flight = read_applied(journal)
+    unread: list[str] = []
+    flight = read_applied(journal, unread=unread)
     told = told_with(flight.meta, file=options.application_file, changes=options.changes)
     say("evaluating")
     assessment, why_not = _assessed(flight)
     treated = treated_of(flight)
     clock = _clock(flight, told, treated, options.time_zone)
-    facts = facts_of(flight, treated, clock, **_volumes(assessment))
+    facts = facts_of(flight, treated, clock, unread=len(unread), **_volumes(assessment))
     records = [legal_record(each, told, facts) for each in _profiles(options, told)]
     contents = contents_of(
         flight,
@@ -79,6 +80,7 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
         clock=clock,
         told=told,
         records=records,
+        unread=unread,
         why_not_evaluated=why_not,
     )
     say("drawing")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -42,15 +43,24 @@ def contents_of(
     clock: Clock,
     told: Told,
     records: Sequence[LegalRecord],
+    unread: Sequence[str] = (),
     why_not_evaluated: str = "",
 ) -> dict[str, Any]:
     """Return the whole content of a report."""
-    warnings = warnings_of(flight, assessment, clock, records, why_not_evaluated)
+    warnings = warnings_of(
+        flight,
+        assessment,
+        clock,
+        records,
+        treated=treated,
+        unread=unread,
+        why_not_evaluated=why_not_evaluated,
+    )
     metrics = {"journal": flight.path.name, **dict.fromkeys(METRICS)}
-    return {
+    contents = {
         "report_version": REPORT_VERSION,
         "program": {"name": "vrspray", "version": _version()},
-        "flight": _flight(flight, treated, clock, told),
+        "flight": {**_flight(flight, treated, clock, told), "unread": list(unread)},
         "verdict": verdict_of(assessment, treated),
         "warnings": [warning.as_json() for warning in warnings],
         **(metrics if assessment is None else assessment.as_json()),
@@ -67,6 +77,23 @@ def contents_of(
             for key, (name, unit, text) in DEFINITIONS.items()
         },
     }  # fmt: skip
+    cleaned: dict[str, Any] = finite(contents)
+    return cleaned
+
+
+def finite(value: Any) -> Any:
+    """Return a value as JSON has it: what is no finite number is missing.
+
+    >>> finite({"a": [float("nan"), 1.0]})
+    {'a': [None, 1.0]}
+    """
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return value
 
 
 def table_5(groups: Sequence[AccuracyGroup]) -> dict[str, Any]:

@@ -25,8 +25,12 @@ def facts_of(
     volume_l: float,
     volume_by: str,
     prescribed_l: float | None,
+    unread: int = 0,
 ) -> Facts:
-    """Return the facts; `volume_by` says in words what measured `volume_l`."""
+    """Return the facts; `volume_by` says in words what measured `volume_l`.
+
+    `unread` is how many parts of the journal could not be read; they count as lost rows.
+    """
     first = clock.at(treated.first_s)
     spraying = while_spraying(flight)
     latitude_deg, longitude_deg = _place(flight, treated)
@@ -53,7 +57,7 @@ def facts_of(
         wind_m_s=_wind(flight, treated),
         training=flight.training,
         is_closed=flight.is_closed,
-        lost_rows=flight.lost,
+        lost_rows=flight.lost + unread,
         ends_spraying=ends_spraying(flight, treated),
         map_sha256=flight.setup.prescription.sha256,
         treated_area=treated.as_geojson(flight.setup.frame),

@@ -175,10 +175,12 @@ def _why_not(facts: Facts) -> Iterator[str]:
     if facts.ends_spraying:
         yield "the end of the spraying: the journal was cut while valves were open"
     if facts.lost_rows:
-        yield f"{facts.lost_rows} rows of the journal"
+        yield f"{facts.lost_rows} lost or unreadable rows of the journal"
 
 
 def _remarks(told: Told, facts: Facts) -> Iterator[str]:
+    if facts.has_area:
+        yield f"quantities are by the {facts.volume_by}"
     if facts.clock_source == "computer":
         yield "times are by the clock of the companion, not verified"
     if facts.clock_source == "operator":

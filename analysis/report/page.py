@@ -79,6 +79,10 @@ def _signed(value: float | None, digits: int) -> str:
     return NOTHING if value is None else f"{value:+,.{digits}f}"
 
 
+def _percent(text: str) -> str:
+    return text if text == NOTHING else f"{text} %"
+
+
 def _span(interval: Mapping[str, Any], digits: int) -> str:
     """Return an interval as it is read; too few independent measurements have none."""
     low, high = interval["low"], interval["high"]
@@ -88,6 +92,7 @@ def _span(interval: Mapping[str, Any], digits: int) -> str:
 FILTERS: dict[str, Callable[..., str]] = {
     "f": _number,
     "signed": _signed,
+    "percent": _percent,
     "span": _span,
     "duration": duration_text,
 }

@@ -13,15 +13,22 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.backends.backend_pdf import PdfPages
 
-from analysis.report.figures.style import INK, QUIET, RED, new_figure, styled
+from analysis.report.figures.style import INK, QUIET, new_figure, styled
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from analysis.report.figures.style import Drawn
 
 # Fits A4 and Letter, each of which is a little more in one direction.
 PAGE_IN = (8.27, 11.0)
-LINES, COLUMNS = 66, 92
-TOP, LEFT, LINE = 0.95, 0.08, 0.0135
+COLUMNS = 105
+TOP, BOTTOM, LEFT = 0.95, 0.06, 0.08
+# Of the page's height, for one line of each style.
+HEIGHTS = {"title": 0.026, "head": 0.018, "mark": 0.022}
+LINE = 0.0138
+
+ALARM = "#A11B00"
 
 _Line = tuple[str, str]  # style, text
 
@@ -30,21 +37,29 @@ def pdf_of(contents: Mapping[str, Any], figures: Iterable[Drawn]) -> bytes:
     """Return the report as PDF."""
     file = io.BytesIO()
     with styled(), PdfPages(file, metadata={"Creator": "vrspray", "CreationDate": None}) as pages:
-        lines = [*_lines(contents)]
-        for start in range(0, len(lines), LINES):
-            page = new_figure(PAGE_IN[1], PAGE_IN[0])
-            for row, (style, text) in enumerate(lines[start : start + LINES]):
-                page.text(LEFT, TOP - LINE * row, text, va="top", **STYLES[style])
+        for page in _pages(contents):
             pages.savefig(page)
         for drawn in figures:
             pages.savefig(drawn.figure)
     return file.getvalue()
 
 
+def _pages(contents: Mapping[str, Any]) -> Iterator[Figure]:
+    page, at = new_figure(PAGE_IN[1], PAGE_IN[0]), TOP
+    for style, text in _lines(contents):
+        height = HEIGHTS.get(style, LINE)
+        if at - height < BOTTOM:
+            yield page
+            page, at = new_figure(PAGE_IN[1], PAGE_IN[0]), TOP
+        page.text(LEFT, at, text, va="top", **STYLES[style])
+        at -= height
+    yield page
+
+
 STYLES: dict[str, dict[str, Any]] = {
     "title": {"size": 15, "weight": "bold", "color": INK},
     "head": {"size": 10, "weight": "bold", "color": INK},
-    "mark": {"size": 13, "weight": "bold", "color": RED},
+    "mark": {"size": 13, "weight": "bold", "color": ALARM},
     "text": {"size": 8.5, "color": INK},
     "quiet": {"size": 8, "color": QUIET},
 }
@@ -58,7 +73,7 @@ def _lines(contents: Mapping[str, Any]) -> Iterator[_Line]:
     for each in contents["warnings"]:
         if each["severity"] == "mark":
             yield "mark", each["text"]
-    yield from _wrapped("head", contents["verdict"]["sentence"])
+    yield from _wrapped("head", contents["verdict"]["sentence"], 88)
     yield "text", ""
     when = f"{flight['spraying_from'] or flight['started'] or 'time not known'}"
     yield from _wrapped("text", f"{when}, time zone {flight['time_zone']}, {flight['clock']}")
@@ -87,7 +102,7 @@ def _metrics(contents: Mapping[str, Any]) -> Iterator[_Line]:
 
 def _record(record: Mapping[str, Any]) -> Iterator[_Line]:
     yield "text", ""
-    yield from _wrapped("head", f"Record of the application: {record['law']}")
+    yield from _wrapped("head", f"Record of the application: {record['law']}", 88)
     if record["complete"]:
         yield "text", "Complete."
     else:

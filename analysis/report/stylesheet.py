@@ -23,9 +23,8 @@ ul.warnings li.warning { border-color: var(--alarm); }
 dl.head { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.2rem; margin: 0; }
 dl.head dt { color: var(--quiet); }
 dl.head dd { margin: 0; overflow-wrap: anywhere; }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: .6rem;
-  margin: 1rem 0; }
-.tile { border: 1px solid var(--line); padding: .5rem .7rem; }
+.tiles { display: flex; flex-wrap: wrap; gap: .6rem; margin: 1rem 0; }
+.tile { flex: 1 1 8rem; border: 1px solid var(--line); padding: .5rem .7rem; }
 .tile b { display: block; font-size: 1.35rem; }
 .tile span { color: var(--quiet); font-size: .85rem; }
 figure { margin: 1rem 0; break-inside: avoid; }
@@ -35,7 +34,10 @@ figcaption { font-size: .85rem; }
 table { border-collapse: collapse; width: 100%; margin: .5rem 0 1rem; font-size: .9rem; }
 caption { text-align: left; padding-bottom: .2rem; }
 th, td { padding: .22rem .6rem .22rem 0; text-align: left; vertical-align: top;
-  border-bottom: 1px solid var(--line); overflow-wrap: anywhere; }
+  border-bottom: 1px solid var(--line); overflow-wrap: break-word; }
+table.record { table-layout: fixed; }
+table.record td { overflow-wrap: anywhere; }
+td.k { white-space: nowrap; }
 th { font-weight: 600; border-bottom: 1.5px solid var(--ink); }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 tr.missing td { color: var(--alarm); font-weight: 600; }
@@ -48,6 +50,8 @@ code { overflow-wrap: anywhere; }
   body { max-width: none; padding: 0; font-size: 10pt; }
   h2 { break-after: avoid; }
   h3, caption { break-after: avoid; }
+  table { font-size: 8.5pt; }
+  .verdict { font-size: 12pt; }
   tr, .tile, ul.warnings li { break-inside: avoid; }
   thead { display: table-header-group; }
   details { display: none; }

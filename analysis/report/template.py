@@ -14,7 +14,7 @@ PAGE = """<!DOCTYPE html>
 <body>
 <header>
 <h1>Spray report</h1>
-<p class="quiet">{{ flight.told.get("application.field_name") or flight.file }}
+<p class="quiet">{{ flight.told.get("application.field_name") or flight.file }}\
 {% if flight.spraying_from or flight.started %}, {{ flight.spraying_from or flight.started }}{% endif %}</p>
 {% for each in warnings if each.severity == "mark" %}<p class="mark">{{ each.text }}</p>
 {% endfor %}<p class="verdict">{{ verdict.sentence }}</p>
@@ -62,8 +62,8 @@ Settled, as in Wang et al. 2024: {{ settled_lag_distance_m.mean|signed(3) }} m o
 {{ groups("Settled lag distance by rate (P1, Fig. 8a)", breakdowns.settled_by_rate) }}
 {{ groups("Settled lag distance by speed (P1, Fig. 8b)", breakdowns.settled_by_speed) }}
 <h2>Spraying accuracy</h2>
-<p>{{ spraying_accuracy_percent|f(2) }} % (95 % interval {{ intervals.spraying_accuracy_percent|span(2) }} %),
-starting {{ starting_accuracy_percent|f(2) }} %, settled {{ settled_accuracy_percent|f(2) }} %;
+<p>{{ spraying_accuracy_percent|f(2)|percent }} (95 % interval {{ intervals.spraying_accuracy_percent|span(2) }} %),
+starting {{ starting_accuracy_percent|f(2)|percent }}, settled {{ settled_accuracy_percent|f(2)|percent }};
 {{ breakdowns.undefined_samples }} samples with nothing prescribed are left out.
 Misapplied {{ misapplied_percent|f(2) }} % (95 % interval {{ intervals.misapplied_percent|span(2) }} %).</p>
 {% if table_5.rows_shown %}<div class="scroll"><table>
@@ -83,9 +83,9 @@ Misapplied {{ misapplied_percent|f(2) }} % (95 % interval {{ intervals.misapplie
 <h2>Volume balance</h2>
 <table><thead><tr><th>by</th><th class="n">L</th><th class="n">against the prescribed</th><th class="n">against the model</th></tr></thead><tbody>
 <tr><td>prescription, on the ground flown over</td><td class="n">{{ balance.prescribed_l|f(3) }}</td><td></td><td></td></tr>
-<tr><td>model: executed changes, calibrated curves, lags</td><td class="n">{{ balance.model_l|f(3) }}</td><td class="n">{{ balance.model_to_prescribed_percent|signed(2) }} %</td><td></td></tr>
-<tr><td>flow meter{% if balance.meter_spread_percent is not none %} (\u00b1{{ balance.meter_spread_percent|f(1) }} %){% endif %}</td><td class="n">{{ balance.meter_l|f(3) }}</td><td class="n">{{ balance.meter_to_prescribed_percent|signed(2) }} %</td><td class="n">{{ balance.meter_to_model_percent|signed(2) }} %</td></tr>
-<tr><td>tank{% if balance.tank_start_l is not none %} ({{ balance.tank_start_l|f(2) }} L to {{ balance.tank_end_l|f(2) }} L, refilled {{ balance.refilled_l|f(2) }} L){% endif %}</td><td class="n">{{ balance.tank_l|f(3) }}</td><td></td><td class="n">{{ balance.tank_to_model_percent|signed(2) }} %</td></tr>
+<tr><td>model: executed changes, calibrated curves, lags</td><td class="n">{{ balance.model_l|f(3) }}</td><td class="n">{{ balance.model_to_prescribed_percent|signed(2)|percent }}</td><td></td></tr>
+<tr><td>flow meter{% if balance.meter_spread_percent is not none %} (\u00b1{{ balance.meter_spread_percent|f(1) }} %){% endif %}</td><td class="n">{{ balance.meter_l|f(3) }}</td><td class="n">{{ balance.meter_to_prescribed_percent|signed(2)|percent }}</td><td class="n">{{ balance.meter_to_model_percent|signed(2)|percent }}</td></tr>
+<tr><td>tank{% if balance.tank_start_l is not none %} ({{ balance.tank_start_l|f(2) }} L to {{ balance.tank_end_l|f(2) }} L, refilled {{ balance.refilled_l|f(2) }} L){% endif %}</td><td class="n">{{ balance.tank_l|f(3) }}</td><td></td><td class="n">{{ balance.tank_to_model_percent|signed(2)|percent }}</td></tr>
 </tbody></table>
 <p>Border: margin {{ border_margin_m.mean|f(3) }} m in the mean, least {{ border_margin_m.min|f(3) }} m of {{ border_margin_m.count }} crossings;
 gaps at switches {{ gap_m2|f(2) }} m\u00b2, overlap {{ overlap_m2|f(2) }} m\u00b2.</p>
@@ -97,17 +97,18 @@ gaps at switches {{ gap_m2|f(2) }} m\u00b2, overlap {{ overlap_m2|f(2) }} m\u00b
 {% endfor %}</tbody></table>
 <p class="quiet">{{ durations.recorded_s|f(1) }} s recorded, {{ durations.spraying_s|f(1) }} s spraying.</p>{% endif %}
 {% if events %}<table><thead><tr><th>time</th><th>event</th><th>text</th></tr></thead><tbody>
-{% for each in events_shown %}<tr><td>{{ each.time or each.time_s|f(1) ~ " s" }}</td><td>{{ each.kind }}</td><td>{{ each.text }}</td></tr>
+{% for each in events_shown %}<tr><td>{{ each.time or (each.time_s|f(1) ~ " s") }}</td><td>{{ each.kind }}</td><td>{{ each.text }}</td></tr>
 {% endfor %}</tbody></table>
 {% if events|length > events_shown|length %}<p class="quiet">{{ events|length - events_shown|length }} more are in report.json.</p>{% endif %}
 {% else %}<p>No events were recorded.</p>{% endif %}
 <h2>Record of the application</h2>
 {% for profile, record in application.items() %}
-<h3>{{ record.law }}</h3>
+<h3>{{ record.law[:1]|upper }}{{ record.law[1:] }}</h3>
 {% if record.complete %}<p>Complete: every field that this record asks for has a value.</p>
 {% else %}<p class="incomplete">INCOMPLETE. Missing: {{ record.missing|join(", ") }}.</p>{% endif %}
+{% if not record.complete %}<p class="quiet">What is known and only missing here is given by --set KEY=VALUE or --application FILE to vrspray report, and is marked as said after the flight.</p>{% endif %}
 {% if record.added_after_flight %}<p>Added after the flight: {{ record.added_after_flight|join(", ") }}.</p>{% endif %}
-<table><thead><tr><th>field</th><th>value</th><th>said</th></tr></thead><tbody>
+<table class="record"><thead><tr><th>field</th><th>value</th><th>said</th></tr></thead><tbody>
 {% for name, entry in record.fields.items() %}<tr{% if name in record.missing %} class="missing"{% endif %}><td>{{ entry.label }}</td>\
 <td>{% if name in record.missing %}MISSING{% elif entry.value is none %}-{% else %}{{ entry.value }} {{ entry.unit }}{% endif %}\
 {% if entry.replaced is defined %} <small>(before: {{ entry.replaced }})</small>{% endif %}</td><td>{{ entry.said }}</td></tr>
@@ -130,7 +131,7 @@ gaps at switches {{ gap_m2|f(2) }} m\u00b2, overlap {{ overlap_m2|f(2) }} m\u00b
 {% if setup.config_toml %}<details><summary>The configuration as it was flown</summary><pre>{{ setup.config_toml }}</pre>
 {% if setup.config_overrides %}<pre>{{ setup.config_overrides }}</pre>{% endif %}</details>{% endif %}
 <h2>What the figures mean</h2>
-<table><tbody>{% for key, each in definitions.items() %}<tr><td>{{ each.name }}</td><td>{{ each.unit }}</td><td>{{ each.text }}</td></tr>
+<table><tbody>{% for key, each in definitions.items() %}<tr><td class="k">{{ each.name }}</td><td class="k">{{ each.unit }}</td><td>{{ each.text }}</td></tr>
 {% endfor %}</tbody></table>
 <p class="quiet">Figures are at the nozzle: where droplets land also depends on wind, tilt and droplet size. Made by {{ program.name }} {{ program.version }}.</p>
 </main>
@@ -146,7 +147,7 @@ MACROS = """
 {% endif %}{% endmacro %}
 {% macro groups(title, rows) %}{% if rows %}<div class="scroll"><table><caption>{{ title }}</caption>
 <thead><tr><th></th><th class="n">changes</th><th class="n">mean [m]</th><th class="n">95 % [m]</th><th class="n">mean abs. [m]</th><th class="n">worst [m]</th><th class="n">apart</th><th class="n">missed</th></tr></thead><tbody>
-{% for each in rows[:40] %}<tr><td>{{ each.name }}</td><td class="n">{{ each.lag_distance_m.count }}</td><td class="n">{{ each.lag_distance_m.mean|signed(3) }}</td>\
+{% for each in rows[:40] %}<tr><td class="k">{{ each.name }}</td><td class="n">{{ each.lag_distance_m.count }}</td><td class="n">{{ each.lag_distance_m.mean|signed(3) }}</td>\
 <td class="n">{{ each.lag_distance_m|span(3) }}</td><td class="n">{{ each.lag_distance_abs_m.mean|f(3) }}</td><td class="n">{{ each.max_abs_m|f(3) }}</td><td class="n">{{ each.apart }}</td><td class="n">{{ each.missed }}</td></tr>
 {% endfor %}</tbody></table></div>
 {% if rows|length > 40 %}<p class="quiet">{{ rows|length - 40 }} more rows are in report.json.</p>{% endif %}{% endif %}{% endmacro %}

@@ -56,7 +56,18 @@ def told_in(meta: Mapping[str, str]) -> dict[str, Any]:
         return {}
     if not isinstance(found, dict):
         return {}
-    return {key: value for key, value in found.items() if is_told(value)}
+    return {key: value for key, value in found.items() if is_told(value) and _is_entry(key, value)}
+
+
+def _is_entry(key: str, value: Any) -> bool:
+    """Return whether this could have been said: what a file was made to say is not believed."""
+    if key not in _known():
+        return False
+    try:
+        _check({key: value})
+    except ConfigError:
+        return False
+    return True
 
 
 def told_with(
@@ -67,7 +78,7 @@ def told_with(
     later = {} if file is None else _read(file)
     later |= dict(_parsed(change) for change in changes)
     values = {**before, **later}
-    _check({**{key: value for key, value in before.items() if key in _known()}, **later})
+    _check(later)
     after = {key for key, value in later.items() if before.get(key) != value}
     return Told(
         values={key: value for key, value in values.items() if is_told(value)},
@@ -123,16 +134,26 @@ def _parsed(change: str) -> tuple[str, Any]:
 
     >>> _parsed('application.customer="A. Farmer"'), _parsed("application.crop_eppo=TRZAW")
     (('application.customer', 'A. Farmer'), ('application.crop_eppo', 'TRZAW'))
+    >>> _parsed("application.growth_stage_bbch=31"), _parsed("application.wind_m_s=2")
+    (('application.growth_stage_bbch', '31'), ('application.wind_m_s', 2))
     """
     key, equals, text = change.partition("=")
-    key = key.strip()
+    key, text = key.strip(), text.strip()
     if not equals or key not in _known():
         raise ConfigError(
             f"--set {change}: no entry of the record; write one such as application.customer=NAME "
             "or product.name=NAME"
         )
     try:
-        parsed = tomllib.loads(f"value = {text.strip()}")
+        parsed = tomllib.loads(f"value = {text}")
     except (tomllib.TOMLDecodeError, RecursionError):
-        return key, text.strip()
-    return key, parsed["value"] if list(parsed) == ["value"] else text.strip()
+        return key, text
+    value = parsed["value"] if list(parsed) == ["value"] else text
+    # A certificate's number and a growth stage are digits, and no numbers.
+    return key, value if isinstance(value, str) or _is_number(key) else text
+
+
+def _is_number(key: str) -> bool:
+    table, _, name = key.partition(".")
+    fields = ApplicationTable.model_fields if table == "application" else ProductTable.model_fields
+    return "float" in str(fields[name].annotation)

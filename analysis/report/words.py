@@ -36,8 +36,8 @@ LATCHED = frozenset(
 )  # fmt: skip
 # A meter of 3 % and a curve of a few percent may differ by this much and be sound.
 METER_OFF_PERCENT = 6.0
-# Less than this is a moment at the start, while the first messages come in.
-MOMENT_S = 0.5
+# Longer than this between two samples nobody knows what held.
+GAP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,13 +96,17 @@ def warnings_of(
     assessment: Assessment | None,
     clock: Clock,
     records: Sequence[LegalRecord],
+    *,
+    treated: Treated,
+    unread: Sequence[str],
     why_not_evaluated: str,
 ) -> list[Caution]:
     """Return what must be known, the gravest first."""
     found = [
         *_training(flight),
         *_journal(flight, clock),
-        *_inhibited(flight, assessment),
+        *(_warning("unread", f"Of the journal could not be read: {each}.") for each in unread),
+        *_inhibited(flight, assessment, treated),
         *_flow(assessment, why_not_evaluated),
         *_records(records),
     ]
@@ -143,21 +147,43 @@ def _journal(flight: AppliedFlight, clock: Clock) -> Iterator[Caution]:
         yield _warning("clock", "Times are by the clock of the companion, which nobody verified.")
 
 
-def _inhibited(flight: AppliedFlight, assessment: Assessment | None) -> Iterator[Caution]:
-    if assessment is not None:
-        held_s = assessment.durations.by_inhibit_s
-        position = {key: held_s[key] for key in sorted(POSITION & held_s.keys())}
-        if sum(position.values()) > MOMENT_S:
-            text = ", ".join(f"{key} {value:.1f} s" for key, value in position.items())
-            yield _warning("position", f"Position not good enough, valves held closed: {text}.")
-        latched = {key: held_s[key] for key in sorted(LATCHED & held_s.keys())}
-        if latched:
-            text = ", ".join(f"{key} {value:.1f} s" for key, value in latched.items())
-            yield _warning("fault", f"Faults or stops held the valves closed: {text}.")
-        if assessment.durations.unknown_s > 0.0:
-            gap = duration_text(assessment.durations.unknown_s)
-            yield _warning("gap", f"For {gap} the journal does not say what the sprayer did.")
+def _inhibited(
+    flight: AppliedFlight, assessment: Assessment | None, treated: Treated
+) -> Iterator[Caution]:
+    held_s = held_between(flight, treated.first_s, treated.last_s)
+    for code, reasons, text in (
+        ("position", POSITION, "Position not good enough during the work, valves held closed"),
+        ("fault", LATCHED, "Faults or stops held the valves closed during the work"),
+    ):
+        found = {key: held_s[key] for key in sorted(reasons & held_s.keys())}
+        if found:
+            times = ", ".join(f"{key} {value:.1f} s" for key, value in found.items())
+            yield _warning(code, f"{text}: {times}.")
+    if assessment is not None and assessment.durations.unknown_s > 0.0:
+        gap = duration_text(assessment.durations.unknown_s)
+        yield _warning("gap", f"For {gap} the journal does not say what the sprayer did.")
     yield from _faults(event.text or event.kind for event in flight.events if _is_fault(event.kind))
+
+
+def held_between(
+    flight: AppliedFlight, first_s: float | None, last_s: float | None
+) -> dict[str, float]:
+    """Return for how long each reason held the valves closed between two times.
+
+    Before the first and after the last spraying much is missing, and rightly so.
+    """
+    held_s: dict[str, float] = {}
+    if first_s is None or last_s is None:
+        return held_s
+    ends_s = [*flight.time_s[1:].tolist(), *flight.time_s[-1:].tolist()]
+    for begin_s, end_s, reasons in zip(
+        flight.time_s.tolist(), ends_s, flight.inhibits, strict=True
+    ):
+        length_s = min(end_s, last_s) - max(begin_s, first_s)
+        if reasons and 0.0 < length_s <= GAP_S:
+            for reason in reasons.split():
+                held_s[reason] = held_s.get(reason, 0.0) + length_s
+    return held_s
 
 
 def _is_fault(kind: str) -> bool:

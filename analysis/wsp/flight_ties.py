@@ -74,7 +74,7 @@ def _tie(flight: AppliedFlight, each: Numbered, place: Position) -> tuple[Row, C
         "deposit_l_ha": main.l_ha,
         "coverage_percent": main.coverage_percent,
         "deposits_per_cm2": main.deposits_per_cm2,
-        "drops_per_cm2": each.card.drops_per_cm2,
+        "drops_per_cm2": each.card.better.drops_per_cm2,
     }
     return row, CardAtChange(
         card=each.number,

@@ -39,7 +39,7 @@ def draw_sheet(pixels: Bytes, cards: Sequence[tuple[int, Card]], path: Path) -> 
         corners = [(float(x) / factor, float(y) / factor) for x, y in card.outline.corners]
         drawing.line([*corners, corners[0]], fill=_OUTLINE, width=line)
         _label(drawing, f"{number}", corners, font)
-    image.save(path, quality=88, dpi=None if not cards else (cards[0][1].dpi / factor,) * 2)
+    image.save(path, quality=88)
 
 
 def _label(
@@ -91,9 +91,8 @@ def draw_distributions(cards: Sequence[Numbered], path: Path) -> None:
         volume.axhline(part, color="0.8", linewidth=0.8, zorder=0)
     numbers = np.arange(1, len(cards) + 1)
     counted = [each.card.main.deposits_per_cm2 for each in cards]
-    corrected = [
-        np.nan if each.card.drops_per_cm2 is None else each.card.drops_per_cm2 for each in cards
-    ]
+    drops = [each.card.better.drops_per_cm2 for each in cards]
+    corrected = [np.nan if each is None else each for each in drops]
     density.bar(numbers, counted, color="#4477aa", label="stains counted")
     density.plot(numbers, corrected, "k_", markersize=9, label="corrected for overlap")
     density.axhline(INSECTICIDE_PER_CM2, color="#cc3311", linestyle="--", label="insecticide, 30")

@@ -62,9 +62,7 @@ def placed(
             notes.append(f"positions: {position.card} is card {number}, which has a place already")
         else:
             places[number] = position
-    notes.extend(
-        f"positions: card {each.number} ({each.names[-1]}) has none"
-        for each in cards
-        if each.number not in places
-    )
+    without = [str(each.number) for each in cards if each.number not in places]
+    if without:
+        notes.append(f"positions: none for card {', '.join(without)}")
     return places, notes

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.wsp.cards import FLAT
 from analysis.wsp.overlap import UNRELIABLE_PERCENT
 from analysis.wsp.rectangle import Rectangle
 from analysis.wsp.stains import Stains
@@ -28,7 +29,7 @@ SIDE_TOLERANCE = 0.06
 _LARGE_STAIN, _PAPER_FLOOR = 0.10, 143
 # Paper that differs by more than this between eighths of the card [grey levels].
 _UNEVEN = 20.0
-_CLIPPED_PAPER, _CLIPPED_STAIN = 0.05, 0.5
+_CLIPPED_PAPER, _CLIPPED_STAIN = 0.05, 0.3
 # 127 within this share of the contrast from the middle; at 600 dpi a stain's edge then lies
 # within about a quarter of a pixel.
 _OFF_MIDDLE = 0.25
@@ -39,6 +40,7 @@ class Seen:
     """What the judgement rests on."""
 
     outline: Rectangle
+    filled: float
     sheet: tuple[int, int]
     dpi: float
     crop: Bytes
@@ -105,7 +107,7 @@ def _clipping(seen: Seen) -> Iterator[tuple[str, str]]:
     if white.sum() > _CLIPPED_PAPER * max(int(paper.sum()), 1):
         yield "clipping", "parts of the paper are pure white; scan darker"
     elif black.sum() > _CLIPPED_STAIN * max(int(stained.sum()), 1):
-        yield "clipping", "most stains are pure black; scan brighter"
+        yield "clipping", "stains are pure black; scan brighter"
 
 
 def _threshold(seen: Seen) -> Iterator[tuple[str, str]]:
@@ -117,7 +119,7 @@ def _threshold(seen: Seen) -> Iterator[tuple[str, str]]:
         yield (
             "threshold-off-middle",
             f"paper is {paper:.0f}, stains {stain:.0f}, the threshold {seen.stains.threshold}: "
-            "stains come out too large or too small; compare --threshold auto",
+            "stains come out too large or too small; see the corrected figures, --threshold auto",
         )
 
 
@@ -134,6 +136,12 @@ def _shape(seen: Seen) -> Iterator[tuple[str, str]]:
     right, bottom = seen.outline.corners.max(axis=0)
     if left < -1.0 or top < -1.0 or right > seen.sheet[0] + 1 or bottom > seen.sheet[1] + 1:
         yield "cut-off", "the card goes over the edge of the picture"
+    if not seen.filled > FLAT:
+        yield (
+            "not-flat",
+            f"the card fills {100.0 * seen.filled:.0f} % of the rectangle around it: bent, or a "
+            "photograph at a slant; sizes are as doubtful as the scale",
+        )
     short, long = (side * 25.4 / seen.dpi for side in (seen.outline.short, seen.outline.long))
     if not any(_near(short, a) and _near(long, b) for a, b in FORMATS_MM):
         yield (

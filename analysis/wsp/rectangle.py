@@ -30,7 +30,8 @@ class Rectangle:
         """Return the four corners, (4, 2), in order around the rectangle."""
         along, across = self._axes()
         a, b = along * self.long / 2.0, across * self.short / 2.0
-        return np.array([self.x, self.y]) + np.array([-a - b, a - b, a + b, -a + b])
+        middle = np.array([self.x, self.y])
+        return np.asarray(middle + np.array([-a - b, a - b, a + b, -a + b]))
 
     def _axes(self) -> tuple[Floats, Floats]:
         angle = np.deg2rad(self.angle_deg)
@@ -72,9 +73,9 @@ class Rectangle:
         dx = (np.arange(left, right) + 0.5 - self.x).astype(np.float32)
         dy = (np.arange(top, bottom) + 0.5 - self.y).astype(np.float32)[:, None]
         along, across = (axis.astype(np.float32) for axis in self._axes())
-        return (np.abs(dx * along[0] + dy * along[1]) <= self.long / 2.0) & (
-            np.abs(dx * across[0] + dy * across[1]) <= self.short / 2.0
-        )
+        inside = np.abs(dx * along[0] + dy * along[1]) <= self.long / 2.0
+        inside &= np.abs(dx * across[0] + dy * across[1]) <= self.short / 2.0
+        return np.asarray(inside)
 
 
 def around(x: Floats, y: Floats) -> Rectangle | None:

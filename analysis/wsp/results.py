@@ -59,7 +59,7 @@ def numbered(sheets: Sequence[SheetResult]) -> list[Numbered]:
         for card in sheet.cards:
             seen[stem] = seen.get(stem, 0) + 1
             number = len(found) + 1
-            names = (str(number), f"{stem}-{seen[stem]}")
+            names: tuple[str, ...] = (str(number), f"{stem}-{seen[stem]}")
             if per_file[stem] == 1:
                 names = (*names, stem)
             found.append(Numbered(number=number, names=names, sheet=sheet, card=card))
@@ -100,8 +100,10 @@ def card_row(each: Numbered) -> Row:
         **{key: main[key] for key in SIZES},
         "stain_percent": card.stain_percent,
         "density_class": density_class(card.main.deposits_per_cm2),
-        "drops_per_cm2": card.drops_per_cm2,
-        "merged_percent": card.merged_percent,
+        "covered_percent": card.better.covered_percent,
+        "drops_per_cm2": card.better.drops_per_cm2,
+        "merged_percent": card.better.merged_percent,
+        "midway_threshold": card.better.threshold,
         "second": {"spread": second["spread"]} | {key: second[key] for key in SIZES},
         "flags": dict(card.flags),
     }
@@ -204,15 +206,15 @@ def table_lines(cards: Sequence[Numbered], method: Method) -> Iterator[str]:
     main, second = method.spread.name, second_of(method.spread).name
     yield f"drop sizes by {main} ({method.spread.formula}) / {second}"
     yield (
-        "card   cover  depos.  drops      Dv0.1      Dv0.5      Dv0.9    span        L/ha  "
-        "where, flags"
+        "card  cover  depos.  cover*  drops*      Dv0.1      Dv0.5      Dv0.9    span         L/ha"
+        "  where, flags"
     )
-    yield "           %    /cm2   /cm2         um         um         um"
+    yield "          %    /cm2       %    /cm2         um         um         um"
     for each in cards:
         yield _line(each)
     yield (
-        "deposits: stains counted; drops: corrected for overlap and blur, for even, random drops "
-        f"({LAW})"
+        "deposits: stains as counted; * corrected: threshold halfway, blur, overlap of drops that "
+        f"fell evenly ({LAW})"
     )
 
 
@@ -227,8 +229,9 @@ def _line(each: Numbered) -> str:
     volume = f"{main.l_ha:6.2f}/{second.l_ha:.2f}"
     flags = ", ".join(card.flags)
     return (
-        f"{each.number:4d}  {main.coverage_percent:6.2f}  {main.deposits_per_cm2:6.1f} "
-        f"{_number(card.drops_per_cm2, 1):>6} {sizes_text}  {span} {volume:>12}  "
+        f"{each.number:4d} {main.coverage_percent:6.2f}  {main.deposits_per_cm2:6.1f}  "
+        f"{card.better.covered_percent:6.2f}  {_number(card.better.drops_per_cm2, 1):>6} "
+        f"{sizes_text}  {span} {volume:>12}  "
         f"{each.sheet.name}{': ' + flags if flags else ''}"
     )
 

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from analysis.wsp.card import Card, Method, measure
-from analysis.wsp.cards import find_cards
+from analysis.wsp.cards import Found, find_cards
 from analysis.wsp.image import Sheet
 from analysis.wsp.quality import SIDE_TOLERANCE
 from analysis.wsp.rectangle import Rectangle
@@ -49,23 +49,31 @@ class SheetResult:
 def read_sheet(sheet: Sheet, reading: Reading) -> SheetResult:
     """Return the cards of a sheet, measured."""
     height, width = sheet.pixels.shape[:2]
-    outlines = [_all_of(width, height)] if reading.whole else find_cards(sheet.pixels)
+    others = 0
+    if reading.whole:
+        found = [Found(outline=_all_of(width, height))]
+    else:
+        found, others = find_cards(sheet.pixels)
     notes = list(sheet.notes)
+    if others:
+        notes.append(
+            f"{others} of card colour but no rectangle, left out: cards must not touch each other"
+        )
     cards: list[Card] = []
     dpi: float | None = None
     source: DpiSource | None = None
-    if outlines:
-        dpi, source = resolution(sheet.dpi, outlines, reading)
+    if found:
+        dpi, source = resolution(sheet.dpi, [each.outline for each in found], reading)
         if reading.dpi is not None and sheet.dpi and abs(sheet.dpi / dpi - 1.0) > 0.01:
             notes.append(f"the file says {sheet.dpi:g} dpi, --dpi {dpi:g} was taken")
-        for outline in outlines:
+        for each in found:
             try:
-                cards.append(measure(sheet.pixels, outline, dpi=dpi, method=reading.method))
+                cards.append(measure(sheet.pixels, each, dpi=dpi, method=reading.method))
             except ValueError as error:
+                short, long = each.outline.short, each.outline.long
                 raise VrsprayError(
-                    f"{sheet.path}: a card of {outline.short:.0f} x {outline.long:.0f} pixels is "
-                    f"too small at {dpi:g} dpi ({error}); give the right --dpi or a smaller "
-                    "--inset-mm"
+                    f"{sheet.path}: a card of {short:.0f} x {long:.0f} pixels is too small at "
+                    f"{dpi:g} dpi ({error}); give the right --dpi or a smaller --inset-mm"
                 ) from error
     else:
         notes.append("no cards: nothing yellow or blue is a rectangle; give --whole for one card")

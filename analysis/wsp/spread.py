@@ -45,7 +45,7 @@ def _table(stain_um: Floats) -> Floats:
     within = np.interp(stain_um, _TABLE_STAIN_UM, _TABLE_DROP_UM)
     # Beyond the table its last ratio.
     beyond = stain_um * (_TABLE_DROP_UM[-1] / _TABLE_STAIN_UM[-1])
-    return np.where(stain_um > _TABLE_STAIN_UM[-1], beyond, within)
+    return np.asarray(np.where(stain_um > _TABLE_STAIN_UM[-1], beyond, within))
 
 
 def _power(name: str, factor: float, exponent: float) -> Spread:

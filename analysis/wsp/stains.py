@@ -17,7 +17,7 @@ Floats = NDArray[np.float64]
 THRESHOLD = 127
 Threshold = int | Literal["auto"]
 # Paper and stain are at least so many grey levels apart; less is the paper's own texture.
-LEAST_CONTRAST = 40.0
+LEAST_CONTRAST = 30.0
 _EIGHT = np.ones((3, 3), dtype=np.int8)
 
 
@@ -50,10 +50,17 @@ def grey_of(pixels: Bytes) -> Bytes:
     return total.astype(np.uint8)
 
 
-def segment(grey: Bytes, roi: Mask, *, threshold: Threshold = THRESHOLD) -> Stains:
-    """Return the stains within `roi`; pixels that touch by a side or a corner are one stain."""
+def segment(
+    grey: Bytes, roi: Mask, *, threshold: Threshold = THRESHOLD, like: Stains | None = None
+) -> Stains:
+    """Return the stains within `roi`; pixels that touch by a side or a corner are one stain.
+
+    `like` is what another threshold gave: the answer too where both are the same.
+    """
     counts = np.bincount(grey[roi], minlength=256)
     level = midway(counts) if threshold == "auto" else threshold
+    if like is not None and like.threshold == level:
+        return like
     dark = (grey <= level) & roi
     labels, _ = ndimage.label(dark, structure=_EIGHT, output=np.int32)
     area_px = np.bincount(labels[dark].ravel())[1:].astype(np.float64)
@@ -61,8 +68,8 @@ def segment(grey: Bytes, roi: Mask, *, threshold: Threshold = THRESHOLD) -> Stai
         labels=labels,
         area_px=area_px,
         threshold=level,
-        paper_grey=_median(counts, level + 1, 256),
-        stain_grey=_median(counts, 0, level + 1),
+        paper_grey=_quantile(counts, level + 1, 256, 0.5),
+        stain_grey=_quantile(counts, 0, level + 1, 0.5),
     )
 
 
@@ -77,7 +84,9 @@ def midway(counts: NDArray[np.int64]) -> int:
     120
     """
     parted = otsu(counts)
-    paper, stain = _median(counts, parted + 1, 256), _median(counts, 0, parted + 1)
+    paper = _quantile(counts, parted + 1, 256, 0.5)
+    # Much of a small stain is blurred edge: the darker quarter tells how dark stains are.
+    stain = _quantile(counts, 0, parted + 1, 0.25)
     if paper is None or stain is None or not paper - stain >= LEAST_CONTRAST:
         return THRESHOLD
     return int((paper + stain) / 2.0)
@@ -105,8 +114,9 @@ def otsu(counts: NDArray[np.int64]) -> int:
     return int(best[len(best) // 2])
 
 
-def _median(counts: NDArray[np.int64], low: int, high: int) -> float | None:
-    part = np.cumsum(counts[low:high])
-    if not len(part) or not part[-1]:
+def _quantile(counts: NDArray[np.int64], low: int, high: int, part: float) -> float | None:
+    """Return the grey level below which `part` of the pixels from `low` to `high` lie."""
+    pixels = np.cumsum(counts[low:high])
+    if not len(pixels) or not pixels[-1]:
         return None
-    return float(low + int(np.searchsorted(part, (part[-1] + 1) // 2)))
+    return float(low + int(np.searchsorted(pixels, part * pixels[-1])))

@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,12 +164,10 @@ def save(sheet: TrueSheet, path: Path, *, dpi: float | None = 600.0, quality: in
     """Write the picture; the ending of the name says as what."""
     from PIL import Image
 
-    image = Image.fromarray(sheet.pixels)
-    stated = {} if dpi is None else {"dpi": (dpi, dpi)}
+    options: dict[str, Any] = {} if dpi is None else {"dpi": (dpi, dpi)}
     if path.suffix.lower() in (".jpg", ".jpeg"):
-        image.save(path, quality=quality, **stated)
-    else:
-        image.save(path, **stated)
+        options["quality"] = quality
+    Image.fromarray(sheet.pixels).save(path, **options)
 
 
 def _fall(spray: Spray, place: Rectangle, dpi: float, rng: np.random.Generator) -> TrueCard:

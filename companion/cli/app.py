@@ -53,6 +53,7 @@ COMMANDS = {
     "report": Place(
         "analysis.report.cli:report", "Evaluate a flight: page, figures, record of application."
     ),
+    "flights": Place("companion.cli.flights:app", "List, show, pin, prune, recover journals."),
     "replay": Place("analysis.cli:replay", "Feed a journal to the core and compare decisions."),
     "export": Place(
         "analysis.exports.cli:export", "Write a flight as CSV, KML, shapefile, ISOXML and others."

@@ -1,14 +1,60 @@
-"""What the journal is told besides inputs and decisions: orders, the link, the self-test."""
+"""The journal around a run: its folder before it, and what tells it what besides the decisions."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
 from companion.cli.output_parts import parts_of
+from companion.config.tables import JournalTable
+from companion.errors import JournalError
 from companion.link.vehicle_link import VehicleLink
 from companion.output.gpio import GpioExecutor
 from companion.output.none import DryRunExecutor
 from companion.output.timed import TimedExecutor
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
+from companion.record.recovery import recover_folder
+from companion.record.retention import WARN_FREE_PERCENT, Rules, prune, space_of
+
+# Three hours of a journal; with less a flight does not begin.
+FREE_MIN_BYTES = 100_000_000
+
+
+def rules_of(journal: JournalTable) -> Rules:
+    """Return the rules of retention as they are configured."""
+    return Rules(
+        free_percent=journal.keep_free_percent or None,
+        count=journal.keep_count,
+        days=journal.keep_days,
+    )
+
+
+def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
+    """Recover what a crash left and make room; yield what was done, a line each.
+
+    A JournalError where there is no room for a flight. What cannot be looked after is said and
+    left: an old journal is no reason not to fly.
+    """
+    if not folder.is_dir():
+        return
+    try:
+        for found in recover_folder(folder):
+            yield f"journal: {found.path.name}: {found.outcome}: {found.text}"
+        for removal in prune(folder, rules_of(journal), now_utc_s=time.time()):
+            yield f"journal: {removal.flight.path.name}: removed: {removal.reason}"
+    except JournalError as error:
+        yield f"warning: journal: {error}"
+    space = space_of(folder)
+    if space.free_bytes < FREE_MIN_BYTES:
+        raise JournalError(
+            f"journal folder {folder}: only {space.free_bytes / 1e6:.0f} MB are free, a flight "
+            f"needs {FREE_MIN_BYTES / 1e6:.0f}; make room (vrspray flights prune) or set "
+            "journal.folder to another disk"
+        )
+    if space.free_percent < WARN_FREE_PERCENT:
+        yield f"warning: journal: only {space.free_percent:.0f} % of the disk is free"
 
 
 def follow(journal: Journal, link: VehicleLink, executor: PlanExecutor) -> None:

@@ -20,11 +20,12 @@ from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.notify import Notifier
 from companion.cli.output_parts import build_outputs
-from companion.cli.record_parts import follow
+from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
 from companion.cli.sensor_parts import build_sensors, follow_refills
 from companion.config import Config
 from companion.config.application_table import missing, told
 from companion.config.rules import unbounded, without_effect
+from companion.core.controller import Setup
 from companion.errors import ActuatorError, LinkError, SensorError
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
@@ -32,6 +33,7 @@ from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_budget import dither_too_much
 from companion.output.servo import DITHER_S
 from companion.ports import PlanExecutor
+from companion.record.continuing import continued
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
 
@@ -49,6 +51,12 @@ def run_companion(
     is_water: Annotated[
         bool, typer.Option("--water", help="Training with water: marked in every record.")
     ] = False,
+    continue_from: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--continue", metavar="JOURNAL", help="Go on: its ground is not sprayed again."
+        ),
+    ] = None,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
@@ -61,7 +69,9 @@ def run_companion(
     wanted = (*(overrides or ()), *(["journal.training=true"] if is_water else []))
     config, given = load_with_kept(config_file, wanted)
     training = training_mark(config)
-    setup = build_setup(config)
+    setup = continued(build_setup(config), continue_from or (), training=training)
+    for line in _continued_lines(setup):
+        note(line)
     link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
     sensors = build_sensors(config)
@@ -72,8 +82,14 @@ def run_companion(
         for problem in deliverable(setup, config.mission.speed_m_s):
             note(f"{problem.severity}: {problem.text}; {problem.fix}")
     folder = config.resolve(config.journal.folder)
+    for line in made_ready(folder, config.journal):
+        note(line)
     journal = Journal.create(
-        folder, setup=setup, setup_text=_about(config, given), training=training
+        folder,
+        setup=setup,
+        setup_text=_about(config, given),
+        training=training,
+        free_min_bytes=FREE_MIN_BYTES,
     )
     follow(journal, link, executor)
     notifier = Notifier.from_environment(os.environ, pid=os.getpid())
@@ -88,6 +104,7 @@ def run_companion(
                     sensors=sensors,
                     duration_s=duration_s,
                     on_step=notifier.stepped,
+                    record_fault=(lambda: journal.fault) if config.journal.required else None,
                 )
             )
     except (ActuatorError, LinkError, SensorError):
@@ -100,6 +117,15 @@ def run_companion(
         [f"journal: {journal.path}"],
         as_json=as_json,
     )
+
+
+def _continued_lines(setup: Setup) -> list[str]:
+    if setup.treated is None or setup.overlap is None:
+        return []
+    return [
+        f"going on: {setup.treated.area_m2 / 10_000.0:.3f} ha are treated; valves close where "
+        f"{setup.overlap.switch_off_percent:g} % of their strip is"
+    ]
 
 
 def training_mark(config: Config) -> str:

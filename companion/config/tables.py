@@ -333,14 +333,14 @@ class JournalTable(Table):
     required: bool = Field(
         default=True, description="true: a flight does not begin to spray without its record"
     )
-    keep_free_percent: float | None = Field(
+    keep_free_percent: float = Field(
         default=10.0,
         ge=0,
         le=90,
         description="old flights are removed while less of the disk is free; 0: never for that",
     )
     keep_count: int | None = Field(
-        default=None, ge=1, le=1_000_000, description="so many flights are kept; absent: all"
+        default=None, ge=1, le=100_000, description="so many flights are kept; absent: all"
     )
     keep_days: float | None = Field(
         default=None, gt=0, le=100_000, description="flights are kept so long; absent: for ever"

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import shapely
+from shapely import MultiPolygon
+from shapely.geometry.base import BaseGeometry
 
 from companion.core.controller import Setup
-from companion.core.coverage import Coverage
+from companion.core.coverage import CELL_M, Coverage
 from companion.core.frame import LocalFrame
 from companion.core.overlap_guard import OverlapGuard
 from companion.errors import JournalError
-from companion.record.coverage_area import moved
+from companion.record.coverage_area import as_polygons, moved, polygons
 from companion.record.coverage_table import read_coverage
 from companion.record.geopackage import wkb_of
 from companion.record.reader import OpenJournal, opened
@@ -32,8 +36,14 @@ class Treated:
     frame: LocalFrame
     setup: Setup
     stopped: tuple[float, float] | None
+    started_utc: str
     is_closed: bool
     training: str | None
+
+    @property
+    def strip_m(self) -> float:
+        """Return the width of the narrowest valve's strip."""
+        return 2.0 * float(self.setup.boom.half_width_m.min())
 
 
 def read_treated_ground(path: Path) -> Treated:
@@ -55,6 +65,7 @@ def read_treated_ground(path: Path) -> Treated:
             frame=setup.frame,
             setup=setup,
             stopped=_stopped(journal),
+            started_utc=journal.meta.get("started_utc", ""),
             is_closed=journal.meta.get("closed") == "yes",
             training=journal.meta.get("training"),
         )
@@ -70,6 +81,34 @@ def _stopped(journal: OpenJournal) -> tuple[float, float] | None:
         return None
     ((longitude_deg, latitude_deg),) = shapely.get_coordinates(shapely.from_wkb(wkb_of(row[0])))
     return float(latitude_deg), float(longitude_deg)
+
+
+def is_journal(path: Path) -> bool:
+    """Return whether a file is a journal, and no map; what cannot be read is none."""
+    if path.suffix.lower() != ".gpkg" or not path.is_file():
+        return False
+    # Without locks or a look at the log beside it: what makes it a journal is never changed.
+    uri = f"{path.resolve().as_uri()}?immutable=1"
+    try:
+        with closing(sqlite3.connect(uri, uri=True)) as connection:
+            sql = "SELECT 1 FROM meta WHERE key = 'journal_version'"
+            return connection.execute(sql).fetchone() is not None
+    except sqlite3.Error:
+        return False
+
+
+def rest_of(field: BaseGeometry, coverage: Coverage, strip_m: float) -> MultiPolygon:
+    """Return the ground of a field that is not treated yet, as wide as half a strip or wider.
+
+    What is narrower is no valve's work: the margin that a strict border leaves, the noise of a
+    position between two passes.
+    """
+    # The steps of the raster are no shape of the ground.
+    treated = polygons(coverage).simplify(CELL_M)
+    bare = field.difference(treated)
+    thin_m = 0.25 * strip_m
+    core = bare.buffer(-thin_m, join_style="mitre")
+    return as_polygons(core.buffer(thin_m, join_style="mitre").intersection(bare))
 
 
 def treated_by(paths: Sequence[Path], frame: LocalFrame, *, training: str = "no") -> Coverage:

@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
 
 from companion.core.coverage import CELL_M, TILE_CELLS, Coverage, TileKey
 from companion.core.frame import LocalFrame
@@ -29,8 +30,25 @@ def polygons(coverage: Coverage) -> MultiPolygon:
     west, south, east, north = np.concatenate(boxes).T
     seam = _SEAM_M
     joined = shapely.union_all(shapely.box(west - seam, south - seam, east + seam, north + seam))
-    parts = [part for part in shapely.get_parts(joined) if isinstance(part, Polygon)]
-    return MultiPolygon(parts)
+    return as_polygons(joined)
+
+
+def as_polygons(area: BaseGeometry) -> MultiPolygon:
+    """Return what has ground of an area."""
+    parts = [part for part in shapely.get_parts(area) if isinstance(part, Polygon)]
+    return MultiPolygon([part for part in parts if part.area > 0.0])
+
+
+def carried(area: BaseGeometry, source: LocalFrame, target: LocalFrame) -> MultiPolygon:
+    """Return an area of one flight's frame in another's."""
+    return as_polygons(
+        shapely.transform(area, lambda places: carried_places(places, source, target))
+    )
+
+
+def carried_places(places: Floats, source: LocalFrame, target: LocalFrame) -> Floats:
+    """Return places (n, 2), east and north, of one flight's frame in another's."""
+    return np.stack(_carried(places, source, target), axis=1)
 
 
 def _boxes(key: TileKey, cells: Bools) -> Floats:

@@ -8,16 +8,13 @@ may cost the record of a moment, never the moment itself.
 from __future__ import annotations
 
 import logging
-import os
-import platform
 import queue
-import re
+import shutil
 import sqlite3
 import threading
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -26,13 +23,9 @@ from typing import TYPE_CHECKING, Self
 from companion.core.controller import Setup
 from companion.core.types import Decision, Input
 from companion.errors import JournalError
-from companion.record.coverage_table import write_treated
 from companion.record.events import Event, LinkSample
-from companion.record.geopackage import SCHEMA
-from companion.record.layers import write_layers
-from companion.record.setup_json import calibration_sha256, setup_to_json
+from companion.record.new_file import about, new_file, open_for_flight
 from companion.record.valve_rows import ValveOrder
-from companion.record.versions import JOURNAL_VERSION
 from companion.record.writer import Item, Writer
 
 if TYPE_CHECKING:
@@ -43,7 +36,7 @@ _logger = logging.getLogger(__name__)
 COMMIT_EVERY_S = 1.0
 QUEUE_ROWS = 10_000  # a minute of 50 decisions and 100 inputs a second
 CLOSE_WITHIN_S = 30.0
-_LIBRARIES = ("vrspray", "numpy", "shapely", "pyproj")
+STALL_MAX_S = 5.0  # a card that is busy with itself takes one or two
 
 _Row = tuple[int, Item]
 
@@ -60,9 +53,13 @@ class Journal:
         utc_offset_s: float,
         queue_rows: int = QUEUE_ROWS,
         waits: bool = False,
+        free_min_bytes: int = 0,
     ) -> None:
         self.path = path
         self._waits = waits
+        self._free_min_bytes = free_min_bytes
+        self._space_fault: str | None = None
+        self._written_s = time.monotonic()
         self._sequence = count(1)
         self._queue_rows = queue_rows
         self._rows: queue.SimpleQueue[_Row | None] = queue.SimpleQueue()
@@ -89,6 +86,7 @@ class Journal:
         queue_rows: int = QUEUE_ROWS,
         waits: bool = False,
         training: str | None = None,
+        free_min_bytes: int = 0,
     ) -> Journal:
         """Begin the next flight's file in `folder`: flight-0001.gpkg, flight-0002.gpkg, ...
 
@@ -101,17 +99,18 @@ class Journal:
             started_s: what the companion's clock shows now; a simulation has its own.
             queue_rows: how far the disk may fall behind.
             waits: for simulations, faster than any disk: wait rather than drop.
+            free_min_bytes: with less room on the disk the journal has a fault.
             training: `no` for a product, else what it is: `water`, `dry`. None: nobody says.
         """
         now_s = time.monotonic() if started_s is None else started_s
         started = datetime.now(UTC)
-        meta = {**(setup_text or {}), **_about(setup, started, now_s)}
+        meta = {**(setup_text or {}), **about(setup, started, now_s)}
         if training is not None:
             meta["training"] = training
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            path = _new_file(folder, setup, meta)
-            connection = _open(path)
+            path = new_file(folder, setup, meta)
+            connection = open_for_flight(path)
         except (OSError, sqlite3.Error) as error:
             raise JournalError(
                 f"journal folder {folder}: cannot be written ({error}); "
@@ -124,6 +123,7 @@ class Journal:
             utc_offset_s=started.timestamp() - now_s,
             queue_rows=queue_rows,
             waits=waits,
+            free_min_bytes=free_min_bytes,
         )
 
     @property
@@ -138,8 +138,11 @@ class Journal:
 
     @property
     def fault(self) -> str | None:
-        """Return why the last second could not be written; None while all is well."""
-        return self._writer.fault
+        """Return why the record is not kept, or soon will not be; None while all is well."""
+        stands_s = time.monotonic() - self._written_s
+        if stands_s > STALL_MAX_S and not self._closing.is_set():
+            return f"nothing was written for {stands_s:.0f} s"
+        return self._writer.fault or self._space_fault
 
     def record_input(self, item: Input) -> None:
         """Take down one input as the core saw it."""
@@ -217,9 +220,23 @@ class Journal:
                     break
                 if time.monotonic() >= due_s:
                     self._writer.commit(lost_before=self._dropped, coverage=self._coverage)
-                    due_s = time.monotonic() + COMMIT_EVERY_S
+                    self._look_at_space()
+                    self._written_s = time.monotonic()
+                    due_s = self._written_s + COMMIT_EVERY_S
         finally:
             self._writer.finish(lost_before=self._dropped, coverage=self._coverage)
+
+    def _look_at_space(self) -> None:
+        """Note in time that the disk fills up."""
+        if not self._free_min_bytes:
+            return
+        try:
+            free_bytes = shutil.disk_usage(self.path.parent).free
+        except OSError as error:
+            self._space_fault = str(error)
+            return
+        is_short = free_bytes < self._free_min_bytes
+        self._space_fault = f"only {free_bytes / 1e6:.0f} MB are free" if is_short else None
 
     def _next(self, due_s: float) -> _Row | None:
         """Return the next row; None when the commit is due or the end has come."""
@@ -229,93 +246,3 @@ class Journal:
             return self._rows.get(timeout=max(due_s - time.monotonic(), 0.001))
         except queue.Empty:
             return None
-
-
-def _about(setup: Setup, started: datetime, started_s: float) -> dict[str, str]:
-    """Return what the file says of itself."""
-    about = {
-        "journal_version": JOURNAL_VERSION,
-        "closed": "no",
-        "lost": "0",
-        "valve_changes": "plans",
-        "started_utc": started.isoformat(),
-        "started_s": repr(started_s),
-        "utc_source": "computer",
-        "utc_offset_s": repr(started.timestamp() - started_s),
-        "origin_latitude_deg": repr(setup.frame.latitude_deg),
-        "origin_longitude_deg": repr(setup.frame.longitude_deg),
-        "map_sha256": setup.prescription.sha256,
-        "calibration_sha256": calibration_sha256(setup),
-        "method": str(setup.method),
-        "platform": platform.platform(),
-        "machine": platform.machine(),
-        "python": platform.python_version(),
-        "setup": setup_to_json(setup),
-    }
-    for name in _LIBRARIES:
-        try:
-            about[f"version_{name}"] = version(name)
-        except PackageNotFoundError:
-            about[f"version_{name}"] = "unknown"
-    return about
-
-
-def _new_file(folder: Path, setup: Setup, meta: Mapping[str, str]) -> Path:
-    """Make a complete, empty journal beside its place and move it there under the next number.
-
-    A link refuses a name that exists, so two processes never share a file, and whoever looks
-    sees a valid GeoPackage or nothing.
-    """
-    draft = folder / f".new-{os.getpid()}-{threading.get_ident()}.gpkg"
-    draft.unlink(missing_ok=True)
-    try:
-        _write_schema(draft, setup, meta)
-        while True:
-            path = folder / f"flight-{_next_number(folder):04d}.gpkg"
-            try:
-                os.link(draft, path)
-            except FileExistsError:
-                continue
-            except OSError:  # a file system without links, such as a FAT card
-                draft.rename(path)
-            return path
-    finally:
-        draft.unlink(missing_ok=True)
-
-
-def _next_number(folder: Path) -> int:
-    numbers = (re.fullmatch(r"flight-(\d+)\.gpkg.*", entry.name) for entry in folder.iterdir())
-    return max((int(found[1]) for found in numbers if found), default=0) + 1
-
-
-def _write_schema(path: Path, setup: Setup, meta: Mapping[str, str]) -> None:
-    connection = sqlite3.connect(path, isolation_level=None)
-    try:
-        # Nobody knows the draft yet: one sync at its end instead of one a statement.
-        connection.execute("PRAGMA synchronous = OFF")
-        connection.execute("PRAGMA journal_mode = MEMORY").fetchall()
-        connection.executescript(SCHEMA)
-        write_layers(connection, setup.frame, setup.prescription)
-        write_treated(connection, setup.treated)
-        connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", meta.items())
-    finally:
-        connection.close()
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
-
-
-def _open(path: Path) -> sqlite3.Connection:
-    """Open for the flight: a log that survives a cut, and nobody else on the file meanwhile.
-
-    EXCLUSIVE before WAL: no second connection can race with a checkpoint (a bug of SQLite before
-    3.51.3 could corrupt the file then), and there is no shared-memory file.
-    """
-    connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
-    for pragma in (
-        "locking_mode = EXCLUSIVE",
-        "journal_mode = WAL",
-        "synchronous = FULL",
-        "wal_autocheckpoint = 0",
-    ):
-        connection.execute(f"PRAGMA {pragma}").fetchall()
-    return connection

@@ -56,6 +56,8 @@ def recover(path: Path) -> Recovery | None:
             if not _is_left(connection, path):
                 return None
             _fold_in(connection)
+        # Of somebody who looked at the cut file and did not end well either.
+        path.with_name(path.name + "-shm").unlink(missing_ok=True)
         outcome, text = "recovered", "what was committed is there"
     except _FAILURES as error:
         reason = " ".join(str(error).split())

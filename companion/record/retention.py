@@ -64,12 +64,13 @@ def chosen(
 ) -> list[Removal]:
     """Return what goes, oldest first; `flights` in their order, oldest first.
 
+    Pinned flights do not count among those that are kept.
     An age counts only where the autopilot told the time: this computer's clock may be anything.
     """
     removals: list[Removal] = []
     ended = [flight for flight in flights if flight.state in _ENDED]
     free = [flight for flight in ended if not flight.is_pinned]
-    too_many = 0 if rules.count is None else max(len(ended) - rules.count, 0)
+    too_many = 0 if rules.count is None else max(len(free) - rules.count, 0)
     for number, flight in enumerate(free):
         reason = None
         if number < too_many:

@@ -24,6 +24,10 @@ _TABLES = {
 class OtherVersionError(JournalError):
     """A journal of a version that this program does not know: only `meta` can be read."""
 
+    def __init__(self, text: str, meta: Mapping[str, str]) -> None:
+        super().__init__(text)
+        self.meta = meta
+
 
 def check_version(name: object, meta: Mapping[str, str], tables: Collection[str]) -> str:
     """Return the version of a journal; a JournalError where it is none, or none that is known."""
@@ -33,7 +37,8 @@ def check_version(name: object, meta: Mapping[str, str], tables: Collection[str]
     if version not in _TABLES:
         raise OtherVersionError(
             f"{name}: is a journal of version {version}, this program reads versions "
-            f"{' and '.join(_TABLES)}; use vrspray {meta.get('version_vrspray')}, which wrote it"
+            f"{' and '.join(_TABLES)}; use vrspray {meta.get('version_vrspray')}, which wrote it",
+            meta,
         )
     if not _TABLES[version] <= set(tables):
         raise JournalError(f"{name}: is a GeoPackage, but no journal of a flight")

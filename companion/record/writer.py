@@ -164,7 +164,7 @@ class Writer:
 
     def _flush(self) -> None:
         """Write the open block; where that fails for whatever reason, the second is lost."""
-        if not self._block.rows:
+        if not self._block.row_count:
             return
         self._begin()
         try:

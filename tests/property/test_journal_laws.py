@@ -28,7 +28,8 @@ from companion.core.types import (
 )
 from companion.errors import JournalError
 from companion.record.codec import FIELD_NAMES, decode, encode
-from companion.record.journal import Journal, _open
+from companion.record.journal import Journal
+from companion.record.new_file import open_for_flight
 from companion.record.reader import read_journal
 from companion.record.writer import Writer
 from tests.builders import flying, setup
@@ -114,7 +115,7 @@ def crashed() -> Any:
     with tempfile.TemporaryDirectory() as folder:
         with Journal.create(Path(folder) / "live", setup=setup()) as journal:
             pass
-        connection = _open(journal.path)
+        connection = open_for_flight(journal.path)
         writer = Writer(
             connection, frame=setup().frame, utc_offset_s=0.0, next_sequence=count(1).__next__
         )

@@ -51,7 +51,8 @@ from companion.core.types import (
 )
 from companion.errors import JournalError
 from companion.record.codec import decode, encode
-from companion.record.journal import Journal, _open
+from companion.record.journal import Journal
+from companion.record.new_file import open_for_flight
 from companion.record.reader import read_journal
 from companion.record.writer import Event, Writer
 from tests.builders import flying, setup
@@ -144,7 +145,7 @@ def closed_journal(folder: Path, how_many: int = 30) -> Path:
 
 def writer_on(path: Path) -> tuple[Writer, sqlite3.Connection]:
     """Return a writer without its thread, on a file that `create` has made."""
-    connection = _open(path)
+    connection = open_for_flight(path)
     sequence = count(1).__next__
     writer = Writer(connection, frame=setup().frame, utc_offset_s=0.0, next_sequence=sequence)
     return writer, connection

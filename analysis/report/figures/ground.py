@@ -39,7 +39,8 @@ PANEL_MIN_IN, PANEL_MAX_IN = 1.2, 5.2
 BESIDE_IN, BAR_IN = 0.75, 1.1
 WIDTH_MIN_IN = 4.0
 # A deviation map reaches at least this far, so that a good flight looks good.
-DEVIATION_MIN_PERCENT, DEVIATION_PERCENTILE = 20.0, 98.0
+# Cells on the border, which get nothing by rule, must not make all others white.
+DEVIATION_MIN_PERCENT, DEVIATION_MAX_PERCENT, DEVIATION_PERCENTILE = 20.0, 50.0, 98.0
 PATH_POINTS_MAX = 4000
 
 
@@ -80,8 +81,9 @@ def sheet_of(flight: AppliedFlight, cells: CellMaps) -> _Sheet:
         float(cells.corner_north_m.max()) + MARGIN_M,
     )
     seen = shapely.box(*box)
-    zones = prescription.zones if prescription.zone_count <= OUTLINES_MAX else ()
-    outlines = [] if prescription.cells is not None else [zone.polygon for zone in zones]
+    # Joining cells to zones may take long, and the cells are drawn themselves.
+    has_outlines = prescription.cells is None and prescription.zone_count <= OUTLINES_MAX
+    outlines = [zone.polygon for zone in prescription.zones] if has_outlines else []
     return _Sheet(
         flight=flight,
         cells=cells,
@@ -94,10 +96,7 @@ def sheet_of(flight: AppliedFlight, cells: CellMaps) -> _Sheet:
 def prescribed_and_applied(sheet: _Sheet) -> Drawn:
     """Draw both maps with one scale of colours."""
     asked, given = sheet.cells.commanded_l_ha, sheet.cells.measured_l_ha
-    most = float(np.nanmax(np.maximum(np.nan_to_num(asked), np.nan_to_num(given)))) or 1.0
-    known = np.concatenate([each[np.isfinite(each) & (each > 0.0)] for each in (asked, given)])
-    least = float(np.percentile(known, 1.0)) if len(known) else 0.0
-    least = 0.0 if least < 0.5 * most else least
+    least, most = _rates_shown(asked)
     size_in, rows, columns = sheet.layout(2)
     figure = new_figure(*size_in)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
@@ -117,12 +116,22 @@ def prescribed_and_applied(sheet: _Sheet) -> Drawn:
     )
 
 
+def _rates_shown(asked: Floats) -> tuple[float, float]:
+    """Return the rates at both ends of the scale; from 0 where the least is not far from it."""
+    known = asked[np.isfinite(asked) & (asked > 0.0)]
+    if not len(known):
+        return 0.0, 1.0
+    least, most = (float(each) for each in np.percentile(known, [1.0, 99.9]))
+    return (least if 0.5 * most < least < most else 0.0), most
+
+
 def deviation(sheet: _Sheet) -> Drawn:
     """Draw by how much each cell is off its rate."""
     error = sheet.cells.relative_error_percent
     known = np.abs(error[np.isfinite(error)])
     reach = float(np.percentile(known, DEVIATION_PERCENTILE)) if len(known) else 0.0
-    reach = max(math.ceil(reach / 5.0) * 5.0, DEVIATION_MIN_PERCENT)
+    reach = math.ceil(reach / 5.0) * 5.0
+    reach = min(max(reach, DEVIATION_MIN_PERCENT), DEVIATION_MAX_PERCENT)
     figure, panel = _single(sheet)
     mesh = _mesh(panel, sheet, error, DEVIATION_MAP, -reach, reach)
     _dress(panel, sheet, "deviation")
@@ -196,6 +205,7 @@ def _dress(panel: Axes, sheet: _Sheet, title: str, *, with_path: bool = False) -
     panel.set_xlim(west, east)
     panel.set_ylim(south, north)
     panel.set_aspect("equal")
+    panel.locator_params(nbins=6)
     panel.set_title(title)
     panel.set_xlabel("east [m]")
     panel.set_ylabel("north [m]")

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 # A count every second is 1 mL in 80 of a flow of 5 L/min: enough for a line.
 METER_STEP_S = 1.0
 INHIBITED_MIN_S = 0.5
+# A page is a thousand points wide; more of them make files larger and lines no finer.
+POINTS_MAX = 3000
 
 
 def flow_over_time(flight: AppliedFlight, clock_text: str) -> Drawn:
@@ -74,14 +76,26 @@ def metered_flow(series: Series, from_s: float, until_s: float) -> tuple[Floats,
     return at_s[:-1] + METER_STEP_S / 2, np.diff(volume_ml) * 60.0 / 1e3 / METER_STEP_S
 
 
-def _flow_panel(panel: Axes, flight: AppliedFlight) -> None:
+def thinned(flight: AppliedFlight, values: Floats) -> tuple[Floats, Floats]:
+    """Return minutes and values, of long flights the least and the largest of each few."""
     minutes = (flight.time_s - flight.time_s[0]) / 60.0
-    target = np.nan_to_num(flight.target_flow_l_min)
+    several = len(minutes) // POINTS_MAX
+    if several < 2:
+        return minutes, values
+    few = 2 * several
+    whole = len(minutes) // few * few
+    parts, at = np.nan_to_num(values[:whole]).reshape(-1, few), minutes[:whole].reshape(-1, few)
+    both = np.stack([parts.min(axis=1), parts.max(axis=1)], axis=1).ravel()
+    return np.repeat(at[:, 0], 2), both
+
+
+def _flow_panel(panel: Axes, flight: AppliedFlight) -> None:
+    minutes, target = thinned(flight, np.nan_to_num(flight.target_flow_l_min))
     panel.fill_between(minutes, target, color="#DDDDD8", lw=0, label="asked", rasterized=True)
     if flight.meter_ml is not None:
         at_s, flow = metered_flow(flight.meter_ml, flight.time_s[0], flight.time_s[-1])
         panel.plot((at_s - flight.time_s[0]) / 60.0, flow, color=RED, lw=0.9, label="metered")
-    panel.plot(minutes, flight.flow_l_min, color=BLUE, lw=1.0, label="ordered")
+    panel.plot(*thinned(flight, flight.flow_l_min), color=BLUE, lw=1.0, label="ordered")
     panel.set_ylabel("flow [L/min]")
     panel.set_ylim(bottom=0.0)
     panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.0)
@@ -97,8 +111,7 @@ def _pressure_panel(panel: Axes, flight: AppliedFlight) -> None:
 
 
 def _speed_panel(panel: Axes, flight: AppliedFlight) -> None:
-    minutes = (flight.time_s - flight.time_s[0]) / 60.0
-    panel.plot(minutes, flight.speed_m_s, color=INK, lw=0.9)
+    panel.plot(*thinned(flight, flight.speed_m_s), color=INK, lw=0.9)
     panel.set_ylabel("speed [m/s]")
     panel.axhline(0.0, color=FAINT, lw=0.6)
     panel.set_ylim(bottom=0.0)

@@ -40,6 +40,8 @@ STYLE: dict[Any, Any] = {
 DPI = 120
 WIDTH_IN = 9.0
 # Nothing of the program, the day or the network in an SVG.
+# A third of the time for a tenth more of bytes.
+PNG: dict[str, Any] = {"compress_level": 3}
 _NO_METADATA = {"Creator": None, "Date": None, "Format": None, "Type": None}
 
 Kind = Literal["chart", "map"]
@@ -88,7 +90,7 @@ def laid_out(drawn: Drawn) -> Drawn:
 def png_of(drawn: Drawn) -> bytes:
     """Return a figure as PNG."""
     file = io.BytesIO()
-    drawn.figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None})
+    drawn.figure.savefig(file, format="png", dpi=DPI, metadata={"Software": None}, pil_kwargs=PNG)
     return file.getvalue()
 
 

@@ -1,0 +1,152 @@
+"""`vrspray flights remaining`: what earlier flights leave of a field, and where they stopped."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import shapely
+import typer
+from shapely import MultiPolygon
+
+from companion.cli.answer import AsJson, answer, note
+from companion.core.coverage import Coverage
+from companion.core.frame import LocalFrame
+from companion.core.prescription import Prescription
+from companion.errors import VrsprayError
+from companion.maps.build import build_prescription
+from companion.maps.registry import read_map
+from companion.record.continuing import Treated, read_treated_ground, rest_of
+from companion.record.coverage_area import moved
+
+M2_PER_HA = 10_000.0
+# The mean rate of the rest is taken at so many places of it.
+PLACES = 40_000
+PLACE_MIN_M = 0.5
+
+
+def remaining(
+    journals: Annotated[
+        list[Path], typer.Argument(metavar="JOURNAL...", help="All flights of the job, .gpkg.")
+    ],
+    map_file: Annotated[
+        Path | None,
+        typer.Option("--map", metavar="FILE", help="Prescription; else that of the last flight."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE.geojson", help="The rest and the resume point."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell what is treated, what is left in hectares and litres, and where to go on.
+
+    What is left in pieces narrower than half a valve's strip does not count: no valve is for that.
+    """
+    flights = sorted((read_treated_ground(path) for path in journals), key=_started)
+    last = flights[-1]
+    for flight in flights:
+        if flight.training not in (None, "no"):
+            note(f"warning: {flight.path}: flown with training = {flight.training}: no product")
+    ground = last.setup.prescription
+    if map_file is not None:
+        ground = build_prescription(read_map(map_file), last.frame, overlap="max")
+    treated = Coverage()
+    for flight in flights:
+        treated = treated.joined(moved(flight.coverage, flight.frame, last.frame))
+    rest = rest_of(ground.field, treated, last.strip_m)
+    result = _result(flights, ground, treated, rest)
+    if out is not None:
+        _write(out, rest, last.frame, result)
+        result["file"] = str(out)
+    answer(result, _lines(result), as_json=as_json)
+
+
+def _started(flight: Treated) -> str:
+    return flight.started_utc
+
+
+def _result(
+    flights: Sequence[Treated], ground: Prescription, treated: Coverage, rest: MultiPolygon
+) -> dict[str, Any]:
+    last = flights[-1]
+    area_m2, litres = _demand(ground, rest)
+    stopped = next((flight.stopped for flight in reversed(flights) if flight.stopped), None)
+    return {
+        "journals": [str(flight.path) for flight in flights],
+        "field_ha": ground.field.area / M2_PER_HA,
+        "treated_ha": treated.area_m2 / M2_PER_HA,
+        "remaining_ha": area_m2 / M2_PER_HA,
+        "remaining_l": litres,
+        "pieces": len(rest.geoms),
+        "narrowest_m": 0.5 * last.strip_m,
+        "resume": None if stopped is None else {"lat": stopped[0], "lon": stopped[1]},
+        # Cut off: its last second is a guess.
+        "is_exact": all(flight.is_closed for flight in flights),
+    }
+
+
+def _demand(ground: Prescription, rest: MultiPolygon) -> tuple[float, float]:
+    """Return the area [m2] that wants liquid, and how much of it [L]."""
+    if rest.is_empty:
+        return 0.0, 0.0
+    step_m = max(PLACE_MIN_M, math.sqrt(rest.area / PLACES))
+    west, south, east, north = rest.bounds
+    x, y = np.meshgrid(
+        np.arange(west + 0.5 * step_m, east, step_m), np.arange(south + 0.5 * step_m, north, step_m)
+    )
+    shapely.prepare(rest)
+    inside = shapely.contains_xy(rest, x.ravel(), y.ravel())
+    if not inside.any():
+        return 0.0, 0.0
+    rates = np.nan_to_num(ground.rates_at(x.ravel()[inside], y.ravel()[inside]))
+    return rest.area * float((rates > 0.0).mean()), rest.area * float(rates.mean()) / M2_PER_HA
+
+
+def _lines(result: Mapping[str, Any]) -> Iterator[str]:
+    yield f"treated {result['treated_ha']:.3f} of {result['field_ha']:.3f} ha"
+    yield (
+        f"left {result['remaining_ha']:.3f} ha, {result['remaining_l']:.2f} L, in "
+        f"{result['pieces']} pieces; none narrower than {result['narrowest_m']:g} m is counted"
+    )
+    place = result["resume"]
+    if place is not None:
+        yield f"stopped at {place['lat']:.7f},{place['lon']:.7f}"
+    if not result["is_exact"]:
+        yield "a flight was cut off: its last second of spraying is worked out, not known"
+
+
+def _write(out: Path, rest: MultiPolygon, frame: LocalFrame, result: Mapping[str, Any]) -> None:
+    """Write the rest as polygons in longitude and latitude, and the place to go on from."""
+
+    def there(places: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, Any]:
+        latitude, longitude = frame.to_geographic_all(places[:, 0].tolist(), places[:, 1].tolist())
+        return np.stack([np.round(longitude, 9), np.round(latitude, 9)], axis=1)
+
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"kind": "remaining", "area_m2": round(piece.area, 1)},
+            "geometry": shapely.geometry.mapping(
+                shapely.transform(shapely.orient_polygons(piece), there)
+            ),
+        }
+        for piece in rest.geoms
+    ]
+    place = result["resume"]
+    if place is not None:
+        features.append(
+            {
+                "type": "Feature",
+                "properties": {"kind": "resume"},
+                "geometry": {"type": "Point", "coordinates": [place["lon"], place["lat"]]},
+            }
+        )
+    try:
+        out.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    except OSError as error:
+        raise VrsprayError(f"{out}: cannot be written: {error}") from error

@@ -1,0 +1,123 @@
+"""What is in one journal, and what of it cannot be read."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from companion.errors import JournalError
+from companion.record.reader import OpenJournal, opened
+from companion.record.versions import OtherVersionError, read_entries
+
+# In `meta` for programs, or shown elsewhere.
+_LONG = frozenset({"setup", "config_toml"})
+_LINK = (
+    "SELECT count(*), max(lost_percent), max(round_trip_s), min(position_hz), max(bad_frames), "
+    "max(unsent_frames) FROM link_stats"
+)
+_LINK_KEYS = (
+    "samples",
+    "lost_percent",
+    "round_trip_max_s",
+    "position_min_hz",
+    "bad_frames",
+    "unsent_frames",
+)
+_COUNTED = ("applied", "valve_changes", "link_stats", "coverage_tiles", "zones", "events")
+
+
+def content_of(path: Path) -> dict[str, Any]:
+    """Return all of it; `unread` says in a line each what is damaged or unknown."""
+    result: dict[str, Any] = {
+        "meta": {},
+        "entries": {},
+        "tables": {},
+        "events": [],
+        "link": None,
+        "unread": [],
+    }
+    unread: list[str] = result["unread"]
+    try:
+        with opened(path, is_lenient=True) as journal:
+            _fill(result, journal)
+    except OtherVersionError as error:
+        result["meta"] = _shown(error.meta)
+        unread.append(str(error))
+    except JournalError as error:
+        unread.append(str(error))
+    return result
+
+
+def _shown(meta: Mapping[str, str]) -> dict[str, str]:
+    return {key: value for key, value in meta.items() if key not in _LONG}
+
+
+def _fill(result: dict[str, Any], journal: OpenJournal) -> None:
+    unread: list[str] = result["unread"]
+    result["meta"] = _shown(journal.meta)
+    kinds: Counter[str] = Counter()
+    result["entries"] = kinds
+    connection = journal.connection
+    verdict = _tried(unread, "the file", connection, "PRAGMA quick_check(1)")
+    if verdict and verdict[0][0] != "ok":
+        unread.append(f"damaged: {' '.join(str(verdict[0][0]).split())}")
+    try:
+        for entry in read_entries(connection, journal.version, unread=unread):
+            kinds[entry.kind] += 1
+    except sqlite3.DatabaseError as error:
+        unread.append(f"inputs and decisions behind the first {kinds.total()}: {error}")
+    try:
+        journal.setup()
+    except (ValueError, KeyError) as error:
+        unread.append(f"the set-up: {error}")
+    there = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+    for name in _COUNTED:
+        if name in there:
+            rows = _tried(unread, name, connection, f"SELECT count(*) FROM {name}")
+            result["tables"][name] = rows[0][0] if rows else None
+    if "link_stats" in there:
+        rows = _tried(unread, "link_stats", connection, _LINK)
+        if rows and rows[0][0]:
+            result["link"] = dict(zip(_LINK_KEYS, rows[0], strict=True))
+    sql = "SELECT time, time_s, kind, text FROM events ORDER BY sequence"
+    marks = _tried(unread, "events", connection, sql)
+    keys = ("time", "time_s", "kind", "text")
+    result["events"] = [dict(zip(keys, row, strict=True)) for row in marks or []]
+
+
+def _tried(
+    unread: list[str], what: str, connection: sqlite3.Connection, sql: str
+) -> list[tuple[Any, ...]]:
+    """Return all rows of a question; what damage hinders is said in `unread`."""
+    try:
+        return connection.execute(sql).fetchall()
+    except sqlite3.DatabaseError as error:
+        unread.append(f"{what}: {' '.join(str(error).split())}")
+        return []
+
+
+def content_lines(content: Mapping[str, Any]) -> Iterator[str]:
+    """Yield it for a person."""
+    for key, value in content["meta"].items():
+        text = " ".join(str(value).split())
+        yield f"{key}: {text if len(text) <= 90 else text[:87] + '...'}"
+    if content["entries"]:
+        counts = ", ".join(f"{count} {kind}" for kind, count in content["entries"].items())
+        yield f"inputs and decisions: {counts}"
+    if content["tables"]:
+        rows = ", ".join(f"{name} {count}" for name, count in content["tables"].items())
+        yield f"rows: {rows}"
+    if content["link"]:
+        link = ", ".join(f"{key} {_number(value)}" for key, value in content["link"].items())
+        yield f"link: {link}"
+    for event in content["events"]:
+        yield f"{event['time'] or '-'} {event['kind']}: {event['text']}"
+    for text in content["unread"]:
+        yield f"not read: {text}"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:g}"

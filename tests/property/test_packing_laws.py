@@ -1,0 +1,62 @@
+"""Laws of the packing: whatever lines go in come out, and damage never does more than damage."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from contextlib import suppress
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.record.packing import pack
+from companion.record.unpacking import unpack
+
+NUMBERS = st.one_of(
+    st.floats(),
+    st.integers(),
+    st.integers(-(2**63), 2**63).map(
+        lambda bits: struct.unpack("<d", struct.pack("<q", bits % 2**63))[0]
+    ),
+    st.integers(0, 10**12).map(lambda nanos: nanos / 1e9),
+    st.sampled_from([0.0, -0.0, 5e-324, 1.7976931348623157e308, 1e22, 1e16, 0.1 + 0.2, -1e-7]),
+)
+VALUES = st.recursive(
+    NUMBERS | st.text(max_size=12) | st.booleans() | st.none(),
+    lambda inner: (
+        st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=4), inner, max_size=2)
+    ),
+    max_leaves=12,
+)
+
+
+@given(values=st.lists(VALUES, max_size=12))
+def test_lines_of_json_come_back_to_the_last_character(values: list[object]) -> None:
+    lines = [json.dumps(value, separators=(",", ":")) for value in values]
+    assert unpack(pack(lines)) == lines
+
+
+@given(rows=st.lists(st.tuples(*[NUMBERS] * 4), max_size=30))
+def test_columns_of_any_numbers_come_back(rows: list[tuple[object, ...]]) -> None:
+    lines = [json.dumps({"State": [*row, {"Plan": [row[0], row[0]]}]}) for row in rows]
+    assert unpack(pack(lines)) == lines
+
+
+@given(lines=st.lists(st.text(st.characters(min_codepoint=32, max_codepoint=126)), max_size=9))
+def test_lines_of_any_text_come_back(lines: list[str]) -> None:
+    assert unpack(pack(lines)) == lines
+
+
+@given(junk=st.binary(max_size=80), at=st.integers(0, 200))
+def test_damage_is_read_or_refused(junk: bytes, at: int) -> None:
+    packed = bytearray(pack([f'{{"A":[{number / 7!r},{number}]}}' for number in range(30)]))
+    packed[at : at + len(junk)] = junk
+    with suppress(ValueError):
+        unpack(bytes(packed))
+
+
+@given(content=st.binary(max_size=120))
+def test_content_that_is_none_is_read_or_refused(content: bytes) -> None:
+    with suppress(ValueError):
+        unpack(zlib.compress(content))

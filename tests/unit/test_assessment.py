@@ -1,0 +1,281 @@
+"""Everything of one call: intervals, tables, cells, causes, balance, durations."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from analysis.applied_flight import Series
+from analysis.applied_record import record_of
+from analysis.assessment import Assessment, assess
+from analysis.breakdowns import speed_bin
+from analysis.causes import Cause
+from analysis.intervals import crossings_of, mean_interval, ratio_interval
+from analysis.strips import strips_of
+from analysis.student import t_factor
+from analysis.volume_balance import balance_of
+from companion.core.controller import Setup
+from companion.core.prescription import Prescription
+from tests.builders import plots, setup
+from tests.unit.applied_flights import SPEED_M_S, eastwards
+
+WIDE = shapely.box(-30.0, -30.0, 90.0, 40.0)
+
+
+@pytest.fixture(scope="module")
+def good() -> Assessment:
+    return assess(eastwards())
+
+
+def rows_of_plots(rows: int, **change: object) -> Setup:
+    """Return the set-up with so many rows of the same plots, and a field that ends with them."""
+    zones = plots([[20.0, 25.0, 15.0, 20.0]] * rows)
+    field = shapely.box(0.0, -0.5, 48.0, 6.0 * rows + 0.5)
+    return setup(prescription=Prescription(zones, boundary=field), **change)
+
+
+# ----------------------------------------------------------------------------------- intervals
+
+
+def test_an_interval_is_that_of_the_cluster_means_where_clusters_are_alike() -> None:
+    values = np.array([1.0, 2.0, 4.0, 5.0])
+    found = mean_interval(values, np.arange(4))
+    half = t_factor(3) * float(values.std(ddof=1)) / math.sqrt(4)
+    assert found.mean == 3.0
+    assert (found.high or 0.0) - 3.0 == pytest.approx(half)
+    assert 3.0 - (found.low or 0.0) == pytest.approx(half)
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=20), st.integers(2, 6))
+def test_valves_that_say_the_same_make_no_interval_narrower(
+    values: list[float], valves: int
+) -> None:
+    each = np.array(values)
+    one = mean_interval(each, np.arange(len(each)))
+    all_valves = mean_interval(np.repeat(each, valves), np.repeat(np.arange(len(each)), valves))
+    assert all_valves.count == valves * one.count
+    assert all_valves.clusters == one.clusters
+    assert all_valves.low == pytest.approx(one.low, abs=1e-9)
+    assert all_valves.high == pytest.approx(one.high, abs=1e-9)
+
+
+def test_one_cluster_has_a_mean_and_no_interval_and_nothing_has_neither() -> None:
+    one = mean_interval(np.array([1.0, 3.0]), np.array([7, 7]))
+    assert (one.mean, one.low, one.high, one.count, one.clusters) == (2.0, None, None, 2, 1)
+    assert mean_interval(np.zeros(0), np.zeros(0, dtype=np.int64)).mean is None
+    assert ratio_interval(np.ones(2), np.zeros(2), np.arange(2)).mean is None
+
+
+def test_intervals_hold_the_truth_nineteen_times_in_twenty() -> None:
+    chance = np.random.default_rng(3)
+    held = 0
+    for _ in range(400):
+        shared = chance.normal(0.0, 1.0, 12)
+        values = np.repeat(shared, 6) + chance.normal(0.0, 0.3, 72)
+        found = mean_interval(values, np.repeat(np.arange(12), 6))
+        assert found.low is not None
+        assert found.high is not None
+        held += found.low <= 0.0 <= found.high
+    assert 0.92 <= held / 400 <= 0.98
+
+
+def test_a_crossing_ends_after_a_pause_and_after_a_second() -> None:
+    assert crossings_of(np.array([0.0, 0.2, 0.4, 0.7])).tolist() == [0, 0, 0, 1]
+    chain = crossings_of(np.arange(0.0, 3.0, 0.2))
+    assert chain.max() >= 2
+
+
+def test_six_valves_over_three_boundaries_are_three_clusters(good: Assessment) -> None:
+    lag = good.intervals["lag_distance_m"]
+    assert (lag.count, lag.clusters) == (18, 3)
+    assert lag.mean == good.evaluation.lag_distance_m.mean
+    assert good.intervals["spraying_accuracy_percent"].mean == pytest.approx(
+        good.evaluation.spraying_accuracy_percent
+    )
+    assert good.intervals["misapplied_percent"].mean == pytest.approx(
+        good.evaluation.misapplied_percent
+    )
+
+
+# -------------------------------------------------------------------------------------- tables
+
+
+def test_tables_split_the_changes_and_lose_none(good: Assessment) -> None:
+    tables = good.breakdowns
+    for rows in (tables.by_kind, tables.by_step, tables.by_rate, tables.by_speed):
+        assert sum(row.lag_distance_m.count for row in rows) == 18
+    kinds = {row.name: row.lag_distance_m.count for row in tables.by_kind}
+    assert kinds == {"on": 0, "off": 0, "up": 12, "down": 6}
+    assert {row.low for row in tables.by_rate} == {15.0, 20.0, 25.0}
+    assert [(row.low, row.high) for row in tables.by_speed] == [(4.75, 5.25)]
+
+
+def test_accuracy_by_speed_and_rate_adds_up_to_that_of_the_flight(good: Assessment) -> None:
+    for rows in (good.breakdowns.accuracy, good.breakdowns.accuracy_by_rate):
+        weights = [row.percent.count for row in rows]
+        percents = [row.percent.mean or 0.0 for row in rows]
+        mean = float(np.average(percents, weights=weights))
+        assert mean == pytest.approx(good.evaluation.spraying_accuracy_percent)
+    assert good.breakdowns.undefined_samples == 0
+
+
+def test_samples_with_nothing_prescribed_are_counted_apart() -> None:
+    given_setup = setup(prescription=Prescription(plots([[20.0, 0.0, 15.0, 20.0]]), boundary=WIDE))
+    found = assess(eastwards(given=given_setup, shut_m=(12.0, 24.0)))
+    assert found.breakdowns.undefined_samples > 12.0 / SPEED_M_S / 0.01
+
+
+def test_a_speed_lies_in_the_bin_around_it() -> None:
+    assert speed_bin(5.0) == (4.75, 5.25)
+    assert speed_bin(5.25) == (5.25, 5.75)
+
+
+# --------------------------------------------------------------------------------------- cells
+
+
+def test_cells_hold_all_that_was_sprayed(good: Assessment) -> None:
+    cells = good.cells
+    assert cells is not None
+    area_m2 = cells.passes * cells.cell_m**2
+    applied_ml = float(np.nansum(cells.measured_l_ha * area_m2)) / 10.0
+    assert applied_ml == pytest.approx(good.evaluation.applied_ml, rel=0.01)
+    assert cells.corner_east_m.shape == tuple(n + 1 for n in cells.commanded_l_ha.shape)
+
+
+def test_five_percent_too_much_is_five_percent_in_every_cell() -> None:
+    cells = assess(eastwards(scale=1.05), cell_m=2.0).cells
+    assert cells is not None
+    inside = (cells.corner_east_m[:-1, :-1] > 1.0) & (cells.corner_east_m[:-1, :-1] < 9.0)
+    error = cells.relative_error_percent[inside & np.isfinite(cells.commanded_l_ha)]
+    assert error == pytest.approx(5.0, abs=0.2)
+    assert cells.histogram_l_ha is not None
+    assert cells.histogram_l_ha.mean == pytest.approx(0.05 * 20.0, rel=0.1)
+    assert cells.histogram_l_ha.counts.sum() == cells.histogram_l_ha.cells
+    assert cells.histogram_l_min is not None
+    per_rate = 6.0 * SPEED_M_S * 60.0 / 10_000.0
+    assert cells.histogram_l_min.mean == pytest.approx(
+        cells.histogram_l_ha.mean * per_rate, rel=0.01
+    )
+
+
+def test_the_duty_map_has_the_duty_of_each_plot(good: Assessment) -> None:
+    cells = good.cells
+    assert cells is not None
+    west = cells.corner_east_m[:-1, :-1]
+    second = cells.duty[(west > 14.0) & (west < 21.0) & np.isfinite(cells.duty)]
+    flow_l_min = 25.0 * SPEED_M_S * 6.0 * 60.0 / 10_000.0
+    expected = eastwards().setup.nozzle_sets[0].curve.duty_for(flow_l_min)
+    assert second == pytest.approx(expected)
+
+
+# -------------------------------------------------------------------------------------- causes
+
+
+def shares(found: Assessment) -> dict[Cause, float]:
+    whole = sum(found.causes.by_cause.values())
+    assert whole == pytest.approx(found.causes.off_m2)
+    return {cause: area / whole for cause, area in found.causes.by_cause.items() if area > 0.0}
+
+
+def test_a_perfect_pass_is_off_at_the_border_only(good: Assessment) -> None:
+    assert good.causes.within_percent is not None
+    assert good.causes.within_percent > 95.0
+    assert set(shares(good)) <= {Cause.EDGE, Cause.CHANGE}
+
+
+def test_late_changes_are_to_blame_for_the_ground_behind_boundaries() -> None:
+    found = assess(eastwards(late_s=0.3))
+    behind_m2 = 3 * 0.3 * SPEED_M_S * 6.0
+    assert found.causes.by_cause[Cause.CHANGE] == pytest.approx(behind_m2, rel=0.35)
+    assert found.causes.by_cause[Cause.UNEXPLAINED] < 1.0
+
+
+def test_what_an_inhibit_closes_is_named_by_its_reason() -> None:
+    found = assess(eastwards(shut_m=(27.0, 33.0), inhibit="wrong-mode"))
+    assert found.causes.by_cause[Cause.INHIBIT] == pytest.approx(36.0, rel=0.1)
+    assert max(found.causes.by_inhibit, key=found.causes.by_inhibit.__getitem__) == "wrong-mode"
+    assert sum(found.causes.by_inhibit.values()) == pytest.approx(
+        found.causes.by_cause[Cause.INHIBIT]
+    )
+    assert found.durations.by_inhibit_s["wrong-mode"] == pytest.approx(6.0 / SPEED_M_S, abs=0.11)
+
+
+def test_the_same_without_a_reason_is_left_out() -> None:
+    found = assess(eastwards(shut_m=(27.0, 33.0)))
+    assert found.causes.by_cause[Cause.SKIP] == pytest.approx(36.0, rel=0.1)
+    assert found.causes.by_cause[Cause.INHIBIT] == 0.0
+
+
+def test_a_wrong_flow_without_any_reason_stays_unexplained() -> None:
+    found = assess(eastwards(scale=1.15))
+    assert shares(found)[Cause.UNEXPLAINED] > 0.8
+
+
+def test_a_rate_beyond_the_nozzles_is_saturation() -> None:
+    found = assess(eastwards(speed_m_s=10.0))
+    # The rest is near borders and changes, which are named first.
+    assert shares(found)[Cause.SATURATION] > 0.6
+
+
+def test_ground_treated_twice_counts_once_as_overlap() -> None:
+    used = setup(prescription=Prescription(plots([[20.0, 25.0, 15.0, 20.0]]), boundary=WIDE))
+    found = assess(eastwards(given=used, passes_north_m=(3.0, 3.0)))
+    assert found.causes.by_cause[Cause.OVERLAP] == pytest.approx(48.0 * 6.0, rel=0.03)
+    assert found.causes.untreated_m2 == pytest.approx(0.0, abs=3.0)
+
+
+def test_a_gap_between_two_passes_is_left_out() -> None:
+    used = rows_of_plots(3)
+    found = assess(eastwards(given=used, passes_north_m=(3.0, 11.0)))
+    # 2 m between the passes, and 4 m beyond them that no later pass came to.
+    assert found.causes.skipped_m2 == pytest.approx(48.0 * 2.0, rel=0.06)
+    assert found.causes.untreated_m2 == pytest.approx(48.0 * 6.0, rel=0.06)
+    assert found.causes.doubled_m2 == 0.0
+
+
+# ------------------------------------------------------------------------- balance, durations
+
+
+def test_the_balance_knows_refills_and_meter() -> None:
+    flight = eastwards()
+    record = record_of(flight)
+    applied_l = float(record.volume_ml[-1].sum()) / 1000.0
+    level = np.array([10.0, 9.5, 14.5, 14.0, 14.0 - applied_l])
+    count_ml = np.linspace(0.0, 1000.0 * applied_l * 1.02, 5)
+    times = np.linspace(record.time_s[0], record.time_s[-1], 5)
+    filled = replace(
+        flight,
+        tank_l=Series(time_s=times, value=level),
+        meter_ml=Series(time_s=times, value=count_ml),
+    )
+    found = balance_of(filled, strips_of(record), 1000.0 * applied_l)
+    assert found.refilled_l == pytest.approx(5.0)
+    assert found.tank_l == pytest.approx(1.0 + applied_l)
+    assert found.meter_to_model_percent == pytest.approx(2.0)
+    assert found.model_to_prescribed_percent == pytest.approx(0.0, abs=1.5)
+    assert balance_of(flight, strips_of(record), 0.0).meter_l is None
+
+
+def test_a_gap_in_the_journal_is_no_spraying() -> None:
+    flight = eastwards(passes_north_m=(3.0, 3.0))
+    late = np.where(flight.time_s > 130.0, 100.0, 0.0)
+    found = assess(replace(flight, time_s=flight.time_s + late))
+    assert found.durations.unknown_s == pytest.approx(100.3, abs=0.31)
+    assert found.durations.recorded_s == pytest.approx(2 * 78.0 / SPEED_M_S + 30.0, abs=0.7)
+
+
+def test_everything_is_json_without_nan(good: Assessment) -> None:
+    text = json.dumps(good.as_json(), allow_nan=False)
+    found = json.loads(text)
+    for key in ("lag_distance_m", "intervals", "breakdowns", "cells", "causes", "balance"):
+        assert found[key] is not None
+    assert found["lag_distance_m"]["count"] == 18
+    assert set(found["intervals"]["lag_distance_m"]) == {"mean", "low", "high", "count", "clusters"}
+    assert sum(found["causes"]["share"].values()) == pytest.approx(1.0)

@@ -1,0 +1,154 @@
+"""Cards tied to a flight: which pass went over them, what was ordered there, how far the change."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.applied_flight import AppliedFlight, ValveChanges
+from analysis.wsp.boundaries import CardAtChange, NearestChange, nearest_change, tables
+from analysis.wsp.passing import duty_at, passing
+from tests import builders
+
+NAN = float("nan")
+STEP_S, SPEED_M_S = 0.05, 5.0
+
+
+def flown(*, north_m: float = 3.0, back: bool = False, forward_m: float = 0.0) -> AppliedFlight:
+    """Return a flight over the row of plots, eastwards at 5 m/s, or back again at 90 s."""
+    east_m = np.arange(-10.0, 58.0, SPEED_M_S * STEP_S)
+    if back:
+        east_m = np.concatenate([east_m, east_m[::-1]])
+    count = len(east_m)
+    heading = np.full(count, 90.0)
+    heading[len(heading) // 2 :] = 270.0 if back else 90.0
+    setup = builders.setup(boom=builders.boom(forward_m=forward_m))
+    rates = setup.prescription.rates_at(east_m, np.full(count, 3.0))
+    return AppliedFlight(
+        path=Path("flight-0001.gpkg"),
+        meta={},
+        setup=setup,
+        is_closed=True,
+        lost=0,
+        events=(),
+        utc_offset_s=1_000_000.0,
+        utc_source="computer",
+        time_s=np.arange(count) * STEP_S,
+        latitude_deg=np.zeros(count),
+        longitude_deg=np.zeros(count),
+        east_m=east_m,
+        north_m=np.full(count, north_m),
+        height_m=np.full(count, 3.5),
+        speed_m_s=np.full(count, SPEED_M_S),
+        course_deg=heading,
+        heading_deg=heading,
+        rate_l_ha=np.repeat(rates[:, None], 6, axis=1),
+        target_flow_l_min=np.zeros(count),
+        flow_l_min=np.zeros(count),
+        inhibits=("",) * count,
+        changes=ValveChanges(
+            planned_s=np.array([1.9, 4.3, 11.5]),
+            actual_s=np.array([NAN, 4.31, NAN]),
+            valve=np.full(3, 2),
+            duty=np.array([0.5, 0.7, 0.0]),
+        ),
+    )
+
+
+def test_the_boom_passes_a_card_at_its_time_and_by_its_valve() -> None:
+    over = passing(flown(), 10.1, 2.4)
+    assert over is not None
+    assert over.time_s == pytest.approx(20.1 / SPEED_M_S)
+    assert over.right_m == pytest.approx(0.6)  # eastwards, so that south is right
+    assert over.valve == 3
+    assert (over.beside_m, over.passes, over.planned_l_ha) == (0.0, 1, 20.0)
+
+
+def test_a_boom_before_the_receiver_passes_earlier() -> None:
+    over = passing(flown(forward_m=1.0), 10.1, 3.5)
+    assert over is not None
+    assert over.time_s == pytest.approx(19.1 / SPEED_M_S)
+
+
+def test_both_ways_count_as_passes_and_the_middle_of_the_boom_is_nearest() -> None:
+    over = passing(flown(back=True), 10.0, 2.9)
+    assert over is not None
+    assert over.passes == 2
+
+
+def test_a_card_beside_the_boom_is_not_under_a_valve() -> None:
+    over = passing(flown(), 10.0, 7.5)
+    assert over is not None
+    assert (over.valve, over.planned_l_ha, over.applied_l_ha) == (None, None, None)
+    assert over.beside_m == pytest.approx(1.5)
+    assert passing(flown(), 10.0, 20.0) is None
+    assert passing(flown(), 80.0, 3.0) is None
+
+
+def test_a_gap_in_the_record_is_no_pass() -> None:
+    flight = flown()
+    keep = (flight.time_s < 3.0) | (flight.time_s > 5.0)
+    names = ("time_s", "east_m", "north_m", "height_m", "speed_m_s", "course_deg", "heading_deg")
+    cut = replace(flight, **{name: getattr(flight, name)[keep] for name in names})
+    assert passing(cut, 10.0, 3.0) is None
+    assert passing(replace(flight, heading_deg=flight.heading_deg * NAN), 10.0, 3.0) is None
+
+
+@pytest.mark.parametrize(
+    ("time_s", "duty"),
+    [(1.9, 0.0), (2.009, 0.0), (2.011, 0.5), (4.42, 0.5), (4.43, 0.7), (11.61, 0.7), (11.63, 0.0)],
+)
+def test_a_duty_holds_from_its_order_and_the_lag_of_its_kind(time_s: float, duty: float) -> None:
+    """on 0.10 s, up 0.104 s, off 0.11 s, each after 0.01 s of the output."""
+    assert duty_at(flown(), 2, time_s) == duty
+
+
+def test_the_applied_rate_is_the_flow_over_speed_and_width() -> None:
+    over = passing(flown(), 10.0, 3.5)
+    assert over is not None and over.valve == 2
+    flow_l_min = builders.CURVE.flow_for(0.5) / 6
+    assert over.applied_l_ha == pytest.approx(flow_l_min / (0.006 * SPEED_M_S * 1.0))
+    closed = passing(flown(), 10.0, 2.5)
+    assert closed is not None and closed.applied_l_ha == 0.0
+
+
+@pytest.mark.parametrize(
+    ("east_m", "course_deg", "distance_m", "rates"),
+    [
+        (13.0, 90.0, 1.0, (20.0, 25.0)),
+        (11.25, 90.0, -0.75, (20.0, 25.0)),
+        (13.0, 270.0, -1.0, (25.0, 20.0)),
+        (0.5, 90.0, 0.5, (None, 20.0)),
+        (47.0, 90.0, -1.0, (20.0, None)),
+    ],
+)
+def test_the_nearest_change_lies_behind_or_ahead(
+    east_m: float, course_deg: float, distance_m: float, rates: tuple[float | None, float | None]
+) -> None:
+    prescription = builders.setup().prescription
+    found = nearest_change(prescription, east_m, 3.0, course_deg=course_deg)
+    assert found is not None
+    assert found.distance_m == pytest.approx(distance_m, abs=0.002)
+    assert (found.before_l_ha, found.after_l_ha) == rates
+
+
+def test_there_is_no_change_far_from_the_field() -> None:
+    prescription = builders.setup().prescription
+    assert nearest_change(prescription, 500.0, 3.0, course_deg=90.0) is None
+
+
+def test_deposit_is_set_against_distance_for_two_cards_or_more_at_a_change() -> None:
+    def at(card: int, distance_m: float, time_s: float) -> CardAtChange:
+        change = NearestChange(distance_m=distance_m, before_l_ha=20.0, after_l_ha=25.0)
+        return CardAtChange(
+            card=card, change=change, time_s=time_s, speed_m_s=5.0, found={"deposit_l_ha": 9.0}
+        )
+
+    # Both cross the change at 10 s; the third is of another pass.
+    (table,) = tables([at(1, 1.0, 10.2), at(2, -2.0, 9.6), at(3, 1.0, 50.2)])
+    assert (table["before_l_ha"], table["after_l_ha"]) == (20.0, 25.0)
+    assert [row["card"] for row in table["cards"]] == [2, 1]
+    assert [row["distance_m"] for row in table["cards"]] == [-2.0, 1.0]
