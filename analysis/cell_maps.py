@@ -28,6 +28,8 @@ BLANK_BELOW = 0.10
 # A cell of which less than this was passed says little about a cell.
 PASSED_MIN = 0.10
 PIECES_PER_CELL = 5
+# Pieces of ground are not longer: one that lies across a boundary counts for one of its sides.
+PIECE_MAX_M = 0.2
 CELLS_MAX = 2_000_000
 HISTOGRAM_BINS = 41
 L_HA_PER_ML_M2 = 10.0
@@ -189,7 +191,7 @@ def cell_maps(
         grid = SquareGrid.over(bounds, size_m)
         source = "squares"
         corners = _square_corners(grid)
-    sums = _sums(grid, strips, duties, size_m / PIECES_PER_CELL)
+    sums = _sums(grid, strips, duties, min(size_m / PIECES_PER_CELL, PIECE_MAX_M))
     return _maps(grid, sums, corners, source, size_m, record.boom.width_m)
 
 

@@ -12,7 +12,9 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
 
 from analysis.changes import Change, changes_of
 from analysis.transitions import (
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.changes import Run
-    from analysis.track import Track
+    from analysis.track import Bools, Floats, Track
     from companion.core.types import TimedChange
 
 SMALLEST_STEP = 0.08
@@ -68,13 +70,12 @@ class Step:
     lag_distance_m: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Line:
-    """The volume against the distance, around one point."""
+class _Lines(NamedTuple):
+    """The volume against the distance around a point each; the slope is NaN where there is none."""
 
-    distance_m: float
-    volume_ml: float
-    slope_ml_m: float
+    distance_m: Floats
+    volume_ml: Floats
+    slope_ml_m: Floats
 
 
 def measure_steps(
@@ -87,6 +88,7 @@ def measure_steps(
     changes = changes_of(track, stretches)
     smooth = SmoothTrack(track)
     transitions = find_transitions(smooth, stretches, changes)
+    lags_m = _lag_distances_m(smooth, changes, transitions)
     steps: list[Step] = []
     for i, change in enumerate(changes):
         if change is None:
@@ -110,7 +112,7 @@ def measure_steps(
             verdict = Verdict.SATURATED
         lag_m = None
         if verdict is Verdict.MEASURED:
-            lag_m = _lag_distance_m(smooth, change, transitions, i)
+            lag_m = lags_m[i]
             verdict = Verdict.CLOSE if lag_m is None else verdict
         steps.append(Step(change=change, verdict=verdict, dry=dry, lag_distance_m=lag_m))
     return steps
@@ -126,42 +128,49 @@ def _verdict(change: Change, stretches: tuple[Run, Run], transition: Transition)
     return Verdict.MEASURED if transition.found else Verdict.CLOSE
 
 
-def _lag_distance_m(
-    smooth: SmoothTrack, change: Change, transitions: Sequence[Transition], i: int
-) -> float | None:
+def _lag_distances_m(
+    smooth: SmoothTrack, changes: Sequence[Change | None], transitions: Sequence[Transition]
+) -> list[float | None]:
     """Return step less boundary; None where a window would reach over a neighbouring change."""
+    if not changes:
+        return []
     track = smooth.track
-    floor_s = transitions[i - 1].settled_s if i > 0 else float(track.time_s[0])
-    last_s = float(track.time_s[-1])
-    ceiling_s = transitions[i + 1].begin_s if i + 1 < len(transitions) else last_s
-    before = _line(smooth, transitions[i].begin_s, floor_s, closed=change.before_l_ha == 0.0)
-    after = _line(smooth, transitions[i].settled_s, ceiling_s, closed=change.after_l_ha == 0.0)
-    if before is None or after is None or before.slope_ml_m == after.slope_ml_m:
-        return None
+    nan = float("nan")
+    closed_before = np.array([each is not None and each.before_l_ha == 0.0 for each in changes])
+    closed_after = np.array([each is not None and each.after_l_ha == 0.0 for each in changes])
+    boundary_m = np.array([nan if each is None else each.distance_m for each in changes])
+    begins_s = np.array([each.begin_s for each in transitions])
+    settles_s = np.array([each.settled_s for each in transitions])
+    floors_s = np.concatenate(([track.time_s[0]], settles_s[:-1]))
+    ceilings_s = np.concatenate((begins_s[1:], [track.time_s[-1]]))
+    before = _lines(smooth, begins_s, floors_s, closed_before)
+    after = _lines(smooth, settles_s, ceilings_s, closed_after)
     rise_ml = after.volume_ml - before.volume_ml
     rise_ml += before.slope_ml_m * before.distance_m - after.slope_ml_m * after.distance_m
-    return rise_ml / (before.slope_ml_m - after.slope_ml_m) - change.distance_m
+    bend = before.slope_ml_m - after.slope_ml_m
+    steps_m = np.divide(rise_ml, bend, out=np.full(len(bend), nan), where=bend != 0.0)
+    return [None if np.isnan(lag_m) else lag_m for lag_m in (steps_m - boundary_m).tolist()]
 
 
-def _line(smooth: SmoothTrack, near_s: float, far_s: float, *, closed: bool) -> _Line | None:
-    """Return the line of the flow between a change (`near_s`) and a neighbour (`far_s`)."""
+def _lines(smooth: SmoothTrack, near_s: Floats, far_s: Floats, closed: Bools) -> _Lines:
+    """Return the lines of the flow between changes (`near_s`) and their neighbours (`far_s`)."""
     track = smooth.track
-    if closed:
-        distance_m = track.value(track.distance_m, near_s)
-        return _Line(
-            distance_m=distance_m,
-            volume_ml=track.value(track.volume_ml, near_s),
-            slope_ml_m=0.0,
-        )
-    away_s = track.period_s if far_s > near_s else -track.period_s
+    away_s = np.where(far_s > near_s, track.period_s, -track.period_s)
     # The smoothing reaches one period to each side of both points.
-    periods = min(int((far_s - near_s) / away_s) - 2, PERIODS_MAX)
-    if periods < PERIODS_MIN:
-        return None
-    anchor_s = near_s + away_s
-    distance_m, volume_ml = smooth.at(anchor_s)
-    slope = smooth.dose_between(*sorted((anchor_s, anchor_s + periods * away_s)))
-    return _Line(distance_m=distance_m, volume_ml=volume_ml, slope_ml_m=slope)
+    periods = np.minimum(np.trunc((far_s - near_s) / away_s) - 2.0, PERIODS_MAX)
+    anchors_s = near_s + away_s
+    ends_s = np.sort(np.stack((anchors_s, anchors_s + periods * away_s)), axis=0)
+    slopes = smooth.doses_between(ends_s[0], ends_s[1])
+    slopes[periods < PERIODS_MIN] = np.nan
+    return _Lines(
+        distance_m=np.where(
+            closed, track.at(track.distance_m, near_s), track.at(smooth.distance_m, anchors_s)
+        ),
+        volume_ml=np.where(
+            closed, track.at(track.volume_ml, near_s), track.at(smooth.volume_ml, anchors_s)
+        ),
+        slope_ml_m=np.where(closed, 0.0, slopes),
+    )
 
 
 def _is_saturated(

@@ -63,31 +63,29 @@ class SmoothTrack:
         rise_m = rise_over(self.distance_m, track.period_steps)
         rise_ml = rise_over(self.volume_ml, track.period_steps)
         moving = rise_m > 0.1 * track.period_s
+        self.metres: Floats = np.diff(self.distance_m, append=self.distance_m[-1])
         self.dose_ml_m: Floats = np.divide(rise_ml, rise_m, out=np.zeros_like(rise_m), where=moving)
 
-    def at(self, time_s: float) -> tuple[float, float]:
-        """Return the smoothed distance and volume at a time."""
-        track = self.track
-        return track.value(self.distance_m, time_s), track.value(self.volume_ml, time_s)
-
-    def dose_between(self, start_s: float, end_s: float) -> float:
-        """Return the mean dose between two times; 0 where the strip stands."""
-        (start_m, start_ml), (end_m, end_ml) = self.at(start_s), self.at(end_s)
-        return (end_ml - start_ml) / (end_m - start_m) if end_m - start_m > MOVED_M else 0.0
+    def doses_between(self, start_s: Floats, end_s: Floats) -> Floats:
+        """Return the mean doses between pairs of times; 0 where the strip stands."""
+        ends_s = np.stack((start_s, end_s))
+        metres, volumes_ml = (
+            np.diff(self.track.at(values, ends_s), axis=0)[0]
+            for values in (self.distance_m, self.volume_ml)
+        )
+        doses: Floats = np.divide(
+            volumes_ml, metres, out=np.zeros(len(metres)), where=metres > MOVED_M
+        )
+        return doses
 
 
 def levels_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
     """Return the dose [mL/m] that the flow had in each stretch; outside the field it is 0."""
     starts_s = np.array([stretch.start_s for stretch in stretches])
     dwells_s = np.array([stretch.dwell_s for stretch in stretches])
-    ends_s = np.stack((starts_s + LEVEL_FROM * dwells_s, starts_s + LEVEL_TO * dwells_s))
-    metres, volumes_ml = (
-        np.diff(smooth.track.at(values, ends_s), axis=0)[0]
-        for values in (smooth.distance_m, smooth.volume_ml)
-    )
-    counts = np.array([stretch.inside for stretch in stretches]) & (metres > MOVED_M)
-    found = np.divide(volumes_ml, metres, out=np.zeros(len(metres)), where=counts)
-    return [float(level) for level in found]
+    found = smooth.doses_between(starts_s + LEVEL_FROM * dwells_s, starts_s + LEVEL_TO * dwells_s)
+    inside = np.array([stretch.inside for stretch in stretches])
+    return [float(level) for level in np.where(inside, found, 0.0)]
 
 
 def prescribed_dose_ml_m(track: Track, rate_l_ha: float, time_s: float) -> float:
@@ -150,8 +148,7 @@ def _located(
     track = smooth.track
     first, last = track.sample(early_s), track.sample(late_s) + 1
     part = (smooth.dose_ml_m[first:last] - levels[0]) / (levels[1] - levels[0])
-    metres = np.diff(smooth.distance_m[first : last + 1], append=smooth.distance_m[-1])
-    excess = np.cumsum((np.clip(part, 0.0, 1.0) - 0.5) * metres[: len(part)])
+    excess = np.cumsum((np.minimum(np.maximum(part, 0.0), 1.0) - 0.5) * smooth.metres[first:last])
     middle = first + int(np.argmin(excess))
     below = np.flatnonzero(part[: middle - first + 1] <= 0.25)
     above = np.flatnonzero(part[middle - first :] >= 0.75)

@@ -34,8 +34,11 @@ def flown(
     motion: Motion,
     rates: Rates,
     pace: Pace,
+    any_depot: bool = False,
 ) -> Paced:
     """Return the sorties; `pace` gives them the speeds that rates and ground need.
+
+    With `any_depot` one sortie is to be flown from the best of the depots.
 
     Raises:
         PlanError: where a tank or a battery does not last for any.
@@ -45,7 +48,9 @@ def flown(
     pace_s_m = line_pace(lines, rates, settings) if math.isfinite(usable_wh) else None
     share = 1.0
     for _ in range(ROUNDS):
-        flying = Flying(motion=motion, pace_s_m=pace_s_m, battery_share=share)
+        flying = Flying(
+            motion=motion, pace_s_m=pace_s_m, battery_share=share, any_depot=any_depot
+        )  # fmt: skip
         found = pace(plan_sorties(lines, demand, ways, settings, flying))
         worst_wh = most_wh(found.sorties, settings)
         if worst_wh <= usable_wh:

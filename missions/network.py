@@ -41,6 +41,10 @@ class Network:
         """Return the index of the depot in `between_s`."""
         return len(self.between_s) - 1
 
+    def put_depot_anywhere(self) -> None:
+        """Leave the ways from and to the depot out: it is put where the tour begins and ends."""
+        self.between_s[self.depot, :] = self.between_s[:, self.depot] = 0.0
+
 
 def build_network(
     pieces: Pieces, depots: Floats, space: FreeSpace, motion: Motion, *, refill_s: float

@@ -3,35 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
-from missions.angle import LAYOUT_WEIGHT, cost_s, ranked
 from missions.coverage import measure
 from missions.demand import Demand, Rates, demands
 from missions.errors import PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
-from missions.fitted_lines import fitted_lines, has_edges_along
 from missions.fleet import fleet_sorties
 from missions.flown import flown
-from missions.open_lines import needed_passes, open_lines
+from missions.layouts import spray_lines
 from missions.paced import Paced, range_warnings
-from missions.patches import patches
 from missions.plan import Plan, Settings, Sortie
 from missions.remaining import Remaining
 from missions.schedule import scheduled
 from missions.short import short_warnings
 from missions.strips import Floats, joined
 from missions.surroundings import NOTHING_AROUND, Surroundings
-from missions.swaths import border_passes, inner_ground, inner_lines
 from missions.turns import Motion
-from missions.ways import Ways, build_ways, suggested_depot
+from missions.ways import Ways, build_ways, edge_places, suggested_depot
 
-# Of the best courses so many are drawn in full.
-ANGLES_TRIED = 2
+# One sortie may begin and end anywhere: its depot is chosen among so many places of the edge.
+EDGE_STEP_M, EDGE_PLACES = 25.0, 24
 
 
 def plan_mission(
@@ -89,21 +86,29 @@ def _planned(
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
     given = _depots(field.frame, depots)
 
-    def one(some: Floats, needs: list[Demand], ways: Ways) -> Paced:
+    def one(some: Floats, needs: list[Demand], ways: Ways, any_depot: bool = False) -> Paced:
         def pace(sorties: Sequence[Sortie]) -> Paced:
             return around.paced(sorties, rates, field, settings)
 
         around.check(field, ways.depots)
-        return flown(some, needs, ways, settings, motion=motion, rates=rates, pace=pace)
+        return flown(
+            some, needs, ways, settings, motion=motion, rates=rates, pace=pace,
+            any_depot=any_depot,
+        )  # fmt: skip
 
     if settings.aircraft > 1:
         fleet = fleet_sorties(
             field, lines, demand, settings, angle_deg=angle_deg, depots=given, one=one
         )
         sorties, places = fleet.paced, fleet.depots
-    else:
+    elif len(given) or not _is_one(settings, litres):
         places = given if len(given) else suggested_depot(field, lines, litres)
         sorties = one(lines, demand, build_ways(field, places))
+    else:
+        edge = edge_places(field, step_m=EDGE_STEP_M, count_max=EDGE_PLACES)
+        sorties = one(lines, demand, build_ways(field, edge), any_depot=True)
+        places = edge[[sorties.sorties[0].depot]]
+        sorties = replace(sorties, sorties=(replace(sorties.sorties[0], depot=0),))
     plan = Plan(
         field=field,
         settings=settings,
@@ -123,37 +128,11 @@ def _planned(
     return scheduled(plan)
 
 
-def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Floats, float]:
-    """Return the lines that cover the field, and the course of the parallel ones.
-
-    Two ways are tried for the best courses: a pass along the whole border with lines inside, and
-    lines from border to border with passes only where they are needed.
-    """
-    width_m, ground = settings.swath_width_m, field.spray
-    inner, passes = inner_ground(ground, width_m), border_passes(ground, width_m)
-    if settings.angle_deg is None:
-        angles = [angle for _, angle in ranked(inner, ground, width_m=width_m, motion=motion)]
-        angles = angles[:ANGLES_TRIED]
-    else:
-        angles = [settings.angle_deg]
-    tried: list[tuple[float, float, Floats]] = []
-    for number, angle_deg in enumerate(angles):
-        choices = []
-        if number == 0:
-            choices.append(joined([passes, inner_lines(inner, width_m, angle_deg)]))
-        straights = [open_lines(ground, width_m, angle_deg)]
-        if number == 0 and has_edges_along(ground, width_m, angle_deg):
-            straights.append(fitted_lines(ground, width_m, angle_deg, motion))
-        for straight in straights:
-            if len(straight):
-                more = needed_passes(straight, passes, ground, width_m)
-                choices.append(joined([more, straight]))
-        for lines in choices:
-            whole = joined([lines, patches(lines, ground, width_m)])
-            cost = cost_s(whole, motion, width_m, ground.area, weight=LAYOUT_WEIGHT)
-            tried.append((cost, angle_deg, whole))
-    _, best_deg, best = min(tried, key=lambda each: each[0])
-    return best, best_deg
+def _is_one(settings: Settings, litres: Floats) -> bool:
+    """Return whether one sortie is enough for the field, whatever the way to it."""
+    battery = settings.battery
+    lasts = battery is None or battery.capacity_wh is None
+    return lasts and float(litres.sum()) <= settings.usable_l
 
 
 def _depots(frame: LocalFrame, depots: tuple[tuple[float, float], ...]) -> Floats:

@@ -103,7 +103,7 @@ def _attempt(state: _State, draw: random.Random, allowed: float) -> float:
         return 0.0
     kind = draw.random()
     if kind < 0.4:
-        return _insert(state, end, other, allowed)
+        return _insert(state, draw, end, other, allowed)
     if state.of[end >> 1] == state.of[other >> 1]:
         return _turn_part(state, end, other, allowed)
     if kind < 0.75:
@@ -111,32 +111,43 @@ def _attempt(state: _State, draw: random.Random, allowed: float) -> float:
     return _exchange(state, end, other, allowed)
 
 
-def _insert(state: _State, end: int, other: int, allowed: float) -> float:
-    """Take a piece out and put it beside another, so that `end` meets `other`."""
+def _insert(state: _State, draw: random.Random, end: int, other: int, allowed: float) -> float:
+    """Take a run of pieces out and put it beside another, so that `end` meets `other`.
+
+    The run begins or ends with `end`, and has one to three pieces.
+    """
     piece, target = end >> 1, other >> 1
     source, goal = state.of[piece], state.of[target]
-    if source != goal and not state.fits(state.load[goal] + state.litres[piece]):
-        return 0.0
-    between, depot = state.between, state.depot
     old = state.sorties[source]
     at = _index(old, piece)
-    before = old[at - 1] ^ 1 if at else depot
-    after = old[at + 1] if at + 1 < len(old) else depot
-    enter = old[at]
-    cost = between[before][after] - between[before][enter] - between[enter ^ 1][after]
-    rest = old[:at] + old[at + 1 :]
+    more = int(3.0 * draw.random() ** 2)
+    start, stop = (at, at + 1 + more) if old[at] == end else (at - more, at + 1)
+    start, stop = max(start, 0), min(stop, len(old))
+    run = old[start:stop]
+    if source == goal:
+        if other in run or other ^ 1 in run:
+            return 0.0
+    elif not state.fits(state.load[goal] + sum(state.litres[enter >> 1] for enter in run)):
+        return 0.0
+    between, depot = state.between, state.depot
+    before = old[start - 1] ^ 1 if start else depot
+    after = old[stop] if stop < len(old) else depot
+    cost = between[before][after] - between[before][run[0]] - between[run[-1] ^ 1][after]
+    rest = old[:start] + old[stop:]
     into = rest if source == goal else state.sorties[goal]
     place = _index(into, target)
-    if into[place] == other:  # the target is entered there: the piece comes before it
-        left, right, new = (into[place - 1] ^ 1 if place else depot), other, end ^ 1
+    if into[place] == other:  # the target is entered there: the run comes before it
+        left, right = (into[place - 1] ^ 1 if place else depot), other
+        new = run if run[-1] ^ 1 == end else turned(run)
     else:
-        left, new = other, end
+        left = other
+        new = run if run[0] == end else turned(run)
         place += 1
         right = into[place] if place < len(into) else depot
-    cost += between[left][new] + between[new ^ 1][right] - between[left][right]
+    cost += between[left][new[0]] + between[new[-1] ^ 1][right] - between[left][right]
     if cost >= allowed:
         return 0.0
-    longer = [*into[:place], new, *into[place:]]
+    longer = [*into[:place], *new, *into[place:]]
     if not state.flies(longer):
         return 0.0
     state.sorties[source] = rest

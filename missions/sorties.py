@@ -19,6 +19,7 @@ from missions.savings import Sortie as Order
 from missions.savings import by_savings
 from missions.search import improve
 from missions.strips import Floats, lengths_m
+from missions.tour import shortest_tour
 from missions.turns import Motion
 from missions.ways import Ways
 
@@ -27,6 +28,8 @@ PIECES_A_TANK = 6
 PIECES_MAX = 600
 TANKS_MAX = 1500
 TOUCH_M = 1e-3
+# What one kick of a tour takes, counted in moves of the search over many sorties.
+MOVES_A_KICK = 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,12 +37,14 @@ class Flying:
     """How lines are flown: `pace_s_m` is the time of a metre of each line, where rates slow it.
 
     `battery_share` is how much of what the battery may give a sortie is planned with: the search
-    knows turns and speeds only nearly.
+    knows turns and speeds only nearly. With `any_depot` the depots are a choice, of which one is
+    taken when the sortie is known.
     """
 
     motion: Motion
     pace_s_m: Floats | None = None
     battery_share: float = 1.0
+    any_depot: bool = False
 
 
 def plan_sorties(
@@ -59,14 +64,21 @@ def plan_sorties(
             "L above its reserve; see mission.tank_l"
         )
     network = build_network(pieces, ways.depots, ways.inside, motion, refill_s=settings.refill_s)
+    if flying.any_depot:
+        network.put_depot_anywhere()
     budget = _budget(network, pieces, settings, flying)
     lasts = None if budget is None else budget.lasts
     if budget is not None:
         _check_reach(budget, pieces, ways, settings)
     orders = by_savings(network, settings.usable_l, lasts=lasts)
-    orders = improve(
-        network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed, lasts=lasts
-    )
+    if len(orders) == 1 and lasts is None:
+        kicks = settings.moves // MOVES_A_KICK
+        orders = [shortest_tour(network, orders[0], kicks=kicks, seed=settings.seed)]
+    else:
+        orders = improve(
+            network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed,
+            lasts=lasts,
+        )  # fmt: skip
     homes = [_home(network, order) for order in orders]
     ranked = sorted(range(len(orders)), key=lambda at: (homes[at], min(orders[at])))
     drawn = _Drawn(pieces=pieces, ways=ways, motion=motion)

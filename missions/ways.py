@@ -93,12 +93,11 @@ def _is_in(blocked: BaseGeometry, east_m: float, north_m: float) -> bool:
     return bool(shapely.contains_xy(blocked, east_m, north_m)) if not blocked.is_empty else False
 
 
-def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:
-    """Return the place on the edge of the field from which the litres are nearest."""
+def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
+    """Return places along the edge of the field, evenly apart."""
     rings = [shapely.get_exterior_ring(part) for part in shapely.get_parts(field.fly)]
-    length_m = sum(ring.length for ring in rings)
-    step_m = max(25.0, length_m / 120.0)
-    places = np.concatenate(
+    step_m = max(step_m, sum(ring.length for ring in rings) / count_max)
+    return np.concatenate(
         [
             shapely.get_coordinates(
                 shapely.line_interpolate_point(ring, np.arange(0.0, ring.length, step_m))
@@ -106,6 +105,11 @@ def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:
             for ring in rings
         ]
     )
+
+
+def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:
+    """Return the place on the edge of the field from which the litres are nearest."""
+    places = edge_places(field, step_m=25.0, count_max=120)
     middle = (lines[:, :2] + lines[:, 2:]) / 2.0
     thirds = np.concatenate([middle, (lines[:, :2] + middle) / 2, (lines[:, 2:] + middle) / 2])
     weight = np.tile(np.maximum(litres, 1e-9), 3)

@@ -298,10 +298,17 @@ def _fly_ours(
         hear(item)
         if isinstance(item, Telemetry):
             decide(item.received_s)
-    if setup.records_coverage:
-        state = estimate(track, next_s)
-        said.coverage = expected(setup, memory, state, now_s=next_s, cut_s=next_s)
+    said.coverage = _treated(setup, memory, estimate(track, next_s), next_s)
     return said
+
+
+def _treated(
+    setup: Setup, memory: Memory, state: VehicleState | None, now_s: float
+) -> Coverage | None:
+    """Return what a flight that ends now has treated; None where it is not kept."""
+    if not setup.records_coverage:
+        return None
+    return expected(setup, memory, state, now_s=now_s, cut_s=now_s)
 
 
 def _fly_wang(

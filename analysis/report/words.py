@@ -74,12 +74,14 @@ def verdict_of(assessment: Assessment | None, treated: Treated) -> dict[str, Any
         "worst_lag_distance_m": evaluation.lag_distance_m.max_abs,
         "outside_ml": evaluation.off_target_ml,
     }
-    return {"sentence": _sentence(figures), **figures}
+    return {"sentence": _sentence(figures, assessment.flight.training), **figures}
 
 
-def _sentence(figures: Mapping[str, Any]) -> str:
+def _sentence(figures: Mapping[str, Any], training: str | None) -> str:
     applied_l, prescribed_l = figures["applied_l"], figures["prescribed_l"]
-    parts = [f"{applied_l:.2f} L applied on {figures['area_ha']:.2f} ha"]
+    what = {"water": "L of water applied", "dry": "L would have been applied"}
+    done = what.get(training or "", "L applied")
+    parts = [f"{applied_l:.2f} {done} on {figures['area_ha']:.2f} ha"]
     if prescribed_l:
         off = 100.0 * (applied_l - prescribed_l) / prescribed_l
         parts[0] += f", {prescribed_l:.2f} L prescribed ({off:+.1f} %)"

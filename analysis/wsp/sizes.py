@@ -77,7 +77,7 @@ def fraction_um(drop_um: Floats, weight: Floats, part: float) -> float | None:
     Straight between the drops in the order of their sizes, and from the origin to the smallest.
 
     >>> fraction_um(np.array([100.0, 200.0]), np.array([1.0, 3.0]), 0.5)
-    133.33333333333331
+    133.33333333333334
     >>> fraction_um(np.array([100.0]), np.array([1.0]), 0.5)
     50.0
     """

@@ -207,12 +207,12 @@ def _insides(quad: Quad) -> Iterator[tuple[int, int, Bools]]:
         rows = math.floor(max(north) / CELL_M - 0.5) - first_row + 1
         if columns < 1 or rows < 1:
             continue
-        # Sides as rows, so that all of them are looked at in one go.
-        x, y = np.array(east)[:, None], np.array(north)[:, None]
-        dx, dy = np.roll(x, -1) - x, np.roll(y, -1) - y
-        of_row = dx * ((np.arange(rows) + (first_row + 0.5)) * CELL_M - y)
-        of_column = dy * ((np.arange(columns) + (first_column + 0.5)) * CELL_M - x)
-        inside = (of_row[:, :, None] - of_column[:, None, :]).min(axis=0) >= -TOUCH_M2
+        x = (np.arange(columns) + (first_column + 0.5)) * CELL_M
+        y = ((np.arange(rows) + (first_row + 0.5)) * CELL_M)[:, None]
+        inside = np.ones((rows, columns), dtype=np.bool_)
+        for (x0, y0), (x1, y1) in zip(part, (*part[1:], part[0]), strict=True):
+            dx, dy = x1 - x0, y1 - y0
+            inside &= dx * y + (TOUCH_M2 - dx * y0 + dy * x0) >= dy * x
         yield first_row, first_column, inside
 
 

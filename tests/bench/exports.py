@@ -19,8 +19,8 @@ def main(path: Path) -> None:
     wall_s, cpu_s = time.perf_counter(), time.process_time()
     flight = read_applied(path)
     wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-    print(f"flight of {flight.duration_s:.0f} s, {len(flight.changes.valve)} changes of valves")
-    print(f"{'reading':12} {'':8} {wall_s:6.2f} s wall {cpu_s:6.2f} s processor")
+    say(f"flight of {flight.duration_s:.0f} s, {len(flight.changes.valve)} changes of valves")
+    say(f"{'reading':12} {'':8} {wall_s:6.2f} s wall {cpu_s:6.2f} s processor")
     for form in FORMATS:
         for shape in form.shapes:
             form.maker()
@@ -28,7 +28,13 @@ def main(path: Path) -> None:
             wall_s, cpu_s = time.perf_counter(), time.process_time()
             size = size_of(form, source)
             wall_s, cpu_s = time.perf_counter() - wall_s, time.process_time() - cpu_s
-            print(line(form, shape, source, size=size, wall_s=wall_s, cpu_s=cpu_s))
+            say(line(form, shape, source, size=size, wall_s=wall_s, cpu_s=cpu_s))
+
+
+def say(text: str) -> None:
+    """Print a line at once."""
+    sys.stdout.write(f"{text}\n")
+    sys.stdout.flush()
 
 
 def size_of(form: Format, source: Source) -> int:

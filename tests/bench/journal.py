@@ -35,6 +35,7 @@ from companion.record.new_file import open_for_flight
 from companion.record.reader import read_journal
 from companion.record.recovery import recover
 from companion.record.writer import Writer
+from companion.runtime import SWITCH_S
 from tests.bench.journal_flight import START_S, Flight, Turn, example_setup
 
 KILL_COMMIT_S = 0.02
@@ -304,7 +305,8 @@ def rate(seconds: float, *, seed: int = 1) -> dict[str, Any]:
 
 
 def _paced(folder: Path | None, setup: Setup, seconds: float, seed: int) -> dict[str, Any]:
-    flight, turn_s, commit_s = Flight(setup, seed=seed), [], []
+    flight, turn_s, commit_s, cpu_s = Flight(setup, seed=seed), [], [], []
+    sys.setswitchinterval(SWITCH_S)  # as `vrspray run` does
     journal = None
     if folder is not None:
         journal = Journal.create(folder, setup=setup, started_s=START_S)
@@ -312,9 +314,10 @@ def _paced(folder: Path | None, setup: Setup, seconds: float, seed: int) -> dict
         commit = journal._writer.commit
 
         def timed(**named: Any) -> None:
-            began_s = time.perf_counter()
+            began_s, busy_s = time.perf_counter(), time.thread_time()
             commit(**named)
             commit_s.append(time.perf_counter() - began_s)
+            cpu_s.append(time.thread_time() - busy_s)
 
         journal._writer.commit = timed  # type: ignore[method-assign]
     began_s = time.perf_counter()
@@ -326,6 +329,7 @@ def _paced(folder: Path | None, setup: Setup, seconds: float, seed: int) -> dict
             record(journal, turn)
         turn_s.append(time.perf_counter() - at_s)
     result: dict[str, Any] = {
+        "load": os.getloadavg()[0],
         "turn_median_ms": 1e3 * quantile(turn_s, 0.5),
         "turn_p99_ms": 1e3 * quantile(turn_s, 0.99),
         "turn_max_ms": 1e3 * max(turn_s),
@@ -337,6 +341,7 @@ def _paced(folder: Path | None, setup: Setup, seconds: float, seed: int) -> dict
             "commits": len(commit_s),
             "commit_p99_ms": 1e3 * quantile(commit_s, 0.99),
             "commit_max_ms": 1e3 * max(commit_s),
+            "commit_cpu_p99_ms": 1e3 * quantile(cpu_s, 0.99),
         }
     return result
 

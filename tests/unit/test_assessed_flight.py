@@ -14,7 +14,7 @@ import pytest
 from analysis.applied_flight import AppliedFlight
 from analysis.applied_record import record_of
 from analysis.assessment import Assessment, assess
-from analysis.evaluation import Evaluation
+from analysis.evaluation import Evaluation, evaluate
 from analysis.exports import csv_samples
 from analysis.exports.source import Source
 from analysis.modelled_flow import ordered_s

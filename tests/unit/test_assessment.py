@@ -21,10 +21,11 @@ from analysis.intervals import crossings_of, mean_interval, ratio_interval
 from analysis.strips import strips_of
 from analysis.student import t_factor
 from analysis.volume_balance import balance_of
+from companion.core.cells import CellGrid, Warp
 from companion.core.controller import Setup
 from companion.core.prescription import Prescription
 from tests.builders import plots, setup
-from tests.unit.applied_flights import SPEED_M_S, eastwards
+from tests.unit.applied_flights import SPEED_M_S, changes_of, eastwards
 
 WIDE = shapely.box(-30.0, -30.0, 90.0, 40.0)
 
@@ -279,3 +280,42 @@ def test_everything_is_json_without_nan(good: Assessment) -> None:
     assert found["lag_distance_m"]["count"] == 18
     assert set(found["intervals"]["lag_distance_m"]) == {"mean", "low", "high", "count", "clusters"}
     assert sum(found["causes"]["share"].values()) == pytest.approx(1.0)
+
+
+def test_a_flight_that_never_sprayed_has_figures_of_nothing() -> None:
+    flight = eastwards(passes_north_m=(200.0,))
+    dry = replace(flight, changes=changes_of([]), flow_l_min=np.zeros(len(flight.time_s)))
+    found = assess(dry)
+    assert found.evaluation.applied_ml == 0.0
+    assert found.cells is None
+    assert found.causes.within_percent is None
+    assert found.intervals["lag_distance_m"].count == 0
+    assert found.balance.model_to_prescribed_percent is None
+    assert found.durations.spraying_s == 0.0
+    json.dumps(found.as_json(), allow_nan=False)
+
+
+def test_a_flight_that_missed_its_field_with_open_valves_is_off_target() -> None:
+    found = assess(eastwards(passes_north_m=(200.0,)))
+    assert found.evaluation.off_target_ml == pytest.approx(found.evaluation.applied_ml)
+    assert found.causes.untreated_m2 == pytest.approx(48.0 * 6.0, rel=0.05)
+    json.dumps(found.as_json(), allow_nan=False)
+
+
+def test_a_map_in_cells_is_compared_on_its_own_cells() -> None:
+    def linear(a: float, d: float) -> Warp:
+        return Warp(x0=0.0, y0=0.0, scale=1.0, terms=((0.0, 0.0), (0.0, d), (a, 0.0)))
+
+    classes = np.array([[0, 1, 2, 0]] * 2, dtype=np.int32)
+    grid = CellGrid(classes, [20.0, 25.0, 15.0], linear(12.0, 3.0), linear(1 / 12.0, 1 / 3.0))
+    used = setup(prescription=Prescription((), cells=grid))
+    found = assess(eastwards(given=used))
+    assert found.evaluation.lag_distance_m.count == 18
+    cells = found.cells
+    assert cells is not None
+    assert cells.source == "map"
+    assert cells.commanded_l_ha.shape == (2, 4)
+    assert cells.commanded_l_ha[0] == pytest.approx([20.0, 25.0, 15.0, 20.0], rel=0.01)
+    assert cells.measured_l_ha[0] == pytest.approx([20.0, 25.0, 15.0, 20.0], rel=0.02)
+    assert cells.passes == pytest.approx(1.0, rel=0.02)
+    assert (cells.corner_east_m[0, -1], cells.corner_north_m[-1, 0]) == (48.0, 6.0)

@@ -166,19 +166,25 @@ def test_figures_are_there_as_png_and_svg(report: Report) -> None:
 
 
 @pytest.mark.parametrize(
-    ("training", "words"),
-    [("water", "TRAINING WITH WATER"), ("dry", "DRY RUN"), ("no", None), (None, None)],
+    ("training", "words", "done"),
+    [
+        ("water", "TRAINING WITH WATER", "L of water applied"),
+        ("dry", "DRY RUN", "L would have been applied"),
+        ("no", None, "L applied"),
+        (None, None, "L applied"),
+    ],
 )
 def test_training_stands_large_above_all(
-    tmp_path: Path, training: str | None, words: str | None
+    tmp_path: Path, training: str | None, words: str | None, done: str
 ) -> None:
     path = fly(tmp_path, told=EU_TOLD, training=training)
     report = build_report(path, ReportOptions(with_figures=False))
     found = Parsed(report.files["report.html"].decode())
     marks = [a for tag, a in found.tags if tag == "p" and a.get("class") == "mark"]
     assert len(marks) == (words is not None)
+    assert done in report.contents["verdict"]["sentence"]
     if words is not None:
-        assert found.text.index(words) < found.text.index("L applied")
+        assert found.text.index(words) < found.text.index(done)
         assert report.contents["application"]["eu"]["complete"] is False
 
 

@@ -36,7 +36,7 @@ def flown(*, north_m: float = 3.0, back: bool = False, forward_m: float = 0.0) -
         events=(),
         utc_offset_s=1_000_000.0,
         utc_source="computer",
-        time_s=np.arange(count) * STEP_S,
+        time_s=np.arange(count, dtype=np.float64) * STEP_S,
         latitude_deg=np.zeros(count),
         longitude_deg=np.zeros(count),
         east_m=east_m,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,7 +29,8 @@ def only(path: Path) -> module.Sheet:
 def test_usual_formats_come_out_as_they_are(
     tmp_path: Path, picture: Image.Image, name: str
 ) -> None:
-    picture.save(tmp_path / name, **({"lossless": True} if name.endswith("webp") else {}))
+    options: dict[str, Any] = {"lossless": True} if name.endswith("webp") else {}
+    picture.save(tmp_path / name, **options)
     sheet = only(tmp_path / name)
     assert sheet.pixels.shape == (20, 40, 3)
     np.testing.assert_allclose(sheet.pixels[5, 5].astype(int), YELLOW, atol=2)

@@ -1,0 +1,206 @@
+"""One sortie for everything: the shortest tour, by local search with small kicks.
+
+A tour is a ring of pieces, each entered at one of its two ends, with the depot as one of them. The
+ring is improved until no part turned round and no run of up to three pieces moved elsewhere makes
+it shorter (2-opt and Or-opt over near ends); then two neighbouring parts are exchanged, and what
+that touched is improved again (Martin, Otto and Felten 1991). Only what is no longer is kept.
+"""
+
+from __future__ import annotations
+
+import random
+from itertools import chain
+
+import numpy as np
+
+from missions.network import Network
+from missions.savings import Sortie
+
+NEAREST = 12
+# Parts that a kick exchanges have so many pieces at most.
+KICK_MAX = 30
+RUN_MAX = 3
+LEAST_S = 1e-7
+# At first a kick may cost so much, at last nothing.
+HOT_S = 3.0
+
+
+def shortest_tour(network: Network, order: Sortie, *, kicks: int, seed: int = 1) -> Sortie:
+    """Return the pieces in an order that takes no longer than the one given."""
+    if len(order) < 3:
+        return order
+    ring = Ring(network, order)
+    draw = random.Random(seed)
+    best, now_s, best_s = ring.order(), 0.0, 0.0
+    for number in range(kicks):
+        before = ring.ends.copy()
+        touched, change_s = ring.kick(draw)
+        change_s += ring.improve(touched)
+        if change_s > HOT_S * (1.0 - number / kicks) * draw.random():
+            ring.set(before)
+            continue
+        now_s += change_s
+        if now_s < best_s - LEAST_S:
+            best, best_s = ring.order(), now_s
+    return best
+
+
+class Ring:
+    """The ends at which pieces are entered, one after the other; the depot is the last piece."""
+
+    def __init__(self, network: Network, order: Sortie) -> None:
+        depot = network.depot
+        # The depot is a piece without length, both of whose ends are the same place.
+        both = [*range(depot + 1), depot]
+        between = network.between_s[np.ix_(both, both)]
+        between[depot:, depot:] = 0.0
+        self._between: list[list[float]] = between.tolist()
+        near = network.near[:, :NEAREST].tolist()
+        home = np.argsort(network.between_s[depot, :depot], kind="stable")[:NEAREST].tolist()
+        self._near: list[list[int]] = [*near, home, home]
+        for row, some in zip(self._between, self._near, strict=True):
+            some.sort(key=row.__getitem__)
+        self._depot = depot
+        self._at = [-1] * (depot // 2 + 1)
+        self.ends: list[int] = []
+        self.set([*order, depot])
+        self.improve([end for enter in self.ends for end in (enter, enter ^ 1)])
+
+    def leave_out(self, piece: int) -> float:
+        """Take a piece out and improve what is left; return the change [s]."""
+        place = self._at[piece]
+        enter = self.ends[place]
+        before, after = self.mate(enter), self.mate(enter ^ 1)
+        between = self._between
+        change_s = between[before][after] - between[before][enter] - between[enter ^ 1][after]
+        self.set(self.ends[:place] + self.ends[place + 1 :])
+        self._at[piece] = -1
+        return change_s + self.improve([before, after])
+
+    def set(self, ends: list[int]) -> None:
+        """Take these ends."""
+        self.ends = ends
+        at = self._at
+        for place, enter in enumerate(ends):
+            at[enter >> 1] = place
+
+    def order(self) -> Sortie:
+        """Return the pieces from the depot on."""
+        place = self._at[self._depot >> 1]
+        return self.ends[place + 1 :] + self.ends[:place]
+
+    def mate(self, end: int) -> int:
+        """Return the end from or to which the way at this one leads."""
+        ends, place = self.ends, self._at[end >> 1]
+        if ends[place] == end:
+            return ends[place - 1] ^ 1
+        return ends[place + 1 - len(ends)]
+
+    def improve(self, touched: list[int]) -> float:
+        """Shorten the ring around these ends until nothing more is found; return the change."""
+        total_s = 0.0
+        waiting = set(touched)
+        while touched:
+            end = touched.pop()
+            waiting.discard(end)
+            found = self._better(end)
+            if found is None:
+                continue
+            change_s, changed = found
+            total_s += change_s
+            for each in (end, *changed):
+                if each not in waiting:
+                    waiting.add(each)
+                    touched.append(each)
+        return total_s
+
+    def _better(self, end: int) -> tuple[float, tuple[int, ...]] | None:
+        """Make the first change that brings `end` and a near one together and shortens."""
+        between, mate = self._between, self.mate(end)
+        row, old_s = between[end], between[end][mate]
+        for other in self._near[end]:
+            gain_s = old_s - row[other]
+            if gain_s <= LEAST_S:
+                break
+            if other >> 1 == end >> 1 or other == mate or self._at[other >> 1] < 0:
+                continue
+            beyond = self.mate(other)
+            gain_s += between[other][beyond]
+            if self._is_entered(end) == self._is_entered(other):
+                change_s = between[mate][beyond] - gain_s
+                if change_s < -LEAST_S:
+                    self._turn(end, other)
+                    return change_s, (mate, other, beyond)
+            found = self._moved(end, other, mate, beyond, gain_s)
+            if found is not None:
+                return found
+        return None
+
+    def _is_entered(self, end: int) -> bool:
+        return self.ends[self._at[end >> 1]] == end
+
+    def _turn(self, end: int, other: int) -> None:
+        """Turn the pieces between two ends, both entered or both left, round."""
+        first, last = sorted((self._at[end >> 1], self._at[other >> 1]))
+        if self._is_entered(end):
+            last -= 1
+        else:
+            first += 1
+        ends = self.ends
+        part = [enter ^ 1 for enter in reversed(ends[first : last + 1])]
+        ends[first : last + 1] = part
+        for place, enter in enumerate(part, first):
+            self._at[enter >> 1] = place
+
+    def _moved(
+        self, end: int, other: int, mate: int, beyond: int, gain_s: float
+    ) -> tuple[float, tuple[int, ...]] | None:
+        """Move a run that begins with `end` between `other` and what is beyond."""
+        between, ends = self._between, self.ends
+        count, at = len(ends), self._at[end >> 1]
+        step = 1 if ends[at] == end else -1
+        for more in range(min(RUN_MAX, count - 3)):
+            piece = ends[(at + step * more) % count] >> 1
+            if piece in (other >> 1, beyond >> 1):
+                return None
+            last = ends[(at + step * more) % count]
+            tail = last ^ 1 if step > 0 else last
+            follows = self.mate(tail)
+            change_s = between[tail][beyond] + between[mate][follows]
+            change_s -= between[tail][follows] + gain_s
+            if change_s < -LEAST_S:
+                self._move(at, step, more, other, end)
+                return change_s, (mate, other, beyond, tail, follows)
+        return None
+
+    def _move(self, at: int, step: int, more: int, other: int, end: int) -> None:
+        count = len(self.ends)
+        start = at if step > 0 else (at - more) % count
+        ring = self.ends[start:] + self.ends[:start]
+        run, rest = ring[: more + 1], ring[more + 1 :]
+        try:
+            place, entered = rest.index(other), True
+        except ValueError:
+            place, entered = rest.index(other ^ 1) + 1, False
+        # `other` entered: the run comes before it, and is left at `end`; else it is entered there.
+        if (run[-1] ^ 1 == end) != entered or (run[0] == end) == entered:
+            run = [enter ^ 1 for enter in reversed(run)]
+        self.set(rest[:place] + run + rest[place:])
+
+    def kick(self, draw: random.Random) -> tuple[list[int], float]:
+        """Exchange two parts that follow each other; return the ends touched, and the change."""
+        count = len(self.ends)
+        longest = max(1, min(KICK_MAX, (count - 1) // 2))
+        one, two = draw.randint(1, longest), draw.randint(1, longest)
+        if one + two > count - 1:
+            two = count - 1 - one
+        start = draw.randrange(count)
+        ring = self.ends[start:] + self.ends[:start]
+        parts = ring[:one], ring[one : one + two], ring[one + two :]
+        first, second, rest = parts
+        between = self._between
+        old = ((rest[-1] ^ 1, first[0]), (first[-1] ^ 1, second[0]), (second[-1] ^ 1, rest[0]))
+        new = ((rest[-1] ^ 1, second[0]), (second[-1] ^ 1, first[0]), (first[-1] ^ 1, rest[0]))
+        change_s = sum(between[a][b] for a, b in new) - sum(between[a][b] for a, b in old)
+        self.set(second + first + rest)
+        return list(chain.from_iterable(old)), change_s

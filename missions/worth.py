@@ -1,0 +1,120 @@
+"""What lines are worth: without those, and those ends, that bring next to nothing.
+
+A short line beside a hole may take ten times as long as the ground that it alone covers takes
+elsewhere. A plan may leave out a little; where that saves most, is decided here, last of all.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from missions.network import JOIN_M
+from missions.one_tour import Tour
+from missions.strips import Floats, Objects, directions, lengths_m, rectangles, united
+from missions.swaths import LINE_MIN_M
+from missions.tour import Ring
+
+# A plan covers 99.9 % of what a strip can reach; all that is left out together stays below this.
+LEFT_SHARE = 0.00085
+# A line stays if the ground that it alone covers is sprayed elsewhere in a tenth of its time.
+WORTH = 0.1
+# So many lines are tried, those that bring least.
+TRIED_MAX = 16
+# Ground beside a strip that is nothing but rounding, and a part of a line not worth cutting off.
+CRUMB_M2, LEAST_M = 0.02, 0.5
+
+
+def worthwhile(tour: Tour, target: BaseGeometry, width_m: float) -> Floats:
+    """Return the lines of a tour that are worth their time, without the ends that others cover."""
+    lines, motion = tour.lines, tour.motion
+    if len(lines) < 2:
+        return lines
+    ground = _Ground(lines, target, width_m)
+    spare_m2 = LEFT_SHARE * target.area - target.difference(united(lines, width_m)).area
+    alone_m2 = np.array([ground.alone_m2(at) for at in range(len(lines))])
+    pays_m2_s = WORTH * motion.speed_m_s * width_m
+    taken_s = motion.legs_s(lengths_m(lines))
+    few = np.flatnonzero(alone_m2 < spare_m2)
+    few = few[np.argsort(alone_m2[few], kind="stable")][:TRIED_MAX]
+    ring = Ring(tour.network, tour.order)
+    saved_s = {int(at): float(taken_s[at]) - _change_s(ring, int(at)) for at in few}
+    for at in sorted(saved_s, key=lambda each: alone_m2[each] / max(saved_s[each], 1e-9)):
+        # The neighbours of one that was left out are worth more than before.
+        lost_m2 = ground.alone_m2(at)
+        if lost_m2 > spare_m2 or not lost_m2 < pays_m2_s * saved_s[at]:
+            continue
+        before = ring.ends.copy()
+        gain_s = float(taken_s[at]) - ring.leave_out(at)
+        if not lost_m2 < pays_m2_s * gain_s:
+            ring.set(before)
+            continue
+        ground.kept[at] = False
+        spare_m2 -= lost_m2
+    for at in np.argsort(lengths_m(lines), kind="stable").tolist():
+        if ground.kept[at]:
+            ground.trim(at)
+    return ground.lines[ground.kept]
+
+
+def _change_s(ring: Ring, piece: int) -> float:
+    """Return what a tour takes more without a piece, whose own time is not in it."""
+    before = ring.ends.copy()
+    change_s = ring.leave_out(piece)
+    ring.set(before)
+    return change_s
+
+
+class _Ground:
+    """Lines and their strips while they are dropped and cut."""
+
+    def __init__(self, lines: Floats, target: BaseGeometry, width_m: float) -> None:
+        self.lines = lines.copy()
+        self.kept = np.ones(len(lines), dtype=np.bool_)
+        self._along = directions(lines)
+        self._strips = rectangles(lines, width_m)
+        self._near = shapely.STRtree(self._strips.copy())
+        self._target = target
+        self._width_m = width_m
+        shapely.prepare(target)
+
+    def alone_m2(self, at: int) -> float:
+        """Return how much ground no other line covers."""
+        return float(shapely.area(self._alone(at)).sum())
+
+    def _alone(self, at: int) -> Objects:
+        strip = self._strips[at]
+        near = self._near.query(strip, predicate="intersects")
+        others = shapely.union_all(self._strips[near[self.kept[near] & (near != at)]])
+        own = shapely.intersection(strip, self._target)
+        parts: Objects = shapely.get_parts(shapely.difference(own, others))
+        return parts
+
+    def trim(self, at: int) -> None:
+        """Cut off the ends of a line that others cover, and from which none goes on."""
+        parts = self._alone(at)
+        parts = parts[shapely.area(parts) > CRUMB_M2]
+        if not len(parts):
+            return
+        first, along = self.lines[at, :2].copy(), self._along[at]
+        length_m = float(np.hypot(*(self.lines[at, 2:] - first)))
+        places_m = (shapely.get_coordinates(parts) - first) @ along
+        start_m, end_m = max(float(places_m.min()), 0.0), min(float(places_m.max()), length_m)
+        if self._joins(at, first):
+            start_m = 0.0
+        if self._joins(at, self.lines[at, 2:]):
+            end_m = length_m
+        if length_m - (end_m - start_m) < LEAST_M:
+            return
+        end_m = min(max(end_m, start_m + LINE_MIN_M), length_m)
+        start_m = max(min(start_m, end_m - LINE_MIN_M), 0.0)
+        self.lines[at] = [*(first + along * start_m), *(first + along * end_m)]
+        self._strips[at] = rectangles(self.lines[[at]], self._width_m)[0]
+
+    def _joins(self, at: int, end: Floats) -> bool:
+        """Return whether another line begins or ends here: it may be flown without a stop."""
+        others = self.kept.copy()
+        others[at] = False
+        ends = self.lines[others].reshape(-1, 2)
+        return bool((np.hypot(*(ends - end).T) < JOIN_M).any())
