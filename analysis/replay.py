@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from analysis.flown.read_applied import read_applied
 from analysis.overrides import override
-from analysis.read_applied import read_applied
 from analysis.what_if import Moved, Orders, Sprayed, compared
 from companion.core.controller import Memory, Setup, step
 from companion.core.estimator import Track, estimate, observe

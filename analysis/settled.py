@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.changes import Change, changes_of
+from analysis.flown.modelled_flow import flow_of, set_in_force
 from analysis.lag import SMALLEST_STEP
-from analysis.modelled_flow import flow_of, set_in_force
 from analysis.smoothing import rise_over
 from analysis.track import Bools, Floats, Ints, Track
 from analysis.transitions import LEVEL_FROM, LEVEL_TO, ML_M_PER_L_HA_M

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.applied_flight import ValveChanges
-from analysis.applied_record import EvaluationError, record_of
 from analysis.dose import zone_volumes
 from analysis.evaluation import Distances, Evaluation, evaluate_strips
+from analysis.flown.applied_flight import ValveChanges
+from analysis.flown.applied_record import EvaluationError, record_of
 from analysis.strips import strips_of
 from companion.record.valve_rows import Row, ValveRows
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight
+    from analysis.flown.applied_flight import AppliedFlight
     from companion.core.types import Decision
 
 _MICRO = 1e-6

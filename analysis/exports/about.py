@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from analysis.exports.utc import utc_text
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight
+    from analysis.flown.applied_flight import AppliedFlight
 
 UNKNOWN = "unknown"
 

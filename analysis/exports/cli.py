@@ -10,10 +10,10 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight
     from analysis.exports.registry import Format
     from analysis.exports.source import Shape, Source
     from analysis.exports.units import System
+    from analysis.flown.applied_flight import AppliedFlight
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 RATE_HZ_MAX = 1000.0
@@ -86,7 +86,7 @@ def export_journal(
 def _read(journal: Path, unread: list[str]) -> AppliedFlight:
     """Return the flight; what of it is damaged is left out and said in `unread`."""
     from analysis.exports.output import ExportError
-    from analysis.read_applied import read_applied
+    from analysis.flown.read_applied import read_applied
 
     flight = read_applied(journal, unread=unread)
     if not len(flight.time_s):

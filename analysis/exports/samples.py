@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.modelled_flow import ordered_s
+from analysis.flown.modelled_flow import ordered_s
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight, Series, ValveChanges
     from analysis.flight_record import FlightRecord
+    from analysis.flown.applied_flight import AppliedFlight, Series, ValveChanges
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-from analysis.applied_flight import AppliedFlight
-from analysis.applied_record import record_of
 from analysis.exports.about import About, about
 from analysis.exports.columns import Column, point_columns, swath_columns
 from analysis.exports.samples import Samples, samples_of
 from analysis.exports.swaths import Swaths, swaths_of
 from analysis.exports.units import System, Unit, units_of
 from analysis.flight_record import FlightRecord
+from analysis.flown.applied_flight import AppliedFlight
+from analysis.flown.applied_record import record_of
 
 Shape = Literal["points", "swaths", "steps"]
 

@@ -21,8 +21,8 @@ from analysis.strips import Strip, strips_of
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
 
-    from analysis.applied_flight import AppliedFlight
     from analysis.flight_record import FlightRecord
+    from analysis.flown.applied_flight import AppliedFlight
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.applied_record import EvaluationError
-from analysis.assessment import Assessment, assess
-from analysis.read_applied import read_applied
+from analysis.assess.assessment import Assessment, assess
+from analysis.flown.applied_record import EvaluationError
+from analysis.flown.read_applied import read_applied
 from analysis.report.clock import Clock, clock_of
 from analysis.report.contents import contents_of
 from analysis.report.facts import facts_of
@@ -24,7 +24,7 @@ from companion.config.application_table import PROFILES, Profile
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from analysis.applied_flight import AppliedFlight
+    from analysis.flown.applied_flight import AppliedFlight
     from analysis.report.figures.style import Drawn
 
 Say = Callable[[str], None]

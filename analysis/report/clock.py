@@ -11,7 +11,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight
+    from analysis.flown.applied_flight import AppliedFlight
 
 # Before there was this program: a clock that shows it was never set.
 PLAUSIBLE_FROM = datetime(2024, 1, 1, tzinfo=UTC)

@@ -15,9 +15,9 @@ from analysis.report.words import verdict_of, warnings_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from analysis.applied_flight import AppliedFlight
-    from analysis.assessment import Assessment
-    from analysis.breakdowns import AccuracyGroup
+    from analysis.assess.assessment import Assessment
+    from analysis.assess.breakdowns import AccuracyGroup
+    from analysis.flown.applied_flight import AppliedFlight
     from analysis.report.clock import Clock
     from analysis.report.legal import LegalRecord
     from analysis.report.told import Told

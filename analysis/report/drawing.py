@@ -10,7 +10,7 @@ from analysis.report.figures import ground, lags, over_time, spread
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from analysis.assessment import Assessment
+    from analysis.assess.assessment import Assessment
     from analysis.report.clock import Clock
     from analysis.report.figures.style import Drawn
 

@@ -9,7 +9,7 @@ import numpy as np
 from analysis.report.legal_fields import Facts
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight, Floats
+    from analysis.flown.applied_flight import AppliedFlight, Floats
     from analysis.report.clock import Clock
     from analysis.report.treated import Treated
 

@@ -19,7 +19,7 @@ from companion.core.frame import LocalFrame
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from analysis.applied_flight import AppliedFlight, Floats
+    from analysis.flown.applied_flight import AppliedFlight, Floats
     from companion.core.boom import Valve
 
 # Points of an edge that lie this near to a straight line say nothing of the ground.

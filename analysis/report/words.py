@@ -12,8 +12,8 @@ from companion.core.types import Inhibit
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from analysis.applied_flight import AppliedFlight
-    from analysis.assessment import Assessment
+    from analysis.assess.assessment import Assessment
+    from analysis.flown.applied_flight import AppliedFlight
     from analysis.report.clock import Clock
     from analysis.report.legal import LegalRecord
     from analysis.report.treated import Treated

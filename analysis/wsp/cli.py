@@ -150,7 +150,7 @@ def _ties(
     by_number, notes = placed(cards, places)
     if journal is None:
         return None, notes
-    from analysis.read_applied import read_applied
+    from analysis.flown.read_applied import read_applied
 
     flight = read_applied(journal)
     if flight.training not in (None, "no"):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from analysis.applied_flight import AppliedFlight
+from analysis.flown.applied_flight import AppliedFlight
 from analysis.wsp.boundaries import CardAtChange, nearest_change, tables
 from analysis.wsp.passing import LEAST_SPEED_M_S, passing
 from analysis.wsp.positions import Position

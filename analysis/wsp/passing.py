@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.applied_flight import AppliedFlight
+from analysis.flown.applied_flight import AppliedFlight
 from companion.core.boom import Boom
 
 Floats = NDArray[np.float64]

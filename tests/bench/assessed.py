@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from analysis.applied_record import record_of
 from analysis.evaluation import Evaluation, evaluate
-from analysis.read_applied import read_applied
+from analysis.flown.applied_record import record_of
+from analysis.flown.read_applied import read_applied
 from sitl.fly import FlyOptions, fly_mission
 from sitl.fly_files import write_journal
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from analysis.exports.registry import FORMATS, Format
 from analysis.exports.source import Shape, Source
-from analysis.read_applied import read_applied
+from analysis.flown.read_applied import read_applied
 
 
 def main(path: Path) -> None:

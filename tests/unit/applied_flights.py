@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.applied_flight import AppliedFlight, Series, ValveChanges
+from analysis.flown.applied_flight import AppliedFlight, Series, ValveChanges
 from companion.core.controller import Setup
 from companion.core.rate import flow_for_rate
 from tests.builders import setup

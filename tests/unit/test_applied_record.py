@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.applied_record import EvaluationError, record_of
 from analysis.evaluation import evaluate
-from analysis.metered import WINDOW_ML, counted
-from analysis.modelled_flow import ML_S_PER_L_MIN, flow_of, levels_ml_s, ramped, valve_flows
+from analysis.flown.applied_record import EvaluationError, record_of
+from analysis.flown.metered import WINDOW_ML, counted
+from analysis.flown.modelled_flow import ML_S_PER_L_MIN, flow_of, levels_ml_s, ramped, valve_flows
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.schedule import LagModel
 from tests.builders import CURVE, LAG

@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.applied_flight import AppliedFlight
-from analysis.applied_record import record_of
-from analysis.assessment import Assessment, assess
+from analysis.assess.assessment import Assessment, assess
 from analysis.evaluation import Evaluation, evaluate
 from analysis.exports import csv_samples
 from analysis.exports.source import Source
-from analysis.modelled_flow import ordered_s
-from analysis.read_applied import read_applied
+from analysis.flown.applied_flight import AppliedFlight
+from analysis.flown.applied_record import record_of
+from analysis.flown.modelled_flow import ordered_s
+from analysis.flown.read_applied import read_applied
 from analysis.replay import replay
 from companion.cli.app import execute
 from companion.errors import JournalError

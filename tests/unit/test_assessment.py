@@ -12,15 +12,15 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.applied_flight import Series
-from analysis.applied_record import record_of
-from analysis.assessment import Assessment, assess
-from analysis.breakdowns import speed_bin
-from analysis.causes import Cause
-from analysis.intervals import crossings_of, mean_interval, ratio_interval
+from analysis.assess.assessment import Assessment, assess
+from analysis.assess.breakdowns import speed_bin
+from analysis.assess.causes import Cause
+from analysis.assess.intervals import crossings_of, mean_interval, ratio_interval
+from analysis.assess.volume_balance import balance_of
+from analysis.flown.applied_flight import Series
+from analysis.flown.applied_record import record_of
 from analysis.strips import strips_of
 from analysis.student import t_factor
-from analysis.volume_balance import balance_of
 from companion.core.cells import CellGrid, Warp
 from companion.core.controller import Setup
 from companion.core.prescription import Prescription

@@ -18,11 +18,11 @@ import shapely
 from numpy.typing import NDArray
 from pyproj import Geod
 
-from analysis.applied_flight import AppliedFlight
 from analysis.exports.output import write_beside
 from analysis.exports.registry import FORMATS, format_for
 from analysis.exports.source import Shape, Source
-from analysis.read_applied import read_applied
+from analysis.flown.applied_flight import AppliedFlight
+from analysis.flown.read_applied import read_applied
 from tests.unit.export_flight import fly
 from tests.unit.export_readers import Layer, read_layer
 

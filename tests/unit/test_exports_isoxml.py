@@ -20,12 +20,12 @@ import pytest
 from isoxml.models.ddi_entities import DDEntity
 from isoxml.util.isoxml_io import isoxml_from_path
 
-from analysis.applied_flight import AppliedFlight
 from analysis.exports.isoxml_log import logged, records
 from analysis.exports.output import write_beside, write_folder
 from analysis.exports.registry import format_for
 from analysis.exports.source import Source
-from analysis.read_applied import read_applied
+from analysis.flown.applied_flight import AppliedFlight
+from analysis.flown.read_applied import read_applied
 from tests.builders import boom, setup
 from tests.unit.export_flight import fly
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 import shapely
 
-from analysis.applied_flight import AppliedFlight
-from analysis.read_applied import read_applied
+from analysis.flown.applied_flight import AppliedFlight
+from analysis.flown.read_applied import read_applied
 from analysis.report.clock import Clock
 from analysis.report.facts import ends_spraying, facts_of
 from analysis.report.legal import AFTER, BEFORE, FLIGHT, legal_record

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from analysis.assessment import assess
-from analysis.read_applied import read_applied
+from analysis.assess.assessment import assess
+from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report
 from analysis.report.clock import clock_of
 from analysis.report.contents import METRICS, contents_of

@@ -12,8 +12,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.applied_flight import AppliedFlight, ValveChanges
-from analysis.read_applied import read_applied
+from analysis.flown.applied_flight import AppliedFlight, ValveChanges
+from analysis.flown.read_applied import read_applied
 from analysis.report.treated import open_spans, treated_of
 from tests.unit.report_flight import fly
 

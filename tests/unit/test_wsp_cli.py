@@ -97,7 +97,7 @@ def test_cards_are_tied_to_the_flight_over_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     flight = flown()
-    monkeypatch.setattr("analysis.read_applied.read_applied", lambda path: flight)
+    monkeypatch.setattr("analysis.flown.read_applied.read_applied", lambda path: flight)
     places = [flight.setup.frame.to_geographic(east_m, 3.5) for east_m in (11.0, 13.5)]
     table = tmp_path / "cards.csv"
     lines = [

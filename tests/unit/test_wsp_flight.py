@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.applied_flight import AppliedFlight, ValveChanges
+from analysis.flown.applied_flight import AppliedFlight, ValveChanges
 from analysis.wsp.boundaries import CardAtChange, NearestChange, nearest_change, tables
 from analysis.wsp.passing import duty_at, passing
 from tests import builders

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
 
-    from analysis.applied_flight import AppliedFlight, Floats
-    from analysis.cell_maps import CellMaps
+    from analysis.assess.cell_maps import CellMaps
+    from analysis.flown.applied_flight import AppliedFlight, Floats
 
 # More zones than these would be all outline.
 OUTLINES_MAX = 1500

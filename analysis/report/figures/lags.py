@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from analysis.breakdowns import Group
+    from analysis.assess.breakdowns import Group
     from analysis.evaluation import Evaluation
     from analysis.lag import Step
 

@@ -11,7 +11,7 @@ from analysis.report.figures.style import BLUE, FAINT, GREEN, GRID, INK, RED, Dr
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from analysis.applied_flight import AppliedFlight, Floats, Series
+    from analysis.flown.applied_flight import AppliedFlight, Floats, Series
 
 # A count every second is 1 mL in 80 of a flow of 5 L/min: enough for a line.
 METER_STEP_S = 1.0

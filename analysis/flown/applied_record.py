@@ -14,16 +14,16 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from analysis.flight_record import FlightMeta, FlightRecord
-from analysis.metered import metered
-from analysis.modelled_flow import ordered_s, valve_flows
-from analysis.pumped_flow import pumped_ml
+from analysis.flown.metered import metered
+from analysis.flown.modelled_flow import ordered_s, valve_flows
+from analysis.flown.pumped_flow import pumped_ml
 from companion.core.types import TimedChange
 from companion.errors import VrsprayError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from analysis.applied_flight import AppliedFlight, Floats
+    from analysis.flown.applied_flight import AppliedFlight, Floats
 
 Source = Literal["model", "meter"]
 STEP_S = 0.01

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.cause_marks import Marks, marks_of
-from analysis.cause_rules import (
+from analysis.assess.cause_marks import Marks, marks_of
+from analysis.assess.cause_rules import (
     beside_border,
     by_inhibit,
     in_acceleration,
@@ -22,13 +22,13 @@ from analysis.cause_rules import (
     in_edge,
     in_saturation,
 )
-from analysis.treated_ground import treated_ground
+from analysis.assess.treated_ground import treated_ground
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from analysis.applied_flight import AppliedFlight
     from analysis.flight_record import FlightRecord
+    from analysis.flown.applied_flight import AppliedFlight
     from analysis.lag import Step
     from analysis.strips import Strip
     from analysis.track import Bools

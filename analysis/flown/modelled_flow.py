@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.applied_flight import ValveChanges
+    from analysis.flown.applied_flight import ValveChanges
     from companion.core.nozzle import NozzleSet
     from companion.core.schedule import LagModel
 

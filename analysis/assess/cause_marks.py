@@ -11,7 +11,7 @@ from analysis.changes import SPEED_MIN_M_S
 from analysis.smoothing import rise_over
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight
+    from analysis.flown.applied_flight import AppliedFlight
     from analysis.strips import Strip
     from analysis.track import Bools, Floats
     from companion.core.controller import Setup

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.modelled_flow import ML_S_PER_L_MIN, ordered_s, ramped
+from analysis.flown.modelled_flow import ML_S_PER_L_MIN, ordered_s, ramped
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight, Floats
+    from analysis.flown.applied_flight import AppliedFlight, Floats
     from companion.core.schedule import LagModel
 
 # Below this share of its width a section is closed: what is left of a ramp is rounding.

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.metered import counted
+from analysis.flown.metered import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.applied_flight import AppliedFlight, Floats
+    from analysis.flown.applied_flight import AppliedFlight, Floats
     from analysis.strips import Strip
 
 ML_PER_L = 1000.0

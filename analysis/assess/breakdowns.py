@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from analysis.assess.intervals import NOTHING, Interval, crossings_of, mean_interval
 from analysis.flow_accuracy import flow_samples
-from analysis.intervals import NOTHING, Interval, crossings_of, mean_interval
 from analysis.lag import Verdict
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from analysis.ground_elements import SquareGrid, slices_of, summed
+from analysis.assess.ground_elements import SquareGrid, slices_of, summed
+from analysis.assess.zone_lookup import lookup_of
 from analysis.track import in_field
-from analysis.zone_lookup import lookup_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

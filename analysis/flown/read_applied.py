@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.applied_flight import AppliedFlight, Floats, Series, ValveChanges
+from analysis.flown.applied_flight import AppliedFlight, Floats, Series, ValveChanges
 from companion.core.controller import Setup
 from companion.core.types import Decision
 from companion.errors import JournalError

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from analysis.ground_elements import Grid, Slices, SquareGrid, slices_of, summed
+from analysis.assess.ground_elements import Grid, Slices, SquareGrid, slices_of, summed
 from companion.core.rate import flow_for_rate
 
 if TYPE_CHECKING:

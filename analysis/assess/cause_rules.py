@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.assess.cause_marks import samples_at
 from analysis.border import CLEAR_M
-from analysis.cause_marks import samples_at
+from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.lag import Verdict
-from analysis.modelled_flow import ML_S_PER_L_MIN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.applied_flight import AppliedFlight
-    from analysis.cause_marks import Marks
+    from analysis.assess.cause_marks import Marks
+    from analysis.flown.applied_flight import AppliedFlight
     from analysis.lag import Step
     from analysis.track import Bools, Floats
     from companion.core.schedule import LagModel

@@ -7,23 +7,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.applied_record import STEP_S, Source, modelled_ml, record_of
-from analysis.breakdowns import Breakdowns, breakdowns, ways_between
-from analysis.causes import Causes, causes_of
-from analysis.cell_maps import CellMaps, cell_maps
+from analysis.assess.breakdowns import Breakdowns, breakdowns, ways_between
+from analysis.assess.causes import Causes, causes_of
+from analysis.assess.cell_maps import CellMaps, cell_maps
+from analysis.assess.intervals import Interval, crossings_of, mean_interval, ratio_interval
+from analysis.assess.volume_balance import Balance, balance_of
 from analysis.dose import misapplied_parts
 from analysis.evaluation import Evaluation, evaluate_strips
 from analysis.flow_accuracy import flow_samples
-from analysis.intervals import Interval, crossings_of, mean_interval, ratio_interval
-from analysis.modelled_flow import ordered_s
+from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
+from analysis.flown.modelled_flow import ordered_s
 from analysis.strips import Strip, strips_of
-from analysis.volume_balance import Balance, balance_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from analysis.applied_flight import AppliedFlight, Floats
     from analysis.flight_record import FlightRecord
+    from analysis.flown.applied_flight import AppliedFlight, Floats
 
 # Longer than this between two decisions nobody knows what the sprayer did.
 GAP_S = 1.0

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from analysis.applied_flight import AppliedFlight, Floats, Series
+    from analysis.flown.applied_flight import AppliedFlight, Floats, Series
 
 # A window holds at least so much: 230 pulses of a meter of 4600 pulses/L, 0.4 % each way.
 WINDOW_ML = 50.0

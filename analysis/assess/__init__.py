@@ -1,0 +1,1 @@
+"""All that can be said of a flown flight: intervals, breakdowns, cells, causes, balance."""
