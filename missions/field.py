@@ -64,11 +64,13 @@ def build_field(
     swath_width_m: float,
     frame: LocalFrame | None = None,
     offset_m: tuple[float, float] = (0.0, 0.0),
+    kept_m: float = 0.0,
 ) -> Field:
     """Return the field of a boundary and what lies in it, all in longitude and latitude.
 
     `offset_m` moves all of it: the offset between map and receiver (prescription.offset_east_m).
-    A `wind` widens the buffers of no-spray areas where it blows towards them.
+    A `wind` widens the buffers of no-spray areas where it blows towards them. Strips keep `kept_m`
+    from every border, where that leaves room for a swath.
 
     Raises:
         PlanError: where nothing is left that a strip of the swath's width fits on.
@@ -98,6 +100,7 @@ def build_field(
     if spray is None or fly is None:
         raise PlanError("obstacles and no-spray areas leave nothing of the field to spray")
     _check_width(spray, swath_width_m)
+    spray = _inset(spray, kept_m, swath_width_m)
     return Field(
         frame=frame,
         outline=outline,
@@ -143,6 +146,16 @@ def _without(fly: Area | None, closed: Sequence[BaseGeometry]) -> Area | None:
         return None
     left = fly.difference(shapely.union_all(closed).buffer(MARGIN_M, join_style="mitre"))
     return as_area(polygons_of(left))
+
+
+def _inset(spray: Area, kept_m: float, swath_width_m: float) -> Area:
+    """Return the ground that far inside; as it is where a swath would not fit on it any more."""
+    if not kept_m > 0.0:
+        return spray
+    inside = as_area(polygons_of(spray.buffer(-kept_m, join_style="mitre")))
+    if inside is None or inside.buffer(-swath_width_m / 2.0).is_empty:
+        return spray
+    return inside
 
 
 def _check_width(spray: Area, swath_width_m: float) -> None:

@@ -11,11 +11,7 @@ import tomllib
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
-
-from companion.config.application_table import ApplicationTable, is_told
-from companion.config.tables import ProductTable, Table
-from companion.config.wording import say
+from companion.config.application_table import check, is_number, is_told, known
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,13 +20,6 @@ if TYPE_CHECKING:
 
 TABLES = ("application", "product")
 SIZE_MAX_BYTES = 1_000_000
-
-
-class _Tables(Table):
-    """The two tables of the configuration that a record is made of."""
-
-    application: ApplicationTable = ApplicationTable()
-    product: ProductTable = ProductTable()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,10 +50,10 @@ def told_in(meta: Mapping[str, str]) -> dict[str, Any]:
 
 def _is_entry(key: str, value: Any) -> bool:
     """Return whether this could have been said: what a file was made to say is not believed."""
-    if key not in _known():
+    if key not in known():
         return False
     try:
-        _check({key: value})
+        check({key: value})
     except ConfigError:
         return False
     return True
@@ -78,29 +67,13 @@ def told_with(
     later = {} if file is None else _read(file)
     later |= dict(_parsed(change) for change in changes)
     values = {**before, **later}
-    _check(later)
+    check(later)
     after = {key for key, value in later.items() if before.get(key) != value}
     return Told(
         values={key: value for key, value in values.items() if is_told(value)},
         after=frozenset(after),
         before={key: before[key] for key in after & before.keys()},
     )
-
-
-def _known() -> set[str]:
-    fields = {"application": ApplicationTable.model_fields, "product": ProductTable.model_fields}
-    return {f"{table}.{key}" for table, keys in fields.items() for key in keys}
-
-
-def _check(values: Mapping[str, Any]) -> None:
-    nested: dict[str, dict[str, Any]] = {}
-    for key, value in values.items():
-        table, _, name = key.partition(".")
-        nested.setdefault(table, {})[name] = value
-    try:
-        _Tables.model_validate(nested)
-    except ValidationError as error:
-        raise ConfigError(f"entry of the record: {say(error.errors(), nested, _Tables)}") from error
 
 
 def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -139,7 +112,7 @@ def _parsed(change: str) -> tuple[str, Any]:
     """
     key, equals, text = change.partition("=")
     key, text = key.strip(), text.strip()
-    if not equals or key not in _known():
+    if not equals or key not in known():
         raise ConfigError(
             f"--set {change}: no entry of the record; write one such as application.customer=NAME "
             "or product.name=NAME"
@@ -150,10 +123,4 @@ def _parsed(change: str) -> tuple[str, Any]:
         return key, text
     value = parsed["value"] if list(parsed) == ["value"] else text
     # A certificate's number and a growth stage are digits, and no numbers.
-    return key, value if isinstance(value, str) or _is_number(key) else text
-
-
-def _is_number(key: str) -> bool:
-    table, _, name = key.partition(".")
-    fields = ApplicationTable.model_fields if table == "application" else ProductTable.model_fields
-    return "float" in str(fields[name].annotation)
+    return key, value if isinstance(value, str) or is_number(key) else text

@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, ValidationError
 
-from companion.config.tables import Table, Text
+from companion.config.tables import ProductTable, Table, Text
+from companion.config.wording import say
+from companion.errors import ConfigError
 
 if TYPE_CHECKING:
     from companion.config.model import Config
@@ -129,6 +131,38 @@ ASKED: dict[Profile, tuple[str, ...]] = {
         "application.humidity_percent",
     ),
 }
+
+
+class _Tables(Table):
+    """The two tables of the configuration that a record is made of."""
+
+    application: ApplicationTable = ApplicationTable()
+    product: ProductTable = ProductTable()
+
+
+def known() -> set[str]:
+    """Return the dotted keys of all that can be said for the record."""
+    fields = {"application": ApplicationTable.model_fields, "product": ProductTable.model_fields}
+    return {f"{table}.{key}" for table, keys in fields.items() for key in keys}
+
+
+def is_number(key: str) -> bool:
+    """Return whether the entry of a known dotted key is a number."""
+    table, _, name = key.partition(".")
+    fields = ApplicationTable.model_fields if table == "application" else ProductTable.model_fields
+    return "float" in str(fields[name].annotation)
+
+
+def check(values: Mapping[str, Any]) -> None:
+    """Raise ConfigError, in one line, for an entry by dotted key that cannot be one."""
+    nested: dict[str, dict[str, Any]] = {}
+    for key, value in values.items():
+        table, _, name = key.partition(".")
+        nested.setdefault(table, {})[name] = value
+    try:
+        _Tables.model_validate(nested)
+    except ValidationError as error:
+        raise ConfigError(f"entry of the record: {say(error.errors(), nested, _Tables)}") from error
 
 
 def told(config: Config) -> dict[str, Any]:

@@ -18,7 +18,7 @@ ALLOWED = {
     "mavsdk": ("missions/upload/",),
     "serial": ("companion/link", "sitl/stub"),
     "pydantic": ("companion/config",),
-    "shapefile": ("companion/maps",),
+    "shapefile": ("companion/maps", "analysis/exports/"),
 }
 CORE_ALLOWED = {
     "numpy": None,

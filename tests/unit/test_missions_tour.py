@@ -1,0 +1,104 @@
+"""One tour for all lines, and which lines are worth their time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from shapely import Polygon, box
+
+from missions.coverage import measure, reachable
+from missions.demand import Pieces, Uniform
+from missions.field import build_field
+from missions.free_space import free_space
+from missions.network import Network, build_network
+from missions.one_tour import tour_of
+from missions.plan import Settings
+from missions.planner import plan_mission
+from missions.savings import by_savings, cost_s
+from missions.strips import Floats, joined, lengths_m
+from missions.swaths import axes
+from missions.tour import shortest_tour
+from missions.turns import Motion
+from missions.worth import worthwhile
+from tests.bench.missions import FRAME, comb, to_degrees
+
+MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5)
+WIDTH_M = 7.0
+
+
+def network_of(lines: Floats) -> Network:
+    """Return the network of lines on open ground, from a depot at the origin."""
+    count = len(lines)
+    pieces = Pieces(ends=lines, litres=np.zeros(count), line=np.arange(count))
+    ground = box(-1000.0, -1000.0, 1000.0, 1000.0)
+    return build_network(pieces, np.zeros((1, 2)), free_space(ground), MOTION, refill_s=0.0)
+
+
+@given(
+    rows=st.lists(
+        st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(0, 360)),
+        min_size=3, max_size=12,
+    ),
+    seed=st.integers(0, 5),
+)  # fmt: skip
+def test_a_tour_flies_every_piece_once_and_is_no_longer(
+    rows: list[tuple[float, float, float]], seed: int
+) -> None:
+    lines = np.array([[x, y, *(np.array([x, y]) + 40.0 * axes(turn)[0])] for x, y, turn in rows])
+    network = network_of(lines)
+    (first,) = by_savings(network, 1.0)
+    found = shortest_tour(network, first, kicks=20, seed=seed)
+    assert sorted(enter >> 1 for enter in found) == list(range(len(lines)))
+    assert cost_s(network, [found]) <= cost_s(network, [first]) + 1e-6
+
+
+def test_a_comb_of_passes_is_flown_to_and_fro() -> None:
+    lines = np.array([[x, 0.0, x, 90.0] for x in np.arange(8.0) * 7.0])
+    network = network_of(lines)
+    order = shortest_tour(network, list(range(0, 16, 2)), kicks=100)
+    ways_s = cost_s(network, [order])
+    turns_s = 7.0 * MOTION.between_passes_s(7.0)
+    assert ways_s == pytest.approx(turns_s + MOTION.leg_s(49.0), abs=1.0)
+
+
+def test_a_line_for_a_sliver_beside_a_hole_is_left_out() -> None:
+    ground = box(0.0, 0.0, 210.0, 300.0)
+    whole = np.array([[x, 0.0, x, 300.0] for x in np.arange(30.0) * 7.0 + 3.5])
+    more = np.array([[104.0, 100.0, 104.0, 140.0]])
+    tour = tour_of(joined([whole, more]), free_space(ground), MOTION)
+    left = worthwhile(tour, reachable(ground, WIDTH_M), WIDTH_M)
+    assert lengths_m(left) == pytest.approx([300.0] * 30)
+
+
+def test_what_is_left_out_stays_below_a_thousandth() -> None:
+    ground = comb()
+    plan = plan_mission(
+        build_field(to_degrees(ground), swath_width_m=WIDTH_M, frame=FRAME),
+        Settings(swath_width_m=WIDTH_M, speed_m_s=6.0, tank_l=1e4),
+        Uniform(rate_l_ha=20.0),
+    )
+    assert plan.coverage.percent > 99.9
+    assert plan.coverage.outside_m2 == 0.0
+    legs = plan.sorties[0].legs[1:-1]
+    # The grid of others takes 36.47 minutes and sprays the holes.
+    assert sum(leg.seconds for leg in legs) / 60.0 < 1.04 * 36.47
+
+
+def test_ends_that_others_cover_are_cut_off_and_borders_that_go_on_are_not() -> None:
+    ground = Polygon([(0, 0), (100, 0), (100, 14), (0, 14)])
+    lines = np.array([[0.0, 3.5, 100.0, 3.5], [0.0, 10.5, 100.0, 10.5], [96.5, 0.0, 96.5, 14.0]])
+    left = worthwhile(tour_of(lines, free_space(ground), MOTION), ground, WIDTH_M)
+    assert measure(left, ground, WIDTH_M).percent == pytest.approx(100.0)
+    assert len(left) == 2
+
+
+def test_passes_keep_from_the_border_where_that_leaves_room() -> None:
+    wide = to_degrees(box(0.0, 0.0, 60.0, 200.0))
+    kept = build_field(wide, swath_width_m=WIDTH_M, frame=FRAME, kept_m=0.3)
+    assert kept.spray.bounds == pytest.approx((0.3, 0.3, 59.7, 199.7), abs=0.02)
+    assert kept.area_m2 == pytest.approx(12_000.0, rel=1e-3)
+    narrow = to_degrees(box(0.0, 0.0, 7.1, 200.0))
+    near = build_field(narrow, swath_width_m=WIDTH_M, frame=FRAME, kept_m=0.3)
+    assert near.spray.bounds[0] == pytest.approx(0.0, abs=0.02)
