@@ -1,4 +1,4 @@
-"""What flows through the core: inputs, the vehicle's state, plans, decisions.
+"""What flows through the core: state and decisions; inputs and plans have files of their own.
 
 Everything is frozen; units are in names; missing is `None`, never 0. All times are seconds on
 the companion's monotonic clock, unless a name says otherwise (`boot_s`: the autopilot's clock).
@@ -7,20 +7,74 @@ the companion's monotonic clock, unless a name says otherwise (`boot_s`: the aut
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
-from itertools import pairwise
+from enum import StrEnum
 
+from companion.core.inputs import (
+    BatteryReport,
+    ClockReport,
+    EstimatorReport,
+    EstopReport,
+    Fix,
+    FlowReport,
+    GnssReport,
+    HeartbeatReport,
+    Input,
+    LandedReport,
+    LegReport,
+    OperatorCommand,
+    OutputReport,
+    PressureReport,
+    RangeReport,
+    RateOverride,
+    RcReport,
+    SpeedReport,
+    StandstillReport,
+    TankReport,
+    Telemetry,
+    UtcReport,
+    WindReport,
+)
+from companion.core.plans import DriveChange, DrivePlan, SprayPlan, TimedChange
 
-class Fix(IntEnum):
-    """Quality of the GNSS fix, in the order of trust (MAVLink GPS_FIX_TYPE 0 to 6)."""
-
-    NONE = 0
-    NO_FIX = 1
-    FIX_2D = 2
-    FIX_3D = 3
-    DGPS = 4
-    RTK_FLOAT = 5
-    RTK_FIXED = 6
+__all__ = [
+    "BatteryReport",
+    "ClockReport",
+    "Decision",
+    "DriveChange",
+    "DrivePlan",
+    "EstimatorReport",
+    "EstopReport",
+    "FaultKind",
+    "Finding",
+    "Fix",
+    "FlowReport",
+    "FlowTrimState",
+    "GnssReport",
+    "HeartbeatReport",
+    "Inhibit",
+    "Input",
+    "LandedReport",
+    "LegReport",
+    "Method",
+    "OperatorCommand",
+    "OutputReport",
+    "PressureReport",
+    "RangeReport",
+    "RateOverride",
+    "RcReport",
+    "SpeedReport",
+    "SprayPlan",
+    "SprayerState",
+    "StandstillReport",
+    "StopAhead",
+    "TankReport",
+    "Telemetry",
+    "TimedChange",
+    "UtcReport",
+    "VehicleState",
+    "Way",
+    "WindReport",
+]
 
 
 class Method(StrEnum):
@@ -113,231 +167,6 @@ class FaultKind(StrEnum):
     TANK_FAULT = "tank-fault"
 
 
-# --------------------------------------------------------------------------------------- inputs
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Telemetry:
-    """One position message of the autopilot (GLOBAL_POSITION_INT), decoded.
-
-    `received_s` is when its first byte was read. A velocity of `None` means that the autopilot
-    did not know it. Course is not in it: it follows from the velocity.
-    """
-
-    received_s: float
-    boot_s: float
-    latitude_deg: float
-    longitude_deg: float
-    relative_altitude_m: float
-    velocity_north_m_s: float | None
-    velocity_east_m_s: float | None
-    velocity_down_m_s: float | None
-    heading_deg: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SpeedReport:
-    """Ground speed by a second way (VFR_HUD): the cross-check of the velocity."""
-
-    received_s: float
-    ground_speed_m_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GnssReport:
-    """Quality of the GNSS fix (GPS_RAW_INT)."""
-
-    received_s: float
-    fix: Fix
-    horizontal_accuracy_m: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EstimatorReport:
-    """Whether the autopilot trusts its own position (EKF_STATUS_REPORT, ESTIMATOR_STATUS)."""
-
-    received_s: float
-    healthy: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeartbeatReport:
-    """A heartbeat of the vehicle's autopilot. `mode` is its name: AUTO, GUIDED, LOITER, ..."""
-
-    received_s: float
-    autopilot: str
-    armed: bool
-    mode: str
-    active: bool = True  # MAV_STATE_ACTIVE: no failsafe, no emergency
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LandedReport:
-    """Whether the vehicle flies (EXTENDED_SYS_STATE); `None` where the autopilot cannot tell.
-
-    Between the two, taking off or landing, it is neither in the air nor on the ground.
-    """
-
-    received_s: float
-    in_air: bool | None
-    on_ground: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WindReport:
-    """Wind, from the autopilot or from the operator; east and north of where it blows to.
-
-    Without a direction the two are `None`: the speed alone still limits the spraying.
-    """
-
-    received_s: float
-    speed_m_s: float
-    east_m_s: float | None = None
-    north_m_s: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RangeReport:
-    """Height above the crop by a sensor that looks down (DISTANCE_SENSOR); None: sees nothing."""
-
-    received_s: float
-    height_m: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RcReport:
-    """Pulse widths of the pilot's channels, channel 1 first (RC_CHANNELS); 0 is no signal."""
-
-    received_s: float
-    pulse_us: tuple[int, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OperatorCommand:
-    """The operator's wish to spray or to stop, and by which way it came."""
-
-    received_s: float
-    enable: bool
-    source: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OutputReport:
-    """What the executor of plans says of itself, and whether the link to the vehicle is up."""
-
-    received_s: float
-    healthy: bool
-    text: str = ""
-    link_up: bool = True
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StandstillReport:
-    """The companion itself stood still: a stopped process, a computer that slept."""
-
-    received_s: float
-    gap_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EstopReport:
-    """An emergency stop: a switch on a `line`, or a `command`; a broken wire is pressed."""
-
-    received_s: float
-    pressed: bool
-    source: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FlowReport:
-    """What the flow meter has counted since it was started: all valves, as its calibration has it.
-
-    A count and not a flow, so that a mean over any time can be formed from two of them. With a
-    `fault` (pulses were lost, more came than can be) the volume is no number.
-    """
-
-    received_s: float
-    volume_ml: float
-    fault: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PressureReport:
-    """Pressure before the valves, mean of a reading's time; None with a `fault` of the sensor."""
-
-    received_s: float
-    pressure_kpa: float | None
-    fault: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TankReport:
-    """What is left in the tank; None where it is not known, with a `fault` where it should be."""
-
-    received_s: float
-    level_l: float | None
-    fault: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BatteryReport:
-    """One of the autopilot's battery monitors (BATTERY_STATUS), counted from 0.
-
-    Behind it may be ArduPilot's fuel flow meter, whose milliampere hours are millilitres, or a
-    fuel level; `None` is what it does not know.
-    """
-
-    received_s: float
-    battery: int
-    consumed: float | None
-    remaining_percent: float | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RateOverride:
-    """The operator's wish to spray a percentage of what is prescribed; see `rate.overridden`."""
-
-    received_s: float
-    percent: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ClockReport:
-    """What TIMESYNC says of the autopilot's clock: add `offset_s` to its time to have ours.
-
-    Of the last exchanges the one with the shortest round trip; `received_s` is that of the newest.
-    """
-
-    received_s: float
-    offset_s: float
-    round_trip_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UtcReport:
-    """The time of day by the autopilot (SYSTEM_TIME), seconds since 1970; for the record only."""
-
-    received_s: float
-    utc_s: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LegReport:
-    """The leg of its mission that the vehicle now flies: from which place to which.
-
-    `stops` says whether the vehicle comes to a stop at its end, `speed_m_s` is the speed that the
-    mission asks for on it. `received_s` is when the autopilot last said which leg it is.
-    """
-
-    received_s: float
-    from_latitude_deg: float
-    from_longitude_deg: float
-    to_latitude_deg: float
-    to_longitude_deg: float
-    stops: bool
-    speed_m_s: float | None = None
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
     """The leg of its mission that the vehicle now flies, in the flight's frame."""
@@ -347,34 +176,6 @@ class Way:
     from_north_m: float
     to_east_m: float
     to_north_m: float
-
-
-Input = (
-    Telemetry
-    | SpeedReport
-    | GnssReport
-    | EstimatorReport
-    | HeartbeatReport
-    | LandedReport
-    | WindReport
-    | RangeReport
-    | RcReport
-    | OperatorCommand
-    | OutputReport
-    | EstopReport
-    | StandstillReport
-    | FlowReport
-    | PressureReport
-    | TankReport
-    | BatteryReport
-    | RateOverride
-    | ClockReport
-    | LegReport
-    | UtcReport
-)
-
-
-# ---------------------------------------------------------------------------------------- state
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -433,118 +234,6 @@ class VehicleState:
     operator_wishes: int = 0  # how often the operator has enabled anew, or disabled
     way: Way | None = None  # None: it is not used, or nothing was heard of it
     way_before: Way | None = None  # the one that it was before, last heard of then
-
-
-# ---------------------------------------------------------------------------------------- plans
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TimedChange:
-    """Valve number `valve` (index from the left) takes `duty` at `at_s`.
-
-    `restart` marks a change of zone: the executor begins a new PWM period there. Without it (a
-    trim for the speed) the next period is early enough.
-    """
-
-    at_s: float
-    valve: int
-    duty: float
-    restart: bool = True
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.duty <= 1.0:
-            raise ValueError(f"duty outside [0, 1]: {self.duty}")
-        if not abs(self.at_s) < float("inf"):
-            raise ValueError(f"time of a change is not finite: {self.at_s}")
-        if not self.valve >= 0:
-            raise ValueError(f"valve index is negative: {self.valve}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DriveChange:
-    """A motor takes `fraction` of its range at `at_s`."""
-
-    at_s: float
-    fraction: float
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.fraction <= 1.0:
-            raise ValueError(f"fraction outside [0, 1]: {self.fraction}")
-        if not abs(self.at_s) < float("inf"):
-            raise ValueError(f"time of a change is not finite: {self.at_s}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrivePlan:
-    """What a motor (a pump, an atomiser) does: 0 is stopped, 1 the end of its range.
-
-    `fraction` holds from the plan's `issued_s`; `changes` follow in order of time.
-    """
-
-    fraction: float
-    changes: tuple[DriveChange, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.fraction <= 1.0:
-            raise ValueError(f"fraction outside [0, 1]: {self.fraction}")
-        if not all(a.at_s <= b.at_s for a, b in pairwise(self.changes)):
-            raise ValueError("changes of a drive are not in order of time")
-
-    @property
-    def is_off(self) -> bool:
-        """Whether it stands still, now and later."""
-        return not self.fraction and not any(change.fraction for change in self.changes)
-
-    def at(self, now_s: float) -> float:
-        """Return the fraction at `now_s`; the lease is the plan's to mind.
-
-        >>> DrivePlan(fraction=0.0, changes=(DriveChange(at_s=1.0, fraction=0.4),)).at(1.0)
-        0.4
-        """
-        fraction = self.fraction
-        for change in self.changes:
-            if not change.at_s <= now_s:
-                break
-            fraction = change.fraction
-        return fraction
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SprayPlan:
-    """The whole future of all valves and drives, until the lease ends; closed after that.
-
-    `duty` holds from `issued_s`, one value a valve; `changes` follow in order of time. A newer
-    plan (by `sequence`) replaces what has not happened yet. An executor that is given the same
-    duty again does nothing. `drives` are the pump, where there is one, and the atomisers in the
-    order of their tables; a plan without any has them all stopped.
-    """
-
-    sequence: int
-    issued_s: float
-    duty: tuple[float, ...]
-    changes: tuple[TimedChange, ...]
-    lease_until_s: float
-    drives: tuple[DrivePlan, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not all(0.0 <= duty <= 1.0 for duty in self.duty):
-            raise ValueError(f"duty outside [0, 1]: {self.duty}")
-        if not self.issued_s < self.lease_until_s < float("inf"):
-            raise ValueError(f"lease ends at {self.lease_until_s}, issued at {self.issued_s}")
-        if any(change.valve >= len(self.duty) for change in self.changes):
-            raise ValueError("a change names a valve that the plan does not have")
-        if not all(a.at_s <= b.at_s for a, b in pairwise(self.changes)):
-            raise ValueError("changes are not in order of time")
-
-    @property
-    def is_off(self) -> bool:
-        """Whether every valve is closed and every drive stopped, now and later."""
-        return not self.opens and all(drive.is_off for drive in self.drives)
-
-    @property
-    def opens(self) -> bool:
-        """Whether a valve is open, now or later."""
-        return any(self.duty) or any(change.duty for change in self.changes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,269 @@
+"""What comes in: one value of a type of its own for everything that the core can be told.
+
+All times are seconds on the companion's monotonic clock, unless a name says otherwise (`boot_s`:
+the autopilot's clock). Missing is `None`, never 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+class Fix(IntEnum):
+    """Quality of the GNSS fix, in the order of trust (MAVLink GPS_FIX_TYPE 0 to 6)."""
+
+    NONE = 0
+    NO_FIX = 1
+    FIX_2D = 2
+    FIX_3D = 3
+    DGPS = 4
+    RTK_FLOAT = 5
+    RTK_FIXED = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Telemetry:
+    """One position message of the autopilot (GLOBAL_POSITION_INT), decoded.
+
+    `received_s` is when its first byte was read. A velocity of `None` means that the autopilot
+    did not know it. Course is not in it: it follows from the velocity.
+    """
+
+    received_s: float
+    boot_s: float
+    latitude_deg: float
+    longitude_deg: float
+    relative_altitude_m: float
+    velocity_north_m_s: float | None
+    velocity_east_m_s: float | None
+    velocity_down_m_s: float | None
+    heading_deg: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeedReport:
+    """Ground speed by a second way (VFR_HUD): the cross-check of the velocity."""
+
+    received_s: float
+    ground_speed_m_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GnssReport:
+    """Quality of the GNSS fix (GPS_RAW_INT)."""
+
+    received_s: float
+    fix: Fix
+    horizontal_accuracy_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimatorReport:
+    """Whether the autopilot trusts its own position (EKF_STATUS_REPORT, ESTIMATOR_STATUS)."""
+
+    received_s: float
+    healthy: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeartbeatReport:
+    """A heartbeat of the vehicle's autopilot. `mode` is its name: AUTO, GUIDED, LOITER, ..."""
+
+    received_s: float
+    autopilot: str
+    armed: bool
+    mode: str
+    active: bool = True  # MAV_STATE_ACTIVE: no failsafe, no emergency
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LandedReport:
+    """Whether the vehicle flies (EXTENDED_SYS_STATE); `None` where the autopilot cannot tell.
+
+    Between the two, taking off or landing, it is neither in the air nor on the ground.
+    """
+
+    received_s: float
+    in_air: bool | None
+    on_ground: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindReport:
+    """Wind, from the autopilot or from the operator; east and north of where it blows to.
+
+    Without a direction the two are `None`: the speed alone still limits the spraying.
+    """
+
+    received_s: float
+    speed_m_s: float
+    east_m_s: float | None = None
+    north_m_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeReport:
+    """Height above the crop by a sensor that looks down (DISTANCE_SENSOR); None: sees nothing."""
+
+    received_s: float
+    height_m: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RcReport:
+    """Pulse widths of the pilot's channels, channel 1 first (RC_CHANNELS); 0 is no signal."""
+
+    received_s: float
+    pulse_us: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OperatorCommand:
+    """The operator's wish to spray or to stop, and by which way it came."""
+
+    received_s: float
+    enable: bool
+    source: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputReport:
+    """What the executor of plans says of itself, and whether the link to the vehicle is up."""
+
+    received_s: float
+    healthy: bool
+    text: str = ""
+    link_up: bool = True
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StandstillReport:
+    """The companion itself stood still: a stopped process, a computer that slept."""
+
+    received_s: float
+    gap_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstopReport:
+    """An emergency stop: a switch on a `line`, or a `command`; a broken wire is pressed."""
+
+    received_s: float
+    pressed: bool
+    source: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowReport:
+    """What the flow meter has counted since it was started: all valves, as its calibration has it.
+
+    A count and not a flow, so that a mean over any time can be formed from two of them. With a
+    `fault` (pulses were lost, more came than can be) the volume is no number.
+    """
+
+    received_s: float
+    volume_ml: float
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PressureReport:
+    """Pressure before the valves, mean of a reading's time; None with a `fault` of the sensor."""
+
+    received_s: float
+    pressure_kpa: float | None
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TankReport:
+    """What is left in the tank; None where it is not known, with a `fault` where it should be."""
+
+    received_s: float
+    level_l: float | None
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BatteryReport:
+    """One of the autopilot's battery monitors (BATTERY_STATUS), counted from 0.
+
+    Behind it may be ArduPilot's fuel flow meter, whose milliampere hours are millilitres, or a
+    fuel level; `None` is what it does not know.
+    """
+
+    received_s: float
+    battery: int
+    consumed: float | None
+    remaining_percent: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RateOverride:
+    """The operator's wish to spray a percentage of what is prescribed; see `rate.overridden`."""
+
+    received_s: float
+    percent: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockReport:
+    """What TIMESYNC says of the autopilot's clock: add `offset_s` to its time to have ours.
+
+    Of the last exchanges the one with the shortest round trip; `received_s` is that of the newest.
+    """
+
+    received_s: float
+    offset_s: float
+    round_trip_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UtcReport:
+    """The time of day by the autopilot (SYSTEM_TIME), seconds since 1970; for the record only."""
+
+    received_s: float
+    utc_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LegReport:
+    """The leg of its mission that the vehicle now flies: from which place to which.
+
+    `stops` says whether the vehicle comes to a stop at its end, `speed_m_s` is the speed that the
+    mission asks for on it. `received_s` is when the autopilot last said which leg it is.
+    """
+
+    received_s: float
+    from_latitude_deg: float
+    from_longitude_deg: float
+    to_latitude_deg: float
+    to_longitude_deg: float
+    stops: bool
+    speed_m_s: float | None = None
+
+
+Input = (
+    Telemetry
+    | SpeedReport
+    | GnssReport
+    | EstimatorReport
+    | HeartbeatReport
+    | LandedReport
+    | WindReport
+    | RangeReport
+    | RcReport
+    | OperatorCommand
+    | OutputReport
+    | EstopReport
+    | StandstillReport
+    | FlowReport
+    | PressureReport
+    | TankReport
+    | BatteryReport
+    | RateOverride
+    | ClockReport
+    | LegReport
+    | UtcReport
+)
