@@ -20,16 +20,16 @@ import numpy as np
 from companion.core import (
     atomiser,
     boom,
-    controller,
     frame,
     interlock,
     nozzle,
     pump,
     schedule,
+    setup,
     types,
 )
 
-_MODULES = (types, boom, nozzle, schedule, interlock, frame, pump, atomiser, controller)
+_MODULES = (types, boom, nozzle, schedule, interlock, frame, pump, atomiser, setup)
 _SCALARS = frozenset({float, int, str, bool, type(None)})
 _SET = "frozenset"
 

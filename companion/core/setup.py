@@ -1,0 +1,134 @@
+"""All that is constant in a flight, checked once; what follows from it is worked out here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from companion.core.atomiser import Atomiser
+from companion.core.boom import Boom
+from companion.core.coverage import Coverage
+from companion.core.crossings import Across, Border
+from companion.core.detection import Detection, Watching
+from companion.core.dosing import Sprayer
+from companion.core.drift import Drift
+from companion.core.flow_trim import FlowTrim, Trimming
+from companion.core.frame import LocalFrame
+from companion.core.interlock import Limits
+from companion.core.lines import Lines
+from companion.core.liquid_law import AutopilotLiquid
+from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.overlap_guard import OverlapGuard
+from companion.core.prescription import Prescription
+from companion.core.pump import Pump, Pumping
+from companion.core.routes import ROUTES_KEPT_S
+from companion.core.schedule import LagModel, Timing
+from companion.core.types import Method
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setup:
+    """All that is constant in a flight."""
+
+    frame: LocalFrame
+    prescription: Prescription
+    boom: Boom
+    nozzle_sets: tuple[NozzleSet, ...]
+    pwm: PwmLimits
+    lag: LagModel
+    method: Method
+    look_ahead_s: float
+    limits: Limits
+    border: Border = "inside"
+    border_buffer_m: float = 0.1
+    across: Across = "centre"
+    lease_s: float = 0.3
+    flow_trim: FlowTrim | None = None
+    detection: Detection | None = None
+    autopilot_liquid: AutopilotLiquid | None = None
+    drift: Drift | None = None
+    rate_max_l_ha: float | None = None
+    mission_braking_m_s2: float | None = None  # None: what the mission says is not used
+    pump: Pump | None = None
+    atomisers: tuple[Atomiser, ...] = ()
+    lines: Lines | None = None  # None: sprayed wherever the map has a rate
+    record_coverage: bool = False
+    overlap: OverlapGuard | None = None  # None: treated ground is sprayed again
+    # What earlier flights treated; not compared by hash: tiles are a mapping.
+    treated: Coverage | None = field(default=None, repr=False, hash=False)
+    timing: Timing = field(init=False, repr=False, compare=False)
+    pumping: Pumping | None = field(init=False, repr=False, compare=False)
+    trimming: Trimming | None = field(init=False, repr=False, compare=False)
+    watching: Watching | None = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if not 0.05 <= self.lease_s <= 5.0:
+            raise ValueError(f"lease_s must lie in [0.05, 5] s, got {self.lease_s}")
+        if not 0.0 <= self.look_ahead_s <= 30.0:
+            raise ValueError(f"look_ahead_s must lie in [0, 30] s, got {self.look_ahead_s}")
+        if not 0.0 <= self.border_buffer_m <= 100.0:
+            raise ValueError(f"border_buffer_m must lie in [0, 100] m, got {self.border_buffer_m}")
+        braking_m_s2 = self.mission_braking_m_s2
+        if braking_m_s2 is not None and not 0.1 <= braking_m_s2 <= 20.0:
+            raise ValueError(f"mission_braking_m_s2 must lie in [0.1, 20], got {braking_m_s2}")
+        if not self.nozzle_sets:
+            raise ValueError("at least one nozzle set is needed")
+        count = len(self.boom.valves)
+        if any(valve >= count for nozzles in self.nozzle_sets for valve in nozzles.valves):
+            raise ValueError("a nozzle set names a valve that the boom does not have")
+        timing = Timing.of(
+            self.method, self.lag, look_ahead_s=self.look_ahead_s, period_s=self.pwm.period_s
+        )
+        object.__setattr__(self, "timing", timing)
+        object.__setattr__(self, "pumping", self._pumping())
+        law, doses = self.flow_trim, self.doses
+        trimming = None if law is None else Trimming.of(law, doses.lag, doses.pwm)
+        object.__setattr__(self, "trimming", trimming)
+        watching = None
+        if self.detection is not None:
+            watching = Watching.of(self.detection, doses.nozzle_sets, doses.lag, doses.pwm)
+        object.__setattr__(self, "watching", watching)
+
+    def _pumping(self) -> Pumping | None:
+        if self.pump is None:
+            return None
+        if self.pump.curve is not None and len(self.nozzle_sets) > 1:
+            raise ValueError("a pump that makes the flow has one nozzle set")
+        return Pumping.of(
+            self.pump,
+            self.boom,
+            method=self.method,
+            look_ahead_s=self.look_ahead_s,
+            valve_timing=self.timing,
+            rate_max_l_ha=self.rate_max_l_ha,
+        )
+
+    @property
+    def records_coverage(self) -> bool:
+        """Return whether it is kept which ground was treated: a guard needs it too."""
+        return self.record_coverage or self.overlap is not None
+
+    @property
+    def doses(self) -> Sprayer:
+        """Return what makes the flow: the valves, or the pump in their place."""
+        return self if self.pumping is None else self.pumping
+
+    @property
+    def longest_s(self) -> float:
+        """Return the longest lead of any order: of valves, pump and atomisers."""
+        longest_s = self.timing.longest_s
+        if self.pumping is not None:
+            longest_s = max(longest_s, self.pumping.timing.longest_s)
+        for atomiser in self.atomisers:
+            longest_s = max(longest_s, atomiser.spin_up_s + self.lag.output_s)
+        return longest_s
+
+    @property
+    def back_s(self) -> float:
+        """Return how far behind a path begins, so that short stays are seen whole."""
+        return 0.1 + 2.0 * self.timing.dwell_min_s
+
+    @property
+    def ahead_s(self) -> float:
+        """Return how far ahead a path must reach: the lease, the longest lead and a short stay."""
+        longest_s = self.longest_s + 2.0 * self.timing.dwell_min_s
+        return self.lease_s + longest_s + ROUTES_KEPT_S + 0.05
