@@ -64,6 +64,10 @@ def plan(
         float | None,
         typer.Option(metavar="V", help="Where rates are too low for the valves, up to this."),
     ] = None,
+    border_m: Annotated[
+        float,
+        typer.Option(metavar="M", help="Passes keep so far from every border.", min=0.0, max=50.0),
+    ] = 0.0,
     angle_deg: Annotated[
         float | None, typer.Option(metavar="DEG", help="Course of the passes; else the best.")
     ] = None,
@@ -136,6 +140,7 @@ def plan(
         ),
         depots=tuple(parse_mark(text, "--depot") for text in depot or ()),
         rate_l_ha=rate_l_ha,
+        border_m=border_m,
         pause=BreakAsked(
             done=done,
             resume=resume,

@@ -20,8 +20,9 @@ from missions.swaths import border_passes, inner_ground, inner_lines
 from missions.turns import Motion
 from missions.worth import worthwhile
 
-# Of the best courses so many are drawn in full, and so many layouts gone through line by line.
-ANGLES_TRIED, LAYOUTS_TRIED = 2, 2
+# Of the best courses so many are drawn in full; of the layouts so many are gone through line by
+# line, and only the best one where it has more lines than this.
+ANGLES_TRIED, LAYOUTS_TRIED, MANY_LINES = 2, 2, 100
 
 
 def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Floats, float]:
@@ -43,6 +44,8 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
     target = reachable(field.spray, width_m)
     tours = [(angle_deg, tour_of(lines, space, motion)) for angle_deg, lines in drawn]
     best = sorted(tours, key=lambda each: cost(each[1]))[:LAYOUTS_TRIED]
+    if len(best[0][1].lines) > MANY_LINES:
+        best = best[:1]
     better = [
         (angle_deg, tour_of(worthwhile(tour, target, width_m), space, motion))
         for angle_deg, tour in best

@@ -13,14 +13,15 @@ import numpy as np
 from missions.demand import Pieces
 from missions.free_space import FreeSpace
 from missions.network import Network, build_network
-from missions.savings import Sortie, by_savings, cost_s
+from missions.savings import Sortie, by_savings, cost_s, one_chain
 from missions.strips import Floats, lengths_m
 from missions.tour import shortest_tour
 from missions.turns import Motion
 
 # With more lines a plan has so many turns that one more or less does not count.
 LINES_MAX = 400
-KICKS = 40
+# Few lines are searched for longer: 300 kicks for 40 of them, 20 for 155.
+KICKS, KICKS_MIN, KICKS_MAX = 480_000, 20, 300
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,5 +47,7 @@ def tour_of(lines: Floats, space: FreeSpace, motion: Motion) -> Tour:
     pieces = Pieces(ends=lines, litres=np.zeros(count), line=np.arange(count))
     network = build_network(pieces, middle, space, motion, refill_s=0.0)
     network.put_depot_anywhere()
-    order = shortest_tour(network, by_savings(network, 1.0)[0], kicks=KICKS)
+    order = one_chain(network, by_savings(network, 1.0))
+    kicks = min(max(KICKS_MIN, KICKS // count**2), KICKS_MAX)
+    order = shortest_tour(network, order, kicks=kicks)
     return Tour(lines=lines, network=network, order=order, motion=motion)

@@ -107,8 +107,14 @@ def _planned(
     else:
         edge = edge_places(field, step_m=EDGE_STEP_M, count_max=EDGE_PLACES)
         sorties = one(lines, demand, build_ways(field, edge), any_depot=True)
-        places = edge[[sorties.sorties[0].depot]]
-        sorties = replace(sorties, sorties=(replace(sorties.sorties[0], depot=0),))
+        used = sorted({sortie.depot for sortie in sorties.sorties})
+        places = edge[used]
+        sorties = replace(
+            sorties,
+            sorties=tuple(
+                replace(sortie, depot=used.index(sortie.depot)) for sortie in sorties.sorties
+            ),
+        )
     plan = Plan(
         field=field,
         settings=settings,

@@ -42,9 +42,6 @@ from missions.surroundings import NOTHING_AROUND, Surroundings
 # Where no configuration is given.
 DEFAULTS = Settings(swath_width_m=6.0, speed_m_s=6.0)
 RATE_L_HA = 20.0
-# Beside the border the companion closes a strip that leaves its buffer: so far further in passes
-# are flown, so that the wander of an aircraft (0.1 to 0.2 m in the twin) shuts no outer valve.
-BESIDE_M = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +68,7 @@ class Asked:
     depots: tuple[tuple[float, float], ...] = ()
     rate_l_ha: float | None = None
     crs: str | None = None
+    border_m: float = 0.0
     ground: GroundAsked = NOTHING_ASKED
     pause: BreakAsked = NO_BREAK
 
@@ -103,7 +101,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         swath_width_m=settings.swath_width_m,
         frame=frame,
         offset_m=offset_m,
-        kept_m=0.0 if settings.border_buffer_m is None else settings.border_buffer_m + BESIDE_M,
+        kept_m=asked.border_m,
     )
     if asked.pause.resume is None and asked.pause.done is not None:
         ground = untreated(ground, asked.pause.done, settings.swath_width_m, offset_m)

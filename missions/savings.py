@@ -50,6 +50,22 @@ def by_savings(
     return list(sorties.values())
 
 
+def one_chain(network: Network, sorties: list[Sortie]) -> Sortie:
+    """Return all sorties as one: each time the nearest one, either way round, comes next.
+
+    Where there are many pieces only near ends are joined by savings, and some chains are left.
+    """
+    left = [list(sortie) for sortie in sorties]
+    whole = left.pop(0)
+    while left:
+        row = network.between_s[whole[-1] ^ 1]
+        nearest = min(left, key=lambda each: min(row[each[0]], row[each[-1] ^ 1]))
+        left.remove(nearest)
+        is_turned = row[nearest[-1] ^ 1] < row[nearest[0]]
+        whole += turned(nearest) if is_turned else nearest
+    return whole
+
+
 def _best_first(network: Network, every_pair_max: int) -> list[tuple[int, int]]:
     """Return pairs of ends of different pieces, those that save most when joined first."""
     count = network.depot

@@ -16,7 +16,7 @@ from missions.errors import PlanError
 from missions.network import JOIN_DEG, JOIN_M, Network, build_network
 from missions.plan import Kind, Leg, Place, Settings, Sortie
 from missions.savings import Sortie as Order
-from missions.savings import by_savings
+from missions.savings import by_savings, one_chain
 from missions.search import improve
 from missions.strips import Floats, lengths_m
 from missions.tour import shortest_tour
@@ -29,7 +29,7 @@ PIECES_MAX = 600
 TANKS_MAX = 1500
 TOUCH_M = 1e-3
 # What one kick of a tour takes, counted in moves of the search over many sorties.
-MOVES_A_KICK = 60
+MOVES_A_KICK = 100
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,9 +71,10 @@ def plan_sorties(
     if budget is not None:
         _check_reach(budget, pieces, ways, settings)
     orders = by_savings(network, settings.usable_l, lasts=lasts)
-    if len(orders) == 1 and lasts is None:
+    if lasts is None and float(pieces.litres.sum()) <= settings.usable_l:
+        order = one_chain(network, orders)
         kicks = settings.moves // MOVES_A_KICK
-        orders = [shortest_tour(network, orders[0], kicks=kicks, seed=settings.seed)]
+        orders = [shortest_tour(network, order, kicks=kicks, seed=settings.seed)]
     else:
         orders = improve(
             network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed,

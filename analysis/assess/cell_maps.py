@@ -2,7 +2,9 @@
 
 As its Figs. 10, 15, 16 and 17: maps on the map's own grid (else square cells of a stated size),
 relative error with small cells left blank, duty, histogram with mean and standard deviation. What
-is measured here is the record's volume, over the ground that the strips passed in each cell.
+is measured here is the record's volume, over the ground of the field that the strips passed in each
+cell. What was commanded is the map's rate where a cell lies in one zone, else the mean of what the
+strips were to spray there.
 """
 
 from __future__ import annotations
@@ -13,6 +15,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from analysis.assess.ground_elements import Grid, Slices, SquareGrid, slices_of, summed
+from analysis.assess.ground_rates import rates_of_squares
+from analysis.assess.histogram import Histogram
+from analysis.assess.map_cells import MapCells
 from companion.core.rate import flow_for_rate
 
 if TYPE_CHECKING:
@@ -20,8 +25,8 @@ if TYPE_CHECKING:
 
     from analysis.flight_record import FlightRecord
     from analysis.strips import Strip
-    from analysis.track import Floats, Ints
-    from companion.core.cells import CellGrid
+    from analysis.track import Bools, Floats
+    from companion.core.prescription import Prescription
 
 # P2 leaves cells blank whose commanded flow is below this part of the highest.
 BLANK_BELOW = 0.10
@@ -31,52 +36,7 @@ PIECES_PER_CELL = 5
 # Pieces of ground are not longer: one that lies across a boundary counts for one of its sides.
 PIECE_MAX_M = 0.2
 CELLS_MAX = 2_000_000
-HISTOGRAM_BINS = 41
 L_HA_PER_ML_M2 = 10.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Histogram:
-    """Deviations of cells in one unit: + is too much; `edges` has one value more than `counts`."""
-
-    unit: Literal["L/ha", "L/min"]
-    edges: Floats
-    counts: Ints
-    mean: float
-    sd: float
-    mean_abs: float
-    sd_abs: float
-    cells: int
-
-    @staticmethod
-    def of(values: Floats, unit: Literal["L/ha", "L/min"]) -> Histogram | None:
-        """Return the histogram of the values that are numbers; None without any."""
-        known = values[np.isfinite(values)]
-        if not len(known):
-            return None
-        # Nearly all: a few cells at the edge would make all others one bar.
-        most = max(float(np.quantile(np.abs(known), 0.99)), 1e-6)
-        counts, edges = np.histogram(
-            np.clip(known, -most, most), bins=HISTOGRAM_BINS, range=(-most, most)
-        )
-        distances = np.abs(known)
-        return Histogram(
-            unit=unit,
-            edges=edges,
-            counts=counts,
-            mean=float(known.mean()),
-            sd=float(known.std()),
-            mean_abs=float(distances.mean()),
-            sd_abs=float(distances.std()),
-            cells=len(known),
-        )
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it without its bars."""
-        return {
-            "unit": self.unit, "mean": self.mean, "sd": self.sd,
-            "mean_abs": self.mean_abs, "sd_abs": self.sd_abs, "cells": self.cells,
-        }  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,7 +45,8 @@ class CellMaps:
 
     `corner_east_m` and `corner_north_m` are (rows + 1, columns + 1), in the flight's frame: what
     `pcolormesh` takes. `commanded_l_ha` is what was prescribed where the strips passed, `passes`
-    how often the ground was passed in the mean, `duty` that of the orders in force.
+    how often the ground was passed in the mean, `duty` that of the orders in force. All are means
+    over the field's ground: a cell that it has half of is judged by that half.
     """
 
     source: Literal["map", "squares"]
@@ -130,38 +91,6 @@ class CellMaps:
         }
 
 
-class _MapCells:
-    """The cells of the map that a box of ground meets."""
-
-    def __init__(self, cells: CellGrid, bounds_m: tuple[float, float, float, float]) -> None:
-        west, south, east, north = bounds_m
-        column, row = cells.to_cells(
-            np.array([west, west, east, east]), np.array([south, north, south, north])
-        )
-        (rows, columns) = cells.shape
-        self._cells = cells
-        self.column = int(np.clip(np.floor(column.min()), 0, columns - 1))
-        self.row = int(np.clip(np.floor(row.min()), 0, rows - 1))
-        self.columns = int(np.clip(np.ceil(column.max()), self.column + 1, columns)) - self.column
-        self.rows = int(np.clip(np.ceil(row.max()), self.row + 1, rows)) - self.row
-
-    def cells_of(self, east_m: Floats, north_m: Floats) -> Ints:
-        column, row = self._cells.to_cells(east_m, north_m)
-        column, row = column - self.column, row - self.row
-        inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
-        number = np.floor(row).astype(np.int64) * self.columns + np.floor(column).astype(np.int64)
-        return np.where(inside, number, self.rows * self.columns)
-
-    def corners(self) -> tuple[Floats, Floats]:
-        rows, columns = np.meshgrid(
-            np.arange(self.rows + 1.0) + self.row,
-            np.arange(self.columns + 1.0) + self.column,
-            indexing="ij",
-        )
-        east_m, north_m = self._cells.to_frame(columns.ravel(), rows.ravel())
-        return east_m.reshape(rows.shape), north_m.reshape(rows.shape)
-
-
 def cell_maps(
     record: FlightRecord,
     strips: Sequence[Strip],
@@ -181,18 +110,20 @@ def cell_maps(
     size_m = cell_m or max(1.0, min(strip.track.width_m for strip in strips))
     area_m2 = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
     size_m = max(size_m, (area_m2 / CELLS_MAX) ** 0.5)
-    grid: Grid
+    grid: MapCells | SquareGrid
     source: Literal["map", "squares"]
     if own is not None and cell_m is None:
-        found = _MapCells(own, bounds)
-        grid, corners, source = found, found.corners(), "map"
+        grid, source = MapCells(own, bounds), "map"
+        corners = grid.corners()
         size_m = float(np.hypot(*(np.diff(each[0, :2])[0] for each in corners)))
     else:
         grid = SquareGrid.over(bounds, size_m)
         source = "squares"
-        corners = _square_corners(grid)
+        corners = grid.corners()
     sums = _sums(grid, strips, duties, min(size_m / PIECES_PER_CELL, PIECE_MAX_M))
-    return _maps(grid, sums, corners, source, size_m, record.boom.width_m)
+    square_m = size_m if source == "squares" else None
+    commanded = _commanded(record.prescription, sums, corners, square_m)
+    return _maps(commanded, sums, corners, source, size_m, record.boom.width_m)
 
 
 def _bounds(strips: Sequence[Strip]) -> tuple[float, float, float, float] | None:
@@ -215,54 +146,51 @@ def _bounds(strips: Sequence[Strip]) -> tuple[float, float, float, float] | None
     return float(low[0]), float(low[1]), float(high[2]), float(high[3])
 
 
-def _square_corners(grid: SquareGrid) -> tuple[Floats, Floats]:
-    north_m, east_m = np.meshgrid(
-        grid.south_m + grid.cell_m * np.arange(grid.rows + 1.0),
-        grid.west_m + grid.cell_m * np.arange(grid.columns + 1.0),
-        indexing="ij",
-    )
-    return east_m, north_m
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sums:
+    """What was summed up in each cell; areas in m2, `inside` that of the field."""
+
+    area: Floats
+    inside: Floats
+    asked_ml: Floats
+    given_ml: Floats
+    duty: Floats
+    speed: Floats
 
 
-def _sums(
-    grid: Grid, strips: Sequence[Strip], duties: Sequence[Floats], piece_m: float
-) -> list[Floats]:
-    """Return area, asked and given volume, area x duty and area x speed of each cell."""
-    totals = [np.zeros(grid.rows * grid.columns + 1) for _ in range(5)]
+def _sums(grid: Grid, strips: Sequence[Strip], duties: Sequence[Floats], piece_m: float) -> _Sums:
+    """Return areas, asked and given volume, area x duty and area x speed of each cell."""
+    totals = np.zeros((6, grid.rows * grid.columns + 1))
     for strip, duty in zip(strips, duties, strict=True):
         slices = slices_of(strip, piece_m)
-        chosen = np.flatnonzero((slices.asked_ml > 1e-12) | (slices.given_ml > 1e-9))
-        sums = summed(grid, slices, piece_m, _values(slices, duty), chosen)
-        for total, each in zip(totals, sums, strict=True):
-            total += each
-    return totals
+        chosen = np.flatnonzero(slices.inside | (slices.given_ml > 1e-9))
+        totals += summed(grid, slices, piece_m, _values(slices, duty), chosen)
+    area, inside, asked_ml, given_ml, duty_m2, speed = (
+        total[:-1].reshape(grid.rows, grid.columns) for total in totals
+    )
+    return _Sums(
+        area=area, inside=inside, asked_ml=asked_ml, given_ml=given_ml, duty=duty_m2, speed=speed
+    )
 
 
 def _values(slices: Slices, duty: Floats) -> list[Floats]:
     track, area = slices.track, slices.area_m2
     at_duty, at_speed = track.at(duty, slices.time_s), track.at(track.speed_m_s, slices.time_s)
-    return [area, slices.asked_ml, slices.given_ml, area * at_duty, area * at_speed]
+    inside = np.where(slices.inside, area, 0.0)
+    return [area, inside, slices.asked_ml, slices.given_ml, area * at_duty, area * at_speed]
 
 
 def _maps(
-    grid: Grid,
-    sums: list[Floats],
+    commanded: Floats,
+    sums: _Sums,
     corners: tuple[Floats, Floats],
     source: Literal["map", "squares"],
     cell_m: float,
     width_m: float,
 ) -> CellMaps:
-    shape = (grid.rows, grid.columns)
-    area, asked, given, duty, speed = (each[:-1].reshape(shape) for each in sums)
-    cell_m2 = _cell_areas(*corners)
-    passed = area > PASSED_MIN * cell_m2
-
-    def mean(total: Floats) -> Floats:
-        share: Floats = np.divide(total, area, out=np.full(shape, np.nan), where=passed)
-        return share
-
-    commanded, measured = L_HA_PER_ML_M2 * mean(asked), L_HA_PER_ML_M2 * mean(given)
-    speeds = mean(speed)
+    ground, passed = _ground(sums, corners)
+    measured = L_HA_PER_ML_M2 * _share(sums.given_ml, ground, passed)
+    speeds = _share(sums.speed, sums.area, passed)
     flow_error = (measured - commanded) * flow_for_rate(1.0, 1.0, width_m) * speeds
     counts = commanded > 0.0
     return CellMaps(
@@ -272,13 +200,41 @@ def _maps(
         corner_north_m=corners[1],
         commanded_l_ha=commanded,
         measured_l_ha=measured,
-        passes=area / cell_m2,
-        duty=mean(duty),
+        passes=ground / _cell_areas(*corners),
+        duty=_share(sums.duty, sums.area, passed),
         speed_m_s=speeds,
         deviation_l_min=flow_error,
         histogram_l_ha=Histogram.of((measured - commanded)[counts], "L/ha"),
         histogram_l_min=Histogram.of(flow_error[counts], "L/min"),
     )
+
+
+def _commanded(
+    prescription: Prescription, sums: _Sums, corners: tuple[Floats, Floats], size_m: float | None
+) -> Floats:
+    """Return the rate of each cell that was passed; of squares of that size, where it is given.
+
+    A strip has the rate under its middle. A square in one zone that the end of a strip of another
+    zone comes over is still to get its own rate.
+    """
+    ground, passed = _ground(sums, corners)
+    commanded = L_HA_PER_ML_M2 * _share(sums.asked_ml, ground, passed)
+    if size_m is not None:
+        west_m, south_m = corners[0][:-1, :-1][passed], corners[1][:-1, :-1][passed]
+        sure, rates = rates_of_squares(prescription, west_m, south_m, size_m)
+        commanded[passed] = np.where(sure, rates, commanded[passed])
+    return commanded
+
+
+def _ground(sums: _Sums, corners: tuple[Floats, Floats]) -> tuple[Floats, Bools]:
+    """Return the ground that counts in each cell, outside the field all; and if it is enough."""
+    ground = np.where(sums.inside > 0.0, sums.inside, sums.area)
+    return ground, ground > PASSED_MIN * _cell_areas(*corners)
+
+
+def _share(total: Floats, ground: Floats, passed: Bools) -> Floats:
+    share: Floats = np.divide(total, ground, out=np.full(ground.shape, np.nan), where=passed)
+    return share
 
 
 def _cell_areas(east_m: Floats, north_m: Floats) -> Floats:

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from analysis.transitions import ML_M_PER_L_HA_M
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from analysis.strips import Strip
-    from analysis.track import Floats, Ints, Track
+    from analysis.track import Bools, Floats, Ints, Track
 
 
 class Grid(Protocol):
@@ -57,12 +59,22 @@ class SquareGrid:
         inside = (column >= 0) & (column < self.columns) & (row >= 0) & (row < self.rows)
         return np.where(inside, row * self.columns + column, self.rows * self.columns)
 
+    def corners(self) -> tuple[Floats, Floats]:
+        """Return east and north of the cells' corners: (rows + 1, columns + 1) each."""
+        north_m, east_m = np.meshgrid(
+            self.south_m + self.cell_m * np.arange(self.rows + 1.0),
+            self.west_m + self.cell_m * np.arange(self.columns + 1.0),
+            indexing="ij",
+        )
+        return east_m, north_m
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Slices:
     """One strip cut across into slices of ground, one after the other along its way.
 
-    `given_ml` and `asked_ml` fell and should have fallen on each, `area_m2` is its ground.
+    `given_ml` and `asked_ml` fell and should have fallen on each, `area_m2` is its ground; `inside`
+    says whether the strip's centre is in the field there.
     """
 
     track: Track
@@ -70,6 +82,7 @@ class Slices:
     area_m2: Floats
     given_ml: Floats
     asked_ml: Floats
+    inside: Bools
 
     def pieces(self, size_m: float, chosen: Ints) -> Iterator[tuple[Floats, Floats]]:
         """Yield east and north of the slices' pieces, each time one piece of every slice.
@@ -91,24 +104,31 @@ class Slices:
 
 
 def slices_of(strip: Strip, length_m: float) -> Slices:
-    """Return the slices of a strip, none longer than `length_m` where the samples allow it."""
+    """Return the slices of a strip, none longer than `length_m` where the samples allow it.
+
+    They end where the rate changes under the strip and where the field does: each has one rate.
+    """
     track = strip.track
     wanted = np.arange(track.distance_m[0], track.distance_m[-1], length_m)
-    ends = np.unique(
-        np.concatenate(
-            ([0], np.searchsorted(track.distance_m, wanted), [len(track.distance_m) - 1])
-        )
+    ends = np.concatenate(
+        ([0], np.searchsorted(track.distance_m, wanted), [len(track.distance_m) - 1])
     )
-    metres = np.diff(track.distance_m[ends])
+    turns_s = np.array([run.start_s for run in strip.stretches[1:]])
+    ends_s = np.unique(np.concatenate((track.time_s[ends], turns_s)))
+    metres = np.diff(track.at(track.distance_m, ends_s))
     kept = metres > 0.0
-    middle_s = 0.5 * (track.time_s[ends[1:]] + track.time_s[ends[:-1]])
-    across_m = track.at(track.across_m, middle_s)
+    middle_s = 0.5 * (ends_s[1:] + ends_s[:-1])[kept]
+    area_m2 = track.at(track.across_m, middle_s) * metres[kept]
+    inside = np.array([run.inside for run in strip.stretches], dtype=np.bool_)
+    starts_s = np.array([run.start_s for run in strip.stretches])
+    under = np.clip(np.searchsorted(starts_s, middle_s, "right") - 1, 0, None)
     return Slices(
         track=track,
-        time_s=middle_s[kept],
-        area_m2=(across_m * metres)[kept],
-        given_ml=np.diff(track.volume_ml[ends])[kept],
-        asked_ml=np.diff(strip.asked_ml[ends])[kept],
+        time_s=middle_s,
+        area_m2=area_m2,
+        given_ml=np.diff(track.at(track.volume_ml, ends_s))[kept],
+        asked_ml=strip.rates_at(middle_s) * ML_M_PER_L_HA_M * area_m2,
+        inside=inside[under],
     )
 
 

@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.assess.ground_elements import SquareGrid, slices_of, summed
-from analysis.assess.zone_lookup import lookup_of
-from analysis.track import in_field
+from analysis.assess.ground_rates import ground_rates
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.flight_record import FlightRecord
     from analysis.strips import Strip
-    from analysis.track import Bools, Floats, Ints
+    from analysis.track import Bools, Floats
 
 CELL_M = 0.5
 PIECE_M = 0.125
@@ -81,15 +80,8 @@ def _rated(record: FlightRecord, grid: SquareGrid, asked: Bools) -> Bools:
     row, column = np.nonzero(asked)
     east: Floats = grid.west_m + grid.cell_m * (column.astype(np.float64) + 0.5)
     north: Floats = grid.south_m + grid.cell_m * (row.astype(np.float64) + 0.5)
-    prescription = record.prescription
-    index = np.flatnonzero(in_field(prescription, east, north))
-    lookup = lookup_of(prescription)
-    under: Ints = lookup.keys(east[index], north[index])
-    keys, place = np.unique(under, return_inverse=True)
-    rates = [prescription.rate_of(lookup.zones(key)) for key in keys.tolist()]
-    is_rated = np.array([rate is not None and rate > 0.0 for rate in rates], dtype=np.bool_)
     found = np.zeros(asked.shape, dtype=np.bool_)
-    found[row[index], column[index]] = is_rated[place]
+    found[row, column] = ground_rates(record.prescription, east, north) > 0.0
     return found
 
 

@@ -60,7 +60,6 @@ class AppliedRows:
             *motion,
             " ".join(sorted(decision.inhibits)),
             _short(decision.rate_l_ha),
-            _short(duty),
         )
 
     def _point(self, state: VehicleState) -> bytes | None:

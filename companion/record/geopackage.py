@@ -60,7 +60,7 @@ CREATE TABLE applied (
     sequence INTEGER PRIMARY KEY NOT NULL, geom POINT, time DATETIME, time_s DOUBLE,
     rate_l_ha DOUBLE, target_flow_l_min DOUBLE, flow_l_min DOUBLE, duty DOUBLE,
     speed_m_s DOUBLE, course_deg DOUBLE, heading_deg DOUBLE, height_m DOUBLE,
-    inhibits TEXT, valve_rates_l_ha TEXT, valve_duties TEXT
+    inhibits TEXT, valve_rates_l_ha TEXT
 );
 CREATE TABLE zones (
     id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY, name TEXT, rate_l_ha DOUBLE
@@ -68,7 +68,8 @@ CREATE TABLE zones (
 CREATE TABLE field (id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY);
 CREATE TABLE blocks (
     first_sequence INTEGER PRIMARY KEY NOT NULL, last_sequence INTEGER, row_count INTEGER,
-    from_s DOUBLE, until_s DOUBLE, crc32 INTEGER, dictionary INTEGER, body BLOB
+    from_s DOUBLE, until_s DOUBLE, dictionary INTEGER, crc32 INTEGER, body BLOB,
+    decisions_crc32 INTEGER, decisions BLOB
 );
 CREATE TABLE block_dictionaries (id INTEGER PRIMARY KEY NOT NULL, body BLOB);
 CREATE TABLE valve_changes (

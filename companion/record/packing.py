@@ -9,6 +9,9 @@ same as any number of the block (a time that stands in four places) a byte or so
 the difference to the one before, as an integer: of decimals where there are few, of the float's
 own bits otherwise; bytes of equal weight lie together, so that deflate finds the zeros.
 
+A packer can have a `follower`, whose lines may refer to the numbers of both: decisions repeat what
+is in the inputs before them, and inputs can be read without the decisions.
+
 A number is taken out only if its text is the one that Python writes for it; so what comes back is
 what went in, whatever it is. Text is ASCII without control characters, as `codec.encode` writes.
 """
@@ -74,19 +77,29 @@ class _Column:
 class Packer:
     """Takes lines one by one, so that a commit finds most of the work done."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, follower: Packer | None = None) -> None:
+        self._follower = follower
         self._forms: dict[str, tuple[int, list[_Column]]] = {}
         self._order: list[int] = []
+        self._gaps: list[int] = []
+        self._leads: list[int] = []
+        self._led = 0
         self._columns: dict[Key, _Column] = {}
-        self._seen: dict[str, int] = {}
+        self._places: dict[str, int] = {}
+        self._seen = 0
 
-    def add(self, line: str) -> None:
-        """Take one line."""
+    def add(self, line: str, gap: int = 1) -> None:
+        """Take one line; `gap` is how much higher its number is than that of the line before."""
         form, numbers = _taken_apart(_NUMBER.split(line))
         known = self._forms.get(form)
         if known is None:
             known = self._forms[form] = (len(self._forms), self._columns_of(form))
         self._order.append(known[0])
+        self._gaps.append(gap)
+        self._leads.append(self._led)
+        self._led = 0
+        if self._follower is not None:
+            self._follower.follow()
         anchor = ""
         for column, number in zip(known[1], numbers, strict=True):
             if column.is_int:
@@ -104,26 +117,38 @@ class Packer:
 
     def _take(self, column: _Column, number: str, anchor: str) -> None:
         column.before = number
-        seen = self._seen
-        place = seen.get(number)
+        place = self._places.get(number)
         if place is None:
-            seen[number] = len(seen)
+            self.see(number)
+            if self._follower is not None:
+                self._follower.see(number)
             column.codes.append(NEW)
             column.fresh.append(number)
             column.anchors.append(anchor)
         else:
-            column.codes.append(BACK + len(seen) - 1 - place)
+            column.codes.append(BACK + self._seen - 1 - place)
+
+    def follow(self) -> None:
+        """Note that the leader has taken a line."""
+        self._led += 1
+
+    def see(self, number: str) -> None:
+        """Note a new number, of this packer's or of its leader's lines."""
+        self._places[number] = self._seen
+        self._seen += 1
 
     def content(self) -> bytes:
         """Return all of it, still to be deflated."""
         forms = "\n".join(self._forms).encode("ascii")
         out = bytearray(WORD.pack(len(self._order)) + WORD.pack(len(forms)) + forms)
-        _put_all(out, self._order)
+        put_all(out, [_unsigned(gap) for gap in self._gaps])
+        put_all(out, self._leads)
+        put_all(out, self._order)
         for column in self._columns.values():
             if column.is_int:
-                _put_all(out, _differences([int(number) for number in column.fresh]))
+                put_all(out, differences([int(number) for number in column.fresh]))
             else:
-                _put_all(out, column.codes)
+                put_all(out, column.codes)
         for column in self._columns.values():
             if not column.is_int and column.fresh:
                 _put_floats(out, column)
@@ -166,18 +191,24 @@ def keys_of(form: str) -> tuple[Key, ...]:
     return tuple(keys)
 
 
-def _differences(values: Sequence[int]) -> list[int]:
+def differences(values: Sequence[int]) -> list[int]:
     """Return each value's difference to the one before, the sign in the lowest bit."""
     found, before = [], 0
     for value in values:
-        step = value - before
+        found.append(_unsigned(value - before))
         before = value
-        found.append(step << 1 if step >= 0 else (-step << 1) - 1)
     return found
 
 
-def _put_all(out: bytearray, values: Sequence[int]) -> None:
+def _unsigned(value: int) -> int:
+    return value << 1 if value >= 0 else (-value << 1) - 1
+
+
+def put_all(out: bytearray, values: Sequence[int]) -> None:
     """Write integers from 0 on, seven bits a byte."""
+    if max(values, default=0) <= 0x7F:
+        out += bytes(values)
+        return
     for value in values:
         while value > 0x7F:
             out.append(value & 0x7F | 0x80)
@@ -191,16 +222,16 @@ def _put_floats(out: bytearray, column: _Column) -> None:
     how = _decimals_of(texts)
     if how == BITS:
         values = bits_of(texts)
-        words = _differences(values)
+        words = differences(values)
         # What follows from the first number of its line (the end of a lease) differs from it
         # always by nearly the same.
         if all(column.anchors):
             anchored = [a - b for a, b in zip(values, bits_of(column.anchors), strict=True)]
-            other = _differences(anchored)
+            other = differences(anchored)
             if sum(map(int.bit_length, other)) < sum(map(int.bit_length, words)):
                 how, words = ANCHORED, other
     else:
-        words = _differences([_scaled(text, how) for text in texts])
+        words = differences([_scaled(text, how) for text in texts])
     width = (max(words).bit_length() + 7) // 8
     out += bytes((how, width))
     raw = b"".join([word.to_bytes(width, "little") for word in words])

@@ -6,6 +6,8 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import accumulate
 
 import numpy as np
@@ -16,22 +18,46 @@ from companion.record.packing import (
     BITS,
     FLOAT,
     HOLE,
-    INT,
     NEW,
     SAME,
     WORD,
     Key,
-    bits_of,
     keys_of,
 )
 
 # A damaged length must not take the reader's memory: a block is a second of a flight.
 UNPACKED_MAX = 64_000_000
+_REAL = struct.Struct("<d")
+_LONG = struct.Struct("<q")
+_PLENTY = 0x7F
+_SIGN = 1 << 63
+# A float has all decimal numbers of fifteen digits, each by a text of its own.
+_EXACT_MAX = 10**15
+_EXACT_DECIMALS_MAX = 22  # ten to the power of so much is a float without an error
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """What was packed: lines, the distances of their numbers, and all new numbers in their order.
+
+    Of the new numbers the first `ends[i]` stand in the lines up to the i-th.
+    """
+
+    lines: list[str]
+    gaps: list[int]
+    seen: list[str]
+    ends: list[int]
+
+    def rows(self, first: int) -> list[tuple[int, str]]:
+        """Return all lines with their numbers, in a block that begins with number `first`."""
+        numbers = accumulate(self.gaps, initial=first - 1)
+        next(numbers)
+        return list(zip(numbers, self.lines, strict=True))
 
 
 def unpack(packed: bytes, dictionary: bytes = b"") -> list[str]:
     """Return the lines that were packed; ValueError for what is no block."""
-    return lines_of(inflated(packed, dictionary))
+    return part_of(inflated(packed, dictionary)).lines
 
 
 def inflated(packed: bytes, dictionary: bytes) -> bytes:
@@ -46,10 +72,13 @@ def inflated(packed: bytes, dictionary: bytes) -> bytes:
     return content
 
 
-def lines_of(content: bytes) -> list[str]:
-    """Return the lines of a block's content; ValueError for what is none."""
+def part_of(content: bytes, leader: Part | None = None) -> Part:
+    """Return what is in a block's content, whose packer followed that of `leader`.
+
+    ValueError for what is no content of a block.
+    """
     try:
-        return list(_unpacked(_Reader(content)))
+        return _part(_Reader(content), leader)
     except (IndexError, KeyError, StopIteration, RuntimeError, struct.error, UnicodeError) as error:
         raise ValueError(f"a block is damaged: {error!r}") from error
     except OverflowError as error:
@@ -75,17 +104,22 @@ class _Reader:
         return self._content[self._at - count : self._at]
 
     def integers(self, count: int) -> list[int]:
-        found, content, at = [], self._content, self._at
+        content, at = self._content, self._at
         if count > len(content) - at:
             raise ValueError("a block is cut off")
+        found = list(content[at : at + count])
+        if max(found, default=0) <= _PLENTY:
+            self._at += count
+            return found
+        found = []
         for _ in range(count):
             value = content[at]
             at += 1
-            if value > 0x7F:
-                value &= 0x7F
+            if value > _PLENTY:
+                value &= _PLENTY
                 shift = 7
-                while content[at] > 0x7F:
-                    value |= (content[at] & 0x7F) << shift
+                while content[at] > _PLENTY:
+                    value |= (content[at] & _PLENTY) << shift
                     shift += 7
                     at += 1
                 value |= content[at] << shift
@@ -111,74 +145,103 @@ class _Reader:
             return (), values
         if how == BITS:
             return _from_bits(values), ()
-        return [_unscaled(value, how) for value in values], ()
+        return _unscaled(values, how), ()
 
 
 def _sums(words: Sequence[int]) -> list[int]:
-    return list(accumulate(word >> 1 if not word & 1 else -((word + 1) >> 1) for word in words))
+    return list(accumulate([word >> 1 if not word & 1 else -((word + 1) >> 1) for word in words]))
 
 
-class _Texts:
-    """The numbers of one column, to be given out in the order of the lines."""
+def _signed(word: int) -> int:
+    return word >> 1 if not word & 1 else -((word + 1) >> 1)
+
+
+class _Column:
+    """The numbers of one place, to be given out in the order of the lines."""
 
     __slots__ = ("before", "codes", "fresh", "is_int", "words")
 
-    def __init__(
-        self,
-        codes: Sequence[int],
-        fresh: Sequence[str] = (),
-        words: Sequence[int] = (),
-        *,
-        is_int: bool,
-    ) -> None:
-        self.codes = iter(codes)
-        self.fresh = iter(fresh)
-        self.words = iter(words) if words else None
+    def __init__(self, codes: Sequence[int] | Sequence[str], *, is_int: bool) -> None:
+        self.codes: Iterator[int] | Iterator[str] = iter(codes)
+        self.fresh: Iterator[str] = iter(())
+        self.words: Iterator[int] | None = None
         self.before = ""
         self.is_int = is_int
 
 
-def _unpacked(reader: _Reader) -> Iterator[str]:
+@lru_cache(maxsize=4096)
+def _pieces_of(form: str) -> tuple[str, ...]:
+    return tuple(HOLE.split(form))
+
+
+def _part(reader: _Reader, leader: Part | None) -> Part:
     count = reader.word()
     forms = reader.take(reader.word()).decode("ascii").split("\n")
-    order = reader.integers(count)
-    keys = [keys_of(form) for form in forms]
-    codes: dict[Key, list[int]] = {}
-    for key, how_many in _counts(order, keys).items():
-        found = reader.integers(how_many)
-        codes[key] = _sums(found) if key[0] == INT else found
-    columns = {}
-    for key, found in codes.items():
-        news = found.count(NEW) if key[0] == FLOAT else 0
-        fresh, words = reader.floats(news) if news else ((), ())
-        columns[key] = _Texts(found, fresh, words, is_int=key[0] == INT)
-    seen: list[str] = []
-    pieces = [HOLE.split(form) for form in forms]
-    holes = [[columns[key] for key in wanted] for wanted in keys]
-    for form in order:
-        parts = pieces[form].copy()
-        parts[1::2] = _numbers(holes[form], seen)
-        yield "".join(parts)
+    gaps = [_signed(gap) for gap in reader.integers(count)]
+    leads, order = reader.integers(count), reader.integers(count)
+    columns = _columns(reader, order, [keys_of(form) for form in forms])
+    pieces = [list(_pieces_of(form)) for form in forms]
+    holes = [[columns[key] for key in keys_of(form)] for form in forms]
+    part = Part(lines=[], gaps=gaps, seen=[], ends=[])
+    heard = told = 0
+    for form, led in zip(order, leads, strict=True):
+        if led:
+            if leader is None:
+                raise ValueError("a block is damaged: it refers to another")
+            heard += led
+            end = leader.ends[heard - 1]
+            part.seen.extend(leader.seen[told:end])
+            told = end
+        parts = pieces[form]
+        parts[1::2] = _numbers(holes[form], part.seen)
+        part.lines.append("".join(parts))
+        part.ends.append(len(part.seen))
+    return part
 
 
-def _numbers(columns: Sequence[_Texts], seen: list[str]) -> list[str]:
+def _columns(
+    reader: _Reader, order: Sequence[int], keys: Sequence[Sequence[Key]]
+) -> dict[Key, _Column]:
+    """Read the columns, in the order of their first numbers."""
+    counts: dict[Key, int] = {}
+    for form, times in Counter(order).items():
+        for key in keys[form]:
+            counts[key] = counts.get(key, 0) + times
+    columns, news = {}, {}
+    for key, how_many in counts.items():
+        codes = reader.integers(how_many)
+        if key[0] == FLOAT:
+            columns[key], news[key] = _Column(codes, is_int=False), codes.count(NEW)
+        else:
+            columns[key] = _Column([str(value) for value in _sums(codes)], is_int=True)
+    for key, how_many in news.items():
+        if how_many:
+            fresh, words = reader.floats(how_many)
+            columns[key].fresh, columns[key].words = iter(fresh), iter(words) if words else None
+    return columns
+
+
+def _numbers(columns: Sequence[_Column], seen: list[str]) -> list[str]:
     """Return the numbers of one line."""
     found = []
     anchor = ""
+    anchor_word: int | None = None
     for column in columns:
         code = next(column.codes)
         if column.is_int:
-            found.append(str(code))
+            found.append(code)
             continue
         if code == SAME:
             text = column.before
         elif code != NEW:
             text = column.before = seen[BACK - 1 - code]
         else:
-            if column.words is None:
+            words = column.words
+            if words is None:
                 text = next(column.fresh)
             else:
-                (text,) = _from_bits([next(column.words) + bits_of([anchor])[0]])
+                anchor_word = _word_of(anchor) if anchor_word is None else anchor_word
+                text = _float_of(anchor_word + next(words))
             column.before = text
             seen.append(text)
         anchor = anchor or text
@@ -186,23 +249,31 @@ def _numbers(columns: Sequence[_Texts], seen: list[str]) -> list[str]:
     return found
 
 
-def _counts(order: Sequence[int], keys: Sequence[Sequence[Key]]) -> dict[Key, int]:
-    """Return how many numbers each column has, the columns in the order of their first ones."""
-    found: dict[Key, int] = {}
-    for form, times in Counter(order).items():
-        for key in keys[form]:
-            found[key] = found.get(key, 0) + times
+def _word_of(text: str) -> int:
+    """Return a float's bits as an integer in the order of the numbers."""
+    (word,) = _LONG.unpack(_REAL.pack(float(text)))
+    return word if word >= 0 else -(word & _SIGN - 1) - 1
+
+
+def _float_of(word: int) -> str:
+    (value,) = _REAL.unpack(_LONG.pack(word if word >= 0 else (-word - 1) - _SIGN))
+    return repr(value)
+
+
+def _unscaled(values: Sequence[int], decimals: int) -> list[str]:
+    scale = 10.0**decimals
+    if -_EXACT_MAX < min(values) <= max(values) < _EXACT_MAX and decimals <= _EXACT_DECIMALS_MAX:
+        return [repr(value / scale) for value in values]
+    found = []
+    for value in values:
+        digits = str(abs(value)).rjust(decimals + 1, "0")
+        cut = len(digits) - decimals
+        part = digits[cut:].rstrip("0") or "0"
+        found.append(f"{'-' if value < 0 else ''}{digits[:cut]}.{part}")
     return found
 
 
-def _unscaled(value: int, decimals: int) -> str:
-    digits = str(abs(value)).rjust(decimals + 1, "0")
-    cut = len(digits) - decimals
-    part = digits[cut:].rstrip("0") or "0"
-    return f"{'-' if value < 0 else ''}{digits[:cut]}.{part}"
-
-
 def _from_bits(words: Sequence[int]) -> list[str]:
-    raw = [word if word >= 0 else (-word - 1) | 1 << 63 for word in words]
+    raw = [word if word >= 0 else (-word - 1) | _SIGN for word in words]
     packed = struct.pack(f"<{len(raw)}Q", *raw)
     return [repr(value) for value in struct.unpack(f"<{len(raw)}d", packed)]

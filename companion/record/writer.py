@@ -30,7 +30,7 @@ __all__ = ["Event", "Item", "Writer"]
 _logger = logging.getLogger(__name__)
 
 _EVENT = "INSERT INTO events VALUES (?, ?, ?, ?, ?)"
-_APPLIED = "INSERT INTO applied VALUES (" + ", ".join("?" * 15) + ")"
+_APPLIED = "INSERT INTO applied VALUES (" + ", ".join("?" * 14) + ")"
 _VALVE = (
     "INSERT INTO valve_changes (planned_us, actual_us, valve, duty_permille) VALUES (?, ?, ?, ?)"
 )

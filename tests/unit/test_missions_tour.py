@@ -63,6 +63,18 @@ def test_a_comb_of_passes_is_flown_to_and_fro() -> None:
     assert ways_s == pytest.approx(turns_s + MOTION.leg_s(49.0), abs=1.0)
 
 
+def test_no_line_is_lost_where_there_are_too_many_for_every_pair() -> None:
+    field = build_field(to_degrees(box(0, 0, 640, 30)), swath_width_m=3.0, frame=FRAME)
+    plan = plan_mission(
+        field,
+        Settings(swath_width_m=3.0, speed_m_s=5.0, tank_l=900.0, moves=0, angle_deg=0.0),
+        Uniform(rate_l_ha=20.0),
+    )
+    assert len(plan.lines) > 210
+    assert sum(sortie.lines for sortie in plan.sorties) == len(plan.lines)
+    assert plan.length_m("spray") == pytest.approx(float(lengths_m(plan.lines).sum()))
+
+
 def test_a_line_for_a_sliver_beside_a_hole_is_left_out() -> None:
     ground = box(0.0, 0.0, 210.0, 300.0)
     whole = np.array([[x, 0.0, x, 300.0] for x in np.arange(30.0) * 7.0 + 3.5])

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from analysis.assess.cell_maps import Histogram
+    from analysis.assess.histogram import Histogram
 
 
 def histogram(found: Sequence[Histogram]) -> Drawn | None:
