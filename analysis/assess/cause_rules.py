@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.assess.cause_marks import samples_at
+from analysis.assess.rate_wishes import percent_at
 from analysis.border import CLEAR_M
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.lag import Verdict
+from analysis.transitions import ML_M_PER_L_HA_M
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,6 +29,18 @@ ACCELERATION_M_S2 = 0.5
 ACCELERATION_OVER_S = 0.5
 # Measured ranges are taken as they are, give or take 2 %, as `FlowCurve.delivers` has it.
 RANGE_SLACK = 0.02
+
+
+def as_wished(flight: AppliedFlight, marks: Marks, off_by: float) -> Bools:
+    """Return where it got the percentage that the operator asked for, give or take `off_by`."""
+    lag, setup = flight.setup.lag, marks.setup
+    percent = percent_at(flight, marks.time_s - lag.output_s - lag.up_s)
+    wished: Floats = marks.asked_ml_m * percent / 100.0
+    if setup.rate_max_l_ha is not None:
+        most = setup.rate_max_l_ha * ML_M_PER_L_HA_M * marks.strip.track.width_m
+        wished = np.minimum(wished, most)
+    found: Bools = np.abs(marks.given_ml_m - wished) <= off_by * wished
+    return found & (percent != 100.0) & (wished > 0.0)
 
 
 def in_edge(marks: Marks, steps: Sequence[Step]) -> Bools:

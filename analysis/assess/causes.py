@@ -15,6 +15,7 @@ import numpy as np
 
 from analysis.assess.cause_marks import Marks, marks_of
 from analysis.assess.cause_rules import (
+    as_wished,
     beside_border,
     by_inhibit,
     in_acceleration,
@@ -41,6 +42,7 @@ SKIPPED_BELOW = 0.10
 class Cause(StrEnum):
     """Why ground is off; where several would do, the first of them is named."""
 
+    OPERATOR = "operator"  # it got the percentage that the operator asked for in flight
     INHIBIT = "inhibit"  # the safety layer held the valves closed
     EDGE = "edge"  # the border rule: nothing may fall outside
     CHANGE = "change"  # a boundary between two rates is near
@@ -137,6 +139,7 @@ def _sorted(
     short = marks.given_ml_m < marks.asked_ml_m
     closed = off & (marks.given_ml_m < SKIPPED_BELOW * marks.asked_ml_m)
     rules = (
+        (Cause.OPERATOR, as_wished(flight, marks, OFF_BY)),
         (Cause.INHIBIT, marks.is_inhibited(flight) & short),
         (Cause.EDGE, in_edge(marks, steps) | beside_border(marks, closed)),
         (Cause.CHANGE, in_change(marks, steps)),

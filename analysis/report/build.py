@@ -84,7 +84,7 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
         why_not_evaluated=why_not,
     )
     say("drawing")
-    return _with_files(contents, records, assessment, clock, options)
+    return _with_files(contents, records, assessment, clock, treated, options)
 
 
 def _assessed(flight: AppliedFlight) -> tuple[Assessment | None, str]:
@@ -126,12 +126,13 @@ def _with_files(
     records: list[LegalRecord],
     assessment: Assessment | None,
     clock: Clock,
+    treated: Treated,
     options: ReportOptions,
 ) -> Report:
     files: dict[str, bytes] = {}
     figures: dict[str, dict[str, str]] = {}
     if options.with_figures and assessment is not None:
-        files, figures = _figures(contents, assessment, clock, with_pdf=options.with_pdf)
+        files, figures = _figures(contents, assessment, clock, treated, with_pdf=options.with_pdf)
     elif options.with_pdf:
         from analysis.report.pdf import pdf_of
 
@@ -146,17 +147,22 @@ def _with_files(
 
 
 def _figures(
-    contents: Mapping[str, Any], assessment: Assessment, clock: Clock, *, with_pdf: bool
+    contents: Mapping[str, Any],
+    assessment: Assessment,
+    clock: Clock,
+    treated: Treated,
+    *,
+    with_pdf: bool,
 ) -> tuple[dict[str, bytes], dict[str, dict[str, str]]]:
     """Return the files of all figures, and how they stand in the page."""
     from analysis.report.drawing import drawn_of
-    from analysis.report.figures.style import inline_svg, laid_out, png_of, styled, svg_of
+    from analysis.report.figures.style import inline_svg, png_of, styled, svg_of
 
     files: dict[str, bytes] = {}
     figures: dict[str, dict[str, str]] = {}
     drawn: list[Drawn] = []
     with styled():
-        for each in map(laid_out, drawn_of(assessment, clock)):
+        for each in drawn_of(assessment, clock, treated):
             png, svg = png_of(each), svg_of(each)
             files[f"figures/{each.name}.png"] = png
             files[f"figures/{each.name}.svg"] = svg.encode()

@@ -9,12 +9,12 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
+from analysis.published import P1_RESULTS
 from analysis.report.definitions import DEFINITIONS
 from analysis.report.words import verdict_of, warnings_of
+from companion.record.content_hash import content_sha256
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from analysis.assess.assessment import Assessment
     from analysis.assess.breakdowns import AccuracyGroup
     from analysis.flown.applied_flight import AppliedFlight
@@ -32,7 +32,6 @@ METRICS = (
 )  # fmt: skip
 # Of the journal's meta, what is not shown as such.
 _LONG = ("setup", "config_toml", "application_json")
-_BLOCK = 1 << 20
 
 
 def contents_of(
@@ -65,6 +64,7 @@ def contents_of(
         "warnings": [warning.as_json() for warning in warnings],
         **(metrics if assessment is None else assessment.as_json()),
         "table_5": None if assessment is None else table_5(assessment.breakdowns.accuracy),
+        "published": P1_RESULTS,
         "events": [
             {"time": clock.text(event.at_s), "time_s": event.at_s, "kind": event.kind,
              "text": event.text}
@@ -133,7 +133,7 @@ def _flight(flight: AppliedFlight, treated: Treated, clock: Clock, told: Told) -
         latitude_deg, longitude_deg = frame.to_geographic(float(place.x), float(place.y))
     return {
         "file": flight.path.name,
-        "sha256": _sha256(flight.path),
+        "sha256": content_sha256(flight.path),
         "is_closed": flight.is_closed,
         "lost": flight.lost,
         "training": flight.training,
@@ -198,12 +198,3 @@ def _setup(flight: AppliedFlight) -> dict[str, Any]:
 def _text_sha256(meta: Mapping[str, str]) -> str | None:
     text = meta.get("config_toml")
     return None if text is None else hashlib.sha256(text.encode()).hexdigest()
-
-
-def _sha256(path: Path) -> str:
-    """Return the hash of a file, so that a report can be shown to be of this very journal."""
-    found = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            found.update(block)
-    return found.hexdigest()

@@ -51,6 +51,7 @@ DEFINITIONS: dict[str, tuple[str, str, str]] = {
 }  # fmt: skip
 
 CAUSES: dict[str, str] = {
+    "operator": "rate changed by the operator",
     "inhibit": "held closed by the safety layer",
     "edge": "border rule: nothing may fall outside",
     "change": "boundary between two rates",

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from analysis.report.definitions import CAUSES
 from analysis.report.figures import ground, lags, over_time, spread
+from analysis.report.figures.treated_map import treated_area
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -13,9 +14,10 @@ if TYPE_CHECKING:
     from analysis.assess.assessment import Assessment
     from analysis.report.clock import Clock
     from analysis.report.figures.style import Drawn
+    from analysis.report.treated import Treated
 
 
-def drawn_of(assessment: Assessment, clock: Clock) -> Iterator[Drawn]:
+def drawn_of(assessment: Assessment, clock: Clock, treated: Treated) -> Iterator[Drawn]:
     """Yield every figure that this flight gives something to draw for."""
     flight, cells = assessment.flight, assessment.cells
     sheet = None if cells is None else ground.sheet_of(flight, cells)
@@ -33,6 +35,8 @@ def drawn_of(assessment: Assessment, clock: Clock) -> Iterator[Drawn]:
     yield from (each for each in found if each is not None)
     if sheet is not None:
         yield ground.duty(sheet)
+        if not treated.area.is_empty:
+            yield treated_area(sheet, treated)
 
 
 def _minute_zero(assessment: Assessment, clock: Clock) -> str:

@@ -34,6 +34,7 @@ def page_of(contents: Mapping[str, Any], figures: Mapping[str, Mapping[str, str]
         "notes": contents.get("notes", []),
         "stylesheet": Markup(STYLESHEET),
         "data": Markup(embedded(contents)),
+        "speeds_text": _speeds_text(contents),
         "figures": _Absent(shown),
     }
     return environment.from_string(MACROS + PAGE).render(values).lstrip()
@@ -50,6 +51,14 @@ def picture(png: bytes, alt: str, width: float) -> str:
     data = base64.b64encode(png).decode()
     element = '<img src="data:image/png;base64,{}" alt="{}" style="width: {}%">'
     return str(Markup(element).format(data, alt, round(100.0 * width)))
+
+
+def _speeds_text(contents: Mapping[str, Any]) -> str:
+    """Return between which speeds the changes were flown."""
+    rows = contents.get("breakdowns", {}).get("by_speed", [])
+    low = [row["low"] for row in rows if row["lag_distance_m"]["count"]]
+    high = [row["high"] for row in rows if row["lag_distance_m"]["count"]]
+    return f"{min(low):g} to {max(high):g} m/s" if low else "no changes"
 
 
 class _Absent(dict[str, Any]):

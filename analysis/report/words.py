@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from analysis.assess.rate_wishes import rate_wishes
 from analysis.report.clock import duration_text
 from companion.core.types import Inhibit
 
@@ -84,12 +85,14 @@ def _sentence(figures: Mapping[str, Any], training: str | None) -> str:
     parts = [f"{applied_l:.2f} {done} on {figures['area_ha']:.2f} ha"]
     if prescribed_l:
         off = 100.0 * (applied_l - prescribed_l) / prescribed_l
-        parts[0] += f", {prescribed_l:.2f} L prescribed ({off:+.1f} %)"
+        parts[0] += f", where the map asked for {prescribed_l:.2f} L ({off:+.1f} %)"
     if figures["within_10_percent"] is not None:
-        parts.append(f"{figures['within_10_percent']:.1f} % of the ground within 10 % of its rate")
+        within = figures["within_10_percent"]
+        parts.append(f"{within:.1f} % of the ground got its rate within 10 %")
     if figures["worst_lag_distance_m"] is not None:
-        parts.append(f"worst change {figures['worst_lag_distance_m']:.2f} m from its boundary")
-    parts.append(f"{figures['outside_ml']:.1f} mL outside the border")
+        worst_m = figures["worst_lag_distance_m"]
+        parts.append(f"the worst change of rate lay {worst_m:.2f} m from its boundary")
+    parts.append(f"{figures['outside_ml']:.1f} mL fell outside the border")
     return "; ".join(parts) + "."
 
 
@@ -109,6 +112,7 @@ def warnings_of(
         *_journal(flight, clock),
         *(_warning("unread", f"Of the journal could not be read: {each}.") for each in unread),
         *_inhibited(flight, assessment, treated),
+        *_wishes(flight, clock),
         *_flow(assessment, why_not_evaluated),
         *_records(records),
     ]
@@ -186,6 +190,18 @@ def held_between(
             for reason in reasons.split():
                 held_s[reason] = held_s.get(reason, 0.0) + length_s
     return held_s
+
+
+def _wishes(flight: AppliedFlight, clock: Clock) -> Iterator[Caution]:
+    wishes = rate_wishes(flight)
+    if wishes:
+        each = ", ".join(
+            f"{percent:g} % from {clock.text(at_s) or 'a time not known'}"
+            for at_s, percent in wishes
+        )
+        yield _warning(
+            "rate-override", f"The operator asked for another part of the prescribed rates: {each}."
+        )
 
 
 def _is_fault(kind: str) -> bool:

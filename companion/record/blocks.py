@@ -49,7 +49,7 @@ class _Rows:
     """The inputs of a block, or its decisions."""
 
     def __init__(self, follower: _Rows | None = None) -> None:
-        self.packer = Packer(follower=None if follower is None else follower.packer)
+        self.packer: Packer = Packer(follower=None if follower is None else follower.packer)
         self.crc = 0
         self.last: int | None = None
 

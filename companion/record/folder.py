@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.errors import JournalError
+from companion.record.content_hash import log_of
 from companion.record.reader import OpenJournal, opened
 from companion.record.versions import OtherVersionError
 
@@ -68,9 +69,7 @@ def _number(name: str) -> tuple[int, str]:
 
 def look_at(path: Path) -> Flight:
     """Return what can be told of a journal without reading all of it."""
-    size_bytes = sum(
-        file.stat().st_size for file in (path, path.with_name(path.name + "-wal")) if file.exists()
-    )
+    size_bytes = sum(file.stat().st_size for file in (path, log_of(path)) if file.exists())
     is_pinned = pin_of(path).exists()
     try:
         with opened(path, is_lenient=True) as journal:

@@ -7,7 +7,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -17,6 +17,7 @@ from companion.core.types import Decision, Input
 from companion.errors import JournalError
 from companion.record.blocks import Entry
 from companion.record.codec import FieldNames, decode
+from companion.record.content_hash import log_of
 from companion.record.coverage_table import read_treated
 from companion.record.events import Event
 from companion.record.geopackage import APPLICATION_ID
@@ -123,17 +124,20 @@ def _line(error: Exception) -> str:
 @contextmanager
 def _connect(path: Path) -> Iterator[sqlite3.Connection]:
     """Open for reading only: what a crash left (the -wal file beside it) is read, not changed."""
-    log = path.with_name(path.name + "-wal")
-    with tempfile.TemporaryDirectory(prefix="vrspray-") as folder:
+    log, index = log_of(path), path.with_name(path.name + "-shm")
+    with ExitStack() as at_end:
+        folder = at_end.enter_context(tempfile.TemporaryDirectory(prefix="vrspray-"))
         source = path
+        if log.exists() and not index.exists():
+            # SQLite makes one to read the log by, and leaves it; nobody needs it any more.
+            at_end.callback(index.unlink, missing_ok=True)
         if log.exists() and not os.access(path.parent, os.W_OK):
             # SQLite needs a shared-memory file beside a log: read a copy.
             for file in (path, log):
                 shutil.copy(file, folder)
             source = Path(folder) / path.name
         uri = f"{source.resolve().as_uri()}?mode=ro"
-        with closing(sqlite3.connect(uri, uri=True, timeout=1.0)) as connection:
-            yield connection
+        yield at_end.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=1.0)))
 
 
 def _checked(path: Path, connection: sqlite3.Connection, *, is_lenient: bool) -> OpenJournal:

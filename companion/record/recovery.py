@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.errors import JournalError
+from companion.record.content_hash import log_of
 from companion.record.folder import journals
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import box_of_points, set_box
@@ -88,7 +89,7 @@ def _is_left(connection: sqlite3.Connection, path: Path) -> bool:
     row = connection.execute("SELECT value FROM meta WHERE key = 'closed'").fetchone()
     if row is None:
         raise ValueError("does not say whether it was closed")
-    return row[0] == "no" or path.with_name(path.name + "-wal").exists()
+    return row[0] == "no" or log_of(path).exists()
 
 
 def _fold_in(connection: sqlite3.Connection) -> None:

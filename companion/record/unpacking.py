@@ -10,30 +10,14 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
 
-import numpy as np
-
-from companion.record.packing import (
-    ANCHORED,
-    BACK,
-    BITS,
-    FLOAT,
-    HOLE,
-    NEW,
-    SAME,
-    WORD,
-    Key,
-    keys_of,
-)
+from companion.record.packed_reader import Reader, signed, sums
+from companion.record.packing import BACK, FLOAT, HOLE, NEW, SAME, Key, keys_of
 
 # A damaged length must not take the reader's memory: a block is a second of a flight.
 UNPACKED_MAX = 64_000_000
 _REAL = struct.Struct("<d")
 _LONG = struct.Struct("<q")
-_PLENTY = 0x7F
 _SIGN = 1 << 63
-# A float has all decimal numbers of fifteen digits, each by a text of its own.
-_EXACT_MAX = 10**15
-_EXACT_DECIMALS_MAX = 22  # ten to the power of so much is a float without an error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,82 +62,11 @@ def part_of(content: bytes, leader: Part | None = None) -> Part:
     ValueError for what is no content of a block.
     """
     try:
-        return _part(_Reader(content), leader)
+        return _part(Reader(content), leader)
     except (IndexError, KeyError, StopIteration, RuntimeError, struct.error, UnicodeError) as error:
         raise ValueError(f"a block is damaged: {error!r}") from error
     except OverflowError as error:
         raise ValueError(f"a block is damaged: {error}") from error
-
-
-class _Reader:
-    """Reads what a packer wrote, from its beginning."""
-
-    def __init__(self, content: bytes) -> None:
-        self._content = content
-        self._at = 0
-
-    def word(self) -> int:
-        (value,) = WORD.unpack_from(self._content, self._at)
-        self._at += WORD.size
-        return int(value)
-
-    def take(self, count: int) -> bytes:
-        if count > len(self._content) - self._at:
-            raise ValueError("a block is cut off")
-        self._at += count
-        return self._content[self._at - count : self._at]
-
-    def integers(self, count: int) -> list[int]:
-        content, at = self._content, self._at
-        if count > len(content) - at:
-            raise ValueError("a block is cut off")
-        found = list(content[at : at + count])
-        if max(found, default=0) <= _PLENTY:
-            self._at += count
-            return found
-        found = []
-        for _ in range(count):
-            value = content[at]
-            at += 1
-            if value > _PLENTY:
-                value &= _PLENTY
-                shift = 7
-                while content[at] > _PLENTY:
-                    value |= (content[at] & _PLENTY) << shift
-                    shift += 7
-                    at += 1
-                value |= content[at] << shift
-                at += 1
-            found.append(value)
-        self._at = at
-        return found
-
-    def values(self, count: int, width: int) -> list[int]:
-        raw = self.take(count * width)
-        if width > 8:  # from the very smallest to the very largest float
-            rows = zip(*(raw[plane * count :][:count] for plane in range(width)), strict=True)
-            return _sums([int.from_bytes(bytes(row), "little") for row in rows])
-        planes = np.zeros((count, 8), dtype=np.uint8)
-        planes[:, :width] = np.frombuffer(raw, dtype=np.uint8).reshape(width, count).T
-        return _sums(planes.view("<u8").ravel().tolist())
-
-    def floats(self, count: int) -> tuple[Sequence[str], Sequence[int]]:
-        """Return new numbers as texts, or as distances from their anchors."""
-        how, width = self.take(2)
-        values = self.values(count, width)
-        if how == ANCHORED:
-            return (), values
-        if how == BITS:
-            return _from_bits(values), ()
-        return _unscaled(values, how), ()
-
-
-def _sums(words: Sequence[int]) -> list[int]:
-    return list(accumulate([word >> 1 if not word & 1 else -((word + 1) >> 1) for word in words]))
-
-
-def _signed(word: int) -> int:
-    return word >> 1 if not word & 1 else -((word + 1) >> 1)
 
 
 class _Column:
@@ -161,9 +74,11 @@ class _Column:
 
     __slots__ = ("before", "codes", "fresh", "is_int", "words")
 
-    def __init__(self, codes: Sequence[int] | Sequence[str], *, is_int: bool) -> None:
-        self.codes: Iterator[int] | Iterator[str] = iter(codes)
-        self.fresh: Iterator[str] = iter(())
+    def __init__(
+        self, *, codes: Sequence[int] = (), fresh: Sequence[str] = (), is_int: bool
+    ) -> None:
+        self.codes = iter(codes)
+        self.fresh = iter(fresh)
         self.words: Iterator[int] | None = None
         self.before = ""
         self.is_int = is_int
@@ -174,10 +89,10 @@ def _pieces_of(form: str) -> tuple[str, ...]:
     return tuple(HOLE.split(form))
 
 
-def _part(reader: _Reader, leader: Part | None) -> Part:
+def _part(reader: Reader, leader: Part | None) -> Part:
     count = reader.word()
     forms = reader.take(reader.word()).decode("ascii").split("\n")
-    gaps = [_signed(gap) for gap in reader.integers(count)]
+    gaps = [signed(gap) for gap in reader.integers(count)]
     leads, order = reader.integers(count), reader.integers(count)
     columns = _columns(reader, order, [keys_of(form) for form in forms])
     pieces = [list(_pieces_of(form)) for form in forms]
@@ -200,7 +115,7 @@ def _part(reader: _Reader, leader: Part | None) -> Part:
 
 
 def _columns(
-    reader: _Reader, order: Sequence[int], keys: Sequence[Sequence[Key]]
+    reader: Reader, order: Sequence[int], keys: Sequence[Sequence[Key]]
 ) -> dict[Key, _Column]:
     """Read the columns, in the order of their first numbers."""
     counts: dict[Key, int] = {}
@@ -211,9 +126,9 @@ def _columns(
     for key, how_many in counts.items():
         codes = reader.integers(how_many)
         if key[0] == FLOAT:
-            columns[key], news[key] = _Column(codes, is_int=False), codes.count(NEW)
+            columns[key], news[key] = _Column(codes=codes, is_int=False), codes.count(NEW)
         else:
-            columns[key] = _Column([str(value) for value in _sums(codes)], is_int=True)
+            columns[key] = _Column(fresh=[str(value) for value in sums(codes)], is_int=True)
     for key, how_many in news.items():
         if how_many:
             fresh, words = reader.floats(how_many)
@@ -227,10 +142,10 @@ def _numbers(columns: Sequence[_Column], seen: list[str]) -> list[str]:
     anchor = ""
     anchor_word: int | None = None
     for column in columns:
-        code = next(column.codes)
         if column.is_int:
-            found.append(code)
+            found.append(next(column.fresh))
             continue
+        code = next(column.codes)
         if code == SAME:
             text = column.before
         elif code != NEW:
@@ -251,29 +166,10 @@ def _numbers(columns: Sequence[_Column], seen: list[str]) -> list[str]:
 
 def _word_of(text: str) -> int:
     """Return a float's bits as an integer in the order of the numbers."""
-    (word,) = _LONG.unpack(_REAL.pack(float(text)))
+    word: int = _LONG.unpack(_REAL.pack(float(text)))[0]
     return word if word >= 0 else -(word & _SIGN - 1) - 1
 
 
 def _float_of(word: int) -> str:
     (value,) = _REAL.unpack(_LONG.pack(word if word >= 0 else (-word - 1) - _SIGN))
     return repr(value)
-
-
-def _unscaled(values: Sequence[int], decimals: int) -> list[str]:
-    scale = 10.0**decimals
-    if -_EXACT_MAX < min(values) <= max(values) < _EXACT_MAX and decimals <= _EXACT_DECIMALS_MAX:
-        return [repr(value / scale) for value in values]
-    found = []
-    for value in values:
-        digits = str(abs(value)).rjust(decimals + 1, "0")
-        cut = len(digits) - decimals
-        part = digits[cut:].rstrip("0") or "0"
-        found.append(f"{'-' if value < 0 else ''}{digits[:cut]}.{part}")
-    return found
-
-
-def _from_bits(words: Sequence[int]) -> list[str]:
-    raw = [word if word >= 0 else (-word - 1) | _SIGN for word in words]
-    packed = struct.pack(f"<{len(raw)}Q", *raw)
-    return [repr(value) for value in struct.unpack(f"<{len(raw)}d", packed)]

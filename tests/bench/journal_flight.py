@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+
+from shapely import box
 
 from companion.assembly import build_setup
 from companion.config.load import load
 from companion.core.controller import Memory, Setup, step
+from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.prescription import Prescription
 from companion.core.types import (
     ClockReport,
     Decision,
@@ -30,6 +34,7 @@ from companion.core.types import (
     UtcReport,
     WindReport,
 )
+from companion.record.events import LinkSample
 from companion.record.valve_rows import ValveOrder, ValveRows
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/anyang/config.toml"
@@ -52,6 +57,22 @@ class Turn:
 def example_setup() -> Setup:
     """Return the set-up of the example: six valves, forty plots."""
     return build_setup(load(EXAMPLE))
+
+
+def open_setup() -> Setup:
+    """Return the set-up of a flight whose valves never close: every place has a rate."""
+    setup = example_setup()
+    ground = setup.prescription
+    return replace(
+        setup,
+        prescription=Prescription(
+            ground.zones,
+            boundary=box(*ground.field.bounds).buffer(40.0),
+            overlap=ground.overlap,
+            default_rate_l_ha=80.0,
+            sha256=ground.sha256,
+        ),
+    )
 
 
 class Field:
@@ -86,9 +107,10 @@ class Flight:
     def __init__(self, setup: Setup, *, seed: int = 1) -> None:
         self._setup = setup
         self._chance = random.Random(seed)
-        self._field = Field(setup)
+        self._field = Field(example_setup())
         self._rows = ValveRows()
         self._volume_ml = 0.0
+        self.coverage = Coverage()
         self.track, self.memory = Track(), Memory()
 
     def turns(self, seconds: float) -> Iterator[Turn]:
@@ -118,6 +140,40 @@ class Flight:
             for planned_us, _, valve, permille in self._rows.take_plan(decision.plan)
         )
         return Turn(inputs, decision, orders)
+
+    def treat(self, second: int) -> None:
+        """Add what the boom passed over in a second to the coverage."""
+        places = [self._field.at(float(at_s)) for at_s in (second, second + 1)]
+        sides = []
+        for east, north, course in places:
+            across = SPACING_M / 2.0
+            angle = math.radians(course)
+            dx, dy = across * math.cos(angle), -across * math.sin(angle)
+            sides.append(((east - dx, north - dy), (east + dx, north + dy)))
+        (a, b), (d, c) = sides
+        self.coverage = self.coverage.stamped([(a, b, c, d)])
+
+    def link(self, second: int) -> LinkSample:
+        """Return what the link tells once a second."""
+        chance = self._chance
+        return LinkSample(
+            at_s=START_S + second + chance.random() * 1e-3,
+            values={
+                "bytes_in": 4000 * second + chance.randrange(500),
+                "bytes_out": 300 * second + chance.randrange(50),
+                "frames_in": 90 * second + chance.randrange(9),
+                "frames_out": 8 * second,
+                "bad_frames": 0,
+                "refused_frames": 0,
+                "unsent_frames": 0,
+                "lost_percent": chance.random() * 0.1,
+                "frames_per_s": chance.gauss(90.0, 2.0),
+                "bytes_in_per_s": chance.gauss(4000.0, 90.0),
+                "bytes_out_per_s": chance.gauss(300.0, 9.0),
+                "position_hz": chance.gauss(20.0, 0.2),
+                "round_trip_s": chance.gauss(0.002, 0.0002),
+            },
+        )
 
     def _inputs(self, number: int, time_s: float, now_s: float) -> Iterator[Input]:
         chance, every = self._chance, lambda hz: number % (DECISIONS_HZ // hz) == 0

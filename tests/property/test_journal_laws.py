@@ -131,7 +131,7 @@ def crashed() -> Any:
         yield Path(folder) / "left"
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(share=st.floats(0.0, 1.0))
 def test_a_log_cut_anywhere_leaves_whole_commits(crashed: Path, share: float) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -147,7 +147,7 @@ def test_a_log_cut_anywhere_leaves_whole_commits(crashed: Path, share: float) ->
         assert share < 1.0 or len(content.entries) == 50
 
 
-@settings(max_examples=60)
+@settings(max_examples=25)
 @given(share=st.floats(0.0, 0.999), junk=st.binary(min_size=1, max_size=300), log=st.booleans())
 def test_junk_anywhere_is_read_or_refused_in_one_line(
     crashed: Path, share: float, junk: bytes, log: bool
@@ -165,7 +165,7 @@ def test_junk_anywhere_is_read_or_refused_in_one_line(
             assert "\n" not in str(refusal)
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(
     values=st.tuples(*[st.floats(0.0, 10.0)] * 6),
     position_s=st.floats(-0.5, 0.5),

@@ -10,8 +10,8 @@ from contextlib import suppress
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.record.packing import pack
-from companion.record.unpacking import unpack
+from companion.record.packing import Packer, pack
+from companion.record.unpacking import part_of, unpack
 
 NUMBERS = st.one_of(
     st.floats(),
@@ -41,6 +41,30 @@ def test_lines_of_json_come_back_to_the_last_character(values: list[object]) -> 
 def test_columns_of_any_numbers_come_back(rows: list[tuple[object, ...]]) -> None:
     lines = [json.dumps({"State": [*row, {"Plan": [row[0], row[0]]}]}) for row in rows]
     assert unpack(pack(lines)) == lines
+
+
+@given(
+    rows=st.lists(
+        st.tuples(st.booleans(), st.integers(-3, 2**40), st.tuples(*[NUMBERS] * 3)), max_size=30
+    )
+)
+def test_lines_that_follow_others_come_back_with_their_numbers(
+    rows: list[tuple[bool, int, tuple[object, ...]]],
+) -> None:
+    follower = Packer()
+    leader = Packer(follower=follower)
+    told: dict[bool, list[tuple[int, str]]] = {False: [], True: []}
+    # What follows repeats the numbers of what it follows.
+    values: tuple[object, ...] = (1.5, 2.5, 3.5)
+    for leads, number, own in rows:
+        values = own if leads else (*values[:2], own[2])
+        line = json.dumps({"A": values})
+        before = told[leads][-1][0] if told[leads] else 6
+        (leader if leads else follower).add(line, number - before)
+        told[leads].append((number, line))
+    first = part_of(leader.content())
+    assert first.rows(7) == told[True]
+    assert part_of(follower.content(), first).rows(7) == told[False]
 
 
 @given(lines=st.lists(st.text(st.characters(min_codepoint=32, max_codepoint=126)), max_size=9))

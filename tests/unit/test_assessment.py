@@ -9,12 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+import shapely.affinity
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from analysis.assess.assessment import Assessment, assess
 from analysis.assess.breakdowns import speed_bin
 from analysis.assess.causes import Cause
+from analysis.assess.cell_maps import cell_maps
 from analysis.assess.intervals import crossings_of, mean_interval, ratio_interval
 from analysis.assess.volume_balance import balance_of
 from analysis.flown.applied_flight import Series
@@ -23,7 +25,8 @@ from analysis.strips import strips_of
 from analysis.student import t_factor
 from companion.core.cells import CellGrid, Warp
 from companion.core.controller import Setup
-from companion.core.prescription import Prescription
+from companion.core.prescription import Prescription, Zone
+from companion.record.events import Event
 from tests.builders import plots, setup
 from tests.unit.applied_flights import SPEED_M_S, changes_of, eastwards
 
@@ -176,7 +179,81 @@ def test_the_duty_map_has_the_duty_of_each_plot(good: Assessment) -> None:
     assert second == pytest.approx(expected)
 
 
+@settings(max_examples=8)
+@given(
+    rate_l_ha=st.floats(5.0, 60.0),
+    turned_deg=st.floats(-20.0, 20.0),
+    hole_m=st.floats(0.3, 4.0),
+    cell_m=st.floats(0.6, 3.0),
+)
+def test_one_rate_over_a_field_is_the_rate_of_each_of_its_cells(
+    rate_l_ha: float, turned_deg: float, hole_m: float, cell_m: float
+) -> None:
+    field = shapely.affinity.rotate(shapely.box(2.0, -4.0, 40.0, 9.0), turned_deg)
+    zones = [Zone(name="all", polygon=field, rate_l_ha=rate_l_ha)]
+    hole = shapely.Point(20.0, 3.0).buffer(hole_m)
+    flight = eastwards(given=setup(prescription=Prescription(zones, exclusions=[hole])))
+    record = record_of(flight)
+    strips = strips_of(record)
+    duties = [np.zeros(len(record.time_s)) for _ in strips]
+    cells = cell_maps(record, strips, duties, cell_m=cell_m)
+    assert cells is not None
+    given_l_ha = cells.commanded_l_ha[np.isfinite(cells.commanded_l_ha)]
+    in_field = given_l_ha > 0.0
+    assert in_field.sum() > 20
+    assert given_l_ha[in_field] == pytest.approx(rate_l_ha, rel=1e-6)
+    # Without a rate are only those cells that lie outside: there the flight sprayed all the same.
+    west_m, south_m = (
+        each[:-1, :-1][np.isfinite(cells.commanded_l_ha)][~in_field]
+        for each in (cells.corner_east_m, cells.corner_north_m)
+    )
+    middles = shapely.points(west_m + 0.5 * cell_m, south_m + 0.5 * cell_m)
+    assert not shapely.contains(field.difference(hole).buffer(-cell_m), middles).any()
+
+
+@settings(max_examples=6)
+@given(cell_m=st.floats(0.6, 2.0), north_m=st.floats(0.0, 6.0))
+def test_a_cell_in_one_zone_is_to_get_the_rate_of_that_zone(cell_m: float, north_m: float) -> None:
+    flight = eastwards(given=rows_of_plots(1), passes_north_m=(north_m,))
+    record = record_of(flight)
+    strips = strips_of(record)
+    duties = [np.zeros(len(record.time_s)) for _ in strips]
+    cells = cell_maps(record, strips, duties, cell_m=cell_m)
+    assert cells is not None
+    passed = np.isfinite(cells.commanded_l_ha)
+    west_m, south_m = (
+        each[:-1, :-1][passed] for each in (cells.corner_east_m, cells.corner_north_m)
+    )
+    squares = shapely.box(west_m, south_m, west_m + cell_m, south_m + cell_m)
+    for zone in flight.setup.prescription.zones:
+        within = shapely.contains_properly(zone.polygon, squares)
+        assert within.any()
+        assert cells.commanded_l_ha[passed][within] == pytest.approx(zone.rate_l_ha, rel=1e-6)
+
+
 # -------------------------------------------------------------------------------------- causes
+
+
+@pytest.mark.parametrize(("text", "is_wish"), [("rate override 80 %", True), ("tank 80 L", False)])
+def test_what_the_operator_wished_is_the_operators(text: str, is_wish: bool) -> None:
+    flown = eastwards(scale=0.8)
+    event = Event(at_s=flown.time_s[0], kind="command", text=text)
+    causes = assess(replace(flown, events=(event,))).causes
+    assert causes.by_cause[Cause.OPERATOR] == pytest.approx(
+        causes.off_m2 if is_wish else 0.0, rel=0.05
+    )
+    assert causes.off_m2 > 0.9 * causes.judged_m2
+    assert math.fsum(causes.by_cause.values()) == pytest.approx(causes.off_m2)
+
+
+def test_before_the_wish_and_at_another_dose_it_is_not() -> None:
+    flown = eastwards(scale=0.8)
+    middle_s = float(flown.time_s.mean())
+    late = Event(at_s=middle_s, kind="command", text="rate override 80 %")
+    causes = assess(replace(flown, events=(late,))).causes
+    assert causes.by_cause[Cause.OPERATOR] == pytest.approx(0.5 * causes.off_m2, rel=0.1)
+    other = Event(at_s=flown.time_s[0], kind="command", text="rate override 60 %")
+    assert assess(replace(flown, events=(other,))).causes.by_cause[Cause.OPERATOR] == 0.0
 
 
 def shares(found: Assessment) -> dict[Cause, float]:

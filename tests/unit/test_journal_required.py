@@ -19,7 +19,7 @@ from tests.builders import setup
 from tests.unit.test_caught_ends import Scribe
 from tests.unit.test_replay import inputs_of
 
-STEPS = 120
+STEPS = 60
 
 
 @dataclass
@@ -85,7 +85,7 @@ def test_a_flight_that_has_begun_goes_on_without_its_record() -> None:
     flight = Flight()
     assert is_spraying(flight.fly(60))
     flight.fault = "database or disk is full"
-    later = flight.fly(60)
+    later = flight.fly(20)
     assert is_spraying(later)
     assert not any(Inhibit.OUTPUT_FAULT in decision.inhibits for decision in later)
 
@@ -94,7 +94,7 @@ def test_after_the_landing_the_record_counts_again() -> None:
     flight = Flight()
     assert is_spraying(flight.fly(60))
     flight.fault = "only 3 MB are free"
-    landed = flight.fly(40, armed=False)
+    landed = flight.fly(20, armed=False)
     assert Inhibit.OUTPUT_FAULT in landed[-1].inhibits
 
 

@@ -109,3 +109,16 @@ def test_a_damaged_block_is_refused_or_left_out_and_said(case: str, tmp_path: Pa
     assert len(content.unread) == 1
     assert content.unread[0].startswith("rows from 1 on (1.000 to 10.000 s)")
     assert content.lost == 10
+
+
+def test_who_wants_a_sensor_needs_no_decision(tmp_path: Path) -> None:
+    path = closed_journal(tmp_path)
+    whole = [entry for entry in read_journal(path).entries if not entry.is_decision]
+    change(path, "UPDATE blocks SET decisions = zeroblob(90)")
+    with opened(path) as found:
+        kinds = {entry.kind for entry in whole}
+        assert list(read_entries(found.connection, found.version, kinds=kinds)) == whole
+    content = read_journal(path, is_lenient=True)
+    assert list(content.entries) == whole
+    assert all(text.startswith("decisions from ") for text in content.unread)
+    assert content.unread

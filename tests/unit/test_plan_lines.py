@@ -111,7 +111,9 @@ def test_the_papers_field_is_planned_and_flown_with_nothing_off_its_lines(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "field.plan"
-    execute(["plan", str(BOUNDARY), "--config", EXAMPLE, "--out", str(out), "--json"])
+    # Passes keep the buffer of the border and the aircraft's wander: no valve stands at its edge.
+    kept = ["--border-m", "0.3"]
+    execute(["plan", str(BOUNDARY), "--config", EXAMPLE, "--out", str(out), "--json", *kept])
     planned = json.loads(capsys.readouterr().out)
     lines = tmp_path / "field.lines.geojson"
     assert planned["lines_file"] == str(lines)
@@ -128,7 +130,7 @@ def test_the_papers_field_is_planned_and_flown_with_nothing_off_its_lines(
     (flight,) = json.loads(capsys.readouterr().out)["flights"]
     assert flight["off_target_ml"] < 0.05
     assert flight["missed"] == 0
-    assert flight["applied_ml"] / 1000.0 == pytest.approx(planned["volume_l"], rel=0.03)
+    assert flight["applied_ml"] / 1000.0 == pytest.approx(planned["volume_l"], rel=0.005)
 
 
 def test_the_set_up_of_a_journal_holds_the_lines() -> None:

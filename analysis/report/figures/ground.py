@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 from matplotlib.collections import LineCollection
+from matplotlib.transforms import ScaledTranslation
 
 from analysis.report.figures.style import (
     DEVIATION_MAP,
-    FAINT,
     INK,
     RATES_MAP,
     WIDTH_IN,
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Transform
 
     from analysis.assess.cell_maps import CellMaps
     from analysis.flown.applied_flight import AppliedFlight, Floats
@@ -34,18 +35,21 @@ if TYPE_CHECKING:
 # More zones than these would be all outline.
 OUTLINES_MAX = 1500
 MARGIN_M = 3.0
-PANEL_MIN_IN, PANEL_MAX_IN = 1.2, 5.2
-# Beside the maps of a sheet: axis labels, and the scale of colours.
-BESIDE_IN, BAR_IN = 0.75, 1.1
-WIDTH_MIN_IN = 4.0
+PANEL_MIN_IN, PANEL_MAX_IN = 1.6, 5.6
+# Around the maps of a sheet, in inches: names of the axes, title and scale above each map, and on
+# the right the scale of colours.
+LEFT_IN, BELOW_IN, ABOVE_IN, GAP_IN = 0.75, 0.55, 0.45, 0.25
+BAR_GAP_IN, BAR_IN, BAR_TEXT_IN = 0.2, 0.16, 0.75
+BAR_MAX_IN = 3.0
 # A deviation map reaches at least this far, so that a good flight looks good.
 # Cells on the border, which get nothing by rule, must not make all others white.
 DEVIATION_MIN_PERCENT, DEVIATION_MAX_PERCENT, DEVIATION_PERCENTILE = 20.0, 50.0, 98.0
 PATH_POINTS_MAX = 4000
+NOTHING_L_HA, NOTHING_COLOUR = 1e-6, "#D9D9D9"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Sheet:
+class Sheet:
     """What all maps of a flight share: extent in metres, outlines, path."""
 
     flight: AppliedFlight
@@ -56,22 +60,45 @@ class _Sheet:
 
     @property
     def is_wide(self) -> bool:
+        """Return whether maps stand one above the other."""
         west, south, east, north = self.box
         return east - west > 1.2 * (north - south)
 
-    def layout(self, count: int) -> tuple[tuple[float, float], int, int]:
-        """Return height and width of a figure with so many maps, its rows and its columns."""
+    def panels(self, count: int, *, has_bar: bool = True) -> tuple[Figure, list[Axes], Axes | None]:
+        """Return a figure with so many maps, and with room for a scale of colours."""
         west, south, east, north = self.box
         rows, columns = (count, 1) if self.is_wide else (1, count)
-        width_in = (WIDTH_IN - BAR_IN) / columns - BESIDE_IN
-        height_in = width_in * (north - south) / max(east - west, 1e-6)
-        if height_in > PANEL_MAX_IN:
-            width_in, height_in = width_in * PANEL_MAX_IN / height_in, PANEL_MAX_IN
-        whole_in = max(BAR_IN + columns * (BESIDE_IN + width_in), WIDTH_MIN_IN)
-        return (0.3 + rows * (0.7 + max(height_in, PANEL_MIN_IN)), whole_in), rows, columns
+        beside_in = BAR_GAP_IN + BAR_IN + BAR_TEXT_IN if has_bar else GAP_IN
+        free_in = WIDTH_IN - LEFT_IN - beside_in - (columns - 1) * GAP_IN
+        per_m = min(free_in / columns / (east - west), PANEL_MAX_IN / (north - south))
+        wide_in, high_in = per_m * (east - west), max(per_m * (north - south), PANEL_MIN_IN)
+        wide_in = max(wide_in, PANEL_MIN_IN)
+        right_in = LEFT_IN + columns * wide_in + (columns - 1) * GAP_IN
+        width_in = right_in + beside_in
+        height_in = BELOW_IN + rows * (high_in + ABOVE_IN)
+        figure = new_figure(height_in, width_in)
+
+        def axes(left: float, bottom: float, wide: float, high: float) -> Axes:
+            return figure.add_axes(
+                (left / width_in, bottom / height_in, wide / width_in, high / height_in)
+            )
+
+        maps = [
+            axes(
+                LEFT_IN + column * (wide_in + GAP_IN),
+                BELOW_IN + (rows - 1 - row) * (high_in + ABOVE_IN),
+                wide_in,
+                high_in,
+            )
+            for row in range(rows)
+            for column in range(columns)
+        ]
+        bar_in = min(BAR_MAX_IN, height_in - BELOW_IN - ABOVE_IN)
+        bar = axes(right_in + BAR_GAP_IN, BELOW_IN, BAR_IN, bar_in) if has_bar else None
+        return figure, maps, bar
 
 
-def sheet_of(flight: AppliedFlight, cells: CellMaps) -> _Sheet:
+def sheet_of(flight: AppliedFlight, cells: CellMaps) -> Sheet:
     """Return what the maps of a flight have in common."""
     prescription = flight.setup.prescription
     box = (
@@ -84,7 +111,7 @@ def sheet_of(flight: AppliedFlight, cells: CellMaps) -> _Sheet:
     # Joining cells to zones may take long, and the cells are drawn themselves.
     has_outlines = prescription.cells is None and prescription.zone_count <= OUTLINES_MAX
     outlines = [zone.polygon for zone in prescription.zones] if has_outlines else []
-    return _Sheet(
+    return Sheet(
         flight=flight,
         cells=cells,
         box=box,
@@ -93,22 +120,26 @@ def sheet_of(flight: AppliedFlight, cells: CellMaps) -> _Sheet:
     )
 
 
-def prescribed_and_applied(sheet: _Sheet) -> Drawn:
+def prescribed_and_applied(sheet: Sheet) -> Drawn:
     """Draw both maps with one scale of colours."""
     asked, given = sheet.cells.commanded_l_ha, sheet.cells.measured_l_ha
     least, most = _rates_shown(asked)
-    size_in, rows, columns = sheet.layout(2)
-    figure = new_figure(*size_in)
-    panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    figure, panels, bar = sheet.panels(2)
+    nothing = (asked <= NOTHING_L_HA) & (given <= NOTHING_L_HA)
     for panel, values, title in zip(panels, (asked, given), ("prescribed", "applied"), strict=True):
-        mesh = _mesh(panel, sheet, values, RATES_MAP, least, most)
-        _dress(panel, sheet, title, with_path=title == "applied")
-    figure.colorbar(mesh, ax=list(panels), label="rate [L/ha]", fraction=0.05, aspect=30)
+        shown = np.where(nothing, -1.0, np.maximum(values, least))
+        mesh = _mesh(panel, sheet, shown, RATES_MAP, least, most)
+        mesh.cmap.set_under(NOTHING_COLOUR)
+        dress(panel, sheet, title, with_path=title == "applied")
+    # One scale for both: the north names one axis of two maps side by side.
+    panels[1].set_ylabel("" if not sheet.is_wide else "north [m]")
+    panels[0].set_xlabel("" if sheet.is_wide else "east [m]")
+    figure.colorbar(mesh, cax=bar, label="rate [L/ha]")
     return Drawn(
         name="map",
         title="Prescribed and applied",
-        caption=f"{_cells_text(sheet.cells)} Dark is little, bright is much; white was not flown "
-        "over. The thin line is the path of the vehicle, the black one the border.",
+        caption=f"{_cells_text(sheet.cells)} Dark is little, bright is much; grey is rate 0, "
+        "white was not flown over. The thin line is the path of the vehicle, the black one the border.",
         alt="Two maps of the field with one scale of colours: the prescribed rate of each cell, "
         "and the rate that was applied.",
         kind="map",
@@ -125,23 +156,24 @@ def _rates_shown(asked: Floats) -> tuple[float, float]:
     return (least if 0.5 * most < least < most else 0.0), most
 
 
-def deviation(sheet: _Sheet) -> Drawn:
+def deviation(sheet: Sheet) -> Drawn:
     """Draw by how much each cell is off its rate."""
     error = sheet.cells.relative_error_percent
     known = np.abs(error[np.isfinite(error)])
     reach = float(np.percentile(known, DEVIATION_PERCENTILE)) if len(known) else 0.0
     reach = math.ceil(reach / 5.0) * 5.0
     reach = min(max(reach, DEVIATION_MIN_PERCENT), DEVIATION_MAX_PERCENT)
-    figure, panel = _single(sheet)
+    figure, (panel,), scale = sheet.panels(1)
     mesh = _mesh(panel, sheet, error, DEVIATION_MAP, -reach, reach)
-    _dress(panel, sheet, "deviation")
-    bar = figure.colorbar(mesh, ax=panel, fraction=0.05, aspect=30, extend="both")
-    bar.set_label("deviation [%]: - too little, + too much")
+    dress(panel, sheet, "deviation")
+    bar = figure.colorbar(mesh, cax=scale, extend="both")
+    bar.set_label("deviation [%], + too much")
     return Drawn(
         name="deviation",
         title="Deviation",
-        caption=f"{_cells_text(sheet.cells)} White: as prescribed. Grey: not flown over, or "
-        "prescribed less than a tenth of the highest rate.",
+        caption=f"{_cells_text(sheet.cells)} White: as prescribed; cells at the ends of a pass "
+        "get less where nothing may fall outside the border. Grey: not flown over, or prescribed "
+        "less than a tenth of the highest rate.",
         alt="Map of the relative deviation of each cell from its prescribed rate, red where too "
         "little was applied and blue where too much.",
         kind="map",
@@ -149,12 +181,12 @@ def deviation(sheet: _Sheet) -> Drawn:
     )
 
 
-def duty(sheet: _Sheet) -> Drawn:
+def duty(sheet: Sheet) -> Drawn:
     """Draw the duty that the valves had over each cell."""
-    figure, panel = _single(sheet)
+    figure, (panel,), scale = sheet.panels(1)
     mesh = _mesh(panel, sheet, 100.0 * sheet.cells.duty, RATES_MAP, 0.0, 100.0)
-    _dress(panel, sheet, "duty")
-    figure.colorbar(mesh, ax=panel, label="duty [%]", fraction=0.05, aspect=30)
+    dress(panel, sheet, "duty")
+    figure.colorbar(mesh, cax=scale, label="duty [%]")
     return Drawn(
         name="duty",
         title="Duty of the valves",
@@ -170,14 +202,8 @@ def _cells_text(cells: CellMaps) -> str:
     return f"Mean of {whose} of {cells.cell_m:.2g} m."
 
 
-def _single(sheet: _Sheet) -> tuple[Figure, Axes]:
-    size_in, _, _ = sheet.layout(1)
-    figure = new_figure(*size_in)
-    return figure, figure.subplots()
-
-
 def _mesh(
-    panel: Axes, sheet: _Sheet, values: Floats, colours: str, low: float, high: float
+    panel: Axes, sheet: Sheet, values: Floats, colours: str, low: float, high: float
 ) -> QuadMesh:
     return panel.pcolormesh(
         sheet.cells.corner_east_m,
@@ -190,11 +216,14 @@ def _mesh(
     )
 
 
-def _dress(panel: Axes, sheet: _Sheet, title: str, *, with_path: bool = False) -> None:
+def dress(panel: Axes, sheet: Sheet, title: str, *, with_path: bool = False) -> None:
+    """Draw zones, border, axes, scale and north around a map, and the vehicle's path over it."""
     west, south, east, north = sheet.box
     if title.startswith("deviation"):
-        panel.set_facecolor("#D9D9D9")
-    panel.add_collection(LineCollection(sheet.outlines, colors=FAINT, lw=0.4, rasterized=True))
+        panel.set_facecolor(NOTHING_COLOUR)
+    panel.add_collection(
+        LineCollection(sheet.outlines, colors=INK, lw=0.35, alpha=0.6, rasterized=True)
+    )
     panel.add_collection(LineCollection(sheet.border, colors=INK, lw=1.0))
     if with_path and len(sheet.flight.time_s):
         every = max(1, len(sheet.flight.time_s) // PATH_POINTS_MAX)
@@ -206,10 +235,9 @@ def _dress(panel: Axes, sheet: _Sheet, title: str, *, with_path: bool = False) -
     panel.set_ylim(south, north)
     panel.set_aspect("equal")
     panel.locator_params(nbins=6)
-    panel.set_title(title)
+    panel.set_title(title, pad=8)
     panel.set_xlabel("east [m]")
     panel.set_ylabel("north [m]")
-    panel.label_outer()
     _scale_and_north(panel, east - west)
 
 
@@ -217,12 +245,20 @@ def _scale_and_north(panel: Axes, width_m: float) -> None:
     """Draw a scale above the map's right corner, and say where north is."""
     length_m = scale_m(width_m)
     share = length_m / width_m
-    where = panel.transAxes
-    panel.plot([1.0 - share, 1.0], [1.03, 1.03], color=INK, lw=2.0, transform=where, clip_on=False)
+    above = panel.get_xaxis_transform() + ScaledTranslation(0.0, 8 / 72, _inches(panel))
+    east_m = panel.get_xlim()[1]
+    west_m = east_m - length_m
+    panel.plot([west_m, east_m], [1.0, 1.0], color=INK, lw=2.5, transform=above, clip_on=False)
     panel.text(
-        1.0 - share - 0.01, 1.03, f"{length_m:g} m  N \u2191", transform=where,
-        ha="right", va="center", size=8.5,
+        east_m - (share + 0.02) * width_m, 1.0, f"N \u2191  {length_m:g} m", transform=above,
+        ha="right", va="center", size=9.5,
     )  # fmt: skip
+
+
+def _inches(panel: Axes) -> Transform:
+    figure = panel.get_figure(root=True)
+    assert figure is not None
+    return figure.dpi_scale_trans
 
 
 def scale_m(width_m: float) -> float:

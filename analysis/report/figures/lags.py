@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from analysis.lag import Step
 
 # More groups than these are not named one by one.
-NAMED_MAX = 14
+NAMED_MAX = 12
+# More points than these make a large file and no finer picture.
+POINTS_MAX = 300
 SPREAD = 0.25
 # An interval from fewer independent crossings says nothing but that there are few.
 CLUSTERS_MIN = 3
@@ -37,8 +39,10 @@ def lag_distances(
     ]
     if not steps:
         return None
-    figure = new_figure(3.7)
-    left, right = figure.subplots(1, 2, sharey=True, gridspec_kw={"width_ratios": [2, 1]})
+    figure = new_figure(4.0, margins_in=(0.85, 0.25, 0.75, 0.4))
+    left, right = figure.subplots(
+        1, 2, sharey=True, gridspec_kw={"width_ratios": [2, 1], "wspace": 0.05}
+    )
     _panel(left, steps, by_rate, [step.change.after_l_ha for step in steps])
     left.set_xlabel("rate that the change leads to [L/ha]")
     left.set_ylabel("lag distance [m], + too late")
@@ -51,7 +55,9 @@ def lag_distances(
         name="lags",
         title="Lag distance by rate and by speed",
         caption="One point for each change of rate and valve inside the field; diamonds are means "
-        "with their 95 % interval, from three crossings on. 0: the change lies on its boundary.",
+        "with their 95 % interval, from three crossings on. 0: the change lies on its boundary. "
+        "Wang et al. 2024 drew such a figure (Fig. 8) of the settled distance, 3.87 m in the mean "
+        "without compensation and 0.32 m with it, at 5 m/s.",
         alt="Two scatter charts of the distance from each boundary to where the flow changed, by "
         "the rate that the change leads to and by speed, with means and 95 % intervals.",
         kind="chart",
@@ -74,7 +80,7 @@ def _panel(
     panel.axhline(0.0, color=INK, lw=1.0, zorder=1)
     panel.scatter(
         place + SPREAD * 2 * beside, lag_m, s=9, color=BLUE, alpha=0.45, lw=0, label="a change",
-        rasterized=len(steps) > 2000,
+        rasterized=len(steps) > POINTS_MAX,
     )  # fmt: skip
     for number, group in enumerate(measured):
         mean = group.lag_distance_m

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 # A count every second is 1 mL in 80 of a flow of 5 L/min: enough for a line.
 METER_STEP_S = 1.0
 INHIBITED_MIN_S = 0.5
-# A page is a thousand points wide; more of them make files larger and lines no finer.
-POINTS_MAX = 3000
+# A page is some thousand points wide; more of them make files larger and lines no finer.
+POINTS_MAX = 2000
 
 
 def flow_over_time(flight: AppliedFlight, clock_text: str) -> Drawn:
@@ -27,9 +27,13 @@ def flow_over_time(flight: AppliedFlight, clock_text: str) -> Drawn:
     if flight.pressure_kpa is not None:
         panels_of.insert(1, _pressure_panel)
         heights.insert(1, 1.0)
-    figure = new_figure(1.2 + 0.8 * sum(heights))
+    figure = new_figure(1.0 + 0.85 * sum(heights))
     panels = figure.subplots(
-        len(panels_of), 1, sharex=True, gridspec_kw={"height_ratios": heights}, squeeze=False
+        len(panels_of),
+        1,
+        sharex=True,
+        gridspec_kw={"height_ratios": heights, "hspace": 0.12},
+        squeeze=False,
     )[:, 0]
     for panel, draw in zip(panels, panels_of, strict=True):
         draw(panel, flight)
@@ -37,6 +41,7 @@ def flow_over_time(flight: AppliedFlight, clock_text: str) -> Drawn:
         panel.set_axisbelow(True)
     for begin, end in inhibited_spans(flight):
         panels[0].axvspan(begin / 60.0, end / 60.0, color="#EEEEEE", lw=0, zorder=0)
+    figure.align_ylabels()
     panels[-1].set_xlabel(f"minutes since {clock_text}")
     panels[-1].set_xlim(0.0, max(flight.duration_s, 1.0) / 60.0)
     return Drawn(

@@ -18,8 +18,8 @@ def histogram(found: Sequence[Histogram]) -> Drawn | None:
     """Draw how often cells deviate by how much, a panel a unit; None without any cell."""
     if not found:
         return None
-    figure = new_figure(3.2)
-    panels = figure.subplots(1, len(found), squeeze=False)[0]
+    figure = new_figure(3.4)
+    panels = figure.subplots(1, len(found), squeeze=False, gridspec_kw={"wspace": 0.18})[0]
     for panel, each in zip(panels, found, strict=True):
         _bars(panel, each)
     panels[0].set_ylabel("cells")
@@ -43,14 +43,14 @@ def causes(shares: Mapping[str, float]) -> Drawn | None:
     )
     if not named:
         return None
-    figure = new_figure(0.8 + 0.3 * len(named))
+    figure = new_figure(0.8 + 0.32 * len(named), margins_in=(2.9, 0.25, 0.6, 0.1))
     panel = figure.subplots()
     areas = [area for _, area in named]
     whole = sum(areas)
     panel.barh([name for name, _ in named], areas, color=BLUE, height=0.65)
     for row, area in enumerate(areas):
         text = f" {area:,.1f} m\u00b2, {100.0 * area / whole:.0f} %"
-        panel.text(area, row, text, va="center", color=INK, size=8.5)
+        panel.text(area, row, text, va="center", color=INK, size=9.5)
     panel.set_xlim(0.0, 1.25 * max(areas))
     panel.set_ylim(-0.6, len(named) - 0.4)
     panel.set_xlabel("area that is off by more than 10 % [m\u00b2]")
@@ -70,10 +70,8 @@ def causes(shares: Mapping[str, float]) -> Drawn | None:
 
 def _bars(panel: Axes, found: Histogram) -> None:
     panel.axvspan(found.mean - found.sd, found.mean + found.sd, color="#F1E3D8", lw=0, zorder=0)
-    panel.bar(
-        found.edges[:-1], found.counts, width=found.edges[1:] - found.edges[:-1], align="edge",
-        color=BLUE,
-    )  # fmt: skip
+    panel.stairs(found.counts, found.edges, fill=True, color=BLUE)
+    panel.set_ylim(bottom=0.0)
     panel.axvline(0.0, color=FAINT, lw=0.8)
     panel.axvline(found.mean, color=RED, lw=1.4)
     panel.set_title(
