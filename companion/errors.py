@@ -7,6 +7,7 @@
      +-- ActuatorError    the valve driver refused or did not answer
      +-- SensorError      a sensor that the configuration names is not to be had
      +-- JournalError     a journal cannot be opened, read or written
+          +-- NoMapError  its map is damaged: the rest can be read
 
 A wrong argument inside our own code is a `ValueError`: a bug, not a condition.
 """
@@ -48,3 +49,7 @@ class SensorError(VrsprayError):
 
 class JournalError(VrsprayError):
     """A journal cannot be opened, read or written."""
+
+
+class NoMapError(JournalError):
+    """The map in a journal is damaged; the message says what else can be read."""

@@ -41,7 +41,8 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
         doubled_m2 = max(float(lengths_m(tour.lines).sum()) * width_m - area_m2, 0.0)
         return tour.seconds + LAYOUT_WEIGHT * doubled_m2 / (width_m * settings.speed_m_s)
 
-    target = reachable(field.spray, width_m)
+    # As the plan is measured: what the margin of the border costs is left out already.
+    target = reachable(field.limit, width_m)
     tours = [(angle_deg, tour_of(lines, space, motion)) for angle_deg, lines in drawn]
     best = sorted(tours, key=lambda each: cost(each[1]))[:LAYOUTS_TRIED]
     if len(best[0][1].lines) > MANY_LINES:

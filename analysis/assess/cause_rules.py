@@ -39,8 +39,9 @@ def as_wished(flight: AppliedFlight, marks: Marks, off_by: float) -> Bools:
     if setup.rate_max_l_ha is not None:
         most = setup.rate_max_l_ha * ML_M_PER_L_HA_M * marks.strip.track.width_m
         wished = np.minimum(wished, most)
-    found: Bools = np.abs(marks.given_ml_m - wished) <= off_by * wished
-    return found & (percent != 100.0) & (wished > 0.0)
+    near = np.abs(marks.given_ml_m - wished) <= off_by * wished
+    found: Bools = near & (percent != 100.0) & (wished > 0.0)
+    return found
 
 
 def in_edge(marks: Marks, steps: Sequence[Step]) -> Bools:

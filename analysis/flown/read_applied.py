@@ -1,43 +1,54 @@
 """Reads a journal into arrays: the one way from a file to an `AppliedFlight`.
 
 What was applied, ten times a second, is in a table of the journal; of the inputs only those of
-sensors are decoded. A journal of version 1 has no table of valve changes: there they are worked
-out from its decisions.
+sensors are decoded. Where rows are missing the valves count as closed (`analysis.flown.holes`).
 """
 
 from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.flown.applied_flight import AppliedFlight, Floats, Series, ValveChanges
-from companion.core.controller import Setup
-from companion.core.types import Decision
+from analysis.flown.applied_flight import AppliedFlight, Floats, Ints, Series
+from analysis.flown.holes import (
+    Hole,
+    closed_over,
+    doubtful_holes,
+    marked,
+    sample_holes,
+    within,
+)
+from analysis.flown.read_changes import read_changes
+from analysis.flown.sound_rows import (
+    POINT_BYTES,
+    clock_offset_s,
+    is_event,
+    is_sample,
+    rates_of,
+    sound_rows,
+)
+from analysis.flown.table_rows import rows_of
 from companion.errors import JournalError
-from companion.record.codec import FieldNames, decode
+from companion.record.codec import FieldNames
 from companion.record.events import Event
 from companion.record.reader import OpenJournal, opened
 from companion.record.setup_json import field_names_of
-from companion.record.valve_rows import Row, ValveRows
-from companion.record.versions import read_entries
+from companion.record.versions import migrated, read_entries
 
 _NAN = float("nan")
-_MICRO = 1e-6
-_APPLIED = """
-    SELECT geom, time_s, target_flow_l_min, flow_l_min, speed_m_s, course_deg, heading_deg,
-           height_m, inhibits, valve_rates_l_ha
-    FROM applied WHERE geom IS NOT NULL ORDER BY sequence
-"""
-# A point as the journal writes it: 8 bytes of the GeoPackage, then WKB, little-endian.
+_APPLIED = """geom, time_s, target_flow_l_min, flow_l_min, speed_m_s, course_deg, heading_deg,
+           height_m, inhibits, valve_rates_l_ha"""
 _POINT = np.dtype(
     [("head", "V8"), ("order", "u1"), ("kind", "<u4"), ("lon", "<f8"), ("lat", "<f8")]
 )
+assert _POINT.itemsize == POINT_BYTES
 # Which value of which sensor's message becomes a series, and which field tells a fault.
 _SENSORS = {
     "FlowReport": ("volume_ml", "fault"),
@@ -53,16 +64,25 @@ def read_applied(path: Path, *, unread: list[str] | None = None) -> AppliedFligh
     With `unread` a damaged journal is read as far as it goes, and what is missing is said there.
     """
     with opened(path, is_lenient=unread is not None) as journal:
-        return _flight(journal, unread)
+        if unread is not None:
+            # A byte that is no text makes one word wrong and not a whole table.
+            journal.connection.text_factory = lambda raw: raw.decode("utf-8", errors="replace")
+        try:
+            return _flight(journal, unread)
+        except (TypeError, AttributeError, IndexError, OverflowError, RecursionError) as error:
+            line = " ".join(str(error).split())
+            raise JournalError(f"{path}: is damaged: {line}") from error
 
 
 class _Applied(NamedTuple):
-    """The rows of the table `applied`, in columns."""
+    """The rows of the table `applied`, in columns; `holes` are where rows are missing."""
 
     place: NDArray[np.void]
     columns: Floats
     inhibits: tuple[str, ...]
     rate_l_ha: Floats
+    holes: list[Hole]
+    missing: int
 
 
 def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
@@ -74,14 +94,17 @@ def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
     east_m, north_m = setup.frame.to_local_all(latitude_deg.tolist(), longitude_deg.tolist())
     sensors = _sensors(journal, names, unread)
     events = _events(journal, unread)
-    return AppliedFlight(
+    changes, missing = read_changes(journal, len(setup.boom.valves), names, unread)
+    flight = AppliedFlight(
         path=journal.path,
         meta=meta,
         setup=setup,
         is_closed=meta.get("closed") == "yes",
-        lost=_lost(journal, len(events)),
+        lost=_lost(journal, len(events)) + applied.missing + sum(hole.rows for hole in missing),
         events=events,
-        utc_offset_s=float(meta["utc_offset_s"]),
+        utc_offset_s=clock_offset_s(
+            meta.get("utc_offset_s"), _at_start(meta), journal.path, unread
+        ),
         utc_source=_source(meta["utc_source"]),
         time_s=time_s,
         latitude_deg=latitude_deg,
@@ -96,11 +119,39 @@ def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
         target_flow_l_min=target,
         flow_l_min=flow,
         inhibits=applied.inhibits,
-        changes=_changes(journal, setup, names, unread),
+        changes=changes,
         meter_ml=sensors["FlowReport"],
         pressure_kpa=sensors["PressureReport"],
         tank_l=sensors["TankReport"],
         wind_m_s=sensors["WindReport"],
+    )
+    return _mended(flight, applied.holes, missing, unread)
+
+
+def _mended(
+    flight: AppliedFlight, samples: list[Hole], missing: list[Hole], unread: list[str] | None
+) -> AppliedFlight:
+    """Return the flight with closed valves, and a mark, where rows are missing."""
+    changes = flight.changes
+    if flight.setup.pumping is None and flight.meta.get("journal_version") != "1":
+        # Where a pump makes the flow, sections may stay open without any.
+        closed = closed_over(changes, (), missing)
+        missing = [*missing, *doubtful_holes(closed, flight.time_s, flight.flow_l_min)]
+    if not samples and not missing:
+        return flight
+    texts = [hole.text("samples") for hole in samples]
+    texts += [hole.text("valve changes") for hole in missing]
+    if unread is not None:
+        unread.extend(texts)
+    unseen = within(flight.time_s, samples)
+    return replace(
+        flight,
+        # Of a hole without numbers nobody knows how many rows it had: one at least.
+        lost=flight.lost + sum(not hole.rows for hole in [*samples, *missing]),
+        changes=closed_over(changes, samples, missing),
+        # A pump would go on over the gap as the last sample before it says.
+        flow_l_min=np.where(unseen, 0.0, flight.flow_l_min),
+        inhibits=marked(flight.inhibits, unseen | within(flight.time_s, missing)),
     )
 
 
@@ -108,50 +159,80 @@ def _source(text: str) -> Literal["autopilot", "computer"]:
     return "autopilot" if text == "autopilot" else "computer"
 
 
+def _at_start(meta: dict[str, str]) -> list[str]:
+    """Return the offset to UTC by the computer's clock at the start, if there is one."""
+    try:
+        without = {key: value for key, value in meta.items() if key != "utc_offset_s"}
+        return [migrated(without)["utc_offset_s"]]
+    except (KeyError, ValueError):
+        return []
+
+
 def _applied(journal: OpenJournal, valves: int, unread: list[str] | None) -> _Applied:
-    rows = list(_rows(journal.connection, _APPLIED, unread, "samples"))
-    sound = [row for row in rows if len(row[0]) == _POINT.itemsize]
-    place = np.frombuffer(b"".join(row[0] for row in sound), dtype=_POINT)
-    columns = np.array([row[1:8] for row in sound], dtype=np.float64).reshape(-1, 7).T
-    # Rows of one rate for all valves are one text, and there are few rates.
-    known: dict[str, Floats] = {}
-    rates = np.empty((len(sound), valves))
-    for i, row in enumerate(sound):
-        text = row[9]
-        found = known.get(text)
-        if found is None:
-            found = known[text] = np.array(json.loads(text or "[null]"), dtype=np.float64)
-        rates[i] = found
-    order = np.argsort(columns[0], kind="stable")
+    found = rows_of(
+        journal.connection, "applied", _APPLIED, key="sequence", unread=unread, what="samples"
+    )
+    rates: dict[object, list[float] | None] = {}
+    for row in found.rows:
+        # Rows of one rate for all valves are one text, and there are few rates.
+        if row[-1] not in rates:
+            rates[row[-1]] = rates_of(row[-1], valves)
+    rows = sound_rows(
+        found.rows, lambda row: is_sample(row) and rates[row[-1]] is not None, unread, "samples"
+    )
+    sequence: Ints = np.array([row[0] for row in rows], dtype=np.int64)
+    holes = sample_holes(
+        sequence, np.array([row[2] for row in rows], dtype=np.float64), _ends(journal)
+    )
+    count = int(journal.meta.get("rows_applied") or 0)
+    placed = [row for row in rows if row[1] is not None]
+    place = np.frombuffer(b"".join(row[1] for row in placed), dtype=_POINT)
+    columns = np.array([row[2:9] for row in placed], dtype=np.float64).reshape(-1, 7).T
+    sound = np.isfinite(place["lat"]) & np.isfinite(place["lon"])
+    order = np.flatnonzero(sound)[np.argsort(columns[0, sound], kind="stable")]
     return _Applied(
         place=place[order],
         columns=np.ascontiguousarray(columns[:, order]),
-        inhibits=tuple(" ".join(sorted((sound[i][8] or "").split())) for i in order.tolist()),
-        rate_l_ha=rates[order],
+        inhibits=tuple(" ".join(sorted((placed[i][9] or "").split())) for i in order.tolist()),
+        rate_l_ha=np.array(
+            [rates[placed[i][-1]] for i in order.tolist()], dtype=np.float64
+        ).reshape(-1, valves),
+        holes=holes,
+        missing=max(count - len(rows), 0),
     )
 
 
-def _rows(
-    connection: sqlite3.Connection, sql: str, unread: list[str] | None, what: str
-) -> Iterator[tuple[Any, ...]]:
-    """Yield the rows of a query; where the file is damaged, those before it."""
-    count = 0
-    try:
-        for row in connection.execute(sql):
-            count += 1
-            yield row
-    except sqlite3.DatabaseError as error:
-        if unread is None:
-            raise
-        unread.append(f"{what} behind the first {count}: {' '.join(str(error).split())}")
+def _ends(journal: OpenJournal) -> Sequence[tuple[float, float]]:
+    """Return number and time of the first and the last of all entries; nothing where unknown."""
+    if journal.version == "1":
+        return ()
+    found = []
+    for sql in (
+        "SELECT first_sequence, from_s FROM blocks ORDER BY first_sequence LIMIT 1",
+        "SELECT last_sequence, until_s FROM blocks ORDER BY first_sequence DESC LIMIT 1",
+    ):
+        try:
+            row = journal.connection.execute(sql).fetchone()
+        except sqlite3.DatabaseError:
+            continue
+        if row is not None and isinstance(row[0], int) and isinstance(row[1], float):
+            found.append((float(row[0]), row[1]))
+    return found
 
 
 def _events(journal: OpenJournal, unread: list[str] | None) -> tuple[Event, ...]:
-    sql = "SELECT time_s, kind, text FROM events ORDER BY sequence"
+    found = rows_of(
+        journal.connection,
+        "events",
+        "time_s, kind, text",
+        key="sequence",
+        unread=unread,
+        what="events",
+    )
     return tuple(
         # SQLite keeps no NaN: a time that was none comes back as missing.
-        Event(at_s=_NAN if at_s is None else at_s, kind=kind, text=text)
-        for at_s, kind, text in _rows(journal.connection, sql, unread, "events")
+        Event(at_s=_NAN if at_s is None else float(at_s), kind=kind, text=text)
+        for _, at_s, kind, text in sound_rows(found.rows, is_event, unread, "events")
     )
 
 
@@ -195,40 +276,3 @@ def _series(rows: list[tuple[float, float | None]]) -> Series | None:
     time_s, value = np.array(rows, dtype=np.float64).T
     order = np.argsort(time_s, kind="stable")
     return Series(time_s=time_s[order], value=value[order])
-
-
-def _changes(
-    journal: OpenJournal, setup: Setup, names: FieldNames, unread: list[str] | None
-) -> ValveChanges:
-    """Return the changes of all valves in the order of time in which they came about."""
-    if journal.version == "1":
-        rows: list[Row] = list(_planned(journal, names, unread))
-    else:
-        sql = "SELECT planned_us, actual_us, valve, duty_permille FROM valve_changes ORDER BY id"
-        rows = list(_rows(journal.connection, sql, unread, "valve changes"))
-    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    planned_s, actual_s = table[:, 0] * _MICRO, table[:, 1] * _MICRO
-    valve = table[:, 2].astype(np.int64)
-    if len(valve) and not (valve.min() >= 0 and valve.max() < len(setup.boom.valves)):
-        raise JournalError(f"{journal.path}: is damaged: a change of a valve that does not exist")
-    # What no plan asked for (a fault that closed) has its real time only.
-    planned_s = np.where(np.isnan(planned_s), actual_s, planned_s)
-    order = np.argsort(np.where(np.isnan(actual_s), planned_s, actual_s), kind="stable")
-    return ValveChanges(
-        planned_s=planned_s[order],
-        actual_s=actual_s[order],
-        valve=valve[order],
-        duty=table[order, 3] / 1000.0,
-    )
-
-
-def _planned(journal: OpenJournal, names: FieldNames, unread: list[str] | None) -> Iterator[Row]:
-    made = ValveRows()
-    entries = read_entries(
-        journal.connection, journal.version, kinds={Decision.__name__}, unread=unread
-    )
-    for entry in entries:
-        decision = decode(entry.body, names)
-        if isinstance(decision, Decision):
-            yield from made.take_plan(decision.plan)
-    yield from made.end()

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from analysis.report.definitions import CAUSES
 from analysis.report.figures import ground, lags, over_time, spread
+from analysis.report.figures.sheet import sheet_of
 from analysis.report.figures.treated_map import treated_area
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 def drawn_of(assessment: Assessment, clock: Clock, treated: Treated) -> Iterator[Drawn]:
     """Yield every figure that this flight gives something to draw for."""
     flight, cells = assessment.flight, assessment.cells
-    sheet = None if cells is None else ground.sheet_of(flight, cells)
+    sheet = None if cells is None else sheet_of(flight, cells)
     if sheet is not None:
         yield ground.prescribed_and_applied(sheet)
         yield ground.deviation(sheet)

@@ -22,7 +22,7 @@ from companion.record.retention import Rules, prune, space_of
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
-    help="Journals of flights: list, show, remaining, pin, prune, recover.",
+    help="Journals of flights: list, show, remaining, pin, unpin, prune, recover.",
     epilog="Example: vrspray flights list --folder flights",
 )
 FAILED = 1
@@ -106,6 +106,7 @@ def prune_flights(
     where, rules = _place(folder, config_file)
     removals = prune(where, rules, now_utc_s=time.time(), is_dry_run=is_dry_run)
     verb = "would go" if is_dry_run else "removed"
+    failed = [each for each in removals if each.problem is not None]
     result = {
         "folder": str(where),
         "is_dry_run": is_dry_run,
@@ -113,10 +114,14 @@ def prune_flights(
             {"file": str(each.flight.path), "size_bytes": each.flight.size_bytes}
             | {"reason": each.reason}
             for each in removals
+            if each.problem is None
         ],
+        "failed": [{"file": str(each.flight.path), "problem": each.problem} for each in failed],
     }
-    lines = [f"{each.flight.path.name}: {verb}: {each.reason}" for each in removals]
+    lines = [f"{each.flight.path.name}: {each.problem or verb}: {each.reason}" for each in removals]
     answer(result, lines or ["nothing to remove"], as_json=as_json)
+    if failed:
+        raise typer.Exit(FAILED)
 
 
 @app.command(epilog="Example: vrspray flights recover --folder flights")

@@ -8,8 +8,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from companion.errors import JournalError
+from companion.errors import JournalError, NoMapError
+from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
+from companion.record.totals import missing_rows
 from companion.record.versions import OtherVersionError, read_entries
 
 # In `meta` for programs, or shown elsewhere.
@@ -58,6 +60,7 @@ def _shown(meta: Mapping[str, str]) -> dict[str, str]:
 def _fill(result: dict[str, Any], journal: OpenJournal) -> None:
     unread: list[str] = result["unread"]
     result["meta"] = _shown(journal.meta)
+    unread += journal.unread
     kinds: Counter[str] = Counter()
     result["entries"] = kinds
     connection = journal.connection
@@ -71,8 +74,11 @@ def _fill(result: dict[str, Any], journal: OpenJournal) -> None:
         unread.append(f"inputs and decisions behind the first {kinds.total()}: {error}")
     try:
         journal.setup()
-    except (ValueError, KeyError) as error:
-        unread.append(f"the set-up: {error}")
+    except NoMapError as error:
+        unread.append(str(error).partition("is damaged: ")[2])
+    except DAMAGE as error:
+        unread.append(f"the set-up: {one_line(error)}")
+    unread += missing_rows(connection, journal.meta)
     there = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
     for name in _COUNTED:
         if name in there:

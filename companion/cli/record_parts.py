@@ -15,6 +15,7 @@ from companion.output.none import DryRunExecutor
 from companion.output.timed import TimedExecutor
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
+from companion.record.read_only import DAMAGE, one_line
 from companion.record.recovery import recover_folder
 from companion.record.retention import WARN_FREE_PERCENT, Rules, prune, space_of
 
@@ -42,10 +43,14 @@ def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
     try:
         for found in recover_folder(folder):
             yield f"journal: {found.path.name}: {found.outcome}: {found.text}"
+    except (JournalError, *DAMAGE) as error:
+        yield f"warning: journal: {one_line(error)}"
+    try:
         for removal in prune(folder, rules_of(journal), now_utc_s=time.time()):
-            yield f"journal: {removal.flight.path.name}: removed: {removal.reason}"
-    except JournalError as error:
-        yield f"warning: journal: {error}"
+            what = removal.problem or "removed"
+            yield f"journal: {removal.flight.path.name}: {what}: {removal.reason}"
+    except (JournalError, *DAMAGE) as error:
+        yield f"warning: journal: {one_line(error)}"
     space = space_of(folder)
     if space.free_bytes < FREE_MIN_BYTES:
         raise JournalError(

@@ -3,7 +3,8 @@
 As a section controller does it: a valve is closed while at least a percentage of its strip's width
 is treated. The cut lies on the boundary of the treated ground, and the schedule orders it as any
 boundary inside the field, each change ahead of it by its own lag. Ground that was treated a moment
-ago is not looked at: a valve does not see its own wake. The guard only ever closes.
+ago, or on the last metres of the boom's way, is not looked at: no valve sees its own wake, nor that
+of one that sits ahead of it. The guard only ever closes.
 """
 
 from __future__ import annotations
@@ -35,6 +36,11 @@ ACROSS_MIN = 5
 # Treated or bare stretches of a way that are shorter are the raster's own noise, or slivers: half
 # of a strip of 1 m.
 STRETCH_MIN_M = 0.5
+# Ground of the last metres of the way is the wake of this very pass: as far as the boom's strips lie
+# one behind the other, a raster's cell, and a gust or two. Whoever has strips farther apart than
+# any aircraft is long has a wrong figure, and half a field is not left unlooked at for it.
+WAKE_MARGIN_M = 1.0
+WAKE_MAX_M = 25.0
 # Below this nothing is sprayed: a way that hardly leads anywhere has no stretches.
 WAY_MIN_M = 0.05
 WAY_MAX_M = 500.0
@@ -42,7 +48,10 @@ WAY_MAX_M = 500.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OverlapGuard:
-    """A valve is closed where this much of its strip was treated more than `fresh_s` ago."""
+    """A valve is closed where this much of its strip was treated more than `fresh_s` ago.
+
+    And farther back on the way than the boom's own wake: see `wake_m`.
+    """
 
     switch_off_percent: float
     fresh_s: float = 2.0
@@ -55,6 +64,12 @@ class OverlapGuard:
         # Longer than a swath under the widest boom takes, shorter than its snapshots are kept.
         if not 0.5 <= self.fresh_s <= 5.0:
             raise ValueError(f"fresh_s must lie in [0.5, 5] s, got {self.fresh_s}")
+
+
+def wake_m(boom: Boom) -> float:
+    """Return on how much of the last way what is treated is this pass's own."""
+    spread_m = float(boom.forward_m.max() - boom.forward_m.min())
+    return min(spread_m + WAKE_MARGIN_M, WAKE_MAX_M)
 
 
 def guarded(
@@ -70,13 +85,19 @@ def guarded(
     guard = setup.overlap
     if guard is None or all(each.rate_l_ha is None for route in routes for each in route):
         return routes
-    seen = None if memory.swath is None else memory.swath.before(now_s - guard.fresh_s)
-    treated = seen if seen is not None else setup.treated
-    if treated is None or _is_far(setup, treated, state):
-        return routes
     if drift_m is not None:
         state = landed(state, drift_m)
     boom = setup.boom
+    seen = None
+    if memory.swath is not None:
+        # The paths begin behind the boom, and their beginning is looked at too.
+        speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+        behind_m = wake_m(boom) + speed_m_s * setup.back_s
+        here = (state.east_m, state.north_m)
+        seen = memory.swath.before(now_s - guard.fresh_s, here=here, behind_m=behind_m)
+    treated = seen if seen is not None else setup.treated
+    if treated is None or _is_far(setup, treated, state):
+        return routes
     paths = predict(state, boom.right_m, boom.forward_m, back_s=setup.back_s, ahead_s=setup.ahead_s)
     lag = setup.lag
     # So near to a border its stricter rule holds for the guard's changes too.

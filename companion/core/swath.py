@@ -21,9 +21,12 @@ import numpy as np
 
 from companion.core.coverage import Coverage, Place, Quad
 from companion.core.drives import liquid_of
+from companion.core.overlap_guard import wake_m
 from companion.core.types import FaultKind, Finding, SprayPlan, VehicleState
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from companion.core.boom import Boom
     from companion.core.controller import Memory, Setup
     from companion.core.drift import Offset
@@ -34,6 +37,8 @@ STAMP_EVERY_S = 2.0
 # States nearer than this add nothing to the way between them: within 0.2 s of braking by 2.5 m/s2
 # a place between two is off by a centimetre.
 FRONT_STEP_M = 0.8
+# However slowly it flies: well below what counts as a gap.
+FRONT_EVERY_S = 0.5
 # So far a tip of the boom may be off a straight piece: below the noise of an RTK position.
 STRAIGHT_M = 0.03
 NEAR_M = 1e-6
@@ -42,8 +47,10 @@ GAP_MAX_S = 1.0
 JUMP_MAX_M = 25.0
 # Strips of neighbours that touch to this are one.
 TOUCH_M = 0.01
-# Snapshots that are kept for whoever wants to know what was treated some time ago.
+# Snapshots that are kept for whoever wants to know what was treated some time ago. Two of them
+# are a stamp's time and a fifth of the wake apart, so seven go back beyond both.
 SNAPSHOTS_MAX = 8
+SNAPSHOT_WAKES = 0.2
 
 # Found in the liquid: nothing, or not what was ordered, comes out.
 NO_LIQUID = frozenset({FaultKind.NO_FLOW, FaultKind.PUMP_OFF, FaultKind.TANK_EMPTY, FaultKind.AIR})
@@ -66,35 +73,65 @@ class Toggle(NamedTuple):
     opens: bool
 
 
+class Snapshot(NamedTuple):
+    """All that had been treated until a time, when the boom had come `way_m` far."""
+
+    until_s: float
+    way_m: float
+    coverage: Coverage
+
+
 class Swath(NamedTuple):
     """What has been treated, and the way that is not yet stamped.
 
     `fronts` begin with the last stamp, `is_open` holds there; `toggles` come later, in the order of
-    their orders. `ordered` is what was ordered last. `older` are coverages and until when each
-    tells all that was treated.
+    their orders. `ordered` is what was ordered last. `way_m` is how far the boom had come at
+    `place` (east, north); what it flew closed counts as straight.
     """
 
     coverage: Coverage
-    older: tuple[tuple[float, Coverage], ...] = ()
+    older: tuple[Snapshot, ...] = ()
     fronts: tuple[Front, ...] = ()
     is_open: tuple[bool, ...] = ()
     ordered: tuple[bool, ...] = ()
     toggles: tuple[Toggle, ...] = ()
+    way_m: float = 0.0
+    place: Place | None = None
 
-    def before(self, at_s: float) -> Coverage | None:
-        """Return what had been treated by some time before `at_s`, the newest that is known."""
+    def before(self, at_s: float, *, here: Place, behind_m: float) -> Coverage | None:
+        """Return what had been treated by some time before `at_s`, the newest that is known.
+
+        And before the boom came nearer than `behind_m`, along its way, to where it is now.
+        """
+        way_m = self.came_m([*((x, y) for _, x, y, _ in self.fronts), here]) - behind_m
         found = None
-        for until_s, coverage in self.older:
-            if until_s <= at_s:
+        for until_s, at_m, coverage in self.older:
+            if until_s <= at_s and at_m <= way_m:
                 found = coverage
         return found
+
+    def came_m(self, places: Iterable[Place]) -> float:
+        """Return how far the boom has come when it has gone on through these places."""
+        way_m, last = self.way_m, self.place
+        for place in places:
+            if last is not None:
+                way_m += math.dist(last, place)
+            last = place
+        return way_m
+
+    def come(self, *more: Front) -> Swath:
+        """Return the swath with the way through its fronts and those ahead counted."""
+        places = [(x, y) for _, x, y, _ in (*self.fronts, *more)]
+        if not places:
+            return self
+        return self._replace(way_m=self.came_m(places), place=places[-1])
 
 
 def begin(setup: Setup) -> Swath:
     """Return the swath of a flight that has not sprayed yet."""
     treated = setup.treated or Coverage()
     shut = (False,) * len(setup.boom.valves)
-    return Swath(treated, ((-math.inf, treated),), (), shut, shut)
+    return Swath(treated, (Snapshot(-math.inf, -math.inf, treated),), (), shut, shut)
 
 
 def follow(
@@ -117,12 +154,12 @@ def follow(
     swath = _ordered(setup, swath, plan, findings, now_s)
     is_at_work = any(swath.is_open) or any(swath.ordered) or bool(swath.toggles)
     if not (is_at_work or (plan is not None and plan.opens)):
-        return swath._replace(fronts=()) if swath.fronts else swath
+        return swath.come()._replace(fronts=()) if swath.fronts else swath
     front = _front(state, drift_m)
     if front is None or not swath.fronts:
         return _broken_off(setup, swath, front, now_s)
     if not is_at_work:
-        return swath._replace(fronts=(front,))
+        return swath.come(front)._replace(fronts=(front,))
     return _moved(setup, swath, front, now_s)
 
 
@@ -144,9 +181,9 @@ def _stays_so(
         if change.at_s <= now_s and (change.duty > 0.0) is not ordered[change.valve]:
             return False
     # With a wind's offset that moved meanwhile this is a little off, and no more than that.
-    _, east_m, north_m, _ = swath.fronts[-1]
+    last_s, east_m, north_m, _ = swath.fronts[-1]
     away_m = abs(state.east_m - east_m) + abs(state.north_m - north_m)
-    return away_m < FRONT_STEP_M
+    return away_m < FRONT_STEP_M and state.time_s - last_s < FRONT_EVERY_S
 
 
 def _moved(setup: Setup, swath: Swath, front: Front, now_s: float) -> Swath:
@@ -156,7 +193,9 @@ def _moved(setup: Setup, swath: Swath, front: Front, now_s: float) -> Swath:
         return _broken_off(setup, swath, front, now_s)
     if now_s - swath.fronts[0].time_s >= STAMP_EVERY_S:
         return _stamped(setup.boom, swath, front)
-    return swath._replace(fronts=(*swath.fronts, front)) if moved_m >= FRONT_STEP_M else swath
+    if moved_m < FRONT_STEP_M and front.time_s - last.time_s < FRONT_EVERY_S:
+        return swath
+    return swath._replace(fronts=(*swath.fronts, front))
 
 
 def expected(
@@ -299,7 +338,7 @@ def _broken_off(setup: Setup, swath: Swath, front: Front | None, now_s: float) -
         swath = _stamped(setup.boom, swath._replace(fronts=swath.fronts[:-1]), swath.fronts[-1])
     is_open, toggles = _open_at(swath.is_open, swath.toggles, now_s)
     fronts = () if front is None else (front,)
-    return swath._replace(fronts=fronts, is_open=is_open, toggles=toggles)
+    return swath.come(*fronts)._replace(fronts=fronts, is_open=is_open, toggles=toggles)
 
 
 def _open_at(
@@ -324,14 +363,24 @@ def _stamped(boom: Boom, swath: Swath, front: Front) -> Swath:
         stays = _stays(swath, fronts[0].time_s, end_s)
         quads = [quad for strip in _strips(boom, stays) for quad in way.quads(*strip)]
         coverage = coverage.stamped(quads)
+    come = swath.come(front)
     return Swath(
         coverage=coverage,
-        older=(*swath.older, (end_s, coverage))[-SNAPSHOTS_MAX:],
+        older=_kept(swath.older, Snapshot(end_s, come.way_m, coverage), wake_m(boom)),
         fronts=fronts[-1:],
         is_open=is_open,
         ordered=swath.ordered,
         toggles=later,
+        way_m=come.way_m,
+        place=come.place,
     )
+
+
+def _kept(older: tuple[Snapshot, ...], new: Snapshot, behind_m: float) -> tuple[Snapshot, ...]:
+    """Return the snapshots with a new one, instead of the last where that is still near."""
+    if len(older) > 1 and older[-1].way_m - older[-2].way_m < SNAPSHOT_WAKES * behind_m:
+        older = older[:-1]
+    return (*older, new)[-SNAPSHOTS_MAX:]
 
 
 # From when until when liquid comes out of one valve.

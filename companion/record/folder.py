@@ -6,17 +6,17 @@ A flight that has ended is never written into: a pin is an empty file beside it.
 from __future__ import annotations
 
 import re
-import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
 
 from companion.errors import JournalError
 from companion.record.content_hash import log_of
+from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
+from companion.record.totals import applied_l
 from companion.record.versions import OtherVersionError
 
 _NAME = re.compile(r"flight-\d+(\.salvaged)?\.gpkg")
-_GAP_MAX_S = 1.0
 _STATES = {"yes": "closed", "no": "cut", "recovered": "recovered", "salvaged": "salvaged"}
 _SPANS = {
     "1": "SELECT min(time_s), max(time_s) FROM records",
@@ -52,9 +52,16 @@ class Flight:
 
 
 def journals(folder: Path) -> list[Path]:
-    """Return the journals in their order; JournalError for a folder that cannot be read."""
+    """Return the journals in their order; JournalError for a folder that cannot be read.
+
+    A folder or a dangling link of such a name is none.
+    """
     try:
-        names = sorted(entry.name for entry in folder.iterdir() if _NAME.fullmatch(entry.name))
+        names = [
+            entry.name
+            for entry in folder.iterdir()
+            if _NAME.fullmatch(entry.name) and entry.is_file()
+        ]
     except OSError as error:
         raise JournalError(
             f"{folder}: cannot be read ({error.strerror}); name the folder of the flights"
@@ -69,9 +76,10 @@ def _number(name: str) -> tuple[int, str]:
 
 def look_at(path: Path) -> Flight:
     """Return what can be told of a journal without reading all of it."""
-    size_bytes = sum(file.stat().st_size for file in (path, log_of(path)) if file.exists())
-    is_pinned = pin_of(path).exists()
+    size_bytes, is_pinned = 0, False
     try:
+        size_bytes = sum(file.stat().st_size for file in (path, log_of(path)) if file.exists())
+        is_pinned = pin_of(path).exists()
         with opened(path, is_lenient=True) as journal:
             return _flight(journal, size_bytes=size_bytes, is_pinned=is_pinned)
     except OtherVersionError as error:
@@ -79,6 +87,8 @@ def look_at(path: Path) -> Flight:
     except JournalError as error:
         problem = str(error)
         state = "open" if "still writes it" in problem else "damaged"
+    except OSError as error:
+        state, problem = "damaged", f"{path}: cannot be read: {error.strerror}"
     return Flight(
         path=path,
         size_bytes=size_bytes,
@@ -89,37 +99,28 @@ def look_at(path: Path) -> Flight:
 
 
 def _flight(journal: OpenJournal, *, size_bytes: int, is_pinned: bool) -> Flight:
-    meta, problem = journal.meta, None
-    duration_s = applied_l = None
+    meta, problems = journal.meta, list(journal.unread)
+    duration_s = litres = started_utc_s = None
     try:
+        started_utc_s = float(meta["started_s"]) + float(meta["utc_offset_s"])
         first_s, last_s = journal.connection.execute(_SPANS[journal.version]).fetchone()
-        duration_s = None if first_s is None else last_s - first_s
-        applied_l = _applied_l(journal.connection)
-    except sqlite3.DatabaseError as error:
-        problem = f"{journal.path}: is damaged: {' '.join(str(error).split())}"
+        duration_s = None if first_s is None else float(last_s) - float(first_s)
+        litres = applied_l(journal.connection, meta)
+    except DAMAGE as error:
+        problems.append(one_line(error))
+    state = _STATES.get(meta.get("closed", ""), "damaged")
     return Flight(
         path=journal.path,
         size_bytes=size_bytes,
-        state="damaged" if problem else _STATES.get(meta.get("closed", ""), "damaged"),
+        state="damaged" if problems else state,
         is_pinned=is_pinned,
-        started_utc_s=float(meta["started_s"]) + float(meta["utc_offset_s"]),
-        utc_source=meta["utc_source"],
+        started_utc_s=started_utc_s,
+        utc_source=meta.get("utc_source"),
         duration_s=duration_s,
-        applied_l=applied_l,
+        applied_l=litres,
         training=meta.get("training"),
-        problem=problem,
+        problem=f"{journal.path}: is damaged: {'; '.join(problems)}" if problems else None,
     )
-
-
-def _applied_l(connection: sqlite3.Connection) -> float:
-    """Return what the ordered duties stand for in litres: not a measurement."""
-    applied_l, before_s, flow_l_min = 0.0, None, 0.0
-    rows = connection.execute("SELECT time_s, flow_l_min FROM applied ORDER BY sequence")
-    for at_s, flow in rows:
-        if before_s is not None and at_s is not None and 0.0 < at_s - before_s < _GAP_MAX_S:
-            applied_l += flow_l_min * (at_s - before_s) / 60.0
-        before_s, flow_l_min = at_s, flow or 0.0
-    return applied_l
 
 
 def pin_of(path: Path) -> Path:

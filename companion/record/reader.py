@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import sqlite3
-import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
 from companion.core.controller import Setup
 from companion.core.types import Decision, Input
-from companion.errors import JournalError
+from companion.errors import JournalError, NoMapError
 from companion.record.blocks import Entry
 from companion.record.codec import FieldNames, decode
-from companion.record.content_hash import log_of
 from companion.record.coverage_table import read_treated
 from companion.record.events import Event
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import read_ground
+from companion.record.read_only import DAMAGE, one_line, read_only, tolerate_damage
+from companion.record.salvage import readable_rows
 from companion.record.setup_json import field_names_of, setup_from_json
-from companion.record.versions import check_version, migrated, read_entries
+from companion.record.totals import missing_rows
+from companion.record.versions import (
+    JOURNAL_VERSION,
+    check_version,
+    migrated,
+    missing_tables,
+    read_entries,
+)
 
-__all__ = ["Entry", "JournalContent", "opened", "read_journal"]
+__all__ = ["Entry", "JournalContent", "OpenJournal", "opened", "read_journal"]
+
+# Without these `meta` says too little of a flight.
+_NEEDED = frozenset({"closed", "lost", "setup", "started_s", "started_utc"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +67,7 @@ class JournalContent:
         try:
             value = decode(entry.body, self.field_names)
         except (ValueError, TypeError, RecursionError) as error:
-            raise JournalError(f"{self.path}: row {entry.sequence}: {_line(error)}") from error
+            raise JournalError(f"{self.path}: row {entry.sequence}: {one_line(error)}") from error
         if type(value).__name__ != entry.kind:
             raise JournalError(f"{self.path}: row {entry.sequence} is no {entry.kind}")
         return cast("Input | Decision", value)
@@ -71,18 +79,44 @@ class JournalContent:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OpenJournal:
-    """A journal that is open for reading: its tables by SQL, what it says of itself in `meta`."""
+    """A journal that is open for reading: its tables by SQL, what it says of itself in `meta`.
+
+    `unread` says what was found to be damaged in opening it; empty for a strict reader.
+    """
 
     path: Path
     connection: sqlite3.Connection
     meta: dict[str, str]
     version: str
+    unread: tuple[str, ...] = ()
 
     def setup(self) -> Setup:
-        """Return all that was constant in the flight; ValueError where it is damaged."""
-        setup = setup_from_json(self.meta["setup"], read_ground(self.connection))
+        """Return all that was constant in the flight; ValueError where it is damaged.
+
+        Where only the map is: a NoMapError, in one line with what else can be read.
+        """
+        try:
+            ground = read_ground(self.connection)
+        except DAMAGE as error:
+            raise NoMapError(
+                f"{self.path}: is damaged: no map: its zones or its field cannot be read "
+                f"({one_line(error)}); {_extent(self.connection)}"
+            ) from error
+        setup = setup_from_json(self.meta["setup"], ground)
         treated = read_treated(self.connection)
         return setup if treated is None else replace(setup, treated=treated)
+
+
+def _extent(connection: sqlite3.Connection) -> str:
+    """Return in words what there is without a map."""
+    parts = []
+    for table in ("blocks", "applied", "valve_changes", "events"):
+        try:
+            (count,) = connection.execute(f"SELECT count(*) FROM {table}").fetchone()
+        except sqlite3.DatabaseError:
+            continue
+        parts.append(f"{count} rows of {table}")
+    return f"{', '.join(parts) or 'nothing else'} can be read; see vrspray flights show"
 
 
 def read_journal(path: Path, *, is_lenient: bool = False) -> JournalContent:
@@ -100,65 +134,88 @@ def opened(path: Path, *, is_lenient: bool = False) -> Iterator[OpenJournal]:
     if not path.is_file():
         raise JournalError(f"{path}: there is no such file; give the .gpkg file of a flight")
     try:
-        with _connect(path) as connection:
+        with read_only(path) as connection:
             yield _checked(path, connection, is_lenient=is_lenient)
     except sqlite3.OperationalError as error:
         if "locked" in str(error):
             raise JournalError(
                 f"{path}: its flight still writes it; end the flight first"
             ) from error
-        raise JournalError(f"{path}: cannot be read: {_line(error)}") from error
+        raise JournalError(f"{path}: cannot be read: {one_line(error)}") from error
     except sqlite3.DatabaseError as error:
         if "not a database" in str(error):
             raise JournalError(f"{path}: is no journal; give the .gpkg file of a flight") from error
-        raise JournalError(f"{path}: is damaged: {_line(error)}") from error
-    except (OSError, ValueError, KeyError) as error:
-        raise JournalError(f"{path}: is damaged: {_line(error)}") from error
-
-
-def _line(error: Exception) -> str:
-    """Return an error's text in one line; SQLite's findings have several."""
-    return " ".join(str(error).split())
-
-
-@contextmanager
-def _connect(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open for reading only: what a crash left (the -wal file beside it) is read, not changed."""
-    log, index = log_of(path), path.with_name(path.name + "-shm")
-    with ExitStack() as at_end:
-        folder = at_end.enter_context(tempfile.TemporaryDirectory(prefix="vrspray-"))
-        source = path
-        if log.exists() and not index.exists():
-            # SQLite makes one to read the log by, and leaves it; nobody needs it any more.
-            at_end.callback(index.unlink, missing_ok=True)
-        if log.exists() and not os.access(path.parent, os.W_OK):
-            # SQLite needs a shared-memory file beside a log: read a copy.
-            for file in (path, log):
-                shutil.copy(file, folder)
-            source = Path(folder) / path.name
-        uri = f"{source.resolve().as_uri()}?mode=ro"
-        yield at_end.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=1.0)))
+        raise JournalError(f"{path}: is damaged: {one_line(error)}") from error
+    except DAMAGE as error:
+        raise JournalError(f"{path}: is damaged: {one_line(error)}") from error
 
 
 def _checked(path: Path, connection: sqlite3.Connection, *, is_lenient: bool) -> OpenJournal:
-    # Through SQLite and not by opening the file: closing a file of its own would give up the locks
-    # that a writer in the same process holds on it (POSIX).
-    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
+    unread: list[str] = []
+    try:
+        application_id, tables = _register(connection)
+    except sqlite3.DatabaseError as error:
+        # Its subclasses are no damage: locked, cannot be opened.
+        if not is_lenient or type(error) is not sqlite3.DatabaseError:
+            raise
+        tolerate_damage(connection)
+        application_id, tables = _register(connection)
+        unread.append(f"the file is shorter than it was, or damaged: {one_line(error)}")
+    if application_id != APPLICATION_ID:
         raise JournalError(f"{path}: is no journal; give the .gpkg file of a flight")
-    tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
     if "meta" not in tables:
         raise JournalError(f"{path}: is a GeoPackage, but no journal of a flight")
-    meta = dict(connection.execute("SELECT key, value FROM meta").fetchall())
-    version = check_version(path, meta, tables)
-    if not is_lenient:
+    meta = _meta(connection, tables, unread if is_lenient else None)
+    version = check_version(path, meta, tables, is_lenient=is_lenient)
+    if is_lenient:
+        unread += [f"the table {table} is missing" for table in missing_tables(version, tables)]
+        unread += [
+            f"what the flight said of {key} is missing" for key in sorted(_NEEDED - meta.keys())
+        ]
+    else:
         (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
         if verdict != "ok":
             raise ValueError(verdict)
-    return OpenJournal(path=path, connection=connection, meta=migrated(meta), version=version)
+    return OpenJournal(
+        path=path,
+        connection=connection,
+        meta=migrated(meta),
+        version=version,
+        unread=tuple(unread),
+    )
+
+
+def _register(connection: sqlite3.Connection) -> tuple[int, set[str]]:
+    """Return the application's number and the tables.
+
+    Through SQLite and not by opening the file: closing a file of its own would give up the locks
+    that a writer in the same process holds on it (POSIX).
+    """
+    (application_id,) = connection.execute("PRAGMA application_id").fetchone()
+    return application_id, {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+
+
+def _meta(
+    connection: sqlite3.Connection, tables: set[str], unread: list[str] | None
+) -> dict[str, str]:
+    """Return what the journal says of itself; with `unread` as far as that can be read."""
+    try:
+        return dict(connection.execute("SELECT key, value FROM meta").fetchall())
+    except sqlite3.DatabaseError as error:
+        if unread is None or "locked" in str(error):
+            raise
+        unread.append(f"meta: {one_line(error)}")
+    rows = list(readable_rows(connection, "meta", [True]))
+    found = {str(row[-2]): str(row[-1]) for row in rows}
+    if "blocks" in tables:
+        found.setdefault("journal_version", JOURNAL_VERSION)
+    return found
 
 
 def _read(journal: OpenJournal, *, is_lenient: bool) -> JournalContent:
-    unread: list[str] = []
+    unread = list(journal.unread)
+    if is_lenient:
+        unread += missing_rows(journal.connection, journal.meta)
     entries, events = [], []
     try:
         for entry in read_entries(
@@ -168,7 +225,7 @@ def _read(journal: OpenJournal, *, is_lenient: bool) -> JournalContent:
     except sqlite3.DatabaseError as error:
         if not is_lenient:
             raise
-        unread.append(f"rows behind {entries[-1].sequence if entries else 0}: {_line(error)}")
+        unread.append(f"rows behind {entries[-1].sequence if entries else 0}: {one_line(error)}")
     marks = "SELECT sequence, time_s, kind, text FROM events ORDER BY sequence"
     last = entries[-1].sequence if entries else 0
     try:
@@ -180,7 +237,7 @@ def _read(journal: OpenJournal, *, is_lenient: bool) -> JournalContent:
     except sqlite3.DatabaseError as error:
         if not is_lenient:
             raise
-        unread.append(f"events behind the first {len(events)}: {_line(error)}")
+        unread.append(f"events behind the first {len(events)}: {one_line(error)}")
     return JournalContent(
         path=journal.path,
         meta=journal.meta,

@@ -1,13 +1,15 @@
 """After a crash or a cut of power: the log that was left beside a journal becomes part of it.
 
-SQLite itself takes every transaction whose frames are whole and leaves out the rest. What it
-cannot open is kept as it is, and a copy is made of all rows that can still be read.
+SQLite itself takes every transaction whose frames are whole and leaves out the rest. A journal is
+looked at first without writing; what is damaged stays as it is, to the byte, and a copy is made of
+all rows that can still be read.
 """
 
 from __future__ import annotations
 
 import sqlite3
 import time
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,16 +19,19 @@ from companion.record.content_hash import log_of
 from companion.record.folder import journals
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import box_of_points, set_box
+from companion.record.read_only import DAMAGE, one_line, read_only
 from companion.record.salvage import salvage, salvaged_name
+from companion.record.totals import totals_of
+from companion.record.versions import OtherVersionError, check_version
 from companion.record.writer import SET_META, tell_times_again
 
-_FAILURES = (sqlite3.Error, OSError, ValueError)
+_OPEN = ("open", "its flight still writes it")
 _KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recovery:
-    """What became of one journal: recovered, open (left alone), salvaged or failed."""
+    """What became of one journal: recovered, open or other-version (left alone), salvaged, failed."""
 
     path: Path
     outcome: str
@@ -37,6 +42,15 @@ class Recovery:
     def is_good(self) -> bool:
         """Whether nothing is left to be done by hand."""
         return self.outcome in ("recovered", "open")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Ending:
+    """What the flight itself would have written at its end; `time` is (offset, known since)."""
+
+    box: tuple[float, float, float, float] | None
+    time: tuple[float, float] | None
+    totals: Mapping[str, str]
 
 
 def recover_folder(folder: Path) -> list[Recovery]:
@@ -51,76 +65,107 @@ def recover_folder(folder: Path) -> list[Recovery]:
 def recover(path: Path) -> Recovery | None:
     """Recover one journal; None where there is nothing to recover."""
     began_s = time.perf_counter()
+    told = _recovered(path)
+    if told is None:
+        return None
+    outcome, text = told
+    return Recovery(path=path, outcome=outcome, text=text, took_s=time.perf_counter() - began_s)
 
+
+def _recovered(path: Path) -> tuple[str, str] | None:
+    """Return what became of a journal, and what is said of it."""
     try:
-        with closing(_connect(path)) as connection:
-            if not _is_left(connection, path):
-                return None
-            _fold_in(connection)
-        # Of somebody who looked at the cut file and did not end well either.
-        path.with_name(path.name + "-shm").unlink(missing_ok=True)
-        outcome, text = "recovered", "what was committed is there"
-    except _FAILURES as error:
-        reason = " ".join(str(error).split())
-        if isinstance(error, sqlite3.OperationalError) and "locked" in reason:
-            outcome, text = "open", "its flight still writes it"
-        elif salvaged_name(path).exists():
-            return None
-        else:
-            outcome, text = _salvaged(path, reason)
-    took_s = time.perf_counter() - began_s
-    return Recovery(path=path, outcome=outcome, text=text, took_s=took_s)
+        is_left, ending = _looked_at(path)
+    except OtherVersionError as error:
+        return "other-version", f"{error}; it was cut and is left alone"
+    except (JournalError, *DAMAGE) as error:
+        if _is_locked(error):
+            return _OPEN
+        return None if salvaged_name(path).exists() else _salvaged(path, one_line(error))
+    return _folded_in(path, ending) if is_left else None
+
+
+def _folded_in(path: Path, ending: _Ending | None) -> tuple[str, str]:
+    try:
+        _fold_in(path, ending)
+    except DAMAGE as error:
+        return _OPEN if _is_locked(error) else ("failed", f"{one_line(error)}; it can be read")
+    return "recovered", "what was committed is there"
+
+
+def _is_locked(error: Exception) -> bool:
+    return isinstance(error, sqlite3.OperationalError) and "locked" in str(error)
+
+
+def _looked_at(path: Path) -> tuple[bool, _Ending | None]:
+    """Return whether a flight ended here without closing its journal, and how it ended then.
+
+    Nothing is written. What is damaged, or no journal, is an error.
+    """
+    with read_only(path, timeout_s=0.0) as connection:
+        if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
+            raise ValueError("is no journal")
+        meta = dict(connection.execute("SELECT key, value FROM meta").fetchall())
+        closed = meta.get("closed")
+        if closed not in (None, "no") and not log_of(path).exists():
+            return False, None
+        tables = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+        check_version(path.name, meta, tables)
+        if closed is None:
+            raise ValueError("does not say whether it was closed")
+        (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+        if verdict != "ok":
+            raise sqlite3.DatabaseError(verdict)
+        return True, _ending(connection, meta) if closed == "no" else None
+
+
+def _ending(connection: sqlite3.Connection, meta: Mapping[str, str]) -> _Ending:
+    (known_s,) = connection.execute(_KNOWN).fetchone()
+    offset = meta.get("utc_offset_s")
+    is_known = meta.get("utc_source") == "autopilot" and known_s is not None and offset is not None
+    return _Ending(
+        box=box_of_points(connection, "applied"),
+        time=(float(offset or "nan"), float(known_s)) if is_known else None,
+        # A journal of version 1 has no table of valve changes.
+        totals=totals_of(connection) if meta["journal_version"] != "1" else {},
+    )
+
+
+def _fold_in(path: Path, ending: _Ending | None) -> None:
+    with closing(_connect(path)) as connection:
+        if ending is not None:
+            connection.execute("BEGIN IMMEDIATE")
+            _settle(connection, ending)
+            connection.execute("COMMIT")
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        connection.execute("PRAGMA journal_mode = DELETE").fetchall()
+    # Of somebody who looked at the cut file and did not end well either.
+    path.with_name(path.name + "-shm").unlink(missing_ok=True)
 
 
 def _connect(path: Path) -> sqlite3.Connection:
     """Open for writing, and alone: a journal whose flight lives is locked."""
-    if not path.is_file():
-        raise JournalError(f"{path}: there is no such file; give the .gpkg file of a flight")
     connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
     # Before the first read, or a shared-memory file would be made.
     connection.execute("PRAGMA locking_mode = EXCLUSIVE").fetchall()
     return connection
 
 
-def _is_left(connection: sqlite3.Connection, path: Path) -> bool:
-    """Return whether a flight ended here without closing its journal."""
-    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
-        raise ValueError("is no journal")
-    row = connection.execute("SELECT value FROM meta WHERE key = 'closed'").fetchone()
-    if row is None:
-        raise ValueError("does not say whether it was closed")
-    return row[0] == "no" or log_of(path).exists()
-
-
-def _fold_in(connection: sqlite3.Connection) -> None:
-    (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-    if verdict != "ok":
-        raise sqlite3.DatabaseError(verdict)
-    (closed,) = connection.execute("SELECT value FROM meta WHERE key = 'closed'").fetchone()
-    if closed == "no":
-        connection.execute("BEGIN IMMEDIATE")
-        _settle(connection)
-        connection.execute(SET_META, ("closed", "recovered"))
-        connection.execute("COMMIT")
-    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-    connection.execute("PRAGMA journal_mode = DELETE").fetchall()
-
-
-def _settle(connection: sqlite3.Connection) -> None:
-    """Fill in what the flight itself would have at its end: the layer's extent, times of day."""
-    set_box(connection, "applied", box_of_points(connection, "applied"))
-    meta = dict(connection.execute("SELECT key, value FROM meta WHERE key LIKE 'utc_%'"))
-    (known_s,) = connection.execute(_KNOWN).fetchone()
-    if meta.get("utc_source") == "autopilot" and known_s is not None:
-        tell_times_again(connection, float(meta["utc_offset_s"]), known_s)
+def _settle(connection: sqlite3.Connection, ending: _Ending) -> None:
+    """Fill in the layer's extent, times of day, and what the tables come to."""
+    set_box(connection, "applied", ending.box)
+    if ending.time is not None:
+        tell_times_again(connection, *ending.time)
+    for fact in (*ending.totals.items(), ("closed", "recovered")):
+        connection.execute(SET_META, fact)
 
 
 def _salvaged(path: Path, reason: str) -> tuple[str, str]:
     """Copy what can still be read beside the file, which stays as it is."""
     try:
         rows, lost_tables = salvage(path)
-    except _FAILURES as error:
-        text = " ".join(str(error).split())
+    except DAMAGE as error:
+        text = one_line(error)
         return "failed", f"{reason}; nothing could be read ({text}); the file is kept as it is"
     parts = f"; not all of {', '.join(lost_tables)}" if lost_tables else ""
     return "salvaged", (

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from companion.errors import JournalError
+from companion.record.content_hash import log_of
 from companion.record.folder import Flight, journals, look_at, pin_of
 
-# For want of space the newest flights stay all the same: a disk that something else has filled
-# must not cost the records of the season.
+# The newest flights stay by every rule: a disk that something else has filled, or a clock that is
+# wrong, must not cost the records of the season.
 ALWAYS_KEPT = 10
 # Below this much free space the flight begins with a warning.
 WARN_FREE_PERCENT = 20.0
@@ -44,10 +45,11 @@ class Space:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Removal:
-    """A flight that goes, and by which rule."""
+    """A flight that goes, and by which rule; `problem`: why it is still there."""
 
     flight: Flight
     reason: str
+    problem: str | None = None
 
 
 def space_of(folder: Path) -> Space:
@@ -64,21 +66,23 @@ def chosen(
 ) -> list[Removal]:
     """Return what goes, oldest first; `flights` in their order, oldest first.
 
-    Pinned flights do not count among those that are kept.
-    An age counts only where the autopilot told the time: this computer's clock may be anything.
+    Pinned flights do not count among those that `count` keeps. The newest ten, pinned or not, stay
+    by every rule.
     """
     removals: list[Removal] = []
     ended = [flight for flight in flights if flight.state in _ENDED]
     free = [flight for flight in ended if not flight.is_pinned]
     too_many = 0 if rules.count is None else max(len(free) - rules.count, 0)
+    sure_utc_s = _sure_utc_s(ended, now_utc_s)
+    safe = ended[max(len(ended) - ALWAYS_KEPT, 0) :]
     for number, flight in enumerate(free):
         reason = None
+        if flight in safe:
+            continue
         if number < too_many:
             reason = f"more than {rules.count} flights"
-        elif _is_older(flight, rules.days, now_utc_s):
+        elif _is_older(flight, rules.days, sure_utc_s):
             reason = f"older than {rules.days:g} days"
-        elif flight in ended[-ALWAYS_KEPT:]:
-            continue
         elif rules.free_percent is not None:
             freed = sum(removal.flight.size_bytes for removal in removals)
             if space.free_bytes + freed < space.total_bytes * rules.free_percent / 100.0:
@@ -88,27 +92,49 @@ def chosen(
     return removals
 
 
-def _is_older(flight: Flight, days: float | None, now_utc_s: float) -> bool:
+def _sure_utc_s(ended: Sequence[Flight], now_utc_s: float) -> float | None:
+    """Return a time that has surely come; None where nobody knows one.
+
+    This computer's clock may be anything, and one flight's autopilot may have been wrong: an age
+    counts against the earlier of the two, the newest end by an autopilot's clock and the
+    computer's. Whichever is wrong alone, nothing goes too early.
+    """
+    ends_s = [
+        flight.ended_utc_s
+        for flight in ended
+        if flight.utc_source == "autopilot" and flight.ended_utc_s is not None
+    ]
+    return min(max(ends_s), now_utc_s) if ends_s else None
+
+
+def _is_older(flight: Flight, days: float | None, sure_utc_s: float | None) -> bool:
     ended_s = flight.ended_utc_s
-    if days is None or ended_s is None or flight.utc_source != "autopilot":
+    if days is None or ended_s is None or flight.utc_source != "autopilot" or sure_utc_s is None:
         return False
-    return now_utc_s - ended_s > days * _DAY_S
+    return sure_utc_s - ended_s > days * _DAY_S
 
 
 def prune(
     folder: Path, rules: Rules, *, now_utc_s: float, is_dry_run: bool = False
 ) -> list[Removal]:
-    """Remove what the rules say, and return it; JournalError where a file cannot be removed."""
+    """Remove what the rules say, and return it; what cannot be removed has a `problem`."""
     flights = [look_at(path) for path in journals(folder)]
     removals = chosen(flights, rules, space_of(folder), now_utc_s)
-    for removal in () if is_dry_run else removals:
-        # Pinned meanwhile, or opened: look again.
-        if pin_of(removal.flight.path).exists() or look_at(removal.flight.path).state not in _ENDED:
-            continue
-        try:
-            removal.flight.path.unlink()
-        except OSError as error:
-            raise JournalError(
-                f"{removal.flight.path}: cannot be removed ({error.strerror})"
-            ) from error
-    return removals
+    if is_dry_run:
+        return removals
+    return [found for removal in removals if (found := _removed(removal)) is not None]
+
+
+def _removed(removal: Removal) -> Removal | None:
+    """Remove a flight and the log beside it; None where it is to stay by now."""
+    path = removal.flight.path
+    # Pinned meanwhile, or opened: look again.
+    if pin_of(path).exists() or look_at(path).state not in _ENDED:
+        return None
+    try:
+        path.unlink()
+        for rest in (log_of(path), path.with_name(path.name + "-shm")):
+            rest.unlink(missing_ok=True)
+    except OSError as error:
+        return replace(removal, problem=f"cannot be removed ({error.strerror})")
+    return removal

@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from companion.record.geopackage import APPLICATION_ID, USER_VERSION
+from companion.record.read_only import read_only, tolerate_damage
 from companion.record.writer import SET_META
 
 # SQL of SQLite's own and of GeoPackage's registers comes with the tables; order as they depend.
@@ -36,9 +37,8 @@ def salvage(path: Path) -> tuple[int, list[str]]:
     draft = target.with_name(f".new-{os.getpid()}-salvaged.gpkg")
     draft.unlink(missing_ok=True)
     try:
-        uri = f"{path.resolve().as_uri()}?mode=ro"
         with (
-            closing(sqlite3.connect(uri, uri=True, timeout=0.0)) as source,
+            read_only(path, timeout_s=0.0) as source,
             closing(sqlite3.connect(draft, isolation_level=None)) as copy,
         ):
             found = _copy_all(source, copy)
@@ -51,6 +51,7 @@ def salvage(path: Path) -> tuple[int, list[str]]:
 
 
 def _copy_all(source: sqlite3.Connection, copy: sqlite3.Connection) -> tuple[int, list[str]]:
+    tolerate_damage(source)
     source.text_factory = _text
     tables = source.execute(_TABLES).fetchall()
     if "meta" not in {name for name, _ in tables}:
@@ -78,14 +79,15 @@ def _copy(source: sqlite3.Connection, copy: sqlite3.Connection, name: str) -> tu
     """Copy one table from both its ends, up to the damage in its middle."""
     whole = [True]
     count = 0
-    for row in _readable(source, name, whole):
+    for row in readable_rows(source, name, whole):
         marks = ", ".join("?" * (len(row) - 1))
         copy.execute(f'INSERT OR IGNORE INTO "{name}" VALUES ({marks})', row[1:])
         count += 1
     return count, whole[0]
 
 
-def _readable(source: sqlite3.Connection, name: str, whole: list[bool]) -> Iterator[Row]:
+def readable_rows(source: sqlite3.Connection, name: str, whole: list[bool]) -> Iterator[Row]:
+    """Yield rowid and row of all that can be read; `whole[0]` becomes False where that is less."""
     last = -(2**62)
     try:
         for row in source.execute(f'SELECT rowid, * FROM "{name}" ORDER BY rowid'):

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 
 from companion.core.types import SprayPlan
 
+# No duty: whatever comes next differs.
+_UNTOLD = -1
+
 Row = tuple[int | None, int | None, int, int]
 
 
@@ -60,6 +63,10 @@ class ValveRows:
         for valve, duty in enumerate(plan.duty):
             rows += self._changed(micros(plan.issued_s), None, valve, duty)
         return rows
+
+    def forget(self) -> None:
+        """Take nothing for told: rows were lost, and each valve's next duty is a change."""
+        self._permille = dict.fromkeys(self._permille, _UNTOLD)
 
     def end(self) -> list[Row]:
         """Return what the last plan brings about by itself: its lease ends."""

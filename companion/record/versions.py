@@ -10,6 +10,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping
 from datetime import datetime
+from importlib import metadata
 
 from companion.errors import JournalError
 from companion.record.blocks import Entry, read_blocks
@@ -29,20 +30,41 @@ class OtherVersionError(JournalError):
         self.meta = meta
 
 
-def check_version(name: object, meta: Mapping[str, str], tables: Collection[str]) -> str:
-    """Return the version of a journal; a JournalError where it is none, or none that is known."""
+def check_version(
+    name: object, meta: Mapping[str, str], tables: Collection[str], *, is_lenient: bool = False
+) -> str:
+    """Return the version of a journal; a JournalError where it is none, or none that is known.
+
+    `is_lenient` allows that tables are missing.
+    """
     version = meta.get("journal_version")
     if version is None:
         raise JournalError(f"{name}: is a GeoPackage, but no journal of a flight")
     if version not in _TABLES:
         raise OtherVersionError(
             f"{name}: is a journal of version {version}, this program reads versions "
-            f"{' and '.join(_TABLES)}; use vrspray {meta.get('version_vrspray')}, which wrote it",
+            f"{' and '.join(_TABLES)}; {_advice(meta.get('version_vrspray'))}",
             meta,
         )
-    if not _TABLES[version] <= set(tables):
+    if not is_lenient and missing_tables(version, tables):
         raise JournalError(f"{name}: is a GeoPackage, but no journal of a flight")
     return version
+
+
+def missing_tables(version: str, tables: Collection[str]) -> list[str]:
+    """Return the tables that a journal of this version has and this one has not."""
+    return sorted(_TABLES[version] - set(tables))
+
+
+def _advice(wrote: str | None) -> str:
+    """Return which program reads it; one that is not yet released bears the number before it."""
+    try:
+        own = metadata.version("vrspray")
+    except metadata.PackageNotFoundError:
+        own = None
+    if wrote in (None, "unknown", own):
+        return "use a newer vrspray"
+    return f"use vrspray {wrote}, which wrote it"
 
 
 def migrated(meta: Mapping[str, str]) -> dict[str, str]:

@@ -7,6 +7,7 @@ this thread: a failure costs the rows of that second, is counted, and the next s
 from __future__ import annotations
 
 import logging
+import math
 import sqlite3
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from companion.record.coverage_table import write_coverage
 from companion.record.events import Event, LinkSample
 from companion.record.flight_clock import FlightClock
 from companion.record.layers import set_box
+from companion.record.totals import totals_of
 from companion.record.valve_rows import Row, ValveOrder, ValveRows
 
 if TYPE_CHECKING:
@@ -61,6 +63,7 @@ SET_META = (
 _TIME_AGAIN = (
     "UPDATE {} SET time = strftime('%Y-%m-%dT%H:%M:%fZ', time_s + ?, 'unixepoch') WHERE time_s < ?"
 )
+_FROM_ORDERS = ("valve_changes", "orders")
 _CHECKPOINT_EVERY = 60  # commits
 # A full disk, a removed card, a value that JSON does not know: rows are lost, the flight goes on.
 _FAILURES = (sqlite3.Error, ValueError, TypeError, OverflowError)
@@ -119,7 +122,7 @@ class Writer:
             self._flush()
             if self.valves.from_orders and not self._told_orders:
                 self._begin()
-                self._connection.execute(SET_META, ("valve_changes", "orders"))
+                self._connection.execute(SET_META, _FROM_ORDERS)
                 self._told_orders = True
             if coverage is not None and coverage is not self._coverage:
                 self._begin()
@@ -146,11 +149,19 @@ class Writer:
         self.commit(lost_before=lost_before, coverage=coverage)
         try:
             execute = self._connection.execute
+            self._begin()
             if self._clock.known_s is not None:
                 tell_times_again(self._connection, self._clock.offset_s, self._clock.known_s)
             set_box(self._connection, "applied", self._applied.box)
+            # Once more: the second in which it was first told may be lost.
+            if self.valves.from_orders:
+                execute(SET_META, _FROM_ORDERS)
+            execute(SET_META, ("utc_source", self._clock.source))
             execute(SET_META, ("utc_offset_s", repr(self._clock.offset_s)))
+            for fact in totals_of(self._connection).items():
+                execute(SET_META, fact)
             execute(SET_META, ("closed", "yes"))
+            execute("COMMIT")
             execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
             execute("PRAGMA journal_mode = DELETE").fetchall()
         except _FAILURES as error:
@@ -179,6 +190,10 @@ class Writer:
             lost += self._pending
             self._pending = 0
             self._block = Block()
+            # What was told of the flight in that second is told again; so are the valves' duties.
+            self._told_orders = False
+            self._told_offset_s = math.inf
+            self.valves.forget()
             if self._connection.in_transaction:
                 self._connection.rollback()
         self.lost += lost

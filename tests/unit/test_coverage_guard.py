@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from companion.core.boom import Boom, Valve
 from companion.core.controller import Memory, Setup, step
 from companion.core.coverage import Coverage
 from companion.core.crossings import Crossing, Route
-from companion.core.overlap_guard import STRETCH_MIN_M, OverlapGuard, cut
+from companion.core.overlap_guard import STRETCH_MIN_M, OverlapGuard, cut, wake_m
 from companion.core.prescription import Prescription
 from companion.core.schedule import rate_at
+from companion.core.swath import SNAPSHOTS_MAX
 from companion.core.types import TimedChange
-from tests.builders import LAG, flying, plots, setup
+from tests.builders import LAG, along, flying, plots, setup
 
 SPEED = 5.0
 HALF = OverlapGuard(switch_off_percent=50.0)
@@ -79,6 +82,97 @@ def test_a_valve_does_not_see_its_own_wake() -> None:
     guarded, _ = opened(field(overlap=OverlapGuard(switch_off_percent=1.0)))
     free, _ = opened(field())
     assert guarded == free
+
+
+def staggered(stagger_m: float, strip_m: float) -> Boom:
+    """Six valves 1 m apart, every other one ahead of the rest, with strips of any width."""
+    valves = tuple(
+        Valve(
+            name=str(k + 1),
+            right_m=k - 2.5,
+            forward_m=stagger_m * (0.5 if k % 2 else -0.5),
+            width_m=strip_m,
+        )
+        for k in range(6)
+    )
+    return Boom(width_m=6.0, valves=valves)
+
+
+def slow_field(own: Boom) -> Setup:
+    """A field with a rate that the nozzles deliver at walking pace."""
+    zones = plots([[80.0] * 4] * 3)
+    limits = replace(setup().limits, speed_min_m_s=0.3)
+    return field(boom=own, prescription=Prescription(zones), limits=limits)
+
+
+def at_speed(own: Setup, speeds: Sequence[float], *, until_m: float) -> tuple[list[float], Memory]:
+    """Return the duties in force of every step of a pass, whose speed changes every second."""
+    memory, done = Memory(), []
+    now, east_m = 10.0, -8.0
+    pace = itertools.cycle([speed for speed in speeds for _ in range(10)])
+    while east_m < until_m:
+        speed = next(pace)
+        state = flying(now, east_m, 3.0, **along(90.0, speed))
+        decision, memory = step(own, state, memory, now)
+        done += decision.plan.duty
+        now, east_m = now + 0.1, east_m + 0.1 * speed
+    return done, memory
+
+
+def test_a_staggered_boom_does_not_see_the_wake_of_its_front_row() -> None:
+    # Rows 3 m apart at 1.2 m/s: the rear one comes 2.5 s later.
+    own = slow_field(staggered(3.0, 2.0))
+    free, _ = at_speed(own, [1.2], until_m=20.0)
+    guarded, memory = at_speed(replace(own, overlap=HALF), [1.2], until_m=20.0)
+    assert any(free)
+    assert guarded == free
+    # Not because it sees nothing: farther back than its wake it does.
+    assert memory.swath is not None
+    seen = memory.swath.before(1e9, here=(20.0, 3.0), behind_m=wake_m(own.boom))
+    assert seen is not None
+    assert seen.area_m2 > 50.0
+
+
+@settings(max_examples=15, deadline=None)
+@example(stagger_m=6.0, strip_m=2.5, percent=20.0, speeds=[0.6])
+@example(stagger_m=4.0, strip_m=2.0, percent=50.0, speeds=[0.6, 3.0])
+@given(
+    stagger_m=st.floats(0.0, 6.0),
+    strip_m=st.floats(1.0, 2.5),
+    percent=st.floats(10.0, 100.0),
+    speeds=st.lists(st.floats(0.6, 5.0), min_size=1, max_size=4),
+)
+def test_on_bare_ground_a_straight_pass_is_the_same_with_a_guard(
+    stagger_m: float, strip_m: float, percent: float, speeds: list[float]
+) -> None:
+    own = slow_field(staggered(stagger_m, strip_m))
+    guard = OverlapGuard(switch_off_percent=percent)
+    free, _ = at_speed(own, speeds, until_m=12.0)
+    guarded, _ = at_speed(replace(own, overlap=guard), speeds, until_m=12.0)
+    assert guarded == free
+
+
+def test_its_own_ground_is_seen_again_when_it_comes_back() -> None:
+    own = replace(slow_field(staggered(3.0, 1.0)), overlap=HALF)
+    first, memory = opened(own)
+    assert opening(first) == set(range(6))
+    again, _ = opened(own, memory=replace(memory, plan=None), start_s=30.0)
+    assert not opening(again)
+
+
+def test_whoever_hardly_moves_keeps_what_lies_farther_back() -> None:
+    # Half a metre a second, stamped every other second: still more than a wake is remembered.
+    own = replace(slow_field(staggered(3.0, 2.0)), overlap=HALF)
+    _, memory = at_speed(own, [4.0] * 4 + [0.5] * 26, until_m=20.0)
+    assert memory.swath is not None
+    first = memory.swath.older[0]
+    assert len(memory.swath.older) == SNAPSHOTS_MAX
+    assert memory.swath.way_m - first.way_m >= wake_m(own.boom)
+
+
+@pytest.mark.parametrize(("spread_m", "wake"), [(0.0, 1.0), (3.0, 4.0), (90.0, 25.0)])
+def test_the_wake_is_as_long_as_the_boom_and_bounded(spread_m: float, wake: float) -> None:
+    assert wake_m(staggered(spread_m, 1.0)) == pytest.approx(wake)
 
 
 @pytest.mark.parametrize(

@@ -259,3 +259,18 @@ def test_where_nothing_is_open_it_is_what_it_was() -> None:
     assert memory.swath is not None
     assert expected(own, memory, state, now_s=now, cut_s=now + 1.0) is memory.swath.coverage
     assert not expected(own, Memory(), None, now_s=now, cut_s=now).tiles
+
+
+@pytest.mark.parametrize("speed_m_s", [0.4, 0.7])
+def test_whoever_creeps_treats_too(speed_m_s: float) -> None:
+    zones = plots([[80.0] * 4])
+    limits = replace(setup().limits, speed_min_m_s=0.2)
+    own = given(prescription=Prescription(zones), limits=limits)
+    memory, now, east_m = Memory(), 10.0, -1.0
+    while east_m < 6.0:
+        state = flying(now, east_m, 3.0, **along(90.0, speed_m_s))
+        _, memory = step(own, state, memory, now)
+        now, east_m = now + 0.1, east_m + 0.1 * speed_m_s
+    assert memory.swath is not None
+    # Up to two seconds are not stamped yet.
+    assert along_middle(memory.swath.coverage) == pytest.approx((0.0, 5.3), abs=0.8)

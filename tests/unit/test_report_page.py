@@ -92,6 +92,26 @@ def test_every_number_of_the_page_is_in_it_as_json(report: Report, page: Parsed)
     assert json.loads(page.script) == json.loads(report.files["report.json"])
 
 
+def test_what_the_figures_mean_is_one_click_away(page: Parsed) -> None:
+    ids = {attributes["id"] for _, attributes in page.tags if "id" in attributes}
+    links = {attributes.get("href") for tag, attributes in page.tags if tag == "a"}
+    assert links == {"#definitions"}
+    assert "definitions" in ids
+
+
+def test_the_published_flights_stand_beside_this_one(page: Parsed) -> None:
+    assert "+0.32" in page.text
+    assert "+3.87" in page.text
+    assert "94.77" in page.text
+
+
+def test_another_percentage_of_the_rates_is_told(tmp_path: Path) -> None:
+    flown = fly(tmp_path, event=("command", "rate override 80 %"))
+    warnings = build_report(flown, ReportOptions(with_figures=False)).contents["warnings"]
+    (told,) = [each for each in warnings if each["code"] == "rate-override"]
+    assert "80 % from 20" in told["text"] or "80 % from a time not known" in told["text"]
+
+
 def test_names_of_parts_are_used_once(page: Parsed) -> None:
     names = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
     assert len(names) == len(set(names)) > 20
@@ -155,7 +175,7 @@ def test_a_good_flight_has_the_metrics_of_the_contract(report: Report) -> None:
 
 
 def test_figures_are_there_as_png_and_svg(report: Report) -> None:
-    names = {"map", "deviation", "flow", "lags", "histogram", "causes", "duty"}
+    names = {"map", "deviation", "flow", "lags", "histogram", "causes", "duty", "treated"}
     found = {Path(name).stem for name in report.contents["figures"]}
     assert found == names
     for name in names:

@@ -9,11 +9,11 @@ import shapely
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
-from analysis.report.figures.ground import dress
+from analysis.report.figures.sheet import dress
 from analysis.report.figures.style import SKY, Drawn
 
 if TYPE_CHECKING:
-    from analysis.report.figures.ground import Sheet
+    from analysis.report.figures.sheet import Sheet
     from analysis.report.treated import Treated
 
 

@@ -1,0 +1,62 @@
+"""Opening a journal so that nothing of it changes: for readers, and before anything is mended."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
+
+from companion.errors import VrsprayError
+from companion.record.content_hash import log_of
+
+# What a damaged journal may do to its reader: SQLite's findings, and values that are none.
+DAMAGE = (
+    sqlite3.Error,
+    OSError,
+    ValueError,
+    TypeError,
+    ArithmeticError,
+    LookupError,
+    AttributeError,
+    RecursionError,
+)
+
+
+@contextmanager
+def read_only(path: Path, *, timeout_s: float = 1.0) -> Iterator[sqlite3.Connection]:
+    """Open for reading only: what a crash left (the -wal file beside it) is read, not changed."""
+    log, index = log_of(path), path.with_name(path.name + "-shm")
+    with ExitStack() as at_end:
+        folder = at_end.enter_context(tempfile.TemporaryDirectory(prefix="vrspray-"))
+        source = path
+        if log.exists() and not index.exists():
+            # SQLite makes one to read the log by, and leaves it; nobody needs it any more.
+            at_end.callback(index.unlink, missing_ok=True)
+        if log.exists() and not os.access(path.parent, os.W_OK):
+            # SQLite needs a shared-memory file beside a log: read a copy.
+            for file in (path, log):
+                shutil.copy(file, folder)
+            source = Path(folder) / path.name
+        uri = f"{source.resolve().as_uri()}?mode=ro"
+        yield at_end.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=timeout_s)))
+
+
+def tolerate_damage(connection: sqlite3.Connection) -> None:
+    """Read a file that is shorter than its header says, or whose list of tables is damaged.
+
+    SQLite refuses such a file as a whole, unless its list of tables may be written; of a
+    connection that is read only nothing is written all the same.
+    """
+    connection.execute("PRAGMA writable_schema = ON")
+
+
+def one_line(error: Exception) -> str:
+    """Return an error's text in one line; SQLite's findings have several."""
+    text = " ".join(str(error).split())
+    if isinstance(error, sqlite3.Error | OSError | ValueError | VrsprayError) and text:
+        return text
+    return f"{type(error).__name__} {text}".strip()
