@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from companion.core.controller import Setup
+from companion.core.coverage import Coverage
 from companion.core.types import Decision, Input, OperatorCommand, Telemetry
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
@@ -58,6 +59,10 @@ class Stamps:
         elif isinstance(item, Telemetry):
             self.position_s = item.received_s
         self.recorder.record_input(item)
+
+    def record_coverage(self, coverage: Coverage) -> None:
+        """Pass it on."""
+        self.recorder.record_coverage(coverage)
 
     def record_decision(self, decision: Decision) -> None:
         """Take the times: the executor has the plan, and what was due has left."""

@@ -284,5 +284,8 @@ def test_without_matplotlib_there_is_all_but_the_pictures(
     assert _write(shown.result, shown.result.as_json(), tmp_path) == ["demo.json", "report.html"]
     captured = capsys.readouterr()
     assert captured.out == ""
-    assert captured.err == "no pictures: matplotlib is missing; pip install vrspray[plot]\n"
+    assert captured.err.splitlines() == [
+        "no pictures: matplotlib is missing; pip install vrspray[plot]",
+        "no report of the flight: pip install vrspray[report]",
+    ]
     assert "scheduled" in (tmp_path / "report.html").read_text()

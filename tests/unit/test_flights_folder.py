@@ -54,16 +54,30 @@ def test_for_want_of_space_the_newest_ten_stay_all_the_same() -> None:
     assert numbers(chosen(FLIGHTS, Rules(free_percent=90.0), FULL, 0.0)) == list(range(1, 11))
 
 
-def test_so_many_are_kept() -> None:
-    rules = Rules(free_percent=None, count=17)
-    assert numbers(chosen(FLIGHTS, rules, FULL, 0.0)) == [1, 2, 3]
+def test_so_many_are_kept_and_never_fewer_than_ten() -> None:
+    assert numbers(chosen(FLIGHTS, Rules(free_percent=None, count=17), FULL, 0.0)) == [1, 2, 3]
+    few = Rules(free_percent=None, count=2)
+    assert numbers(chosen(FLIGHTS, few, FULL, 0.0)) == list(range(1, 11))
+
+
+LONG = Rules(free_percent=None, days=12.0)
+NOW_S = 1e9 + 20.5 * DAY_S
 
 
 def test_they_are_kept_so_long_where_the_autopilot_told_the_time() -> None:
-    rules, now_s = Rules(free_percent=None, days=10.0), 1e9 + 20.5 * DAY_S
-    assert numbers(chosen(FLIGHTS, rules, ROOMY, now_s)) == list(range(1, 11))
+    assert numbers(chosen(FLIGHTS, LONG, ROOMY, NOW_S)) == list(range(1, 8))
     unsure = [flight(number, utc_source="computer") for number in range(1, 21)]
-    assert chosen(unsure, rules, ROOMY, now_s) == []
+    assert chosen(unsure, LONG, ROOMY, NOW_S) == []
+    assert numbers(chosen(FLIGHTS, Rules(days=0.01), ROOMY, NOW_S)) == list(range(1, 11))
+
+
+@pytest.mark.parametrize("wrong_s", [-1e9, -30 * DAY_S, 3650 * DAY_S, 1e12])
+def test_no_clock_that_is_wrong_alone_removes_a_flight_too_early(wrong_s: float) -> None:
+    right = {1, 2, 3, 4, 5, 6, 7, 8}  # what is older than twelve days
+    assert set(numbers(chosen(FLIGHTS, LONG, ROOMY, NOW_S + wrong_s))) <= right
+    # And one flight whose autopilot was wrong.
+    flights = [*FLIGHTS[:-1], flight(20, started_utc_s=NOW_S + wrong_s)]
+    assert set(numbers(chosen(flights, LONG, ROOMY, NOW_S))) <= right
 
 
 @pytest.mark.parametrize(
@@ -78,12 +92,14 @@ def test_what_is_pinned_open_or_not_whole_never_goes(changes: dict[str, Any]) ->
 
 
 def test_a_flight_that_is_recovered_may_go() -> None:
-    flights = [flight(number, state="recovered") for number in range(1, 4)]
-    assert numbers(chosen(flights, Rules(count=2), ROOMY, 0.0)) == [1]
+    flights = [flight(number, state="recovered") for number in range(1, 13)]
+    assert numbers(chosen(flights, Rules(count=11), ROOMY, 0.0)) == [1]
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder of three flights, as if one were already too many."""
+    monkeypatch.setattr(retention, "ALWAYS_KEPT", 0)
     for _ in range(3):
         closed_journal(tmp_path, 25)
     return tmp_path
@@ -110,6 +126,43 @@ def test_a_pin_is_a_file_beside_and_the_flight_is_not_touched(folder: Path) -> N
     assert (path.read_bytes(), path.stat().st_mtime_ns) == before
     with pytest.raises(JournalError, match="no such file"):
         set_pinned(folder / "flight-0009.gpkg", is_pinned=True)
+
+
+def test_a_log_beside_a_flight_goes_with_it(folder: Path) -> None:
+    log = folder / "flight-0001.gpkg-wal"
+    log.write_bytes(b"")
+    assert numbers(prune(folder, Rules(free_percent=None, count=2), now_utc_s=0.0)) == [1]
+    assert not log.exists()
+
+
+def test_what_is_pinned_meanwhile_is_neither_removed_nor_listed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def space(_folder: Path) -> Space:
+        set_pinned(folder / "flight-0001.gpkg", is_pinned=True)
+        return ROOMY
+
+    monkeypatch.setattr(retention, "space_of", space)
+    assert numbers(prune(folder, Rules(free_percent=None, count=1), now_utc_s=0.0)) == [2]
+    assert (folder / "flight-0001.gpkg").exists()
+
+
+def test_what_cannot_be_removed_is_said_and_the_others_go(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unlink = Path.unlink
+
+    def stuck(path: Path, missing_ok: bool = False) -> None:
+        if path.name == "flight-0001.gpkg":
+            raise PermissionError(1, "Operation not permitted")
+        unlink(path, missing_ok=missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", stuck)
+    monkeypatch.setattr("companion.cli.flights.Rules", lambda: Rules(count=1, free_percent=None))
+    found = told(capsys, "prune", "--folder", str(folder), code=1)
+    assert [Path(each["file"]).name for each in found["removed"]] == ["flight-0002.gpkg"]
+    assert found["failed"][0]["problem"] == "cannot be removed (Operation not permitted)"
+    assert len(journals(folder)) == 2
 
 
 def test_a_dry_run_removes_nothing(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -183,6 +236,7 @@ def test_a_file_that_was_cut_off_is_shown_as_far_as_it_goes(
     os.truncate(path, int(path.stat().st_size * share))
     shown = told(capsys, "show", str(path), code=1)
     assert shown["unread"]
+    assert ("map_sha256" in shown["meta"]) == (share > 0.9)  # so small a file: it lies behind
     assert all("\n" not in text for text in shown["unread"])
 
 

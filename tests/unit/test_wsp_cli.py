@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,9 @@ def test_cards_are_tied_to_the_flight_over_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     flight = flown()
-    monkeypatch.setattr("analysis.flown.read_applied.read_applied", lambda path: flight)
+    monkeypatch.setattr("analysis.flown.read_applied.read_applied", lambda path, unread: flight)
+    journal = tmp_path / "f.gpkg"
+    journal.touch()
     places = [flight.setup.frame.to_geographic(east_m, 3.5) for east_m in (11.0, 13.5)]
     table = tmp_path / "cards.csv"
     lines = [
@@ -105,9 +108,9 @@ def test_cards_are_tied_to_the_flight_over_them(
     ]
     table.write_text("\n".join(["card,latitude,longitude,height", *lines, "9,36,114.5,"]))
     code, found, err = run(
-        capsys, scan, "--out", tmp_path, "--positions", table, "--journal", "f.gpkg"
+        capsys, scan, "--out", tmp_path, "--positions", table, "--journal", journal
     )
-    assert code == 0
+    assert (code, found["warnings"]) == (0, [])
     first, second = (card["flight"] for card in found["cards"])
     assert (first["prescribed_l_ha"], second["prescribed_l_ha"]) == (20.0, 25.0)
     assert first["boundary_m"] == pytest.approx(-1.0, abs=0.01)
@@ -118,6 +121,40 @@ def test_cards_are_tied_to_the_flight_over_them(
     assert [row["card"] for row in change["cards"]] == [1, 2]
     assert found["cards"][0]["position"]["height_m"] == 0.5
     assert "there is no card 9" in err
+
+
+def test_a_journal_is_looked_at_before_the_scans(
+    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A missing one is an error at once; cards are measured with a damaged one all the same."""
+    table = tmp_path / "cards.csv"
+    table.write_text("card,latitude,longitude\n1,36,114.5\n")
+    out = tmp_path / "out"
+    options = ("--out", out, "--positions", table, "--journal", tmp_path / "f.gpkg")
+    assert run(capsys, scan, *options)[0] == 2
+    assert not out.exists()
+    (tmp_path / "f.gpkg").write_bytes(b"no journal at all" * 100)
+    code, found, _ = run(capsys, scan, *options)
+    assert code == 1
+    assert len(found["cards"]) == 2
+    assert "is no journal" in found["warnings"][0]
+
+
+def test_a_flight_that_was_cut_is_a_warning(
+    scan: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = replace(flown(), is_closed=False)
+    monkeypatch.setattr("analysis.flown.read_applied.read_applied", lambda path, unread: flight)
+    (tmp_path / "f.gpkg").touch()
+    (tmp_path / "c.csv").write_text("card,latitude,longitude\n1,36,114.5\n")
+    options = ("--positions", tmp_path / "c.csv", "--journal", tmp_path / "f.gpkg")
+    code, found, err = run(capsys, scan, "--out", tmp_path / "out", *options)
+    assert code == 1
+    assert "was cut off" in found["warnings"][0]
+    assert "was cut off" in err
 
 
 def test_a_sheet_without_cards_is_a_problem(

@@ -94,7 +94,25 @@ def test_a_gap_in_the_record_is_no_pass() -> None:
     names = ("time_s", "east_m", "north_m", "height_m", "speed_m_s", "course_deg", "heading_deg")
     cut = replace(flight, **{name: getattr(flight, name)[keep] for name in names})
     assert passing(cut, 10.0, 3.0) is None
-    assert passing(replace(flight, heading_deg=flight.heading_deg * NAN), 10.0, 3.0) is None
+
+
+def test_the_course_stands_for_a_heading_that_is_not_known() -> None:
+    flight = flown()
+    blind = replace(flight, heading_deg=flight.heading_deg * NAN)
+    assert passing(blind, 10.0, 2.4) == passing(flight, 10.0, 2.4)
+    assert passing(replace(blind, course_deg=blind.course_deg * NAN), 10.0, 3.0) is None
+
+
+def test_a_pass_that_sprayed_counts_before_a_nearer_one_that_did_not() -> None:
+    """Eastwards valve 2 sprays; on the way back, 0.2 m nearer, nothing does."""
+    flight = flown(back=True)
+    half = len(flight.time_s) // 2
+    north_m = np.where(np.arange(len(flight.time_s)) < half, 3.0, 3.3)
+    over = passing(replace(flight, north_m=north_m), 10.0, 3.5)
+    assert over is not None
+    assert (over.passes, over.course_deg) == (2, 90.0)
+    assert over.applied_l_ha is not None and over.applied_l_ha > 0.0
+    assert over.applied_all_passes_l_ha == over.applied_l_ha
 
 
 @pytest.mark.parametrize(
