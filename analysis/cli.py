@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from analysis.replay import ReplayResult
 
 ZONES_SHOWN = 10
+# A border that nothing may cross is kept by the first and the last flow of a valve.
+STRICT = {"lag.on_s": "lag.on_start_s", "lag.off_s": "lag.off_end_s"}
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -32,24 +34,49 @@ def replay_journal(
     With --set: what would have been sprayed. The ground cannot react: the aircraft flies as it
     flew, and the sprayer stays what the recorded set-up says of it.
 
-    Exit 0: all the same; 1: at least one differs; 2: the file or an option cannot be used.
+    Exit 0: all the same; 1: a decision or the treated ground differs, or the file is damaged; 2: it
+    is no journal, or an option cannot be used.
     """
     from analysis.replay import replay as run
+    from companion.errors import JournalError
+    from companion.record.continuing import is_damage
 
-    result = run(journal, overrides=changes or (), say=lambda line: typer.echo(line, err=True))
+    try:
+        result = run(journal, overrides=changes or (), say=lambda line: typer.echo(line, err=True))
+    except JournalError as error:
+        if not is_damage(error):
+            raise
+        if as_json:
+            typer.echo(json.dumps({"error": str(error)}))
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from error
     typer.echo(json.dumps(asdict(result)) if as_json else _sentence(result))
     if not as_json:
-        for line in _what_if(result):
+        for line in _without_effect(changes or ()) if _is_idle(result) else _what_if(result):
             typer.echo(line)
     for note in _notes(result):
         typer.echo(note, err=True)
-    raise typer.Exit(1 if result.differences else 0)
+    is_same = not (result.differences or result.coverage_differs or result.unread)
+    raise typer.Exit(0 if is_same else 1)
 
 
 def _sentence(result: ReplayResult) -> str:
     return (
         f"{result.decisions} decisions from {result.inputs} inputs, {result.differences} different"
     )
+
+
+def _is_idle(result: ReplayResult) -> bool:
+    return result.is_what_if and not result.differences
+
+
+def _without_effect(changes: Sequence[str]) -> Iterator[str]:
+    """Yield that a what-if changed nothing, and why where that is known."""
+    yield f"no decision of this flight depends on {', '.join(changes)}"
+    for change in changes:
+        key = change.partition("=")[0].strip()
+        if key in STRICT:
+            yield f"where the border is strict, {STRICT[key]} rules in its place"
 
 
 def _what_if(result: ReplayResult) -> Iterator[str]:
@@ -90,6 +117,11 @@ def _notes(result: ReplayResult) -> list[str]:
         notes.append(f"training: {result.training}")
     if result.first_difference:
         notes.append(f"first difference: {result.first_difference}")
+    if result.coverage_differs:
+        notes.append(f"treated ground: {result.coverage_differs} cells of 0.2 m differ")
+    elif result.coverage_differs is None and not result.is_what_if:
+        notes.append("treated ground is not compared: the journal keeps none")
+    notes += [f"not read: {text}" for text in result.unread]
     if result.lost:
         notes.append(f"{result.lost} rows are missing in the journal: differences may follow")
     if not result.is_closed:

@@ -3,7 +3,7 @@
 The core is a function of set-up, inputs and times, and the journal has all three; so the same
 program must decide the same, to the last bit. A difference means that the core has changed, that
 rows are missing, or, with overrides, what would have been decided otherwise. What that would have
-put on the ground is in `what_if.py`.
+put on the ground is in `what_if.py`; whether the same ground is treated, `replayed_ground.py` says.
 """
 
 from __future__ import annotations
@@ -17,12 +17,16 @@ from typing import Any, Protocol
 
 from analysis.flown.read_applied import read_applied
 from analysis.overrides import override
+from analysis.replayed_ground import ReplayedGround
 from analysis.what_if import Moved, Orders, Sprayed, compared
 from companion.core.controller import Memory, Setup, step
 from companion.core.estimator import Track, estimate, observe
 from companion.core.types import Decision, Input
+from companion.errors import JournalError
 from companion.record.codec import FIELD_NAMES, FieldNames, encode
-from companion.record.reader import Entry, JournalContent, read_journal
+from companion.record.continuing import is_damage
+from companion.record.coverage_table import read_coverage
+from companion.record.reader import Entry, JournalContent, opened, read_journal
 
 SAY_EVERY = 5000
 
@@ -44,6 +48,7 @@ class FlownCore:
         self._setup = setup
         self._track = Track()
         self._memory = Memory()
+        self.ground = ReplayedGround(setup)
 
     def observe(self, item: Input) -> None:
         """Take in one input."""
@@ -53,12 +58,17 @@ class FlownCore:
         """Return the decision of `now_s`."""
         state = estimate(self._track, now_s)
         decision, self._memory = step(self._setup, state, self._memory, now_s)
+        self.ground.take(self._memory, state, now_s)
         return decision
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayResult:
-    """How many decisions were made again, and how many came out differently."""
+    """How many decisions were made again, and how many came out differently.
+
+    `coverage_differs` is how many cells of treated ground did; None where they are not compared: a
+    what-if, or a journal that keeps none. `unread` says in a line each what of it is damaged.
+    """
 
     inputs: int
     decisions: int
@@ -71,6 +81,8 @@ class ReplayResult:
     recorded: Sprayed | None = None
     what_if: Sprayed | None = None
     moved_m: Moved | None = None
+    coverage_differs: int | None = None
+    unread: tuple[str, ...] = ()
 
 
 def replay(
@@ -86,22 +98,23 @@ def replay(
     have been sprayed. JournalError for a file that cannot be used, ConfigError for a wrong
     override.
     """
-    content = read_journal(path)
+    content = _content(path)
+    unread = list(content.unread)
     flown = core(override(content.setup, overrides))
     ways = (Orders(), Orders()) if overrides else None
     inputs = decisions = differences = 0
     first: str | None = None
     for entry in content.entries:
         if not entry.is_decision:
-            item = content.value(entry)
-            if not isinstance(item, Decision):
+            item = _value(content, entry, unread)
+            if item is not None and not isinstance(item, Decision):
                 flown.observe(item)
             inputs += 1
             continue
         decisions += 1
         if not decisions % SAY_EVERY:
             say(f"{decisions} decisions, {differences} different")
-        recorded, decided = _both(content, entry, flown)
+        recorded, decided = _both(_value(content, entry, unread), flown)
         if ways is not None and recorded is not None and decided is not None:
             ways[0].take(recorded)
             ways[1].take(decided)
@@ -109,7 +122,10 @@ def replay(
         if difference is not None:
             differences += 1
             first = first or f"decision {decisions}: {difference}"
-    what_if = None if ways is None else compared(read_applied(path), *ways)
+    what_if = None if ways is None or unread else compared(read_applied(path), *ways)
+    apart = None
+    if isinstance(flown, FlownCore) and not overrides:
+        apart = _coverage_differs(content, flown.ground, unread)
     return ReplayResult(
         inputs=inputs,
         decisions=decisions,
@@ -122,14 +138,43 @@ def replay(
         recorded=None if what_if is None else what_if.recorded,
         what_if=None if what_if is None else what_if.what_if,
         moved_m=None if what_if is None else what_if.moved_m,
+        coverage_differs=apart,
+        unread=tuple(unread),
     )
 
 
-def _both(
-    content: JournalContent, entry: Entry, core: Core
-) -> tuple[Decision | None, Decision | None]:
+def _content(path: Path) -> JournalContent:
+    """Return the journal; of a damaged one what can be read."""
+    try:
+        return read_journal(path)
+    except JournalError as error:
+        if not is_damage(error):
+            raise
+        return read_journal(path, is_lenient=True)
+
+
+def _value(content: JournalContent, entry: Entry, unread: list[str]) -> Input | Decision | None:
+    """Return what a row says; None where it is damaged in a file that is known to be."""
+    try:
+        return content.value(entry)
+    except JournalError as error:
+        if not content.unread:
+            raise
+        unread.append(str(error).removeprefix(f"{content.path}: "))
+        return None
+
+
+def _coverage_differs(
+    content: JournalContent, ground: ReplayedGround, unread: list[str]
+) -> int | None:
+    """Return how many cells of treated ground differ from those in the journal."""
+    with opened(content.path, is_lenient=True) as journal:
+        kept = read_coverage(journal.connection, unread=unread)
+    return None if kept is None else ground.differing(kept, is_closed=content.is_closed)
+
+
+def _both(recorded: Input | Decision | None, core: Core) -> tuple[Decision | None, Decision | None]:
     """Return the recorded decision and the one made now."""
-    recorded = content.value(entry)
     if not isinstance(recorded, Decision):
         return None, None
     return recorded, core.decide(recorded.now_s)

@@ -15,6 +15,7 @@ from shapely import LineString, MultiPolygon
 
 from companion.config import Config
 from companion.config.motors import atomisers_of, pump_of
+from companion.config.rules import mismatches
 from companion.config.sensor_rules import tank_capacity_l
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
@@ -88,6 +89,16 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
         record_coverage=config.coverage.record and config.output.kind != "none",
         overlap=_overlap(config),
     )
+
+
+def refuse_mismatch(config: Config) -> None:
+    """Refuse widths that do not agree, as `config check` does: sprayed so, every dose is wrong.
+
+    Raises:
+        ConfigError: with the key and what is wrong.
+    """
+    for found in mismatches(config):
+        raise ConfigError(f"{config.path}: {found.key}: {found.text}")
 
 
 def _overlap(config: Config) -> OverlapGuard | None:

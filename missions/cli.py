@@ -22,6 +22,7 @@ from missions.reading import Asked, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
 from missions.sheet import sheet, sortie_lines
+from missions.treated_rates import UntreatedRates
 
 # Attempted moves of the search: about one second, ten, and a minute on an old laptop.
 MOVES = {"quick": 40_000, "good": 300_000, "best": 2_000_000}
@@ -179,6 +180,11 @@ def plan(
         "lines_files": [str(path) for path in marks],
     }
     answer(result, _lines(planned, result, files), as_json=as_json)
+    if isinstance(task.rates, UntreatedRates):
+        note(
+            "note: fly it with `vrspray run --continue`: its guard closes the valves on treated "
+            "ground and on what is covered twice, and the litres count neither"
+        )
     for warning in warnings:
         note(f"warning: {warning}")
 

@@ -31,7 +31,8 @@ class Field:
     """`outline` is as given; `fly` lies in it without holes and obstacles; `spray` in `fly`.
 
     `limit` is all that may be sprayed; `spray` keeps a margin from its edge.
-    `blocked` is what may not be flown over, not even on the way to the field.
+    `blocked` is what may not be flown over, not even on the way to the field. `closes` is the
+    ground outside of which the companion closes its valves, where that is another than `limit`.
     """
 
     frame: LocalFrame
@@ -40,6 +41,7 @@ class Field:
     spray: Area
     limit: BaseGeometry
     blocked: BaseGeometry
+    closes: BaseGeometry | None = None
 
     @property
     def area_m2(self) -> float:

@@ -24,6 +24,7 @@ from missions.schedule import scheduled
 from missions.short import short_warnings
 from missions.strips import Floats, joined
 from missions.surroundings import NOTHING_AROUND, Surroundings
+from missions.treated_rates import UntreatedRates, demands_once
 from missions.turns import Motion
 from missions.ways import Ways, build_ways, edge_places, suggested_depot
 
@@ -76,11 +77,9 @@ def _planned(
     else:
         lines, angle_deg = left.lines, left.angle_deg
         sprayed = joined([left.done, lines])
-    kept_m = settings.border_buffer_m
-    extents = None
-    if kept_m is not None:
-        extents = extents_of(field.limit, width_m=width_m, buffer_m=kept_m)
-    demand = demands(lines, rates, width_m=width_m, valves=settings.valves, extents=extents)
+    demand = _demand(lines, rates, field, settings)
+    if isinstance(rates, UntreatedRates):
+        rates = rates.rates
     litres = np.array([need.total_l for need in demand])
     if not float(litres.sum()) > 0.0:
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
@@ -132,6 +131,18 @@ def _planned(
         terrain=around.terrain,
     )
     return scheduled(plan)
+
+
+def _demand(lines: Floats, rates: Rates, field: Field, settings: Settings) -> list[Demand]:
+    """Return what each line needs; of a field that is gone on with, what a guard leaves to it."""
+    kept_m, width_m = settings.border_buffer_m, settings.swath_width_m
+    limit = rates.limit if isinstance(rates, UntreatedRates) else field.limit
+    extents = None
+    if kept_m is not None:
+        extents = extents_of(limit, width_m=width_m, buffer_m=kept_m)
+    if isinstance(rates, UntreatedRates):
+        return demands_once(lines, rates, width_m=width_m, valves=settings.valves, extents=extents)
+    return demands(lines, rates, width_m=width_m, valves=settings.valves, extents=extents)
 
 
 def _is_one(settings: Settings, litres: Floats) -> bool:

@@ -38,6 +38,7 @@ from missions.reading_ground import (
 from missions.reading_outline import near_area, outline_of
 from missions.remaining import Remaining
 from missions.surroundings import NOTHING_AROUND, Surroundings
+from missions.treated_rates import untreated_rates
 
 # Where no configuration is given.
 DEFAULTS = Settings(swath_width_m=6.0, speed_m_s=6.0)
@@ -103,13 +104,16 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         offset_m=offset_m,
         kept_m=asked.border_m,
     )
+    whole = ground
     if asked.pause.resume is None and asked.pause.done is not None:
         ground = untreated(ground, asked.pause.done, settings.swath_width_m, offset_m)
     configured = () if mission is None else mission.depots
     return Task(
         field=ground,
         settings=settings,
-        rates=_rates(asked, config, map_file, boundary, frame),
+        rates=untreated_rates(
+            _rates(asked, config, map_file, boundary, frame), asked.pause.ground, whole, offset_m
+        ),
         depots=asked.depots or tuple(configured),
         around=Surroundings(
             terrain=terrain_of(asked.ground, config, frame),

@@ -51,6 +51,13 @@ class BreakAsked:
                 "the treated ground"
             )
 
+    @property
+    def ground(self) -> Path | None:
+        """Return the file of the treated ground: that of --done, or a journal to go on with."""
+        if self.done is None and self.resume is not None and is_journal(self.resume):
+            return self.resume
+        return self.done
+
 
 NO_BREAK = BreakAsked()
 
@@ -100,7 +107,7 @@ def left_of(
         return None
     is_flown = is_journal(asked.resume)
     rows = _flown_lines(asked.resume, frame) if is_flown else read_lines(asked.resume, frame)
-    done = asked.resume if asked.done is None and is_flown else asked.done
+    done = asked.ground
     treated = None if done is None else treated_area(done, frame, width_m, offset_m)
     since = Break(
         stop=None if asked.stop is None else frame.to_local(*asked.stop),

@@ -197,7 +197,12 @@ def fly_one(job: Job) -> Flown:
         config = example()
         text = {"config_path": str(config.path), "config_toml": config.source_text}
         with Journal.create(
-            job.journal_folder, setup=setup, setup_text=text, started_s=START_S, waits=True
+            job.journal_folder,
+            setup=setup,
+            setup_text=text,
+            started_s=START_S,
+            waits=True,
+            training="simulated",
         ) as journal:
             result = _fly(job, setup, profile, journal)
     return Flown(

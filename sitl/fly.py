@@ -20,7 +20,7 @@ import numpy as np
 import shapely
 
 from analysis.evaluation import Evaluation, evaluate, limit_ratio
-from companion.assembly import build_setup, deliverable
+from companion.assembly import build_setup, deliverable, refuse_mismatch
 from companion.config import Config, load
 from companion.core.controller import Setup
 from companion.core.nozzle import NozzleSet, allowed_duty
@@ -165,6 +165,7 @@ def prepare(options: FlyOptions) -> Task:
             f"--meter-rate-hz {options.meter_rate_hz:g}: give 0 (no meter) to {METER_RATE_MAX_HZ:g}"
         )
     config = load(options.config)
+    refuse_mismatch(config)
     setup = build_setup(config)
     profile = _plant(options.plant, setup)
     faults: tuple[Fault, ...] = ()

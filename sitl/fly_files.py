@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from sitl.fly import Flown
 
+# What was sprayed, as a journal says it: no flight goes on from there.
+SIMULATED = "simulated"
 RASTER_CELLS_MAX = 4_000_000
 MARGIN_M = 5.0
 
@@ -85,6 +87,7 @@ def write_journal(flown: Flown, folder: Path) -> Path:
         setup_text={"config_toml": flown.task.config.source_text},
         started_s=float(flown.trajectory.time_s[0]),
         waits=True,
+        training=SIMULATED,
     ) as journal:
         for item in flown.trace:
             if isinstance(item, Decision):

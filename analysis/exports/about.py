@@ -101,4 +101,8 @@ def _asked_before(meta: Mapping[str, str]) -> Mapping[str, object]:
 def _text(values: Mapping[str, object], key: str) -> str | None:
     """Return a text on one line; None where there is none."""
     found = values.get(key)
-    return (" ".join(found.split()) or None) if isinstance(found, str) else None
+    if not isinstance(found, str):
+        return None
+    # JSON can hold half of a pair of UTF-16, which no file of ours can.
+    sound = found.encode("utf-8", errors="replace").decode("utf-8")
+    return " ".join(sound.split()) or None

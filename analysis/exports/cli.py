@@ -90,7 +90,12 @@ def _read(journal: Path, unread: list[str]) -> AppliedFlight:
 
     flight = read_applied(journal, unread=unread)
     if not len(flight.time_s):
-        raise ExportError(f"{journal}: the flight never had a position; there is nothing to export")
+        why = (
+            f"nothing of its path can be read ({unread[0]})"
+            if unread
+            else ("the flight never had a position")
+        )
+        raise ExportError(f"{journal}: {why}; there is nothing to export")
     return flight
 
 

@@ -1,7 +1,7 @@
 """An export appears whole or not at all, and never in the place of something else.
 
 Everything is written into a folder beside its destination, which goes away whatever happens, and
-is moved from there when it is complete.
+is moved from there when it is complete. Where a move fails, those before it are taken back.
 """
 
 from __future__ import annotations
@@ -45,10 +45,7 @@ def write_beside(out: Path, content: Content, *, force: bool) -> int:
     try:
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as folder:
             size = _write(Path(folder), content)
-            # Old parts under a new name would be taken for one set: the last goes first.
-            (out.parent / list(content)[-1]).unlink(missing_ok=True)
-            for name in content:
-                (Path(folder) / name).replace(out.parent / name)
+            _exchange(Path(folder), out.parent, list(content))
     except OSError as error:
         raise _not_written(out, error) from None
     return size
@@ -64,9 +61,7 @@ def write_folder(out: Path, content: Content, *, force: bool) -> int:
             fresh = Path(folder) / "fresh"
             fresh.mkdir()
             size = _write(fresh, content)
-            if out.exists():
-                out.rename(Path(folder) / "replaced")
-            fresh.rename(out)
+            _exchange_folder(fresh, out, Path(folder) / "replaced")
     except OSError as error:
         raise _not_written(out, error) from None
     return size
@@ -82,6 +77,42 @@ def zipped(members: Mapping[str, bytes]) -> bytes:
             member.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(member, content)
     return packed.getvalue()
+
+
+def _exchange(fresh: Path, place: Path, names: list[str]) -> None:
+    """Move files to their place, all or none: what is there already waits in a folder."""
+    replaced = fresh / ".replaced"
+    replaced.mkdir()
+    moved: list[str] = []
+    kept: list[str] = []
+    try:
+        # Old parts under a new name would be taken for one set: all the old ones go first.
+        for name in names:
+            if (place / name).exists():
+                (place / name).rename(replaced / name)
+                kept.append(name)
+        for name in names:
+            (fresh / name).rename(place / name)
+            moved.append(name)
+    except OSError:
+        for name in moved:
+            (place / name).unlink(missing_ok=True)
+        for name in kept:
+            (replaced / name).rename(place / name)
+        raise
+
+
+def _exchange_folder(fresh: Path, out: Path, replaced: Path) -> None:
+    """Move a folder to its place; what is there comes back where that fails."""
+    is_there = out.exists()
+    if is_there:
+        out.rename(replaced)
+    try:
+        fresh.rename(out)
+    except OSError:
+        if is_there:
+            replaced.rename(out)
+        raise
 
 
 def _is_ours(out: Path, content: Content) -> bool:

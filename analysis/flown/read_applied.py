@@ -8,30 +8,25 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from analysis.flown.applied_flight import AppliedFlight, Floats, Ints, Series
+from analysis.flown.applied_flight import AppliedFlight, Series
 from analysis.flown.holes import (
     Hole,
     closed_over,
     doubtful_holes,
     marked,
-    sample_holes,
     within,
 )
 from analysis.flown.read_changes import read_changes
+from analysis.flown.read_samples import read_samples
 from analysis.flown.sound_rows import (
-    POINT_BYTES,
     clock_offset_s,
     is_event,
-    is_sample,
-    rates_of,
     sound_rows,
 )
 from analysis.flown.table_rows import rows_of
@@ -43,12 +38,6 @@ from companion.record.setup_json import field_names_of
 from companion.record.versions import migrated, read_entries
 
 _NAN = float("nan")
-_APPLIED = """geom, time_s, target_flow_l_min, flow_l_min, speed_m_s, course_deg, heading_deg,
-           height_m, inhibits, valve_rates_l_ha"""
-_POINT = np.dtype(
-    [("head", "V8"), ("order", "u1"), ("kind", "<u4"), ("lon", "<f8"), ("lat", "<f8")]
-)
-assert _POINT.itemsize == POINT_BYTES
 # Which value of which sensor's message becomes a series, and which field tells a fault.
 _SENSORS = {
     "FlowReport": ("volume_ml", "fault"),
@@ -74,21 +63,10 @@ def read_applied(path: Path, *, unread: list[str] | None = None) -> AppliedFligh
             raise JournalError(f"{path}: is damaged: {line}") from error
 
 
-class _Applied(NamedTuple):
-    """The rows of the table `applied`, in columns; `holes` are where rows are missing."""
-
-    place: NDArray[np.void]
-    columns: Floats
-    inhibits: tuple[str, ...]
-    rate_l_ha: Floats
-    holes: list[Hole]
-    missing: int
-
-
 def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
     setup, meta = journal.setup(), journal.meta
     names = field_names_of(meta["setup"])
-    applied = _applied(journal, len(setup.boom.valves), unread)
+    applied = read_samples(journal, len(setup.boom.valves), unread)
     time_s, target, flow, speed, course, heading, height = applied.columns
     latitude_deg, longitude_deg = applied.place["lat"].copy(), applied.place["lon"].copy()
     east_m, north_m = setup.frame.to_local_all(latitude_deg.tolist(), longitude_deg.tolist())
@@ -168,58 +146,6 @@ def _at_start(meta: dict[str, str]) -> list[str]:
         return []
 
 
-def _applied(journal: OpenJournal, valves: int, unread: list[str] | None) -> _Applied:
-    found = rows_of(
-        journal.connection, "applied", _APPLIED, key="sequence", unread=unread, what="samples"
-    )
-    rates: dict[object, list[float] | None] = {}
-    for row in found.rows:
-        # Rows of one rate for all valves are one text, and there are few rates.
-        if row[-1] not in rates:
-            rates[row[-1]] = rates_of(row[-1], valves)
-    rows = sound_rows(
-        found.rows, lambda row: is_sample(row) and rates[row[-1]] is not None, unread, "samples"
-    )
-    sequence: Ints = np.array([row[0] for row in rows], dtype=np.int64)
-    holes = sample_holes(
-        sequence, np.array([row[2] for row in rows], dtype=np.float64), _ends(journal)
-    )
-    count = int(journal.meta.get("rows_applied") or 0)
-    placed = [row for row in rows if row[1] is not None]
-    place = np.frombuffer(b"".join(row[1] for row in placed), dtype=_POINT)
-    columns = np.array([row[2:9] for row in placed], dtype=np.float64).reshape(-1, 7).T
-    sound = np.isfinite(place["lat"]) & np.isfinite(place["lon"])
-    order = np.flatnonzero(sound)[np.argsort(columns[0, sound], kind="stable")]
-    return _Applied(
-        place=place[order],
-        columns=np.ascontiguousarray(columns[:, order]),
-        inhibits=tuple(" ".join(sorted((placed[i][9] or "").split())) for i in order.tolist()),
-        rate_l_ha=np.array(
-            [rates[placed[i][-1]] for i in order.tolist()], dtype=np.float64
-        ).reshape(-1, valves),
-        holes=holes,
-        missing=max(count - len(rows), 0),
-    )
-
-
-def _ends(journal: OpenJournal) -> Sequence[tuple[float, float]]:
-    """Return number and time of the first and the last of all entries; nothing where unknown."""
-    if journal.version == "1":
-        return ()
-    found = []
-    for sql in (
-        "SELECT first_sequence, from_s FROM blocks ORDER BY first_sequence LIMIT 1",
-        "SELECT last_sequence, until_s FROM blocks ORDER BY first_sequence DESC LIMIT 1",
-    ):
-        try:
-            row = journal.connection.execute(sql).fetchone()
-        except sqlite3.DatabaseError:
-            continue
-        if row is not None and isinstance(row[0], int) and isinstance(row[1], float):
-            found.append((float(row[0]), row[1]))
-    return found
-
-
 def _events(journal: OpenJournal, unread: list[str] | None) -> tuple[Event, ...]:
     found = rows_of(
         journal.connection,
@@ -261,12 +187,18 @@ def _sensors(
         for kind, wanted in _SENSORS.items()
         if kind in names
     }
-    entries = read_entries(journal.connection, journal.version, kinds=places.keys(), unread=unread)
-    for entry in entries:
-        ((_, values),) = json.loads(entry.body).items()
-        at, value, fault = places[entry.kind]
-        is_sound = fault < 0 or not values[fault]
-        pairs[entry.kind].append((values[at], values[value] if is_sound else None))
+    try:
+        for entry in read_entries(
+            journal.connection, journal.version, kinds=places.keys(), unread=unread
+        ):
+            ((_, values),) = json.loads(entry.body).items()
+            at, value, fault = places[entry.kind]
+            is_sound = fault < 0 or not values[fault]
+            pairs[entry.kind].append((values[at], values[value] if is_sound else None))
+    except sqlite3.DatabaseError as error:
+        if unread is None or "locked" in str(error):
+            raise
+        unread.append(f"what sensors said behind a damaged place: {' '.join(str(error).split())}")
     return {kind: _series(rows) for kind, rows in pairs.items()}
 
 

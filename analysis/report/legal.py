@@ -168,8 +168,9 @@ def _flown(profile: Profile, told: Told, facts: Facts) -> Iterator[Entry]:
 
 
 def _why_not(facts: Facts) -> Iterator[str]:
-    if facts.training in ("water", "dry"):
-        yield f"a product: this was training ({facts.training})"
+    if facts.training in ("water", "dry", "simulated"):
+        what = "a simulation" if facts.training == "simulated" else f"training ({facts.training})"
+        yield f"a product: this was {what}"
     elif not facts.area_ha > 0.0:
         yield "an application: nothing was sprayed"
     if facts.ends_spraying:

@@ -80,7 +80,11 @@ def verdict_of(assessment: Assessment | None, treated: Treated) -> dict[str, Any
 
 def _sentence(figures: Mapping[str, Any], training: str | None) -> str:
     applied_l, prescribed_l = figures["applied_l"], figures["prescribed_l"]
-    what = {"water": "L of water applied", "dry": "L would have been applied"}
+    what = {
+        "water": "L of water applied",
+        "dry": "L would have been applied",
+        "simulated": "L applied in a simulation",
+    }
     done = what.get(training or "", "L applied")
     parts = [f"{applied_l:.2f} {done} on {figures['area_ha']:.2f} ha"]
     if prescribed_l:
@@ -137,10 +141,12 @@ def _training(flight: AppliedFlight) -> Iterator[Caution]:
         yield _mark("training", "TRAINING WITH WATER: no product was applied")
     elif flight.training == "dry":
         yield _mark("training", "DRY RUN: no valve was opened, nothing was applied")
+    elif flight.training == "simulated":
+        yield _mark("training", "SIMULATION: nothing was flown, nothing was applied")
     elif flight.training is None:
         yield _note(
             "training-unknown",
-            "The journal does not say whether a product was sprayed: a simulation, or an old one.",
+            "The journal does not say whether a product was sprayed: it is an old one.",
         )
 
 

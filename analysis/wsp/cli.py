@@ -11,6 +11,7 @@ import typer
 
 from analysis.wsp.card import INSET_MM, Method
 from analysis.wsp.flight_ties import Ties, tie, tie_lines
+from analysis.wsp.flown_journal import Flown, read_flown
 from analysis.wsp.image import LEAST_DPI, MOST_DPI, ImageError, sheets_of
 from analysis.wsp.picture import draw_distributions, draw_sheet
 from analysis.wsp.positions import Position, placed, read_positions
@@ -68,7 +69,8 @@ def measure_cards(
 ) -> None:
     """Measure coverage, deposits and drop sizes on scans of water-sensitive paper.
 
-    Exit 0: measured; 1: no card found, or an image could not be read; 2: wrong options or input.
+    Exit 0: measured; 1: no card found, an image could not be read, or the journal was cut, is
+    damaged or lacks rows; 2: wrong options or input.
     """
     if journal is not None and positions is None:
         raise ConfigError("--journal: give --positions too, where the cards lay")
@@ -83,14 +85,16 @@ def measure_cards(
         card_width_mm=_within("--card-width-mm", card_width_mm, 5.0, 200.0) or CARD_WIDTH_MM,
     )
     places = [] if positions is None else read_positions(positions)
+    flown = Flown() if journal is None else read_flown(journal)
     _make(out)
     sheets, pictures, refused = _read_all(images, reading, out)
     cards = numbered(sheets)
-    ties, notes = _ties(cards, places, journal)
+    ties, notes = _ties(cards, places, flown)
     rows = [_joined(each, ties, places, cards) for each in cards]
     result = _result(reading, sheets, pictures, cards, rows) | {
         "boundaries": ties.boundaries if ties else [],
         "notes": notes,
+        "warnings": list(flown.warnings),
         "refused": refused,
         "files": [*pictures, "wsp.json", "wsp.csv"],
     }
@@ -98,11 +102,11 @@ def measure_cards(
         result["files"].append(FIGURE)
     _write(out / "wsp.csv", csv_text(rows))
     _write(out / "wsp.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
-    for line in notes:
+    for line in (*notes, *(f"warning: {each}" for each in flown.warnings)):
         note(line)
     lines = [*table_lines(cards, reading.method), *(tie_lines(ties) if ties else [])]
     answer(result, [*lines, "", f"written to {out}: {', '.join(result['files'])}"], as_json=as_json)
-    if refused or not cards:
+    if refused or not cards or flown.warnings:
         raise typer.Exit(1)
 
 
@@ -143,18 +147,16 @@ def _saved(path: Path, pixels: Any, found: SheetResult, first: int) -> None:
 
 
 def _ties(
-    cards: Sequence[Numbered], places: Sequence[Position], journal: Path | None
+    cards: Sequence[Numbered], places: Sequence[Position], flown: Flown
 ) -> tuple[Ties | None, list[str]]:
     if not places:
         return None, []
     by_number, notes = placed(cards, places)
-    if journal is None:
+    flight = flown.flight
+    if flight is None:
         return None, notes
-    from analysis.flown.read_applied import read_applied
-
-    flight = read_applied(journal)
     if flight.training not in (None, "no"):
-        notes.append(f"{journal.name}: training: {flight.training}")
+        notes.append(f"{flight.path.name}: training: {flight.training}")
     return tie(flight, cards, by_number), notes
 
 

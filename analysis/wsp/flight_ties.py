@@ -57,6 +57,7 @@ def _tie(flight: AppliedFlight, each: Numbered, place: Position) -> tuple[Row, C
         "beside_m": over.beside_m,
         "planned_l_ha": over.planned_l_ha,
         "applied_l_ha": over.applied_l_ha,
+        "applied_all_passes_l_ha": over.applied_all_passes_l_ha,
         "speed_m_s": over.speed_m_s,
         "course_deg": over.course_deg,
         "height_m": over.height_m,

@@ -6,12 +6,14 @@ changes of the valve stand for, after the lags of the configuration. No drift is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from analysis.flown.applied_flight import AppliedFlight
+from analysis.flown.applied_record import heading_deg
+from analysis.flown.pumped_flow import pumped_ml
 from companion.core.boom import Boom
 
 Floats = NDArray[np.float64]
@@ -21,6 +23,9 @@ LONGEST_STEP_S = 1.0
 # A rate of a vehicle that hardly moves is no figure.
 LEAST_SPEED_M_S = 0.3
 _ML_FACTOR = 60.0 / 10_000.0
+# A pump's flow is followed from so long before, many of its time constants, in such steps.
+PUMP_BEFORE_S, PUMP_STEP_S = 10.0, 0.01
+_L_MIN_PER_ML_S = 60.0 / 1000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,7 +33,7 @@ class Passing:
     """The boom's way over a place; `valve` is the one whose strip held it, None beside the boom.
 
     `beside_m` is how far the place lay beside the end of the boom, 0 under it. `passes` counts
-    how often the boom went over it at all.
+    how often the boom went over it at all, `applied_all_passes_l_ha` what all of them gave.
     """
 
     time_s: float
@@ -41,39 +46,47 @@ class Passing:
     passes: int
     planned_l_ha: float | None
     applied_l_ha: float | None
+    applied_all_passes_l_ha: float | None
     inhibits: str
 
 
 def passing(flight: AppliedFlight, east_m: float, north_m: float) -> Passing | None:
-    """Return the nearest pass over a place; None where the boom's line never crossed it.
+    """Return the pass that counts for a place; None where the boom's line never crossed it.
 
     A pass is where the line of the boom goes over the place from behind to before or the other
-    way; of several that covered it, the one with the middle of the boom nearest to it.
+    way; of several that covered it, one that sprayed, and of those the one with the middle of the
+    boom nearest to it.
     """
     at, part, right_m = _crossings(flight, east_m, north_m)
     boom = flight.setup.boom
     if not len(at):
         return None
     beside_m = np.maximum(_beyond_m(boom, right_m), 0.0)
-    best = int(np.lexsort((np.abs(right_m), beside_m))[0])
-    i, share = int(at[best]), float(part[best])
-    if not beside_m[best] <= boom.width_m:
+    order = np.lexsort((np.abs(right_m), beside_m))
+    covering = [each for each in order.tolist() if beside_m[each] <= 0.0]
+    if not beside_m[order[0]] <= boom.width_m:
         return None
-    return _passing_at(
-        flight,
-        i,
-        share,
-        right_m=float(right_m[best]),
-        beside_m=float(beside_m[best]),
-        passes=int(np.count_nonzero(beside_m <= 0.0)),
-    )
+    found = [
+        _passing_at(
+            flight,
+            int(at[each]),
+            float(part[each]),
+            right_m=float(right_m[each]),
+            beside_m=float(beside_m[each]),
+            passes=len(covering),
+        )
+        for each in covering or order[:1].tolist()
+    ]
+    best = next((each for each in found if each.applied_l_ha), found[0])
+    given = [each.applied_l_ha for each in found if each.applied_l_ha is not None]
+    return replace(best, applied_all_passes_l_ha=sum(given) if given else None)
 
 
 def _crossings(
     flight: AppliedFlight, east_m: float, north_m: float
 ) -> tuple[NDArray[np.intp], Floats, Floats]:
     """Return samples before a crossing, the share of the step to it, and the offset there."""
-    heading = np.deg2rad(flight.heading_deg)
+    heading = np.deg2rad(_nose_deg(flight))
     de, dn = east_m - flight.east_m, north_m - flight.north_m
     middle_m = float(np.mean(flight.setup.boom.forward_m))
     ahead_m = de * np.sin(heading) + dn * np.cos(heading) - middle_m
@@ -90,6 +103,12 @@ def _crossings(
     at = at[step_m >= 0.5 * np.abs(ahead_m[at + 1] - ahead_m[at])]
     part = ahead_m[at] / (ahead_m[at] - ahead_m[at + 1])
     return at, part, right_m[at] + part * (right_m[at + 1] - right_m[at])
+
+
+def _nose_deg(flight: AppliedFlight) -> Floats:
+    """Return the nose's direction at the samples; the course stands for a heading not known."""
+    known = np.isfinite(flight.heading_deg) | np.isfinite(flight.course_deg)
+    return heading_deg(flight, flight.time_s) if known.any() else flight.heading_deg
 
 
 def _beyond_m(boom: Boom, right_m: Floats) -> Floats:
@@ -123,6 +142,7 @@ def _passing_at(
         passes=passes,
         planned_l_ha=planned if np.isfinite(planned) else None,
         applied_l_ha=_applied_l_ha(flight, valve, time_s, speed_m_s) if is_under else None,
+        applied_all_passes_l_ha=None,
         inhibits=flight.inhibits[near],
     )
 
@@ -134,10 +154,12 @@ def _applied_l_ha(
     if not speed_m_s >= LEAST_SPEED_M_S:
         return None
     boom = flight.setup.boom
-    if flight.setup.pump is not None:
-        # The pump makes the flow of all valves; its own lag is not in this.
-        flow = float(np.interp(time_s, flight.time_s, flight.flow_l_min))
-        return flow / (_ML_FACTOR * speed_m_s * boom.width_m)
+    if flight.setup.pumping is not None:
+        steps = round(PUMP_BEFORE_S / PUMP_STEP_S) + 1
+        before_s = np.linspace(time_s - PUMP_BEFORE_S, time_s, steps, dtype=np.float64)
+        volume_ml = pumped_ml(flight, before_s)[:, valve]
+        pumped_l_min = (volume_ml[-1] - volume_ml[-2]) / PUMP_STEP_S * _L_MIN_PER_ML_S
+        return float(pumped_l_min / (_ML_FACTOR * speed_m_s * boom.valves[valve].width_m))
     duties = [duty_at(flight, each, time_s) for each in range(len(boom.valves))]
     if duties[valve] <= 0.0:
         return 0.0

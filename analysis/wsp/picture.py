@@ -84,7 +84,7 @@ def draw_distributions(cards: Sequence[Numbered], path: Path) -> None:
             share = 100.0 * np.cumsum(drop_um**3) / (drop_um**3).sum()
             style = {"label": f"card {each.number}"} if len(cards) <= _NAMED else {"color": "0.5"}
             volume.plot(drop_um, share, linewidth=1.2, **style)
-    if len(cards) <= _NAMED:
+    if volume.get_legend_handles_labels()[0]:
         volume.legend(fontsize=8, loc="lower right")
     volume.set(xlabel="drop diameter [um]", ylabel="volume in smaller drops [%]", ylim=(0, 100))
     for part in (10, 50, 90):

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.wsp.cards import FLAT
+from analysis.wsp.cards import FLAT, YELLOW_ABOVE_BLUE
 from analysis.wsp.overlap import UNRELIABLE_PERCENT
 from analysis.wsp.rectangle import Rectangle
 from analysis.wsp.stains import Stains
@@ -30,6 +30,8 @@ _LARGE_STAIN, _PAPER_FLOOR = 0.10, 143
 # Paper that differs by more than this between eighths of the card [grey levels].
 _UNEVEN = 20.0
 _CLIPPED_PAPER, _CLIPPED_STAIN = 0.05, 0.3
+# So much of what is no stain must be yellow: brown or faded paper still is, in parts.
+_YELLOW_LEAST = 0.01
 # 127 within this share of the contrast from the middle; at 600 dpi a stain's edge then lies
 # within about a quarter of a pixel.
 _OFF_MIDDLE = 0.25
@@ -75,6 +77,8 @@ def _light(seen: Seen) -> Iterator[tuple[str, str]]:
     if not greys:
         yield "no-paper", "no unstained paper is to be seen; is this a card?"
         return
+    if not _has_yellow(seen):
+        yield "no-paper", "nothing on it is yellow; is this a card, and scanned in colour?"
     largest = float(seen.stains.area_px.max(initial=0.0)) / max(int(seen.roi.sum()), 1)
     span = max(greys) - min(greys)
     if span > _UNEVEN or (largest > _LARGE_STAIN and min(greys) < _PAPER_FLOOR):
@@ -83,6 +87,13 @@ def _light(seen: Seen) -> Iterator[tuple[str, str]]:
             f"the paper's grey goes from {min(greys):.0f} to {max(greys):.0f} over the card; "
             "scan it flat, lid closed",
         )
+
+
+def _has_yellow(seen: Seen) -> bool:
+    """Whether at least a hundredth of what is no stain is yellow, as the paper is."""
+    paper = seen.crop[::3, ::3][(seen.roi & (seen.stains.labels == 0))[::3, ::3]].astype(np.int16)
+    yellow = paper[:, :2].min(axis=1) > paper[:, 2] + YELLOW_ABOVE_BLUE
+    return bool(yellow.sum() >= max(_YELLOW_LEAST * len(paper), 1.0))
 
 
 def block_greys(grey: Bytes, paper: Mask) -> Iterator[float]:

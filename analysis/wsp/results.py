@@ -203,18 +203,21 @@ def _cell(value: Any) -> Any:
 
 def table_lines(cards: Sequence[Numbered], method: Method) -> Iterator[str]:
     """Yield the table for a person, figures of both spread factors side by side."""
+    if not cards:
+        yield "no card was found"
+        return
     main, second = method.spread.name, second_of(method.spread).name
     yield f"drop sizes by {main} ({method.spread.formula}) / {second}"
     yield (
-        "card  cover  depos.  cover*  drops*      Dv0.1      Dv0.5      Dv0.9    span         L/ha"
+        "card  cover*  drops*   cover  depos.      Dv0.1      Dv0.5      Dv0.9    span         L/ha"
         "  where, flags"
     )
-    yield "          %    /cm2       %    /cm2         um         um         um"
+    yield "           %    /cm2       %    /cm2         um         um         um"
     for each in cards:
         yield _line(each)
     yield (
-        "deposits: stains as counted; * corrected: threshold halfway, blur, overlap of drops that "
-        f"fell evenly ({LAW})"
+        "* use these: corrected for threshold, blur and overlap of drops that fell evenly "
+        f"({LAW}); cover and deposits without it: as P1 counts stains"
     )
 
 
@@ -229,8 +232,9 @@ def _line(each: Numbered) -> str:
     volume = f"{main.l_ha:6.2f}/{second.l_ha:.2f}"
     flags = ", ".join(card.flags)
     return (
-        f"{each.number:4d} {main.coverage_percent:6.2f}  {main.deposits_per_cm2:6.1f}  "
-        f"{card.better.covered_percent:6.2f}  {_number(card.better.drops_per_cm2, 1):>6} "
+        f"{each.number:4d}  {card.better.covered_percent:6.2f}  "
+        f"{_number(card.better.drops_per_cm2, 1):>6}  "
+        f"{main.coverage_percent:6.2f}  {main.deposits_per_cm2:6.1f} "
         f"{sizes_text}  {span} {volume:>12}  "
         f"{each.sheet.name}{': ' + flags if flags else ''}"
     )

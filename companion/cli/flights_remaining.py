@@ -17,10 +17,10 @@ from companion.cli.answer import AsJson, answer, note
 from companion.core.coverage import Coverage
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
-from companion.errors import VrsprayError
+from companion.errors import JournalError, VrsprayError
 from companion.maps.build import build_prescription
 from companion.maps.registry import read_map
-from companion.record.continuing import Treated, read_treated_ground, rest_of
+from companion.record.continuing import Treated, is_damage, read_treated_ground, rest_of
 from companion.record.coverage_area import moved
 
 M2_PER_HA = 10_000.0
@@ -46,12 +46,14 @@ def remaining(
     """Tell what is treated, what is left in hectares and litres, and where to go on.
 
     What is left in pieces narrower than half a valve's strip does not count: no valve is for that.
+
+    Exit 0: all was read; 1: a journal is damaged, and what of it could not be read is said; 2: no
+    journal, or none that keeps treated ground.
     """
-    flights = sorted((read_treated_ground(path) for path in journals), key=_started)
+    flights = sorted((_read(path, as_json=as_json) for path in journals), key=_started)
     last = flights[-1]
-    for flight in flights:
-        if flight.training not in (None, "no"):
-            note(f"warning: {flight.path}: flown with training = {flight.training}: no product")
+    for line in _training(flights):
+        note(line)
     ground = last.setup.prescription
     if map_file is not None:
         ground = build_prescription(read_map(map_file), last.frame, overlap="max")
@@ -64,6 +66,37 @@ def remaining(
         _write(out, rest, last.frame, result)
         result["file"] = str(out)
     answer(result, _lines(result), as_json=as_json)
+    for text in result["unread"]:
+        note(f"not read: {text}")
+    if result["unread"]:
+        raise typer.Exit(1)
+
+
+def _read(path: Path, *, as_json: bool) -> Treated:
+    """Return what can be read of a journal; one that tells nothing is said, and ends it."""
+    try:
+        return read_treated_ground(path, is_lenient=True)
+    except JournalError as error:
+        if not is_damage(error):
+            raise
+        answer({"error": str(error)}, (), as_json=as_json)
+        note(str(error))
+        raise typer.Exit(1) from error
+
+
+def _training(flights: Sequence[Treated]) -> Iterator[str]:
+    """Yield which flights treated nothing, and of which nobody says."""
+    for flight in flights:
+        if flight.training is None:
+            yield (
+                f"warning: {flight.path}: does not say whether a product was sprayed: "
+                "`vrspray run --continue` takes it with --continue-unmarked only"
+            )
+        elif flight.training != "no":
+            yield (
+                f"warning: {flight.path}: flown with training = {flight.training}: no product; "
+                "`vrspray run --continue` refuses it"
+            )
 
 
 def _started(flight: Treated) -> str:
@@ -85,8 +118,10 @@ def _result(
         "pieces": len(rest.geoms),
         "narrowest_m": 0.5 * last.strip_m,
         "resume": None if stopped is None else {"lat": stopped[0], "lon": stopped[1]},
-        # Cut off: its last second is a guess.
-        "is_exact": all(flight.is_closed for flight in flights),
+        # Cut off: its last second is a guess; damaged: more was treated than could be read.
+        "is_exact": all(flight.is_closed and not flight.unread for flight in flights),
+        "training": [flight.training for flight in flights],
+        "unread": [f"{flight.path}: {text}" for flight in flights for text in flight.unread],
     }
 
 
@@ -116,7 +151,9 @@ def _lines(result: Mapping[str, Any]) -> Iterator[str]:
     place = result["resume"]
     if place is not None:
         yield f"stopped at {place['lat']:.7f},{place['lon']:.7f}"
-    if not result["is_exact"]:
+    if result["unread"]:
+        yield "a journal is damaged: more may be treated than could be read"
+    elif not result["is_exact"]:
         yield "a flight was cut off: its last second of spraying is worked out, not known"
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from companion.errors import JournalError, NoMapError
 from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
+from companion.record.salvage import readable_rows
 from companion.record.totals import missing_rows
 from companion.record.versions import OtherVersionError, read_entries
 
@@ -78,20 +79,37 @@ def _fill(result: dict[str, Any], journal: OpenJournal) -> None:
         unread.append(str(error).partition("is damaged: ")[2])
     except DAMAGE as error:
         unread.append(f"the set-up: {one_line(error)}")
-    unread += missing_rows(connection, journal.meta)
-    there = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
-    for name in _COUNTED:
-        if name in there:
-            rows = _tried(unread, name, connection, f"SELECT count(*) FROM {name}")
-            result["tables"][name] = rows[0][0] if rows else None
-    if "link_stats" in there:
-        rows = _tried(unread, "link_stats", connection, _LINK)
-        if rows and rows[0][0]:
-            result["link"] = dict(zip(_LINK_KEYS, rows[0], strict=True))
+    _fill_tables(result, journal)
     sql = "SELECT time, time_s, kind, text FROM events ORDER BY sequence"
     marks = _tried(unread, "events", connection, sql)
     keys = ("time", "time_s", "kind", "text")
     result["events"] = [dict(zip(keys, row, strict=True)) for row in marks or []]
+
+
+def _fill_tables(result: dict[str, Any], journal: OpenJournal) -> None:
+    unread: list[str] = result["unread"]
+    connection = journal.connection
+    there = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+    for name in _COUNTED:
+        if name in there:
+            result["tables"][name] = _count(unread, name, connection)
+    told = {text.partition(":")[0] for text in unread}
+    for text in missing_rows(connection, journal.meta):
+        unread += [] if text.partition(":")[0] in told else [text]
+    if "link_stats" in there:
+        rows = _tried(unread, "link_stats", connection, _LINK)
+        if rows and rows[0][0]:
+            result["link"] = dict(zip(_LINK_KEYS, rows[0], strict=True))
+
+
+def _count(unread: list[str], name: str, connection: sqlite3.Connection) -> int:
+    """Return how many rows of a table there are, or can be read."""
+    try:
+        return int(connection.execute(f"SELECT count(*) FROM {name}").fetchone()[0])
+    except sqlite3.DatabaseError as error:
+        count = sum(1 for _ in readable_rows(connection, name, [True]))
+        unread.append(f"{name}: only {count} rows can be read: {one_line(error)}")
+        return count
 
 
 def _tried(

@@ -15,7 +15,7 @@ from typing import Annotated
 import typer
 
 from companion import runtime
-from companion.assembly import build_setup, deliverable
+from companion.assembly import build_setup, deliverable, refuse_mismatch
 from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.notify import Notifier
@@ -36,6 +36,7 @@ from companion.ports import PlanExecutor
 from companion.record.continuing import continued
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
+from companion.record.unfinished import unfinished
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -57,6 +58,12 @@ def run_companion(
             "--continue", metavar="JOURNAL", help="Go on: its ground is not sprayed again."
         ),
     ] = None,
+    takes_unmarked: Annotated[
+        bool,
+        typer.Option(
+            "--continue-unmarked", help="A journal of --continue that does not say it: a product."
+        ),
+    ] = False,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
@@ -69,7 +76,13 @@ def run_companion(
     wanted = (*(overrides or ()), *(["journal.training=true"] if is_water else []))
     config, given = load_with_kept(config_file, wanted)
     training = training_mark(config)
-    setup = continued(build_setup(config), continue_from or (), training=training)
+    refuse_mismatch(config)
+    setup = continued(
+        build_setup(config),
+        continue_from or (),
+        training=training,
+        takes_unmarked=takes_unmarked,
+    )
     for line in _continued_lines(setup):
         note(line)
     link = build_link(config, given, component_options(config, training=training))
@@ -83,6 +96,8 @@ def run_companion(
             note(f"{problem.severity}: {problem.text}; {problem.fix}")
     folder = config.resolve(config.journal.folder)
     for line in made_ready(folder, config.journal):
+        note(line)
+    for line in _left_lines(folder, setup, training):
         note(line)
     journal = Journal.create(
         folder,
@@ -125,6 +140,20 @@ def _continued_lines(setup: Setup) -> list[str]:
     return [
         f"going on: {setup.treated.area_m2 / 10_000.0:.3f} ha are treated; valves close where "
         f"{setup.overlap.switch_off_percent:g} % of their strip is"
+    ]
+
+
+def _left_lines(folder: Path, setup: Setup, training: str) -> list[str]:
+    """Return that an earlier flight left ground of this map, where nobody goes on from any."""
+    if setup.treated is not None or not setup.records_coverage:
+        return []
+    left = unfinished(folder, setup, training=training)
+    if left is None:
+        return []
+    return [
+        f"note: {left.path.name} left {left.left_ha:.2f} ha of this map "
+        f"({100.0 * left.left_share:.0f} %); to spray only what is left: "
+        f"vrspray run ... --continue {left.path}"
     ]
 
 

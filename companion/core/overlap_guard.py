@@ -36,9 +36,9 @@ ACROSS_MIN = 5
 # Treated or bare stretches of a way that are shorter are the raster's own noise, or slivers: half
 # of a strip of 1 m.
 STRETCH_MIN_M = 0.5
-# Ground of the last metres of the way is the wake of this very pass: as far as the boom's strips lie
-# one behind the other, a raster's cell, and a gust or two. Whoever has strips farther apart than
-# any aircraft is long has a wrong figure, and half a field is not left unlooked at for it.
+# Ground of the last metres of the way is the wake of this very pass: as far as the boom's strips
+# lie one behind the other, a raster's cell, and a gust or two. Whoever has strips farther apart
+# than any aircraft is long has a wrong figure, and half a field is not left unlooked at for it.
 WAKE_MARGIN_M = 1.0
 WAKE_MAX_M = 25.0
 # Below this nothing is sprayed: a way that hardly leads anywhere has no stretches.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
@@ -20,6 +21,7 @@ from companion.errors import JournalError
 from companion.record.coverage_area import as_polygons, moved, polygons
 from companion.record.coverage_table import read_coverage
 from companion.record.geopackage import wkb_of
+from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
 
 # Where nothing else is configured, whoever goes on closes a valve that is more over treated ground
@@ -29,7 +31,10 @@ SWITCH_OFF_PERCENT = 50.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Treated:
-    """What one journal says of treated ground; `stopped` is (latitude, longitude)."""
+    """What one journal says of treated ground; `stopped` is (latitude, longitude).
+
+    `unread` says in a line each what is damaged and left out; empty for a sound file.
+    """
 
     path: Path
     coverage: Coverage
@@ -39,6 +44,7 @@ class Treated:
     started_utc: str
     is_closed: bool
     training: str | None
+    unread: tuple[str, ...] = ()
 
     @property
     def strip_m(self) -> float:
@@ -46,40 +52,56 @@ class Treated:
         return 2.0 * float(self.setup.boom.half_width_m.min())
 
 
-def read_treated_ground(path: Path) -> Treated:
+def read_treated_ground(path: Path, *, is_lenient: bool = False) -> Treated:
     """Return what was treated when a flight ended, by it and before it.
 
-    JournalError where the file cannot be used or keeps no coverage.
+    JournalError where the file cannot be used or keeps no coverage. `is_lenient` leaves out what
+    is damaged and says so in `unread`.
     """
-    with opened(path) as journal:
-        coverage = read_coverage(journal.connection)
+    with opened(path, is_lenient=is_lenient) as journal:
+        unread = [*journal.unread]
+        coverage = read_coverage(journal.connection, unread=unread if is_lenient else None)
         if coverage is None:
             raise JournalError(
                 f"{path}: keeps no treated ground: coverage.record was false, or an older version "
                 "wrote it"
             )
         setup = journal.setup()
+        stopped = _stopped(journal, unread if is_lenient else None)
         return Treated(
             path=path,
             coverage=coverage,
             frame=setup.frame,
             setup=setup,
-            stopped=_stopped(journal),
+            stopped=stopped,
             started_utc=journal.meta.get("started_utc", ""),
             is_closed=journal.meta.get("closed") == "yes",
             training=journal.meta.get("training"),
+            unread=tuple(unread),
         )
 
 
-def _stopped(journal: OpenJournal) -> tuple[float, float] | None:
+def is_damage(error: JournalError) -> bool:
+    """Return whether a file is a journal, of which a part cannot be read."""
+    return re.search(r": is damaged|: row \d+", str(error)) is not None
+
+
+def _stopped(journal: OpenJournal, unread: list[str] | None) -> tuple[float, float] | None:
     """Return where a valve was open for the last time."""
-    row = journal.connection.execute(
-        "SELECT geom FROM applied WHERE duty > 0 AND geom IS NOT NULL "
-        "ORDER BY sequence DESC LIMIT 1"
-    ).fetchone()
-    if row is None:
+    try:
+        row = journal.connection.execute(
+            "SELECT geom FROM applied WHERE duty > 0 AND geom IS NOT NULL "
+            "ORDER BY sequence DESC LIMIT 1"
+        ).fetchone()
+        if row is None:
+            return None
+        places = shapely.get_coordinates(shapely.from_wkb(wkb_of(row[0])))
+        ((longitude_deg, latitude_deg),) = places
+    except (*DAMAGE, shapely.errors.ShapelyError) as error:
+        if unread is None:
+            raise
+        unread.append(f"where the spraying stopped: {one_line(error)}")
         return None
-    ((longitude_deg, latitude_deg),) = shapely.get_coordinates(shapely.from_wkb(wkb_of(row[0])))
     return float(latitude_deg), float(longitude_deg)
 
 
@@ -111,15 +133,23 @@ def rest_of(field: BaseGeometry, coverage: Coverage, strip_m: float) -> MultiPol
     return as_polygons(core.buffer(thin_m, join_style="mitre").intersection(bare))
 
 
-def treated_by(paths: Sequence[Path], frame: LocalFrame, *, training: str = "no") -> Coverage:
+def treated_by(
+    paths: Sequence[Path], frame: LocalFrame, *, training: str = "no", takes_unmarked: bool = False
+) -> Coverage:
     """Return what all these flights treated, in another flight's frame.
 
-    A flight with water treated nothing for one with a product, and the other way round.
+    A flight with water, or a simulated one, treated nothing for one with a product, and the other
+    way round. What says nothing of it counts only where somebody vouches for it.
     """
     whole = Coverage()
     for path in paths:
         found = read_treated_ground(path)
-        if (found.training or "no") != training:
+        if found.training is None and not takes_unmarked:
+            raise JournalError(
+                f"{path}: does not say whether a product was sprayed: an old journal, or one of a "
+                "simulation; leave it out, or vouch for it with --continue-unmarked"
+            )
+        if found.training not in (None, training):
             raise JournalError(
                 f"{path}: was flown with training = {found.training}, this flight has {training}: "
                 "it treated nothing; leave it out"
@@ -128,10 +158,12 @@ def treated_by(paths: Sequence[Path], frame: LocalFrame, *, training: str = "no"
     return replace(whole, ahead_s=0.0)
 
 
-def continued(setup: Setup, paths: Sequence[Path], *, training: str = "no") -> Setup:
+def continued(
+    setup: Setup, paths: Sequence[Path], *, training: str = "no", takes_unmarked: bool = False
+) -> Setup:
     """Return the set-up of a flight that goes on where these ended: nothing is sprayed twice."""
     if not paths:
         return setup
     guard = setup.overlap or OverlapGuard(switch_off_percent=SWITCH_OFF_PERCENT)
-    treated = treated_by(paths, setup.frame, training=training)
+    treated = treated_by(paths, setup.frame, training=training, takes_unmarked=takes_unmarked)
     return replace(setup, overlap=guard, treated=treated)

@@ -53,15 +53,18 @@ def write_treated(connection: sqlite3.Connection, treated: Coverage | None) -> N
         _write(connection, "before", treated, None)
 
 
-def read_coverage(connection: sqlite3.Connection) -> Coverage | None:
+def read_coverage(
+    connection: sqlite3.Connection, *, unread: list[str] | None = None
+) -> Coverage | None:
     """Return all that was treated when the flight ended, by it and before it.
 
-    None where the journal keeps no coverage; ValueError where its tiles are damaged.
+    None where the journal keeps no coverage; ValueError where its tiles are damaged. With `unread`
+    it is said there how many are, and they are left out.
     """
-    flight = _read(connection, "flight")
+    flight = _read(connection, "flight", unread)
     if flight is None:
         return None
-    before = _read(connection, "before")
+    before = _read(connection, "before", unread)
     found = connection.execute("SELECT value FROM meta WHERE key = ?", (AHEAD_KEY,)).fetchone()
     if found is None and not flight.tiles:
         return None  # it was never told any: recording was off
@@ -95,7 +98,9 @@ def _write(
     connection.executemany(_DROP, gone)
 
 
-def _read(connection: sqlite3.Connection, kind: _Kind) -> Coverage | None:
+def _read(
+    connection: sqlite3.Connection, kind: _Kind, unread: list[str] | None = None
+) -> Coverage | None:
     sql = "SELECT 1 FROM sqlite_master WHERE name = 'coverage_tiles'"
     if connection.execute(sql).fetchone() is None:
         return None
@@ -103,7 +108,20 @@ def _read(connection: sqlite3.Connection, kind: _Kind) -> Coverage | None:
         "SELECT tile_east, tile_north, cells FROM coverage_tiles WHERE kind = ? LIMIT ?",
         (kind, TILES_MAX),
     )
-    return Coverage(tiles={_key(east, north): _tile(cells) for east, north, cells in rows})
+    if unread is None:
+        return Coverage(tiles={_key(east, north): _tile(cells) for east, north, cells in rows})
+    tiles, damaged = {}, 0
+    try:
+        for east, north, cells in rows:
+            try:
+                tiles[_key(east, north)] = _tile(cells)
+            except ValueError:
+                damaged += 1
+    except sqlite3.DatabaseError as error:
+        unread.append(f"treated ground behind the first {len(tiles)} tiles: {error}")
+    if damaged:
+        unread.append(f"treated ground: {damaged} of {damaged + len(tiles)} tiles are damaged")
+    return Coverage(tiles=tiles)
 
 
 def _key(east: object, north: object) -> TileKey:

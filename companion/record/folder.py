@@ -107,7 +107,7 @@ def _flight(journal: OpenJournal, *, size_bytes: int, is_pinned: bool) -> Flight
         duration_s = None if first_s is None else float(last_s) - float(first_s)
         litres = applied_l(journal.connection, meta)
     except DAMAGE as error:
-        problems.append(one_line(error))
+        problems += [] if any(one_line(error) in text for text in problems) else [one_line(error)]
     state = _STATES.get(meta.get("closed", ""), "damaged")
     return Flight(
         path=journal.path,

@@ -29,6 +29,8 @@ WGS84_WKT = (
     'AXIS["Latitude",NORTH],AXIS["Longitude",EAST],AUTHORITY["EPSG","4326"]]'
 )
 
+# All tables at once: one that came in the flight would have its entry in the list of tables far
+# behind, and nothing of a file that is cut off before it could be read.
 SCHEMA = f"""
 PRAGMA page_size = {PAGE_BYTES};
 PRAGMA application_id = {APPLICATION_ID};
@@ -84,6 +86,10 @@ CREATE TABLE link_stats (
 );
 CREATE TABLE events (
     sequence INTEGER PRIMARY KEY NOT NULL, time DATETIME, time_s DOUBLE, kind TEXT, text TEXT
+);
+CREATE TABLE coverage_tiles (
+    id INTEGER PRIMARY KEY NOT NULL, kind TEXT NOT NULL, tile_east INTEGER NOT NULL,
+    tile_north INTEGER NOT NULL, cells BLOB NOT NULL, UNIQUE (kind, tile_east, tile_north)
 );
 CREATE TABLE meta (id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT);
 INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES

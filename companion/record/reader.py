@@ -102,6 +102,8 @@ class OpenJournal:
                 f"{self.path}: is damaged: no map: its zones or its field cannot be read "
                 f"({one_line(error)}); {_extent(self.connection)}"
             ) from error
+        if "setup" not in self.meta:
+            raise ValueError("what was constant in the flight is gone")
         setup = setup_from_json(self.meta["setup"], ground)
         treated = read_treated(self.connection)
         return setup if treated is None else replace(setup, treated=treated)

@@ -31,7 +31,10 @@ _KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recovery:
-    """What became of one journal: recovered, open or other-version (left alone), salvaged, failed."""
+    """What became of one journal.
+
+    Recovered, open or other-version (both left alone), salvaged, or failed.
+    """
 
     path: Path
     outcome: str
@@ -75,6 +78,7 @@ def recover(path: Path) -> Recovery | None:
 def _recovered(path: Path) -> tuple[str, str] | None:
     """Return what became of a journal, and what is said of it."""
     try:
+        _undo_half_written(path)
         is_left, ending = _looked_at(path)
     except OtherVersionError as error:
         return "other-version", f"{error}; it was cut and is left alone"
@@ -95,6 +99,16 @@ def _folded_in(path: Path, ending: _Ending | None) -> tuple[str, str]:
 
 def _is_locked(error: Exception) -> bool:
     return isinstance(error, sqlite3.OperationalError) and "locked" in str(error)
+
+
+def _undo_half_written(path: Path) -> None:
+    """Have SQLite undo what a cut in the moment of closing left half written.
+
+    Only then is there such a file beside a journal, and nobody can read it before.
+    """
+    if path.with_name(path.name + "-journal").exists():
+        with closing(_connect(path)) as connection:
+            connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
 def _looked_at(path: Path) -> tuple[bool, _Ending | None]:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 import zlib
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
 from companion.core.frame import LocalFrame
 from companion.core.overlap_guard import OverlapGuard
+from companion.core.swath import expected
 from companion.core.types import (
     Decision,
     EstimatorReport,
@@ -49,6 +52,8 @@ from companion.record.coverage_table import (
 )
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
+from companion.record.unfinished import unfinished
+from companion.runtime import COVERAGE_AHEAD_S
 from tests.builders import setup
 
 FRAME = LocalFrame(36.0, 114.5)
@@ -187,6 +192,7 @@ def position(received_s: float, east_m: float) -> Telemetry:
 def journal(folder: Path, own: Setup, until_s: float = 17.0, **how: Any) -> Path:
     """Fly east over the field of the builders until a time, and write the journal of it."""
     track, memory = Track(), Memory()
+    how.setdefault("training", "no")
     with Journal.create(folder, setup=own, started_s=10.0, waits=True, **how) as made:
         for item in inputs(until_s):
             made.record_input(item)
@@ -252,6 +258,127 @@ def test_a_flight_with_water_treats_nothing_for_one_with_a_product(tmp_path: Pat
     with pytest.raises(JournalError, match="training = water"):
         treated_by([path], FRAME)
     assert treated_by([path], FRAME, training="water").area_m2 > 0.0
+
+
+@pytest.mark.parametrize("training", ["simulated", "dry"])
+def test_what_sprayed_no_product_is_no_ground_to_go_on_from(tmp_path: Path, training: str) -> None:
+    path = journal(tmp_path, setup(record_coverage=True), until_s=15.0, training=training)
+    with pytest.raises(JournalError, match=f"training = {training}"):
+        continued(setup(), [path])
+
+
+def test_what_says_nothing_of_it_needs_somebody_who_does(tmp_path: Path) -> None:
+    path = journal(tmp_path, setup(record_coverage=True), until_s=15.0, training=None)
+    with pytest.raises(JournalError, match="--continue-unmarked"):
+        continued(setup(), [path])
+    assert continued(setup(), [path], takes_unmarked=True).treated is not None
+
+
+def test_a_flight_that_left_ground_is_named(first: Path, second: Path) -> None:
+    own = setup(record_coverage=True)
+    with_map = replace(own, prescription=copy(own.prescription))
+    with_map.prescription.sha256 = "a" * 64
+    assert unfinished(first.parent, own) is None  # a map without a hash is not known again
+    journal(first.parent, replace(with_map, record_coverage=True), until_s=15.0)
+    found = unfinished(first.parent, with_map)
+    assert found is not None
+    assert found.path.name == "flight-0002.gpkg"
+    assert found.left_share > 0.5
+    # Later flights with water, or that treated nothing, hide nothing.
+    journal(first.parent, with_map, until_s=15.0, training="water")
+    journal(first.parent, with_map, until_s=10.5)
+    assert unfinished(first.parent, with_map) == found
+    assert unfinished(first.parent, with_map, training="dry") is None
+    assert unfinished(first.parent / "absent", with_map) is None
+    (first.parent / "flight-0099.gpkg").write_text("no database")
+    assert unfinished(first.parent, with_map) == found
+
+
+def test_a_replay_proves_the_treated_ground(first: Path, tmp_path: Path) -> None:
+    assert replay(first).coverage_differs == 0
+    path = tmp_path / "other.gpkg"
+    path.write_bytes(first.read_bytes())
+    with sqlite3.connect(path) as connection:
+        kept = read_coverage(connection)
+        assert kept is not None
+        write_coverage(connection, kept.joined(ground(30.0, 20.0, 34.0, 22.0)), kept)
+    connection.close()
+    result = replay(path)
+    assert (result.differences, result.coverage_differs) == (0, 200)
+    assert execute(["replay", str(path)]) == 1
+
+
+def test_a_replay_of_a_cut_flight_compares_what_was_to_be(tmp_path: Path) -> None:
+    own = setup(record_coverage=True)
+    track, memory, told_s = Track(), Memory(), -math.inf
+    with Journal.create(tmp_path, setup=own, started_s=10.0, waits=True) as made:
+        for item in inputs(17.0):
+            made.record_input(item)
+            track = observe(track, item, own)
+            now_s, state = item.received_s, estimate(track, item.received_s)
+            decision, memory = step(own, state, memory, now_s)
+            made.record_decision(decision)
+            if now_s >= told_s + 0.1:
+                told_s = now_s
+                cut_s = now_s + COVERAGE_AHEAD_S
+                made.record_coverage(expected(own, memory, state, now_s=now_s, cut_s=cut_s))
+    with sqlite3.connect(made.path) as connection:
+        connection.execute("UPDATE meta SET value = 'recovered' WHERE key = 'closed'")
+    connection.close()
+    assert replay(made.path).coverage_differs == 0
+    with sqlite3.connect(made.path) as connection:
+        connection.execute("DELETE FROM coverage_tiles WHERE tile_east = 0")
+    connection.close()
+    assert (replay(made.path).coverage_differs or 0) > 100
+
+
+def test_a_replay_without_treated_ground_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = journal(tmp_path, setup(), until_s=11.0)
+    assert replay(path).coverage_differs is None
+    assert execute(["replay", str(path)]) == 0
+    assert "not compared" in capsys.readouterr().err
+
+
+def damaged(first: Path, folder: Path) -> Path:
+    """A copy whose treated ground has one tile that cannot be read."""
+    path = folder / "damaged.gpkg"
+    path.write_bytes(first.read_bytes())
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE coverage_tiles SET cells = x'00' WHERE id = 1")
+    connection.close()
+    return path
+
+
+def test_of_a_damaged_journal_is_told_what_can_be_read(
+    first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = damaged(first, tmp_path)
+    assert execute(["flights", "remaining", str(path), "--json"]) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert "1 of 2 tiles are damaged" in found["unread"][0]
+    assert not found["is_exact"]
+    # Nobody goes on from it: what is not read would be sprayed twice.
+    with pytest.raises(JournalError, match="is damaged"):
+        continued(setup(), [path])
+    assert execute(["replay", str(path), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["unread"]
+
+
+def test_of_a_damaged_set_up_nothing_can_be_told_in_one_line(
+    first: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "damaged.gpkg"
+    path.write_bytes(first.read_bytes())
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE meta SET value = '{' WHERE key = 'setup'")
+    connection.close()
+    for command in (["flights", "remaining"], ["replay"]):
+        assert execute([*command, str(path), "--json"]) == 1
+        said = capsys.readouterr()
+        assert "is damaged" in json.loads(said.out)["error"]
+        assert len(said.err.splitlines()) == 1
 
 
 def test_a_journal_that_kept_no_coverage_is_refused(tmp_path: Path) -> None:

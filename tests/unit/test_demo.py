@@ -176,6 +176,7 @@ def test_limit_ratio_is_against_perfect_knowledge(shown: Shown) -> None:
 
 def test_journal_of_the_flight_replays_without_a_difference(shown: Shown) -> None:
     again = replay(shown.folder / "flight-0001.gpkg")
+    assert again.training == "simulated"
     assert (again.differences, again.lost, again.is_closed) == (0, 0, True)
     scheduled = shown.result.flights[-1]
     assert again.decisions > 20.0 * scheduled.simulated_s

@@ -265,3 +265,43 @@ def test_nothing_prescribed_is_nothing_and_not_zero(journal: Path, out: Path) ->
     assert rates[len(rates) // 4] > 0.0
     flows = np.array([each["properties"]["flow_l_min"] for each in features])
     assert flows[0] == 0.0
+
+
+def test_files_that_cannot_all_be_moved_leave_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "a.shp"
+    write_beside(out, {"a.dbf": [b"old"], "a.shp": [b"old"]}, force=False)
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if target == out and self.read_bytes() == b"new":
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(ExportError, match="cannot be written"):
+        write_beside(out, {"a.dbf": [b"new"], "a.shp": [b"new"]}, force=True)
+    assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == {
+        "a.dbf": b"old",
+        "a.shp": b"old",
+    }
+
+
+def test_a_folder_that_cannot_be_moved_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "TASKDATA"
+    write_folder(out, {"a.xml": [b"old"]}, force=False)
+    rename = Path.rename
+
+    def failing(self: Path, target: Path) -> Path:
+        if self.name == "fresh":
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(ExportError, match="cannot be written"):
+        write_folder(out, {"a.xml": [b"new"]}, force=True)
+    assert (out / "a.xml").read_bytes() == b"old"
+    assert [each.name for each in tmp_path.iterdir()] == ["TASKDATA"]

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from shapely import Polygon, box
 
+from missions.demand import Uniform, demands
 from missions.errors import PlanError
 from missions.remaining import Break, read_lines, remaining
 from missions.strips import lengths_m
+from missions.treated_rates import UntreatedRates, demands_once
 from tests.bench.missions import FRAME
 from tests.unit.test_missions_cli import run, written
 
@@ -156,3 +158,26 @@ def test_half_a_break_is_refused(
     code, found = planned(capsys, tmp_path, *words)
     assert code == 2
     assert says in found["error"]
+
+
+def test_the_litres_are_what_a_guard_leaves_to_spray(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Half of the field is treated: the whole lines over it need half of what they did.
+    code, before = planned(capsys, tmp_path)
+    assert code == 0
+    done = written(box(-5.0, -5.0, 60.0, 205.0), tmp_path / "done.geojson")
+    code, found = planned(capsys, tmp_path, "--done", done)
+    assert code == 0
+    assert found["volume_l"] == pytest.approx(0.5 * before["volume_l"], rel=0.06)
+
+
+def test_ground_under_two_lines_is_counted_once() -> None:
+    field = box(0.0, 0.0, 100.0, 100.0)
+    rates = UntreatedRates(rates=Uniform(rate_l_ha=10.0), treated=box(50, 0, 100, 100), limit=field)
+    lines = np.array([[0.0, 50.0, 100.0, 50.0], [0.0, 53.0, 100.0, 53.0]])
+    valves = tuple((k - 2.5, 1.0) for k in range(6))
+    found = demands_once(lines, rates, width_m=6.0, valves=valves)
+    assert [need.total_l for need in found] == pytest.approx([0.3, 0.15], rel=0.02)
+    both = demands(lines, rates, width_m=6.0, valves=valves)
+    assert [need.total_l for need in both] == pytest.approx([0.3, 0.3], rel=0.02)

@@ -273,3 +273,24 @@ def test_a_row_that_is_no_input_is_refused(copy: Path) -> None:
     with_body(copy, 5, "{}")
     with pytest.raises(JournalError, match="row 5"):
         replay(copy)
+
+
+def test_a_what_if_that_changes_nothing_says_so(
+    flown: tuple[Path, list[Decision]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    same = f"lag.on_s={setup().lag.on_s!r}"
+    assert execute(["replay", str(flown[0]), "--set", same]) == 0
+    said = capsys.readouterr().out
+    assert f"no decision of this flight depends on {same}" in said
+    assert "lag.on_start_s rules in its place" in said
+    assert "what-if" not in said
+
+
+def test_a_row_that_is_no_input_fails_in_one_line(
+    copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with_body(copy, 5, "{}")
+    assert execute(["replay", str(copy)]) == 1
+    said = capsys.readouterr().err
+    assert "row 5" in said
+    assert len(said.splitlines()) == 1

@@ -81,6 +81,7 @@ def test_out_keeps_truth_result_picture_and_a_journal_that_replays(
     kept = json.loads((out / "result.json").read_text(encoding="utf-8"))
     assert kept["flights"][0]["applied_ml"] == pytest.approx(applied_ml)
     found = replay(out / "flight-0001.gpkg")
+    assert (found.training, found.coverage_differs) == ("simulated", 0)
     assert found.decisions == kept["flights"][0]["steps"]
     assert found.differences == 0
     assert (out / "flight.png").stat().st_size > 10_000

@@ -10,7 +10,9 @@ from pathlib import Path
 import pytest
 
 from analysis.evaluation import evaluate
+from analysis.flown.read_applied import read_applied
 from analysis.replay import replay
+from analysis.report import words
 from companion.cli.app import execute
 from companion.cli.run import component_options, training_mark
 from companion.config import load
@@ -20,6 +22,7 @@ from companion.record.journal import Journal
 from companion.record.reader import read_journal
 from companion.sensors.tank import TankSensor
 from tests import builders
+from tests.unit import report_flight
 from tests.unit.test_component import Peer
 from tests.unit.test_evaluation_flights import Flight, record_of
 from tests.unit.test_sensors_gauges import FakeCounter, FakeLevel
@@ -144,3 +147,23 @@ def test_a_filling_that_the_sensor_refuses_is_denied_and_not_shown() -> None:
     component.tick(CLOSED, 2.1)
     component.tick(CLOSED, 3.2)
     assert set(peer.named("SPR_TANK")) == {8.0}
+
+
+def test_a_simulated_flight_is_marked_and_its_report_says_so(tmp_path: Path) -> None:
+    path = report_flight.fly(tmp_path, training="simulated")
+    flight = read_applied(path)
+    assert [each.code for each in words._training(flight)] == ["training"]
+
+
+def test_run_refuses_widths_that_config_check_refuses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code = execute(
+        [
+            *("run", "--config", str(EXAMPLE), "--json", "--duration-s", "0.2"),
+            *("--set", "boom.width_m=5.0", "--set", f"journal.folder={tmp_path}"),
+        ]
+    )
+    assert code == 2
+    assert "width_m" in json.loads(capsys.readouterr().out)["error"]
+    assert not list(tmp_path.iterdir())

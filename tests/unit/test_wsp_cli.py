@@ -234,3 +234,15 @@ def test_an_image_that_is_none_and_a_folder_that_cannot_be_are_refused(
 
 def test_the_command_is_one_of_typers() -> None:
     assert cli.wsp.name is not None
+
+
+@pytest.mark.parametrize("size", [(1, 1), (300, 400)])
+def test_a_white_image_as_a_whole_card_is_told_to_be_none(
+    size: tuple[int, int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.new("RGB", size, (250, 250, 250)).save(tmp_path / "white.png")
+    options = ("--whole", "--dpi", "600", "--out", tmp_path / "out")
+    code, found, err = run(capsys, tmp_path / "white.png", *options)
+    assert code == 0
+    assert "no-paper" in found["cards"][0]["flags"]
+    assert "No artists" not in err

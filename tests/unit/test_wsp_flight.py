@@ -12,6 +12,7 @@ from analysis.flown.applied_flight import AppliedFlight, ValveChanges
 from analysis.wsp.boundaries import CardAtChange, NearestChange, nearest_change, tables
 from analysis.wsp.passing import duty_at, passing
 from tests import builders
+from tests.pump_flight import pump, pump_setup
 
 NAN = float("nan")
 STEP_S, SPEED_M_S = 0.05, 5.0
@@ -170,3 +171,22 @@ def test_deposit_is_set_against_distance_for_two_cards_or_more_at_a_change() -> 
     assert (table["before_l_ha"], table["after_l_ha"]) == (20.0, 25.0)
     assert [row["card"] for row in table["cards"]] == [2, 1]
     assert [row["distance_m"] for row in table["cards"]] == [-2.0, 1.0]
+
+
+def test_a_pump_sprays_through_the_open_sections_only() -> None:
+    """Two of six sections are open: each gets half of the flow, a closed one nothing."""
+    flight = flown()
+    made = replace(
+        flight.setup,
+        pump=pump("valves"),
+        nozzle_sets=(pump_setup([20.0], "valves", valves=6).nozzle_sets),
+    )
+    count = len(flight.time_s)
+    changes = ValveChanges(
+        planned_s=np.zeros(2), actual_s=np.full(2, NAN), valve=np.array([2, 3]), duty=np.ones(2)
+    )
+    pumped = replace(flight, setup=made, flow_l_min=np.full(count, 0.6), changes=changes)
+    opened, closed = passing(pumped, 40.0, 3.5), passing(pumped, 40.0, 1.5)
+    assert opened is not None and closed is not None
+    assert opened.applied_l_ha == pytest.approx(0.3 / (0.006 * SPEED_M_S), rel=0.01)
+    assert closed.applied_l_ha == 0.0
