@@ -44,6 +44,11 @@ class Field:
     closes: BaseGeometry | None = None
 
     @property
+    def kept_in(self) -> BaseGeometry:
+        """Return the ground that the companion's border rule keeps the valves in."""
+        return self.limit if self.closes is None else self.closes
+
+    @property
     def area_m2(self) -> float:
         """Return the ground that is to be sprayed."""
         return float(self.limit.area)

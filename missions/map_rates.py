@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
+from shapely.geometry.base import BaseGeometry
 
 from companion.core.prescription import Prescription
 from missions.strips import Floats
@@ -24,6 +25,11 @@ class MapRates:
         self._rates = np.array([zones[at].rate_l_ha for at in owner.tolist()])
         self._bounds = shapely.bounds(self._parts)
         shapely.prepare(self._parts)
+
+    @property
+    def field(self) -> BaseGeometry:
+        """Return the ground outside of which nothing is sprayed."""
+        return self._prescription.field
 
     def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
         """Return the rate at each place [L/ha]; NaN where there is none."""

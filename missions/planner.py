@@ -136,7 +136,7 @@ def _planned(
 def _demand(lines: Floats, rates: Rates, field: Field, settings: Settings) -> list[Demand]:
     """Return what each line needs; of a field that is gone on with, what a guard leaves to it."""
     kept_m, width_m = settings.border_buffer_m, settings.swath_width_m
-    limit = rates.limit if isinstance(rates, UntreatedRates) else field.limit
+    limit = rates.limit if isinstance(rates, UntreatedRates) else field.kept_in
     extents = None
     if kept_m is not None:
         extents = extents_of(limit, width_m=width_m, buffer_m=kept_m)

@@ -12,7 +12,7 @@ from shapely import MultiPolygon
 
 from companion.assembly import above_label, flow_range, read_configured_map
 from companion.config import Config
-from companion.config.tables import MissionTable
+from companion.config.tables import MissionTable, PrescriptionTable
 from companion.core.frame import LocalFrame
 from companion.maps.build import build_prescription, frame_for
 from companion.maps.local import Area
@@ -104,6 +104,9 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         offset_m=offset_m,
         kept_m=asked.border_m,
     )
+    rates = _rates(asked, config, map_file, boundary, frame)
+    if isinstance(rates, MapRates) and _is_flown(asked, config):
+        ground = replace(ground, closes=rates.field)
     whole = ground
     if asked.pause.resume is None and asked.pause.done is not None:
         ground = untreated(ground, asked.pause.done, settings.swath_width_m, offset_m)
@@ -111,9 +114,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
     return Task(
         field=ground,
         settings=settings,
-        rates=untreated_rates(
-            _rates(asked, config, map_file, boundary, frame), asked.pause.ground, whole, offset_m
-        ),
+        rates=untreated_rates(rates, asked.pause.ground, whole, offset_m),
         depots=asked.depots or tuple(configured),
         around=Surroundings(
             terrain=terrain_of(asked.ground, config, frame),
@@ -228,20 +229,38 @@ def _rates(
         label = above_label(config, map_file)
         if label is not None:
             raise PlanError(f"{label.text}; {label.fix}")
+    is_own = _is_flown(asked, config)
     table = None if config is None else config.prescription
-    if table is None:
+    if config is None or table is None:
         built = build_prescription(map_file, frame, boundary=_many(boundary))
     else:
         built = build_prescription(
             map_file,
             frame,
             overlap=table.overlap,
-            boundary=_many(boundary),
+            # As the companion does it: where it closes the valves there is no demand.
+            boundary=_own_boundary(config, table, frame) if is_own else _many(boundary),
+            exclusions=[near_area(config.resolve(name), frame) for name in table.exclusions],
             default_rate_l_ha=table.default_rate_l_ha,
             offset_east_m=table.offset_east_m,
             offset_north_m=table.offset_north_m,
         )
     return MapRates(built)
+
+
+def _is_flown(asked: Asked, config: Config | None) -> bool:
+    """Return whether the map is that of the configuration, which then says where it ends."""
+    if config is None or config.prescription is None:
+        return False
+    own = config.resolve(config.prescription.file)
+    return asked.prescription is None or asked.prescription.resolve() == own.resolve()
+
+
+def _own_boundary(
+    config: Config, table: PrescriptionTable, frame: LocalFrame
+) -> MultiPolygon | None:
+    name = table.boundary
+    return None if name is None else near_area(config.resolve(name), frame)
 
 
 def _many(area: Area) -> MultiPolygon:

@@ -54,10 +54,10 @@ def untreated_rates(
     if is_journal(done):
         found = read_treated_ground(done)
         cells = moved(found.coverage, found.frame, field.frame)
-        return UntreatedRates(rates=rates, treated=cells, limit=field.limit)
+        return UntreatedRates(rates=rates, treated=cells, limit=field.kept_in)
     area = translate(local_area(read_area(done), field.frame), *offset_m)
     shapely.prepare(area)
-    return UntreatedRates(rates=rates, treated=area, limit=field.limit)
+    return UntreatedRates(rates=rates, treated=area, limit=field.kept_in)
 
 
 def demands_once(
