@@ -340,7 +340,10 @@ class JournalTable(Table):
         description="old flights are removed while less of the disk is free; 0: never for that",
     )
     keep_count: int | None = Field(
-        default=None, ge=1, le=100_000, description="so many flights are kept, never fewer than ten; absent: all"
+        default=None,
+        ge=1,
+        le=100_000,
+        description="so many flights are kept, never fewer than ten; absent: all",
     )
     keep_days: float | None = Field(
         default=None, gt=0, le=100_000, description="flights are kept so long; absent: for ever"
