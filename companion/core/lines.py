@@ -155,27 +155,32 @@ class Lines:
         return found
 
 
-def _ways(state: VehicleState) -> tuple[Way, ...]:
+def _ways(state: VehicleState) -> tuple[Way, ...] | None:
     """Return the leg that is flown, and the one before while the vehicle still flies its way.
 
-    Autopilots go on to the next item some metres before the end of a leg. None where the mission
-    is not flown, or says nothing.
+    Autopilots go on to the next item some metres before the end of a leg: a leg that the vehicle
+    flies against is not flown yet, and a ferry that ends at the far end of a line is no line. None
+    where the mission is not flown, or says nothing.
     """
     way, before = state.way, state.way_before
     if way is None or state.mode not in MISSION_MODES:
-        return ()
+        return None
     if not 0.0 <= state.time_s - way.received_s <= WAY_AGE_MAX_S:
-        return ()
-    if before is None or not 0.0 <= state.time_s - before.received_s <= WAY_ENDS_S:
-        return (way,)
-    east, north = before.to_east_m - before.from_east_m, before.to_north_m - before.from_north_m
-    is_onwards = state.velocity_east_m_s * east + state.velocity_north_m_s * north > 0.0
-    return (way, before) if is_onwards else (way,)
+        return None
+    known = [way]
+    if before is not None and 0.0 <= state.time_s - before.received_s <= WAY_ENDS_S:
+        known.append(before)
+    return tuple(each for each in known if _is_onwards(state, each))
 
 
-def _is_told(piece: Piece, ways: tuple[Way, ...], course: float) -> bool:
+def _is_onwards(state: VehicleState, way: Way) -> bool:
+    east, north = way.to_east_m - way.from_east_m, way.to_north_m - way.from_north_m
+    return state.velocity_east_m_s * east + state.velocity_north_m_s * north > 0.0
+
+
+def _is_told(piece: Piece, ways: tuple[Way, ...] | None, course: float) -> bool:
     """Return whether a leg that is flown lies along a piece; where no leg is known, any does."""
-    return not ways or any(_is_along(piece, way, course) for way in ways)
+    return ways is None or any(_is_along(piece, way, course) for way in ways)
 
 
 def _is_along(piece: Piece, way: Way, course: float) -> bool:

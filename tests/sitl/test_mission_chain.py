@@ -108,7 +108,10 @@ async def test_what_was_planned_is_uploaded_flown_and_sprayed_on_its_lines(
     assert (flight["state"], flight["enabled"], flight["speed_m_s"]) == ("landed", True, 5.0)
     metrics = json.loads((tmp_path / "truth" / "truth.json").read_text())["metrics"]
     assert metrics["missed"] == 0
-    assert metrics["lag_distance_m"]["count"] == 6 * (len(RATES_L_HA) - 1)
+    # Flown from the far end, where it starts from a stop, an outer valve is barely open before it
+    # changes: that one counts apart.
+    assert metrics["apart"] <= 1
+    assert metrics["lag_distance_m"]["count"] == 6 * (len(RATES_L_HA) - 1) - metrics["apart"]
     assert metrics["lag_distance_m"]["mean_abs"] <= 0.2
     assert metrics["off_target_ml"] < 1.0
     assert flight["volume_l"] == pytest.approx(plan["volume_l"], rel=0.1)

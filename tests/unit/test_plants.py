@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from companion.assembly import build_setup
 from companion.config import load
-from companion.core import types as core_types
+from companion.core import inputs as core_inputs
 from companion.core.controller import Memory, step
 from companion.core.dosing import TRIM_AGE_S
 from companion.core.types import FlowReport, Input, SprayPlan, Telemetry, TimedChange
@@ -285,8 +285,8 @@ def test_the_core_is_given_inputs_of_numbers_and_words_and_nothing_else() -> Non
     assert {Telemetry, FlowReport} <= {type(item) for item in given}
     allowed = get_args(Input)
     assert isinstance(Input, UnionType)
-    assert all(kind.__module__ == core_types.__name__ for kind in allowed)
-    plain = (float, int, str, bool, type(None), core_types.Fix)
+    assert all(kind.__module__ == core_inputs.__name__ for kind in allowed)
+    plain = (float, int, str, bool, type(None), core_inputs.Fix)
     for item in given:
         assert type(item) in allowed
         assert not hasattr(item, "__dict__")
