@@ -15,8 +15,8 @@ from companion.core.types import VehicleState
 
 Floats = NDArray[np.float64]
 
-# Below these, the tenth of a second that an order looks ahead deviates from a straight line by
-# less than a centimetre, and the estimate of an acceleration is mostly noise.
+# Below these, the estimate of a turn is mostly noise. What it leaves out: in the 0.3 s that an
+# order looks ahead at most, a valve 2.5 m from the middle gains or loses up to 0.04 m.
 STRAIGHT_YAW_RATE_DEG_S = 3.0
 STRAIGHT_LATERAL_M_S2 = 1.0
 CURVE_CHORDS = 6

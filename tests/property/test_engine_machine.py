@@ -123,14 +123,10 @@ class EngineMachine(RuleBasedStateMachine):
             half.engine.turn()
             half.note(self.now_s)
 
-    @property
-    def next_s(self) -> float:
-        return min(self.given.engine.next_s, self.spared.engine.next_s)
-
     def pass_time(self, for_s: float, late_s: float = 0.0) -> None:
         end_s = self.now_s + for_s
-        # One of them may wake sooner and find nothing to do; what comes out is compared.
-        while (next_s := self.next_s + late_s) < end_s:
+        while (next_s := self.given.engine.next_s + late_s) < end_s:
+            assert next_s == self.spared.engine.next_s + late_s
             self.now_s = max(next_s, self.now_s)
             self.turn()
         self.now_s = end_s

@@ -95,11 +95,11 @@ class Engine:
             return
         self._notice_standstill()
         refusal = self._schedule.submit(plan, self._clock())
-        self._look_ahead()
-        if refusal is None:
-            self.accepted += 1
-        else:
+        if refusal is not None:
             self.refuse(refusal)
+            return
+        self._look_ahead()
+        self.accepted += 1
 
     def refuse(self, reason: str) -> None:
         """Count a packet that is not acted on."""
