@@ -2,7 +2,7 @@
 
 A flight that ended in order wrote its ground at its very end: a few hundredths of a second behind
 the last decision, which matters only where a valve was still open. One that was cut wrote what was
-to be within the next half second, as of one of its last turns. Both are made again here by the
+to be half way to its next commit, as of one of its last turns. Both are made again here by the
 runtime's own rules.
 """
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from companion.core.coverage import Coverage
 from companion.core.swath import expected
-from companion.runtime import COVERAGE_AHEAD_S, COVERAGE_EVERY_S, STEP_MAX_S
+from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
 
 if TYPE_CHECKING:
     from companion.core.controller import Memory, Setup
@@ -47,8 +47,7 @@ class ReplayedGround:
         if is_closed:
             return self._at_the_end(kept, *self._last)
         counts = (
-            cells_apart(kept, self._expected(*told, ahead_s=COVERAGE_AHEAD_S))
-            for told in self._told
+            cells_apart(kept, self._expected(*told, ahead_s=kept.ahead_s)) for told in self._told
         )
         return min(counts)
 

@@ -8,6 +8,9 @@ from typing import Protocol
 from companion.core.coverage import Coverage
 from companion.core.types import Decision, Input, SprayPlan
 
+# How often a recorder commits, unless it is told otherwise.
+COMMIT_EVERY_S = 1.0
+
 
 class PlanExecutor(Protocol):
     """Carries a plan out to the millisecond and closes everything when its lease ends."""

@@ -37,7 +37,7 @@ from companion.core.types import (
     VehicleState,
 )
 from companion.errors import SensorError
-from companion.ports import PlanExecutor, Recorder, Sensor, VehicleLink
+from companion.ports import COMMIT_EVERY_S, PlanExecutor, Recorder, Sensor, VehicleLink
 
 _logger = logging.getLogger(__name__)
 
@@ -59,11 +59,17 @@ LEAVE_CLOSED_S = 3.0
 # sign of life to the autopilot's watchdog (10 Hz), and not just before a position at 20 Hz.
 STEP_MAX_S = 0.06
 
-# The record gets the treated ground so often while it grows, and commits it once a second: a cut of
-# power comes at any moment until the next commit, in the middle of that second on the mean. What
-# is written is what will be treated by then, so that a flight that goes on errs to both sides.
+# The record gets the treated ground so often while it grows.
 COVERAGE_EVERY_S = 0.1
-COVERAGE_AHEAD_S = 0.5 + 0.5 * COVERAGE_EVERY_S
+
+
+def coverage_ahead_s(commit_every_s: float) -> float:
+    """Return how far ahead of its moment the treated ground is written.
+
+    A cut of power comes at any moment until the next commit, in the middle on the mean. What is
+    written is what will be treated by then, so that a flight that goes on errs to both sides.
+    """
+    return 0.5 * (commit_every_s + COVERAGE_EVERY_S)
 
 
 def boot_time_s() -> float:
@@ -101,6 +107,7 @@ class ControlLoop:
         sensors: Sequence[Sensor] = (),
         boot_clock: Callable[[], float] | None = None,
         record_fault: Callable[[], str | None] | None = None,
+        commit_every_s: float = COMMIT_EVERY_S,
     ) -> None:
         self._setup = setup
         self._boot_clock = boot_clock or boot_time_s
@@ -110,6 +117,7 @@ class ControlLoop:
         self._executor = executor
         self._recorder = recorder
         self._record_fault = record_fault
+        self._ahead_s = coverage_ahead_s(commit_every_s)
         self._has_begun = False
         self._clock = clock
         self._track = Track()
@@ -142,7 +150,7 @@ class ControlLoop:
         self._note_begin(decision)
         self._recorder.record_decision(decision)
         if self._setup.records_coverage and now_s >= self._coverage_s + COVERAGE_EVERY_S:
-            self._keep_coverage(state, now_s, ahead_s=COVERAGE_AHEAD_S)
+            self._keep_coverage(state, now_s, ahead_s=self._ahead_s)
         if decision.findings:
             self._tell_findings(decision)
         return decision
@@ -284,12 +292,14 @@ async def run(
     clock: Callable[[], float] = time.monotonic,
     on_step: Callable[[], None] | None = None,
     record_fault: Callable[[], str | None] | None = None,
+    commit_every_s: float = COMMIT_EVERY_S,
 ) -> int:
     """Spray until a signal comes or `duration_s` is over; return 0 then.
 
     `on_step` is called after each step that was carried out, and at no other time: a watchdog that
     it feeds sees a loop that stands still. `record_fault`, if given, says why the record cannot be
-    kept: a flight then does not begin to spray; one that has begun goes on.
+    kept: a flight then does not begin to spray; one that has begun goes on. `commit_every_s` is how
+    often the recorder commits.
 
     Raises what went wrong otherwise, a `LinkError` for a link that cannot be opened, a
     `SensorError` for a sensor. The valves are closed before any sensor is let go. A link that
@@ -321,6 +331,7 @@ async def run(
                         clock=clock,
                         sensors=sensors,
                         record_fault=record_fault,
+                        commit_every_s=commit_every_s,
                     )
                     await _turn_until_the_end(control, ending, duration_s, on_step)
                 finally:

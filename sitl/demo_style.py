@@ -7,8 +7,23 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from analysis.report.figures import style
+from analysis.report.figures.style import FAINT, INK, QUIET
+
 if TYPE_CHECKING:
     from sitl.demo import DemoResult, Flown
+
+__all__ = [
+    "COLOURS",
+    "DPI",
+    "FAINT",
+    "INK",
+    "QUIET",
+    "STYLE",
+    "TITLES",
+    "new_figure",
+    "shown",
+]
 
 # Okabe and Ito's colours, told apart by all kinds of eyes.
 COLOURS = {
@@ -23,21 +38,7 @@ TITLES = {
     "look-ahead-stated": "look-ahead 0.97 s, as stated",
     "scheduled": "scheduled",
 }
-INK, QUIET, FAINT = "#222222", "#555555", "#8A8A8A"
-STYLE: dict[Any, Any] = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.0,
-    "axes.edgecolor": FAINT,
-    "axes.labelcolor": INK,
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-}
+STYLE: dict[Any, Any] = {**style.STYLE, "font.size": 9.0, "axes.titlesize": 10.0}
 DPI = 150
 
 

@@ -24,7 +24,9 @@ from analysis.exports.utc import utc_text
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content
+    from analysis.exports.samples import Samples
     from analysis.exports.source import Source
+    from analysis.exports.swaths import Swaths
 
 Floats = NDArray[np.float64]
 
@@ -70,6 +72,18 @@ def _fields(source: Source) -> list[_Field]:
     return _swath_fields(source) if source.shape == "swaths" else _point_fields(source)
 
 
+def _work_fields(rows: Swaths | Samples) -> list[_Field]:
+    return [
+        _standard("AppliedTotalVolume", "l", rows.volume_ml / 1000.0),
+        _standard("AppliedArea", "ha", rows.area_m2 / 10_000.0),
+        _standard("DistanceTraveled", "m", rows.distance_m),
+        _standard("Width", "m", rows.width_m),
+        _standard("DutyCycle", "prcnt", 100.0 * rows.duty),
+        _standard("Speed", "m1sec-1", rows.speed_m_s),
+        _standard("Heading", "arcdeg", rows.heading_deg),
+    ]
+
+
 def _swath_fields(source: Source) -> list[_Field]:
     swaths = source.swaths
     names = source.valve_names
@@ -82,13 +96,7 @@ def _swath_fields(source: Source) -> list[_Field]:
         _Field(name="valve", unit="", values=[names[at] for at in swaths.valve.tolist()]),
         _standard("AppliedVolumePerAreaTarget", "l1ha-1", swaths.rate_l_ha),
         _standard("AppliedVolumePerAreaActual", "l1ha-1", swaths.applied_l_ha),
-        _standard("AppliedTotalVolume", "l", swaths.volume_ml / 1000.0),
-        _standard("AppliedArea", "ha", swaths.area_m2 / 10_000.0),
-        _standard("DistanceTraveled", "m", swaths.distance_m),
-        _standard("Width", "m", swaths.width_m),
-        _standard("DutyCycle", "prcnt", 100.0 * swaths.duty),
-        _standard("Speed", "m1sec-1", swaths.speed_m_s),
-        _standard("Heading", "arcdeg", swaths.heading_deg),
+        *_work_fields(swaths),
         _Field(name="height_m", unit="m", values=swaths.height_m),
         _Field(name="longitude_deg", unit="arcdeg", values=swaths.longitude_deg),
         _Field(name="latitude_deg", unit="arcdeg", values=swaths.latitude_deg),
@@ -102,13 +110,7 @@ def _point_fields(source: Source) -> list[_Field]:
         _standard("AppliedVolumePerAreaTarget", "l1ha-1", samples.rate_l_ha),
         _standard("AppliedVolumePerAreaActual", "l1ha-1", samples.applied_l_ha),
         _standard("AppliedVolumePerTime", "l1sec-1", samples.flow_l_min / _SECONDS_A_MINUTE),
-        _standard("AppliedTotalVolume", "l", samples.volume_ml / 1000.0),
-        _standard("AppliedArea", "ha", samples.area_m2 / 10_000.0),
-        _standard("DistanceTraveled", "m", samples.distance_m),
-        _standard("Width", "m", samples.width_m),
-        _standard("DutyCycle", "prcnt", 100.0 * samples.duty),
-        _standard("Speed", "m1sec-1", samples.speed_m_s),
-        _standard("Heading", "arcdeg", samples.heading_deg),
+        *_work_fields(samples),
     ]
     if samples.pressure_kpa is not None:
         fields.append(_standard("SprayPressureActual", "Pa", 1000.0 * samples.pressure_kpa))

@@ -101,6 +101,14 @@ def _rounded(value: float | None, digits: int) -> float | None:
     return None if value is None else round(value, digits)
 
 
+def _measured(
+    name: str, label: str, unit: str, digits: int, value: Callable[[Facts], float | None]
+) -> Field:
+    return Field(
+        name=name, label=label, unit=_in(unit), value=lambda f, _: _rounded(value(f), digits)
+    )
+
+
 def _volume(facts: Facts, _: Told) -> float | None:
     return round(facts.volume_l, 3) if facts.has_area else None
 
@@ -187,30 +195,12 @@ FIELDS: dict[Profile, tuple[Field, ...]] = {
         VOLUME,
         PRODUCT,
         RATE,
-        Field(
-            name="asked_rate_l_ha",
-            label="Mixture prescribed, mean",
-            value=lambda f, _: _rounded(f.asked_rate_l_ha, 2),
-            unit=_in("L/ha"),
+        _measured(
+            "asked_rate_l_ha", "Mixture prescribed, mean", "L/ha", 2, lambda f: f.asked_rate_l_ha
         ),
-        Field(
-            name="boom_width_m",
-            label="Effective width of the boom",
-            value=lambda f, _: _rounded(f.boom_width_m, 2),
-            unit=_in("m"),
-        ),
-        Field(
-            name="height_m",
-            label="Height while spraying, mean",
-            value=lambda f, _: _rounded(f.height_m, 1),
-            unit=_in("m"),
-        ),
-        Field(
-            name="speed_m_s",
-            label="Speed while spraying, mean",
-            value=lambda f, _: _rounded(f.speed_m_s, 1),
-            unit=_in("m/s"),
-        ),
+        _measured("boom_width_m", "Effective width of the boom", "m", 2, lambda f: f.boom_width_m),
+        _measured("height_m", "Height while spraying, mean", "m", 1, lambda f: f.height_m),
+        _measured("speed_m_s", "Speed while spraying, mean", "m/s", 1, lambda f: f.speed_m_s),
         Field(
             name="map_sha256",
             label="Prescription map, SHA-256",

@@ -105,6 +105,7 @@ def run_companion(
         setup_text=_about(config, given),
         training=training,
         free_min_bytes=FREE_MIN_BYTES,
+        commit_every_s=config.journal.commit_s,
     )
     follow(journal, link, executor)
     notifier = Notifier.from_environment(os.environ, pid=os.getpid())
@@ -120,6 +121,7 @@ def run_companion(
                     duration_s=duration_s,
                     on_step=notifier.stepped,
                     record_fault=(lambda: journal.fault) if config.journal.required else None,
+                    commit_every_s=config.journal.commit_s,
                 )
             )
     except (ActuatorError, LinkError, SensorError):

@@ -333,6 +333,12 @@ class JournalTable(Table):
     required: bool = Field(
         default=True, description="true: a flight does not begin to spray without its record"
     )
+    commit_s: float = Field(
+        default=1.0,
+        ge=0.1,
+        le=1.0,
+        description="between two commits, what a cut of power may lose; less wears the card",
+    )
     keep_free_percent: float = Field(
         default=10.0,
         ge=0,

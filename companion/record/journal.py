@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Self
 from companion.core.controller import Setup
 from companion.core.types import Decision, Input
 from companion.errors import JournalError
+from companion.ports import COMMIT_EVERY_S
 from companion.record.events import Event, LinkSample
 from companion.record.new_file import about, new_file, open_for_flight
 from companion.record.valve_rows import ValveOrder
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
 
 _logger = logging.getLogger(__name__)
 
-COMMIT_EVERY_S = 1.0
 QUEUE_ROWS = 10_000  # a minute of 50 decisions and 100 inputs a second
 CLOSE_WITHIN_S = 30.0
 STALL_MAX_S = 5.0  # a card that is busy with itself takes one or two
@@ -54,10 +54,12 @@ class Journal:
         queue_rows: int = QUEUE_ROWS,
         waits: bool = False,
         free_min_bytes: int = 0,
+        commit_every_s: float = COMMIT_EVERY_S,
     ) -> None:
         self.path = path
         self._waits = waits
         self._free_min_bytes = free_min_bytes
+        self._commit_every_s = commit_every_s
         self._space_fault: str | None = None
         self._written_s = time.monotonic()
         self._sequence = count(1)
@@ -87,6 +89,7 @@ class Journal:
         waits: bool = False,
         training: str | None = None,
         free_min_bytes: int = 0,
+        commit_every_s: float = COMMIT_EVERY_S,
     ) -> Journal:
         """Begin the next flight's file in `folder`: flight-0001.gpkg, flight-0002.gpkg, ...
 
@@ -100,6 +103,7 @@ class Journal:
             queue_rows: how far the disk may fall behind.
             waits: for simulations, faster than any disk: wait rather than drop.
             free_min_bytes: with less room on the disk the journal has a fault.
+            commit_every_s: what a cut of power may lose.
             training: `no` for a product, else what it is: `water`, `dry`. None: nobody says.
         """
         now_s = time.monotonic() if started_s is None else started_s
@@ -124,6 +128,7 @@ class Journal:
             queue_rows=queue_rows,
             waits=waits,
             free_min_bytes=free_min_bytes,
+            commit_every_s=commit_every_s,
         )
 
     @property
@@ -210,7 +215,7 @@ class Journal:
         return True
 
     def _run(self) -> None:
-        due_s = time.monotonic() + COMMIT_EVERY_S
+        due_s = time.monotonic() + self._commit_every_s
         try:
             while True:
                 row = self._next(due_s)
@@ -222,7 +227,7 @@ class Journal:
                     self._writer.commit(lost_before=self._dropped, coverage=self._coverage)
                     self._look_at_space()
                     self._written_s = time.monotonic()
-                    due_s = self._written_s + COMMIT_EVERY_S
+                    due_s = self._written_s + self._commit_every_s
         finally:
             self._writer.finish(lost_before=self._dropped, coverage=self._coverage)
 

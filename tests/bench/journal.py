@@ -30,7 +30,6 @@ import pyogrio
 from analysis.flown.read_applied import read_applied
 from companion.core.controller import Setup
 from companion.core.coverage import Coverage
-from companion.record import journal as journal_module
 from companion.record.codec import encode
 from companion.record.events import LinkSample
 from companion.record.journal import Journal
@@ -118,8 +117,7 @@ def _killed(folder: Path, setup: Setup, turns: Sequence[Turn], after_s: float) -
 
 
 def _write_for_ever(folder: Path, setup: Setup, turns: Sequence[Turn], send: int) -> None:
-    journal_module.COMMIT_EVERY_S = KILL_COMMIT_S
-    journal = Journal.create(folder, setup=setup, started_s=START_S)
+    journal = Journal.create(folder, setup=setup, started_s=START_S, commit_every_s=KILL_COMMIT_S)
     told = 0
     for turn in turns:
         record(journal, turn)

@@ -26,8 +26,9 @@ from companion.core.coverage import Coverage
 from companion.core.overlap_guard import OverlapGuard
 from companion.core.swath import expected
 from companion.core.types import Input, OperatorCommand, VehicleState
+from companion.ports import COMMIT_EVERY_S
 from companion.record.continuing import SWITCH_OFF_PERCENT
-from companion.runtime import COVERAGE_AHEAD_S, COVERAGE_EVERY_S
+from companion.runtime import COVERAGE_EVERY_S, coverage_ahead_s
 from sitl.demo_field import START_S, demo_route
 from sitl.deposit import L_HA_PER_ML_M2, Deposit
 from sitl.flight import FlightOptions, FlightResult, OnStep, fly
@@ -42,7 +43,6 @@ Floats = NDArray[np.float64]
 
 SPEED_M_S = 5.0
 CELL_M = 0.2
-COMMIT_S = 1.0
 MISSED, DOUBLED = 0.5, 1.5
 # Rows and columns of plots of 12 x 6 m: 192 x 204 m, 3.9 ha.
 LARGE_ROWS, LARGE_COLUMNS = 34, 16
@@ -141,27 +141,28 @@ def _fly(
 class _Journal:
     """What the journal of a flight that is cut at `cut_s` ends with; commits at any phase."""
 
-    def __init__(self, setup: Setup, cut_s: float, phase_s: float) -> None:
-        self._setup, self._cut_s = setup, cut_s
+    def __init__(self, setup: Setup, cut_s: float, commit_every_s: float, phase: float) -> None:
+        self._setup, self._cut_s, self._every_s = setup, cut_s, commit_every_s
         self._due_s = self._told_s = float("-inf")
-        self._commit_s = START_S + phase_s
+        self._commit_s = START_S + phase * commit_every_s
         self._is_cut = False
         self._told: tuple[Coverage, Coverage] | None = None
         self.foreseen = self.seen = Coverage()
 
     def on_step(self, memory: Memory, state: VehicleState | None, now_s: float) -> None:
-        """Take what the runtime tells, as often as it does, and commit it once a second."""
+        """Take what the runtime tells, as often as it does, and commit it now and then."""
         self._is_cut |= now_s >= self._cut_s and (memory.plan is None or memory.plan.is_off)
         if self._is_cut:
             return
         while self._commit_s <= now_s:
-            self._commit_s += COMMIT_S
+            self._commit_s += self._every_s
             if self._told is not None:
                 self.foreseen, self.seen = self._told
         if now_s >= self._told_s + COVERAGE_EVERY_S:
             self._told_s = now_s
+            ahead_s = coverage_ahead_s(self._every_s)
             self._told = (
-                expected(self._setup, memory, state, now_s=now_s, cut_s=now_s + COVERAGE_AHEAD_S),
+                expected(self._setup, memory, state, now_s=now_s, cut_s=now_s + ahead_s),
                 expected(self._setup, memory, state, now_s=now_s, cut_s=now_s),
             )
 
@@ -223,12 +224,14 @@ def _rest(route: Route, place: tuple[float, float]) -> Route:
     return replace(route, start_east_m=begin[0], start_north_m=begin[1], legs=route.legs[number:])
 
 
-def _cases(ground: Ground, truth: _Truth, number: int, rng: np.random.Generator) -> Iterator[Case]:
+def _cases(
+    ground: Ground, truth: _Truth, number: int, rng: np.random.Generator, commit_every_s: float
+) -> Iterator[Case]:
     seed = 1000 + number
     path = _path(ground.route, seed)
     sprayed_s = float(path.time_s[-1]) - START_S
     cut_s = START_S + float(rng.uniform(0.02, 0.98)) * sprayed_s
-    journal = _Journal(ground.setup, cut_s, float(rng.uniform(0.0, COMMIT_S)))
+    journal = _Journal(ground.setup, cut_s, commit_every_s, float(rng.uniform()))
     first = _fly(ground.setup, path, seed, stop_s=cut_s, on_step=journal.on_step)
     dose = truth.dose_l_ha(first)
     whole = truth.dose_l_ha(_fly(ground.setup, path, seed))
@@ -264,12 +267,14 @@ def _cases(ground: Ground, truth: _Truth, number: int, rng: np.random.Generator)
             yield case(kind, begin, dose + truth.dose_l_ha(rest))
 
 
-def measured(ground: Ground, flights: int, *, seed: int = 1) -> list[Case]:
+def measured(
+    ground: Ground, flights: int, *, seed: int = 1, commit_every_s: float = COMMIT_EVERY_S
+) -> list[Case]:
     """Return all cases of so many cuts."""
     truth, rng = _Truth(ground), np.random.default_rng(seed)
     found: list[Case] = []
     for number in range(flights):
-        found += _cases(ground, truth, number, rng)
+        found += _cases(ground, truth, number, rng, commit_every_s)
         print(f"{ground.name}: {number + 1} of {flights} cuts", file=sys.stderr)  # noqa: T201
     return found
 
@@ -296,6 +301,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flights", type=int, default=40)
     parser.add_argument("--large", type=int, default=0, help="cuts on 3.9 ha, a minute each")
+    parser.add_argument("--commit-s", type=float, default=COMMIT_EVERY_S, help="journal.commit_s")
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     is_met = True
@@ -303,7 +309,7 @@ def main() -> int:
         if not flights:
             continue
         ground = make()
-        cases = measured(ground, flights, seed=asked.seed)
+        cases = measured(ground, flights, seed=asked.seed, commit_every_s=asked.commit_s)
         print("\n".join(lines(ground, cases)))  # noqa: T201
         is_met &= all(case.percent <= TARGET_PERCENT for case in cases if case.kind in KINDS[:2])
     return 0 if is_met else 1

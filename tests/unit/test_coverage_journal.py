@@ -53,7 +53,7 @@ from companion.record.coverage_table import (
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
 from companion.record.unfinished import unfinished
-from companion.runtime import COVERAGE_AHEAD_S
+from companion.runtime import coverage_ahead_s
 from tests.builders import setup
 
 FRAME = LocalFrame(36.0, 114.5)
@@ -320,7 +320,7 @@ def test_a_replay_of_a_cut_flight_compares_what_was_to_be(tmp_path: Path) -> Non
             made.record_decision(decision)
             if now_s >= told_s + 0.1:
                 told_s = now_s
-                cut_s = now_s + COVERAGE_AHEAD_S
+                cut_s = now_s + coverage_ahead_s(1.0)
                 made.record_coverage(expected(own, memory, state, now_s=now_s, cut_s=cut_s))
     with sqlite3.connect(made.path) as connection:
         connection.execute("UPDATE meta SET value = 'recovered' WHERE key = 'closed'")

@@ -115,9 +115,10 @@ def wait_for(holds: object, fault: str, journal: Journal) -> None:
 
 
 def test_a_disk_that_fills_up_is_a_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(journal_module, "COMMIT_EVERY_S", 0.02)
     monkeypatch.setattr(shutil, "disk_usage", lambda _path: Usage(10**9, 10**9, 2_000_000))
-    with Journal.create(tmp_path, setup=setup(), free_min_bytes=10**8) as journal:
+    with Journal.create(
+        tmp_path, setup=setup(), free_min_bytes=10**8, commit_every_s=0.02
+    ) as journal:
         wait_for("space", "only 2 MB are free", journal)
 
 
