@@ -18,6 +18,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.engine.engine import GAP_S, Engine
+from companion.output.engine.late import KEPT
 from companion.output.engine.lines import MemoryLines
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import CHANGES_MAX, Kind, edges_from, pack_plan, unpack
@@ -61,6 +62,17 @@ def duty_error_max(duty: float, pwm: PwmLimits) -> float:
     elif last < duty < 1.0:
         one = 1.0 - last
     return max(0.005, 2.0 * one / PERIODS)
+
+
+def settle_periods(duty: float, pwm: PwmLimits, behind_s: float) -> int:
+    """Return after how many periods pulses that are `behind_s` late are in their places again.
+
+    None of them is skipped: in each period a twentieth of the pulse and what of the gap is not
+    needed make up for it.
+    """
+    pulse_s = duty * pwm.period_s
+    gained_s = (1.0 - KEPT) * pulse_s + max(pwm.period_s - pulse_s - pwm.min_off_s, 0.0)
+    return SETTLE + math.ceil(behind_s / gained_s)
 
 
 class Half:
@@ -115,6 +127,7 @@ class EngineMachine(RuleBasedStateMachine):
         self.lease_s = -math.inf
         self.since_s = self.now_s  # plans made before are void
         self.last: SprayPlan | None = None
+        self.behind_s = 0.0  # the most by which a line may be late
 
     # ------------------------------------------------------------------------------- helpers
 
@@ -162,7 +175,8 @@ class EngineMachine(RuleBasedStateMachine):
         duties = st.one_of(st.floats(least, 1.0), st.sampled_from(on_edges(self.pwm)))
         duty = data.draw(st.tuples(*[duties] * COUNT))
         period_s = self.pwm.period_s
-        begin_s = self.now_s + SETTLE * period_s
+        settle = max(settle_periods(d, self.pwm, self.behind_s) for d in duty)
+        begin_s = self.now_s + settle * period_s
         end_s = begin_s + PERIODS * period_s
         while self.now_s < end_s + PLAN_S:
             self.plan(duty)
@@ -172,6 +186,7 @@ class EngineMachine(RuleBasedStateMachine):
             open_s = sum(max(min(b, end_s) - max(a, begin_s), 0.0) for a, b in spans)
             error = abs(open_s / (end_s - begin_s) - duty[valve])
             assert error <= duty_error_max(duty[valve], self.pwm) + 1e-6
+        self.behind_s = 0.0
 
     @rule(
         duty=st.tuples(*[st.sampled_from([0.0, 0.0, 0.15, 0.5, 0.77, 1.0])] * COUNT),
@@ -204,6 +219,7 @@ class EngineMachine(RuleBasedStateMachine):
     @rule(delay_s=st.floats(0.0, GAP_S - 0.001))
     def be_late(self, delay_s: float) -> None:
         self.now_s += delay_s
+        self.behind_s += delay_s
         self.turn()
 
     @rule(for_s=st.floats(0.0, 1.5))
@@ -218,7 +234,7 @@ class EngineMachine(RuleBasedStateMachine):
         else:
             self.now_s += for_s
         self.turn()
-        self.lease_s, self.since_s = -math.inf, self.now_s
+        self.lease_s, self.since_s, self.behind_s = -math.inf, self.now_s, 0.0
         assert not self.given.lines.levels & VALVES
 
     @precondition(lambda self: self.last is not None and self.last.issued_s < self.since_s)
