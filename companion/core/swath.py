@@ -1,10 +1,8 @@
 """What the valves sweep: from orders and states to treated ground, by what a valve really does.
 
-An order to open or close takes effect on the liquid after its lag. It is the volume-equivalent
-one: a sharp edge there carries the same volume as the rise or fall, so ground that a later flight
-begins at this edge gets its dose, neither more nor less on the mean. What the schedule only meant
-to do is not looked at. A valve is open by the changes that a plan has brought about in its time; an
-inhibit has made a plan without any. What flow, pressure and tank say of the liquid goes before it.
+When a valve lets liquid out, `swath_liquid` says; its edges carry the volume of the rise and fall,
+so ground that a later flight begins at such an edge gets its dose, neither more nor less on the
+mean. What the schedule only meant to do is not looked at.
 
 The way since the last stamp is kept as a few states and stamped every other second, in pieces as
 long as they are straight: a step stays cheap.
@@ -13,16 +11,13 @@ long as they are straight: a step stays cheap.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
-from companion.core.coverage import Coverage, Place, Quad
-from companion.core.drives import liquid_of
+from companion.core.coverage import Coverage, Place
 from companion.core.overlap_guard import wake_m
-from companion.core.types import FaultKind, Finding, SprayPlan, VehicleState
+from companion.core.swath_liquid import Toggle, open_at, ordered_until
+from companion.core.swath_way import Front, swept
+from companion.core.types import Finding, SprayPlan, VehicleState
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -30,7 +25,6 @@ if TYPE_CHECKING:
     from companion.core.boom import Boom
     from companion.core.controller import Memory, Setup
     from companion.core.drift import Offset
-    from companion.core.schedule import LagModel
 
 # The way is stamped after this time: a swath of 10 m at 5 m/s is one look at some 2000 cells.
 STAMP_EVERY_S = 2.0
@@ -39,38 +33,13 @@ STAMP_EVERY_S = 2.0
 FRONT_STEP_M = 0.8
 # However slowly it flies: well below what counts as a gap.
 FRONT_EVERY_S = 0.5
-# So far a tip of the boom may be off a straight piece: below the noise of an RTK position.
-STRAIGHT_M = 0.03
-NEAR_M = 1e-6
 # States farther apart than these are a gap or a jump: nothing is known of the way between.
 GAP_MAX_S = 1.0
 JUMP_MAX_M = 25.0
-# Strips of neighbours that touch to this are one.
-TOUCH_M = 0.01
 # Snapshots that are kept for whoever wants to know what was treated some time ago. Two of them
 # are a stamp's time and a fifth of the wake apart, so seven go back beyond both.
 SNAPSHOTS_MAX = 8
 SNAPSHOT_WAKES = 0.2
-
-# Found in the liquid: nothing, or not what was ordered, comes out.
-NO_LIQUID = frozenset({FaultKind.NO_FLOW, FaultKind.PUMP_OFF, FaultKind.TANK_EMPTY, FaultKind.AIR})
-
-
-class Front(NamedTuple):
-    """Where the boom was, the liquid's offset by the wind in it."""
-
-    time_s: float
-    east_m: float
-    north_m: float
-    heading_deg: float
-
-
-class Toggle(NamedTuple):
-    """From `at_s` on liquid comes out of a valve, or none does."""
-
-    at_s: float
-    valve: int
-    opens: bool
 
 
 class Snapshot(NamedTuple):
@@ -246,9 +215,6 @@ def _front(state: VehicleState | None, drift_m: Offset | None) -> Front | None:
     return front if all(map(math.isfinite, front)) else None
 
 
-# ------------------------------------------------------------------------------ orders to liquid
-
-
 def _ordered(
     setup: Setup,
     swath: Swath,
@@ -258,111 +224,32 @@ def _ordered(
     *,
     lapses: bool = True,
 ) -> Swath:
-    """Return the swath with the orders until `now_s` and what becomes of them.
-
-    With `lapses` a plan ends with its lease, as an executor has it.
-    """
-    ordered, toggles = swath.ordered, swath.toggles
-    for at_s, opened, lag in _openings(setup, plan, now_s, lapses=lapses):
-        wanted = _real(opened, findings) if findings else opened
-        if wanted == ordered:
-            continue
-        for valve, (was, opens) in enumerate(zip(ordered, wanted, strict=True)):
-            if was != opens:
-                lag_s = (lag.on_s if opens else lag.off_s) + setup.lag.output_s
-                toggles = _toggled(toggles, Toggle(at_s + lag_s, valve, opens))
-        ordered = wanted
+    ordered, toggles = ordered_until(
+        setup, plan, findings, now_s,
+        ordered=swath.ordered, toggles=swath.toggles, lapses=lapses,
+    )  # fmt: skip
     if ordered is swath.ordered:
         return swath
     return swath._replace(ordered=ordered, toggles=toggles)
-
-
-def _openings(
-    setup: Setup, plan: SprayPlan | None, now_s: float, *, lapses: bool
-) -> list[tuple[float, tuple[bool, ...], LagModel]]:
-    """Return which valves let liquid out, from when on, and by the lag of what."""
-    if plan is None:
-        return []
-    duty = [each > 0.0 for each in plan.duty]
-    until_s = min(now_s, plan.lease_until_s) if lapses else now_s
-    pumped = None if setup.pumping is None else liquid_of(setup, plan)
-    runs = pumped is None or pumped.duty[0] > 0.0
-    lag = setup.lag
-    found = [(plan.issued_s, tuple(each and runs for each in duty), lag)]
-    changes = [(change.at_s, change.valve, change.duty > 0.0) for change in plan.changes]
-    if pumped is not None:
-        changes += [(change.at_s, -1, change.duty > 0.0) for change in pumped.changes]
-        changes.sort()
-    for at_s, valve, opens in changes:
-        if not at_s <= until_s:
-            break
-        if valve < 0:
-            runs = opens
-        else:
-            duty[valve] = opens
-        lag = setup.doses.lag if valve < 0 else setup.lag
-        found.append((at_s, tuple(each and runs for each in duty), lag))
-    if lapses and not now_s < plan.lease_until_s:
-        found.append((plan.lease_until_s, (False,) * len(duty), setup.lag))
-    return found
-
-
-def _real(opened: tuple[bool, ...], findings: tuple[Finding, ...]) -> tuple[bool, ...]:
-    """Return which valves let liquid out, after all that was found."""
-    kinds = {finding.kind for finding in findings}
-    shut = {each.valve for each in findings if each.kind is FaultKind.STUCK_CLOSED}
-    stuck = {each.valve for each in findings if each.kind is FaultKind.STUCK_OPEN}
-    flows = not kinds & NO_LIQUID
-    return tuple(
-        flows and ((is_open and valve not in shut) or valve in stuck)
-        for valve, is_open in enumerate(opened)
-    )
-
-
-def _toggled(toggles: tuple[Toggle, ...], new: Toggle) -> tuple[Toggle, ...]:
-    """Return the toggles with one more; one that comes before the last of its valve undoes it."""
-    for number in range(len(toggles) - 1, -1, -1):
-        if toggles[number].valve == new.valve:
-            if toggles[number].at_s >= new.at_s:
-                return toggles[:number] + toggles[number + 1 :]
-            break
-    return (*toggles, new)
-
-
-# ------------------------------------------------------------------------------ liquid to ground
 
 
 def _broken_off(setup: Setup, swath: Swath, front: Front | None, now_s: float) -> Swath:
     """Return the swath stamped as far as its way is known, and begun anew at `front`."""
     if len(swath.fronts) > 1:
         swath = _stamped(setup.boom, swath._replace(fronts=swath.fronts[:-1]), swath.fronts[-1])
-    is_open, toggles = _open_at(swath.is_open, swath.toggles, now_s)
+    is_open, toggles = open_at(swath.is_open, swath.toggles, now_s)
     fronts = () if front is None else (front,)
     return swath.come(*fronts)._replace(fronts=fronts, is_open=is_open, toggles=toggles)
-
-
-def _open_at(
-    is_open: tuple[bool, ...], toggles: tuple[Toggle, ...], at_s: float
-) -> tuple[tuple[bool, ...], tuple[Toggle, ...]]:
-    """Return which valves are open at a time, and what follows later."""
-    now = list(is_open)
-    for toggle in toggles:
-        if toggle.at_s <= at_s:
-            now[toggle.valve] = toggle.opens
-    return tuple(now), tuple(toggle for toggle in toggles if toggle.at_s > at_s)
 
 
 def _stamped(boom: Boom, swath: Swath, front: Front) -> Swath:
     """Return the swath with its way to `front` stamped."""
     fronts = (*swath.fronts, front) if front.time_s > swath.fronts[-1].time_s else swath.fronts
     end_s = fronts[-1].time_s
-    is_open, later = _open_at(swath.is_open, swath.toggles, end_s)
+    is_open, later = open_at(swath.is_open, swath.toggles, end_s)
     coverage = swath.coverage
     if len(fronts) > 1 and (any(swath.is_open) or len(later) < len(swath.toggles)):
-        way = _Way(boom, fronts)
-        stays = _stays(swath, fronts[0].time_s, end_s)
-        quads = [quad for strip in _strips(boom, stays) for quad in way.quads(*strip)]
-        coverage = coverage.stamped(quads)
+        coverage = coverage.stamped(swept(boom, fronts, swath.is_open, swath.toggles))
     come = swath.come(front)
     return Swath(
         coverage=coverage,
@@ -381,119 +268,3 @@ def _kept(older: tuple[Snapshot, ...], new: Snapshot, behind_m: float) -> tuple[
     if len(older) > 1 and older[-1].way_m - older[-2].way_m < SNAPSHOT_WAKES * behind_m:
         older = older[:-1]
     return (*older, new)[-SNAPSHOTS_MAX:]
-
-
-# From when until when liquid comes out of one valve.
-_Stays = tuple[tuple[float, float], ...]
-
-
-def _stays(swath: Swath, start_s: float, end_s: float) -> list[_Stays]:
-    """Return when each valve is open between two times."""
-    found: list[_Stays] = []
-    for valve, is_open in enumerate(swath.is_open):
-        stays = []
-        since_s = start_s
-        for toggle in swath.toggles:
-            if toggle.valve != valve or toggle.at_s > end_s or toggle.opens is is_open:
-                continue
-            if is_open:
-                stays.append((since_s, toggle.at_s))
-            is_open, since_s = toggle.opens, max(toggle.at_s, start_s)
-        if is_open:
-            stays.append((since_s, end_s))
-        found.append(tuple(stay for stay in stays if stay[1] > stay[0]))
-    return found
-
-
-# Left and right end, place ahead, and when it is open: of valves side by side that are so together.
-_Strip = tuple[float, float, float, _Stays]
-
-
-def _strips(boom: Boom, stays: list[_Stays]) -> list[_Strip]:
-    found: list[_Strip] = []
-    for right_m, forward_m, half_m, own in zip(
-        boom.right_m.tolist(),
-        boom.forward_m.tolist(),
-        boom.half_width_m.tolist(),
-        stays,
-        strict=True,
-    ):
-        left_m = right_m - half_m
-        if found and found[-1][2:] == (forward_m, own) and abs(found[-1][1] - left_m) <= TOUCH_M:
-            left_m = found.pop()[0]
-        found.append((left_m, right_m + half_m, forward_m, own))
-    return found
-
-
-class _Way:
-    """The way of the boom through its fronts, in as few straight pieces as it allows.
-
-    Plain numbers: for some ten fronts that is several times as fast as arrays are.
-    """
-
-    def __init__(self, boom: Boom, fronts: tuple[Front, ...]) -> None:
-        self._fronts = fronts
-        reach_m = float((np.abs(boom.right_m) + boom.half_width_m).max())
-        tips = []
-        for _, east_m, north_m, heading_deg in fronts:
-            angle = math.radians(heading_deg)
-            sin, cos = reach_m * math.sin(angle), reach_m * math.cos(angle)
-            tips.append((east_m - cos, north_m + sin, east_m + cos, north_m - sin))
-        self._knots_s = [fronts[bend].time_s for bend in _bends(tips, 0, len(tips) - 1)]
-
-    def quads(self, left_m: float, right_m: float, forward_m: float, stays: _Stays) -> list[Quad]:
-        """Return the quadrilaterals that a strip sweeps while it is open."""
-        found: list[Quad] = []
-        for begin_s, end_s in stays:
-            inner = [knot_s for knot_s in self._knots_s if begin_s < knot_s < end_s]
-            ends = [
-                self._ends(at_s, left_m, right_m, forward_m) for at_s in (begin_s, *inner, end_s)
-            ]
-            found.extend(
-                (left, right, next_right, next_left)
-                for (left, right), (next_left, next_right) in pairwise(ends)
-            )
-        return found
-
-    def _ends(
-        self, at_s: float, left_m: float, right_m: float, forward_m: float
-    ) -> tuple[Place, Place]:
-        """Return where the ends of a strip are at a time."""
-        number = bisect_right(self._fronts, at_s, key=_time) - 1
-        number = min(max(number, 0), len(self._fronts) - 2)
-        first, last = self._fronts[number : number + 2]
-        share = min(max((at_s - first.time_s) / (last.time_s - first.time_s), 0.0), 1.0)
-        turned_deg = (last.heading_deg - first.heading_deg + 180.0) % 360.0 - 180.0
-        angle = math.radians(first.heading_deg + share * turned_deg)
-        sin, cos = math.sin(angle), math.cos(angle)
-        east_m = first.east_m + share * (last.east_m - first.east_m) + forward_m * sin
-        north_m = first.north_m + share * (last.north_m - first.north_m) + forward_m * cos
-        return (
-            (east_m + left_m * cos, north_m - left_m * sin),
-            (east_m + right_m * cos, north_m - right_m * sin),
-        )
-
-
-def _time(front: Front) -> float:
-    return front.time_s
-
-
-def _bends(tips: list[tuple[float, float, float, float]], first: int, last: int) -> list[int]:
-    """Return the indices between which both tips go straight (as Douglas and Peucker have it)."""
-    x0, y0, x1, y1 = tips[first]
-    x2, y2, x3, y3 = tips[last]
-    dx, dy, ex, ey = x2 - x0, y2 - y0, x3 - x1, y3 - y1
-    left, right = math.hypot(dx, dy), math.hypot(ex, ey)
-    worst, worst_m = 0, STRAIGHT_M
-    for number in range(first + 1, last):
-        xa, ya, xb, yb = tips[number]
-        xa, ya, xb, yb = xa - x0, ya - y0, xb - x1, yb - y1
-        off_m = max(
-            abs(xa * dy - ya * dx) / left if left > NEAR_M else math.hypot(xa, ya),
-            abs(xb * ey - yb * ex) / right if right > NEAR_M else math.hypot(xb, yb),
-        )
-        if off_m > worst_m:
-            worst, worst_m = number, off_m
-    if not worst:
-        return []
-    return [*_bends(tips, first, worst), worst, *_bends(tips, worst, last)]

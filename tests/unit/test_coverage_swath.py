@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import shapely
 
-from companion.core import swath as law
+from companion.core import swath_liquid as law
 from companion.core.controller import Memory, Setup, step
 from companion.core.coverage import Coverage
 from companion.core.prescription import Prescription
-from companion.core.swath import Swath, Toggle, expected, follow
+from companion.core.swath import Swath, expected, follow
+from companion.core.swath_liquid import Toggle
 from companion.core.types import FaultKind, Finding, SprayPlan, TimedChange, VehicleState
 from tests.builders import LAG, along, boom, flying, plots, setup
 
@@ -208,9 +209,9 @@ def test_a_lease_that_ends_closes() -> None:
 
 def test_a_change_that_overtakes_the_one_before_undoes_it() -> None:
     off = Toggle(10.2, 1, opens=False)
-    assert law._toggled((off,), Toggle(10.1, 1, opens=True)) == ()
+    assert law.toggled((off,), Toggle(10.1, 1, opens=True)) == ()
     other = Toggle(10.1, 0, opens=True)
-    assert law._toggled((off,), other) == (off, other)
+    assert law.toggled((off,), other) == (off, other)
 
 
 def test_an_opening_of_a_moment_treats_its_moment() -> None:
