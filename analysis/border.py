@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from analysis.changes import SPEED_MIN_M_S, Run, bisect
+from analysis.holds import BESIDE_S, CLEAR_M
 from analysis.lag import DWELL_MIN_S, Step, Verdict
 from analysis.strips import GRAZE_M, Strip
 from analysis.track import TOUCH_M, Bools, Floats, Ints, Track
@@ -26,14 +27,10 @@ ENDED_BELOW = 0.02
 # Cumulative volumes are rounded; less than this in one step is nothing.
 NOTHING_ML = 1e-9
 ELEMENT_M = 0.1
-# How long before and after a change the strip must keep in the field.
+# How long before and after a change the strip must keep in the field. What a line is laid through
+# may reach further, but not over a hold of the border; whether a change was missed is judged by the
+# whole of both stretches.
 AROUND_S = 1.0
-BESIDE_S = 0.5
-# What the lines of a change are laid through reaches this far to both sides at 11 Hz (20 periods
-# and the change itself); whether a change was missed is judged by the whole of both stretches.
-WINDOWS_S = 2.3
-# A controller may keep a strip closed whose end comes this near to the border.
-CLEAR_M = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,8 +218,8 @@ def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Ste
     starts_s = np.array([stretch.start_s for stretch in strip.stretches])
     times_s = np.array([step.change.time_s for step in steps])
     # Looked at all at once: most changes have no border within reach of what they were measured on.
-    last = over[np.searchsorted(marks_s, times_s + WINDOWS_S, "right")]
-    is_near = (last > over[np.searchsorted(marks_s, times_s - WINDOWS_S)]).tolist()
+    last = over[np.searchsorted(marks_s, times_s + AROUND_S, "right")]
+    is_near = (last > over[np.searchsorted(marks_s, times_s - AROUND_S)]).tolist()
     found: list[Step] = []
     for step, near in zip(steps, is_near, strict=True):
         change = step.change
@@ -230,7 +227,7 @@ def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Ste
         if not missed and (step.verdict is not Verdict.MEASURED or change.border or not near):
             found.append(step)
             continue
-        around_s = AROUND_S if change.border else np.inf if missed else WINDOWS_S
+        around_s = np.inf if missed and not change.border else AROUND_S
         span_s = (change.time_s - around_s, change.time_s + around_s)
         if not change.border:
             span_s = _in_two_stretches(starts_s, change.time_s, span_s)

@@ -17,6 +17,7 @@ from analysis.changes import find_runs, stretches_of
 from analysis.dose import misapplied_percent, section_error_percent, volume_error_percent
 from analysis.flight_record import FlightMeta, FlightRecord, whole_boom
 from analysis.flow_accuracy import flow_accuracy
+from analysis.holds import holds_of
 from analysis.lag import Step, Verdict, measure_steps
 from analysis.published import P1_RESULTS
 from analysis.settled import SettledStep, measure_settled
@@ -179,5 +180,6 @@ def limit_ratio(flight: Evaluation, perfect: Evaluation) -> float | None:
 
 def _steps(strip: Strip, record: FlightRecord) -> list[Step]:
     """Return the steps of one strip; what the border held back is no change missed."""
-    steps = measure_steps(strip.track, strip.stretches, strip.orders, record.duty_limits)
+    holds = holds_of(strip.track, record.prescription, strip.stretches, strip.orders)
+    steps = measure_steps(strip.track, strip.stretches, strip.orders, record.duty_limits, holds)
     return held_by_border(strip, record.prescription, steps)

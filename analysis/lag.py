@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from analysis.changes import Change, changes_of
+from analysis.holds import sides_of
 from analysis.transitions import (
+    Sides,
     SmoothTrack,
     Transition,
     find_transitions,
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from analysis.changes import Run
+    from analysis.holds import Hold
     from analysis.track import Bools, Floats, Track
     from companion.core.types import TimedChange
 
@@ -83,24 +86,26 @@ def measure_steps(
     stretches: Sequence[Run],
     orders: Sequence[TimedChange],
     duty_limits: tuple[float, float],
+    holds: Sequence[Hold] = (),
 ) -> list[Step]:
-    """Return the step of every change of one valve; `orders` are that valve's."""
+    """Return the step of every change of one valve; `orders` and `holds` are that valve's."""
     changes = changes_of(track, stretches)
     smooth = SmoothTrack(track)
-    transitions = find_transitions(smooth, stretches, changes)
-    lags_m = _lag_distances_m(smooth, changes, transitions)
+    sides = sides_of(smooth, stretches, holds)
+    transitions = find_transitions(smooth, sides, changes)
+    lags_m = _lag_distances_m(smooth, changes, transitions, sides)
     steps: list[Step] = []
     for i, change in enumerate(changes):
         if change is None:
             continue
-        transition, pair = transitions[i], (stretches[i], stretches[i + 1])
+        transition, pair = transitions[i], (sides[i].before, sides[i].after)
         per_rate = prescribed_dose_ml_m(track, 1.0, change.time_s)
         asked = (per_rate * change.before_l_ha, per_rate * change.after_l_ha)
         dry = any(
             given < DRY_BELOW * dose
             for given, dose in zip(transition.levels_ml_m, asked, strict=True)
         )
-        verdict = _verdict(change, pair, transition)
+        verdict = _verdict(change, sides[i], transition)
         if (
             min(asked) > 0.0
             and verdict in (Verdict.MEASURED, Verdict.MISSED)
@@ -118,10 +123,12 @@ def measure_steps(
     return steps
 
 
-def _verdict(change: Change, stretches: tuple[Run, Run], transition: Transition) -> Verdict:
+def _verdict(change: Change, sides: Sides, transition: Transition) -> Verdict:
     if not change.relative >= SMALLEST_STEP:
         return Verdict.SMALL
-    if not all(stretch.dwell_s >= DWELL_MIN_S for stretch in stretches):
+    if sides.held:
+        return Verdict.BORDER
+    if not min(sides.before.dwell_s, sides.after.dwell_s) >= DWELL_MIN_S:
         return Verdict.CLOSE
     if not transition.progress >= MISSED_BELOW:
         return Verdict.MISSED
@@ -129,7 +136,10 @@ def _verdict(change: Change, stretches: tuple[Run, Run], transition: Transition)
 
 
 def _lag_distances_m(
-    smooth: SmoothTrack, changes: Sequence[Change | None], transitions: Sequence[Transition]
+    smooth: SmoothTrack,
+    changes: Sequence[Change | None],
+    transitions: Sequence[Transition],
+    sides: Sequence[Sides],
 ) -> list[float | None]:
     """Return step less boundary; None where a window would reach over a neighbouring change."""
     if not changes:
@@ -143,6 +153,9 @@ def _lag_distances_m(
     settles_s = np.array([each.settled_s for each in transitions])
     floors_s = np.concatenate(([track.time_s[0]], settles_s[:-1]))
     ceilings_s = np.concatenate((begins_s[1:], [track.time_s[-1]]))
+    # What the border holds bounds a line as a neighbouring change does.
+    floors_s = np.maximum(floors_s, [each.floor_s for each in sides])
+    ceilings_s = np.minimum(ceilings_s, [each.ceiling_s - track.period_s for each in sides])
     before = _lines(smooth, begins_s, floors_s, closed_before)
     after = _lines(smooth, settles_s, ceilings_s, closed_after)
     rise_ml = after.volume_ml - before.volume_ml

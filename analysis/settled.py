@@ -208,8 +208,11 @@ class _ByOrders:
         trims = max(round(TRIM_S / boom.step_s), 1)
         low = -highest(np.where(right, -ordered, -np.inf), trims)
         high = highest(np.where(right, ordered, -np.inf), trims)
-        near = flow.ml_s[where] >= flow_is * (low - band)
-        near &= flow.ml_s[where] <= flow_is * (high + band)
+        # Without an order for the new rate the band is infinitely empty; of a flow of 0 it is no
+        # number then, and nothing is near that either.
+        with np.errstate(invalid="ignore"):
+            near = flow.ml_s[where] >= flow_is * (low - band)
+            near &= flow.ml_s[where] <= flow_is * (high + band)
         return flow.stays_s(near, where.start)
 
 

@@ -23,8 +23,13 @@ def shifted(values: Floats, steps: float) -> Floats:
     whole = math.floor(steps)
     part = steps - whole
     last = len(values) - 1
-    index = np.clip(np.arange(whole, whole + len(values) + 1), 0, last)
-    moved = values[index]
+    moved = np.empty(len(values) + 1)
+    # What lies beyond an end, then the array itself: slices are quicker than an index of each.
+    before = min(max(-whole, 0), len(moved))
+    moved[:before] = values[0]
+    kept = values[max(whole, 0) : max(whole, 0) + len(moved) - before]
+    moved[before : before + len(kept)] = kept
+    moved[before + len(kept) :] = values[last]
     mixed: Floats = moved[:-1] * (1.0 - part) + moved[1:] * part
     return mixed
 

@@ -91,11 +91,13 @@ def _asked_ml(track: Track, stretches: list[Run]) -> Floats:
     """Return the cumulative prescribed volume at every sample; exact across boundaries."""
     starts_s = np.array([run.start_s for run in stretches])
     rates = np.array([run.rate_l_ha for run in stretches])
-    knots_s = np.sort(np.concatenate((track.time_s, starts_s)))
+    # All samples and all starts in one order; where each is in it is known, not to be sought.
+    places = np.searchsorted(track.time_s, starts_s, "right")
+    knots_s = np.insert(track.time_s, places, starts_s)
+    distance_m = np.insert(track.distance_m, places, track.at(track.distance_m, starts_s))
+    is_start = np.insert(np.zeros(len(track.time_s), dtype=np.bool_), places, values=True)
+    rate = rates[np.clip(np.cumsum(is_start)[:-1] - 1, 0, None)]
     middle_s = 0.5 * (knots_s[1:] + knots_s[:-1])
-    rate = rates[np.clip(np.searchsorted(starts_s, middle_s, "right") - 1, 0, None)]
-    metres = np.diff(track.at(track.distance_m, knots_s))
-    drops = rate * ML_M_PER_L_HA_M * track.at(track.across_m, middle_s) * metres
-    total = np.concatenate(([0.0], np.cumsum(drops)))
-    asked: Floats = total[np.searchsorted(knots_s, track.time_s)]
+    drops = rate * ML_M_PER_L_HA_M * track.at(track.across_m, middle_s) * np.diff(distance_m)
+    asked: Floats = np.concatenate(([0.0], np.cumsum(drops)))[~is_start]
     return asked

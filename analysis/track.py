@@ -86,6 +86,8 @@ class Track:
         deep = sure_field(prescription, half_m)
         inside = np.asarray(shapely.contains_xy(deep, east_m, north_m), dtype=np.bool_)
         doubtful = np.flatnonzero(~inside)
+        # Of a strip whose middle is outside nobody has to look at the ends: half of a flight turns.
+        doubtful = doubtful[in_field(prescription, east_m[doubtful], north_m[doubtful])]
         if len(doubtful):
             near_s = time_s[doubtful]
             left, right = self.points(near_s, -half_m), self.points(near_s, half_m)

@@ -6,6 +6,7 @@ missed a change. Everything is volume per metre of track, so that a change of sp
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -53,6 +54,21 @@ class Transition:
     found: bool
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sides:
+    """The stretches before and after a change, or what the border leaves of them by its holds.
+
+    `held` says that the valve is held closed at the change itself, on one side or on both;
+    `floor_s` and `ceiling_s` are the holds that no measurement of the change may reach into.
+    """
+
+    before: Run
+    after: Run
+    held: bool = False
+    floor_s: float = -math.inf
+    ceiling_s: float = math.inf
+
+
 class SmoothTrack:
     """The track's volume and distance, each smoothed alike: a constant dose stays a line."""
 
@@ -84,7 +100,7 @@ def levels_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
     starts_s = np.array([stretch.start_s for stretch in stretches])
     dwells_s = np.array([stretch.dwell_s for stretch in stretches])
     found = smooth.doses_between(starts_s + LEVEL_FROM * dwells_s, starts_s + LEVEL_TO * dwells_s)
-    inside = np.array([stretch.inside for stretch in stretches])
+    inside = np.array([stretch.inside for stretch in stretches], dtype=np.bool_)
     return [float(level) for level in np.where(inside, found, 0.0)]
 
 
@@ -94,28 +110,30 @@ def prescribed_dose_ml_m(track: Track, rate_l_ha: float, time_s: float) -> float
 
 
 def find_transitions(
-    smooth: SmoothTrack, stretches: Sequence[Run], changes: Sequence[Change | None]
+    smooth: SmoothTrack, sides: Sequence[Sides], changes: Sequence[Change | None]
 ) -> list[Transition]:
     """Return the transition of each pair of neighbouring stretches."""
-    levels = levels_of(smooth, stretches)
+    levels_before = levels_of(smooth, [each.before for each in sides])
+    levels_after = levels_of(smooth, [each.after for each in sides])
     found: list[Transition] = []
     for i, change in enumerate(changes):
-        before, after = stretches[i], stretches[i + 1]
-        early_s = max(before.start_s, after.start_s - SEARCH_BEFORE_S)
+        before, after = sides[i].before, sides[i].after
+        early_s = max(before.start_s, before.end_s - SEARCH_BEFORE_S)
         if found:
             early_s = max(early_s, found[-1].middle_s)
         late_s = after.start_s + 0.5 * after.dwell_s if not after.inside else after.end_s
-        pair = (levels[i], levels[i + 1])
-        if change is None:
-            found.append(_nominal(smooth.track, after.start_s, 0.0, pair))
+        pair = (levels_before[i], levels_after[i])
+        at_s = after.start_s if change is None else change.time_s
+        if change is None or sides[i].held:
+            found.append(_nominal(smooth.track, at_s, 0.0, pair))
             continue
-        asked = prescribed_dose_ml_m(smooth.track, 1.0, after.start_s)
+        asked = prescribed_dose_ml_m(smooth.track, 1.0, at_s)
         asked *= after.rate_l_ha - before.rate_l_ha
-        progress = (levels[i + 1] - levels[i]) / asked
+        progress = (pair[1] - pair[0]) / asked
         if progress > 0.0 and late_s - early_s > smooth.track.step_s:
             found.append(_located(smooth, pair, early_s, late_s, progress=progress))
         else:
-            found.append(_nominal(smooth.track, after.start_s, progress, pair))
+            found.append(_nominal(smooth.track, at_s, progress, pair))
     return found
 
 

@@ -171,7 +171,7 @@ def _durations(flight: AppliedFlight) -> Durations:
     known_s = np.where(lengths_s <= GAP_S, lengths_s, 0.0)
     by_inhibit: dict[str, float] = {}
     inhibited_s = 0.0
-    for reasons in set(flight.inhibits) - {""}:
+    for reasons in sorted(set(flight.inhibits) - {""}):
         its = np.array([each == reasons for each in flight.inhibits], dtype=np.bool_)
         held_s = float(known_s[its].sum())
         inhibited_s += held_s

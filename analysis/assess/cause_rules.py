@@ -8,8 +8,8 @@ import numpy as np
 
 from analysis.assess.cause_marks import samples_at
 from analysis.assess.rate_wishes import percent_at
-from analysis.border import CLEAR_M
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
+from analysis.holds import CLEAR_M
 from analysis.lag import Verdict
 from analysis.transitions import ML_M_PER_L_HA_M
 

@@ -92,6 +92,15 @@ def _percent(text: str) -> str:
     return text if text == NOTHING else f"{text} %"
 
 
+def _moment(text: str | None) -> str:
+    """Return a time of ISO 8601 as it is read, without its offset: the page names the zone.
+
+    >>> _moment("2026-11-22T03:22:39+00:00")
+    '2026-11-22 03:22:39'
+    """
+    return NOTHING if text is None else text[:19].replace("T", " ")
+
+
 def _span(interval: Mapping[str, Any], digits: int) -> str:
     """Return an interval as it is read; too few independent measurements have none."""
     low, high = interval["low"], interval["high"]
@@ -102,6 +111,7 @@ FILTERS: dict[str, Callable[..., str]] = {
     "f": _number,
     "signed": _signed,
     "percent": _percent,
+    "moment": _moment,
     "span": _span,
     "duration": duration_text,
 }

@@ -24,7 +24,7 @@ dl.head { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1.2
 dl.head dt { color: var(--quiet); }
 dl.head dd { margin: 0; overflow-wrap: anywhere; }
 .tiles { display: flex; flex-wrap: wrap; gap: .6rem; margin: 1rem 0; }
-.tile { flex: 1 1 8rem; border: 1px solid var(--line); padding: .5rem .7rem; }
+.tile { flex: 1 1 6.6rem; border: 1px solid var(--line); padding: .5rem .7rem; }
 .tile b { display: block; font-size: 1.35rem; }
 .tile span { color: var(--quiet); font-size: .85rem; }
 figure { margin: 1rem 0; break-inside: avoid; }
@@ -52,7 +52,11 @@ code { overflow-wrap: anywhere; }
   h3, caption { break-after: avoid; }
   table { font-size: 8.5pt; }
   .verdict { font-size: 12pt; }
+  .tiles { gap: .3rem; }
+  .tile { padding: .4rem .45rem; }
   tr, .tile, ul.warnings li { break-inside: avoid; }
+  /* Two maps on a page: of tall fields one would fill more than half of it. */
+  figure img { max-height: 88mm; max-width: 100%; width: auto !important; }
   thead { display: table-header-group; }
   details { display: none; }
 }

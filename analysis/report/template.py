@@ -15,23 +15,23 @@ PAGE = """<!DOCTYPE html>
 <header>
 <h1>Spray report</h1>
 <p class="quiet">{{ flight.told.get("application.field_name") or flight.file }}\
-{% if flight.spraying_from or flight.started %}, {{ flight.spraying_from or flight.started }}{% endif %}</p>
+{% if flight.spraying_from or flight.started %}, {{ (flight.spraying_from or flight.started)|moment }} ({{ flight.time_zone }}){% endif %}</p>
 {% for each in warnings if each.severity == "mark" %}<p class="mark">{{ each.text }}</p>
 {% endfor %}<p class="verdict">{{ verdict.sentence }}</p>
 {% if evaluated %}<div class="tiles">
 {{ tile(verdict.applied_l|f(2) ~ " L", "applied, " ~ verdict.prescribed_l|f(2) ~ " L prescribed") }}
 {{ tile(verdict.area_ha|f(3) ~ " ha", "treated") }}
 {{ tile(verdict.within_10_percent|f(1) ~ " %", "of the ground within 10 % of its rate") }}
-{{ tile(verdict.worst_lag_distance_m|f(2) ~ " m", "worst lag distance, mean of absolute values " ~ lag_distance_m.mean_abs|f(3) ~ " m") }}
-{{ tile(verdict.outside_ml|f(1) ~ " mL", "outside the border") }}
+{{ tile(lag_distance_m.mean_abs|f(2) ~ " m", "early or late where the rate changes (mean of " ~ lag_distance_m.count ~ "; worst " ~ verdict.worst_lag_distance_m|f(2) ~ " m)") }}
+{{ tile(verdict.outside_ml|f(1) ~ " mL", "fell outside the border") }}
 </div>
 {% endif %}<dl class="head">
 <dt>What</dt><dd>{{ flight.told.get("product.name") or "product not named" }}\
 {% if flight.told.get("application.crop") %}, on {{ flight.told["application.crop"] }}{% endif %}</dd>
 <dt>Where</dt><dd>{{ flight.latitude_deg|f(6) }}, {{ flight.longitude_deg|f(6) }} (WGS84)\
 {% if flight.told.get("application.parcel") %}, parcel {{ flight.told["application.parcel"] }}{% endif %}</dd>
-<dt>When</dt><dd>{% if flight.spraying_from %}sprayed {{ flight.spraying_from }} to {{ flight.spraying_until }}\
-{% elif flight.started %}flown {{ flight.started }} to {{ flight.ended }}{% else %}not known{% endif %};
+<dt>When</dt><dd>{% if flight.spraying_from %}sprayed {{ flight.spraying_from|moment }} to {{ flight.spraying_until|moment }}\
+{% elif flight.started %}flown {{ flight.started|moment }} to {{ flight.ended|moment }}{% else %}not known{% endif %};
 {{ flight.duration_s|duration }} in the air; time zone {{ flight.time_zone }}; {{ flight.clock }}</dd>
 <dt>Who</dt><dd>{{ flight.told.get("application.operator") or flight.told.get("application.pilot") or "operator not named" }}\
 {% if flight.told.get("application.customer") %}, for {{ flight.told["application.customer"] }}{% endif %}</dd>
@@ -57,11 +57,13 @@ worst {{ lag_distance_m.max_abs|f(3) }} m, of {{ lag_distance_m.count }} changes
 <a href="#definitions">What the figures mean</a>.</p>
 <table><caption>Beside the published flights of Wang et al. 2024 ({{ published.source }}) with a real sprayer, at 5 m/s</caption>
 <thead><tr><th></th><th class="n">settled lag distance, mean [m]</th><th class="n">spraying accuracy, mean [%]</th></tr></thead><tbody>
-<tr><td>this flight, at {{ speeds_text }}</td><td class="n">{{ settled_lag_distance_m.mean|signed(2) }} <small>n {{ settled_lag_distance_m.count }}</small></td><td class="n">{{ spraying_accuracy_percent|f(2) }}</td></tr>
+<tr><td>this flight, at {{ speeds_text }}</td><td class="n">{{ settled_lag_distance_m.mean|signed(2) }} <small>n {{ settled_lag_distance_m.count }}{% if settled_lag_distance_m.missed %}, {{ settled_lag_distance_m.missed }} never settled{% endif %}</small></td><td class="n">{{ spraying_accuracy_percent|f(2) }}</td></tr>
 <tr><td>published, with lag compensation</td><td class="n">{{ published.lag_distance_m["look-ahead"][0].mean|signed(2) }}</td><td class="n">{{ published.spraying_accuracy_percent.mean|f(2) }} <small>4 to 6 m/s</small></td></tr>
 <tr><td>published, without</td><td class="n">{{ published.lag_distance_m.none[0].mean|signed(2) }}</td><td class="n">-</td></tr>
 </tbody></table>
-<p class="quiet">The settled distance has its sign: early and late cancel. Theirs was measured by a flow meter, ours is modelled from the executed changes.</p>
+<p class="quiet">The settled distance has its sign: early and late cancel. Theirs was measured by a flow meter, ours is modelled from the executed changes.\
+{% if settled_lag_distance_m.missed %} It judges the flow of the whole boom by the rate under its middle, as in plots as wide as the boom. \
+Where rates differ across the boom that flow changes with each valve's own boundary, and often never settles: there the lag distance by valve, above and below, is the one to read.{% endif %}</p>
 {{ fig("lags") }}
 {{ groups("By kind of change", breakdowns.by_kind) }}
 {{ groups("By size of the step", breakdowns.by_step) }}

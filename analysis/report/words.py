@@ -237,11 +237,19 @@ def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
         yield _warning("outside", f"{evaluation.off_target_ml:.1f} mL fell outside the border.")
 
 
+def _labels(record: LegalRecord) -> Iterator[str]:
+    """Yield what is missing in words; the record itself has the keys by which it is said."""
+    for entry in record.entries:
+        if entry.is_missing:
+            yield entry.label[:1].lower() + entry.label[1:]
+    yield from record.why_not
+
+
 def _records(records: Sequence[LegalRecord]) -> Iterator[Caution]:
     for record in records:
         if not record.is_complete:
             yield _warning(
                 "record",
                 f"The {record.profile} record of the application is INCOMPLETE; missing: "
-                f"{', '.join(record.missing)}.",
+                f"{', '.join(_labels(record))}.",
             )

@@ -164,3 +164,11 @@ def test_the_ordered_flow_is_that_of_the_smallest_set_with_all_open_valves() -> 
     at_s, total_ml_s = ordered_ml_s(orders, (large, small))
     assert at_s.tolist() == [1.0, 1.0, 2.0, 3.0]
     assert (total_ml_s / ML_S_PER_L_MIN).tolist() == pytest.approx([0.0, 1.5, 3.0, 3.6, 3.0])
+
+
+def test_a_flow_that_dries_up_while_orders_are_wrong_is_no_number_and_no_warning() -> None:
+    # Three fifths of the step are ordered first: no order asks for the new rate, and nothing flows.
+    record = polled(shares(first=0.6, first_s=1.0), [20.0, 14.0])
+    dry_ml = np.minimum(record.volume_ml, np.interp(PLOT_M, record.east_m, record.volume_ml[:, 0]))
+    (lag_s,) = lags_s(replace(record, volume_ml=dry_ml))
+    assert lag_s is None or lag_s >= 1.0

@@ -10,13 +10,16 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from analysis.assess.assessment import assess
+from analysis.assess.histogram import Histogram
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report
 from analysis.report.clock import clock_of
 from analysis.report.contents import METRICS, contents_of
+from analysis.report.figures.spread import histogram
 from analysis.report.page import embedded, page_of
 from analysis.report.told import told_with
 from analysis.report.treated import treated_of
@@ -103,6 +106,59 @@ def test_the_published_flights_stand_beside_this_one(page: Parsed) -> None:
     assert "+0.32" in page.text
     assert "+3.87" in page.text
     assert "94.77" in page.text
+
+
+def test_the_first_screen_speaks_to_a_farmer(report: Report, page: Parsed) -> None:
+    contents = report.contents
+    lag = contents["lag_distance_m"]
+    text = re.sub(r"\s+", " ", page.text).partition("On the ground")[0]
+    assert f"{lag['mean_abs']:.2f} m" in text
+    assert f"(mean of {lag['count']}; worst {lag['max_abs']:.2f} m)" in text
+    # Times as they are read; the zone is named beside them.
+    start = contents["flight"]["spraying_from"][:19]
+    assert f"sprayed {start.replace('T', ' ')} to" in text
+    assert start not in text
+
+
+def test_what_is_missing_of_a_record_is_said_in_words(journal: Path) -> None:
+    options = ReportOptions(profiles=("us",), with_figures=False)
+    contents = build_report(journal, options).contents
+    (told,) = [each for each in contents["warnings"] if each["code"] == "record"]
+    missing = contents["application"]["us"]["missing"]
+    assert "pilot_certificate" in missing
+    label = contents["application"]["us"]["fields"]["pilot_certificate"]["label"]
+    assert label.lower() in told["text"].lower()
+    assert "_" not in told["text"]
+
+
+@pytest.mark.parametrize("missed", [0, 7])
+def test_changes_that_never_settled_are_counted_beside_those_that_did(
+    report: Report, missed: int
+) -> None:
+    settled = report.contents["settled_lag_distance_m"] | {"missed": missed}
+    text = Parsed(page_of({**report.contents, "settled_lag_distance_m": settled}, {})).text
+    assert (f"{missed} never settled" in text) == (missed > 0)
+    assert ("Where rates differ across the boom" in text) == (missed > 0)
+
+
+@pytest.mark.parametrize(("most", "scale"), [(200, "linear"), (20_000, "log")])
+def test_a_histogram_of_one_great_bar_shows_the_others_too(most: int, scale: str) -> None:
+    counts = np.array([30, 40, 50, most, 40, 30])
+    found = Histogram(
+        unit="L/ha",
+        edges=np.linspace(-3.0, 3.0, 7),
+        counts=counts,
+        mean=0.0,
+        sd=1.0,
+        mean_abs=0.5,
+        sd_abs=0.5,
+        cells=int(counts.sum()),
+    )
+    drawn = histogram([found])
+    assert drawn is not None
+    (panel,) = drawn.figure.axes
+    assert panel.get_yscale() == scale
+    assert panel.get_ylim()[1] > most
 
 
 def test_another_percentage_of_the_rates_is_told(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from analysis.report.figures.style import BLUE, FAINT, GREEN, GRID, INK, RED, Drawn, new_figure
 
@@ -43,6 +44,7 @@ def flow_over_time(flight: AppliedFlight, clock_text: str) -> Drawn:
         panels[0].axvspan(begin / 60.0, end / 60.0, color="#EEEEEE", lw=0, zorder=0)
     figure.align_ylabels()
     panels[-1].set_xlabel(f"minutes since {clock_text}")
+    panels[-1].xaxis.set_major_locator(MaxNLocator(nbins=12, steps=[1, 2, 5, 10]))
     panels[-1].set_xlim(0.0, max(flight.duration_s, 1.0) / 60.0)
     return Drawn(
         name="flow",

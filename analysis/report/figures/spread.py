@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+from matplotlib.ticker import NullLocator
+
 from analysis.report.figures.style import BLUE, FAINT, GRID, INK, RED, Drawn, new_figure
 
 if TYPE_CHECKING:
@@ -12,6 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from analysis.assess.histogram import Histogram
+    from analysis.track import Ints
+
+# A bar so many times as high as the usual one makes the usual one a line.
+STEEP = 50.0
 
 
 def histogram(found: Sequence[Histogram]) -> Drawn | None:
@@ -22,7 +29,8 @@ def histogram(found: Sequence[Histogram]) -> Drawn | None:
     panels = figure.subplots(1, len(found), squeeze=False, gridspec_kw={"wspace": 0.18})[0]
     for panel, each in zip(panels, found, strict=True):
         _bars(panel, each)
-    panels[0].set_ylabel("cells")
+    steep = any(_is_steep(each.counts) for each in found)
+    panels[0].set_ylabel("cells (each step ten times)" if steep else "cells")
     return Drawn(
         name="histogram",
         title="Deviation of the cells",
@@ -68,10 +76,24 @@ def causes(shares: Mapping[str, float]) -> Drawn | None:
     )
 
 
+def _is_steep(counts: Ints) -> bool:
+    """Return whether most bars would be lines on an even scale."""
+    filled = counts[counts > 0]
+    return bool(len(filled) > 2 and filled.max() > STEEP * float(np.median(filled)))
+
+
 def _bars(panel: Axes, found: Histogram) -> None:
     panel.axvspan(found.mean - found.sd, found.mean + found.sd, color="#F1E3D8", lw=0, zorder=0)
     panel.stairs(found.counts, found.edges, fill=True, color=BLUE)
-    panel.set_ylim(bottom=0.0)
+    is_steep = _is_steep(found.counts)
+    if is_steep:
+        # One bar of nearly all cells: the others would not be seen beside it.
+        panel.set_yscale("log")
+        panel.set_ylim(0.7, 2.0 * float(found.counts.max()))
+        panel.yaxis.set_major_formatter("{x:,.0f}")
+        panel.yaxis.set_minor_locator(NullLocator())
+    else:
+        panel.set_ylim(bottom=0.0)
     panel.axvline(0.0, color=FAINT, lw=0.8)
     panel.axvline(found.mean, color=RED, lw=1.4)
     panel.set_title(
