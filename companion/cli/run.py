@@ -171,6 +171,7 @@ def component_options(
 ) -> ComponentOptions:
     """Return who we are on the link."""
     major, minor, patch, *_ = (*map(int, re.findall(r"\d+", version("vrspray"))), 0, 0, 0)
+    has_lines = config.mission is not None and config.mission.lines is not None
     return ComponentOptions(
         system_id=config.link.system_id,
         component_id=config.link.component_id,
@@ -178,8 +179,8 @@ def component_options(
         version=(major, minor, patch),
         closed_us=config.output.closed_us,
         full_us=config.output.full_us,
-        use_mission=config.prediction.use_mission
-        or (config.mission is not None and config.mission.lines is not None),
+        use_mission=config.prediction.use_mission or has_lines,
+        need_mission=has_lines,
         use_battery="autopilot" in (config.flow_meter.source, config.tank.source),
         watch_mission=watch_mission,
         training="" if training == "no" else training,

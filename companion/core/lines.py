@@ -2,9 +2,9 @@
 
 A line is a polyline on which the whole boom may be open: its strip has square ends. Where a
 vehicle is off all of them, or on its way across, nothing is sprayed. It takes no item of the
-mission, and every autopilot will do. Where the autopilot tells which leg of its mission is flown,
-that has to lie along the line too: a ferry nearly along one is none. Each check is written so
-that NaN closes.
+mission. While the autopilot flies its mission, the leg of it that is flown has to lie along the
+line too, as a ferry nearly along one is none; while no leg is known, nothing is sprayed. Each
+check is written so that NaN closes.
 """
 
 from __future__ import annotations
@@ -42,10 +42,13 @@ MOVING_M_S = 0.3
 SPEED_MAX_M_S = 100.0
 # Places of a mission are exact to some centimetres; two that are nearer than 0.6 m may be one.
 WAY_ASIDE_M = 0.5
-# ArduPilot says twice a second which leg is flown, PX4 at a change and every ten seconds.
-WAY_AGE_MAX_S = 11.0
-# So long a leg that was left for the next one may still be on its last metres: they brake.
-WAY_ENDS_S = 12.0
+# ArduPilot says twice a second which leg is flown, PX4 at a change and every ten seconds: two in a
+# row may be lost on the way. If it was a change that was lost, a leg that is over lies along its
+# own line only, and a ferry that is over closes.
+WAY_AGE_MAX_S = 31.0
+# So long after it was last told a leg that was left for the next one may still be on its last
+# metres: they brake.
+WAY_ENDS_S = WAY_AGE_MAX_S + 2.0
 # A leg over a line begins and ends so near to its ends: the longest run-in (12 m/s, 2.5 m/s2).
 WAY_BEYOND_M = 30.0
 # The modes that fly the mission, as ArduPilot and PX4 call them.
@@ -160,13 +163,13 @@ def _ways(state: VehicleState) -> tuple[Way, ...] | None:
 
     Autopilots go on to the next item some metres before the end of a leg: a leg that the vehicle
     flies against is not flown yet, and a ferry that ends at the far end of a line is no line. None
-    where the mission is not flown, or says nothing.
+    of the legs where it is not known which; None where it is not the mission that is flown.
     """
     way, before = state.way, state.way_before
-    if way is None or state.mode not in MISSION_MODES:
+    if state.mode not in MISSION_MODES:
         return None
-    if not 0.0 <= state.time_s - way.received_s <= WAY_AGE_MAX_S:
-        return None
+    if way is None or not 0.0 <= state.time_s - way.received_s <= WAY_AGE_MAX_S:
+        return ()
     known = [way]
     if before is not None and 0.0 <= state.time_s - before.received_s <= WAY_ENDS_S:
         known.append(before)
@@ -179,7 +182,7 @@ def _is_onwards(state: VehicleState, way: Way) -> bool:
 
 
 def _is_told(piece: Piece, ways: tuple[Way, ...] | None, course: float) -> bool:
-    """Return whether a leg that is flown lies along a piece; where no leg is known, any does."""
+    """Return whether a leg that is flown lies along a piece; off the mission any piece will do."""
     return ways is None or any(_is_along(piece, way, course) for way in ways)
 
 

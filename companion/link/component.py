@@ -9,11 +9,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeGuard, get_args
 
+from companion.core.lines import MISSION_MODES
 from companion.core.types import Decision, HeartbeatReport, Input, Telemetry
 from companion.link.announcer import Announcer
 from companion.link.clock import ClockOffset
 from companion.link.codec import Codec
-from companion.link.commands import SET_MESSAGE_INTERVAL, Desk
+from companion.link.commands import REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, Desk
 from companion.link.encode import Encoder
 from companion.link.messages import (
     AckReceived,
@@ -44,7 +45,10 @@ _INPUTS = get_args(Input)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComponentOptions:
-    """Who we are on the link, what we want to know how often, and the ends of the pulses."""
+    """Who we are on the link, what we want to know how often, and the ends of the pulses.
+
+    `need_mission`: all stays closed where the mission is flown and its leg is not known.
+    """
 
     system_id: int = 0
     component_id: int = 191
@@ -53,6 +57,7 @@ class ComponentOptions:
     closed_us: int = 1000
     full_us: int = 2000
     use_mission: bool = False
+    need_mission: bool = False
     use_battery: bool = False
     watch_mission: bool = False
     training: str = ""
@@ -88,8 +93,13 @@ class Component:
             self._desk, self._encoder, self._announcer, self._send, version=options.version
         )
         self._mission = MissionReader(
-            self._encoder, self._send, self.warn, is_used=options.use_mission
+            self._encoder,
+            self._send,
+            self.warn,
+            is_used=options.use_mission,
+            is_needed=options.need_mission,
         )
+        self._flies_mission = False
         self._supervisor: StreamSupervisor | None = None
         self._boot_s: float | None = None
         self.clock = ClockOffset()
@@ -177,7 +187,7 @@ class Component:
             self._send(frame)
         self._service.tick(now_s)
         self.outputs.tick(now_s)
-        self._mission.tick(now_s, is_armed=self._desk.is_armed)
+        self._mission.tick(now_s, is_armed=self._desk.is_armed, flies_mission=self._flies_mission)
         if self._supervisor is None:
             return
         for request in self._supervisor.due(self.codec.vehicle_counts, now_s):
@@ -209,7 +219,7 @@ class Component:
             return
         self._encoder.system_id = vehicle.system_id
         self.outputs.meet(vehicle)
-        self._mission.meet(vehicle.system_id)
+        self._mission.meet(vehicle.system_id, is_streamed=not vehicle.is_px4)
         self.met_s, self.is_answered = now_s, False
         self.mission_active = None
         if self._options.training:
@@ -236,6 +246,7 @@ class Component:
         """Take from an input what the link itself has to know of it."""
         if isinstance(item, HeartbeatReport):
             self._desk.is_armed = item.armed
+            self._flies_mission = item.mode in MISSION_MODES
             self.outputs.armed(item.armed)
         elif isinstance(item, Telemetry):
             self._watch_boot(item)
@@ -269,6 +280,8 @@ class Component:
             self.on_order_ack(ack.result)
         elif ack.command == SET_MESSAGE_INTERVAL and self._supervisor is not None:
             self._supervisor.answered(ack.result, ack.received_s)
+        elif ack.command == REQUEST_MESSAGE:
+            self._mission.answered(ack.result)
 
     def _take_timesync(self, message: TimesyncReceived) -> None:
         if message.tc1_ns == 0:

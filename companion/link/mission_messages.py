@@ -55,7 +55,7 @@ class MissionCurrent:
 class MissionTransfer:
     """A message of a transfer of the mission itself, whoever it is between.
 
-    `number` is the count or the item's number.
+    `number` is the count or the item's number. `is_current`: that item is flown to.
     """
 
     received_s: float
@@ -66,6 +66,7 @@ class MissionTransfer:
     step: MissionStep
     number: int = 0
     item: MissionItem | None = None
+    is_current: bool = False
 
 
 def _current(m: Any, received_s: float) -> MissionCurrent:
@@ -81,7 +82,13 @@ def _current(m: Any, received_s: float) -> MissionCurrent:
 
 
 def _transfer(
-    m: Any, received_s: float, step: MissionStep, number: int = 0, item: MissionItem | None = None
+    m: Any,
+    received_s: float,
+    step: MissionStep,
+    number: int = 0,
+    item: MissionItem | None = None,
+    *,
+    is_current: bool = False,
 ) -> MissionTransfer | None:
     if m.mission_type != 0:
         return None  # of a fence or of rally points
@@ -94,6 +101,7 @@ def _transfer(
         step=step,
         number=number,
         item=item,
+        is_current=is_current,
     )
 
 
@@ -110,7 +118,8 @@ def _item(m: Any, received_s: float) -> MissionTransfer | None:
         param2=m.param2,
         place=place if has_place else None,
     )
-    return _transfer(m, received_s, MissionStep.ITEM, m.seq, item)
+    # ArduPilot has other meanings for numbers above 1.
+    return _transfer(m, received_s, MissionStep.ITEM, m.seq, item, is_current=m.current == 1)
 
 
 def _ended(m: Any, received_s: float) -> MissionTransfer | None:

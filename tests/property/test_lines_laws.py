@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from companion.core.crossings import Route, find_routes
 from companion.core.lines import Lines, Piece, Polyline
 from companion.core.prescription import Prescription, Zone
-from companion.core.types import VehicleState
+from companion.core.types import VehicleState, Way
 from tests.builders import along, boom, flying
 from tests.property.test_core_laws import turned
 
@@ -30,6 +30,7 @@ FIELD = field()
 
 
 def found(lines: Lines, state: VehicleState, ground: Prescription = FIELD) -> tuple[Route, ...]:
+    state = replace(state, mode="GUIDED")  # by position and course alone
     flown = lines.flown(state, back_s=BACK_S, ahead_s=AHEAD_S, reach_m=BOOM.reach_m)
     return find_routes(
         ground, state, BOOM, back_s=BACK_S, ahead_s=AHEAD_S, border="inside",
@@ -112,6 +113,52 @@ def test_no_valve_is_open_off_every_line(
                 ) <= lines.aside_m
                 for piece in lines.pieces
             )  # fmt: skip
+
+
+@given(
+    polylines=LINES,
+    number=st.integers(0, 20),
+    share=st.floats(0.0, 1.0),
+    off=st.floats(-15.0, 15.0),
+    leg=st.one_of(st.none(), st.tuples(PLACES, PLACES), st.floats(-0.5, 1.5)),
+    age_s=st.one_of(st.floats(-40.0, 40.0), st.just(math.nan)),
+)
+def test_a_leg_only_takes_away_and_without_one_the_mission_opens_nothing(
+    polylines: list[Polyline],
+    number: int,
+    share: float,
+    off: float,
+    leg: tuple[tuple[float, float], tuple[float, float]] | float | None,
+    age_s: float,
+) -> None:
+    lines = planned(polylines)
+    if lines is None:
+        return
+    piece = lines.pieces[number % len(lines.pieces)]
+    ue, un, length = piece.unit_east, piece.unit_north, piece.length_m
+    course = math.degrees(math.atan2(ue, un)) + off
+    state = flying(
+        10.0, piece.east_m + ue * share * length, piece.north_m + un * share * length,
+        **along(course),
+    )  # fmt: skip
+    if isinstance(leg, float):  # along the line, from somewhere to its end
+        begin = (piece.east_m + ue * leg * length, piece.north_m + un * leg * length)
+        leg = (begin, (piece.east_m + ue * length, piece.north_m + un * length))
+    way = None
+    if leg is not None:
+        way = Way(
+            received_s=10.0 - age_s, from_east_m=leg[0][0], from_north_m=leg[0][1],
+            to_east_m=leg[1][0], to_north_m=leg[1][1],
+        )  # fmt: skip
+
+    def flown(mode: str) -> set[Piece]:
+        now = replace(state, mode=mode, way=way)
+        return set(lines.flown(now, back_s=BACK_S, ahead_s=AHEAD_S, reach_m=BOOM.reach_m))
+
+    assert flown("AUTO") == flown("MISSION")
+    if way is None or not 0.0 <= state.time_s - way.received_s <= 31.0:
+        assert not flown("AUTO")
+    assert not flown("AUTO") or flown("GUIDED")
 
 
 @given(

@@ -88,8 +88,8 @@ async def flown(config: Path, serve: tuple[str, ...], port: int) -> tuple[dict[s
     return plan, upload, json.loads(out)
 
 
-# PX4 tells of its mission every ten seconds only: armed sooner, the companion knows no legs of it.
-@pytest.mark.parametrize("autopilot", ["ardupilot"])
+# PX4 tells of its mission every ten seconds only, and is armed before: the companion asks for it.
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 async def test_what_was_planned_is_uploaded_flown_and_sprayed_on_its_lines(
     tmp_path: Path, autopilot: Literal["ardupilot", "px4"]
 ) -> None:

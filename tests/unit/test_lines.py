@@ -13,21 +13,39 @@ from companion.core.estimator import Track, observe
 from companion.core.lines import Lines, Polyline
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import LegReport, TimedChange, VehicleState, Way
-from tests.builders import LAG, along, boom, flying, setup
-from tests.unit.test_controller import crossing_s, fly
+from tests import builders
+from tests.builders import LAG, along, boom, setup
+from tests.unit.test_controller import SPEED, crossing_s
 
 GROUND = shapely.box(-100.0, -100.0, 200.0, 100.0)
 FIELD = Prescription([Zone(name="all", polygon=GROUND, rate_l_ha=20.0)])
 LINE: Polyline = ((12.0, 3.0), (36.0, 3.0))
+LIMITS = replace(setup().limits, modes=frozenset({"AUTO", "GUIDED"}))
 
 
 def on_lines(*polylines: Polyline, aside_m: float = 1.0, **change: object) -> Setup:
     lines = Lines(polylines=polylines or (LINE,), aside_m=aside_m)
-    return setup(prescription=FIELD, lines=lines, **change)
+    return setup(prescription=FIELD, lines=lines, limits=LIMITS, **change)
 
 
-def switches(given: Setup, start_m: float, end_m: float, **how: float) -> list[TimedChange]:
-    return [c for c in fly(given, start_m, end_m, **how) if c.valve == 2 and c.restart]
+def flying(now_s: float, east_m: float, north_m: float = 3.0, **change: object) -> VehicleState:
+    """Return a vehicle on a leg of its mission where one is given, else flown by hand."""
+    mode = "AUTO" if "way" in change else "GUIDED"
+    return builders.flying(now_s, east_m, north_m, **({"mode": mode} | change))
+
+
+def switches(
+    given: Setup, start_m: float, end_m: float, *, hz: float = 20.0, **change: object
+) -> list[TimedChange]:
+    """Return when valve 3 is switched on the way east at 5 m/s."""
+    memory, done, pending = Memory(), [], []
+    for i in range(int((end_m - start_m) / SPEED * hz)):
+        now_s = 10.0 + i / hz
+        done += [change_ for change_ in pending if change_.at_s <= now_s]
+        state = flying(now_s, start_m + SPEED * i / hz, **change)
+        decision, memory = step(given, state, memory, now_s)
+        pending = list(decision.plan.changes)
+    return [change_ for change_ in done if change_.valve == 2 and change_.restart]
 
 
 def opens(given: Setup, state: VehicleState, memory: Memory | None = None) -> bool:
@@ -210,7 +228,10 @@ def test_a_leg_that_was_left_counts_to_its_last_metres_but_not_on_the_way_back()
     assert not opens(on_lines(), flying(10.0, 30.0, way=ferry))
     back = {"velocity_east_m_s": -5.0, "heading_deg": 270.0}
     assert not opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=line, **back))
-    old = replace(line, received_s=-2.1)
+    assert opens(
+        on_lines(), flying(10.0, 30.0, way=ferry, way_before=replace(line, received_s=-22.9))
+    )
+    old = replace(line, received_s=-23.1)
     assert not opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=old))
 
 
@@ -218,14 +239,46 @@ def test_a_leg_without_length_is_along_no_line() -> None:
     assert not opens(on_lines(), flying(10.0, 20.0, way=way((40.0, 3.0), (40.0, 3.0))))
 
 
-def test_an_old_leg_and_one_outside_the_mission_say_nothing() -> None:
+@pytest.mark.parametrize("mode", ["AUTO", "MISSION"])
+def test_while_no_leg_is_known_the_mission_sprays_nothing(mode: str) -> None:
+    given = on_lines()
+    assert opens(given, flying(10.0, 20.0, way=way(*LINE), mode=mode))
+    assert not opens(given, flying(10.0, 20.0, way=None, mode=mode))
+    assert not opens(given, flying(10.0, 20.0, way=None, way_before=way(*LINE), mode=mode))
+
+
+@pytest.mark.parametrize(
+    ("received_s", "sprayed"),
+    [(10.0, True), (-20.9, True), (-21.1, False), (10.1, False), (math.nan, False)],
+)
+def test_a_leg_counts_until_three_of_px4s_ten_seconds_are_over(
+    received_s: float, *, sprayed: bool
+) -> None:
+    told = way(*LINE, received_s=received_s)
+    assert opens(on_lines(), flying(10.0, 20.0, way=told)) is sprayed
+
+
+def test_a_leg_whose_change_was_lost_opens_its_own_line_only() -> None:
+    """It is told again ten seconds later: until then ferries are closed all the same."""
+    given = on_lines(LINE, ((36.0, 9.0), (12.0, 9.0)))
+    old = way(*LINE, received_s=1.0)
+    assert not opens(given, flying(10.0, 20.0, 9.0, **along(270.0), way=old))
+    assert not opens(given, flying(10.0, 20.0, 3.0, **along(270.0), way=old))
+    assert not opens(given, flying(10.0, 45.0, 3.0, way=old))
+
+
+def test_a_leg_says_nothing_of_who_does_not_fly_the_mission() -> None:
     ferry = way((-20.0, 2.0), (60.0, 4.5))
-    assert not opens(on_lines(), flying(20.0, 20.0, way=ferry))
-    assert opens(on_lines(), flying(21.0, 20.0, way=ferry))
-    limits = replace(setup().limits, modes=frozenset({"AUTO", "GUIDED"}))
-    given = on_lines(limits=limits)
+    given = on_lines()
     assert opens(given, flying(10.0, 20.0, way=ferry, mode="GUIDED"))
     assert not opens(given, flying(10.0, 20.0, way=ferry))
+
+
+def test_legs_that_come_every_ten_seconds_close_nothing_on_the_line() -> None:
+    far = ((0.0, 3.0), (190.0, 3.0))
+    given = on_lines(far)
+    found = switches(given, 5.0, 105.0, way=way(*far, received_s=9.9))  # told once in 20 s
+    assert [change.duty > 0.0 for change in found] == [True]
 
 
 def test_the_leg_is_heard_only_where_lines_are_followed() -> None:

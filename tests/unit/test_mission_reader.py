@@ -133,17 +133,29 @@ def test_a_leg_that_is_flown_through_or_that_nobody_knows_the_next_of_does_not_s
 class Bench:
     """A reader, and an autopilot that answers as it is told to."""
 
-    def __init__(self, *, is_used: bool = True, items: Sequence[MissionItem] = MISSION) -> None:
+    def __init__(
+        self,
+        *,
+        is_used: bool = True,
+        is_needed: bool = False,
+        is_streamed: bool = True,
+        items: Sequence[MissionItem] = MISSION,
+    ) -> None:
         self.sent: list[tuple[float, Any]] = []
         self.warnings: list[str] = []
+        self.legs: list[LegReport] = []  # that came with an item, and not with MISSION_CURRENT
+        self.flagged: int | None = None  # the item that says it is flown to
+        self.flies_mission = True
         self.items = items
         self.now_s = 100.0
         self.is_armed = False
         self.answers = True
         self._parser = mavlink.MAVLink(None)
         encoder = Encoder(system_id=1, component_id=191)
-        self.reader = MissionReader(encoder, self._send, self.warnings.append, is_used=is_used)
-        self.reader.meet(1)
+        self.reader = MissionReader(
+            encoder, self._send, self.warnings.append, is_used=is_used, is_needed=is_needed
+        )
+        self.reader.meet(1, is_streamed=is_streamed)
 
     def _send(self, frame: bytes) -> bool:
         self.sent.extend((self.now_s, message) for message in self._parser.parse_buffer(frame))
@@ -161,8 +173,9 @@ class Bench:
             step=step,
             number=number,
             item=item_,
+            is_current=step is MissionStep.ITEM and number == self.flagged,
         )
-        assert self.reader.take(message) == ()
+        self.legs += self.reader.take(message)
 
     def current(self, sequence: int = 5, **more: Any) -> tuple[LegReport, ...]:
         told = {"total": len(self.items) - 1} | more
@@ -172,7 +185,7 @@ class Bench:
         for _ in range(round(duration_s / 0.02)):
             self.now_s += 0.02
             before = len(self.sent)
-            self.reader.tick(self.now_s, is_armed=self.is_armed)
+            self.reader.tick(self.now_s, is_armed=self.is_armed, flies_mission=self.flies_mission)
             for _, message in self.sent[before:] if self.answers else ():
                 match message.get_type():
                     case "MISSION_REQUEST_LIST":
@@ -209,12 +222,76 @@ def test_each_current_item_gives_its_leg() -> None:
     assert bench.current(is_flown=False) == ()
 
 
-def test_nothing_is_asked_before_a_mission_is_heard_of_or_unless_it_is_used() -> None:
-    bench, unused = Bench(), Bench(is_used=False)
+def test_nothing_is_asked_before_a_vehicle_is_met_or_unless_the_mission_is_used() -> None:
+    bench, unused = Bench(is_streamed=False), Bench(is_used=False, is_streamed=False)
+    bench.reader.meet(0)
     unused.current()
     for one in (bench, unused):
         one.run(5.0)
         assert not one.sent
+
+
+def test_the_mission_is_read_before_anything_is_heard_of_it() -> None:
+    bench = Bench()
+    bench.run(5.0)
+    assert bench.reader.items == MISSION
+    assert bench.legs == []
+    assert bench.current() == (leg_report(MISSION, 5, bench.now_s),)
+    bench.run(5.0)
+    assert len(bench.of("MISSION_REQUEST_LIST")) == 1
+
+
+@pytest.mark.parametrize("total", [0, 6, 7])  # not told, as ArduPilot counts, as PX4 does
+def test_a_first_total_that_fits_what_was_read_is_no_other_mission(total: int) -> None:
+    bench = Bench()
+    bench.run(5.0)
+    assert bench.current(total=total) != ()
+    during = Bench()
+    during.run(0.2)
+    during.current(total=total)
+    during.run(4.0)
+    assert during.reader.items == MISSION
+    assert len(during.of("MISSION_REQUEST_LIST")) == 1
+
+
+@pytest.mark.parametrize("total", [5, 8, 65535])
+def test_a_first_total_that_does_not_fit_is_another_mission(total: int) -> None:
+    bench = Bench()
+    bench.run(5.0)
+    assert bench.current(total=total) == ()
+    assert bench.reader.items is None
+
+
+def test_the_item_that_says_it_is_flown_to_gives_the_leg_until_news_come() -> None:
+    bench = Bench()
+    bench.flagged = 5
+    bench.run(5.0)
+    (leg_,) = bench.legs
+    assert leg_ == leg_report(MISSION, 5, leg_.received_s)
+    assert 100.0 < leg_.received_s < 102.0
+    assert bench.current(sequence=6) == (leg_report(MISSION, 6, bench.now_s),)
+
+
+def test_what_was_heard_in_the_meantime_counts_more_than_an_item_read_before() -> None:
+    bench = Bench()
+    bench.flagged = 3
+    bench.run(0.3)
+    assert bench.current(sequence=5) == ()
+    bench.run(5.0)
+    assert [leg_ == leg_report(MISSION, 5, leg_.received_s) for leg_ in bench.legs] == [True]
+    told = Bench()
+    told.flagged = 5
+    told.current(is_flown=False)
+    told.run(5.0)
+    assert told.legs == []
+
+
+def test_a_mission_that_is_read_again_tells_no_old_leg_anew() -> None:
+    bench = known()
+    heard = len(bench.legs)
+    bench.run(40.0)
+    assert len(bench.of("MISSION_REQUEST_LIST")) == 2
+    assert len(bench.legs) == heard
 
 
 @pytest.mark.parametrize("total", [65535])
@@ -362,6 +439,140 @@ def test_another_vehicle_has_another_mission() -> None:
     assert bench.reader.items is None
 
 
+# ------------------------------------------------------------- where nothing opens without a leg
+
+
+def test_where_the_leg_is_needed_it_is_read_in_flight_too_and_then_left_alone() -> None:
+    bench = Bench(is_needed=True)
+    bench.is_armed = True
+    bench.flagged = 5
+    bench.run(5.0)
+    assert bench.reader.items == MISSION
+    assert len(bench.legs) == 1
+    bench.run(120.0)
+    assert len(bench.of("MISSION_REQUEST_LIST")) == 1
+    bench.items = MISSION[:6]
+    bench.current(sequence=3)
+    bench.run(5.0)
+    assert bench.reader.items == MISSION[:6]
+
+
+def test_who_does_not_fly_the_mission_is_not_asked_in_flight() -> None:
+    bench = Bench(is_needed=True)
+    bench.is_armed, bench.flies_mission = True, False
+    bench.run(10.0)
+    assert not bench.sent
+
+
+def test_arming_does_not_end_a_transfer_that_is_needed() -> None:
+    bench = Bench(is_needed=True)
+    bench.run(0.2)
+    bench.is_armed = True
+    bench.run(2.0)
+    assert bench.reader.items == MISSION
+    assert len(bench.of("MISSION_REQUEST_LIST")) == 1
+
+
+def test_a_mission_written_in_flight_is_read_after_the_writer_is_done() -> None:
+    bench = known(is_needed=True)
+    bench.is_armed = True
+    bench.items = (*MISSION[:3], item(WAYPOINT, AHEAD), *MISSION[4:])
+    bench.transfer(MissionStep.UPLOAD, to=(255, 190))
+    assert bench.current() == ()
+    before = len(bench.sent)
+    bench.run(2.9)
+    assert len(bench.sent) == before
+    bench.run(3.0)
+    assert bench.reader.items == bench.items
+
+
+def test_where_a_vehicle_was_in_the_old_mission_says_nothing_of_the_new_one() -> None:
+    bench = known(is_needed=True)
+    bench.is_armed = True
+    bench.legs.clear()
+    bench.transfer(MissionStep.UPLOAD, to=(255, 190))
+    bench.flagged = 3
+    bench.run(6.0)
+    assert [leg_ == leg_report(MISSION, 3, leg_.received_s) for leg_ in bench.legs] == [True]
+
+
+def test_what_cannot_be_read_is_tried_again_every_half_minute_and_told_once() -> None:
+    bench = Bench(is_needed=True)
+    bench.answers = False
+    bench.is_armed = True
+    bench.run(120.0)
+    # Five beginnings take 7.5 s, and 30 s are waited after them.
+    assert 15 <= len(bench.of("MISSION_REQUEST_LIST")) <= 20
+    assert bench.warnings == ["mission cannot be read", "valves stay closed while it is flown"]
+    bench.answers = True
+    bench.run(40.0)
+    assert bench.reader.items == MISSION
+    bench.answers = False
+    bench.current(total=3)
+    bench.run(60.0)
+    assert len(bench.warnings) == 4
+
+
+def test_another_vehicle_and_another_mission_are_asked_at_once() -> None:
+    bench = Bench(is_needed=True)
+    bench.answers = False
+    bench.run(10.0)  # given up for half a minute
+    before = len(bench.sent)
+    bench.run(5.0)
+    assert len(bench.sent) == before
+    bench.answers = True
+    bench.current()
+    bench.run(2.0)
+    assert bench.reader.items == MISSION
+    bench.reader.meet(1)
+    bench.answers = False
+    bench.run(10.0)
+    bench.answers = True
+    bench.reader.meet(1)
+    bench.run(2.0)
+    assert bench.reader.items == MISSION
+
+
+# ------------------------------------------------------------- where the item is not streamed
+
+
+def test_an_item_that_is_not_streamed_is_asked_for_and_a_refusal_ends_that() -> None:
+    streamed, bench = known(), Bench(is_streamed=False)
+    assert not streamed.of("COMMAND_LONG")
+    bench.run(0.1)
+    (asked,) = [m for _, m in bench.sent if m.get_type() == "COMMAND_LONG"]
+    assert (asked.command, asked.param1) == (512, 42.0)
+    bench.reader.answered(2)
+    bench.run(120.0)
+    assert len(bench.of("COMMAND_LONG")) == 1
+    bench.reader.meet(1, is_streamed=False)
+    bench.run(0.5)
+    assert len(bench.of("COMMAND_LONG")) == 2
+
+
+def test_requests_in_vain_are_few() -> None:
+    bench = Bench(is_streamed=False)
+    bench.run(29.0)
+    asked = bench.of("COMMAND_LONG")
+    assert len(asked) == 3
+    assert all(b - a >= 0.99 for a, b in pairwise(asked))
+    for _ in range(6):  # PX4 says it by itself every ten seconds: that is no answer
+        bench.current()
+        bench.run(10.0)
+    assert 6 <= len(bench.of("COMMAND_LONG")) <= 12
+
+
+def test_where_it_answers_it_is_asked_once_a_second() -> None:
+    bench = Bench(is_streamed=False)
+    for _ in range(30):
+        before = len(bench.of("COMMAND_LONG"))
+        bench.run(0.5)
+        if len(bench.of("COMMAND_LONG")) > before:
+            bench.current()
+            bench.reader.answered(0)
+    assert 10 <= len(bench.of("COMMAND_LONG")) <= 15
+
+
 # -------------------------------------------------------------------------------------- on the wire
 
 
@@ -436,36 +647,121 @@ def test_a_component_that_uses_no_mission_reads_none() -> None:
     assert not [one for one in autopilot.asked if "MISSION" in one.get_type()]
 
 
-def test_the_stub_autopilots_mission_gives_the_legs_that_it_flies() -> None:
-    bench = stub_bench.Bench(items=stub_bench.mission((60.0, 0.0), (60.0, 6.0), (0.0, 6.0)))
-    channels: list[Any] = []
-    options = ComponentOptions(use_mission=True)
-    component = Component(
-        options, lambda frame: bench.autopilot.receive(channels[0], frame, bench.now_s) is None
-    )
-    legs: list[LegReport] = []
+class OnStub:
+    """A component on the wire to a stub autopilot; what it was told of its legs, and where to."""
 
-    def take(frame: bytes) -> None:
-        found = component.receive(frame, bench.now_s)
-        legs.extend(one for one in found if isinstance(one, LegReport))
+    def __init__(self, autopilot: str, *, need_mission: bool = False) -> None:
+        items = stub_bench.mission((60.0, 0.0), (60.0, 6.0), (0.0, 6.0))
+        self.bench = stub_bench.Bench(autopilot=autopilot, items=items)
+        self.options = ComponentOptions(use_mission=True, need_mission=need_mission)
+        self.loses: set[str] = set()
+        self.asked: list[Any] = []
+        self.legs: list[LegReport] = []
+        self._parser = mavlink.MAVLink(None)
+        self._channel = self.bench.autopilot.attach("companion", self._take)
+        self.start()
 
-    channels.append(bench.autopilot.attach("companion", take))
+    def start(self) -> None:
+        """Begin anew, as after a crash: nothing is known."""
+        self.component = Component(self.options, self._send)
 
-    def run(duration_s: float) -> None:
+    def _send(self, frame: bytes) -> bool:
+        self.asked += self._parser.parse_buffer(frame)
+        self.bench.autopilot.receive(self._channel, frame, self.bench.now_s)
+        return True
+
+    def _take(self, frame: bytes) -> None:
+        (message,) = mavlink.MAVLink(None).parse_buffer(frame)
+        if message.get_type() not in self.loses:
+            found = self.component.receive(frame, self.bench.now_s)
+            self.legs += [one for one in found if isinstance(one, LegReport)]
+
+    def run(self, duration_s: float) -> None:
         for _ in range(round(duration_s / 0.1)):
-            bench.run(0.1)
-            component.tick(None, bench.now_s)
+            self.bench.run(0.1)
+            self.component.tick(None, self.bench.now_s)
 
-    run(6.0)
-    bench.fly()
-    run(12.0)
-    frame = stub_bench.HOME
-    ends = [
-        (*frame.to_local(leg.from_latitude_deg, leg.from_longitude_deg),
-         *frame.to_local(leg.to_latitude_deg, leg.to_longitude_deg))
-        for leg in legs
-    ]  # fmt: skip
-    assert ends
-    assert ends[-1] == pytest.approx((0.0, 0.0, 60.0, 0.0), abs=0.05)
-    assert legs[-1].stops
-    assert bench.now_s - legs[-1].received_s < 1.0
+    def fly(self) -> None:
+        self.bench.companion.command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1)
+        self.run(0.2)
+        self.bench.companion.command(mavlink.MAV_CMD_MISSION_START)
+        self.run(0.2)
+        assert self.bench.autopilot.flight.armed
+
+    def ends(self) -> list[tuple[int, ...]]:
+        """Return the legs that were told, each once: east and north of both ends in metres."""
+        found: list[tuple[int, ...]] = []
+        for leg_ in self.legs:
+            begin = stub_bench.HOME.to_local(leg_.from_latitude_deg, leg_.from_longitude_deg)
+            end = stub_bench.HOME.to_local(leg_.to_latitude_deg, leg_.to_longitude_deg)
+            whole = tuple(map(round, (*begin, *end)))
+            found += [whole] if not found or found[-1] != whole else []
+        return found
+
+
+OUT, ACROSS, BACK = (0, 0, 60, 0), (60, 0, 60, 6), (60, 6, 0, 6)
+
+
+def test_the_stub_autopilots_mission_gives_the_legs_that_it_flies() -> None:
+    wire = OnStub("ardupilot")
+    wire.run(6.0)
+    wire.fly()
+    wire.run(12.0)
+    assert wire.ends()[-1] == OUT
+    assert wire.legs[-1].stops
+    assert wire.bench.now_s - wire.legs[-1].received_s < 1.0
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_armed_as_soon_as_it_is_heard_every_leg_is_known(autopilot: str) -> None:
+    wire = OnStub(autopilot, need_mission=True)
+    wire.run(1.2)  # a heartbeat has come, and of PX4 no news of its mission for ten seconds
+    wire.fly()
+    wire.run(40.0)
+    told = wire.ends()
+    assert [each for each in told if each[:2] != each[2:]][-3:] == [OUT, ACROSS, BACK]
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_started_anew_in_flight_it_knows_the_leg_within_two_seconds(autopilot: str) -> None:
+    wire = OnStub(autopilot, need_mission=True)
+    wire.run(1.2)
+    wire.fly()
+    wire.run(10.0)
+    assert wire.ends()[-1] == OUT
+    wire.legs.clear()
+    wire.start()
+    wire.run(2.0)
+    assert wire.ends() == [OUT]
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_where_the_leg_is_not_needed_a_vehicle_in_flight_is_not_asked(autopilot: str) -> None:
+    wire = OnStub(autopilot)
+    wire.run(1.2)
+    wire.fly()
+    wire.start()
+    wire.asked.clear()
+    wire.run(12.0)
+    assert not [one for one in wire.asked if one.get_type().startswith("MISSION")]
+
+
+def test_px4_refuses_what_is_asked_for_once() -> None:
+    wire = OnStub("px4", need_mission=True)
+    wire.run(1.2)
+    wire.fly()
+    wire.run(20.0)
+    asked = [one for one in wire.asked if one.get_type() == "COMMAND_LONG" and one.command == 512]
+    assert [one.param1 for one in asked] == [42.0]
+
+
+def test_without_any_news_of_px4_the_items_themselves_say_which_is_flown() -> None:
+    wire = OnStub("px4", need_mission=True)
+    wire.run(1.2)
+    wire.fly()
+    wire.run(10.0)
+    wire.loses = {"MISSION_CURRENT"}
+    wire.legs.clear()
+    wire.start()
+    wire.run(2.0)
+    assert wire.ends() == [OUT]
