@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import ndimage
 
+from analysis.wsp.image import Sheet
 from analysis.wsp.rectangle import Rectangle, around
 
 Bytes = NDArray[np.uint8]
@@ -72,15 +72,14 @@ class Found:
         return np.asarray(inside & is_known & form[np.ix_(y, x)])
 
 
-def find_cards(pixels: Bytes) -> tuple[list[Found], int]:
+def find_cards(sheet: Sheet) -> tuple[list[Found], int]:
     """Return the cards of a sheet in reading order, and how many large things were none.
 
     Rows from the top, each from the left. What has the colours and size of a card but is no
     rectangle may be several cards that touch.
     """
-    height, width = pixels.shape[:2]
-    factor = max(1, max(height, width) // _SMALL_SIDE)
-    small = np.asarray(Image.fromarray(pixels).reduce(factor)).astype(np.int16)
+    factor = max(1, max(sheet.pixels.shape[:2]) // _SMALL_SIDE)
+    small = np.asarray(sheet.reduced(factor)).astype(np.int16)
     found, others = _cards(card_colours(small), factor)
     return reading_order(found), others
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from analysis.wsp.card import INSET_MM, Method
-from analysis.wsp.flight_ties import Ties, tie, tie_lines
+from analysis.wsp.figure import draw_distributions
 from analysis.wsp.flown_journal import Flown, read_flown
 from analysis.wsp.image import LEAST_DPI, MOST_DPI, ImageError, sheets_of
-from analysis.wsp.picture import draw_distributions, draw_sheet
+from analysis.wsp.picture import draw_sheet
 from analysis.wsp.positions import Position, placed, read_positions
 from analysis.wsp.results import (
     Numbered,
@@ -31,6 +32,9 @@ from analysis.wsp.spread import SPREADS, spread_of
 from analysis.wsp.stains import THRESHOLD, Threshold
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    from analysis.wsp.flight_ties import Ties
 
 FIGURE = "distributions.png"
 
@@ -98,13 +102,17 @@ def measure_cards(
         "refused": refused,
         "files": [*pictures, "wsp.json", "wsp.csv"],
     }
-    if cards and _figure(cards, out):
+    if cards:
+        _written(out / FIGURE, partial(draw_distributions, cards))
         result["files"].append(FIGURE)
-    _write(out / "wsp.csv", csv_text(rows))
-    _write(out / "wsp.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    for name, text in (
+        ("wsp.csv", csv_text(rows)),
+        ("wsp.json", json.dumps(result, indent=1, allow_nan=False) + "\n"),
+    ):
+        _written(out / name, partial(_write, text))
     for line in (*notes, *(f"warning: {each}" for each in flown.warnings)):
         note(line)
-    lines = [*table_lines(cards, reading.method), *(tie_lines(ties) if ties else [])]
+    lines = [*table_lines(cards, reading.method), *_tie_lines(ties)]
     answer(result, [*lines, "", f"written to {out}: {', '.join(result['files'])}"], as_json=as_json)
     if refused or not cards or flown.warnings:
         raise typer.Exit(1)
@@ -124,7 +132,8 @@ def _read_all(
                 found = read_sheet(sheet, reading)
                 picture = f"sheet-{len(sheets) + 1:02d}-{path.stem}.jpg"
                 first = sum(len(each.cards) for each in sheets) + 1
-                _saved(out / picture, sheet.pixels, found, first)
+                numbers = list(enumerate(found.cards, start=first))
+                _written(out / picture, partial(draw_sheet, sheet, numbers))
                 sheets.append(found)
                 pictures.append(picture)
                 for line in found.notes:
@@ -139,9 +148,9 @@ def _read_all(
     return sheets, pictures, refused
 
 
-def _saved(path: Path, pixels: Any, found: SheetResult, first: int) -> None:
+def _written(path: Path, draw: Callable[[Path], None]) -> None:
     try:
-        draw_sheet(pixels, list(enumerate(found.cards, start=first)), path)
+        draw(path)
     except OSError as error:
         raise ConfigError(f"--out: {path} cannot be written ({error.strerror or error})") from error
 
@@ -155,9 +164,19 @@ def _ties(
     flight = flown.flight
     if flight is None:
         return None, notes
+    from analysis.wsp.flight_ties import tie  # what knows of flights is read for them alone
+
     if flight.training not in (None, "no"):
         notes.append(f"{flight.path.name}: training: {flight.training}")
     return tie(flight, cards, by_number), notes
+
+
+def _tie_lines(ties: Ties | None) -> list[str]:
+    if ties is None:
+        return []
+    from analysis.wsp.flight_ties import tie_lines
+
+    return list(tie_lines(ties))
 
 
 def _joined(
@@ -196,15 +215,6 @@ def _result(
     }
 
 
-def _figure(cards: Sequence[Numbered], out: Path) -> bool:
-    try:
-        draw_distributions(cards, out / FIGURE)
-    except ImportError:
-        note("no figure: matplotlib is not installed (pip install vrspray[plot])")
-        return False
-    return True
-
-
 def _threshold(text: str) -> Threshold:
     if text == "auto":
         return "auto"
@@ -234,11 +244,8 @@ def _make(out: Path) -> None:
         raise ConfigError(f"--out {out}: cannot be made ({error.strerror or error})") from error
 
 
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"--out: {path} cannot be written ({error.strerror or error})") from error
+def _write(text: str, path: Path) -> None:
+    path.write_text(text, encoding="utf-8")
 
 
 # What the program's own command line takes in: one command of the kind that Typer makes.

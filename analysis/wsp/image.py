@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ LEAST_DPI = 100.0
 MOST_DPI = 9600.0
 # 16 bits a channel to 8: the high byte.
 _HIGH_BYTE = 256
+# Where EXIF says how a picture is turned; 1 is upright.
+_ORIENTATION = 0x0112
 
 
 class ImageError(VrsprayError):
@@ -38,18 +40,27 @@ class ImageError(VrsprayError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sheet:
-    """One page of one file; `dpi` is what the file says, None where it does not."""
+    """One page of one file; `dpi` is what the file says, None where it does not.
+
+    `image` is the same picture as the file was unpacked to, where that is RGB and of one page.
+    """
 
     path: Path
     page: int
     pixels: Bytes
     dpi: float | None
     notes: tuple[str, ...] = ()
+    image: Image.Image | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
         """Return what the sheet is called: the file, and the page after the first."""
         return self.path.name if self.page == 1 else f"{self.path.name} page {self.page}"
+
+    def reduced(self, factor: int) -> Image.Image:
+        """Return the picture with the mean of so many pixels each way for one."""
+        image = Image.fromarray(self.pixels) if self.image is None else self.image
+        return image.reduce(factor)
 
 
 def sheets_of(path: Path) -> Iterator[Sheet]:
@@ -83,10 +94,14 @@ def _pages(path: Path, image: Image.Image) -> Iterator[Sheet]:
         if image.width * image.height > MAX_PIXELS:
             raise _too_large(path, f"{image.width} x {image.height}")
         dpi, doubt = dpi_of(image.info)
-        upright = ImageOps.exif_transpose(image)
+        image.load()  # a PNG may say last how it is turned
+        # A picture that lies upright is not copied.
+        is_turned = image.getexif().get(_ORIENTATION, 1) != 1
+        upright = ImageOps.exif_transpose(image) if is_turned else image
         pixels, changed = to_rgb(upright)
         notes = tuple(note for note in (doubt, changed) if note)
-        yield Sheet(path=path, page=page + 1, pixels=pixels, dpi=dpi, notes=notes)
+        kept = upright if upright.mode == "RGB" and pages == 1 else None
+        yield Sheet(path=path, page=page + 1, pixels=pixels, dpi=dpi, notes=notes, image=kept)
 
 
 def _too_large(path: Path, size: str) -> ImageError:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -83,10 +82,8 @@ def around(x: Floats, y: Floats) -> Rectangle | None:
 
     One of its sides lies along a side of the convex hull, so those are tried.
     """
-    points = np.column_stack([x, y])
-    try:
-        hull = points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):
+    hull = _hull(x, y)
+    if len(hull) < 3:
         return None
     sides = np.roll(hull, -1, axis=0) - hull
     angles = np.arctan2(sides[:, 1], sides[:, 0])
@@ -106,3 +103,29 @@ def around(x: Floats, y: Floats) -> Rectangle | None:
         short=float(min(width[best], height[best])),
         angle_deg=(angle_deg + 90.0) % 180.0 - 90.0,
     )
+
+
+def _hull(x: Floats, y: Floats) -> Floats:
+    """Return the corners of the convex hull in order, (n, 2); fewer than three of a line."""
+    order = np.lexsort((x, y))
+    x, y = x[order], y[order]
+    # Only the first and the last point of a row can be corners.
+    is_first = np.diff(y, prepend=np.nan) != 0.0
+    is_end = is_first | np.roll(is_first, -1)
+    points = list(zip(x[is_end].tolist(), y[is_end].tolist(), strict=True))
+    return np.array(_chain(points)[:-1] + _chain(points[::-1])[:-1]).reshape(-1, 2)
+
+
+def _chain(points: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return the hull on one side of points in order (Andrew's monotone chain)."""
+    chain: list[tuple[float, float]] = []
+    for point in points:
+        while len(chain) > 1 and _bend(chain[-2], chain[-1], point) <= 0.0:
+            chain.pop()
+        if not chain or point != chain[-1]:
+            chain.append(point)
+    return chain
+
+
+def _bend(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])

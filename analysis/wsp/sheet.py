@@ -53,7 +53,7 @@ def read_sheet(sheet: Sheet, reading: Reading) -> SheetResult:
     if reading.whole:
         found = [Found(outline=_all_of(width, height))]
     else:
-        found, others = find_cards(sheet.pixels)
+        found, others = find_cards(sheet)
     notes = list(sheet.notes)
     if others:
         notes.append(

@@ -7,12 +7,13 @@ from the paper around it is not changed by blur: divided by that of a full stain
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from analysis.wsp.faint import WINDOW, by_peak, darkest
 from analysis.wsp.stains import LEAST_CONTRAST, Stains
 
 Bytes = NDArray[np.uint8]
@@ -31,29 +32,55 @@ _LEAST_DEEP = 50
 _LEAST_SINGLE = 5
 
 
-def darkness_area_px(grey: Bytes, roi: Mask, stains: Stains) -> Floats:
-    """Return the area of each stain: of small, single ones by their darkness."""
-    full = _full_grey(grey, stains)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Paper:
+    """The grey of the paper: the mean about each block of 4 x 4 pixels of a picture."""
+
+    blocks: NDArray[np.float32]
+    width: int
+
+    def at(self, places: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Return the grey of the paper at places, indices of pixels."""
+        rows, columns = np.divmod(places, self.width)
+        return np.asarray(self.blocks[rows // _BLOCK, columns // _BLOCK])
+
+
+def darkness_area_px(grey: Bytes, roi: Mask, stains: Stains, *, full: float | None) -> Floats:
+    """Return the area of each stain: of small ones by their darkness; `full` is full_grey's."""
     if full is None or stains.paper_grey is None:
         return stains.area_px
-    labels, last = _narrow(stains.labels, len(stains.area_px))
-    side = 2 * _REACH + 1
-    owners = ndimage.maximum_filter(labels, size=side)
-    lowest = ndimage.minimum_filter(np.where(labels == 0, last, labels), size=side)
+    zones, zone_of = _zones(stains)
     # Only the pixels in and about stains matter from here on: a small part of them all.
-    about = np.flatnonzero(owners)
-    owner, other = owners.ravel()[about], lowest.ravel()[about]
-    paper = _paper_around(grey, roi & (owners == 0), stains.paper_grey, about)
+    about = np.flatnonzero(zones > 0)
+    ground = _paper_around(grey, roi & (zones == 0), stains.paper_grey)
+    paper = ground.at(about)
     taken = (paper - grey.ravel()[about]) / np.maximum(paper - full, LEAST_CONTRAST)
     taken *= roi.ravel()[about]
-    area_px = np.bincount(owner, weights=taken, minlength=int(last))[1:]
-    use = stains.area_px <= SMALL_PX
+    area_px = np.bincount(zones.ravel()[about], weights=taken)[zone_of]
     # Where the surroundings of two stains meet, darkness cannot be told apart.
-    is_shared = owner != other
-    for shared in (owner[is_shared], other[is_shared]):
-        use[shared.astype(np.int64) - 1] = False
+    use = (stains.area_px <= SMALL_PX) & (np.bincount(zone_of)[zone_of] == 1)
     single = np.where(use, np.maximum(area_px, stains.area_px), stains.area_px)
-    return _as_singles(single, stains.area_px, use)
+    areas = _as_singles(single, stains.area_px, use)
+    label, places = darkest(grey, stains)
+    about_them = _taken_about(grey, roi, places, ground.at(places), full)
+    by_height = by_peak(about_them, use[label - 1], stains.area_px[label - 1])
+    known = np.isfinite(by_height)
+    areas[label[known] - 1] = by_height[known]
+    return areas
+
+
+def _taken_about(
+    grey: Bytes, roi: Mask, places: NDArray[np.intp], paper: NDArray[np.float32], full: float
+) -> Floats:
+    """Return how much of the paper's light is gone around places, (places, 7, 7), 1 where full."""
+    height, width = grey.shape
+    rows, columns = np.divmod(places, width)
+    reach = np.arange(WINDOW) - WINDOW // 2
+    rows = np.clip(rows[:, None] + reach, 0, height - 1)[:, :, None]
+    columns = np.clip(columns[:, None] + reach, 0, width - 1)[:, None, :]
+    ground = paper[:, None, None].astype(np.float64)
+    taken = (ground - grey[rows, columns]) / np.maximum(ground - full, LEAST_CONTRAST)
+    return np.asarray(taken * roi[rows, columns])
 
 
 def _as_singles(area_px: Floats, threshold_px: Floats, is_single: Mask) -> Floats:
@@ -67,13 +94,26 @@ def _as_singles(area_px: Floats, threshold_px: Floats, is_single: Mask) -> Float
     return np.where(beside, mean[np.minimum(size, SMALL_PX)], area_px)
 
 
-def _narrow(labels: NDArray[np.int32], count: int) -> tuple[NDArray[Any], Any]:
-    """Return the labels in as few bytes as they need, and a number above them all."""
-    kind = np.uint16 if count < np.iinfo(np.uint16).max else np.int32
-    return labels.astype(kind), kind(count + 1)
+def _zones(stains: Stains) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+    """Return the zones of stains and their surroundings, and in which of them each stain lies."""
+    near = stains.labels > 0
+    for axis in (0, 1):
+        wide = near.copy()
+        for step in range(1, _REACH + 1):
+            start, end = (slice(step, None), slice(None, -step))
+            low, high = (start, end) if axis == 0 else ((slice(None), start), (slice(None), end))
+            wide[low] |= near[high]
+            wide[high] |= near[low]
+        near = wide
+    zones, _ = ndimage.label(near, structure=np.ones((3, 3)), output=np.int32)
+    places = np.flatnonzero(stains.labels > 0)
+    zone_of = np.zeros(len(stains.area_px), dtype=np.intp)
+    zone_of[stains.labels.ravel()[places] - 1] = zones.ravel()[places]
+    return zones, zone_of
 
 
-def _full_grey(grey: Bytes, stains: Stains) -> float | None:
+def full_grey(grey: Bytes, stains: Stains) -> float | None:
+    """Return how dark stains are in their depths; None where none is large enough."""
     mask = stains.labels > 0
     inner = slice(2, -2)
     deep = mask[inner, inner].copy()
@@ -84,20 +124,21 @@ def _full_grey(grey: Bytes, stains: Stains) -> float | None:
     return float(np.median(values)) if len(values) >= _LEAST_DEEP else None
 
 
-def _paper_around(
-    grey: Bytes, paper: Mask, usual: float, places: NDArray[np.intp]
-) -> NDArray[np.float32]:
-    """Return the mean grey of the paper around places (indices of pixels), from block means."""
-    height, width = grey.shape
-    rows, columns = -(-height // _BLOCK), -(-width // _BLOCK)
-    share = np.zeros((rows * _BLOCK, columns * _BLOCK), dtype=np.float32)
-    total = np.zeros_like(share)
-    share[:height, :width] = paper
-    np.multiply(grey, paper, out=total[:height, :width], dtype=np.float32)
+def _paper_around(grey: Bytes, paper: Mask, usual: float) -> Paper:
+    """Return the mean grey of the paper around every place, from block means."""
+    # Every second pixel of every second row is enough: the paper's texture is coarser.
+    height, width = (-(-side // _BLOCK) for side in grey.shape)
+    share, total = np.zeros((2, height * _BLOCK // 2, width * _BLOCK // 2), dtype=np.float32)
+    some = paper[::2, ::2]
+    share[: some.shape[0], : some.shape[1]] = some
+    np.multiply(grey[::2, ::2], some, out=total[: some.shape[0], : some.shape[1]])
     around = max(_AROUND // _BLOCK, 1)
     blocks = [
-        ndimage.uniform_filter(each.reshape(rows, _BLOCK, columns, _BLOCK).mean((1, 3)), around)
+        ndimage.uniform_filter(
+            each[::2, ::2] + each[1::2, ::2] + each[::2, 1::2] + each[1::2, 1::2], around
+        )
         for each in (share, total)
     ]
-    mean = np.where(blocks[0] > 0.1, blocks[1] / np.maximum(blocks[0], 0.1), np.float32(usual))
-    return np.asarray(mean[(places // width) // _BLOCK, (places % width) // _BLOCK])
+    is_known = blocks[0] > 0.4
+    mean = np.where(is_known, blocks[1] / np.where(is_known, blocks[0], 1.0), np.float32(usual))
+    return Paper(blocks=mean, width=grey.shape[1])

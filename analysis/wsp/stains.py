@@ -26,7 +26,7 @@ class Stains:
     """The stains of one card: labels 1, 2, ... and 0, and the area of each label from 1 on.
 
     `paper_grey` and `stain_grey` are the medians on both sides of the threshold, None where a
-    side is empty.
+    side is empty; `counts` are the pixels of each grey level, stained or not.
     """
 
     labels: NDArray[np.int32]
@@ -34,6 +34,7 @@ class Stains:
     threshold: int
     paper_grey: float | None
     stain_grey: float | None
+    counts: NDArray[np.int64]
 
 
 def grey_of(pixels: Bytes) -> Bytes:
@@ -55,9 +56,10 @@ def segment(
 ) -> Stains:
     """Return the stains within `roi`; pixels that touch by a side or a corner are one stain.
 
-    `like` is what another threshold gave: the answer too where both are the same.
+    `like` is what another threshold gave on the same pixels: the answer too where both are the
+    same.
     """
-    counts = np.bincount(grey[roi], minlength=256)
+    counts = np.bincount(grey[roi], minlength=256) if like is None else like.counts
     level = midway(counts) if threshold == "auto" else threshold
     if like is not None and like.threshold == level:
         return like
@@ -70,6 +72,7 @@ def segment(
         threshold=level,
         paper_grey=_quantile(counts, level + 1, 256, 0.5),
         stain_grey=_quantile(counts, 0, level + 1, 0.5),
+        counts=counts,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -37,14 +38,22 @@ def drawn(*places: Rectangle, spray: Spray = LIGHT, scanner: Scanner | None = No
     )
 
 
+@cache
+def one_card() -> TrueSheet:
+    return drawn(card(60.0, 50.0, 0.0))
+
+
+def sheet_of(pixels: np.ndarray, *, dpi: float | None = DPI) -> Sheet:
+    return Sheet(path=Path("scan.png"), page=1, pixels=pixels, dpi=dpi)
+
+
 def read(truth: TrueSheet, *, dpi: float | None = DPI, reading: Reading = READING) -> SheetResult:
-    sheet = Sheet(path=Path("scan.png"), page=1, pixels=truth.pixels, dpi=dpi)
-    return read_sheet(sheet, reading)
+    return read_sheet(sheet_of(truth.pixels, dpi=dpi), reading)
 
 
 def test_cards_are_found_turned_and_in_reading_order() -> None:
     places = [card(25.0, 45.0, 86.0), card(60.0, 48.0, 92.5), card(70.0, 106.0, -2.0)]
-    found, others = find_cards(drawn(*[places[k] for k in (2, 1, 0)]).pixels)
+    found, others = find_cards(sheet_of(drawn(*[places[k] for k in (2, 1, 0)]).pixels))
     assert (len(found), others) == (3, 0)
     for each, place in zip(found, places, strict=True):
         assert (each.outline.x, each.outline.y) == pytest.approx((place.x, place.y), abs=0.3 * PX)
@@ -55,11 +64,11 @@ def test_cards_are_found_turned_and_in_reading_order() -> None:
 
 
 def test_coverage_and_drops_agree_with_the_truth_of_the_region() -> None:
-    place = card(60.0, 50.0, 3.0)
+    place = card(45.0, 20.0, 3.0)
     truth = draw_sheet(
         [Spray(drops_per_cm2=40.0, nmd_um=150.0)],
         [place.scaled(2.0)],
-        size=(round(240 * PX), round(190 * PX)),
+        size=(round(180 * PX), round(80 * PX)),
         seed=5,
     )
     (found,) = read(truth, dpi=600.0).cards
@@ -85,7 +94,7 @@ def test_coverage_and_drops_agree_with_the_truth_of_the_region() -> None:
 def test_the_resolution_says_where_it_comes_from(
     stated: float | None, asked: float | None, dpi: float, source: str
 ) -> None:
-    found = read(drawn(card(60.0, 50.0, 0.0)), dpi=stated, reading=replace(READING, dpi=asked))
+    found = read(one_card(), dpi=stated, reading=replace(READING, dpi=asked))
     assert found.dpi_source == source
     assert found.dpi == pytest.approx(dpi, rel=0.015)
 
@@ -108,7 +117,7 @@ def test_a_yellow_round_thing_is_no_card() -> None:
     truth = drawn()
     y, x = np.mgrid[: truth.pixels.shape[0], : truth.pixels.shape[1]]
     truth.pixels[(x - 700) ** 2 + (y - 600) ** 2 < 300**2] = (226, 210, 92)
-    assert find_cards(truth.pixels) == ([], 1)
+    assert find_cards(sheet_of(truth.pixels)) == ([], 1)
 
 
 def test_cards_that_touch_are_told_and_not_measured_as_one() -> None:
@@ -118,7 +127,7 @@ def test_cards_that_touch_are_told_and_not_measured_as_one() -> None:
 
 
 def test_a_bent_card_is_measured_in_its_own_form() -> None:
-    truth = drawn(card(60.0, 50.0, 0.0))
+    truth = one_card()
     columns = np.arange(truth.pixels.shape[1])
     shift = (8.0 * PX * ((columns / PX - 60.0) / 38.0) ** 2 / 2.0).astype(int)
     bent = np.stack(
