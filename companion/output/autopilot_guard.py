@@ -178,7 +178,7 @@ class OutputGuard:
             return (
                 f"output {channel} gives no pulse: press the safety switch, or set BRD_SAFETY_MASK"
             )
-        return (
-            f"output {channel} reads {reading.pulse_us} us, ordered {reading.ordered_us}: set "
-            f"SERVO{channel}_FUNCTION to 0"
-        )
+        seen = f"output {channel} reads {reading.pulse_us} us, ordered {reading.ordered_us}"
+        if self._known.get(f"SERVO{channel}_FUNCTION") == 0.0:
+            return f"{seen}: slow link, or another orders it"
+        return f"{seen}: set SERVO{channel}_FUNCTION to 0"

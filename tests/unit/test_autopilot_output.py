@@ -325,6 +325,18 @@ def test_every_line_fits_the_operators_screen() -> None:
     assert max(lengths) <= 84
 
 
+async def test_no_parameter_is_blamed_that_is_known_to_be_right() -> None:
+    executor, _ = await ardupilot_executor([])
+    executor.learned({"SERVO9_FUNCTION": 0.0, "SERVO10_FUNCTION": 0.0, "SPRAY_ENABLE": None})
+    executor.submit(plan(1, 0.5, 0.5))
+    begin_s = now() + 0.5
+    for k in range(2):
+        executor.reported(0, report(c9=1500, c10=1200), begin_s + 0.1 * k)
+    assert executor.fault == (
+        "output 10 reads 1200 us, ordered 1500: slow link, or another orders it"
+    )
+
+
 async def test_a_refusal_is_explained_by_the_parameters() -> None:
     said: list[str] = []
     executor, _ = await ardupilot_executor(said)
