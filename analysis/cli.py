@@ -34,22 +34,12 @@ def replay_journal(
     With --set: what would have been sprayed. The ground cannot react: the aircraft flies as it
     flew, and the sprayer stays what the recorded set-up says of it.
 
-    Exit 0: all the same; 1: a decision or the treated ground differs, or the file is damaged; 2: it
-    is no journal, or an option cannot be used.
+    Exit 0: all the same; 1: a decision or the treated ground differs, or the file is damaged or of
+    another version; 2: it is no journal, or an option cannot be used.
     """
     from analysis.replay import replay as run
-    from companion.errors import JournalError
-    from companion.record.continuing import is_damage
 
-    try:
-        result = run(journal, overrides=changes or (), say=lambda line: typer.echo(line, err=True))
-    except JournalError as error:
-        if not is_damage(error):
-            raise
-        if as_json:
-            typer.echo(json.dumps({"error": str(error)}))
-        typer.echo(str(error), err=True)
-        raise typer.Exit(1) from error
+    result = run(journal, overrides=changes or (), say=lambda line: typer.echo(line, err=True))
     typer.echo(json.dumps(asdict(result)) if as_json else _sentence(result))
     if not as_json:
         for line in _without_effect(changes or ()) if _is_idle(result) else _what_if(result):
@@ -120,7 +110,8 @@ def _notes(result: ReplayResult) -> list[str]:
     if result.coverage_differs:
         notes.append(f"treated ground: {result.coverage_differs} cells of 0.2 m differ")
     elif result.coverage_differs is None and not result.is_what_if:
-        notes.append("treated ground is not compared: the journal keeps none")
+        why = "it cannot be read" if result.unread else "the journal keeps none"
+        notes.append(f"treated ground is not compared: {why}")
     notes += [f"not read: {text}" for text in result.unread]
     if result.lost:
         notes.append(f"{result.lost} rows are missing in the journal: differences may follow")

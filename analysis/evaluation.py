@@ -8,16 +8,17 @@ this one have one metric each.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from analysis.border import BorderCrossing, border_crossings, held_by_border, off_target_ml
-from analysis.changes import find_runs, stretches_of
+from analysis.changes import Run, find_runs, stretches_of
 from analysis.dose import misapplied_percent, section_error_percent, volume_error_percent
 from analysis.flight_record import FlightMeta, FlightRecord, whole_boom
 from analysis.flow_accuracy import flow_accuracy
-from analysis.holds import holds_of
+from analysis.holds import BESIDE_S, holds_of, with_unknown
 from analysis.lag import Step, Verdict, measure_steps
 from analysis.published import P1_RESULTS
 from analysis.settled import SettledStep, measure_settled
@@ -139,7 +140,8 @@ def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation
     crossings = [c for strip in strips for c in border_crossings(strip, record.prescription)]
     whole = tracks_of(whole_boom(record))[0]
     stretches = stretches_of(find_runs(whole, record.prescription))
-    settled = measure_settled(whole, stretches, record.orders, record.nozzle_sets)
+    of_boom = measure_settled(whole, stretches, record.orders, record.nozzle_sets)
+    settled = _known(of_boom, stretches, record)
     accuracy = flow_accuracy(strips)
     volume_error, zone_errors = volume_error_percent(strips, record.prescription)
     all_steps = [step for each in steps for step in each]
@@ -150,7 +152,7 @@ def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation
         apart=sum(step.verdict not in (Verdict.MEASURED, Verdict.MISSED) for step in inside),
         missed=sum(step.verdict is Verdict.MISSED for step in all_steps),
         settled_lag_distance_m=Distances.of(step.lag_distance_m for step in settled),
-        settled_apart=sum(step.small for step in settled),
+        settled_apart=sum(step.small for step in settled) + len(of_boom) - len(settled),
         settled_missed=sum(not step.small and step.lag_distance_m is None for step in settled),
         spraying_accuracy_percent=accuracy.all_percent,
         settled_accuracy_percent=accuracy.settled_percent,
@@ -181,5 +183,32 @@ def limit_ratio(flight: Evaluation, perfect: Evaluation) -> float | None:
 def _steps(strip: Strip, record: FlightRecord) -> list[Step]:
     """Return the steps of one strip; what the border held back is no change missed."""
     holds = holds_of(strip.track, record.prescription, strip.stretches, strip.orders)
+    unknown = record.unknown[strip.track.valve] if record.unknown else ()
+    holds = with_unknown(holds, unknown)
     steps = measure_steps(strip.track, strip.stretches, strip.orders, record.duty_limits, holds)
-    return held_by_border(strip, record.prescription, steps)
+    return [
+        replace(step, verdict=Verdict.UNKNOWN, lag_distance_m=None)
+        if _is_unknown(step.change.time_s, unknown)
+        else step
+        for step in held_by_border(strip, record.prescription, steps)
+    ]
+
+
+def _known(
+    steps: Sequence[SettledStep], stretches: Sequence[Run], record: FlightRecord
+) -> list[SettledStep]:
+    """Return the steps on whose two stretches all is known: they are judged by all of both."""
+    if not record.unknown:
+        return list(steps)
+    around_s = {b.start_s: (a.start_s, b.end_s) for a, b in pairwise(stretches)}
+    spans = [around_s[step.change.time_s] for step in steps]
+    return [
+        step
+        for step, (from_s, until_s) in zip(steps, spans, strict=True)
+        if not any(a < until_s and from_s < b for own in record.unknown for a, b in own)
+    ]
+
+
+def _is_unknown(time_s: float, unknown: Sequence[tuple[float, float]]) -> bool:
+    """Return whether nothing is known of what was sprayed around a time."""
+    return any(a - BESIDE_S < time_s < b + BESIDE_S for a, b in unknown)

@@ -49,7 +49,9 @@ class FlightRecord:
     executed at the output, in order of time; they may be empty. `duty_limits` are the lowest and
     the highest duty of the PWM: a valve held there and still beside its dose is saturated.
     `nozzle_sets` are those that the controller took its duties from: they tell what flow an order
-    asked for; none where that is not known. With `lines` only they were to be sprayed.
+    asked for; none where that is not known. With `lines` only they were to be sprayed. `unknown`
+    has each valve's times, in order and apart, of which nobody can tell what was sprayed; it is
+    empty where all is known.
     """
 
     time_s: Floats
@@ -65,6 +67,7 @@ class FlightRecord:
     duty_limits: tuple[float, float] = (0.0, 1.0)
     nozzle_sets: tuple[NozzleSet, ...] = ()
     lines: Lines | None = None
+    unknown: tuple[tuple[tuple[float, float], ...], ...] = ()
 
     def __post_init__(self) -> None:
         samples = len(self.time_s)

@@ -1,9 +1,9 @@
-"""Where the border holds a valve closed inside the field: there its flow says nothing of the rate.
+"""Where a valve's flow says nothing of the rate: the border holds it closed, or nobody knows it.
 
 A strip that comes too near to the border or to a hole is switched off, by order, until it is clear
 again. A rate that is judged by its flow is judged by what is left of its stretch: else a rate of
 which a pond takes the second half counts as half a rate, and a change that came to the centimetre
-as missed, or as metres late.
+as missed, or as metres late. A time of which the record is missing is no better.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ SETTLES_PERIODS = 1.35
 class Hold:
     """A time in which a valve is closed by order and its strip reaches over the border, or nearly.
 
-    From the order that closes it to the order that opens it, or `BESIDE_S` around the border.
+    From the order that closes it to the order that opens it, or `BESIDE_S` around the border. Or
+    one of which nothing is known.
     """
 
     start_s: float
@@ -102,6 +103,20 @@ def _spans(marks_s: Floats, near: Ints, opened: Ints, at_s: Floats, duty: Floats
             start_s=max(start_s, float(marks_s[first]) - BESIDE_S),
             end_s=min(end_s, float(marks_s[last]) + BESIDE_S),
         )
+
+
+def with_unknown(holds: Sequence[Hold], unknown: Sequence[tuple[float, float]]) -> tuple[Hold, ...]:
+    """Return the holds and the times of which nothing is known, in order and apart."""
+    if not unknown:
+        return tuple(holds)
+    every = [*((hold.start_s, hold.end_s) for hold in holds), *unknown]
+    found: list[Hold] = []
+    for start_s, end_s in sorted(every):
+        if found and start_s <= found[-1].end_s:
+            last = found.pop()
+            start_s, end_s = last.start_s, max(last.end_s, end_s)
+        found.append(Hold(start_s=start_s, end_s=end_s))
+    return tuple(found)
 
 
 def sides_of(smooth: SmoothTrack, stretches: Sequence[Run], holds: Sequence[Hold]) -> list[Sides]:

@@ -49,6 +49,7 @@ class Verdict(StrEnum):
     """What became of a change; all but the first and the last count apart.
 
     `border`: the strip reaches over the border there, which may rightly hold its valve closed.
+    `unknown`: the record of that time is missing.
     """
 
     MEASURED = "measured"
@@ -56,6 +57,7 @@ class Verdict(StrEnum):
     CLOSE = "close"
     SATURATED = "saturated"
     BORDER = "border"
+    UNKNOWN = "unknown"
     MISSED = "missed"
 
 

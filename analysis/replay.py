@@ -22,9 +22,8 @@ from analysis.what_if import Moved, Orders, Sprayed, compared
 from companion.core.controller import Memory, Setup, step
 from companion.core.estimator import Track, estimate, observe
 from companion.core.types import Decision, Input
-from companion.errors import JournalError
+from companion.errors import UnreadableError
 from companion.record.codec import FIELD_NAMES, FieldNames, encode
-from companion.record.continuing import is_damage
 from companion.record.coverage_table import read_coverage
 from companion.record.reader import Entry, JournalContent, opened, read_journal
 
@@ -147,9 +146,7 @@ def _content(path: Path) -> JournalContent:
     """Return the journal; of a damaged one what can be read."""
     try:
         return read_journal(path)
-    except JournalError as error:
-        if not is_damage(error):
-            raise
+    except UnreadableError:
         return read_journal(path, is_lenient=True)
 
 
@@ -157,7 +154,7 @@ def _value(content: JournalContent, entry: Entry, unread: list[str]) -> Input | 
     """Return what a row says; None where it is damaged in a file that is known to be."""
     try:
         return content.value(entry)
-    except JournalError as error:
+    except UnreadableError as error:
         if not content.unread:
             raise
         unread.append(str(error).removeprefix(f"{content.path}: "))

@@ -7,7 +7,8 @@
      +-- ActuatorError    the valve driver refused or did not answer
      +-- SensorError      a sensor that the configuration names is not to be had
      +-- JournalError     a journal cannot be opened, read or written
-          +-- NoMapError  its map is damaged: the rest can be read
+          +-- UnreadableError  a journal, of which what is asked for cannot be read
+               +-- NoMapError  its map is damaged: the rest can be read
 
 A wrong argument inside our own code is a `ValueError`: a bug, not a condition.
 """
@@ -51,5 +52,9 @@ class JournalError(VrsprayError):
     """A journal cannot be opened, read or written."""
 
 
-class NoMapError(JournalError):
+class UnreadableError(JournalError):
+    """A journal is damaged, or of another version: what is asked for cannot be read of it."""
+
+
+class NoMapError(UnreadableError):
     """The map in a journal is damaged; the message says what else can be read."""

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from analysis.exports.source import Shape, Source
     from analysis.exports.units import System
     from analysis.flown.applied_flight import AppliedFlight
+    from companion.errors import UnreadableError
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 RATE_HZ_MAX = 1000.0
@@ -47,11 +48,12 @@ def export_journal(
 ) -> None:
     """Write what was applied for farms, maps and other programs.
 
-    Exit 0: all of the flight; 1: the journal was cut, is damaged or lacks rows, and what there is
-    was written; 2: the journal, an option or OUT cannot be used.
+    Exit 0: all of the flight; 1: the journal was cut, is damaged, lacks rows or is of another
+    version, and what can be read was written; 2: no journal, or an option or OUT cannot be used.
     """
     from analysis.exports.registry import format_for
     from analysis.exports.source import Source
+    from analysis.flown.applied_record import EvaluationError
 
     form = format_for(out, name)
     system = _system(form, units)
@@ -66,7 +68,12 @@ def export_journal(
     source = Source(
         flight=flight, shape=chosen, system=system, rate_hz=rate_hz, unread=tuple(unread)
     )
-    size = _write(source, form, out, force=force)
+    try:
+        size = _write(source, form, out, force=force)
+    except EvaluationError as error:
+        if not (unread or flight.lost):
+            raise
+        raise _too_little(flight, unread) from error
     warnings = [*_warnings(flight), *(f"not read: {each}" for each in unread)]
     result = {
         "out": str(out),
@@ -89,14 +96,21 @@ def _read(journal: Path, unread: list[str]) -> AppliedFlight:
     from analysis.flown.read_applied import read_applied
 
     flight = read_applied(journal, unread=unread)
-    if not len(flight.time_s):
-        why = (
-            f"nothing of its path can be read ({unread[0]})"
-            if unread
-            else ("the flight never had a position")
-        )
-        raise ExportError(f"{journal}: {why}; there is nothing to export")
-    return flight
+    if len(flight.time_s):
+        return flight
+    if unread or flight.lost:
+        raise _too_little(flight, unread)
+    raise ExportError(f"{journal}: the flight never had a position; there is nothing to export")
+
+
+def _too_little(flight: AppliedFlight, unread: list[str]) -> UnreadableError:
+    from companion.errors import UnreadableError
+
+    why = unread[0] if unread else f"{flight.lost} rows are missing"
+    return UnreadableError(
+        f"{flight.path}: is damaged: too little of its path can be read ({why}); there is nothing "
+        "to export; see vrspray flights show"
+    )
 
 
 def _write(source: Source, form: Format, out: Path, *, force: bool) -> int:

@@ -115,8 +115,12 @@ def format_for(out: Path, name: str | None) -> Format:
         return found
     found = _named(name)
     if suffix not in found.suffixes + found.also:
-        ends = ", ".join(end or "no end (a folder)" for end in found.suffixes + found.also)
-        raise ExportError(f"{out}: {found.name} is written with the name's end {ends}")
+        ends = [end for end in found.suffixes + found.also if end]
+        folder = "a folder (a name without a dot) or into " if "" in found.also else ""
+        raise ExportError(
+            f"{out}: {found.name} is written into {folder}a file whose name ends in "
+            f"{' or '.join(ends)}"
+        )
     return found
 
 

@@ -19,6 +19,8 @@ from companion.record.writer import Event
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+# (from, until) in seconds.
+Spans = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +53,8 @@ class AppliedFlight:
     one value a decision with a known position; `rate_l_ha` is samples x valves, NaN where nothing
     is prescribed. `inhibits` has the reasons not to spray, sorted, with spaces between; "" without.
     `flow_l_min` is what the ordered duties stand for, all valves together; `meter_ml` what a flow
-    meter has counted since its start.
+    meter has counted since its start. `unknown` has, for each valve, the times of which rows are
+    missing, in order and apart, which may be without end; none at all in a whole journal.
     """
 
     path: Path
@@ -80,6 +83,7 @@ class AppliedFlight:
     pressure_kpa: Series | None = None
     tank_l: Series | None = None
     wind_m_s: Series | None = None
+    unknown: tuple[Spans, ...] = ()
 
     @property
     def training(self) -> str | None:

@@ -17,6 +17,7 @@ from analysis.flight_record import FlightMeta, FlightRecord
 from analysis.flown.metered import metered
 from analysis.flown.modelled_flow import ordered_s, valve_flows
 from analysis.flown.pumped_flow import pumped_ml
+from analysis.flown.unknown import with_gaps
 from companion.core.types import TimedChange
 from companion.errors import VrsprayError
 
@@ -70,6 +71,7 @@ def record_of(
         nozzle_sets=() if makes_flow else setup.nozzle_sets,
         orders=executed_orders(flight),
         meta=_meta(flight),
+        unknown=with_gaps(flight.unknown, flight.time_s, valves=len(setup.boom.valves)),
     )
 
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -30,14 +31,17 @@ from analysis.flown.sound_rows import (
     sound_rows,
 )
 from analysis.flown.table_rows import rows_of
-from companion.errors import JournalError
+from analysis.flown.unknown import unknown_times
+from companion.record.blocks import Entry
 from companion.record.codec import FieldNames
 from companion.record.events import Event
 from companion.record.reader import OpenJournal, opened
 from companion.record.setup_json import field_names_of
 from companion.record.versions import migrated, read_entries
+from companion.record.whole_file import damages
 
 _NAN = float("nan")
+PARSED_AT_ONCE = 1000
 # Which value of which sensor's message becomes a series, and which field tells a fault.
 _SENSORS = {
     "FlowReport": ("volume_ml", "fault"),
@@ -50,17 +54,16 @@ _SENSORS = {
 def read_applied(path: Path, *, unread: list[str] | None = None) -> AppliedFlight:
     """Return the flight in `path`; JournalError, in one line, where it cannot be read.
 
-    With `unread` a damaged journal is read as far as it goes, and what is missing is said there.
+    With `unread` a damaged journal is read as far as it goes, and what is missing is said there:
+    also what is damaged in a part of the file that a flight is not made of.
     """
     with opened(path, is_lenient=unread is not None) as journal:
         if unread is not None:
             # A byte that is no text makes one word wrong and not a whole table.
             journal.connection.text_factory = lambda raw: raw.decode("utf-8", errors="replace")
-        try:
-            return _flight(journal, unread)
-        except (TypeError, AttributeError, IndexError, OverflowError, RecursionError) as error:
-            line = " ".join(str(error).split())
-            raise JournalError(f"{path}: is damaged: {line}") from error
+            unread += journal.unread
+            unread += damages(journal.connection)
+        return _flight(journal, unread)
 
 
 def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
@@ -130,6 +133,9 @@ def _mended(
         # A pump would go on over the gap as the last sample before it says.
         flow_l_min=np.where(unseen, 0.0, flight.flow_l_min),
         inhibits=marked(flight.inhibits, unseen | within(flight.time_s, missing)),
+        unknown=unknown_times(
+            flight.changes, samples, missing, valves=len(flight.setup.boom.valves)
+        ),
     )
 
 
@@ -188,18 +194,40 @@ def _sensors(
         if kind in names
     }
     try:
-        for entry in read_entries(
+        entries = read_entries(
             journal.connection, journal.version, kinds=places.keys(), unread=unread
-        ):
-            ((_, values),) = json.loads(entry.body).items()
-            at, value, fault = places[entry.kind]
+        )
+        for kind, values in _messages(entries):
+            at, value, fault = places[kind]
             is_sound = fault < 0 or not values[fault]
-            pairs[entry.kind].append((values[at], values[value] if is_sound else None))
+            pairs[kind].append((values[at], values[value] if is_sound else None))
     except sqlite3.DatabaseError as error:
         if unread is None or "locked" in str(error):
             raise
         unread.append(f"what sensors said behind a damaged place: {' '.join(str(error).split())}")
     return {kind: _series(rows) for kind, rows in pairs.items()}
+
+
+def _messages(entries: Iterator[Entry]) -> Iterator[tuple[str, list[Any]]]:
+    """Yield the kind and the values of each message; many are parsed at once, which is quicker."""
+    several: list[Entry] = []
+    try:
+        for entry in entries:
+            several.append(entry)
+            if len(several) == PARSED_AT_ONCE:
+                yield from _parsed(several)
+                several = []
+    except sqlite3.DatabaseError:
+        yield from _parsed(several)
+        raise
+    yield from _parsed(several)
+
+
+def _parsed(entries: list[Entry]) -> Iterator[tuple[str, list[Any]]]:
+    messages = json.loads(f"[{','.join(entry.body for entry in entries)}]")
+    for entry, message in zip(entries, messages, strict=True):
+        ((_, values),) = message.items()
+        yield entry.kind, values
 
 
 def _series(rows: list[tuple[float, float | None]]) -> Series | None:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from analysis.flown.table_rows import Row
-from companion.errors import JournalError
+from companion.errors import UnreadableError
 
 # A point as the journal writes it: 8 bytes of the GeoPackage, then WKB, little-endian.
 POINT_BYTES = 29
@@ -95,7 +95,7 @@ def clock_offset_s(
 ) -> float:
     """Return seconds from the companion's clock to UTC: the given one, or that of the start.
 
-    `started` is the same by the computer's clock; JournalError where neither is a time.
+    `started` is the same by the computer's clock; UnreadableError where neither is a time.
     """
     if _is_offset(given):
         return float(str(given))
@@ -103,7 +103,7 @@ def clock_offset_s(
     if sound and unread is not None:
         unread.append("the time in UTC is none: that of the start of the record stands")
         return float(sound[0])
-    raise JournalError(f"{path}: is damaged: the time in UTC ({str(given)[:20]}) is none")
+    raise UnreadableError(f"{path}: is damaged: the time in UTC ({str(given)[:20]}) is none")
 
 
 def _is_offset(value: object) -> bool:

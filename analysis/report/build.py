@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from analysis.report.figures.style import Drawn
 
 Say = Callable[[str], None]
+TOO_LITTLE = "too little of the journal can be read"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +69,7 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
     flight = read_applied(journal, unread=unread)
     told = told_with(flight.meta, file=options.application_file, changes=options.changes)
     say("evaluating")
-    assessment, why_not = _assessed(flight)
+    assessment, why_not = _assessed(flight, is_whole=not (unread or flight.lost))
     treated = treated_of(flight)
     clock = _clock(flight, told, treated, options.time_zone)
     facts = facts_of(flight, treated, clock, unread=len(unread), **_volumes(assessment))
@@ -87,11 +88,17 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
     return _with_files(contents, records, assessment, clock, treated, options)
 
 
-def _assessed(flight: AppliedFlight) -> tuple[Assessment | None, str]:
+def _assessed(flight: AppliedFlight, *, is_whole: bool) -> tuple[Assessment | None, str]:
+    """Return the evaluation, or None and why there is none: nothing flown, or too little read."""
     try:
-        return assess(flight), ""
+        found = assess(flight)
     except EvaluationError as error:
-        return None, str(error).removeprefix(f"{flight.path}: ")
+        why = str(error).removeprefix(f"{flight.path}: ")
+        return None, why if is_whole else TOO_LITTLE
+    if is_whole or found.evaluation.applied_ml > 0.0:
+        return found, ""
+    # Valves count as closed where nothing is known: that nothing was sprayed is no result then.
+    return None, TOO_LITTLE
 
 
 def _clock(flight: AppliedFlight, told: Told, treated: Treated, time_zone: str | None) -> Clock:

@@ -54,8 +54,8 @@ def report_flight(
 ) -> None:
     """Evaluate a flight and write its report, with every number and the record of the application.
 
-    Exit 0: written; 1: written, of a journal that was cut or has lost rows; 2: the journal or an
-    option cannot be used, or DIR cannot be written.
+    Exit 0: written; 1: of a journal that was cut, is damaged, lacks rows or is of another version:
+    what can be read is written; 2: no journal, an option is wrong, or DIR cannot be written.
     """
     from analysis.report.build import ReportOptions, build_report
     from analysis.report.folder import check_folder, write_files

@@ -55,12 +55,17 @@ def contents_of(
         unread=unread,
         why_not_evaluated=why_not_evaluated,
     )
+    is_whole = not (unread or flight.lost)
+    is_known = is_whole or assessment is not None
     metrics = {"journal": flight.path.name, **dict.fromkeys(METRICS)}
     contents = {
         "report_version": REPORT_VERSION,
         "program": {"name": "vrspray", "version": _version()},
-        "flight": {**_flight(flight, treated, clock, told), "unread": list(unread)},
-        "verdict": verdict_of(assessment, treated),
+        "flight": {
+            **_flight(flight, treated, clock, told, is_known=is_known),
+            "unread": list(unread),
+        },
+        "verdict": verdict_of(assessment, treated, is_whole=is_whole),
         "warnings": [warning.as_json() for warning in warnings],
         **(metrics if assessment is None else assessment.as_json()),
         "table_5": None if assessment is None else table_5(assessment.breakdowns.accuracy),
@@ -123,8 +128,10 @@ def _version() -> str:
         return "unknown"
 
 
-def _flight(flight: AppliedFlight, treated: Treated, clock: Clock, told: Told) -> dict[str, Any]:
-    """Return what, where, when and by whom."""
+def _flight(
+    flight: AppliedFlight, treated: Treated, clock: Clock, told: Told, *, is_known: bool
+) -> dict[str, Any]:
+    """Return what, where, when and by whom; what was treated only where that is known."""
     has_samples = len(flight.time_s) > 0
     frame = flight.setup.frame
     latitude_deg, longitude_deg = frame.latitude_deg, frame.longitude_deg
@@ -141,13 +148,13 @@ def _flight(flight: AppliedFlight, treated: Treated, clock: Clock, told: Told) -
         "ended": clock.text(float(flight.time_s[-1])) if has_samples else None,
         "spraying_from": clock.text(treated.first_s),
         "spraying_until": clock.text(treated.last_s),
-        "duration_s": flight.duration_s,
+        "duration_s": flight.duration_s if has_samples or is_known else None,
         "time_zone": clock.zone_name,
         "clock": clock.source_text,
         "clock_verified": clock.is_verified,
         "latitude_deg": latitude_deg,
         "longitude_deg": longitude_deg,
-        "treated_area_ha": treated.area_ha,
+        "treated_area_ha": treated.area_ha if is_known else None,
         "field_area_ha": float(flight.setup.prescription.field.area) / 1e4,
         "told": dict(told.values),
         "told_after_flight": sorted(told.after),

@@ -172,7 +172,12 @@ def _why_not(facts: Facts) -> Iterator[str]:
         what = "a simulation" if facts.training == "simulated" else f"training ({facts.training})"
         yield f"a product: this was {what}"
     elif not facts.area_ha > 0.0:
-        yield "an application: nothing was sprayed"
+        what = (
+            "whether anything was sprayed is not known"
+            if facts.lost_rows
+            else "nothing was sprayed"
+        )
+        yield f"an application: {what}"
     if facts.ends_spraying:
         yield "the end of the spraying: the journal was cut while valves were open"
     if facts.lost_rows:

@@ -78,7 +78,9 @@ def _lines(contents: Mapping[str, Any]) -> Iterator[_Line]:
     when = f"{flight['spraying_from'] or flight['started'] or 'time not known'}"
     yield from _wrapped("text", f"{when}, time zone {flight['time_zone']}, {flight['clock']}")
     place = f"{flight['latitude_deg']:.6f}, {flight['longitude_deg']:.6f} (WGS84)"
-    yield "text", f"{place}, {flight['treated_area_ha']:.4f} ha treated"
+    area_ha = flight["treated_area_ha"]
+    treated = "treated area not known" if area_ha is None else f"{area_ha:.4f} ha treated"
+    yield "text", f"{place}, {treated}"
     for each in contents["warnings"]:
         if each["severity"] != "mark":
             yield from _wrapped("text", f"{each['severity'].upper()}: {each['text']}")

@@ -32,7 +32,7 @@ PAGE = """<!DOCTYPE html>
 {% if flight.told.get("application.parcel") %}, parcel {{ flight.told["application.parcel"] }}{% endif %}</dd>
 <dt>When</dt><dd>{% if flight.spraying_from %}sprayed {{ flight.spraying_from|moment }} to {{ flight.spraying_until|moment }}\
 {% elif flight.started %}flown {{ flight.started|moment }} to {{ flight.ended|moment }}{% else %}not known{% endif %};
-{{ flight.duration_s|duration }} in the air; time zone {{ flight.time_zone }}; {{ flight.clock }}</dd>
+{% if flight.duration_s is not none %}{{ flight.duration_s|duration }} in the air; {% endif %}time zone {{ flight.time_zone }}; {{ flight.clock }}</dd>
 <dt>Who</dt><dd>{{ flight.told.get("application.operator") or flight.told.get("application.pilot") or "operator not named" }}\
 {% if flight.told.get("application.customer") %}, for {{ flight.told["application.customer"] }}{% endif %}</dd>
 <dt>Journal</dt><dd>{{ flight.file }}, SHA-256 <code>{{ flight.sha256 }}</code></dd>

@@ -6,7 +6,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from analysis.assess.causes import Cause
 from analysis.assess.rate_wishes import rate_wishes
+from analysis.flown.holes import UNREAD
 from analysis.report.clock import duration_text
 from companion.core.types import Inhibit
 
@@ -37,6 +39,9 @@ LATCHED = frozenset(
 )  # fmt: skip
 # A meter of 3 % and a curve of a few percent may differ by this much and be sound.
 METER_OFF_PERCENT = 6.0
+# More of the ground than this is not flown over closed by the way.
+HELD_SHARE = 0.01
+UNKNOWN = "Nothing can be said of what was sprayed: too little of the journal can be read."
 # Longer than this between two samples nobody knows what held.
 GAP_S = 1.0
 
@@ -54,14 +59,19 @@ class Caution:
         return {"severity": self.severity, "code": self.code, "text": self.text}
 
 
-def verdict_of(assessment: Assessment | None, treated: Treated) -> dict[str, Any]:
-    """Return the figures of the verdict, and the verdict in one sentence."""
+def verdict_of(
+    assessment: Assessment | None, treated: Treated, *, is_whole: bool = True
+) -> dict[str, Any]:
+    """Return the figures of the verdict, and the verdict in one sentence.
+
+    What was sprayed in a flight of which too little can be read, nobody knows: null, and not zero.
+    """
     if assessment is None or assessment.evaluation.applied_ml <= 0.0:
         return {
-            "sentence": "Nothing was sprayed in this flight.",
-            "applied_l": 0.0,
+            "sentence": "Nothing was sprayed in this flight." if is_whole else UNKNOWN,
+            "applied_l": 0.0 if is_whole else None,
             "prescribed_l": None,
-            "area_ha": treated.area_ha,
+            "area_ha": treated.area_ha if is_whole else None,
             "within_10_percent": None,
             "worst_lag_distance_m": None,
             "outside_ml": None,
@@ -75,7 +85,8 @@ def verdict_of(assessment: Assessment | None, treated: Treated) -> dict[str, Any
         "worst_lag_distance_m": evaluation.lag_distance_m.max_abs,
         "outside_ml": evaluation.off_target_ml,
     }
-    return {"sentence": _sentence(figures, assessment.flight.training), **figures}
+    sentence = _sentence(figures, assessment.flight.training)
+    return {"sentence": sentence if is_whole else f"By what could be read: {sentence}", **figures}
 
 
 def _sentence(figures: Mapping[str, Any], training: str | None) -> str:
@@ -116,6 +127,7 @@ def warnings_of(
         *_journal(flight, clock),
         *(_warning("unread", f"Of the journal could not be read: {each}.") for each in unread),
         *_inhibited(flight, assessment, treated),
+        *held_ground(assessment),
         *_wishes(flight, clock),
         *_flow(assessment, why_not_evaluated),
         *_records(records),
@@ -175,6 +187,22 @@ def _inhibited(
         gap = duration_text(assessment.durations.unknown_s)
         yield _warning("gap", f"For {gap} the journal does not say what the sprayer did.")
     yield from _faults(event.text or event.kind for event in flight.events if _is_fault(event.kind))
+
+
+def held_ground(assessment: Assessment | None) -> Iterator[Caution]:
+    """Yield which ground was flown over closed: after the last spraying, too."""
+    if assessment is None:
+        return
+    causes = assessment.causes
+    held_m2 = causes.by_cause[Cause.INHIBIT]
+    by_reason = sorted(causes.by_inhibit.items(), key=lambda each: -each[1])
+    reasons = ", ".join(f"{name} {area_m2:.0f} m2" for name, area_m2 in by_reason if name != UNREAD)
+    if not reasons or not held_m2 > HELD_SHARE * causes.judged_m2:
+        return
+    yield _warning(
+        "held-ground",
+        f"{held_m2:.0f} m2 were flown over with the valves held closed: {reasons}.",
+    )
 
 
 def held_between(

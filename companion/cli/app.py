@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 from typer.core import TyperGroup
 
-from companion.errors import ActuatorError, MapError, NoMapError, VrsprayError
+from companion.errors import ActuatorError, MapError, UnreadableError, VrsprayError
 
 if TYPE_CHECKING:
     from typer._click.core import Command, Context
@@ -146,7 +146,7 @@ def execute(arguments: Sequence[str]) -> int:
     except typer.TyperException as error:
         return _fail(f"{error.format_message()} (see --help)", error.exit_code, as_json=as_json)
     except VrsprayError as error:
-        code = FAILED if isinstance(error, ActuatorError | NoMapError) else REFUSED
+        code = FAILED if isinstance(error, ActuatorError | UnreadableError) else REFUSED
         more = {"ok": False, "problems": [refusal(error)]} if isinstance(error, MapError) else {}
         return _fail(str(error), code, as_json=as_json, more=more)
     except (KeyboardInterrupt, typer.Abort):

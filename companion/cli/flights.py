@@ -70,7 +70,11 @@ def show(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A journal, a .gpkg file.")],
     as_json: AsJson = False,
 ) -> None:
-    """Show what a journal says of itself, and how much of what is in it; damage is exit 1."""
+    """Show what a journal says of itself, and how much of what is in it.
+
+    Exit 0: all can be read; 1: it is damaged or of another version, and what could not be read is
+    said; 2: no journal, or its flight still writes it.
+    """
     flight = look_at(path)
     if flight.state == "open" or not path.is_file():
         raise JournalError(flight.problem or f"{path}: its flight still writes it")

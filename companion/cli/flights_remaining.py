@@ -17,10 +17,10 @@ from companion.cli.answer import AsJson, answer, note
 from companion.core.coverage import Coverage
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
-from companion.errors import JournalError, VrsprayError
+from companion.errors import VrsprayError
 from companion.maps.build import build_prescription
 from companion.maps.registry import read_map
-from companion.record.continuing import Treated, is_damage, read_treated_ground, rest_of
+from companion.record.continuing import Treated, read_treated_ground, rest_of
 from companion.record.coverage_area import moved
 
 M2_PER_HA = 10_000.0
@@ -47,10 +47,12 @@ def remaining(
 
     What is left in pieces narrower than half a valve's strip does not count: no valve is for that.
 
-    Exit 0: all was read; 1: a journal is damaged, and what of it could not be read is said; 2: no
-    journal, or none that keeps treated ground.
+    Exit 0: all was read; 1: a journal is damaged or of another version, and what of it could not be
+    read is said; 2: no journal, or none that keeps treated ground.
     """
-    flights = sorted((_read(path, as_json=as_json) for path in journals), key=_started)
+    flights = sorted(
+        (read_treated_ground(path, is_lenient=True) for path in journals), key=_started
+    )
     last = flights[-1]
     for line in _training(flights):
         note(line)
@@ -70,18 +72,6 @@ def remaining(
         note(f"not read: {text}")
     if result["unread"]:
         raise typer.Exit(1)
-
-
-def _read(path: Path, *, as_json: bool) -> Treated:
-    """Return what can be read of a journal; one that tells nothing is said, and ends it."""
-    try:
-        return read_treated_ground(path, is_lenient=True)
-    except JournalError as error:
-        if not is_damage(error):
-            raise
-        answer({"error": str(error)}, (), as_json=as_json)
-        note(str(error))
-        raise typer.Exit(1) from error
 
 
 def _training(flights: Sequence[Treated]) -> Iterator[str]:

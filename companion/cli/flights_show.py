@@ -8,12 +8,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from companion.errors import JournalError, NoMapError
+from companion.errors import UnreadableError
 from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
+from companion.record.refusals import SEE_SHOW
 from companion.record.salvage import readable_rows
 from companion.record.totals import missing_rows
 from companion.record.versions import OtherVersionError, read_entries
+from companion.record.whole_file import damaged_pages
 
 # In `meta` for programs, or shown elsewhere.
 _LONG = frozenset({"setup", "config_toml"})
@@ -33,7 +35,10 @@ _COUNTED = ("applied", "valve_changes", "link_stats", "coverage_tiles", "zones",
 
 
 def content_of(path: Path) -> dict[str, Any]:
-    """Return all of it; `unread` says in a line each what is damaged or unknown."""
+    """Return all of it; `unread` says in a line each what is damaged or unknown.
+
+    JournalError for what is no journal.
+    """
     result: dict[str, Any] = {
         "meta": {},
         "entries": {},
@@ -49,8 +54,8 @@ def content_of(path: Path) -> dict[str, Any]:
     except OtherVersionError as error:
         result["meta"] = _shown(error.meta)
         unread.append(str(error))
-    except JournalError as error:
-        unread.append(str(error))
+    except UnreadableError as error:
+        unread.append(str(error).partition("is damaged: ")[2] or str(error))
     return result
 
 
@@ -65,9 +70,7 @@ def _fill(result: dict[str, Any], journal: OpenJournal) -> None:
     kinds: Counter[str] = Counter()
     result["entries"] = kinds
     connection = journal.connection
-    verdict = _tried(unread, "the file", connection, "PRAGMA quick_check(1)")
-    if verdict and verdict[0][0] != "ok":
-        unread.append(f"damaged: {' '.join(str(verdict[0][0]).split())}")
+    unread += damaged_pages(connection)
     try:
         for entry in read_entries(connection, journal.version, unread=unread):
             kinds[entry.kind] += 1
@@ -75,10 +78,10 @@ def _fill(result: dict[str, Any], journal: OpenJournal) -> None:
         unread.append(f"inputs and decisions behind the first {kinds.total()}: {error}")
     try:
         journal.setup()
-    except NoMapError as error:
-        unread.append(str(error).partition("is damaged: ")[2])
+    except UnreadableError as error:
+        unread.append(str(error).partition("is damaged: ")[2].removesuffix(SEE_SHOW))
     except DAMAGE as error:
-        unread.append(f"the set-up: {one_line(error)}")
+        unread.append(f"what earlier flights treated: {one_line(error)}")
     _fill_tables(result, journal)
     sql = "SELECT time, time_s, kind, text FROM events ORDER BY sequence"
     marks = _tried(unread, "events", connection, sql)

@@ -150,7 +150,7 @@ def read_blocks(
                 rows.sort()
         except (ValueError, TypeError, OverflowError) as error:
             what = "rows" if inputs is None else "decisions"
-            text = f"{what} from {first} on ({_span(from_s, until_s)}): {error}"
+            text = f"{what} from {first} on ({span_text(from_s, until_s)}): {error}"
             if unread is None:
                 raise ValueError(text) from error
             unread.append(text)
@@ -184,7 +184,8 @@ class _Dictionaries:
         return self._found[number]
 
 
-def _span(from_s: object, until_s: object) -> str:
+def span_text(from_s: object, until_s: object) -> str:
+    """Return from when until when a block is, for a person."""
     if isinstance(from_s, float) and isinstance(until_s, float):
         return f"{from_s:.3f} to {until_s:.3f} s"
     return "of an unknown time"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,12 +16,14 @@ from companion.core.controller import Setup
 from companion.core.coverage import CELL_M, Coverage
 from companion.core.frame import LocalFrame
 from companion.core.overlap_guard import OverlapGuard
-from companion.errors import JournalError
+from companion.errors import JournalError, UnreadableError
 from companion.record.coverage_area import as_polygons, moved, polygons
 from companion.record.coverage_table import read_coverage
 from companion.record.geopackage import wkb_of
 from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
+from companion.record.totals import missing_rows
+from companion.record.whole_file import damages
 
 # Where nothing else is configured, whoever goes on closes a valve that is more over treated ground
 # than over bare: misses and doubles come out even.
@@ -60,7 +61,15 @@ def read_treated_ground(path: Path, *, is_lenient: bool = False) -> Treated:
     """
     with opened(path, is_lenient=is_lenient) as journal:
         unread = [*journal.unread]
+        if is_lenient:
+            unread += damages(journal.connection)
+            unread += missing_rows(journal.connection, journal.meta)
         coverage = read_coverage(journal.connection, unread=unread if is_lenient else None)
+        if coverage is None and unread:
+            raise UnreadableError(
+                f"{path}: is damaged: no treated ground can be read of it ({unread[0]}); see "
+                "vrspray flights show"
+            )
         if coverage is None:
             raise JournalError(
                 f"{path}: keeps no treated ground: coverage.record was false, or an older version "
@@ -79,11 +88,6 @@ def read_treated_ground(path: Path, *, is_lenient: bool = False) -> Treated:
             training=journal.meta.get("training"),
             unread=tuple(unread),
         )
-
-
-def is_damage(error: JournalError) -> bool:
-    """Return whether a file is a journal, of which a part cannot be read."""
-    return re.search(r": is damaged|: row \d+", str(error)) is not None
 
 
 def _stopped(journal: OpenJournal, unread: list[str] | None) -> tuple[float, float] | None:
@@ -143,7 +147,11 @@ def treated_by(
     """
     whole = Coverage()
     for path in paths:
-        found = read_treated_ground(path)
+        try:
+            found = read_treated_ground(path)
+        except UnreadableError as error:
+            # For a start it is a wrong input: exit 2, which no service tries again.
+            raise JournalError(str(error)) from error
         if found.training is None and not takes_unmarked:
             raise JournalError(
                 f"{path}: does not say whether a product was sprayed: an old journal, or one of a "

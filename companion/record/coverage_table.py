@@ -65,11 +65,23 @@ def read_coverage(
     if flight is None:
         return None
     before = _read(connection, "before", unread)
-    found = connection.execute("SELECT value FROM meta WHERE key = ?", (AHEAD_KEY,)).fetchone()
+    found = _ahead(connection, unread)
     if found is None and not flight.tiles:
         return None  # it was never told any: recording was off
     tiles = (flight if before is None else before.joined(flight)).tiles
     return Coverage(tiles=tiles, ahead_s=0.0 if found is None else float(found[0]))
+
+
+def _ahead(connection: sqlite3.Connection, unread: list[str] | None) -> tuple[str] | None:
+    sql = "SELECT value FROM meta WHERE key = ?"
+    try:
+        found: tuple[str] | None = connection.execute(sql, (AHEAD_KEY,)).fetchone()
+    except sqlite3.DatabaseError as error:
+        if unread is None:
+            raise
+        unread.append(f"treated ground: how far it is told ahead: {error}")
+        return None
+    return found
 
 
 def read_treated(connection: sqlite3.Connection) -> Coverage | None:
@@ -104,15 +116,13 @@ def _read(
     sql = "SELECT 1 FROM sqlite_master WHERE name = 'coverage_tiles'"
     if connection.execute(sql).fetchone() is None:
         return None
-    rows = connection.execute(
-        "SELECT tile_east, tile_north, cells FROM coverage_tiles WHERE kind = ? LIMIT ?",
-        (kind, TILES_MAX),
-    )
+    query = "SELECT tile_east, tile_north, cells FROM coverage_tiles WHERE kind = ? LIMIT ?"
     if unread is None:
+        rows = connection.execute(query, (kind, TILES_MAX))
         return Coverage(tiles={_key(east, north): _tile(cells) for east, north, cells in rows})
     tiles, damaged = {}, 0
     try:
-        for east, north, cells in rows:
+        for east, north, cells in connection.execute(query, (kind, TILES_MAX)):
             try:
                 tiles[_key(east, north)] = _tile(cells)
             except ValueError:

@@ -11,7 +11,7 @@ from typing import cast
 
 from companion.core.controller import Setup
 from companion.core.types import Decision, Input
-from companion.errors import JournalError, NoMapError
+from companion.errors import NoMapError, UnreadableError
 from companion.record.blocks import Entry
 from companion.record.codec import FieldNames, decode
 from companion.record.coverage_table import read_treated
@@ -19,21 +19,20 @@ from companion.record.events import Event
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import read_ground
 from companion.record.read_only import DAMAGE, one_line, read_only, tolerate_damage
+from companion.record.refusals import check_kind, extent, no_file, refused, why_no_setup
 from companion.record.salvage import readable_rows
 from companion.record.setup_json import field_names_of, setup_from_json
 from companion.record.totals import missing_rows
 from companion.record.versions import (
-    JOURNAL_VERSION,
+    as_far_as_said,
+    check_said,
     check_version,
     migrated,
-    missing_tables,
     read_entries,
 )
+from companion.record.whole_file import damaged_pages
 
 __all__ = ["Entry", "JournalContent", "OpenJournal", "opened", "read_journal"]
-
-# Without these `meta` says too little of a flight.
-_NEEDED = frozenset({"closed", "lost", "setup", "started_s", "started_utc"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,9 +66,11 @@ class JournalContent:
         try:
             value = decode(entry.body, self.field_names)
         except (ValueError, TypeError, RecursionError) as error:
-            raise JournalError(f"{self.path}: row {entry.sequence}: {one_line(error)}") from error
+            raise UnreadableError(
+                f"{self.path}: row {entry.sequence}: {one_line(error)}"
+            ) from error
         if type(value).__name__ != entry.kind:
-            raise JournalError(f"{self.path}: row {entry.sequence} is no {entry.kind}")
+            raise UnreadableError(f"{self.path}: row {entry.sequence} is no {entry.kind}")
         return cast("Input | Decision", value)
 
     def items(self) -> Iterator[Input | Decision]:
@@ -91,40 +92,36 @@ class OpenJournal:
     unread: tuple[str, ...] = ()
 
     def setup(self) -> Setup:
-        """Return all that was constant in the flight; ValueError where it is damaged.
+        """Return all that was constant in the flight; UnreadableError where it is damaged.
 
-        Where only the map is: a NoMapError, in one line with what else can be read.
+        In one line, with what else can be read; a NoMapError where only the map is damaged.
         """
         try:
             ground = read_ground(self.connection)
         except DAMAGE as error:
             raise NoMapError(
                 f"{self.path}: is damaged: no map: its zones or its field cannot be read "
-                f"({one_line(error)}); {_extent(self.connection)}"
+                f"({one_line(error)}); {extent(self.connection)}"
             ) from error
-        if "setup" not in self.meta:
-            raise ValueError("what was constant in the flight is gone")
-        setup = setup_from_json(self.meta["setup"], ground)
+        try:
+            setup = setup_from_json(self.meta["setup"], ground)
+        except DAMAGE as error:
+            why = why_no_setup(error) if "setup" in self.meta else "it is gone"
+            raise UnreadableError(
+                f"{self.path}: is damaged: no set-up of the flight: {why}; "
+                f"{extent(self.connection)}"
+            ) from error
         treated = read_treated(self.connection)
         return setup if treated is None else replace(setup, treated=treated)
-
-
-def _extent(connection: sqlite3.Connection) -> str:
-    """Return in words what there is without a map."""
-    parts = []
-    for table in ("blocks", "applied", "valve_changes", "events"):
-        try:
-            (count,) = connection.execute(f"SELECT count(*) FROM {table}").fetchone()
-        except sqlite3.DatabaseError:
-            continue
-        parts.append(f"{count} rows of {table}")
-    return f"{', '.join(parts) or 'nothing else'} can be read; see vrspray flights show"
 
 
 def read_journal(path: Path, *, is_lenient: bool = False) -> JournalContent:
     """Return what is in the file; JournalError, in one line, where it cannot be used.
 
-    `is_lenient` leaves out what is damaged and says so in `unread`.
+    An UnreadableError where it is a journal, but damaged or of another version.
+
+    `is_lenient` leaves out what is damaged and says so in `unread`; that rows are missing is said
+    there in any case.
     """
     with opened(path, is_lenient=is_lenient) as journal:
         return _read(journal, is_lenient=is_lenient)
@@ -134,57 +131,51 @@ def read_journal(path: Path, *, is_lenient: bool = False) -> JournalContent:
 def opened(path: Path, *, is_lenient: bool = False) -> Iterator[OpenJournal]:
     """Open a journal for reading; whatever SQLite finds inside becomes a JournalError."""
     if not path.is_file():
-        raise JournalError(f"{path}: there is no such file; give the .gpkg file of a flight")
+        raise no_file(path)
     try:
         with read_only(path) as connection:
             yield _checked(path, connection, is_lenient=is_lenient)
-    except sqlite3.OperationalError as error:
-        if "locked" in str(error):
-            raise JournalError(
-                f"{path}: its flight still writes it; end the flight first"
-            ) from error
-        raise JournalError(f"{path}: cannot be read: {one_line(error)}") from error
-    except sqlite3.DatabaseError as error:
-        if "not a database" in str(error):
-            raise JournalError(f"{path}: is no journal; give the .gpkg file of a flight") from error
-        raise JournalError(f"{path}: is damaged: {one_line(error)}") from error
     except DAMAGE as error:
-        raise JournalError(f"{path}: is damaged: {one_line(error)}") from error
+        raise refused(path, error) from error
 
 
 def _checked(path: Path, connection: sqlite3.Connection, *, is_lenient: bool) -> OpenJournal:
     unread: list[str] = []
-    try:
-        application_id, tables = _register(connection)
-    except sqlite3.DatabaseError as error:
-        # Its subclasses are no damage: locked, cannot be opened.
-        if not is_lenient or type(error) is not sqlite3.DatabaseError:
-            raise
-        tolerate_damage(connection)
-        application_id, tables = _register(connection)
-        unread.append(f"the file is shorter than it was, or damaged: {one_line(error)}")
-    if application_id != APPLICATION_ID:
-        raise JournalError(f"{path}: is no journal; give the .gpkg file of a flight")
-    if "meta" not in tables:
-        raise JournalError(f"{path}: is a GeoPackage, but no journal of a flight")
+    application_id, tables = _registered(connection, unread if is_lenient else None)
+    check_kind(path, tables, is_geopackage=application_id == APPLICATION_ID)
     meta = _meta(connection, tables, unread if is_lenient else None)
     version = check_version(path, meta, tables, is_lenient=is_lenient)
     if is_lenient:
-        unread += [f"the table {table} is missing" for table in missing_tables(version, tables)]
-        unread += [
-            f"what the flight said of {key} is missing" for key in sorted(_NEEDED - meta.keys())
-        ]
+        meta, lacking = as_far_as_said(meta, version, tables)
+        unread += lacking
     else:
-        (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
-        if verdict != "ok":
-            raise ValueError(verdict)
+        check_said(meta)
+        meta = migrated(meta)
+        for text in damaged_pages(connection):
+            raise ValueError(text)
     return OpenJournal(
-        path=path,
-        connection=connection,
-        meta=migrated(meta),
-        version=version,
-        unread=tuple(unread),
+        path=path, connection=connection, meta=meta, version=version, unread=tuple(unread)
     )
+
+
+def _registered(connection: sqlite3.Connection, unread: list[str] | None) -> tuple[int, set[str]]:
+    """Return the application's number and the tables; with `unread` also of a file cut short."""
+    try:
+        return _register(connection)
+    except sqlite3.DatabaseError as error:
+        # Its subclasses are no damage: locked, cannot be opened.
+        if unread is None or type(error) is not sqlite3.DatabaseError:
+            raise
+        if "not a database" in str(error):
+            raise
+        unread.append(f"the file is shorter than it was, or damaged: {one_line(error)}")
+    tolerate_damage(connection)
+    try:
+        return _register(connection)
+    except sqlite3.DatabaseError as error:
+        raise ValueError(
+            f"nothing of it can be read: its list of tables is gone ({one_line(error)})"
+        ) from error
 
 
 def _register(connection: sqlite3.Connection) -> tuple[int, set[str]]:
@@ -201,23 +192,24 @@ def _meta(
     connection: sqlite3.Connection, tables: set[str], unread: list[str] | None
 ) -> dict[str, str]:
     """Return what the journal says of itself; with `unread` as far as that can be read."""
+    if "meta" not in tables:
+        return {}
     try:
-        return dict(connection.execute("SELECT key, value FROM meta").fetchall())
+        rows = connection.execute("SELECT key, value FROM meta").fetchall()
+        return {str(key): str(value) for key, value in rows if value is not None}
     except sqlite3.DatabaseError as error:
         if unread is None or "locked" in str(error):
             raise
         unread.append(f"meta: {one_line(error)}")
-    rows = list(readable_rows(connection, "meta", [True]))
-    found = {str(row[-2]): str(row[-1]) for row in rows}
-    if "blocks" in tables:
-        found.setdefault("journal_version", JOURNAL_VERSION)
-    return found
+    kept = readable_rows(connection, "meta", [True])
+    return {str(row[-2]): str(row[-1]) for row in kept if row[-1] is not None}
 
 
 def _read(journal: OpenJournal, *, is_lenient: bool) -> JournalContent:
     unread = list(journal.unread)
     if is_lenient:
-        unread += missing_rows(journal.connection, journal.meta)
+        unread += damaged_pages(journal.connection)
+    unread += missing_rows(journal.connection, journal.meta)
     entries, events = [], []
     try:
         for entry in read_entries(

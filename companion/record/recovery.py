@@ -13,19 +13,20 @@ from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from companion.errors import JournalError
 from companion.record.content_hash import log_of
 from companion.record.folder import journals
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import box_of_points, set_box
+from companion.record.log_damage import LogDamage, keep_log, kept_log_of, log_damage, mark
 from companion.record.read_only import DAMAGE, one_line, read_only
 from companion.record.salvage import salvage, salvaged_name
 from companion.record.totals import totals_of
 from companion.record.versions import OtherVersionError, check_version
 from companion.record.writer import SET_META, tell_times_again
 
-_OPEN = ("open", "its flight still writes it")
 _KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"
 
 
@@ -33,18 +34,20 @@ _KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"
 class Recovery:
     """What became of one journal.
 
-    Recovered, open or other-version (both left alone), salvaged, or failed.
+    Recovered, open or other-version (both left alone), salvaged, or failed. `is_whole`: nothing
+    that was committed is lost.
     """
 
     path: Path
     outcome: str
     text: str
     took_s: float
+    is_whole: bool = True
 
     @property
     def is_good(self) -> bool:
         """Whether nothing is left to be done by hand."""
-        return self.outcome in ("recovered", "open")
+        return self.is_whole and self.outcome in ("recovered", "open")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +57,15 @@ class _Ending:
     box: tuple[float, float, float, float] | None
     time: tuple[float, float] | None
     totals: Mapping[str, str]
+
+
+class _Told(NamedTuple):
+    outcome: str
+    text: str
+    is_whole: bool = True
+
+
+_OPEN = _Told("open", "its flight still writes it")
 
 
 def recover_folder(folder: Path) -> list[Recovery]:
@@ -71,17 +83,22 @@ def recover(path: Path) -> Recovery | None:
     told = _recovered(path)
     if told is None:
         return None
-    outcome, text = told
-    return Recovery(path=path, outcome=outcome, text=text, took_s=time.perf_counter() - began_s)
+    return Recovery(
+        path=path,
+        outcome=told.outcome,
+        text=told.text,
+        took_s=time.perf_counter() - began_s,
+        is_whole=told.is_whole,
+    )
 
 
-def _recovered(path: Path) -> tuple[str, str] | None:
+def _recovered(path: Path) -> _Told | None:
     """Return what became of a journal, and what is said of it."""
     try:
         _undo_half_written(path)
         is_left, ending = _looked_at(path)
     except OtherVersionError as error:
-        return "other-version", f"{error}; it was cut and is left alone"
+        return _Told("other-version", f"{error}; it was cut and is left alone")
     except (JournalError, *DAMAGE) as error:
         if _is_locked(error):
             return _OPEN
@@ -89,12 +106,20 @@ def _recovered(path: Path) -> tuple[str, str] | None:
     return _folded_in(path, ending) if is_left else None
 
 
-def _folded_in(path: Path, ending: _Ending | None) -> tuple[str, str]:
+def _folded_in(path: Path, ending: _Ending | None) -> _Told:
     try:
-        _fold_in(path, ending)
+        damage = log_damage(path)
+        if damage is not None:
+            keep_log(path)
+        told = _fold_in(path, ending, damage)
+        if told is None:
+            kept_log_of(path).unlink(missing_ok=True)
     except DAMAGE as error:
-        return _OPEN if _is_locked(error) else ("failed", f"{one_line(error)}; it can be read")
-    return "recovered", "what was committed is there"
+        return _OPEN if _is_locked(error) else _Told("failed", f"{one_line(error)}; it can be read")
+    if told is None:
+        return _Told("recovered", "what was committed is there")
+    text = f"{told}; the damaged log is kept as {kept_log_of(path).name}"
+    return _Told("recovered", text, is_whole=False)
 
 
 def _is_locked(error: Exception) -> bool:
@@ -119,6 +144,10 @@ def _looked_at(path: Path) -> tuple[bool, _Ending | None]:
     with read_only(path, timeout_s=0.0) as connection:
         if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
             raise ValueError("is no journal")
+        (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
+        if path.stat().st_size % page_bytes:
+            # SQLite takes zeros for the rest of a page.
+            raise ValueError("the file was cut off within a page")
         meta = dict(connection.execute("SELECT key, value FROM meta").fetchall())
         closed = meta.get("closed")
         if closed not in (None, "no") and not log_of(path).exists():
@@ -145,16 +174,19 @@ def _ending(connection: sqlite3.Connection, meta: Mapping[str, str]) -> _Ending:
     )
 
 
-def _fold_in(path: Path, ending: _Ending | None) -> None:
+def _fold_in(path: Path, ending: _Ending | None, damage: LogDamage | None) -> str | None:
+    """Make one file of it; return what is said of a damaged log."""
     with closing(_connect(path)) as connection:
+        connection.execute("BEGIN IMMEDIATE")
         if ending is not None:
-            connection.execute("BEGIN IMMEDIATE")
             _settle(connection, ending)
-            connection.execute("COMMIT")
+        told = None if damage is None else mark(connection, damage)
+        connection.execute("COMMIT")
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
         connection.execute("PRAGMA journal_mode = DELETE").fetchall()
     # Of somebody who looked at the cut file and did not end well either.
     path.with_name(path.name + "-shm").unlink(missing_ok=True)
+    return told
 
 
 def _connect(path: Path) -> sqlite3.Connection:
@@ -174,14 +206,19 @@ def _settle(connection: sqlite3.Connection, ending: _Ending) -> None:
         connection.execute(SET_META, fact)
 
 
-def _salvaged(path: Path, reason: str) -> tuple[str, str]:
+def _salvaged(path: Path, reason: str) -> _Told:
     """Copy what can still be read beside the file, which stays as it is."""
     try:
-        rows, lost_tables = salvage(path)
+        found = salvage(path)
     except DAMAGE as error:
         text = one_line(error)
-        return "failed", f"{reason}; nothing could be read ({text}); the file is kept as it is"
-    parts = f"; not all of {', '.join(lost_tables)}" if lost_tables else ""
-    return "salvaged", (
-        f"{reason}; the file is kept, {rows} rows are in {salvaged_name(path).name}{parts}"
-    )
+        return _Told(
+            "failed", f"{reason}; nothing could be read ({text}); the file is kept as it is"
+        )
+    text = f"{reason}; the file is kept, {found.rows} rows are in {salvaged_name(path).name}"
+    if found.stray:
+        strays = ", ".join(f"{name} {count}" for name, count in found.stray.items())
+        text += f", of these from pages that nothing leads to: {strays}"
+    if found.lost_tables:
+        text += f"; not all of {', '.join(found.lost_tables)}"
+    return _Told("salvaged", text)

@@ -10,6 +10,7 @@ from pathlib import Path
 from companion.errors import JournalError
 from companion.record.content_hash import log_of
 from companion.record.folder import Flight, journals, look_at, pin_of
+from companion.record.log_damage import kept_log_of
 
 # The newest flights stay by every rule: a disk that something else has filled, or a clock that is
 # wrong, must not cost the records of the season.
@@ -133,7 +134,7 @@ def _removed(removal: Removal) -> Removal | None:
         return None
     try:
         path.unlink()
-        for rest in (log_of(path), path.with_name(path.name + "-shm")):
+        for rest in (log_of(path), kept_log_of(path), path.with_name(path.name + "-shm")):
             rest.unlink(missing_ok=True)
     except OSError as error:
         return replace(removal, problem=f"cannot be removed ({error.strerror})")

@@ -20,6 +20,16 @@ def totals_of(connection: sqlite3.Connection) -> dict[str, str]:
     return {**found, _LITRES: repr(_summed_l(connection))}
 
 
+def tell_litres_again(connection: sqlite3.Connection) -> None:
+    """Have `meta` say what the rows come to that are there: a part of what was told before."""
+    connection.execute("DELETE FROM meta WHERE key = ?", (_LITRES,))
+    try:
+        found_l = _summed_l(connection)
+    except (TypeError, ValueError):  # rows that are none
+        return
+    connection.execute("INSERT INTO meta (key, value) VALUES (?, ?)", (_LITRES, repr(found_l)))
+
+
 def applied_l(connection: sqlite3.Connection, meta: Mapping[str, str]) -> float:
     """Return what the ordered duties stand for in litres: not a measurement."""
     try:

@@ -12,17 +12,23 @@ from collections.abc import Collection, Iterator, Mapping
 from datetime import datetime
 from importlib import metadata
 
-from companion.errors import JournalError
+from companion.errors import UnreadableError
 from companion.record.blocks import Entry, read_blocks
+from companion.record.refusals import check_kind
 
 JOURNAL_VERSION = "2"
+_BOTH = {"meta", "events", "zones", "field", "applied"}
 _TABLES = {
-    "1": frozenset({"meta", "records", "events", "zones", "field"}),
-    "2": frozenset({"meta", "blocks", "events", "zones", "field"}),
+    "1": frozenset({*_BOTH, "records"}),
+    "2": frozenset({*_BOTH, "blocks", "block_dictionaries", "valve_changes", "link_stats"}),
 }
+# Without these `meta` says too little of a flight.
+_NEEDED = frozenset({"closed", "lost", "setup", "started_s", "started_utc"})
+# Of a journal of another version, what its refusal says: the rest is for `flights show`.
+_SHOWN = {"started_utc": "begun", "closed": "closed", "training": "training", "method": "method"}
 
 
-class OtherVersionError(JournalError):
+class OtherVersionError(UnreadableError):
     """A journal of a version that this program does not know: only `meta` can be read."""
 
     def __init__(self, text: str, meta: Mapping[str, str]) -> None:
@@ -35,20 +41,71 @@ def check_version(
 ) -> str:
     """Return the version of a journal; a JournalError where it is none, or none that is known.
 
-    `is_lenient` allows that tables are missing.
+    `is_lenient` allows that tables are missing, and the version too: then the tables tell it.
     """
-    version = meta.get("journal_version")
-    if version is None:
-        raise JournalError(f"{name}: is a GeoPackage, but no journal of a flight")
-    if version not in _TABLES:
+    check_kind(name, tables, is_geopackage=True)
+    told = meta.get("journal_version")
+    if _is_later(told):
         raise OtherVersionError(
-            f"{name}: is a journal of version {version}, this program reads versions "
-            f"{' and '.join(_TABLES)}; {_advice(meta.get('version_vrspray'))}",
+            f"{name}: is a journal of version {told}, this program reads versions "
+            f"{' and '.join(_TABLES)}; {_advice(meta.get('version_vrspray'))}{_said(meta)}",
             meta,
         )
-    if not is_lenient and missing_tables(version, tables):
-        raise JournalError(f"{name}: is a GeoPackage, but no journal of a flight")
+    if told in _TABLES:
+        version = str(told)
+    elif is_lenient:
+        version = "1" if "records" in tables else JOURNAL_VERSION
+    else:
+        raise UnreadableError(f"{name}: is damaged: {_no_version(told)}")
+    missing = missing_tables(version, tables)
+    if missing and not is_lenient:
+        raise UnreadableError(f"{name}: is damaged: the table {missing[0]} is missing")
     return version
+
+
+def check_said(meta: Mapping[str, str]) -> None:
+    """Refuse a journal that does not say what every flight does."""
+    missing = sorted(_NEEDED - meta.keys())
+    if missing:
+        raise ValueError(f"what the flight said of {missing[0]} is missing")
+
+
+def as_far_as_said(
+    meta: Mapping[str, str], version: str, tables: Collection[str]
+) -> tuple[dict[str, str], list[str]]:
+    """Return `meta` of a damaged journal so that it can be worked with, and what it lacks."""
+    told = meta.get("journal_version")
+    unread = [f"the table {table} is missing" for table in missing_tables(version, tables)]
+    if told != version:
+        unread.append(f"{_no_version(told)}; by its tables it is of version {version}")
+    unread += [f"what the flight said of {key} is missing" for key in sorted(_NEEDED - meta.keys())]
+    found = {**meta, "journal_version": version}
+    try:
+        int(found.setdefault("lost", "0"))
+    except ValueError:
+        unread.append("what the flight said of lost is no number")
+        found["lost"] = "0"
+    try:
+        return migrated(found), unread
+    except (ValueError, TypeError, LookupError):
+        # Said above, or by whoever wants a time of day.
+        return {"utc_source": "computer", **found}, unread
+
+
+def _is_later(version: str | None) -> bool:
+    """Whether a version is a number, and one that comes after those that are known."""
+    text = str(version)
+    return text.isdecimal() and int(text) > int(JOURNAL_VERSION)
+
+
+def _no_version(told: str | None) -> str:
+    return "its version is missing" if told is None else f"its version ({str(told)[:20]}) is none"
+
+
+def _said(meta: Mapping[str, str]) -> str:
+    """Return what a journal says of itself as the end of a sentence."""
+    facts = [f"{word} {str(meta[key])[:40]}" for key, word in _SHOWN.items() if key in meta]
+    return f"; it says of itself: {', '.join(facts)}" if facts else ""
 
 
 def missing_tables(version: str, tables: Collection[str]) -> list[str]:

@@ -107,7 +107,15 @@ def test_a_person_reads_a_sentence_with_the_mark_of_a_training(
         (["--out", "f.gpx"], "no format is known by .gpx; there are .csv, "),
         (["--out", "folder"], "no format is known by a name without an end"),
         (["--out", "f.csv", "--format", "gpx"], "there is no format 'gpx'; there are csv, "),
-        (["--out", "f.csv", "--format", "kml"], "kml is written with the name's end .kml, .kmz"),
+        (
+            ["--out", "f.csv", "--format", "kml"],
+            "kml is written into a file whose name ends in .kml or .kmz",
+        ),
+        (
+            ["--out", "f.csv", "--format", "isoxml"],
+            "isoxml is written into a folder (a name without a dot) or into a file whose name ends "
+            "in .zip",
+        ),
         (["--out", "f.mcap", "--units", "us"], "mcap has units of its own"),
         (["--out", "f.csv", "--units", "imperial"], "there are metric and us"),
         (["--out", "f.csv", "--geometry", "swaths"], "csv has points"),

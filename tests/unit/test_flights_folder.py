@@ -129,10 +129,11 @@ def test_a_pin_is_a_file_beside_and_the_flight_is_not_touched(folder: Path) -> N
 
 
 def test_a_log_beside_a_flight_goes_with_it(folder: Path) -> None:
-    log = folder / "flight-0001.gpkg-wal"
-    log.write_bytes(b"")
+    logs = [folder / f"flight-0001.gpkg-wal{end}" for end in ("", ".damaged")]
+    for log in logs:
+        log.write_bytes(b"")
     assert numbers(prune(folder, Rules(free_percent=None, count=2), now_utc_s=0.0)) == [1]
-    assert not log.exists()
+    assert not any(log.exists() for log in logs)
 
 
 def test_what_is_pinned_meanwhile_is_neither_removed_nor_listed(

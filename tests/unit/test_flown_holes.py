@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.evaluation import evaluate
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import record_of
 from analysis.flown.holes import Hole, change_holes, closed_over, doubtful_holes, sample_holes
@@ -98,6 +99,29 @@ def test_missing_rows_are_noticed_and_make_no_spray(
     assert flight.lost > 0
     assert any("no spray is counted there" in each for each in unread)
     assert litres(flight) < 0.999 * litres(read_applied(journal))
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "DELETE FROM valve_changes WHERE id > (SELECT max(id) / 2 FROM valve_changes)",
+        "DELETE FROM valve_changes WHERE id < (SELECT max(id) / 2 FROM valve_changes)",
+        "DELETE FROM valve_changes WHERE id % 40 > 20",
+        "DELETE FROM applied WHERE sequence % 400 > 300",
+    ],
+)
+def test_missing_rows_make_no_lag_and_no_missed_change(
+    sql: str, journal: Path, damaged: Callable[[str], Path]
+) -> None:
+    sound = evaluate(record_of(read_applied(journal)))
+    record = record_of(read_applied(damaged(sql)))
+    found = evaluate(record)
+    assert record.unknown
+    assert record_of(read_applied(journal)).unknown == ()
+    assert found.missed <= sound.missed
+    worst, sound_worst = found.lag_distance_m, sound.lag_distance_m
+    assert sound_worst is not None
+    assert worst is None or worst.max_abs <= sound_worst.max_abs + 0.01
 
 
 @pytest.mark.parametrize(

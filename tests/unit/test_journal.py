@@ -485,7 +485,7 @@ BROKEN = {
         "journal of version 9, this program reads versions 1 and 2",
     ),
     "other database": (lambda path: change(path, "PRAGMA application_id = 5"), "is no journal"),
-    "other geopackage": (lambda path: change(path, "DROP TABLE blocks"), "no journal of a flight"),
+    "no blocks": (lambda path: change(path, "DROP TABLE blocks"), "the table blocks is missing"),
     "set-up": (
         lambda path: change(path, "UPDATE meta SET value = '{}' WHERE key = 'setup'"),
         "is damaged",

@@ -112,7 +112,7 @@ def test_what_cannot_be_done_is_refused_in_one_line(
     assert captured.out == ""
     assert len(errors) == 1
     assert text in errors[0]
-    assert not (tmp_path / "report" / "report.html").exists()
+    assert not (tmp_path / "report").exists()
 
 
 def test_report_has_help_with_an_example(capsys: Captured) -> None:

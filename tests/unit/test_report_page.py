@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from analysis.assess.assessment import assess
+from analysis.assess.causes import Cause
 from analysis.assess.histogram import Histogram
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report
@@ -23,7 +24,7 @@ from analysis.report.figures.spread import histogram
 from analysis.report.page import embedded, page_of
 from analysis.report.told import told_with
 from analysis.report.treated import treated_of
-from analysis.report.words import held_between
+from analysis.report.words import held_between, held_ground
 from companion.record.writer import Event
 from tests.unit.report_flight import EU_TOLD, fly
 
@@ -293,6 +294,24 @@ def test_only_what_held_during_the_work_is_a_warning(journal: Path) -> None:
 
     assert held(flight.time_s[0], treated.first_s - 0.1) == {}
     assert held(middle_s, middle_s + 1.0)["fix-too-low"] == pytest.approx(1.0, abs=0.2)
+
+
+def test_ground_that_was_flown_over_closed_is_a_warning_with_its_reasons(journal: Path) -> None:
+    assessment = assess(read_applied(journal))
+    causes = assessment.causes
+
+    def said(share: float, **by_inhibit: float) -> list[str]:
+        area_m2 = {**causes.by_cause, Cause.INHIBIT: share * causes.judged_m2}
+        reasons = {name.replace("_", "-"): each for name, each in by_inhibit.items()}
+        held = replace(assessment, causes=replace(causes, by_cause=area_m2, by_inhibit=reasons))
+        return [each.text for each in held_ground(held)]
+
+    (text,) = said(0.5, output_fault=2.0, rearm_needed=70.0)
+    assert text.endswith("with the valves held closed: rearm-needed 70 m2, output-fault 2 m2.")
+    assert said(0.009, rearm_needed=1.0) == []
+    # Of missing rows other warnings tell.
+    assert said(0.5, unread=70.0) == []
+    assert list(held_ground(None)) == []
 
 
 def test_lost_rows_and_a_cut_are_warnings(journal: Path) -> None:

@@ -1,0 +1,173 @@
+"""The log beside a journal, read without SQLite: which frames count, and what lies behind damage.
+
+After https://www.sqlite.org/fileformat2.html, section 4. A frame counts where it has the salts of
+the log's header, and its check sum follows from the frame before; SQLite takes all up to the last
+commit before the first frame that does not.
+
+A cut of power tears the end of a log in the ordinary way: of the transaction that was being
+written, some pages reach the disk and others do not, in any order; its commit may have come and a
+page before it not. But no transaction begins before the one before is on the disk (`synchronous =
+FULL`). So a commit behind the first bad frame that yet another frame follows was once safe, and
+the log is damaged. Damage within the very last transaction looks like an ordinary cut.
+"""
+
+from __future__ import annotations
+
+import struct
+import sys
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+_MAGIC = 0x377F0682  # its last bit: the words of the check sums are big-endian
+_VERSION = 3_007_000
+_HEADER = struct.Struct(">IIIIIIII")
+_FRAME = struct.Struct(">IIIIII")
+_PAGE_BYTES = frozenset(2**power for power in range(9, 17))
+_WORD = 0xFFFFFFFF
+
+Sums = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A page in the log: its number, where its content begins, and whether it is a commit."""
+
+    page: int
+    at: int
+    is_commit: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Log:
+    """What is in a log: the frames of whole transactions, and whole ones behind damage.
+
+    `damage_at` is the first byte of the first bad frame where the log goes on behind it; None for
+    a log that is whole, or torn at its end by a cut.
+    """
+
+    content: bytes
+    page_bytes: int
+    counted: tuple[Frame, ...] = ()
+    behind: tuple[Frame, ...] = ()
+    damage_at: int | None = None
+
+    def page(self, frame: Frame) -> bytes:
+        """Return the content of a frame."""
+        return self.content[frame.at : frame.at + self.page_bytes]
+
+
+def read_log(path: Path, page_bytes: int) -> Log:
+    """Return what a log holds; nothing where there is none. `page_bytes`: those of the journal."""
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        content = b""
+    return log_from(content, page_bytes)
+
+
+def log_from(content: bytes, page_bytes: int) -> Log:
+    """Return what a log holds that lies in memory."""
+    salts, sums, is_big = _begun(content, page_bytes)
+    counted: list[Frame] = []
+    at, step = _HEADER.size, _FRAME.size + page_bytes
+    is_good = salts is not None
+    while is_good and at + step <= len(content):
+        found = _frame(content, at, page_bytes, salts, sums, is_big=is_big)
+        if found is None:
+            break
+        frame, sums = found
+        counted.append(frame)
+        at += step
+    behind = _behind(content, at, page_bytes, salts, is_big=is_big)
+    commits = [number for number, frame in enumerate(behind) if frame.is_commit]
+    is_damaged = bool(commits) and commits[0] < len(behind) - 1
+    return Log(
+        content=content,
+        page_bytes=page_bytes,
+        counted=_up_to_commit(counted),
+        behind=_up_to_commit(behind) if is_damaged else (),
+        damage_at=(at if is_good else 0) if is_damaged else None,
+    )
+
+
+def _begun(content: bytes, page_bytes: int) -> tuple[Sums | None, Sums, bool]:
+    """Return the salts of the header, its check sums, their order; no salts: it is damaged."""
+    is_big = sys.byteorder == "big"
+    if len(content) < _HEADER.size:
+        return None, (0, 0), is_big
+    magic, version, log_page_bytes, _, *salts, first, second = _HEADER.unpack_from(content)
+    if magic | 1 != _MAGIC | 1 or version != _VERSION or log_page_bytes != page_bytes:
+        return None, (0, 0), is_big
+    is_big = bool(magic & 1)
+    if summed(content[: _HEADER.size - 8], (0, 0), is_big=is_big) != (first, second):
+        return None, (0, 0), is_big
+    return (salts[0], salts[1]), (first, second), is_big
+
+
+def _frame(
+    content: bytes, at: int, page_bytes: int, salts: Sums | None, sums: Sums, *, is_big: bool
+) -> tuple[Frame, Sums] | None:
+    """Return the frame there and its check sums; None where it does not follow from `sums`.
+
+    Without `salts` any will do.
+    """
+    page, pages, *has, first, second = _FRAME.unpack_from(content, at)
+    if not page or (salts is not None and tuple(has) != salts):
+        return None
+    begin = at + _FRAME.size
+    sums = summed(content[at : at + 8], sums, is_big=is_big)
+    sums = summed(content[begin : begin + page_bytes], sums, is_big=is_big)
+    return (Frame(page, begin, bool(pages)), sums) if sums == (first, second) else None
+
+
+def _behind(
+    content: bytes, bad_at: int, page_bytes: int, salts: Sums | None, *, is_big: bool
+) -> list[Frame]:
+    """Return the good frames behind a bad one, of its log.
+
+    The check sum of a frame follows from that in the header of the one before, of which no more
+    has to be whole.
+    """
+    found: list[Frame] = []
+    step = _FRAME.size + page_bytes
+    for at in range(bad_at + step, len(content) - step + 1, step):
+        before = _FRAME.unpack_from(content, at - step)
+        has = _FRAME.unpack_from(content, at)[2:4]
+        # Behind the end of a log lies, as a rule, what an earlier one left: other salts.
+        if before[2:4] != has or (salts is not None and has != salts):
+            continue
+        good = _frame(content, at, page_bytes, has, before[4:6], is_big=is_big)
+        if good is not None:
+            found.append(good[0])
+    return found
+
+
+def _up_to_commit(frames: list[Frame]) -> tuple[Frame, ...]:
+    """Return the frames without those of a transaction that has no commit."""
+    commits = [number for number, frame in enumerate(frames, 1) if frame.is_commit]
+    return tuple(frames[: commits[-1]]) if commits else ()
+
+
+def summed(data: bytes, sums: Sums, *, is_big: bool) -> Sums:
+    """Return the check sums after some more data, a multiple of eight bytes.
+
+    >>> summed(bytes([1, 0, 0, 0, 2, 0, 0, 0]), (0, 0), is_big=False)
+    (1, 3)
+    """
+    words = array("I", data)
+    if is_big != (sys.byteorder == "big"):
+        words.byteswap()
+    first, second = sums
+    each = iter(words)
+    for word, following in zip(each, each, strict=True):
+        first = (first + word + second) & _WORD
+        second = (second + following + first) & _WORD
+    return first, second
+
+
+def newest(log: Log) -> Iterator[Frame]:
+    """Yield all good frames of whole transactions, the last written first."""
+    yield from reversed(log.behind)
+    yield from reversed(log.counted)
