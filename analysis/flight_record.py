@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from companion.core.boom import Boom, Valve
 
 if TYPE_CHECKING:
+    from analysis.spans import Spans
     from companion.core.lines import Lines
     from companion.core.nozzle import NozzleSet
     from companion.core.prescription import Prescription
@@ -67,7 +68,7 @@ class FlightRecord:
     duty_limits: tuple[float, float] = (0.0, 1.0)
     nozzle_sets: tuple[NozzleSet, ...] = ()
     lines: Lines | None = None
-    unknown: tuple[tuple[tuple[float, float], ...], ...] = ()
+    unknown: tuple[Spans, ...] = ()
 
     def __post_init__(self) -> None:
         samples = len(self.time_s)

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from analysis.spans import joined
 from analysis.transitions import LEVEL_FROM, LEVEL_TO, ML_M_PER_L_HA_M, Sides
 
 if TYPE_CHECKING:
@@ -109,14 +110,8 @@ def with_unknown(holds: Sequence[Hold], unknown: Sequence[tuple[float, float]]) 
     """Return the holds and the times of which nothing is known, in order and apart."""
     if not unknown:
         return tuple(holds)
-    every = [*((hold.start_s, hold.end_s) for hold in holds), *unknown]
-    found: list[Hold] = []
-    for start_s, end_s in sorted(every):
-        if found and start_s <= found[-1].end_s:
-            last = found.pop()
-            start_s, end_s = last.start_s, max(last.end_s, end_s)
-        found.append(Hold(start_s=start_s, end_s=end_s))
-    return tuple(found)
+    every = joined([*((hold.start_s, hold.end_s) for hold in holds), *unknown])
+    return tuple(Hold(start_s=start_s, end_s=end_s) for start_s, end_s in every)
 
 
 def sides_of(smooth: SmoothTrack, stretches: Sequence[Run], holds: Sequence[Hold]) -> list[Sides]:

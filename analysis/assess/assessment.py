@@ -17,6 +17,7 @@ from analysis.evaluation import Evaluation, evaluate_strips
 from analysis.flow_accuracy import flow_samples
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
 from analysis.flown.modelled_flow import ordered_s
+from analysis.flown.unknown import GAP_S
 from analysis.strips import Strip, strips_of
 
 if TYPE_CHECKING:
@@ -24,9 +25,6 @@ if TYPE_CHECKING:
 
     from analysis.flight_record import FlightRecord
     from analysis.flown.applied_flight import AppliedFlight, Floats
-
-# Longer than this between two decisions nobody knows what the sprayer did.
-GAP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,13 +14,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.spans import Spans
 from companion.core.controller import Setup
 from companion.record.writer import Event
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-# (from, until) in seconds.
-Spans = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,10 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from analysis.flown.applied_flight import Floats, Spans, ValveChanges
+from analysis.flown.applied_flight import Floats, ValveChanges
 from analysis.flown.holes import Hole
+from analysis.spans import Spans, joined
 
-# Samples farther apart are no way that anyone has seen.
+# Longer than this between two samples nobody knows what the sprayer did.
 GAP_S = 1.0
 _INF = float("inf")
 
@@ -49,17 +50,6 @@ def with_gaps(unknown: Sequence[Spans], time_s: Floats, *, valves: int) -> tuple
         return tuple(unknown)
     spans = [(float(time_s[i]), float(time_s[i + 1])) for i in gaps]
     return tuple(joined([*own, *spans]) for own in unknown or ((),) * valves)
-
-
-def joined(spans: Sequence[tuple[float, float]]) -> Spans:
-    """Return the spans in order and apart."""
-    found: list[tuple[float, float]] = []
-    for begin_s, end_s in sorted(spans):
-        if found and begin_s <= found[-1][1]:
-            found[-1] = (found[-1][0], max(found[-1][1], end_s))
-        else:
-            found.append((begin_s, end_s))
-    return tuple(found)
 
 
 def _next_s(at_s: Floats, from_s: float) -> float:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from analysis.assess.causes import Cause
 from analysis.assess.rate_wishes import rate_wishes
 from analysis.flown.holes import UNREAD
+from analysis.flown.unknown import GAP_S
 from analysis.report.clock import duration_text
 from companion.core.types import Inhibit
 
@@ -42,8 +43,6 @@ METER_OFF_PERCENT = 6.0
 # More of the ground than this is not flown over closed by the way.
 HELD_SHARE = 0.01
 UNKNOWN = "Nothing can be said of what was sprayed: too little of the journal can be read."
-# Longer than this between two samples nobody knows what held.
-GAP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
