@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from analysis.report.folder import check_folder
 from analysis.wsp.card import INSET_MM, Method
 from analysis.wsp.figure import draw_distributions
 from analysis.wsp.flown_journal import Flown, read_flown
@@ -90,7 +91,7 @@ def measure_cards(
     )
     places = [] if positions is None else read_positions(positions)
     flown = Flown() if journal is None else read_flown(journal)
-    _make(out)
+    check_folder(out)
     sheets, pictures, refused = _read_all(images, reading, out)
     cards = numbered(sheets)
     ties, notes = _ties(cards, places, flown)
@@ -150,6 +151,8 @@ def _read_all(
 
 def _written(path: Path, draw: Callable[[Path], None]) -> None:
     try:
+        # Not before there is something to write: what is refused leaves no folder.
+        path.parent.mkdir(parents=True, exist_ok=True)
         draw(path)
     except OSError as error:
         raise ConfigError(f"--out: {path} cannot be written ({error.strerror or error})") from error
@@ -235,13 +238,6 @@ def _within(name: str, value: float | None, low: float, high: float) -> float | 
     if value is not None and not low <= value <= high:
         raise ConfigError(f"{name} {value:g}: give {low:g} to {high:g}")
     return value
-
-
-def _make(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out {out}: cannot be made ({error.strerror or error})") from error
 
 
 def _write(text: str, path: Path) -> None:

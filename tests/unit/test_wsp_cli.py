@@ -166,6 +166,16 @@ def test_a_sheet_without_cards_is_a_problem(
     assert "--whole" in err
 
 
+def test_what_is_refused_leaves_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "page.md").write_text("no picture")
+    out = tmp_path / "made" / "out"
+    assert execute(["wsp", str(tmp_path / "page.md"), "--out", str(out)]) == 2
+    assert "is no image" in capsys.readouterr().err
+    assert not out.parent.exists()
+
+
 def test_one_bad_file_of_two_is_told_and_the_other_measured(
     scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
