@@ -96,9 +96,11 @@ def follow(
 
 def _heard(memory: WatchMemory, report: FlowReport | None, now_s: float) -> float:
     """Return when the meter was last sound; before its first word from the first step on."""
-    if report is None or not 0.0 <= now_s - report.received_s <= STALE_S:
-        return now_s if memory.heard_s == -math.inf else memory.heard_s
-    return report.received_s if math.isfinite(report.volume_ml) else memory.heard_s
+    if memory.heard_s == -math.inf:
+        return now_s
+    if report is None or not math.isfinite(report.volume_ml):
+        return memory.heard_s
+    return max(memory.heard_s, min(report.received_s, now_s))
 
 
 def _enabled(memory: WatchMemory, state: VehicleState) -> WatchMemory:

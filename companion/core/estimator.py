@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from companion.core.clock import Clock, tick
+from companion.core.clock import Clock, on_time_s, tick
 from companion.core.frozen import Stand, look
 from companion.core.leg import Approach, Leg, approach, learned, leg_of, stop_ahead, way_of
 from companion.core.motion import BRIDGED_MAX_S, Axis
@@ -86,6 +86,7 @@ class Track:
     range: RangeReport | None = None
     output: OutputReport | None = None
     flow: FlowReport | None = None
+    counted: FlowReport | None = None  # the autopilot's, until the next position dates it
     pressure: PressureReport | None = None
     tank: TankReport | None = None
     leg: Leg | None = None
@@ -140,12 +141,23 @@ _KEEP: dict[type, Callable[[Track, Any], Track]] = {
 
 
 def _observe_battery(track: Track, item: BatteryReport, setup: Setup) -> Track:
-    """Take a flow meter or a level that the autopilot reads as one of its batteries."""
+    """Take a flow meter or a level that the autopilot reads as one of its batteries.
+
+    A count has no time of its own: it waits for the next position, which tells how late it came.
+    """
     wiring = setup.autopilot_liquid
     if wiring is None:
         return track
     flow, tank = wiring.flow(item), wiring.tank(item)
-    return replace(track, flow=flow or track.flow, tank=tank or track.tank)
+    return replace(track, counted=flow or track.counted, tank=tank or track.tank)
+
+
+def _dated(track: Track, clock: Clock) -> FlowReport | None:
+    """Return the flow meter's newest count, as old as it is by the positions around it."""
+    counted = track.counted
+    if counted is None:
+        return track.flow
+    return replace(counted, received_s=on_time_s(counted.received_s, track.clock, clock))
 
 
 def _observe_heartbeat(track: Track, item: HeartbeatReport, setup: Setup) -> Track:
@@ -268,6 +280,8 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         track,
         motion=motion,
         clock=clock,
+        flow=_dated(track, clock),
+        counted=None,
         stand=stand,
         position_valid=motion.confirm_left == 0,
         position_received_s=item.received_s,

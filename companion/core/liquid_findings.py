@@ -20,7 +20,10 @@ Findings = tuple[Finding, ...]
 # Fewer bins than this have no name yet; so many of nothing are no flow (5 of 0.27 s: 1.4 s).
 BINS_NAMED = 4
 NOTHING_S = 1.3
-CLOSED_BINS = 4
+# While closed: so many bins after the first with liquid in it, the last two with liquid as well.
+# What closed late leaves its end in the first ones; a fault that begins fills the first in part.
+CLOSED_BINS = 3
+CLOSED_LAST_BINS = 2
 # Further from the table than this nothing is sprayed, whatever it is.
 FAR_SHARE = 0.25
 # Without a sound word of the meter for this long, while valves are open, it is silent.
@@ -109,12 +112,13 @@ def told_apart(watching: Watching, memory: WatchMemory) -> WatchMemory:
 
 def of_closed(watching: Watching, memory: WatchMemory) -> WatchMemory:
     """Return the memory with what is metered while every valve is closed."""
-    bins = memory.closed
+    tolerated_ml_s = watching.law.closed_share * watching.full_ml_s
+    wet = (i for i, each in enumerate(memory.closed) if _flow([each], memory.gain) > tolerated_ml_s)
+    bins = memory.closed[next(wet, len(memory.closed)) + 1 :]
     if len(bins) < CLOSED_BINS or not watching.law.closed_check:
         return memory
-    length_s = bins[-1].end_s - bins[0].begin_s
-    flow_ml_s = math.fsum(each.metered_ml for each in bins) / length_s / memory.gain
-    if flow_ml_s <= watching.law.closed_share * watching.full_ml_s:
+    flow_ml_s, last_ml_s = _flow(bins, memory.gain), _flow(bins[-CLOSED_LAST_BINS:], memory.gain)
+    if not (flow_ml_s > tolerated_ml_s and last_ml_s > tolerated_ml_s):
         return memory
     is_valve = 0.8 <= flow_ml_s / watching.open_ml_s <= 1.2
     kind = FaultKind.STUCK_OPEN if is_valve else FaultKind.LEAK
@@ -125,6 +129,12 @@ def of_closed(watching: Watching, memory: WatchMemory) -> WatchMemory:
         valve = _valve(watching, memory, together, is_open=True)
     found = Finding(kind=kind, at_s=bins[-1].end_s, text=text, valve=valve)
     return _named(memory, found, is_sure=True)
+
+
+def _flow(bins: Sequence[Bin], gain: float) -> float:
+    """Return the mean flow in bins that follow each other, mL/s."""
+    length_s = bins[-1].end_s - bins[0].begin_s
+    return math.fsum(each.metered_ml for each in bins) / length_s / gain
 
 
 def of_sensors(

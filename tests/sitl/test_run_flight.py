@@ -8,6 +8,8 @@ import signal
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
 
 import pytest
 
@@ -17,7 +19,7 @@ from companion.errors import LinkError
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import ServoExecutor, ServoOptions
-from companion.runtime import execute, run
+from companion.runtime import STEP_MAX_S, execute, run
 from tests import builders
 from tests.sitl.wire_peer import TcpHost, WirePeer, free_port, over_udp
 
@@ -426,7 +428,9 @@ def test_the_precise_loop_runs_it_and_gives_the_result_back() -> None:
     assert scribe.calls[-2:] == ["stop", "close"]
 
 
-async def test_without_news_a_step_follows_every_twentieth_of_a_second() -> None:
+async def test_without_news_a_step_follows_after_the_longest_wait() -> None:
     scribe, notes = Scribe(), Notes()
-    await run(SETUP, link=scribe, executor=scribe, recorder=notes, duration_s=0.5)
-    assert 9 <= len(notes.decisions) <= 12
+    await run(SETUP, link=scribe, executor=scribe, recorder=notes, duration_s=1.0)
+    gaps_s = [b.now_s - a.now_s for a, b in pairwise(notes.decisions)]
+    # A busy computer makes some of them late; what was asked for shows in most.
+    assert median(gaps_s) == pytest.approx(STEP_MAX_S, abs=0.005)

@@ -61,6 +61,8 @@ class Rig:
     enabled: bool = True
     tank: TankReport | None = None
     fault: str = ""
+    order_late_s: float = 0.0
+    count_late_s: float = 0.0
     now_s: float = 100.0
     seed: int = 1
 
@@ -87,11 +89,13 @@ class Rig:
 
     def step(self) -> None:
         self.now_s += STEP_S
-        delayed = [duty for at_s, duty in self.past if at_s <= self.now_s - 0.115]
+        lag_s = 0.115 + self.order_late_s
+        delayed = [duty for at_s, duty in self.past if at_s <= self.now_s - lag_s]
         duty = delayed[-1] if delayed else (0.0,) * 6
         factor = self.gain * (1.0 + self.noise * self.chance.gauss(0.0, 1.0))
         self.ml += max(self.flow_ml_s(duty) * STEP_S * factor, 0.0)
-        flow = FlowReport(received_s=self.now_s, volume_ml=NAN if self.fault else self.ml)
+        counted_s = self.now_s - self.count_late_s
+        flow = FlowReport(received_s=counted_s, volume_ml=NAN if self.fault else self.ml)
         mean = sum(duty) / 6.0
         kpa = (164.0 + 126.0 * mean) * self.pressure
         state = replace(
@@ -278,6 +282,23 @@ def test_what_the_lags_leave_after_closing_is_no_leak() -> None:
     assert not rig.memory.findings
 
 
+@pytest.mark.parametrize("late_s", [0.3, 0.6, 0.9])
+def test_valves_that_were_told_late_to_close_are_no_leak(late_s: float) -> None:
+    rig = healthy()
+    rig.order_late_s, rig.duty = late_s, (0.0,) * 6
+    assert not rig.run(6.0).memory.findings
+
+
+@pytest.mark.parametrize("begin_s", [1.0, 1.1, 1.2, 1.3])
+def test_a_valve_that_opens_while_all_is_closed_is_no_small_leak(begin_s: float) -> None:
+    rig = healthy()
+    rig.duty = (0.0,) * 6
+    assert not rig.run(begin_s).memory.findings
+    rig.stuck_open = {2}
+    assert rig.until_found(3.0) <= 1.6
+    assert rig.kinds == [FaultKind.STUCK_OPEN]
+
+
 def test_a_meter_before_the_return_valve_says_nothing_while_closed() -> None:
     rig = healthy(law=Detection(closed_check=False))
     rig.duty, rig.leak_ml_s = (0.0,) * 6, 50.0
@@ -380,6 +401,12 @@ def test_a_silent_meter_is_said_and_closes_where_it_is_required() -> None:
     assert 1.4 <= rig.until_found() <= 2.1
     assert rig.kinds == [FaultKind.METER_FAULT]
     assert rig.memory.latched == {Inhibit.FLOW_FAULT}
+
+
+def test_a_meter_whose_counts_come_late_is_not_silent() -> None:
+    rig = healthy(law=replace(LAW, meter_required=True))
+    rig.count_late_s = 1.0
+    assert not rig.run(5.0).memory.findings
 
 
 def test_a_latch_holds_until_the_operator_disables() -> None:

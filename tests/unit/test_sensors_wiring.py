@@ -24,7 +24,7 @@ from companion.ports import Sensor
 from companion.sensors.flow_meter import FlowMeter
 from companion.sensors.pressure import PressureSensor
 from companion.sensors.tank import TankSensor
-from tests.builders import setup
+from tests.builders import position, setup
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang" / "config.toml"
 METER = ["flow_meter.source=gpio", "flow_meter.line=24", "flow_meter.pulses_per_l=4600.0"]
@@ -108,16 +108,55 @@ def test_flow_meter_and_tank_of_the_autopilot_are_its_batteries() -> None:
     track = observe(Track(), battery(0, 100.0, 50.0), over)
     assert (track.flow, track.tank) == (None, None)
     track = observe(track, battery(1, 4711.0, None), over)
+    assert track.flow is None  # until a position tells how late it came
+    track = observe(track, position(5.05, 0.0, 0.0), over)
     assert track.flow == FlowReport(received_s=5.0, volume_ml=4711.0)
     track = observe(track, battery(2, None, 25.0), over)
     assert track.tank is not None
     assert track.tank.level_l == 10.0
     assert track.flow == FlowReport(received_s=5.0, volume_ml=4711.0)
-    track = observe(track, battery(1, None, None), over)
+    track = observe(observe(track, battery(1, None, None), over), position(5.1, 0.25, 0.0), over)
     assert track.flow is not None
     assert math.isnan(track.flow.volume_ml)
     assert track.flow.fault
-    assert observe(Track(), battery(1, 1.0, 1.0), setup()).flow is None
+    assert observe(track, battery(1, 1.0, 1.0), setup()).counted is None
+
+
+@pytest.mark.parametrize(("from_s", "until_s"), [(21.0, 21.7), (21.04, 21.4), (20.9, 21.85)])
+def test_a_count_that_a_link_held_back_is_as_old_as_the_positions_around_it(
+    from_s: float, until_s: float
+) -> None:
+    """Between `from_s` and `until_s` nothing comes; then all of it does, in its order."""
+    over = setup(autopilot_liquid=AutopilotLiquid(flow_battery=1))
+
+    def arrival_s(sent_s: float) -> float:
+        return until_s if from_s <= sent_s < until_s else sent_s
+
+    track, dated = Track(), dict[float, float]()
+    for turn in range(260):
+        sent_s = 10.0 + turn / 20.0
+        sent = position(arrival_s(sent_s), 5.0 * sent_s, 0.0, boot_s=sent_s)
+        track = observe(track, sent, over)
+        if track.flow is not None:
+            assert track.flow.received_s <= sent.received_s
+            dated[track.flow.volume_ml] = track.flow.received_s
+        if turn % 4 == 3:
+            counted_s = sent_s + 0.02
+            count = BatteryReport(
+                received_s=arrival_s(counted_s),
+                battery=1,
+                consumed=100.0 * counted_s,
+                remaining_percent=None,
+            )
+            track = observe(track, count, over)
+    assert len(dated) == 64
+    times = list(dated.values())
+    assert times == sorted(set(times))
+    for volume_ml, at_s in dated.items():
+        # Half an interval of the positions, and what the mean of the arrivals gave way.
+        assert at_s == pytest.approx(volume_ml / 100.0, abs=0.035)
+    calm = [abs(at_s - ml / 100.0) for ml, at_s in dated.items() if ml < 100.0 * (from_s - 0.05)]
+    assert max(calm) < 1e-6
 
 
 def test_batteries_are_asked_for_where_one_is_a_meter() -> None:
