@@ -33,6 +33,7 @@ from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_budget import dither_too_much
 from companion.output.servo import DITHER_S
 from companion.ports import PlanExecutor
+from companion.record.commit_pace import commit_every_s
 from companion.record.continuing import continued
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
@@ -99,13 +100,16 @@ def run_companion(
         note(line)
     for line in _left_lines(folder, setup, training):
         note(line)
+    commit_s = config.journal.commit_s or commit_every_s(
+        setup, None if config.mission is None else config.mission.speed_m_s
+    )
     journal = Journal.create(
         folder,
         setup=setup,
         setup_text=_about(config, given),
         training=training,
         free_min_bytes=FREE_MIN_BYTES,
-        commit_every_s=config.journal.commit_s,
+        commit_every_s=commit_s,
     )
     follow(journal, link, executor)
     notifier = Notifier.from_environment(os.environ, pid=os.getpid())
@@ -121,7 +125,7 @@ def run_companion(
                     duration_s=duration_s,
                     on_step=notifier.stepped,
                     record_fault=(lambda: journal.fault) if config.journal.required else None,
-                    commit_every_s=config.journal.commit_s,
+                    commit_every_s=commit_s,
                 )
             )
     except (ActuatorError, LinkError, SensorError):

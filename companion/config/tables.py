@@ -333,11 +333,12 @@ class JournalTable(Table):
     required: bool = Field(
         default=True, description="true: a flight does not begin to spray without its record"
     )
-    commit_s: float = Field(
-        default=1.0,
+    commit_s: float | None = Field(
+        default=None,
         ge=0.1,
         le=1.0,
-        description="between two commits, what a cut of power may lose; less wears the card",
+        description="between two commits, what a cut of power may lose; absent: 1, "
+        "less on fields below about 1.5 ha",
     )
     keep_free_percent: float = Field(
         default=10.0,

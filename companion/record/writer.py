@@ -1,7 +1,8 @@
 """The journal's side of the disk: owns the connection, lives in its own thread.
 
-One commit a second, so that a cut of power costs a second. Whatever the disk does, it does to
-this thread: a failure costs the rows of that second, is counted, and the next second is tried anew.
+One commit a second, or sooner where it is told so, so that a cut of power costs a second. Whatever
+the disk does, it does to this thread: a failure costs the rows of that second, is counted, and the
+next second is tried anew.
 """
 
 from __future__ import annotations

@@ -27,6 +27,7 @@ from companion.core.overlap_guard import OverlapGuard
 from companion.core.swath import expected
 from companion.core.types import Input, OperatorCommand, VehicleState
 from companion.ports import COMMIT_EVERY_S
+from companion.record.commit_pace import commit_every_s
 from companion.record.continuing import SWITCH_OFF_PERCENT
 from companion.runtime import COVERAGE_EVERY_S, coverage_ahead_s
 from sitl.demo_field import START_S, demo_route
@@ -301,7 +302,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--flights", type=int, default=40)
     parser.add_argument("--large", type=int, default=0, help="cuts on 3.9 ha, a minute each")
-    parser.add_argument("--commit-s", type=float, default=COMMIT_EVERY_S, help="journal.commit_s")
+    parser.add_argument("--commit-s", type=float, help="journal.commit_s; default: by the field")
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     is_met = True
@@ -309,7 +310,8 @@ def main() -> int:
         if not flights:
             continue
         ground = make()
-        cases = measured(ground, flights, seed=asked.seed, commit_every_s=asked.commit_s)
+        pace_s = asked.commit_s or commit_every_s(ground.setup, SPEED_M_S)
+        cases = measured(ground, flights, seed=asked.seed, commit_every_s=pace_s)
         print("\n".join(lines(ground, cases)))  # noqa: T201
         is_met &= all(case.percent <= TARGET_PERCENT for case in cases if case.kind in KINDS[:2])
     return 0 if is_met else 1
