@@ -25,6 +25,8 @@ setup: $(INSTALLED) ## the virtual environment, from the lock files
 demo: $(INSTALLED) ## fly the demo; pictures and figures in demo-out
 	$(BIN)/vrspray demo --out demo-out $(ARGS)
 
+# Each of the processes that tests start would else compile all it imports.
+test: export PYTHONDONTWRITEBYTECODE :=
 test: $(INSTALLED) ## all tests (ARGS="-k lag" for some; WORKERS=0 for one process)
 	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 

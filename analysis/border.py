@@ -140,7 +140,9 @@ def _contacts_s(
     # At an oblique border the strip's end goes over by ever more between the two; along a border
     # it stays where it is until the crossing.
     nearly_s = exact_s[both] + 0.9 * (grazing_s[both] - exact_s[both])
-    along = strip.track.wholly_inside(prescription, nearly_s, widen_m=-0.8 * GRAZE_M)
+    along = strip.track.wholly_inside(
+        prescription, strip.track.places(nearly_s), widen_m=-0.8 * GRAZE_M
+    )
     contacts_s = grazing_s.copy()
     contacts_s[both] = np.where(along, grazing_s[both], exact_s[both])
     return contacts_s
@@ -170,7 +172,7 @@ def _edges_s(
             marks.append(mark)
             beyond.append(mark + 1 if ahead else mark - 1)
     found[rows] = bisect(
-        lambda t: strip.track.wholly_inside(prescription, t, widen_m=widen_m),
+        lambda t: strip.track.wholly_inside(prescription, strip.track.places(t), widen_m=widen_m),
         marks_s[np.array(marks, dtype=np.int64)],
         marks_s[np.array(beyond, dtype=np.int64)],
     )
@@ -241,7 +243,7 @@ def held_by_border(strip: Strip, prescription: Prescription, steps: Sequence[Ste
             index = index[:: max(len(index) // 10, 1)]
             beside = np.abs(marks_s[index] - change.time_s) > (BESIDE_S if change.border else 0.0)
             clear = strip.track.wholly_inside(
-                prescription, marks_s[index[beside]], widen_m=CLEAR_M
+                prescription, strip.track.places(marks_s[index[beside]]), widen_m=CLEAR_M
             ).all()
         held = replace(step, verdict=Verdict.BORDER, lag_distance_m=None)
         found.append(step if clear else held)

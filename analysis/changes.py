@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.assess.zone_lookup import PIECE, lookup_of
-from analysis.track import Bools, Floats, Track, in_field
+from analysis.track import Bools, Floats, Places, Track, in_field
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -95,25 +95,25 @@ class _States:
         self.prescription = prescription
         self.lookup = lookup_of(prescription)
 
-    def at(self, time_s: Floats) -> Ints:
+    def at(self, places: Places) -> Ints:
         """Return the number of the state under the strip's centre."""
-        east_m, north_m = self.track.points(time_s)
-        inside = in_field(self.prescription, east_m, north_m) & self.track.on_line(time_s)
-        states = np.full(len(time_s), OUTSIDE)
-        index = np.flatnonzero(inside)
-        states[index] = self.lookup.keys(east_m[index], north_m[index])
+        inside = in_field(self.prescription, places.east_m, places.north_m)
+        index = np.flatnonzero(inside & self.track.on_line(places))
+        states = np.full(len(inside), OUTSIDE)
+        states[index] = self.lookup.keys(places.east_m[index], places.north_m[index])
         return states
 
-    def along(self, marks_s: Floats) -> Ints:
+    def along(self, marked: Places) -> Ints:
         """Return the states at all marks; where no edge is near, one of a piece says all."""
         if self.track.planned is not None:
-            return self.at(marks_s)
-        asked = np.ones(len(marks_s), dtype=np.bool_)
-        clear = np.flatnonzero(self.lookup.constant(*self.track.points(marks_s))) * PIECE
+            return self.at(marked)
+        count = len(marked.time_s)
+        asked = np.ones(count, dtype=np.bool_)
+        clear = np.flatnonzero(self.lookup.constant(marked.east_m, marked.north_m)) * PIECE
         asked[(clear[:, np.newaxis] + np.arange(1, PIECE)).ravel()] = False
-        which = np.maximum.accumulate(np.where(asked, np.arange(len(marks_s)), 0))
-        places = np.cumsum(asked) - 1
-        found: Ints = self.at(marks_s[asked])[places[which]]
+        which = np.maximum.accumulate(np.where(asked, np.arange(count), 0))
+        numbers = np.cumsum(asked) - 1
+        found: Ints = self.at(marked.some(np.flatnonzero(asked)))[numbers[which]]
         return found
 
     def run(self, state: int, start_s: float, end_s: float) -> Run:
@@ -135,11 +135,14 @@ class _States:
 def find_runs(track: Track, prescription: Prescription) -> list[Run]:
     """Return the runs along a track, without gaps between them."""
     states = _States(track, prescription)
-    marks_s = track.time_s[track.marks]
-    found = states.along(marks_s)
+    marked = track.marked()
+    marks_s = marked.time_s
+    found = states.along(marked)
     turns = np.flatnonzero(found[1:] != found[:-1])
     before = found[turns]
-    edges_s = bisect(lambda t: states.at(t) == before, marks_s[turns], marks_s[turns + 1])
+    edges_s = bisect(
+        lambda t: states.at(track.places(t)) == before, marks_s[turns], marks_s[turns + 1]
+    )
     ends_s = [float(marks_s[0]), *edges_s.tolist(), float(marks_s[-1])]
     numbers = [*before.tolist(), int(found[-1])]
     runs = [

@@ -39,10 +39,12 @@ class Strip:
     asked_ml: Floats
 
     def rates_at(self, time_s: Floats) -> Floats:
-        """Return the prescribed rate under the strip's centre at any times."""
-        starts_s = np.array([run.start_s for run in self.stretches])
+        """Return the prescribed rate under the strip's centre at times that increase."""
+        starts_s = np.array([run.start_s for run in self.stretches[1:]])
         rates = np.array([run.rate_l_ha for run in self.stretches])
-        found: Floats = rates[np.clip(np.searchsorted(starts_s, time_s, "right") - 1, 0, None)]
+        # Few stretches are sought among many times, not each time among the stretches.
+        edges = np.concatenate(([0], np.searchsorted(time_s, starts_s), [len(time_s)]))
+        found: Floats = np.repeat(rates, np.diff(edges))
         return found
 
     def inside_at(self, time_s: Floats) -> Bools:
@@ -79,11 +81,11 @@ def _strip(track: Track, record: FlightRecord, orders: list[TimedChange]) -> Str
 
 
 def _inside(track: Track, prescription: Prescription) -> tuple[Bools, Bools]:
-    marks_s = track.time_s[track.marks]
-    whole = track.wholly_inside(prescription, marks_s)
+    marked = track.marked()
+    whole = track.wholly_inside(prescription, marked)
     grazing = whole.copy()
     index = np.flatnonzero(~whole)
-    grazing[index] = track.wholly_inside(prescription, marks_s[index], widen_m=-GRAZE_M)
+    grazing[index] = track.wholly_inside(prescription, marked.some(index), widen_m=-GRAZE_M)
     return whole, grazing
 
 

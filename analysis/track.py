@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -24,6 +24,26 @@ Bools = NDArray[np.bool_]
 MARK_SPACING_M = 0.09
 # A strip's ends may touch the border: tiled strips do, and arithmetic is not exact.
 TOUCH_M = 0.001
+
+
+class Places(NamedTuple):
+    """Where a strip's centre is at some times, and how the strip lies there."""
+
+    time_s: Floats
+    east_m: Floats
+    north_m: Floats
+    heading_rad: Floats
+
+    def beside(self, right_m: float) -> tuple[Floats, Floats]:
+        """Return east and north of the strip's point `right_m` of its centre."""
+        return (
+            self.east_m + np.cos(self.heading_rad) * right_m,
+            self.north_m - np.sin(self.heading_rad) * right_m,
+        )
+
+    def some(self, which: Ints) -> Places:
+        """Return some of the places."""
+        return Places(*(values[which] for values in self))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,43 +90,49 @@ class Track:
         """Return the sample at or just before a time."""
         return int(min(max((time_s - self.time_s[0]) / self.step_s, 0.0), len(self.time_s) - 1.0))
 
-    def points(self, time_s: Floats, right_m: Floats | float = 0.0) -> tuple[Floats, Floats]:
-        """Return east and north of the strip's point `right_m` of its centre."""
-        heading = self.at(self.heading_rad, time_s)
-        east_m = self.at(self.east_m, time_s) + np.cos(heading) * right_m
-        north_m = self.at(self.north_m, time_s) - np.sin(heading) * right_m
-        return east_m, north_m
+    def places(self, time_s: Floats) -> Places:
+        """Return the places at any times."""
+        values = (self.at(each, time_s) for each in (self.east_m, self.north_m, self.heading_rad))
+        return Places(time_s, *values)
+
+    def marked(self) -> Places:
+        """Return the places at all marks: they are samples, and nothing is to be sought."""
+        values = (self.time_s, self.east_m, self.north_m, self.heading_rad)
+        return Places(*(each[self.marks] for each in values))
 
     def wholly_inside(
-        self, prescription: Prescription, time_s: Floats, *, widen_m: float = -TOUCH_M
+        self, prescription: Prescription, places: Places, *, widen_m: float = -TOUCH_M
     ) -> Bools:
         """Return where the whole strip, widened at both ends, lies in the field."""
         half_m = max(0.5 * self.width_m + widen_m, 0.25 * self.width_m)
-        east_m, north_m = self.at(self.east_m, time_s), self.at(self.north_m, time_s)
         deep = sure_field(prescription, half_m)
-        inside = np.asarray(shapely.contains_xy(deep, east_m, north_m), dtype=np.bool_)
+        inside = np.asarray(
+            shapely.contains_xy(deep, places.east_m, places.north_m), dtype=np.bool_
+        )
         doubtful = np.flatnonzero(~inside)
         # Of a strip whose middle is outside nobody has to look at the ends: half of a flight turns.
-        doubtful = doubtful[in_field(prescription, east_m[doubtful], north_m[doubtful])]
+        near = places.some(doubtful)
+        middle_inside = in_field(prescription, near.east_m, near.north_m)
+        doubtful, near = doubtful[middle_inside], near.some(np.flatnonzero(middle_inside))
         if len(doubtful):
-            near_s = time_s[doubtful]
-            left, right = self.points(near_s, -half_m), self.points(near_s, half_m)
+            left, right = near.beside(-half_m), near.beside(half_m)
             ends = np.stack((np.stack(left, axis=-1), np.stack(right, axis=-1)), axis=1)
             shapely.prepare(prescription.field)
             inside[doubtful] = shapely.contains_properly(
                 prescription.field, shapely.linestrings(ends)
             )
-        return inside & self.on_line(time_s)
+        return inside & self.on_line(places)
 
-    def on_line(self, time_s: Floats) -> Bools:
-        """Return when the strip's centre is on a planned line; always, where there are none."""
+    def on_line(self, places: Places) -> Bools:
+        """Return where the strip's centre is on a planned line; always, where there are none."""
         if self.planned is None:
-            return np.ones(len(time_s), dtype=np.bool_)
-        return self.planned.flown(time_s, *self.points(time_s))
+            return np.ones(len(places.time_s), dtype=np.bool_)
+        return self.planned.flown(places.time_s, places.east_m, places.north_m)
 
     def inside(self, prescription: Prescription, time_s: Floats, right_m: float = 0.0) -> Bools:
         """Return when the strip's point `right_m` of its centre is where it may spray."""
-        return in_field(prescription, *self.points(time_s, right_m)) & self.on_line(time_s)
+        places = self.places(time_s)
+        return in_field(prescription, *places.beside(right_m)) & self.on_line(places)
 
 
 _SURE: WeakKeyDictionary[Prescription, dict[float, shapely.Geometry]] = WeakKeyDictionary()
@@ -180,7 +206,6 @@ def _track(
 
 def _marks(travel_m: Floats) -> Ints:
     """Return samples at most `MARK_SPACING_M` and one step apart, both ends among them."""
-    wanted = np.arange(0.0, travel_m[-1], MARK_SPACING_M)
-    marks = np.searchsorted(travel_m, wanted)
+    marks = np.flatnonzero(np.diff(np.floor(travel_m / MARK_SPACING_M))) + 1
     both = np.concatenate(([0], marks, [len(travel_m) - 1]))
     return both[np.diff(both, prepend=-1) > 0].astype(np.int64)

@@ -65,7 +65,7 @@ def beside_border(marks: Marks, closed: Bools) -> Bools:
         strip = marks.strip
         found[index] = ~strip.track.wholly_inside(
             marks.prescription,
-            marks.time_s[index],
+            strip.track.places(marks.time_s[index]),
             widen_m=max(CLEAR_M, marks.setup.border_buffer_m),
         )
     return found

@@ -26,6 +26,7 @@ def two(path):
         # last
         close(path)
 """
+LISTED = tuple(listed(ROOT))
 OURS = ("companion", "sitl", "analysis", "missions")
 
 
@@ -52,7 +53,7 @@ def test_every_finally_is_left_out_and_bound_to_success() -> None:
 
 
 def test_every_inhibit_and_every_finally_of_the_code_has_its_mutant() -> None:
-    names = [found.name for found in listed(ROOT)]
+    names = [found.name for found in LISTED]
     checks = (ROOT / INTERLOCK).read_text(encoding="utf-8").count("found.append(Inhibit.")
     assert sum(name.startswith("no check of ") for name in names) == checks
     finals = sum(
@@ -65,16 +66,16 @@ def test_every_inhibit_and_every_finally_of_the_code_has_its_mutant() -> None:
 
 
 def test_every_mutant_applies_to_the_code_as_it_is() -> None:
-    texts = {found.file: (ROOT / found.file).read_text("utf-8") for found in listed(ROOT)}
-    idle = [found.name for found in listed(ROOT) if found.applied(texts[found.file]) is None]
+    texts = {found.file: (ROOT / found.file).read_text("utf-8") for found in LISTED}
+    idle = [found.name for found in LISTED if found.applied(texts[found.file]) is None]
     assert idle == []
 
 
 def test_no_two_mutants_have_one_name() -> None:
-    names = [found.name for found in listed(ROOT)]
+    names = [found.name for found in LISTED]
     assert sorted(names) == sorted(set(names))
 
 
-@pytest.mark.parametrize("path", sorted({test for found in listed(ROOT) for test in found.tests}))
+@pytest.mark.parametrize("path", sorted({test for found in LISTED for test in found.tests}))
 def test_the_tests_of_the_mutants_are_there(path: str) -> None:
     assert Path(ROOT, path).is_file()
