@@ -1,8 +1,9 @@
 """What was applied, sample by sample: the rows of points that most formats write.
 
 A row stands for the time from halfway since the row before to halfway to the next. Its volume is
-what the valves gave in that time, by the model that the evaluation uses; so the rows' volumes add
-up to the flight's, however many rows there are.
+what the valves gave in that time, by the model that the evaluation uses, and its area what they
+covered while they gave it; so volumes, areas and distances of the rows add up to the flight's,
+however many rows there are.
 """
 
 from __future__ import annotations
@@ -105,14 +106,14 @@ def samples_of(
         speed_m_s=speed_m_s,
         course_deg=flight.course_deg[index],
         heading_deg=flight.heading_deg[index],
-        distance_m=_distance_m(flight, edges_s),
+        distance_m=np.diff(_along_m(flight, outer_s)),
         rate_l_ha=_weighted(rates, widths_m),
         applied_l_ha=_rate(valve_flow.sum(axis=1), speed_m_s, width_m * across),
         target_flow_l_min=flight.target_flow_l_min[index],
         flow_l_min=valve_flow.sum(axis=1),
         volume_ml=valve_ml.sum(axis=1),
         width_m=width_m,
-        area_m2=width_m * across * speed_m_s * lasted_s,
+        area_m2=_covered_m2(flight, record, outer_s, widths_m),
         duty=_mean_of_open(duty),
         pressure_kpa=_at(flight.pressure_kpa, time_s),
         inhibits=tuple(flight.inhibits[i] for i in index.tolist()),
@@ -182,12 +183,26 @@ def _mean_of_open(duty: Floats) -> Floats:
     return found
 
 
-def _distance_m(flight: AppliedFlight, edges_s: Floats) -> Floats:
-    """Return how far the aircraft flew in the time of each row."""
+def _along_m(flight: AppliedFlight, time_s: Floats) -> Floats:
+    """Return how far the aircraft has flown by each time."""
     flown = np.hypot(np.diff(flight.east_m), np.diff(flight.north_m))
     along = np.concatenate(([0.0], np.cumsum(flown)))
-    found: Floats = np.diff(np.interp(edges_s, np.maximum.accumulate(flight.time_s), along))
-    return found
+    return np.interp(time_s, np.maximum.accumulate(flight.time_s), along)
+
+
+def _covered_m2(
+    flight: AppliedFlight, record: FlightRecord, edges_s: Floats, widths_m: Floats
+) -> Floats:
+    """Return the ground that the valves covered between edges while they gave something."""
+    steps_s = np.diff(record.time_s)
+    least_ml = FLOW_MIN_L_MIN * _ML_S_PER_L_MIN * steps_s
+    width_m = (np.diff(record.volume_ml, axis=0) > least_ml[:, None]) @ widths_m
+    middles_s = record.time_s[:-1] + 0.5 * steps_s
+    all_across = _across(flight.heading_deg, flight.course_deg)
+    across = np.interp(middles_s, np.maximum.accumulate(flight.time_s), all_across)
+    covered = width_m * across * np.diff(_along_m(flight, record.time_s))
+    total = np.concatenate(([0.0], np.cumsum(covered)))
+    return np.diff(np.interp(edges_s, record.time_s, total))
 
 
 def _at(series: Series | None, time_s: Floats) -> Floats | None:

@@ -58,10 +58,12 @@ def report_flight(
     what can be read is written; 2: no journal, an option is wrong, or DIR cannot be written.
     """
     from analysis.report.build import ReportOptions, build_report
+    from analysis.report.clock import zone_of
     from analysis.report.folder import check_folder, write_files
 
     began_s = time.perf_counter()
     check_folder(out)
+    zone_of(time_zone)  # refused before the flight is read
     options = ReportOptions(
         profiles=tuple(law.value for law in profile or ()),
         time_zone=time_zone,

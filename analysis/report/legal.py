@@ -108,7 +108,7 @@ def legal_record(profile: Profile, told: Told, facts: Facts) -> LegalRecord:
     return LegalRecord(
         profile=profile,
         entries=entries,
-        why_not=tuple(_why_not(facts)),
+        why_not=tuple(_why_not(profile, told, facts)),
         remarks=tuple(_remarks(told, facts)),
         treated_area=facts.treated_area,
     )
@@ -167,7 +167,10 @@ def _flown(profile: Profile, told: Told, facts: Facts) -> Iterator[Entry]:
         )
 
 
-def _why_not(facts: Facts) -> Iterator[str]:
+def _why_not(profile: Profile, told: Told, facts: Facts) -> Iterator[str]:
+    skills_date = told.values.get("application.pilot_skills_date")
+    if profile == "us" and skills_date and facts.date and str(skills_date) > facts.date:
+        yield f"pilot_skills_date: {skills_date} is after the flight"
     if facts.training in ("water", "dry", "simulated"):
         what = "a simulation" if facts.training == "simulated" else f"training ({facts.training})"
         yield f"a product: this was {what}"

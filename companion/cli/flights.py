@@ -190,7 +190,7 @@ def _line(flight: Flight) -> str:
     if flight.duration_s is not None:
         parts.append(f"{flight.duration_s / 60.0:.1f} min")
     if flight.applied_l is not None:
-        parts.append(f"{flight.applied_l:.2f} L")
+        parts.append(f"{flight.applied_l:.2f} L ordered")
     parts += [flight.state, f"{flight.size_bytes / 1e6:.1f} MB"]
     if flight.is_pinned:
         parts.append("pinned")

@@ -8,9 +8,12 @@ asks for what stands here, so that `run` and `doctor` can name what is missing.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
-from pydantic import Field, FiniteFloat, ValidationError
+from pydantic import AfterValidator, Field, FiniteFloat, ValidationError
+from pydantic_core import PydanticCustomError
 
 from companion.config.tables import ProductTable, Table, Text
 from companion.config.wording import say
@@ -22,9 +25,47 @@ if TYPE_CHECKING:
 Profile = Literal["eu", "us", "generic"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
 
-_DAY = r"^\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])$"
+# Figures are those of ASCII: in a pattern \d is a figure of any script.
+_DAY = r"^[0-9]{4}-[0-9]{2}-[0-9]{2}$"
 # Whole minutes or seconds, and always with an offset from UTC: a time without one is two times.
-_MOMENT = _DAY[:-1] + r"T([01]\d|2[0-3]):[0-5]\d(:[0-5]\d)?(Z|[+-](0\d|1[0-4]):[0-5]\d)$"
+_MOMENT = (
+    _DAY[:-1] + r"T([01][0-9]|2[0-3]):[0-5][0-9](:[0-5][0-9])?(Z|[+-](0[0-9]|1[0-4]):[0-5][0-9])$"
+)
+
+
+def _a_day(value: str) -> str:
+    """Return a day that there is: a pattern takes the 31st of February."""
+    try:
+        date.fromisoformat(value)
+    except ValueError as error:
+        raise PydanticCustomError("no_day", "no such day") from error
+    return value
+
+
+def _a_moment(value: str) -> str:
+    try:
+        datetime.fromisoformat(value)
+    except ValueError as error:
+        raise PydanticCustomError("no_moment", "no such time") from error
+    return value
+
+
+def _a_stage(value: str) -> str:
+    """Return a stage, or a range of stages that does not go backwards."""
+    first, _, last = value.partition("-")
+    if first.isdigit() and last and not first < last:
+        raise PydanticCustomError("no_range", "the later stage stands first")
+    return value
+
+
+def _a_zone(value: str) -> str:
+    """Return a time zone that is known; any where this computer knows none at all."""
+    try:
+        ZoneInfo(value)
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        if available_timezones():
+            raise PydanticCustomError("no_zone", "no such time zone") from error
+    return value
 
 
 class ApplicationTable(Table):
@@ -34,7 +75,7 @@ class ApplicationTable(Table):
         default=None,
         description="whose record: eu (2023/564), us (14 CFR 137.71), generic; absent: none",
     )
-    time_zone: Text | None = Field(
+    time_zone: Annotated[Text, AfterValidator(_a_zone)] | None = Field(
         default=None, description="of the times in record and report, such as Europe/Madrid"
     )
     operator: Text | None = Field(
@@ -46,7 +87,7 @@ class ApplicationTable(Table):
     pilot: Text | None = Field(default=None, description="in command, by name")
     pilot_address: Text | None = Field(default=None, description="of the pilot")
     pilot_certificate: Text | None = Field(default=None, description="of the pilot, number")
-    pilot_skills_date: str | None = Field(
+    pilot_skills_date: Annotated[str, AfterValidator(_a_day)] | None = Field(
         default=None,
         pattern=_DAY,
         description="day on which the pilot met the requirements of 137.19(e), YYYY-MM-DD",
@@ -59,9 +100,9 @@ class ApplicationTable(Table):
     crop_eppo: str | None = Field(
         default=None, pattern=r"^[A-Z0-9]{5,6}$", description="its EPPO code, such as TRZAW"
     )
-    growth_stage_bbch: str | None = Field(
+    growth_stage_bbch: Annotated[str, AfterValidator(_a_stage)] | None = Field(
         default=None,
-        pattern=r"^(\d{2}(-\d{2})?|not-required)$",
+        pattern=r"^([0-9]{2}(-[0-9]{2})?|not-required)$",
         description="BBCH stage: 31, or 31-33; not-required where the label sets no stage",
     )
     product_per_l: float | None = Field(
@@ -84,7 +125,7 @@ class ApplicationTable(Table):
     humidity_percent: Annotated[FiniteFloat, Field(ge=0, le=100)] | None = Field(
         default=None, description="of the air, relative"
     )
-    start_time: str | None = Field(
+    start_time: Annotated[str, AfterValidator(_a_moment)] | None = Field(
         default=None,
         pattern=_MOMENT,
         description="only where no clock was right: start of spraying, 2026-05-01T06:30:00+02:00",

@@ -9,7 +9,7 @@ import pytest
 
 from analysis.report.legal_fields import LABELS
 from companion.cli.run import _about, _application_notes
-from companion.config import load
+from companion.config import application_table, load
 from companion.config.application_table import ASKED, PROFILES, missing, told
 from companion.doctor.application import application_check
 from companion.doctor.check import Status
@@ -52,7 +52,14 @@ def test_each_key_alone_is_missed(key: str) -> None:
         ("crop_eppo", '"wheat"'),
         ("growth_stage_bbch", '"early"'),
         ("growth_stage_bbch", "31"),
+        ("growth_stage_bbch", '"39-31"'),
+        ("growth_stage_bbch", '"\u0663\u0661"'),
         ("pilot_skills_date", '"2026-13-01"'),
+        ("pilot_skills_date", '"2026-02-31"'),
+        ("pilot_skills_date", '"0000-01-01"'),
+        ("start_time", '"2026-02-31T06:30:00Z"'),
+        ("time_zone", '"Mars/Phobos"'),
+        ("time_zone", '"../../etc/passwd"'),
         ("start_time", '"2026-05-01T06:30:00"'),
         ("product_per_l", "0"),
         ("product_unit", '"gal"'),
@@ -82,7 +89,6 @@ def test_run_names_what_will_be_missing_unless_it_is_training() -> None:
         ([], Status.WARN, "application.profile is not set"),
         (EU, Status.OK, "all there"),
         (EU[:-1], Status.WARN, "missing: product.registration"),
-        ([*EU, "application.time_zone=Mars/Base"], Status.WARN, "no time zone"),
         ([*EU, "application.time_zone=Europe/Madrid"], Status.OK, "all there"),
         (["journal.training=true"], Status.NOT_APPLICABLE, "training"),
         (["output.kind=none"], Status.NOT_APPLICABLE, "training"),
@@ -91,3 +97,12 @@ def test_run_names_what_will_be_missing_unless_it_is_training() -> None:
 def test_doctor_says_how_the_record_stands(overrides: list[str], status: Status, text: str) -> None:
     check = application_check(load(EXAMPLE, overrides=overrides))
     assert (check.status, text in check.text) == (status, True)
+
+
+def test_a_computer_without_time_zones_takes_any_and_doctor_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(application_table, "available_timezones", set)
+    config = load(EXAMPLE, overrides=[*EU, "application.time_zone=Mars/Base"])
+    check = application_check(config)
+    assert (check.status, "no time zone" in check.text) == (Status.WARN, True)

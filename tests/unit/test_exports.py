@@ -194,6 +194,11 @@ def test_fewer_points_hold_the_same_volume(flight: AppliedFlight) -> None:
     assert len(thin) == pytest.approx(2.0 * flight.duration_s, abs=2)
     assert np.diff(thin.time_s).min() > 0.4
     assert thin.volume_ml.sum() == pytest.approx(full.volume_ml.sum(), rel=1e-9)
+    # From sample to sample a valve may open or close, and the speed change.
+    thinnest = source(flight, rate_hz=0.5).samples
+    for each in (thin, thinnest):
+        assert each.area_m2.sum() == pytest.approx(full.area_m2.sum(), rel=1e-4)
+        assert each.distance_m.sum() == pytest.approx(full.distance_m.sum(), rel=1e-3)
 
 
 def test_points_have_what_each_valve_did(flight: AppliedFlight, tmp_path: Path) -> None:

@@ -102,6 +102,21 @@ def test_us_record_has_gallons_and_the_pilots_day(facts: Facts) -> None:
     assert fields["pilot_skills_date"]["value"] == "2024-02-01"
 
 
+def test_a_pilot_who_met_the_requirements_after_the_flight_had_not(facts: Facts) -> None:
+    said = {**US_TOLD, "application.pilot_skills_date": "2026-05-02"}
+    record = legal_record("us", told_with({"application_json": json.dumps(said)}), facts)
+    assert record.missing == ("pilot_skills_date: 2026-05-02 is after the flight",)
+    on_the_day = {**said, "application.pilot_skills_date": facts.date}
+    assert legal_record(
+        "us", told_with({"application_json": json.dumps(on_the_day)}), facts
+    ).is_complete
+
+
+def test_a_day_that_never_was_in_a_journal_is_not_believed() -> None:
+    said = {**EU_TOLD, "application.start_time": "2026-02-31T06:30:00Z"}
+    assert told_in({"application_json": json.dumps(said)}) == EU_TOLD
+
+
 def test_wind_that_was_measured_in_flight_needs_no_saying(facts: Facts) -> None:
     without = legal_record("generic", told_with({}), facts)
     measured = legal_record("generic", told_with({}), replace(facts, wind_m_s=2.34))

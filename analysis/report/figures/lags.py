@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from analysis.assess.breakdowns import Group
+    from analysis.assess.intervals import Interval
     from analysis.evaluation import Evaluation
     from analysis.lag import Step
 
@@ -48,8 +49,11 @@ def lag_distances(
     left.set_ylabel("lag distance [m], + too late")
     _panel(right, steps, by_speed, [step.change.speed_m_s for step in steps])
     right.set_xlabel("speed [m/s]")
-    farthest_m = max(abs(step.lag_distance_m or 0.0) for step in steps)
-    left.set_ylim(-max(1.15 * farthest_m, REACH_MIN_M), max(1.15 * farthest_m, REACH_MIN_M))
+    reached_m = [abs(step.lag_distance_m or 0.0) for step in steps]
+    for group in (*by_rate, *by_speed):
+        reached_m += [abs(end) for end in _ends(group.lag_distance_m)]
+    limit_m = max(1.15 * max(reached_m), REACH_MIN_M)
+    left.set_ylim(-limit_m, limit_m)
     left.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
     return Drawn(
         name="lags",
@@ -85,8 +89,8 @@ def _panel(
     for number, group in enumerate(measured):
         mean = group.lag_distance_m
         assert mean.mean is not None
-        if mean.low is not None and mean.high is not None and mean.clusters >= CLUSTERS_MIN:
-            panel.plot([number, number], [mean.low, mean.high], color=RED, lw=1.6, zorder=3)
+        ends = _ends(mean)
+        panel.plot([number] * len(ends), ends, color=RED, lw=1.6, zorder=3)
         panel.plot(
             number, mean.mean, marker="D", ms=5, color=RED, mec="white", mew=0.7, ls="", zorder=4,
             label="mean, 95 %" if number == 0 else None,
@@ -99,6 +103,13 @@ def _panel(
     panel.tick_params(axis="x", length=0, colors=INK)
     panel.spines["bottom"].set_color(FAINT)
     panel.set_axisbelow(True)
+
+
+def _ends(mean: Interval) -> tuple[float, ...]:
+    """Return the ends of an interval that is drawn; none for one that says nothing."""
+    if mean.low is None or mean.high is None or mean.clusters < CLUSTERS_MIN:
+        return ()
+    return mean.low, mean.high
 
 
 def _name(group: Group) -> str:
