@@ -67,7 +67,7 @@ def read_applied(path: Path, *, unread: list[str] | None = None) -> AppliedFligh
 
 
 def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
-    setup, meta = journal.setup(), journal.meta
+    setup, meta = journal.setup(unread), journal.meta
     names = field_names_of(meta["setup"])
     applied = read_samples(journal, len(setup.boom.valves), unread)
     time_s, target, flow, speed, course, heading, height = applied.columns

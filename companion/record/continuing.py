@@ -75,7 +75,7 @@ def read_treated_ground(path: Path, *, is_lenient: bool = False) -> Treated:
                 f"{path}: keeps no treated ground: coverage.record was false, or an older version "
                 "wrote it"
             )
-        setup = journal.setup()
+        setup = journal.setup(unread if is_lenient else None)
         stopped = _stopped(journal, unread if is_lenient else None)
         return Treated(
             path=path,

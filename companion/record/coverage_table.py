@@ -84,9 +84,14 @@ def _ahead(connection: sqlite3.Connection, unread: list[str] | None) -> tuple[st
     return found
 
 
-def read_treated(connection: sqlite3.Connection) -> Coverage | None:
-    """Return what earlier flights had treated; None where the flight was not to know."""
-    before = _read(connection, "before")
+def read_treated(
+    connection: sqlite3.Connection, unread: list[str] | None = None
+) -> Coverage | None:
+    """Return what earlier flights had treated; None where the flight was not to know.
+
+    With `unread`, which is told what is damaged, as far as it can be read.
+    """
+    before = _read(connection, "before", unread)
     return before if before is not None and before.tiles else None
 
 
@@ -128,7 +133,9 @@ def _read(
             except ValueError:
                 damaged += 1
     except sqlite3.DatabaseError as error:
-        unread.append(f"treated ground behind the first {len(tiles)} tiles: {error}")
+        text = f"treated ground behind the first {len(tiles)} tiles: {error}"
+        if text not in unread:  # one table: what the flight and what earlier ones treated
+            unread.append(text)
     if damaged:
         unread.append(f"treated ground: {damaged} of {damaged + len(tiles)} tiles are damaged")
     return Coverage(tiles=tiles)

@@ -91,10 +91,11 @@ class OpenJournal:
     version: str
     unread: tuple[str, ...] = ()
 
-    def setup(self) -> Setup:
+    def setup(self, unread: list[str] | None = None) -> Setup:
         """Return all that was constant in the flight; UnreadableError where it is damaged.
 
-        In one line, with what else can be read; a NoMapError where only the map is damaged.
+        In one line, with what else can be read; a NoMapError where only the map is damaged. With
+        `unread` what earlier flights treated may be damaged, and is named there.
         """
         try:
             ground = read_ground(self.connection)
@@ -111,7 +112,7 @@ class OpenJournal:
                 f"{self.path}: is damaged: no set-up of the flight: {why}; "
                 f"{extent(self.connection)}"
             ) from error
-        treated = read_treated(self.connection)
+        treated = read_treated(self.connection, unread)
         return setup if treated is None else replace(setup, treated=treated)
 
 
@@ -235,7 +236,7 @@ def _read(journal: OpenJournal, *, is_lenient: bool) -> JournalContent:
     return JournalContent(
         path=journal.path,
         meta=journal.meta,
-        setup=journal.setup(),
+        setup=journal.setup(unread if is_lenient else None),
         field_names=field_names_of(journal.meta["setup"]),
         entries=tuple(entries),
         events=tuple(events),

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import shapely
 
+from analysis.flown.read_applied import read_applied
 from analysis.replay import replay
 from companion.cli.app import execute
 from companion.core.controller import Memory, Setup, step
@@ -364,6 +365,30 @@ def test_of_a_damaged_journal_is_told_what_can_be_read(
         continued(setup(), [path])
     assert execute(["replay", str(path), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["unread"]
+
+
+def test_without_the_treated_ground_the_rest_of_a_journal_is_read(
+    first: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / first.name
+    connection = sqlite3.connect(first)
+    with connection:
+        # The table and its index.
+        sql = "SELECT rootpage FROM sqlite_master WHERE tbl_name = 'coverage_tiles'"
+        pages = [page for (page,) in connection.execute(sql) if page]
+        ((size,),) = connection.execute("PRAGMA page_size").fetchall()
+    connection.close()
+    damaged = bytearray(first.read_bytes())
+    for page in pages:
+        damaged[(page - 1) * size : page * size] = bytes(size)
+    path.write_bytes(damaged)
+    unread: list[str] = []
+    flight = read_applied(path, unread=unread)
+    assert flight.changes.duty.tolist() == read_applied(first).changes.duty.tolist()
+    assert sum(text.startswith("treated ground") for text in unread) == 1
+    assert read_journal(path, is_lenient=True).entries == read_journal(first).entries
+    with pytest.raises(JournalError, match="damaged"):
+        read_treated_ground(path)
 
 
 def test_of_a_damaged_set_up_nothing_can_be_told_in_one_line(
