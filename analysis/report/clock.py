@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, tzinfo
 from typing import TYPE_CHECKING
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
+from companion.config.application_table import zone_named
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -83,12 +83,12 @@ def zone_of(name: str | None) -> tzinfo:
     """Return the time zone of that name; UTC without one."""
     if name is None or name == "UTC":
         return UTC
-    try:
-        return ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+    zone = zone_named(name)
+    if zone is None:
         raise ConfigError(
             f"time zone {name}: not known here; write one such as Europe/Madrid or America/Chicago"
-        ) from error
+        )
+    return zone
 
 
 def duration_text(duration_s: float) -> str:

@@ -7,7 +7,7 @@ asks for what stands here, so that `run` and `doctor` can name what is missing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import date, datetime
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
@@ -33,21 +33,17 @@ _MOMENT = (
 )
 
 
-def _a_day(value: str) -> str:
-    """Return a day that there is: a pattern takes the 31st of February."""
-    try:
-        date.fromisoformat(value)
-    except ValueError as error:
-        raise PydanticCustomError("no_day", "no such day") from error
-    return value
+def _is_some(parse: Callable[[str], object], wrong: str) -> AfterValidator:
+    """Return the check that there is what a text names: a pattern takes the 31st of February."""
 
+    def checked(value: str) -> str:
+        try:
+            parse(value)
+        except ValueError as error:
+            raise PydanticCustomError("is_none", wrong) from error
+        return value
 
-def _a_moment(value: str) -> str:
-    try:
-        datetime.fromisoformat(value)
-    except ValueError as error:
-        raise PydanticCustomError("no_moment", "no such time") from error
-    return value
+    return AfterValidator(checked)
 
 
 def _a_stage(value: str) -> str:
@@ -58,13 +54,18 @@ def _a_stage(value: str) -> str:
     return value
 
 
+def zone_named(name: str) -> ZoneInfo | None:
+    """Return a time zone; None where this computer knows none of that name."""
+    try:
+        return ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        return None
+
+
 def _a_zone(value: str) -> str:
     """Return a time zone that is known; any where this computer knows none at all."""
-    try:
-        ZoneInfo(value)
-    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
-        if available_timezones():
-            raise PydanticCustomError("no_zone", "no such time zone") from error
+    if zone_named(value) is None and available_timezones():
+        raise PydanticCustomError("no_zone", "no such time zone")
     return value
 
 
@@ -87,7 +88,7 @@ class ApplicationTable(Table):
     pilot: Text | None = Field(default=None, description="in command, by name")
     pilot_address: Text | None = Field(default=None, description="of the pilot")
     pilot_certificate: Text | None = Field(default=None, description="of the pilot, number")
-    pilot_skills_date: Annotated[str, AfterValidator(_a_day)] | None = Field(
+    pilot_skills_date: Annotated[str, _is_some(date.fromisoformat, "no such day")] | None = Field(
         default=None,
         pattern=_DAY,
         description="day on which the pilot met the requirements of 137.19(e), YYYY-MM-DD",
@@ -125,7 +126,7 @@ class ApplicationTable(Table):
     humidity_percent: Annotated[FiniteFloat, Field(ge=0, le=100)] | None = Field(
         default=None, description="of the air, relative"
     )
-    start_time: Annotated[str, AfterValidator(_a_moment)] | None = Field(
+    start_time: Annotated[str, _is_some(datetime.fromisoformat, "no such time")] | None = Field(
         default=None,
         pattern=_MOMENT,
         description="only where no clock was right: start of spraying, 2026-05-01T06:30:00+02:00",

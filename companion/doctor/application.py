@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
-
 from companion.config import Config
-from companion.config.application_table import missing, told
+from companion.config.application_table import missing, told, zone_named
 from companion.doctor.check import Check, not_applicable, ok, warn
 
 NAME = "application-record"
@@ -29,19 +27,10 @@ def application_check(config: Config) -> Check:
             f"{table.profile}: missing: {', '.join(absent)}",
             "write them before the flight; docs/application-record.md has all",
         )
-    if table.time_zone is not None and not is_time_zone(table.time_zone):
+    if table.time_zone is not None and zone_named(table.time_zone) is None:
         return warn(
             NAME,
             f"application.time_zone = {table.time_zone}: no time zone that this computer knows",
             "write one such as Europe/Madrid",
         )
     return ok(NAME, f"{table.profile}: all there that the operator must say")
-
-
-def is_time_zone(name: str) -> bool:
-    """Return whether this computer knows a time zone of that name."""
-    try:
-        ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        return False
-    return True
