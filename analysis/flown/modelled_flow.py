@@ -26,8 +26,6 @@ Ints = NDArray[np.int64]
 ML_S_PER_L_MIN = 1000.0 / 60.0
 # Shorter ramps are steps: the sum below divides by their length.
 RAMP_MIN_S = 1e-3
-# Curves are read at so many flows, between them along straight lines: 0.05 % of the flow at worst.
-TABLE_POINTS = 2001
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,16 +90,9 @@ def levels_ml_s(changes: ValveChanges, nozzle_sets: Sequence[NozzleSet]) -> Floa
 
 def flow_of(nozzles: NozzleSet, duty: Floats) -> Floats:
     """Return the flow [mL/s] of a whole set at many duties."""
-    curve = nozzles.curve
-    if len(duty) < TABLE_POINTS:
-        different, place = np.unique(duty, return_inverse=True)
-        flows = np.array([curve.flow_for(value) for value in different.tolist()], dtype=np.float64)
-        return flows[place] * ML_S_PER_L_MIN
-    # Even steps of the flow: where a curve begins, it is steep.
-    flows = np.linspace(curve.flow_l_min[0], curve.flow_l_min[-1], TABLE_POINTS)
-    duties = [curve.duty_for(flow) for flow in flows.tolist()]
+    duties, flows = nozzles.curve.duty, nozzles.curve.flow_l_min
     if duties[0] > 0.0:
-        flows, duties = np.concatenate(([0.0], flows)), [0.0, *duties]
+        duties, flows = (0.0, *duties), (0.0, *flows)
     found: Floats = np.interp(duty, duties, flows) * ML_S_PER_L_MIN
     return np.where(duty > 0.0, found, 0.0)
 

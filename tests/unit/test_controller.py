@@ -6,6 +6,7 @@ import itertools
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import shapely
 
@@ -237,6 +238,36 @@ def test_noise_does_not_take_an_issued_change_back() -> None:
     decision, _ = step(given, flying(10.30, 11.36), memory, 10.30)
     assert all(value == pytest.approx(duty_of(25.0), abs=0.01) for value in
                duty_in_force(decision.plan, 10.30, 6))  # fmt: skip
+
+
+# Wang et al. 2024, Table 2: one of twelve nozzles. Not `CURVE`: a judge has its own numbers.
+TABLE_2_PERCENT = (20, 40, 50, 70, 80, 90, 100)
+TABLE_2_NOZZLE_L_MIN = (0.123, 0.252, 0.273, 0.385, 0.421, 0.496, 0.508)
+
+
+def given_l_min(duty: float) -> float:
+    """Return what P1's sprayer gives at a duty if it is straight between what was measured."""
+    return 12.0 * float(np.interp(100.0 * duty, TABLE_2_PERCENT, TABLE_2_NOZZLE_L_MIN))
+
+
+@pytest.mark.parametrize("wanted_l_min", [1.5, 1.8, 2.39, 3.1, 4.0, 5.5, 6.05])
+def test_a_sprayer_straight_between_its_measured_points_gives_what_was_asked(
+    wanted_l_min: float,
+) -> None:
+    rate_l_ha = wanted_l_min / (0.006 * 6.0 * SPEED)
+    field = Prescription(plots([[rate_l_ha] * 4]), boundary=shapely.box(0.0, -1.0, 48.0, 7.0))
+    decision, _ = step(setup(prescription=field), flying(10.0, 6.0), Memory(), 10.0)
+    duty = duty_in_force(decision.plan, 10.0, 6)
+    assert [given_l_min(each) for each in duty] == pytest.approx([wanted_l_min] * 6, rel=1e-6)
+
+
+def test_between_the_measured_points_the_curve_never_leaves_them() -> None:
+    # A long flat stretch between steep ones: a smooth curve would swing past its points.
+    curve = FlowCurve(duty=(0.1, 0.2, 0.8, 0.9), flow_l_min=(1.0, 3.0, 3.1, 5.0))
+    for flow in np.linspace(1.0, 5.0, 401).tolist():
+        expected = float(np.interp(flow, curve.flow_l_min, curve.duty))
+        assert curve.duty_for(flow) == pytest.approx(expected, abs=1e-12)
+        assert curve.flow_for(curve.duty_for(flow)) == pytest.approx(flow, rel=1e-12)
 
 
 def test_small_trims_do_not_restart_the_period() -> None:
