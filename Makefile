@@ -15,7 +15,7 @@ COMPILE = $(BIN)/uv pip compile --universal --python-version 3.11 --generate-has
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio docs lock clean
+.PHONY: help setup demo test lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs lock clean
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -59,6 +59,10 @@ faults: $(INSTALLED) ## 200 real flights with faults (ARGS="--only SIGSTOP --fli
 
 test-gpio: $(INSTALLED) ## the valve engine on the kernel's simulated chip (builds a kernel once)
 	@tests/gpio/run.sh $(ARGS)
+
+# One flight at a time, by the wall clock: leave it two idle cores.
+test-firmware: $(INSTALLED) ## flights beside the real firmwares of VRSPRAY_FIRMWARE (ARGS="-m short" for one of each)
+	$(BIN)/pytest -m firmware $(ARGS) tests/firmware
 
 docs: $(INSTALLED) ## every link in the documents leads somewhere
 	$(BIN)/pytest --quiet tests/unit/test_foundation.py -k link

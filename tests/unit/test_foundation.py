@@ -206,7 +206,18 @@ def test_an_old_python_is_refused_with_the_way_out(tmp_path: Path) -> None:
 
 @needs_make
 def test_every_target_that_was_promised_exists() -> None:
-    promised = ["demo", "test", "lint", "bench", "faults", "test-gpio", "docs", "clean", "lock"]
+    promised = [
+        "demo",
+        "test",
+        "lint",
+        "bench",
+        "faults",
+        "test-gpio",
+        "test-firmware",
+        "docs",
+        "clean",
+        "lock",
+    ]
     makefile = (ROOT / "Makefile").read_text()
     assert [name for name in promised if f"\n{name}:" not in makefile] == []
 
@@ -215,7 +226,8 @@ def test_ci_runs_lint_and_tests() -> None:
     script = ROOT / ".ci/run"
     assert os.access(script, os.X_OK)
     text = script.read_text()
-    assert "\nmake --keep-going lint || status=$?\nmake test || status=$?\nexit" in text
+    assert "\nmake --keep-going lint || status=$?\nmake test || status=$?\n" in text
+    assert '\nmake test-firmware ARGS="-m short" || status=$?\nexit' in text
 
 
 def test_image_copies_only_what_exists_and_is_not_ignored() -> None:

@@ -1,0 +1,96 @@
+"""What the flights have in common: ready, armed, enabled, flown, landed, judged."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.firmware import firmware
+from tests.firmware.station import COMPANION, MissionItem, NoAnswerError, Station
+
+SIMSTATE, SERVO_OUTPUT_RAW, GLOBAL_POSITION_INT = 164, 36, 33
+DO_SPRAYER, DO_SET_MODE, ARM, MISSION_START = 216, 176, 400, 300
+AUTO, GUIDED, RTL = 3.0, 4.0, 6.0
+ACCEPTED = 0
+TRUTH_HZ, OUTPUTS_HZ, POSITION_HZ = 100.0, 100.0, 20.0
+# Until the estimator has its position the simulation may run as fast as it can: nobody watches.
+HURRIED = 10.0
+READY_WITHIN_S = 90.0
+
+
+@dataclass(slots=True)
+class Vehicle:
+    """ArduCopter, ready to be armed, and the folder of its flight."""
+
+    station: Station
+    folder: Path
+
+    @property
+    def journal(self) -> Path:
+        """The only journal of the flight."""
+        (found,) = self.folder.rglob("flight-*.gpkg")
+        return found
+
+
+@contextmanager
+def ready_copter(
+    folder: Path, where: Path, home: str, *, parameters: dict[str, float] | None = None
+) -> Iterator[Vehicle]:
+    """ArduCopter with the watchdog script set up, waiting until it may be armed."""
+    with firmware.arducopter(where, folder, home, parameters=parameters) as station:
+        vehicle = Vehicle(station, folder)
+        station.until(lambda: station.said("watchdog: started"), "watchdog script", READY_WITHIN_S)
+        station.set_parameter("SIM_SPEEDUP", HURRIED)
+        station.set_parameter("SPRW_FIRST", 9.0)
+        station.set_parameter("SPRW_LAST", 14.0)
+        for message, rate_hz in (
+            (SIMSTATE, TRUTH_HZ),
+            (SERVO_OUTPUT_RAW, OUTPUTS_HZ),
+            (GLOBAL_POSITION_INT, POSITION_HZ),
+        ):
+            station.ask_for(message, rate_hz)
+        station.until(lambda: station.said("is using GPS"), "position", READY_WITHIN_S)
+        station.set_parameter("SIM_SPEEDUP", 1.0)
+        yield vehicle
+
+
+def until_heard(station: Station, started: subprocess.Popen[bytes], log: Path) -> None:
+    """Wait until the companion is heard, and for its first look at the vehicle."""
+
+    def is_heard() -> bool:
+        if started.poll() is not None:
+            raise NoAnswerError(f"the companion has ended: {log.read_text(errors='replace')}")
+        return station.heard("HEARTBEAT", COMPANION) is not None
+
+    station.until(is_heard, "companion", 30.0)
+
+
+def start(vehicle: Vehicle, items: Sequence[MissionItem] | None) -> None:
+    """Upload the mission, if there is one; arm in AUTO, start it, enable spraying."""
+    station = vehicle.station
+    if items is not None:
+        station.upload(items)
+    set_mode(station, AUTO)
+    assert station.command(ARM, 1.0) == ACCEPTED
+    assert station.command(MISSION_START) == ACCEPTED
+    station.until(lambda: station.is_armed, "arming")
+    enable(station)
+
+
+def set_mode(station: Station, mode: float) -> None:
+    """Change the mode, and wait until the vehicle is in it."""
+    assert station.command(DO_SET_MODE, 1.0, mode) == ACCEPTED
+    station.until(lambda: station.heard("HEARTBEAT").custom_mode == mode, f"mode {mode:g}")
+
+
+def enable(station: Station, *, is_on: bool = True) -> None:
+    """Give the operator's consent to spray, or take it back."""
+    assert station.command(DO_SPRAYER, float(is_on), to=COMPANION) == ACCEPTED
+
+
+def until_landed(vehicle: Vehicle, within_s: float) -> None:
+    """Wait until the motors stand still."""
+    vehicle.station.until(lambda: not vehicle.station.is_armed, "landing", within_s)

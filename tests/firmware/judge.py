@@ -1,0 +1,370 @@
+"""Judges a flight beside a real firmware: where each change fell, from truth and servo outputs.
+
+Imports nothing of the program. The sprayer is the simplest that has a sprayer's delays: a board
+that obeys the pulses of a servo frame, valves with a dead time and a straight rise, flow by the
+published table with straight lines between its points, one tank, no PWM ripple, no scatter.
+
+The definitions are those of docs/metrics.md, written anew: a change lies where a sharp step of the
+same volume would lie; + is too late, in metres along the track.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from tests.firmware.station import Place, Pulses
+
+Floats = NDArray[np.float64]
+
+STEP_S = 0.002
+SMOOTHED_S = 0.1  # to each side: the vehicle's acceleration is steady for so long
+METRES_A_DEGREE = 111_319.49
+CLOSED_US, FULL_US, DEAD_BAND = 1000.0, 2000.0, 0.01
+SMALL_STEP, CLOSE_M, REACH_M = 0.08, 2.5, 4.0
+OFF_TARGET_ELEMENT_M = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Sprayer:
+    """The valves and what they do with a pulse: as examples/anyang, whose lags are the same."""
+
+    right_m: tuple[float, ...] = (-2.5, -1.5, -0.5, 0.5, 1.5, 2.5)
+    outputs: tuple[int, ...] = (9, 10, 11, 12, 13, 14)
+    width_m: float = 1.0
+    # An order waits for the next frame of 20 ms: drawn for each output, 10 ms in the mean.
+    frame_s: float = 0.020
+    dead_s: float = 0.069
+    rise_s: float = 0.070
+    duty: tuple[float, ...] = (0.0, 0.2, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0)
+    # Of all six, Wang et al. 2024, Table 2; below the first point a straight line to closed.
+    flow_l_min: tuple[float, ...] = (0.0, 1.476, 3.024, 3.276, 4.62, 5.052, 5.952, 6.096)
+
+    def flow_ml_s(self, pulse_us: Floats) -> Floats:
+        """Return one valve's flow at steady pulses."""
+        duty = (pulse_us - CLOSED_US) / (FULL_US - CLOSED_US)
+        duty = np.where(duty < DEAD_BAND, 0.0, np.clip(duty, 0.0, 1.0))
+        found: Floats = np.interp(duty, self.duty, self.flow_l_min)
+        return found * 1000.0 / 60.0 / len(self.right_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """A part of the field with one rate, in degrees."""
+
+    outline: shapely.Geometry
+    rate_l_ha: float
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One valve at one boundary; `lag_m` is None for a change that never came."""
+
+    valve: int
+    at_s: float
+    along_m: float
+    from_l_ha: float
+    to_l_ha: float
+    speed_m_s: float
+    lag_m: float | None
+
+
+@dataclass(slots=True)
+class Verdict:
+    """What a flight did."""
+
+    changes: list[Change] = field(default_factory=list)
+    apart: list[Change] = field(default_factory=list)
+    off_target_ml: float = 0.0
+    sprayed_l: float = 0.0
+    prescribed_l: float = 0.0
+    position_late_s: float = float("nan")
+
+    @property
+    def lags_m(self) -> Floats:
+        """Of the changes that came."""
+        return np.array([one.lag_m for one in self.changes if one.lag_m is not None])
+
+    @property
+    def missed(self) -> list[Change]:
+        """Those that never came."""
+        return [one for one in self.changes if one.lag_m is None]
+
+    @property
+    def mean_abs_m(self) -> float:
+        """Mean of absolute lag distances."""
+        return float(np.mean(np.abs(self.lags_m)))
+
+    @property
+    def worst_m(self) -> float:
+        """The largest absolute lag distance."""
+        return float(np.max(np.abs(self.lags_m)))
+
+    def __str__(self) -> str:
+        lags_m = self.lags_m
+        if not len(lags_m):
+            return f"no change came; {len(self.missed)} missed, {self.sprayed_l:.3f} L sprayed"
+        return (
+            f"{len(lags_m)} changes: mean {self.mean_abs_m:.3f} m (signed {lags_m.mean():+.3f}), "
+            f"worst {self.worst_m:.3f} m; {len(self.missed)} missed, {len(self.apart)} apart; "
+            f"off target {self.off_target_ml:.2f} mL; sprayed {self.sprayed_l:.3f} L of "
+            f"{self.prescribed_l:.3f} L"
+        )
+
+
+def geojson_zones(path: Path, rate_field: str = "rate") -> list[Zone]:
+    """Read zones without any reader of the program."""
+    found = json.loads(path.read_text())
+    return [
+        Zone(shapely.geometry.shape(one["geometry"]), float(one["properties"][rate_field]))
+        for one in found["features"]
+    ]
+
+
+def geojson_area(path: Path) -> shapely.Geometry:
+    """Return the union of a file's outlines."""
+    found = json.loads(path.read_text())
+    return shapely.union_all([shapely.geometry.shape(one["geometry"]) for one in found["features"]])
+
+
+# ---------------------------------------------------------------------------------------- clocks
+
+
+def vehicle_times(places: Sequence[Place], pulses: Sequence[Pulses]) -> Floats:
+    """Return when each place was true on the vehicle's clock.
+
+    SIMSTATE has no time. The servo outputs come in the same stream and have one: a place is as
+    far from the nearest of them in time as it came apart from it, mostly in the same packet.
+    """
+    if places[0].at_s is not None:
+        return np.array([one.at_s for one in places])
+    came_s = np.array([one.came_s for one in places])
+    marks_s = np.array([one.came_s for one in pulses])
+    at_s = np.array([one.at_s for one in pulses])
+    after = np.clip(np.searchsorted(marks_s, came_s), 1, len(marks_s) - 1)
+    is_after = marks_s[after] - came_s <= came_s - marks_s[after - 1]
+    nearest = np.where(is_after, after, after - 1)
+    found: Floats = at_s[nearest] + came_s - marks_s[nearest]
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Path2d:
+    """The true way on an even grid of time."""
+
+    at_s: Floats
+    east_m: Floats
+    north_m: Floats
+    yaw_rad: Floats
+    along_m: Floats
+    speed_m_s: Floats
+
+
+class Plane:
+    """Degrees to metres about a place; over a field its error is below a millimetre."""
+
+    def __init__(self, latitude_deg: float, longitude_deg: float) -> None:
+        self._latitude_deg, self._longitude_deg = latitude_deg, longitude_deg
+        latitude = np.radians(latitude_deg)
+        # WGS 84: radii of the meridian and of the prime vertical.
+        squared, flat = 0.00669437999014, np.sin(latitude) ** 2
+        prime_m = 6_378_137.0 / np.sqrt(1.0 - squared * flat)
+        self._north_m = np.radians(1.0) * prime_m * (1.0 - squared) / (1.0 - squared * flat)
+        self._east_m = np.radians(1.0) * prime_m * np.cos(latitude)
+
+    def metres(self, longitude_deg: Any, latitude_deg: Any) -> tuple[Floats, Floats]:
+        """Return east and north."""
+        return (
+            (np.asarray(longitude_deg) - self._longitude_deg) * self._east_m,
+            (np.asarray(latitude_deg) - self._latitude_deg) * self._north_m,
+        )
+
+    def of(self, geometry: shapely.Geometry) -> shapely.Geometry:
+        """Return a geometry in metres."""
+        return shapely.transform(
+            geometry, lambda rows: np.column_stack(self.metres(rows[:, 0], rows[:, 1]))
+        )
+
+
+def _smooth(at_s: Floats, values: Floats, grid_s: Floats) -> Floats:
+    """Fit a parabola about each moment of a grid; samples are uneven and rounded to 1 cm."""
+    coarse_s = np.arange(grid_s[0], grid_s[-1], 0.01)
+    low = np.searchsorted(at_s, coarse_s - SMOOTHED_S)
+    high = np.searchsorted(at_s, coarse_s + SMOOTHED_S)
+    found = np.empty_like(coarse_s)
+    for number, moment_s in enumerate(coarse_s):
+        near = slice(low[number], high[number])
+        if high[number] - low[number] < 5:
+            found[number] = np.interp(moment_s, at_s, values)
+        else:
+            found[number] = np.polynomial.polynomial.polyfit(
+                at_s[near] - moment_s, values[near], 2
+            )[0]
+    smooth: Floats = np.interp(grid_s, coarse_s, found)
+    return smooth
+
+
+def true_path(places: Sequence[Place], at_s: Floats, plane: Plane) -> Path2d:
+    """Return the way on a grid of STEP_S."""
+    order = np.argsort(at_s, kind="stable")
+    at_s = at_s[order]
+    rows = [places[number] for number in order]
+    east_m, north_m = plane.metres(
+        [one.longitude_deg for one in rows], [one.latitude_deg for one in rows]
+    )
+    yaw_rad = np.unwrap([one.yaw_rad for one in rows])
+    grid_s = np.arange(at_s[0] + SMOOTHED_S, at_s[-1] - SMOOTHED_S, STEP_S)
+    east_m, north_m = _smooth(at_s, east_m, grid_s), _smooth(at_s, north_m, grid_s)
+    steps_m = np.hypot(np.diff(east_m), np.diff(north_m))
+    along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    speed = np.gradient(along_m, STEP_S)
+    return Path2d(grid_s, east_m, north_m, np.interp(grid_s, at_s, yaw_rad), along_m, speed)
+
+
+# -------------------------------------------------------------------------------------- sprayer
+
+
+def flows_ml_s(pulses: Sequence[Pulses], grid_s: Floats, sprayer: Sprayer, seed: int) -> Floats:
+    """Return the flow of each valve on the grid: rows are valves."""
+    draw = np.random.default_rng(seed)
+    at_s = np.array([one.at_s for one in pulses])
+    # A pulse that first shows in a message began since the one before.
+    since_s = np.concatenate([[at_s[0]], 0.5 * (at_s[1:] + at_s[:-1])])
+    flows = []
+    for output in sprayer.outputs:
+        us = np.array([one.us[output - 1] for one in pulses], dtype=float)
+        phase_s = draw.uniform(0.0, sprayer.frame_s)
+        frames_s = np.arange(grid_s[0] - 1.0 + phase_s, grid_s[-1] + 1.0, sprayer.frame_s)
+        seen = np.searchsorted(since_s, frames_s, side="right") - 1
+        wanted = sprayer.flow_ml_s(us[np.clip(seen, 0, None)])
+        # Each frame's flow begins after the dead time and rises over the rise.
+        held = np.searchsorted(frames_s, grid_s - sprayer.dead_s, side="right") - 1
+        sharp = wanted[np.clip(held, 0, None)]
+        width = max(1, round(sprayer.rise_s / STEP_S))
+        summed = np.cumsum(np.concatenate([np.full(width, sharp[0]), sharp]))
+        flows.append((summed[width:] - summed[:-width]) / width)
+    return np.array(flows)
+
+
+# -------------------------------------------------------------------------------------- verdict
+
+
+def judge(
+    places: Sequence[Place],
+    pulses: Sequence[Pulses],
+    zones: Sequence[Zone],
+    *,
+    inside: shapely.Geometry | None = None,
+    sprayer: Sprayer | None = None,
+    seed: int = 1,
+) -> Verdict:
+    """Return what a flight did; `inside` is where liquid may fall, else all zones."""
+    sprayer = sprayer or Sprayer()
+    middle = shapely.union_all([zone.outline for zone in zones]).centroid
+    plane = Plane(middle.y, middle.x)
+    path = true_path(places, vehicle_times(places, pulses), plane)
+    flows = flows_ml_s(pulses, path.at_s, sprayer, seed)
+    flat = [Zone(plane.of(zone.outline), zone.rate_l_ha) for zone in zones]
+    allowed = plane.of(inside) if inside is not None else None
+    if allowed is None:
+        allowed = shapely.union_all([zone.outline for zone in flat])
+    verdict = Verdict(sprayed_l=float(flows.sum()) * STEP_S / 1000.0)
+    for valve, right_m in enumerate(sprayer.right_m):
+        east_m = path.east_m + right_m * np.cos(path.yaw_rad)
+        north_m = path.north_m - right_m * np.sin(path.yaw_rad)
+        rates = rates_at(flat, east_m, north_m)
+        _judge_valve(verdict, valve, path, rates, flows[valve], sprayer)
+    verdict.off_target_ml = _off_target_ml(path, flows, allowed, sprayer)
+    return verdict
+
+
+def rates_at(zones: Sequence[Zone], east_m: Floats, north_m: Floats) -> Floats:
+    """Return the rate at each place, NaN outside."""
+    rates = np.full(len(east_m), np.nan)
+    for zone in zones:
+        rates[shapely.contains_xy(zone.outline, east_m, north_m)] = zone.rate_l_ha
+    return rates
+
+
+def _judge_valve(
+    verdict: Verdict, valve: int, path: Path2d, rates: Floats, flow: Floats, sprayer: Sprayer
+) -> None:
+    known = np.where(np.isnan(rates), -1.0, rates)
+    edges = np.flatnonzero(np.diff(known) != 0.0) + 1
+    edges = edges[path.speed_m_s[edges] >= 1.0]
+    volume = np.concatenate([[0.0], np.cumsum(flow[1:] * np.diff(path.at_s))])
+    ml = np.where(np.isnan(rates), 0.0, rates) * sprayer.width_m * path.speed_m_s * STEP_S * 0.1
+    verdict.prescribed_l += float(ml.sum()) / 1000.0
+    bounds = np.concatenate([[0], edges, [len(known) - 1]])
+    for number, edge in enumerate(edges, start=1):
+        before, after = known[edge - 1], known[edge]
+        if before < 0.0 or after < 0.0:
+            continue  # the border's
+        here_m = path.along_m[edge]
+        back_m = here_m - path.along_m[bounds[number - 1]]
+        on_m = path.along_m[bounds[number + 1]] - here_m
+        lag_m = _lag_m(path.along_m, volume, here_m, back_m, on_m, (before, after))
+        change = Change(
+            valve + 1,
+            float(path.at_s[edge]),
+            float(here_m),
+            float(before),
+            float(after),
+            float(path.speed_m_s[edge]),
+            lag_m,
+        )
+        is_small = abs(after - before) < SMALL_STEP * max(before, after)
+        if is_small or min(back_m, on_m) < CLOSE_M:
+            verdict.apart.append(change)
+        else:
+            verdict.changes.append(change)
+
+
+def _lag_m(
+    along_m: Floats,
+    volume_ml: Floats,
+    here_m: float,
+    back_m: float,
+    on_m: float,
+    rates: tuple[float, float],
+) -> float | None:
+    """Return how late a sharp step of the same volume would lie; None where none came."""
+    near_m = min(1.0, 0.35 * min(back_m, on_m))
+    far_back_m = min(max(0.75 * back_m, near_m + 0.8), back_m - 0.3, REACH_M)
+    far_on_m = min(max(0.75 * on_m, near_m + 0.8), on_m - 0.3, REACH_M)
+    marks_m = here_m + np.array([-far_back_m, -near_m, near_m, far_on_m])
+    v0, v1, v2, v3 = np.interp(marks_m, along_m, volume_ml)
+    dose_before = (v1 - v0) / (far_back_m - near_m)
+    dose_after = (v3 - v2) / (far_on_m - near_m)
+    wanted = 0.1 * (rates[1] - rates[0])
+    if not (dose_after - dose_before) / wanted >= 0.5:
+        return None
+    # Two lines: v1 + dose_before (s - s1) and v2 + dose_after (s - s2).
+    crossing_m = (v2 - v1 + dose_before * marks_m[1] - dose_after * marks_m[2]) / (
+        dose_before - dose_after
+    )
+    return float(crossing_m - here_m)
+
+
+def _off_target_ml(
+    path: Path2d, flows: Floats, allowed: shapely.Geometry, sprayer: Sprayer
+) -> float:
+    """Return the volume that fell outside, the strips in elements of a decimetre."""
+    count = round(sprayer.width_m / OFF_TARGET_ELEMENT_M)
+    found_ml = 0.0
+    for valve, right_m in enumerate(sprayer.right_m):
+        open_now = np.flatnonzero(flows[valve] > 0.0)
+        for number in range(count):
+            aside_m = right_m + sprayer.width_m * ((number + 0.5) / count - 0.5)
+            east_m = path.east_m[open_now] + aside_m * np.cos(path.yaw_rad[open_now])
+            north_m = path.north_m[open_now] - aside_m * np.sin(path.yaw_rad[open_now])
+            is_out = ~shapely.contains_xy(allowed, east_m, north_m)
+            found_ml += float(flows[valve][open_now[is_out]].sum()) * STEP_S / count
+    return found_ml

@@ -1,0 +1,63 @@
+"""Beside a real ArduCopter: where the changes fall, judged from its simulator's own truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.firmware.fields import HOME, pass_items, write_pass
+from tests.firmware.firmware import companion
+from tests.firmware.flights import ready_copter, start, until_heard, until_landed
+from tests.firmware.judge import Verdict, geojson_area, geojson_zones, judge
+
+pytestmark = [pytest.mark.firmware, pytest.mark.timeout(300)]
+
+MEAN_MAX_M, WORST_MAX_M, OFF_TARGET_MAX_ML = 0.05, 0.25, 0.1
+
+
+def fly_pass(firmwares: Path, folder: Path, speed_m_s: float) -> Verdict:
+    """Fly one pass over eight zones and judge it."""
+    config = write_pass(folder / "field", speed_m_s)
+    with ready_copter(folder / "copter", firmwares, HOME) as vehicle:
+        with companion(folder, "--config", str(config)) as started:
+            until_heard(vehicle.station, started, folder / "companion.txt")
+            vehicle.station.log.clear_flight()
+            start(vehicle, pass_items(speed_m_s))
+            until_landed(vehicle, 150.0)
+        log = vehicle.station.log
+    return judge(
+        log.places,
+        log.pulses,
+        geojson_zones(config.parent / "zones.geojson"),
+        inside=geojson_area(config.parent / "boundary.geojson"),
+    )
+
+
+def holds(verdict: Verdict) -> None:
+    """Hold a flight to what is asked of ArduCopter."""
+    assert not verdict.missed
+    assert verdict.mean_abs_m <= MEAN_MAX_M
+    assert verdict.worst_m <= WORST_MAX_M
+    assert verdict.off_target_ml <= OFF_TARGET_MAX_ML
+    assert verdict.sprayed_l == pytest.approx(verdict.prescribed_l, rel=0.05)
+
+
+@pytest.mark.short
+def test_each_change_of_a_pass_at_5_m_s_falls_on_its_boundary(
+    firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
+) -> None:
+    verdict = fly_pass(firmwares, tmp_path, 5.0)
+    tell(verdict)
+    assert len(verdict.changes) == 7 * 6
+    holds(verdict)
+
+
+def test_each_change_of_a_pass_at_3_m_s_falls_on_its_boundary(
+    firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
+) -> None:
+    verdict = fly_pass(firmwares, tmp_path, 3.0)
+    tell(verdict)
+    assert len(verdict.changes) == 7 * 6
+    holds(verdict)
