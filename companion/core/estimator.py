@@ -125,7 +125,6 @@ _KEEP: dict[type, Callable[[Track, Any], Track]] = {
     GnssReport: lambda track, item: replace(track, gnss=item),
     EstimatorReport: lambda track, item: replace(track, estimator=item),
     LandedReport: lambda track, item: replace(track, landed=item),
-    WindReport: lambda track, item: replace(track, wind=item),
     RangeReport: lambda track, item: replace(track, range=item),
     OutputReport: lambda track, item: replace(track, output=item),
     FlowReport: lambda track, item: replace(track, flow=item),
@@ -189,6 +188,13 @@ def _observe_estop(track: Track, item: EstopReport, _setup: Setup) -> Track:
     return replace(track, estops=pressed - {item.source})
 
 
+def _observe_wind(track: Track, item: WindReport, setup: Setup) -> Track:
+    """Take what is known of the wind; not to know it does not calm one that was too strong."""
+    before_m_s = None if track.wind is None else track.wind.speed_m_s
+    is_calm = before_m_s is None or 0.0 <= before_m_s <= setup.limits.wind_max_m_s
+    return replace(track, wind=item) if item.speed_m_s is not None or is_calm else track
+
+
 def _observe_standstill(track: Track, item: StandstillReport, _setup: Setup) -> Track:
     """Forget what was heard: what comes now may have waited as long as we stood still.
 
@@ -245,6 +251,7 @@ _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
     EstopReport: _observe_estop,
     StandstillReport: _observe_standstill,
     RcReport: _observe_rc,
+    WindReport: _observe_wind,
     BatteryReport: _observe_battery,
 }
 
@@ -434,10 +441,14 @@ def _height(track: Track, motion: Motion, now_s: float) -> float:
 
 
 def _checked_speed(track: Track, now_s: float) -> float | None:
-    """Return the second opinion on the ground speed, if it is young enough."""
+    """Return the second opinion on the ground speed, if it is young enough.
+
+    One that is told and is no number agrees with nothing: NaN, which closes.
+    """
     if track.speed is None or not _young(track.speed, now_s, SPEED_REPORT_AGE_MAX_S):
         return None
-    return track.speed.ground_speed_m_s
+    told_m_s = track.speed.ground_speed_m_s
+    return math.nan if told_m_s is None else told_m_s
 
 
 def _reported_velocity(east: Axis, north: Axis, speed_m_s: float) -> tuple[float, float, bool]:

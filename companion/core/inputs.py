@@ -43,10 +43,13 @@ class Telemetry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpeedReport:
-    """Ground speed by a second way (VFR_HUD): the cross-check of the velocity."""
+    """Ground speed by a second way (VFR_HUD): the cross-check of the velocity.
+
+    `None` is a speed that the autopilot told and that is no number.
+    """
 
     received_s: float
-    ground_speed_m_s: float
+    ground_speed_m_s: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,11 +96,12 @@ class LandedReport:
 class WindReport:
     """Wind, from the autopilot or from the operator; east and north of where it blows to.
 
-    Without a direction the two are `None`: the speed alone still limits the spraying.
+    Without a direction the two are `None`: the speed alone still limits the spraying. Without a
+    speed the report says that the wind is not known.
     """
 
     received_s: float
-    speed_m_s: float
+    speed_m_s: float | None
     east_m_s: float | None = None
     north_m_s: float | None = None
 

@@ -73,7 +73,7 @@ def _estop(_desk: Desk, command: CommandReceived) -> Answer:
     return Answer(result=ACCEPTED, inputs=(stop,), text="emergency stop", event="emergency stop")
 
 
-def rate_override(desk: Desk, percent: float, received_s: float) -> Answer:
+def rate_override(desk: Desk, percent: float | None, received_s: float) -> Answer:
     """Take another percentage of the prescribed rates, by command or by parameter."""
     refusal = desk.parameters.set(RATE_PERCENT, percent, is_frozen=False)
     if refusal is not None:
@@ -120,9 +120,10 @@ def _reboot(_desk: Desk, _command: CommandReceived) -> Answer:
 
 
 def _request_message(desk: Desk, command: CommandReceived) -> Answer:
-    if command.param1 not in OWN_MESSAGES:
+    if command.param1 is None or command.param1 not in OWN_MESSAGES:
         return Answer(result=UNSUPPORTED)
-    index = int(command.param2) if 0 <= command.param2 < 1e4 else -1
+    number = command.param2
+    index = int(number) if number is not None and 0 <= number < 1e4 else -1
     if command.param1 == PARAM_VALUE and desk.parameters.at(index) is None:
         return Answer(result=DENIED)
     return Answer(result=ACCEPTED, send=int(command.param1), send_index=index)
@@ -143,7 +144,7 @@ def _set_interval(desk: Desk, command: CommandReceived) -> Answer:
         desk.values_hz = desk.parameters.get(VALUES_HZ, 1.0)
         return Answer(result=ACCEPTED)
     # -1, which switches a message off, is refused: another station may be looking.
-    if not 1e6 / VALUES_HZ_MAX <= interval_us <= 1e6 / VALUES_HZ_MIN:
+    if interval_us is None or not 1e6 / VALUES_HZ_MAX <= interval_us <= 1e6 / VALUES_HZ_MIN:
         return Answer(result=DENIED, text=f"values: {VALUES_HZ_MIN:g} to {VALUES_HZ_MAX:g} Hz")
     desk.values_hz = 1e6 / interval_us
     return Answer(result=ACCEPTED)
@@ -151,7 +152,8 @@ def _set_interval(desk: Desk, command: CommandReceived) -> Answer:
 
 def _get_interval(_desk: Desk, command: CommandReceived) -> Answer:
     number = command.param1
-    return Answer(result=ACCEPTED, interval_of=int(number) if 0 <= number < 65536 else 65535)
+    is_id = number is not None and 0 <= number < 65536
+    return Answer(result=ACCEPTED, interval_of=int(number or 0.0) if is_id else 65535)
 
 
 _HANDLERS: dict[int, Callable[[Desk, CommandReceived], Answer]] = {

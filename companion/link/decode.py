@@ -1,7 +1,8 @@
 """One MAVLink message to one of our types: scale factors, sentinels and flags live here only.
 
-Raw units stay in this file. What a message does not know becomes `None`; what it claims is passed
-on even where it is absurd (latitude 0, NaN), for the core to judge and the journal to keep.
+Raw units stay in this file. What a message does not know becomes `None`, and so does NaN or an
+infinite number; what it claims is passed on even where it is absurd (latitude 0), for the core to
+judge and the journal to keep. No content of a message may raise.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from companion.link.messages import (
     ServoOutput,
     TimesyncReceived,
 )
-from companion.link.mission_messages import CURRENT, TRANSFERS
+from companion.link.mission_messages import CURRENT, TRANSFERS, finite
 from companion.link.modes import autopilot_name, mode_name
 
 ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
@@ -78,7 +79,7 @@ def _velocity(velocity_cm_s: int) -> float | None:
 
 
 def _speed(m: Any, received_s: float) -> SpeedReport:
-    return SpeedReport(received_s=received_s, ground_speed_m_s=m.groundspeed)
+    return SpeedReport(received_s=received_s, ground_speed_m_s=finite(m.groundspeed))
 
 
 def _gnss(m: Any, received_s: float) -> GnssReport:
@@ -127,22 +128,28 @@ def _landed(m: Any, received_s: float) -> LandedReport:
 
 def _wind(m: Any, received_s: float) -> WindReport:
     # `direction` is where it comes from.
-    angle = math.radians(m.direction)
+    speed_m_s, from_deg = finite(m.speed), finite(m.direction)
+    if speed_m_s is None or from_deg is None:
+        return WindReport(received_s=received_s, speed_m_s=speed_m_s)
+    angle = math.radians(from_deg)
     return WindReport(
         received_s=received_s,
-        speed_m_s=m.speed,
-        east_m_s=-m.speed * math.sin(angle),
-        north_m_s=-m.speed * math.cos(angle),
+        speed_m_s=speed_m_s,
+        east_m_s=-speed_m_s * math.sin(angle),
+        north_m_s=-speed_m_s * math.cos(angle),
     )
 
 
 def _wind_cov(m: Any, received_s: float) -> WindReport:
     # x is north, y is east, and both are where it blows to.
+    north_m_s, east_m_s = finite(m.wind_x), finite(m.wind_y)
+    if north_m_s is None or east_m_s is None:
+        return WindReport(received_s=received_s, speed_m_s=None)
     return WindReport(
         received_s=received_s,
-        speed_m_s=math.hypot(m.wind_x, m.wind_y),
-        east_m_s=m.wind_y,
-        north_m_s=m.wind_x,
+        speed_m_s=math.hypot(north_m_s, east_m_s),
+        east_m_s=east_m_s,
+        north_m_s=north_m_s,
     )
 
 
@@ -204,8 +211,8 @@ def _command(m: Any, received_s: float) -> CommandReceived:
         target_system=m.target_system,
         target_component=m.target_component,
         command=m.command,
-        param1=m.param1,
-        param2=m.param2,
+        param1=finite(m.param1),
+        param2=finite(m.param2),
     )
 
 
@@ -250,12 +257,13 @@ def _param_set(m: Any, received_s: float) -> ParamSet:
         target_system=m.target_system,
         target_component=m.target_component,
         name=m.param_id,
-        value=m.param_value,
+        value=finite(m.param_value),
         kind=m.param_type,
     )
 
 
 def _param_value(m: Any, received_s: float) -> ParamValue:
+    # Not `finite`: PX4 puts a whole number's bytes where the float would be, and -1 looks like NaN.
     return ParamValue(
         received_s=received_s, name=m.param_id, value=m.param_value, kind=m.param_type
     )

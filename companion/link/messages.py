@@ -18,15 +18,15 @@ class Sender:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommandReceived:
-    """COMMAND_LONG or COMMAND_INT, whoever it is for; parameters 5 and 6 are not kept."""
+    """COMMAND_LONG or COMMAND_INT, whoever it is for; parameters 3 to 7 are not kept."""
 
     received_s: float
     sender: Sender
     target_system: int
     target_component: int
     command: int
-    param1: float
-    param2: float
+    param1: float | None
+    param2: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +82,7 @@ class ParamSet:
     target_system: int
     target_component: int
     name: str
-    value: float
+    value: float | None
     kind: int
 
 

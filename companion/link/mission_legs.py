@@ -84,7 +84,7 @@ def _stops(
     items: Sequence[MissionItem], number: int, start: tuple[float, float], end: tuple[float, float]
 ) -> bool:
     item = items[number]
-    if item.command != _WAYPOINT or item.param1 > 0.0:
+    if item.command != _WAYPOINT or (item.param1 or 0.0) > 0.0:
         return True
     following = _next_flown(items, number + 1)
     between = items[number + 1 : following]
@@ -115,6 +115,6 @@ def _bend_deg(
 def _speed_m_s(items: Sequence[MissionItem], number: int) -> float | None:
     """Return the speed that was last set before an item."""
     for item in reversed(items[:number]):
-        if item.command == _CHANGE_SPEED and item.param2 > 0.0:
+        if item.command == _CHANGE_SPEED and (item.param2 or 0.0) > 0.0:
             return item.param2
     return None

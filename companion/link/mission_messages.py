@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
@@ -31,8 +32,8 @@ class MissionItem:
     """One item; `place` is latitude and longitude in degrees, None where it has none."""
 
     command: int
-    param1: float
-    param2: float
+    param1: float | None
+    param2: float | None
     place: tuple[float, float] | None
 
 
@@ -67,6 +68,15 @@ class MissionTransfer:
     number: int = 0
     item: MissionItem | None = None
     is_current: bool = False
+
+
+def finite(value: float) -> float | None:
+    """Return a number of a message; None for NaN and for what is infinite.
+
+    >>> finite(float("inf")), finite(float("nan")), finite(0.0)
+    (None, None, 0.0)
+    """
+    return value if math.isfinite(value) else None
 
 
 def _current(m: Any, received_s: float) -> MissionCurrent:
@@ -114,8 +124,8 @@ def _item(m: Any, received_s: float) -> MissionTransfer | None:
     has_place = m.frame in _GLOBAL_FRAMES and place != (0.0, 0.0)
     item = MissionItem(
         command=m.command,
-        param1=m.param1,
-        param2=m.param2,
+        param1=finite(m.param1),
+        param2=finite(m.param2),
         place=place if has_place else None,
     )
     # ArduPilot has other meanings for numbers above 1.

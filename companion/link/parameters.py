@@ -108,9 +108,11 @@ class Parameters:
         """Return the place of a name; None for a name that we do not have."""
         return self._order.index(name) if name in self._known else None
 
-    def set(self, name: str, value: float, *, is_frozen: bool) -> str | None:
+    def set(self, name: str, value: float | None, *, is_frozen: bool) -> str | None:
         """Take a value; return None, or why the old one stays."""
         one = self._known[name]
+        if value is None:
+            return "give a number"
         # A float of 32 bits has seven digits: 0.12 shall not become 0.11999999731779099.
         value = float(f"{value:.6g}")
         if not self._in_range(one, value):

@@ -17,7 +17,7 @@ class Tank:
         self.level_l: float | None = None
         self._last: tuple[float, float] | None = None
 
-    def filled(self, litres: float) -> bool:
+    def filled(self, litres: float | None) -> bool:
         """Take a filling, 0 for a full tank; return whether it can be one."""
         level_l = self.capacity_l if litres == 0.0 else litres
         most_l = 10_000.0 if self.capacity_l is None else self.capacity_l

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from companion.link.decode import FROM_ANYONE, FROM_VEHICLE
 
-_UNDERSTOOD = tuple(sorted({*FROM_VEHICLE, *FROM_ANYONE}))
+READ = tuple(sorted({*FROM_VEHICLE, *FROM_ANYONE}))
 _ALL = tuple(sorted(mavlink.mavlink_map))
 # What a field takes at the ends of its type: 0, all ones, the largest and the smallest, NaN.
 _EXTREMES = (b"\x00", b"\xff", b"\x7f", b"\x80", b"\x00\x00\xc0\x7f")
+
+_MAX_FLOAT = 3.4028234663852886e38
+_FLOATS = (math.nan, math.inf, -math.inf, _MAX_FLOAT, -_MAX_FLOAT, 1e-45, -0.0, 1e19, 2.0**31, -1.0)
 
 
 def sealed(message_id: int, payload: bytes, *, system_id: int, component_id: int) -> bytes:
@@ -36,7 +43,7 @@ def random_frame(rng: np.random.Generator, frame: bytes, *, system_id: int) -> b
 
 def _random_message(rng: np.random.Generator, system_id: int) -> bytes:
     known = rng.random() < 0.8
-    message_id = int(rng.choice(_UNDERSTOOD if known else _ALL))
+    message_id = int(rng.choice(READ if known else _ALL))
     size = mavlink.mavlink_map[message_id].unpacker.size
     payload = rng.bytes(size)
     if rng.random() < 0.5:
@@ -65,3 +72,51 @@ def _damaged(rng: np.random.Generator, frame: bytes) -> bytes:
     for _ in range(int(rng.integers(1, 4))):
         damaged[int(rng.integers(0, len(damaged)))] = int(rng.integers(0, 256))
     return bytes(damaged[: int(rng.integers(1, len(damaged) + 1))])
+
+
+def _values(kind: str) -> tuple[Any, ...]:
+    """Return what a field of a type takes at the ends of it."""
+    if kind in ("float", "double"):
+        return _FLOATS
+    if kind == "char":
+        return (b"\x00", b"\xff", b"A", b"\x7f")
+    bits = int("".join(letter for letter in kind if letter.isdigit()))
+    if kind.startswith("u"):
+        return (0, 1, 2 ** (bits - 1), 2**bits - 1)
+    return (0, 1, -1, 2 ** (bits - 1) - 1, -(2 ** (bits - 1)))
+
+
+def packed(message_id: int, change: dict[str, Any]) -> bytes:
+    """Return the payload of a message, all fields 0 but those that are changed."""
+    kind = mavlink.mavlink_map[message_id]
+    given: list[Any] = []
+    for name, count in zip(kind.ordered_fieldnames, kind.array_lengths, strict=True):
+        is_text = kind.fieldtypes[kind.fieldnames.index(name)] == "char"
+        value = change.get(name, b"\x00" if is_text else 0)
+        if is_text:
+            given.append(value * max(count, 1))
+        else:
+            given += [value] * max(count, 1)
+    return bytes(kind.unpacker.pack(*given))
+
+
+def _payloads(message_id: int) -> Iterator[tuple[str, bytes]]:
+    """Yield each field alone at each extreme, and all fields of a type at it together."""
+    kind = mavlink.mavlink_map[message_id]
+    types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
+    for name, one in types.items():
+        for value in _values(one):
+            yield f"{name}={value!r}", packed(message_id, {name: value})
+    for one in sorted(set(types.values())):
+        names = [name for name, other in types.items() if other == one]
+        for value in _values(one):
+            yield f"all {one}={value!r}", packed(message_id, dict.fromkeys(names, value))
+    for number in range(max(len(_values(one)) for one in types.values())):
+        change = {name: _values(one)[number % len(_values(one))] for name, one in types.items()}
+        yield f"all at extreme {number}", packed(message_id, change)
+
+
+def extreme_frames(message_id: int) -> Iterator[tuple[str, bytes]]:
+    """Yield the vehicle's frames of a message with its fields at their extremes, each named."""
+    for label, payload in _payloads(message_id):
+        yield label, sealed(message_id, payload, system_id=1, component_id=1)

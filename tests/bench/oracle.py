@@ -45,6 +45,8 @@ class Oracle:
     def hear(self, item: Input) -> None:
         """Take one input."""
         before = self.newest.get(type(item))
+        if isinstance(item, WindReport) and item.speed_m_s is None:
+            return  # says nothing of the wind: what was known of it before stays
         self.newest[type(item)] = item
         if isinstance(item, OperatorCommand):
             self.enabled = item.enable
@@ -75,7 +77,9 @@ _GOOD: dict[type, Callable[[Any], bool]] = {
     EstimatorReport: lambda item: item.healthy,
     OutputReport: lambda item: item.healthy and item.link_up,
     LandedReport: lambda item: item.in_air is True,
-    SpeedReport: lambda item: 0.0 <= item.ground_speed_m_s <= 13.0,
+    SpeedReport: lambda item: (
+        item.ground_speed_m_s is not None and 0.0 <= item.ground_speed_m_s <= 13.0
+    ),
     WindReport: lambda item: 0.0 <= item.speed_m_s <= 6.0,
     Telemetry: lambda item: abs(item.latitude_deg) <= 90.0 and item.heading_deg is not None,
 }

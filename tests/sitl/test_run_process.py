@@ -16,6 +16,7 @@ import pytest
 import shapely
 
 from companion.core.frame import LocalFrame
+from tests.bench.bad_frames import READ, extreme_frames
 from tests.sitl.wire_peer import WirePeer, free_port, over_udp
 
 pytestmark = pytest.mark.sitl
@@ -78,6 +79,27 @@ async def test_a_signal_closes_every_valve_and_ends_the_process(
         assert b"Traceback" not in stderr
         await peer.until(lambda: peer.is_all_closed)
         assert [order.pulse_us for order in peer.orders[-12:]] == [1000] * 12
+
+
+async def test_no_extreme_of_any_message_ends_the_process(config: Path) -> None:
+    port = free_port()
+    peer = peer_over_the_middle()
+    async with companion(config, port) as process, over_udp(peer, port):
+        await peer.until(lambda: peer.is_all_closed, within_s=20.0)
+        peer.place(east_m=-6.0)
+        peer.enable()
+        await peer.until(lambda: len(peer.open_channels) == 6)
+        for message_id in READ:
+            for _, frame in extreme_frames(message_id):
+                peer.write(frame)
+            await asyncio.sleep(0.02)  # the socket's buffer is finite
+        beats = len(peer.of("HEARTBEAT"))
+        await peer.until(lambda: len(peer.of("HEARTBEAT")) >= beats + 2)
+        process.send_signal(signal.SIGTERM)
+        _, stderr = await asyncio.wait_for(process.communicate(), 10.0)
+        assert process.returncode == 0, stderr.decode()
+        assert b"Traceback" not in stderr
+        await peer.until(lambda: peer.is_all_closed)
 
 
 async def test_a_port_in_use_is_one_line_and_exit_two(config: Path) -> None:

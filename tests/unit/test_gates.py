@@ -128,9 +128,7 @@ CLOSING: list[tuple[Inhibit, tuple[Any, ...]]] = [
     (Inhibit.SPEED_DISAGREES, ("vfr_hud", 0.0, NAN, 90, 40, 60.0, 0.0)),
     (Inhibit.SPEED_DISAGREES, ("vfr_hud", 0.0, -5.0, 90, 40, 60.0, 0.0)),
     (Inhibit.WIND_ABOVE_MAX, ("wind", 0.0, 6.1, 0.0)),
-    (Inhibit.WIND_ABOVE_MAX, ("wind", 0.0, NAN, 0.0)),
     (Inhibit.WIND_ABOVE_MAX, ("wind_cov", 0, 5.0, -5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
-    (Inhibit.WIND_ABOVE_MAX, ("wind_cov", 0, NAN, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
     (Inhibit.HEIGHT_BELOW_MIN, distance(90)),
     (Inhibit.HEIGHT_ABOVE_MAX, distance(1100)),
 ]
@@ -225,6 +223,22 @@ def test_wind_that_is_required_has_to_be_young() -> None:
     found = [flight.step().inhibits for _ in range(110)]
     assert not any(found[:98])
     assert found[-1] == {Inhibit.WIND_UNKNOWN}
+
+
+@pytest.mark.parametrize(
+    "message",
+    [("wind", 0.0, NAN, 0.0), ("wind_cov", 0, NAN, *([0.0] * 7)), ("wind", 0.0, INF, 0.0)],
+)
+def test_a_wind_that_is_no_number_is_unknown_and_calms_none_that_was_too_strong(
+    message: tuple[Any, ...],
+) -> None:
+    flight = Flight(STRICT)
+    for _ in range(READY):
+        flight.step(enables=flight.number == 5)
+    assert not flight.step(flight.says("wind", 0.0, 3.0, 0.0)).inhibits
+    assert flight.step(flight.says(*message)).inhibits == {Inhibit.WIND_UNKNOWN}
+    assert flight.step(flight.says("wind", 0.0, 8.0, 0.0)).inhibits == {Inhibit.WIND_ABOVE_MAX}
+    assert flight.step(flight.says(*message)).inhibits == {Inhibit.WIND_ABOVE_MAX}
 
 
 def test_wind_that_was_too_strong_and_is_no_longer_told_stays_too_strong() -> None:
@@ -504,6 +518,8 @@ NOTHING: list[Callable[[], Input]] = [
     lambda: RcReport(received_s=NOW_S, pulse_us=(1900,) * 6),
     lambda: HeartbeatReport(received_s=NOW_S, autopilot="", armed=True, mode=""),
     lambda: OutputReport(received_s=NOW_S, healthy=False),
+    lambda: SpeedReport(received_s=NOW_S, ground_speed_m_s=None),
+    lambda: WindReport(received_s=NOW_S, speed_m_s=None),
 ]
 
 
