@@ -44,6 +44,7 @@ class Codec:
         self._senders: dict[tuple[int, int], _Sequence] = {}
         self.vehicle_counts: dict[int, int] = {}
         self.ignored_count = 0
+        self.vehicle_frame_count = 0
         self.byte_count = 0
 
     @property
@@ -79,6 +80,17 @@ class Codec:
         """
         return {sender: (one.count, one.lost) for sender, one in self._senders.items()}
 
+    def is_autopilot(self, system_id: int, component_id: int) -> bool:
+        """Whether a sender is the vehicle's autopilot, the only one who speaks for the vehicle.
+
+        A camera or a gimbal of the same system may say what it likes.
+        """
+        vehicle = self.vehicle
+        return vehicle is not None and (system_id, component_id) == (
+            vehicle.system_id,
+            AUTOPILOT_COMPONENT,
+        )
+
     def decode(self, data: bytes, received_s: float) -> list[Message]:
         """Return what `data` completes, in its order; never raises."""
         self.byte_count += len(data)
@@ -93,11 +105,13 @@ class Codec:
         sender = (raw.get_srcSystem(), raw.get_srcComponent())
         self._count(sender, raw.get_seq())
         message_id: int = raw.get_msgId()
-        if message_id in FROM_ANYONE:
-            return FROM_ANYONE[message_id](raw, received_s)
         if message_id == _HEARTBEAT:
             self.census.heartbeat(*sender, kind=raw.type, autopilot=raw.autopilot, now_s=received_s)
-        if self.vehicle is None or sender != (self.vehicle.system_id, AUTOPILOT_COMPONENT):
+        if self.vehicle is not None and sender[0] == self.vehicle.system_id:
+            self.vehicle_frame_count += 1
+        if message_id in FROM_ANYONE:
+            return FROM_ANYONE[message_id](raw, received_s)
+        if not self.is_autopilot(*sender):
             self.ignored_count += 1
             return None
         self.vehicle_counts[message_id] = self.vehicle_counts.get(message_id, 0) + 1

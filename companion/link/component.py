@@ -108,6 +108,7 @@ class Component:
         self.is_answered = False
         self.mission_active: bool | None = None
         self.on_order_ack: Callable[[int], None] | None = None
+        self.on_valid: Callable[[bool], None] | None = None
 
     @property
     def on_event(self) -> OnEvent | None:
@@ -161,7 +162,12 @@ class Component:
     def receive(self, data: bytes, received_s: float) -> list[Input]:
         """Return the inputs in `data`, and answer what wants an answer."""
         inputs: list[Input] = []
-        for message in self.codec.decode(data, received_s):
+        codec = self.codec
+        before = (codec.frame_count, codec.vehicle_frame_count)
+        messages = codec.decode(data, received_s)
+        if self.on_valid is not None and codec.frame_count > before[0]:
+            self.on_valid(codec.vehicle_frame_count > before[1])
+        for message in messages:
             if self._supervisor is None and self.is_vehicle_known:
                 self._meet(received_s)
             if _is_input(message):
@@ -288,8 +294,7 @@ class Component:
             now_ns = round(message.received_s * 1e9)
             self._send(self._encoder.timesync(now_ns, message.ts1_ns))
             return
-        vehicle = self.codec.vehicle
-        if vehicle is not None and message.sender.system_id == vehicle.system_id:
+        if self.codec.is_autopilot(message.sender.system_id, message.sender.component_id):
             self.clock.answer(message.tc1_ns, message.ts1_ns, message.received_s)
             self.is_answered = self.is_answered or self.clock.offset_s is not None
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from companion.core.types import LegReport
+from companion.link.census import AUTOPILOT_COMPONENT
 from companion.link.encode import Encoder
 from companion.link.mission_asker import MissionAsker
 from companion.link.mission_legs import leg_report
@@ -183,7 +184,13 @@ class MissionReader:
     def _take_transfer(self, message: MissionTransfer) -> None:
         own = (self._encoder.system_id, self._encoder.component_id)
         is_ours = (message.target_system, message.target_component) == own
-        if not (is_ours and message.system_id == self._vehicle):
+        is_autopilot = (message.system_id, message.component_id) == (
+            self._vehicle,
+            AUTOPILOT_COMPONENT,
+        )
+        if is_ours and not is_autopilot:
+            return  # nobody else has a mission of the vehicle to give
+        if not is_ours:
             self._stand_back(message)
         elif not self._is_waiting:
             return

@@ -10,7 +10,7 @@ import asyncio
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from companion.errors import LinkError
 
@@ -31,9 +31,13 @@ class Transport(Protocol):
     """An open link."""
 
     is_up: bool
+    speaker: Any  # where the bytes that are being handed over came from, where there are several
 
     def send(self, data: bytes) -> bool:
         """Send now or not at all; return whether it left."""
+
+    def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
+        """Take that a valid frame came from `speaker`, of the vehicle's system or of another."""
 
     async def close(self) -> None:
         """Let what was sent go out, for half a second at most, and let go."""
@@ -117,6 +121,7 @@ class Reconnecting:
     ) -> None:
         self.url = url
         self.is_up = False
+        self.speaker: Any = None
         self._on_bytes = on_bytes
         self._on_change = on_change
         self._on_trouble = on_trouble
@@ -149,6 +154,9 @@ class Reconnecting:
     @abstractmethod
     def send(self, data: bytes) -> bool:
         """Send now or not at all; return whether it left."""
+
+    def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
+        """Do nothing: there is one other end, and we chose it."""
 
     async def close(self) -> None:
         """Stop trying and let go."""

@@ -4,21 +4,38 @@ from __future__ import annotations
 
 import asyncio
 import errno
+from dataclasses import dataclass
 from typing import Any, cast
 
 from companion.errors import LinkError
 from companion.link.transport import LinkUrl, OnBytes
 
 _PEERS_MAX = 4
+# A peer that has said nothing valid for so long may lose its place; heartbeats come every second.
+_SILENT_S = 5.0
+
+
+@dataclass(slots=True)
+class _Peer:
+    """When an address last said something valid, and whether the vehicle speaks from it."""
+
+    heard_s: float
+    is_vehicle: bool
 
 
 class UdpTransport(asyncio.DatagramProtocol):
-    """One socket. `udpin` answers everyone that it has heard of late, four at most."""
+    """One socket. `udpin` sends to the addresses that were adopted, four at most.
+
+    Anyone can send a datagram here, so nobody becomes a peer by that alone: the link adopts an
+    address once a frame from it has been found valid. A newcomer never displaces a peer that is
+    still heard, but for the vehicle, which displaces a stranger.
+    """
 
     def __init__(self, on_bytes: OnBytes, *, is_connected: bool) -> None:
         self._on_bytes = on_bytes
         self._is_connected = is_connected
-        self._peers: dict[Any, None] = {}
+        self._peers: dict[Any, _Peer] = {}
+        self.speaker: Any = None
         self._socket: asyncio.DatagramTransport | None = None
         self._closed = asyncio.get_running_loop().create_future()
         self.is_up = True
@@ -30,13 +47,35 @@ class UdpTransport(asyncio.DatagramProtocol):
         self._socket = cast(asyncio.DatagramTransport, transport)
 
     def datagram_received(self, data: bytes, addr: Any) -> None:
-        """Remember who speaks, the latest last, and hand the bytes over."""
-        if not self._is_connected:
-            self._peers.pop(addr, None)
-            self._peers[addr] = None
-            while len(self._peers) > _PEERS_MAX:
-                del self._peers[next(iter(self._peers))]
+        """Hand the bytes over; `speaker` says meanwhile where they came from."""
+        self.speaker = addr
         self._on_bytes(data)
+
+    def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
+        """Send to an address from now on, if there is a place for it."""
+        if self._is_connected or speaker is None:
+            return
+        known = self._peers.get(speaker)
+        if known is None:
+            if len(self._peers) >= _PEERS_MAX and not self._make_room(now_s, is_vehicle):
+                return
+            self._peers[speaker] = _Peer(now_s, is_vehicle)
+            return
+        known.heard_s = now_s
+        known.is_vehicle = known.is_vehicle or is_vehicle
+
+    def _make_room(self, now_s: float, is_vehicle: bool) -> bool:
+        """Let go of a peer that has fallen silent, or of a stranger where the vehicle speaks."""
+        by_age = sorted(self._peers, key=lambda address: self._peers[address].heard_s)
+        for address in by_age:
+            if now_s - self._peers[address].heard_s > _SILENT_S:
+                del self._peers[address]
+                return True
+        strangers = [address for address in by_age if not self._peers[address].is_vehicle]
+        if not (is_vehicle and strangers):
+            return False
+        del self._peers[strangers[0]]
+        return True
 
     def error_received(self, _exc: Exception) -> None:
         """Count what the network reports: nobody listens yet, or no longer."""

@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from typing import Any
 
 from companion.core.types import Decision, Input, OperatorCommand, RateOverride
 from companion.link.component import Component, ComponentOptions
@@ -49,11 +50,13 @@ class VehicleLink:
         self._url = url
         self._clock = clock
         self._signing = signing
-        self._chunks: deque[tuple[bytes, float]] = deque(maxlen=_CHUNKS_MAX)
+        self._chunks: deque[tuple[bytes, float, Any]] = deque(maxlen=_CHUNKS_MAX)
+        self._spoke: tuple[Any, float] = (None, 0.0)
         self._transport: Transport | None = None
         self._wake: Callable[[], None] = _nothing
         self.component = Component(options, self._send, parameters=parameters, signing=signing)
         self.component.on_event = self._event
+        self.component.on_valid = self._adopt
         self._on_event: OnEvent | None = None
         self._on_statistics: OnStatistics | None = None
         self._sampled_s = float("-inf")
@@ -108,7 +111,8 @@ class VehicleLink:
             self.component.link_changed(self._clock())
         inputs: list[Input] = []
         while self._chunks:
-            data, received_s = self._chunks.popleft()
+            data, received_s, speaker = self._chunks.popleft()
+            self._spoke = (speaker, received_s)
             inputs.extend(self.component.receive(data, received_s))
         self._heard = self._heard or any(
             not isinstance(item, OperatorCommand | RateOverride) for item in inputs
@@ -183,8 +187,18 @@ class VehicleLink:
         return self._transport is not None and self._transport.send(data)
 
     def _on_bytes(self, data: bytes) -> None:
-        self._chunks.append((data, self._clock()))
+        speaker = None if self._transport is None else self._transport.speaker
+        self._chunks.append((data, self._clock(), speaker))
         self._wake()
+
+    def _adopt(self, is_vehicle: bool) -> None:
+        """Have the answers sent to whoever just said something valid.
+
+        Before anything is answered: what the vehicle is asked at once must reach it.
+        """
+        speaker, now_s = self._spoke
+        if self._transport is not None:
+            self._transport.adopt(speaker, now_s, is_vehicle=is_vehicle)
 
     def _on_change(self, is_up: bool) -> None:
         _logger.warning("link %s: %s", "is up" if is_up else "was lost", self._url)

@@ -63,6 +63,10 @@ class _Wire:
     """The companion's end: a transport that delivers after a moment."""
 
     is_up = True
+    speaker = None
+
+    def adopt(self, speaker: object, now_s: float, *, is_vehicle: bool) -> None:
+        """Do nothing: there is one other end."""
 
     def __init__(self, deliver: Callable[[bytes], None]) -> None:
         self._deliver = deliver

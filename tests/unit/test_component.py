@@ -10,8 +10,16 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.core.controller import Memory, step
-from companion.core.types import Decision, Inhibit, OperatorCommand, SprayPlan, Telemetry
+from companion.core.types import (
+    ClockReport,
+    Decision,
+    Inhibit,
+    OperatorCommand,
+    SprayPlan,
+    Telemetry,
+)
 from companion.link.component import Component, ComponentOptions
+from companion.link.decode import FROM_ANYONE, FROM_VEHICLE
 from companion.link.vehicle_link import VehicleLink
 from tests import builders
 
@@ -205,6 +213,53 @@ def test_answers_to_other_peoples_questions_are_ignored(peer: Peer, met: Compone
     assert met.clock.offset_s is None
 
 
+def said_by(
+    component_id: int, name: str, *fields: Any, system: int = VEHICLE, **more: Any
+) -> bytes:
+    """Return a frame of a component of the vehicle that is not its autopilot."""
+    sender = mavlink.MAVLink(None, srcSystem=system, srcComponent=component_id)
+    message = getattr(sender, f"{name}_encode")(*fields, **more)
+    return bytes(message.pack(sender))
+
+
+@pytest.mark.parametrize("component_id", [2, 100, 154, 190, 191, 240])
+def test_only_the_autopilot_tells_the_time(peer: Peer, met: Component, component_id: int) -> None:
+    met.tick(None, 10.0)
+    (question,) = peer.of("TIMESYNC")
+    first = said_by(component_id, "timesync", 5_450_000_000, question.ts1)
+    assert met.receive(first, 10.002) == []
+    assert met.clock.offset_s is None
+    (report,) = met.receive(peer.autopilot("timesync", 5_000_000_000, question.ts1), 10.004)
+    assert isinstance(report, ClockReport)
+    assert report.offset_s == pytest.approx(5.002)
+
+
+# What counts from anyone: questions to us and commands, each judged by whom it is addressed to;
+# TIMESYNC and the transfers of missions look at their sender themselves.
+FROM_ANYONE_TOO = {4, 20, 21, 23, 38, 40, 43, 44, 45, 47, 51, 73, 75, 76, 111}
+
+
+@pytest.mark.parametrize("message_id", sorted(FROM_VEHICLE))
+def test_nobody_but_the_autopilot_describes_the_vehicle(
+    peer: Peer, met: Component, message_id: int
+) -> None:
+    heard: list[Any] = []
+    met.outputs.report = heard.append  # type: ignore[method-assign]
+    met.outputs.parameter = heard.append  # type: ignore[method-assign]
+    met.on_order_ack = heard.append
+    kind = mavlink.mavlink_map[message_id]
+    for system, component_id in ((VEHICLE, 100), (VEHICLE, 191), (VEHICLE, 0), (8, 1)):
+        size = kind.unpacker.size
+        frame = bytes((0xFD, size, 0, 0, 1, system, component_id))
+        frame += message_id.to_bytes(3, "little") + b"\x01" * size
+        check = mavlink.x25crc(frame[1:] + bytes([kind.crc_extra])).crc
+        assert met.receive(frame + check.to_bytes(2, "little"), 1.0) == []
+    assert met.codec.frame_count == 5
+    assert not heard
+    assert met.mission_active is None
+    assert set(FROM_ANYONE) == FROM_ANYONE_TOO
+
+
 # ------------------------------------------------------------------------------------- streams
 
 
@@ -394,6 +449,11 @@ def test_the_sign_of_life_comes_before_a_valve_opens(peer: Peer, met: Component)
 
 class UpAndDown:
     """A transport whose state the test sets."""
+
+    speaker = None
+
+    def adopt(self, speaker: object, now_s: float, *, is_vehicle: bool) -> None:
+        """Do nothing: there is one other end."""
 
     def __init__(self, peer: Peer) -> None:
         self.is_up = True

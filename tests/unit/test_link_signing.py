@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 from itertools import pairwise
 from pathlib import Path
@@ -13,9 +14,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.errors import LinkError
 from companion.link.codec import Codec
+from companion.link.component import ComponentOptions
 from companion.link.encode import Encoder
 from companion.link.signing import STATE_NAME, Signing, read_key
 from companion.link.state_file import read_state
+from companion.link.vehicle_link import VehicleLink
+from tests.sitl.wire_peer import free_port
 
 KEY = bytes(range(100, 132))
 PHRASE_32 = b"a passphrase of 32 characters..."
@@ -189,3 +193,58 @@ def test_a_key_that_is_not_there_is_said_in_one_line(tmp_path: Path) -> None:
         read_key(tmp_path / "nothing")
     with pytest.raises(LinkError, match="is a directory"):
         read_key(tmp_path)
+
+
+class _Socket(asyncio.DatagramProtocol):
+    """One address that speaks to a port of this computer, and counts what it is told."""
+
+    def __init__(self) -> None:
+        self.heard = 0
+
+    def datagram_received(self, _data: bytes, _addr: object) -> None:
+        self.heard += 1
+
+
+async def _speaks(port: int) -> tuple[asyncio.DatagramTransport, _Socket]:
+    return await asyncio.get_running_loop().create_datagram_endpoint(
+        _Socket, remote_addr=("127.0.0.1", port)
+    )
+
+
+@pytest.mark.parametrize("is_signed", [True, False])
+async def test_strangers_do_not_displace_the_vehicle_on_udpin(is_signed: bool) -> None:
+    port, arrived = free_port(), asyncio.Event()
+    link = VehicleLink(
+        f"udpin:127.0.0.1:{port}",
+        ComponentOptions(),
+        signing=signing() if is_signed else None,
+        clock=lambda: 10.0,
+    )
+    await link.open(arrived.set)
+    vehicle, inbox = await _speaks(port)
+    station, stranger = Station(), mavlink.MAVLink(None, srcSystem=66, srcComponent=190)
+    said = station.heartbeat()
+    unsigned = bytes(stranger.heartbeat_encode(6, 8, 0, 0, 4).pack(stranger))
+
+    async def says(socket: asyncio.DatagramTransport, frame: bytes) -> None:
+        arrived.clear()
+        socket.sendto(frame)
+        async with asyncio.timeout(5.0):
+            await arrived.wait()
+        link.receive()
+
+    await says(vehicle, said)
+    others = [await _speaks(port) for _ in range(6)]
+    for number, (socket, _) in enumerate(others):
+        # Noise, a frame without a signature (or of another system), the vehicle's own once more.
+        await says(socket, [b"noise", unsigned, said if is_signed else unsigned][number % 3])
+    before = inbox.heard
+    assert link.component.outputs.order(9, 1000)
+    async with asyncio.timeout(5.0):
+        while inbox.heard == before:
+            await asyncio.sleep(0)
+    if is_signed:
+        assert not any(other.heard for _, other in others)
+    for socket, _ in [(vehicle, inbox), *others]:
+        socket.close()
+    await link.close()

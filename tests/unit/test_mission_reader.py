@@ -353,6 +353,19 @@ def test_somebody_elses_transfer_is_waited_for() -> None:
     assert bench.reader.items == MISSION
 
 
+def test_a_mission_comes_from_the_autopilot_alone() -> None:
+    bench = Bench()
+    bench.current()
+    while bench.reader.items is None:
+        # A camera of the same system is always first, with another mission.
+        bench.transfer(MissionStep.COUNT, 1, sender=(1, 100))
+        bench.transfer(MissionStep.ITEM, 0, sender=(1, 100))
+        bench.transfer(MissionStep.ENDED, sender=(1, 100))
+        bench.run(0.05)
+        assert bench.now_s < 160.0
+    assert bench.reader.items == MISSION
+
+
 def test_what_is_being_written_is_not_what_was_read() -> None:
     bench = known()
     bench.is_armed = True

@@ -64,6 +64,8 @@ async def test_udp_carries_bytes_both_ways() -> None:
     assert not listening.send(b"nobody is there yet")
     assert speaking.send(b"hello")
     assert await here.until_bytes(5) == b"hello"
+    assert not listening.send(b"whoever you are")
+    listening.adopt(listening.speaker, 0.0, is_vehicle=True)
     assert listening.send(b"welcome")
     assert await there.until_bytes(7) == b"welcome"
     await speaking.close()
@@ -85,7 +87,7 @@ async def test_udp_survives_a_peer_that_is_not_there_yet() -> None:
     await listening.close()
 
 
-async def test_udp_answers_everyone_it_has_heard_of_late() -> None:
+async def test_udp_sends_to_four_and_the_vehicle_is_never_displaced() -> None:
     port = free_port()
     here = Inbox()
     listening = await here.open(f"udpin:127.0.0.1:{port}")
@@ -95,10 +97,27 @@ async def test_udp_answers_everyone_it_has_heard_of_late() -> None:
         speakers.append(await inbox.open(f"udpout:127.0.0.1:{port}"))
         speakers[-1].send(b"x")
         await here.until_bytes(number + 1)
+        # Three strangers, the vehicle, and two more strangers for whom there is no place.
+        listening.adopt(listening.speaker, 0.1 * number, is_vehicle=number == 3)
     listening.send(b"order")
-    for inbox in inboxes[2:]:
+    for inbox in inboxes[:4]:
         assert await inbox.until_bytes(5) == b"order"
-    assert not inboxes[0].data
+    speakers[5].send(b"x")
+    await here.until_bytes(7)
+    # The vehicle speaks from another port; the stranger that was heard longest ago makes room.
+    listening.adopt(listening.speaker, 1.0, is_vehicle=True)
+    listening.send(b"again")
+    for inbox in inboxes[1:4]:
+        assert await inbox.until_bytes(10) == b"orderagain"
+    assert await inboxes[5].until_bytes(5) == b"again"
+    assert inboxes[0].data == b"order"
+    assert not inboxes[4].data
+    # Whoever has fallen silent makes room for anyone.
+    speakers[4].send(b"x")
+    await here.until_bytes(8)
+    listening.adopt(listening.speaker, 7.0, is_vehicle=False)
+    listening.send(b"last!")
+    assert await inboxes[4].until_bytes(5) == b"last!"
     for transport in [*speakers, listening]:
         await transport.close()
 
