@@ -200,9 +200,11 @@ class _Socket(asyncio.DatagramProtocol):
 
     def __init__(self) -> None:
         self.heard = 0
+        self.news = asyncio.Event()
 
     def datagram_received(self, _data: bytes, _addr: object) -> None:
         self.heard += 1
+        self.news.set()
 
 
 async def _speaks(port: int) -> tuple[asyncio.DatagramTransport, _Socket]:
@@ -242,7 +244,8 @@ async def test_strangers_do_not_displace_the_vehicle_on_udpin(is_signed: bool) -
     assert link.component.outputs.order(9, 1000)
     async with asyncio.timeout(5.0):
         while inbox.heard == before:
-            await asyncio.sleep(0)
+            inbox.news.clear()
+            await inbox.news.wait()
     if is_signed:
         assert not any(other.heard for _, other in others)
     for socket, _ in [(vehicle, inbox), *others]:
