@@ -227,6 +227,7 @@ async def read_exactly(descriptor: int, count: int) -> bytes:
         async with asyncio.timeout(5.0):
             while len(data) < count:
                 await ready.wait()
+                ready.clear()  # or the next read would wait for bytes and block the loop
                 data += os.read(descriptor, count - len(data))
                 ready.clear()
     finally:
