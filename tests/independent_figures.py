@@ -15,6 +15,7 @@ import json
 import sqlite3
 import struct
 import sys
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -54,7 +55,8 @@ class Map:
     """Zones with rates; a point is in a zone if a ray from it crosses its rings an odd time."""
 
     def __init__(self, journal: Path) -> None:
-        with sqlite3.connect(f"{journal.resolve().as_uri()}?mode=ro", uri=True) as connection:
+        uri = f"{journal.resolve().as_uri()}?mode=ro"
+        with closing(sqlite3.connect(uri, uri=True)) as connection:
             rows = connection.execute("SELECT geom, rate_l_ha FROM zones").fetchall()
             (field,) = connection.execute("SELECT geom FROM field").fetchone()
         self.zones = [(rings_of(geom), float(rate)) for geom, rate in rows]

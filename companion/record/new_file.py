@@ -8,6 +8,7 @@ import re
 import sqlite3
 import threading
 from collections.abc import Mapping
+from contextlib import ExitStack, closing
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -80,8 +81,7 @@ def _next_number(folder: Path) -> int:
 
 
 def _write_schema(path: Path, setup: Setup, meta: Mapping[str, str]) -> None:
-    connection = sqlite3.connect(path, isolation_level=None)
-    try:
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
         # Nobody knows the draft yet: one sync at its end instead of one a statement.
         connection.execute("PRAGMA synchronous = OFF")
         connection.execute("PRAGMA journal_mode = MEMORY").fetchall()
@@ -89,8 +89,6 @@ def _write_schema(path: Path, setup: Setup, meta: Mapping[str, str]) -> None:
         write_layers(connection, setup.frame, setup.prescription)
         write_treated(connection, setup.treated)
         connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", meta.items())
-    finally:
-        connection.close()
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
@@ -101,12 +99,16 @@ def open_for_flight(path: Path) -> sqlite3.Connection:
     EXCLUSIVE before WAL: no second connection can race with a checkpoint (a bug of SQLite before
     3.51.3 could corrupt the file then), and there is no shared-memory file.
     """
-    connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
-    for pragma in (
-        "locking_mode = EXCLUSIVE",
-        "journal_mode = WAL",
-        "synchronous = FULL",
-        "wal_autocheckpoint = 0",
-    ):
-        connection.execute(f"PRAGMA {pragma}").fetchall()
-    return connection
+    with ExitStack() as on_failure:
+        connection = on_failure.enter_context(
+            closing(sqlite3.connect(path, isolation_level=None, check_same_thread=False))
+        )
+        for pragma in (
+            "locking_mode = EXCLUSIVE",
+            "journal_mode = WAL",
+            "synchronous = FULL",
+            "wal_autocheckpoint = 0",
+        ):
+            connection.execute(f"PRAGMA {pragma}").fetchall()
+        on_failure.pop_all()
+        return connection

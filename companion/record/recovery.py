@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Mapping
-from contextlib import closing
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -132,7 +132,7 @@ def _undo_half_written(path: Path) -> None:
     Only then is there such a file beside a journal, and nobody can read it before.
     """
     if path.with_name(path.name + "-journal").exists():
-        with closing(_connect(path)) as connection:
+        with _alone(path) as connection:
             connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
@@ -176,7 +176,7 @@ def _ending(connection: sqlite3.Connection, meta: Mapping[str, str]) -> _Ending:
 
 def _fold_in(path: Path, ending: _Ending | None, damage: LogDamage | None) -> str | None:
     """Make one file of it; return what is said of a damaged log."""
-    with closing(_connect(path)) as connection:
+    with _alone(path) as connection:
         connection.execute("BEGIN IMMEDIATE")
         if ending is not None:
             _settle(connection, ending)
@@ -189,12 +189,13 @@ def _fold_in(path: Path, ending: _Ending | None, damage: LogDamage | None) -> st
     return told
 
 
-def _connect(path: Path) -> sqlite3.Connection:
+@contextmanager
+def _alone(path: Path) -> Iterator[sqlite3.Connection]:
     """Open for writing, and alone: a journal whose flight lives is locked."""
-    connection = sqlite3.connect(path, isolation_level=None, timeout=0.0)
-    # Before the first read, or a shared-memory file would be made.
-    connection.execute("PRAGMA locking_mode = EXCLUSIVE").fetchall()
-    return connection
+    with closing(sqlite3.connect(path, isolation_level=None, timeout=0.0)) as connection:
+        # Before the first read, or a shared-memory file would be made.
+        connection.execute("PRAGMA locking_mode = EXCLUSIVE").fetchall()
+        yield connection
 
 
 def _settle(connection: sqlite3.Connection, ending: _Ending) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol, cast
 
@@ -20,6 +21,7 @@ Address = tuple[str, int]
 
 _PEERS_MAX = 16
 _RECONNECT_S = 0.5
+_CLOSE_WAIT_S = 0.5
 _BACKLOG_MAX = 256 * 1024
 
 
@@ -164,6 +166,16 @@ async def _serve_stream(
     finally:
         hub.detach(channel)
         writer.close()
+        await _let_go(writer)
+
+
+async def _let_go(writer: asyncio.StreamWriter) -> None:
+    """Wait for a connection's end; a peer that does not read what is on its way loses it."""
+    closed = asyncio.ensure_future(writer.wait_closed())
+    if not (await asyncio.wait({closed}, timeout=_CLOSE_WAIT_S))[0]:
+        writer.transport.abort()
+    with suppress(OSError):
+        await closed
 
 
 class _TcpServer:

@@ -38,7 +38,9 @@ class Layer:
 
 def read_layer(path: Path, layer: str | None = None) -> Layer:
     """Return a layer, the only one by default."""
-    about, _, wkb, values = pyogrio.raw.read(path, layer=layer)
+    # Times as text: for one that is missing pyogrio makes a NaT without a unit, which NumPy 2.5
+    # warns of.
+    about, _, wkb, values = pyogrio.raw.read(path, layer=layer, datetime_as_string=True)
     shapes = np.array([]) if wkb is None else shapely.from_wkb(wkb)
     return Layer(
         columns=dict(zip(about["fields"].tolist(), values, strict=True)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import zlib
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,7 +123,7 @@ def test_the_reader_finds_what_the_decisions_say(flown: Flown) -> None:
 def test_a_damaged_journal_is_read_as_far_as_it_goes(flown: Flown, tmp_path: Path) -> None:
     path = tmp_path / "flight-0001.gpkg"
     path.write_bytes(flown.journal.read_bytes())
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         ((first,),) = connection.execute("SELECT max(first_sequence) FROM blocks").fetchall()
         connection.execute("UPDATE blocks SET crc32 = 1 WHERE first_sequence = ?", (first,))
     with pytest.raises(JournalError, match="is damaged"):

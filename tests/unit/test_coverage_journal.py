@@ -7,6 +7,7 @@ import math
 import sqlite3
 import zlib
 from collections.abc import Iterator
+from contextlib import closing
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -299,11 +300,10 @@ def test_a_replay_proves_the_treated_ground(first: Path, tmp_path: Path) -> None
     assert replay(first).coverage_differs == 0
     path = tmp_path / "other.gpkg"
     path.write_bytes(first.read_bytes())
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         kept = read_coverage(connection)
         assert kept is not None
         write_coverage(connection, kept.joined(ground(30.0, 20.0, 34.0, 22.0)), kept)
-    connection.close()
     result = replay(path)
     assert (result.differences, result.coverage_differs) == (0, 200)
     assert execute(["replay", str(path)]) == 1
@@ -323,13 +323,11 @@ def test_a_replay_of_a_cut_flight_compares_what_was_to_be(tmp_path: Path) -> Non
                 told_s = now_s
                 cut_s = now_s + coverage_ahead_s(1.0)
                 made.record_coverage(expected(own, memory, state, now_s=now_s, cut_s=cut_s))
-    with sqlite3.connect(made.path) as connection:
+    with closing(sqlite3.connect(made.path)) as connection, connection:
         connection.execute("UPDATE meta SET value = 'recovered' WHERE key = 'closed'")
-    connection.close()
     assert replay(made.path).coverage_differs == 0
-    with sqlite3.connect(made.path) as connection:
+    with closing(sqlite3.connect(made.path)) as connection, connection:
         connection.execute("DELETE FROM coverage_tiles WHERE tile_east = 0")
-    connection.close()
     assert (replay(made.path).coverage_differs or 0) > 100
 
 
@@ -346,9 +344,8 @@ def damaged(first: Path, folder: Path) -> Path:
     """A copy whose treated ground has one tile that cannot be read."""
     path = folder / "damaged.gpkg"
     path.write_bytes(first.read_bytes())
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE coverage_tiles SET cells = x'00' WHERE id = 1")
-    connection.close()
     return path
 
 
@@ -371,13 +368,11 @@ def test_without_the_treated_ground_the_rest_of_a_journal_is_read(
     first: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / first.name
-    connection = sqlite3.connect(first)
-    with connection:
+    with closing(sqlite3.connect(first)) as connection:
         # The table and its index.
         sql = "SELECT rootpage FROM sqlite_master WHERE tbl_name = 'coverage_tiles'"
         pages = [page for (page,) in connection.execute(sql) if page]
         ((size,),) = connection.execute("PRAGMA page_size").fetchall()
-    connection.close()
     damaged = bytearray(first.read_bytes())
     for page in pages:
         damaged[(page - 1) * size : page * size] = bytes(size)
@@ -396,9 +391,8 @@ def test_of_a_damaged_set_up_nothing_can_be_told_in_one_line(
 ) -> None:
     path = tmp_path / "damaged.gpkg"
     path.write_bytes(first.read_bytes())
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("UPDATE meta SET value = '{' WHERE key = 'setup'")
-    connection.close()
     for command in (["flights", "remaining"], ["replay"]):
         assert execute([*command, str(path), "--json"]) == 1
         said = capsys.readouterr()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 import struct
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -36,9 +37,8 @@ def damaged(journal: Path, tmp_path: Path) -> Callable[[str], Path]:
     def changed(sql: str) -> Path:
         path = tmp_path / "flight-0001.gpkg"
         path.write_bytes(journal.read_bytes())
-        with sqlite3.connect(path) as connection:
+        with closing(sqlite3.connect(path)) as connection, connection:
             connection.executescript(sql)
-        connection.close()
         return path
 
     return changed
@@ -156,28 +156,26 @@ def test_text_that_is_no_utf_8_does_not_end_the_table(damaged: Callable[[str], P
 
 def test_a_table_is_read_on_behind_a_bad_page(tmp_path: Path) -> None:
     path = tmp_path / "table.db"
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("PRAGMA page_size = 512")
         connection.execute("CREATE TABLE t (id INTEGER PRIMARY KEY, text TEXT)")
         connection.executemany(
             "INSERT INTO t VALUES (?, ?)", ((i, "x" * 40) for i in range(1, 999))
         )
-    connection.close()
     content = bytearray(path.read_bytes())
     content[20 * 512 : 21 * 512] = bytes(512)
     path.write_bytes(content)
-    connection = sqlite3.connect(path)
     unread: list[str] = []
-    found = rows_of(connection, "t", "text", key="id", unread=unread, what="rows")
+    with closing(sqlite3.connect(path)) as connection:
+        found = rows_of(connection, "t", "text", key="id", unread=unread, what="rows")
+        with pytest.raises(sqlite3.DatabaseError):
+            rows_of(connection, "t", "text", key="id", unread=None, what="rows")
     numbers = [row[0] for row in found.rows]
     assert found.reaches_end
     assert numbers == sorted(set(numbers))
     assert 970 < len(numbers) < 998
     assert numbers[-1] == 998
     assert len(unread) == 1
-    with pytest.raises(sqlite3.DatabaseError):
-        rows_of(connection, "t", "text", key="id", unread=None, what="rows")
-    connection.close()
 
 
 def test_holes_in_changes_lie_between_the_numbers() -> None:

@@ -6,6 +6,7 @@ import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
+from contextlib import closing
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -96,11 +97,9 @@ def test_an_old_journal_with_a_time_that_is_none_is_damaged(path: Path) -> None:
 
 
 def test_a_cut_journal_without_the_offset_of_its_clock_is_recovered(left: Path) -> None:
-    connection = sqlite3.connect(left)
-    with connection:
+    with closing(sqlite3.connect(left)) as connection, connection:
         connection.execute("DELETE FROM meta WHERE key = 'utc_offset_s'")
         connection.execute("UPDATE meta SET value = 'autopilot' WHERE key = 'utc_source'")
-    connection.close()
     found = recover(left)
     assert found is None or found.outcome == "recovered"
     assert look_at(left).state == "recovered"
@@ -166,13 +165,12 @@ def test_a_folder_or_a_dangling_link_of_that_name_is_passed_over(path: Path) -> 
 
 def test_what_a_cut_in_the_moment_of_closing_left_half_written_is_undone(path: Path) -> None:
     whole = read_journal(path).entries
-    connection = sqlite3.connect(path, isolation_level=None)
-    connection.execute("PRAGMA cache_size = 5")
-    connection.execute("BEGIN IMMEDIATE")
-    connection.execute("UPDATE applied SET duty = duty + 1, inhibits = inhibits || 'x'")
     half = path.parent.with_name(path.parent.name + "-half")
-    shutil.copytree(path.parent, half)
-    connection.close()
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute("PRAGMA cache_size = 5")
+        connection.execute("BEGIN IMMEDIATE")
+        connection.execute("UPDATE applied SET duty = duty + 1, inhibits = inhibits || 'x'")
+        shutil.copytree(path.parent, half)
     names = {file.name for file in half.iterdir()}
     assert names == {path.name, f"{path.name}-journal"}
     assert not [found for found in recover_folder(half) if not found.is_good]

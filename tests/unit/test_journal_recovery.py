@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -95,11 +96,10 @@ def test_an_open_journal_is_left_alone(tmp_path: Path) -> None:
 
 def spoil(path: Path, table: str) -> None:
     """Overwrite the first leaf page of a table."""
-    connection = sqlite3.connect(path)
-    (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
-    sql = "SELECT pageno FROM dbstat WHERE name = ? AND pagetype = 'leaf' ORDER BY pageno"
-    pages = [row[0] for row in connection.execute(sql, (table,))]
-    connection.close()
+    with closing(sqlite3.connect(path)) as connection:
+        (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
+        sql = "SELECT pageno FROM dbstat WHERE name = ? AND pagetype = 'leaf' ORDER BY pageno"
+        pages = [row[0] for row in connection.execute(sql, (table,))]
     with path.open("r+b") as file:
         file.seek((pages[len(pages) // 2] - 1) * page_bytes)
         file.write(b"\xa5" * page_bytes)
@@ -108,10 +108,8 @@ def spoil(path: Path, table: str) -> None:
 def test_a_damaged_journal_is_kept_and_a_copy_saves_what_can_be_read(left: Path) -> None:
     recover(left)
     spoil(left, "applied")
-    connection = sqlite3.connect(left)
-    with connection:
+    with closing(sqlite3.connect(left)) as connection, connection:
         connection.execute("UPDATE meta SET value = 'no' WHERE key = 'closed'")
-    connection.close()
     whole = left.read_bytes()
     found = recover(left)
     assert found is not None
@@ -137,12 +135,11 @@ def test_what_is_no_database_any_more_is_said_and_kept(left: Path) -> None:
 
 
 def test_a_log_that_was_left_beside_a_closed_journal_is_folded_in(left: Path) -> None:
-    connection = sqlite3.connect(left)
-    connection.execute("PRAGMA wal_checkpoint")
-    with connection:
-        connection.execute("UPDATE meta SET value = 'yes' WHERE key = 'closed'")
-    shutil.copytree(left.parent, left.parent.with_name("again"))
-    connection.close()
+    with closing(sqlite3.connect(left)) as connection:
+        connection.execute("PRAGMA wal_checkpoint")
+        with connection:
+            connection.execute("UPDATE meta SET value = 'yes' WHERE key = 'closed'")
+        shutil.copytree(left.parent, left.parent.with_name("again"))
     path = left.parent.with_name("again") / left.name
     assert path.with_name(path.name + "-wal").exists()
     recover_folder(path.parent)

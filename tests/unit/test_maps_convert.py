@@ -84,7 +84,7 @@ def cell_map() -> MapFile:
 def _zones_by_gdal(path: Path, rate: str = "rate") -> Lookup:
     layers = pyogrio.list_layers(path)[:, 0].tolist()
     layer = next(name for name in layers if name.casefold() != "boundary")
-    meta, _, blobs, values = pyogrio.raw.read(str(path), layer=layer)
+    meta, _, blobs, values = pyogrio.raw.read(str(path), layer=layer, columns=[rate])
     rates = values[meta["fields"].tolist().index(rate)].astype(np.float64)
     return _in_zones(shapely.from_wkb(blobs), rates)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,8 @@ def test_a_flight_that_was_cut_is_reported_and_exit_1(
 ) -> None:
     cut = tmp_path / "cut.gpkg"
     shutil.copy(flown, cut)
-    with sqlite3.connect(cut) as connection:
+    with closing(sqlite3.connect(cut)) as connection, connection:
         connection.execute("UPDATE meta SET value = 'no' WHERE key = 'closed'")
-    connection.close()
     out = tmp_path / "report"
     assert execute(["report", str(cut), "--out", str(out), "--no-figures"]) == 1
     assert "The journal was cut" in capsys.readouterr().err
@@ -71,9 +71,8 @@ def test_a_damaged_journal_is_reported_as_far_as_it_goes_and_exit_1(
 ) -> None:
     damaged = tmp_path / "damaged.gpkg"
     shutil.copy(flown, damaged)
-    with sqlite3.connect(damaged) as connection:
+    with closing(sqlite3.connect(damaged)) as connection, connection:
         connection.execute("UPDATE blocks SET body = x'00' WHERE rowid = 1")
-    connection.close()
     out = tmp_path / "report"
     assert execute(["report", str(damaged), "--out", str(out), "--no-figures"]) == 1
     assert "could not be read" in capsys.readouterr().err
@@ -100,10 +99,8 @@ def test_what_cannot_be_done_is_refused_in_one_line(
     flown: Path, tmp_path: Path, capsys: Captured, arguments: list[str], text: str
 ) -> None:
     (tmp_path / "text.gpkg").write_text("no database at all, but a text of some length\n" * 99)
-    connection = sqlite3.connect(tmp_path / "other.gpkg")
-    connection.execute("CREATE TABLE t (x)")
-    connection.commit()
-    connection.close()
+    with closing(sqlite3.connect(tmp_path / "other.gpkg")) as connection, connection:
+        connection.execute("CREATE TABLE t (x)")
     given = [each.format(folder=tmp_path, flown=flown) for each in arguments]
     out = [] if "--out" in given else ["--out", str(tmp_path / "report")]
     assert execute(["report", *given, *out, "--no-figures"]) == 2

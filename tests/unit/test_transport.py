@@ -143,10 +143,19 @@ class Server:
         async with asyncio.timeout(5.0):
             return await self.accepted.get()
 
-    async def stop(self) -> None:
+    def stop(self) -> None:
+        """Take no more connections; those that are there go on."""
         if self._server is not None:
             self._server.close()
+
+    async def stopped(self) -> None:
+        """Wait for its end: since Python 3.12 that of its connections too."""
+        if self._server is not None:
             await self._server.wait_closed()
+
+    async def close(self) -> None:
+        self.stop()
+        await self.stopped()
 
 
 async def hang_up(writer: asyncio.StreamWriter) -> None:
@@ -173,7 +182,7 @@ async def test_tcp_comes_back_after_the_peer_was_away() -> None:
     assert await reader.readexactly(5) == b"three"
     await link.close()
     await hang_up(writer)
-    await server.stop()
+    await server.close()
 
 
 @pytest.mark.usefixtures("quick_back_off")
@@ -182,8 +191,9 @@ async def test_tcp_goes_on_trying_while_nobody_listens() -> None:
     await server.start()
     link = await inbox.open(f"tcp:127.0.0.1:{server.port}")
     _, writer = await server.connection()
-    await server.stop()
+    server.stop()
     await hang_up(writer)
+    await server.stopped()
     await inbox.until_changes(1)
     await asyncio.sleep(0.05)
     assert inbox.changes == [False]
@@ -192,7 +202,7 @@ async def test_tcp_goes_on_trying_while_nobody_listens() -> None:
     await inbox.until_changes(2)
     await link.close()
     await hang_up(writer)
-    await server.stop()
+    await server.close()
 
 
 async def test_tcp_close_sends_what_was_sent_before() -> None:
@@ -204,7 +214,7 @@ async def test_tcp_close_sends_what_was_sent_before() -> None:
     await link.close()
     assert await reader.read() == b"close all valves"
     await hang_up(writer)
-    await server.stop()
+    await server.close()
 
 
 async def test_a_tcp_peer_that_does_not_read_gets_no_old_orders() -> None:
@@ -216,7 +226,7 @@ async def test_a_tcp_peer_that_does_not_read_gets_no_old_orders() -> None:
     assert sent < 4000
     writer.transport.abort()
     await link.close()
-    await server.stop()
+    await server.close()
 
 
 async def read_exactly(descriptor: int, count: int) -> bytes:

@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 
 from companion.output.engine.wire import PACKET_MAX
 
@@ -20,7 +20,8 @@ class EngineChild:
 
     def __init__(self, command: Sequence[str]) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
+        with ExitStack() as on_failure, theirs:
+            on_failure.enter_context(ours)
             file = theirs.fileno()
             self._process = subprocess.Popen(
                 [*command, str(file), str(os.getpid())],
@@ -31,6 +32,7 @@ class EngineChild:
                 # leave the engine's wake-ups a twentieth of a processor that others want as well.
                 start_new_session=True,
             )
+            on_failure.pop_all()
         ours.setblocking(False)
         self.socket = ours
         self.is_connected = True

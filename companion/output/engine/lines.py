@@ -64,7 +64,11 @@ class FileLines:
 
     def __init__(self, path: str, *, levels: int) -> None:
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        self.write(levels)
+        try:
+            self.write(levels)
+        except OSError:
+            os.close(self._file)
+            raise
 
     def write(self, levels: int) -> None:
         """Put the levels into the file."""

@@ -50,7 +50,11 @@ class SpiDevice:
     def __init__(self, path: str, speed_hz: int) -> None:
         self._file = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         self._speed_hz = speed_hz
-        fcntl.ioctl(self._file, _SPEED, speed_hz.to_bytes(4, "little"))
+        try:
+            fcntl.ioctl(self._file, _SPEED, speed_hz.to_bytes(4, "little"))
+        except OSError:
+            os.close(self._file)
+            raise
 
     def transfer(self, data: bytes) -> bytes:
         """Shift bytes out; return those that came in."""
