@@ -187,6 +187,7 @@ def component_options(
         need_mission=has_lines,
         use_battery="autopilot" in (config.flow_meter.source, config.tank.source),
         watch_mission=watch_mission,
+        may_enable="command" in config.safety.enable_by,
         training="" if training == "no" else training,
     )
 

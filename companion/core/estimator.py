@@ -174,10 +174,15 @@ def _observe_heartbeat(track: Track, item: HeartbeatReport, setup: Setup) -> Tra
 
 
 def _observe_operator(track: Track, item: OperatorCommand, setup: Setup) -> Track:
-    """Take the operator's wish; to disable also ends a stop that was commanded."""
+    """Take the operator's wish; to disable also ends a stop that was commanded.
+
+    Who may not enable changes nothing by trying; everyone may disable.
+    """
+    if item.enable and item.source not in setup.limits.enable_by:
+        return track
     if not item.enable and track.estops:
         track = replace(track, estops=track.estops - {"command"})
-    return _wished(track, item.enable and item.source in setup.limits.enable_by)
+    return _wished(track, item.enable)
 
 
 def _observe_estop(track: Track, item: EstopReport, _setup: Setup) -> Track:

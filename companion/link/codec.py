@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from companion.link.census import AUTOPILOT_COMPONENT, Census, Vehicle
 from companion.link.decode import FROM_ANYONE, FROM_VEHICLE
 from companion.link.framer import Accept, Framer
-from companion.link.messages import Message
+from companion.link.messages import CommandReceived, Message
 
 _HEARTBEAT = 0
 _SENDERS_MAX = 64
+# So many frames in a row that seem overtaken, and their sender has begun to count anew.
+_ANEW = 32
 
 __all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]
 
@@ -18,18 +21,27 @@ __all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]
 class _Sequence:
     """Counts the frames of one sender, and those that its numbers say are missing."""
 
-    __slots__ = ("count", "last", "lost")
+    __slots__ = ("_behind", "_counts", "count", "last", "lost")
 
     def __init__(self) -> None:
         self.count, self.lost, self.last = 0, 0, -1
+        self._behind, self._counts = 0, False
 
-    def take(self, number: int) -> None:
-        if self.last >= 0:
-            # More than half the circle ahead is a frame that was overtaken or sent twice.
-            ahead = (number - self.last - 1) % 256
-            self.lost += ahead if ahead < 128 else 0
-        self.last = number
+    def take(self, number: int) -> bool:
+        """Count a frame; return whether it was overtaken or sent twice: half the circle ahead.
+
+        A sender whose numbers never move (a script) sends nothing late.
+        """
         self.count += 1
+        ahead = 0 if self.last < 0 else (number - self.last - 1) % 256
+        self._counts = self._counts or (self.last >= 0 and number != self.last)
+        is_late = ahead >= 128 and self._counts
+        self._behind = self._behind + 1 if is_late else 0
+        if is_late and self._behind < _ANEW:
+            return True
+        self.lost += ahead if ahead < 128 else 0
+        self.last = number
+        return is_late
 
 
 class Codec:
@@ -103,14 +115,17 @@ class Codec:
 
     def _understand(self, raw: Any, received_s: float) -> Message | None:
         sender = (raw.get_srcSystem(), raw.get_srcComponent())
-        self._count(sender, raw.get_seq())
+        is_late = self._count(sender, raw.get_seq())
         message_id: int = raw.get_msgId()
         if message_id == _HEARTBEAT:
             self.census.heartbeat(*sender, kind=raw.type, autopilot=raw.autopilot, now_s=received_s)
         if self.vehicle is not None and sender[0] == self.vehicle.system_id:
             self.vehicle_frame_count += 1
         if message_id in FROM_ANYONE:
-            return FROM_ANYONE[message_id](raw, received_s)
+            message = FROM_ANYONE[message_id](raw, received_s)
+            if is_late and isinstance(message, CommandReceived):
+                return replace(message, is_late=True)
+            return message
         if not self.is_autopilot(*sender):
             self.ignored_count += 1
             return None
@@ -118,10 +133,11 @@ class Codec:
         decoder = FROM_VEHICLE.get(message_id)
         return None if decoder is None else decoder(raw, received_s)
 
-    def _count(self, sender: tuple[int, int], number: int) -> None:
+    def _count(self, sender: tuple[int, int], number: int) -> bool:
+        """Count a frame of a sender; return whether it comes late."""
         one = self._senders.get(sender)
         if one is None:
             if len(self._senders) >= _SENDERS_MAX:
-                return
+                return False
             one = self._senders[sender] = _Sequence()
-        one.take(number)
+        return one.take(number)

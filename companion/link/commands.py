@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from companion.core.types import EstopReport, Input, OperatorCommand, RateOverride
+from companion.core.types import Decision, EstopReport, Input, OperatorCommand, RateOverride
 from companion.link.messages import CommandReceived
 from companion.link.parameters import RATE_PERCENT, VALUES_HZ, Parameters
 from companion.link.tank import Tank
@@ -24,6 +24,10 @@ ACCEPTED, REJECTED_FOR_NOW, DENIED, UNSUPPORTED = 0, 1, 2, 3
 HEARTBEAT, PARAM_VALUE, AUTOPILOT_VERSION, NAMED_VALUE_FLOAT, STATUSTEXT = 0, 22, 148, 251, 253
 OWN_MESSAGES = frozenset({HEARTBEAT, PARAM_VALUE, AUTOPILOT_VERSION, NAMED_VALUE_FLOAT, STATUSTEXT})
 VALUES_HZ_MIN, VALUES_HZ_MAX = 0.2, 5.0
+# An ENABLE that was sent before a stop must not enable after it. Stations retransmit a command for
+# some seconds (QGroundControl 3 times, 3 s apart); a second radio or a router is some seconds late.
+REPEATED_MAX_S = 30.0
+LATE_MAX_S = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,8 +52,33 @@ class Desk:
     values_hz: float = 1.0
     is_armed: bool = False
     is_open: bool = False
+    may_enable: bool = True
+    is_enabled: bool = False
+    # When the consent last went, by whatever took it; None: it was given anew since.
+    stopped_s: float | None = None
     # The sensor that counts the tank, where there is one; whether it takes this many litres.
     on_refilled: Callable[[float], bool] | None = None
+
+    def look_at(self, decision: Decision | None, now_s: float) -> None:
+        """Take what was decided: whether a valve is open, and whether the operator's consent went.
+
+        The pilot, a switch or a disarming take it as a stop does.
+        """
+        self.is_open = decision is not None and not decision.plan.is_off
+        state = None if decision is None else decision.state
+        is_enabled = state is not None and state.enabled
+        if self.is_enabled and not is_enabled:
+            self.stopped_s = now_s
+        self.is_enabled = is_enabled
+
+    def is_old(self, command: CommandReceived) -> bool:
+        """Return whether an ENABLE may have been sent before the last stop."""
+        if self.stopped_s is None:
+            return False
+        since_s = command.received_s - self.stopped_s
+        if command.confirmation > 0 and since_s < REPEATED_MAX_S:
+            return True
+        return command.is_late and since_s < LATE_MAX_S
 
     def obey(self, command: CommandReceived) -> Answer:
         """Return the answer; whatever we do not know is unsupported."""
@@ -57,18 +86,30 @@ class Desk:
         return Answer(result=UNSUPPORTED) if handler is None else handler(self, command)
 
 
-def _sprayer(_desk: Desk, command: CommandReceived) -> Answer:
+def stops(command: CommandReceived) -> bool:
+    """Return whether a command only closes: such a one may be said to everyone."""
+    return command.command == USER_ESTOP or (command.command == DO_SPRAYER and command.param1 == 0)
+
+
+def _sprayer(desk: Desk, command: CommandReceived) -> Answer:
     """Take the operator's wish: exactly 1 enables, exactly 0 disables."""
     if command.param1 not in (0.0, 1.0):
         return Answer(result=DENIED, text="DO_SPRAYER takes 0 or 1")
-    wish = OperatorCommand(
-        received_s=command.received_s, enable=command.param1 == 1.0, source="command"
-    )
+    enable = command.param1 == 1.0
+    if enable and not desk.may_enable:
+        return Answer(result=DENIED, text="enable by command: see safety.enable_by")
+    if enable and command.target_system == 0:
+        return Answer(result=DENIED, text="enable: name this vehicle's system, not 0")
+    if enable and desk.is_old(command):
+        return Answer(result=REJECTED_FOR_NOW, text="late enable not taken: enable again")
+    desk.stopped_s = None if enable else command.received_s
+    wish = OperatorCommand(received_s=command.received_s, enable=enable, source="command")
     return Answer(result=ACCEPTED, inputs=(wish,))
 
 
-def _estop(_desk: Desk, command: CommandReceived) -> Answer:
+def _estop(desk: Desk, command: CommandReceived) -> Answer:
     """Take an emergency stop, whatever its parameters: DO_SPRAYER 0 ends it."""
+    desk.stopped_s = command.received_s
     stop = EstopReport(received_s=command.received_s, pressed=True, source="command")
     return Answer(result=ACCEPTED, inputs=(stop,), text="emergency stop", event="emergency stop")
 

@@ -48,6 +48,7 @@ class ComponentOptions:
     """Who we are on the link, what we want to know how often, and the ends of the pulses.
 
     `need_mission`: all stays closed where the mission is flown and its leg is not known.
+    `may_enable`: a command may enable; one may always stop.
     """
 
     system_id: int = 0
@@ -60,6 +61,7 @@ class ComponentOptions:
     need_mission: bool = False
     use_battery: bool = False
     watch_mission: bool = False
+    may_enable: bool = True
     training: str = ""
 
 
@@ -87,7 +89,9 @@ class Component:
         )
         self._announcer = Announcer(self._encoder, training=options.training)
         self._desk = Desk(
-            parameters=parameters if parameters is not None else Parameters(), tank=Tank()
+            parameters=parameters if parameters is not None else Parameters(),
+            tank=Tank(),
+            may_enable=options.may_enable,
         )
         self._service = Service(
             self._desk, self._encoder, self._announcer, self._send, version=options.version

@@ -213,6 +213,7 @@ def _command(m: Any, received_s: float) -> CommandReceived:
         command=m.command,
         param1=finite(m.param1),
         param2=finite(m.param2),
+        confirmation=getattr(m, "confirmation", 0),  # COMMAND_INT has none
     )
 
 

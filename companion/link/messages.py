@@ -18,7 +18,11 @@ class Sender:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommandReceived:
-    """COMMAND_LONG or COMMAND_INT, whoever it is for; parameters 3 to 7 are not kept."""
+    """COMMAND_LONG or COMMAND_INT, whoever it is for; parameters 3 to 7 are not kept.
+
+    `confirmation` counts retransmissions (COMMAND_INT does not); `is_late`: its sender has said
+    something newer, or the same, before.
+    """
 
     received_s: float
     sender: Sender
@@ -27,6 +31,8 @@ class CommandReceived:
     command: int
     param1: float | None
     param2: float | None
+    confirmation: int = 0
+    is_late: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

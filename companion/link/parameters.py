@@ -111,11 +111,9 @@ class Parameters:
     def set(self, name: str, value: float | None, *, is_frozen: bool) -> str | None:
         """Take a value; return None, or why the old one stays."""
         one = self._known[name]
-        if value is None:
-            return "give a number"
         # A float of 32 bits has seven digits: 0.12 shall not become 0.11999999731779099.
-        value = float(f"{value:.6g}")
-        if not self._in_range(one, value):
+        value = None if value is None else float(f"{value:.6g}")
+        if value is None or not self._in_range(one, value):
             return f"{one.low:g} to {one.high:g} only"
         if value == self._values[name]:
             return None

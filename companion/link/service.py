@@ -42,7 +42,7 @@ class Service:
     def look_at(self, decision: Decision | None, now_s: float) -> None:
         """Take what was decided: what may be changed, and what is left in the tank."""
         desk, self._decision = self._desk, decision
-        desk.is_open = decision is not None and not decision.plan.is_off
+        desk.look_at(decision, now_s)
         desk.tank.flows(0.0 if decision is None else decision.flow_l_min, now_s)
         self._announcer.tank_l = desk.tank.level_l
         self._announcer.set_values_rate(desk.values_hz)
@@ -53,8 +53,11 @@ class Service:
             self._send(frame)
 
     def obey(self, command: CommandReceived) -> tuple[Input, ...]:
-        """Answer a command addressed to us, as often as it comes."""
-        if not self._is_ours(command.target_system, command.target_component):
+        """Answer a command addressed to us, as often as it comes; of a broadcast only a stop."""
+        target = command.target_component
+        if target == 0 and commands.stops(command):
+            target = self._encoder.component_id
+        if not self._is_ours(command.target_system, target):
             return ()
         answer, sender = self._desk.obey(command), command.sender
         self._send(

@@ -59,9 +59,18 @@ class Peer:
         boot_ms = round(boot_s * 1000)
         return self.autopilot("global_position_int", boot_ms, 0, 0, 0, 0, 0, 0, 0, 0)
 
-    def command(self, command: int, *params: float, system: int = VEHICLE, to: int = 191) -> bytes:
+    def command(
+        self,
+        command: int,
+        *params: float,
+        system: int = VEHICLE,
+        to: int = 191,
+        confirmation: int = 0,
+        sequence: int = 0,
+    ) -> bytes:
         filled = (*params, *([0.0] * (7 - len(params))))
-        return self.ground("command_long", system, to, command, 0, *filled)
+        self._ground.seq = sequence
+        return self.ground("command_long", system, to, command, confirmation, *filled)
 
     def of(self, kind: str) -> list[Any]:
         return [message for message in self.sent if message.get_type() == kind]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from companion.core.controller import Memory, step
-from companion.core.types import RateOverride
+from companion.core.types import EstopReport, OperatorCommand, RateOverride
 from companion.link.component import Component, ComponentOptions
 from companion.link.parameters import Parameters, known_parameters
 from tests import builders
@@ -42,6 +43,136 @@ def result(peer: Peer, component: Component, command: int, *params: float) -> in
     (ack,) = peer.of("COMMAND_ACK")
     assert (ack.command, ack.target_system, ack.target_component) == (command, 255, 190)
     return int(ack.result)
+
+
+EVERYONE = [{"to": 0}, {"system": 0}, {"system": 0, "to": 0}]
+ESTOP = EstopReport(received_s=2.0, pressed=True, source="command")
+DISABLE = OperatorCommand(received_s=2.0, enable=False, source="command")
+ENABLED = replace(builders.SPRAYING, enabled=True)
+
+
+@pytest.mark.parametrize("target", EVERYONE)
+@pytest.mark.parametrize(("command", "meant"), [(216, DISABLE), (31014, ESTOP)])
+def test_a_stop_that_is_said_to_everyone_is_taken_and_answered(
+    peer: Peer, component: Component, target: dict[str, int], command: int, meant: object
+) -> None:
+    assert component.receive(peer.command(command, 0.0, **target), 2.0) == [meant]
+    (ack,) = peer.of("COMMAND_ACK")
+    assert (ack.command, ack.result) == (command, ACCEPTED)
+
+
+@pytest.mark.parametrize("target", EVERYONE)
+@pytest.mark.parametrize("value", [1.0, 0.5, NAN])
+def test_nothing_but_a_stop_is_taken_from_what_is_said_to_everyone(
+    peer: Peer, component: Component, target: dict[str, int], value: float
+) -> None:
+    assert component.receive(peer.command(216, value, **target), 2.0) == []
+    assert component.receive(peer.command(31010, 90.0, **target | {"to": 0}), 2.0) == []
+
+
+@pytest.mark.parametrize("target", [{"to": 1}, {"to": 190}, {"system": 8}, {"system": 8, "to": 0}])
+def test_a_stop_that_is_said_to_somebody_else_is_not_ours(
+    peer: Peer, component: Component, target: dict[str, int]
+) -> None:
+    for command in (216, 31014):
+        assert component.receive(peer.command(command, 0.0, **target), 2.0) == []
+    assert not peer.of("COMMAND_ACK")
+
+
+def test_a_way_that_may_not_enable_is_denied_and_changes_nothing(peer: Peer) -> None:
+    component = Component(ComponentOptions(may_enable=False), peer.take)
+    component.receive(peer.heartbeat(), 0.0)
+    peer.sent.clear()
+    assert component.receive(peer.command(216, 1.0), 2.0) == []
+    assert peer.of("COMMAND_ACK")[0].result == DENIED
+    assert component.receive(peer.command(216, 0.0), 2.0) == [DISABLE]
+    component.tick(None, 2.1)
+    assert peer.texts() == ["Spray: enable by command: see safety.enable_by"]
+
+
+def enables(
+    peer: Peer, component: Component, at_s: float, *, confirmation: int = 0, sequence: int = 0
+) -> bool:
+    """Return whether an ENABLE is taken; the answer has to say the same."""
+    peer.sent.clear()
+    data = peer.command(216, 1.0, confirmation=confirmation, sequence=sequence)
+    inputs = component.receive(data, at_s)
+    (ack,) = peer.of("COMMAND_ACK")
+    assert (ack.result == ACCEPTED) is bool(inputs)
+    assert ack.result in (ACCEPTED, FOR_NOW)
+    return bool(inputs)
+
+
+def test_a_retransmission_enables_where_the_first_was_lost(
+    peer: Peer, component: Component
+) -> None:
+    assert enables(peer, component, 2.0, confirmation=1)
+
+
+@pytest.mark.parametrize("stop", [216, 31014])
+@pytest.mark.parametrize("to", [0, 191])
+def test_a_retransmission_of_before_a_stop_enables_nothing(
+    peer: Peer, component: Component, stop: int, to: int
+) -> None:
+    assert enables(peer, component, 2.0)
+    component.receive(peer.command(stop, 0.0, to=to), 3.0)
+    assert not enables(peer, component, 3.1, confirmation=1)
+    assert not enables(peer, component, 32.9, confirmation=3)
+    assert enables(peer, component, 33.1, confirmation=3)
+
+
+def test_after_a_stop_a_new_command_enables_and_its_retransmission_is_answered_alike(
+    peer: Peer, component: Component
+) -> None:
+    component.receive(peer.command(216, 0.0), 3.0)
+    assert enables(peer, component, 3.1)
+    assert enables(peer, component, 3.6, confirmation=1)
+
+
+def test_a_retransmission_does_not_bring_back_what_the_pilot_took(
+    peer: Peer, component: Component
+) -> None:
+    taken_back = replace(OPEN, state=replace(ENABLED, enabled=False))
+    assert enables(peer, component, 2.0)
+    component.tick(replace(OPEN, state=ENABLED), 2.1)
+    component.tick(taken_back, 2.5)
+    assert not enables(peer, component, 2.6, confirmation=1)
+    assert enables(peer, component, 2.7)
+
+
+def test_a_copy_that_comes_late_enables_nothing_after_a_stop(
+    peer: Peer, component: Component
+) -> None:
+    assert enables(peer, component, 2.0, sequence=254)
+    component.receive(peer.command(216, 0.0, sequence=1), 2.5)
+    for sequence in (254, 255, 0, 1):  # the same frame by another radio, or one that was lost
+        assert not enables(peer, component, 3.0, sequence=sequence)
+    assert enables(peer, component, 3.1, sequence=2)
+
+
+def test_a_copy_of_an_order_in_integers_enables_nothing_after_a_stop(
+    peer: Peer, component: Component
+) -> None:
+    enable = peer.ground("command_int", VEHICLE, 191, 0, 216, 0, 0, 1.0, 0, 0, 0, 0, 0, 0.0)
+    assert len(component.receive(enable, 2.0)) == 1
+    component.receive(peer.command(216, 0.0, sequence=1), 2.5)
+    assert component.receive(enable, 2.6) == []
+
+
+def test_a_station_that_begins_anew_is_late_for_a_moment_only(
+    peer: Peer, component: Component
+) -> None:
+    component.receive(peer.command(216, 0.0, sequence=100), 2.0)
+    assert not enables(peer, component, 2.5, sequence=5)
+    assert enables(peer, component, 7.1, sequence=6)
+
+
+def test_a_station_that_does_not_count_its_frames_is_never_late(
+    peer: Peer, component: Component
+) -> None:
+    assert enables(peer, component, 2.0)
+    component.receive(peer.command(216, 0.0), 2.1)
+    assert enables(peer, component, 2.2)
 
 
 @pytest.mark.parametrize("percent", [80.0, 95.0, 100.0, 110.0])

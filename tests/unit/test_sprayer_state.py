@@ -284,6 +284,19 @@ def test_the_switch_is_a_wish_too() -> None:
     assert sprayer.track.operator_wishes == 1
 
 
+def test_who_may_not_enable_takes_no_consent_away_and_may_stop() -> None:
+    law = setup(limits=Limits(rc_channel=7, enable_by=frozenset({"rc"})))
+    sprayer = Sprayer(law)
+    for pulse_us in (1000, 2000):
+        sprayer.hear(RcReport(received_s=sprayer.now_s, pulse_us=(0,) * 6 + (pulse_us,)))
+        sprayer.fly(1.0)
+    sprayer.wish(True)
+    assert sprayer.step().sprayer is SprayerState.SPRAYING
+    assert sprayer.track.operator_wishes == 1
+    sprayer.wish(False)
+    assert Inhibit.NOT_ENABLED in sprayer.step().inhibits
+
+
 class AnyFlight(RuleBasedStateMachine):
     """Faults, stops and wishes in any order: nothing opens but in SPRAYING, nor under a latch."""
 
