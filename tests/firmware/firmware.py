@@ -67,7 +67,12 @@ def _taken_port() -> str | None:
 
 @contextmanager
 def process(
-    command: Sequence[str | Path], log: Path, *, with_signal: int = signal.SIGTERM, **variables: str
+    command: Sequence[str | Path],
+    log: Path,
+    *,
+    with_signal: int = signal.SIGTERM,
+    within: Path | None = None,
+    **variables: str,
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run a command, its output in `log`; end it, and what it has started, at the end."""
     with log.open("wb") as out:
@@ -76,6 +81,7 @@ def process(
             stdin=subprocess.DEVNULL,
             stdout=out,
             stderr=subprocess.STDOUT,
+            cwd=within,
             env={**os.environ, **variables},
             start_new_session=True,
             preexec_fn=_die_with_parent,
@@ -99,11 +105,11 @@ def end(started: subprocess.Popen[bytes], with_signal: int = signal.SIGTERM) -> 
 
 @contextmanager
 def companion(
-    folder: Path, *options: str, name: str = "companion.txt"
+    folder: Path, *options: str, name: str = "companion.txt", within: Path | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run `vrspray run` as it would fly; what it says is in `name`."""
     command = (sys.executable, "-m", "companion", "run", *options)
-    with process(command, folder / name) as started:
+    with process(command, folder / name, within=within) as started:
         yield started
 
 

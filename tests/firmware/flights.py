@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import struct
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -11,13 +13,15 @@ from pathlib import Path
 from tests.firmware import firmware
 from tests.firmware.station import COMPANION, MissionItem, NoAnswerError, Station
 
-SIMSTATE, SERVO_OUTPUT_RAW, GLOBAL_POSITION_INT = 164, 36, 33
+SIMSTATE, SERVO_OUTPUT_RAW, GLOBAL_POSITION_INT, RC_CHANNELS = 164, 36, 33, 65
 DO_SPRAYER, DO_SET_MODE, ARM, MISSION_START = 216, 176, 400, 300
-AUTO, GUIDED, RTL = 3.0, 4.0, 6.0
+AUTO, GUIDED, LAND = 3.0, 4.0, 9.0
 ACCEPTED = 0
 TRUTH_HZ, OUTPUTS_HZ, POSITION_HZ = 100.0, 100.0, 20.0
 # Until the estimator has its position the simulation may run as fast as it can: nobody watches.
 HURRIED = 10.0
+OPEN_US = 1010
+RADIO_PORT, RADIO_CHANNELS = 5501, 16
 READY_WITHIN_S = 90.0
 
 
@@ -50,6 +54,7 @@ def ready_copter(
             (SIMSTATE, TRUTH_HZ),
             (SERVO_OUTPUT_RAW, OUTPUTS_HZ),
             (GLOBAL_POSITION_INT, POSITION_HZ),
+            (RC_CHANNELS, 5.0),
         ):
             station.ask_for(message, rate_hz)
         station.until(lambda: station.said("is using GPS"), "position", READY_WITHIN_S)
@@ -68,7 +73,9 @@ def until_heard(station: Station, started: subprocess.Popen[bytes], log: Path) -
     station.until(is_heard, "companion", 30.0)
 
 
-def start(vehicle: Vehicle, items: Sequence[MissionItem] | None) -> None:
+def start(
+    vehicle: Vehicle, items: Sequence[MissionItem] | None, *, is_enabled: bool = True
+) -> None:
     """Upload the mission, if there is one; arm in AUTO, start it, enable spraying."""
     station = vehicle.station
     if items is not None:
@@ -77,7 +84,8 @@ def start(vehicle: Vehicle, items: Sequence[MissionItem] | None) -> None:
     assert station.command(ARM, 1.0) == ACCEPTED
     assert station.command(MISSION_START) == ACCEPTED
     station.until(lambda: station.is_armed, "arming")
-    enable(station)
+    if is_enabled:
+        enable(station)
 
 
 def set_mode(station: Station, mode: float) -> None:
@@ -94,3 +102,46 @@ def enable(station: Station, *, is_on: bool = True) -> None:
 def until_landed(vehicle: Vehicle, within_s: float) -> None:
     """Wait until the motors stand still."""
     vehicle.station.until(lambda: not vehicle.station.is_armed, "landing", within_s)
+
+
+def open_outputs(us: Sequence[int]) -> list[int]:
+    """Return the outputs 9 to 14 whose pulse opens a valve."""
+    return [number for number in range(9, 15) if us[number - 1] > OPEN_US]
+
+
+def until_spraying(vehicle: Vehicle, within_s: float = 60.0) -> None:
+    """Wait until all six valves are ordered open."""
+    pulses = vehicle.station.log.pulses
+    vehicle.station.until(
+        lambda: bool(pulses) and len(open_outputs(pulses[-1].us)) == 6, "spraying", within_s
+    )
+
+
+def closing_s(vehicle: Vehicle, since_s: float, within_s: float = 3.0) -> float:
+    """Wait until no valve is ordered open; return how long after a moment that was."""
+    pulses = vehicle.station.log.pulses
+    vehicle.station.until(
+        lambda: pulses[-1].came_s > since_s and not open_outputs(pulses[-1].us),
+        "closing",
+        within_s,
+    )
+    return pulses[-1].came_s - since_s
+
+
+class Radio:
+    """The pilot's transmitter, as ArduPilot's simulation takes it; all else as it was."""
+
+    def __init__(self, station: Station) -> None:
+        heard = station.heard("RC_CHANNELS")
+        self._us = [getattr(heard, f"chan{number}_raw") for number in range(1, RADIO_CHANNELS + 1)]
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    def close(self) -> None:
+        """Give the socket back."""
+        self._socket.close()
+
+    def put(self, channel: int, us: int) -> None:
+        """Move a switch."""
+        self._us[channel - 1] = us
+        frame = struct.pack(f"<{RADIO_CHANNELS}H", *self._us)
+        self._socket.sendto(frame, ("127.0.0.1", RADIO_PORT))

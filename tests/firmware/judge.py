@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapefile
 import shapely
 from numpy.typing import NDArray
 
@@ -24,12 +25,15 @@ from tests.firmware.station import Place, Pulses
 
 Floats = NDArray[np.float64]
 
-STEP_S = 0.002
+STEP_S, COARSE_S = 0.002, 0.01
 SMOOTHED_S = 0.1  # to each side: the vehicle's acceleration is steady for so long
 METRES_A_DEGREE = 111_319.49
 CLOSED_US, FULL_US, DEAD_BAND = 1000.0, 2000.0, 0.01
 SMALL_STEP, CLOSE_M, REACH_M = 0.08, 2.5, 4.0
 OFF_TARGET_ELEMENT_M = 0.1
+CELL_M = 0.5
+# On a line: within a metre of it, and within 20 degrees of its course.
+ASIDE_MAX_M, ALONG = 1.0, 0.94
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +87,7 @@ class Verdict:
     changes: list[Change] = field(default_factory=list)
     apart: list[Change] = field(default_factory=list)
     off_target_ml: float = 0.0
+    off_lines_ml: float = 0.0
     sprayed_l: float = 0.0
     prescribed_l: float = 0.0
     position_late_s: float = float("nan")
@@ -114,8 +119,8 @@ class Verdict:
         return (
             f"{len(lags_m)} changes: mean {self.mean_abs_m:.3f} m (signed {lags_m.mean():+.3f}), "
             f"worst {self.worst_m:.3f} m; {len(self.missed)} missed, {len(self.apart)} apart; "
-            f"off target {self.off_target_ml:.2f} mL; sprayed {self.sprayed_l:.3f} L of "
-            f"{self.prescribed_l:.3f} L"
+            f"off target {self.off_target_ml:.2f} mL, off lines {self.off_lines_ml:.2f} mL; "
+            f"sprayed {self.sprayed_l:.3f} L of {self.prescribed_l:.3f} L"
         )
 
 
@@ -125,6 +130,25 @@ def geojson_zones(path: Path, rate_field: str = "rate") -> list[Zone]:
     return [
         Zone(shapely.geometry.shape(one["geometry"]), float(one["properties"][rate_field]))
         for one in found["features"]
+    ]
+
+
+def shapefile_zones(path: Path, rate_field: str = "rate") -> list[Zone]:
+    """Read the zones of a shapefile in degrees."""
+    with shapefile.Reader(str(path)) as reader:
+        return [
+            Zone(shapely.geometry.shape(row.shape.__geo_interface__), float(row.record[rate_field]))
+            for row in reader.iterShapeRecords()
+        ]
+
+
+def geojson_lines(path: Path, kind: str = "spray") -> list[shapely.LineString]:
+    """Return the lines of one kind of a plan."""
+    found = json.loads(path.read_text())
+    return [
+        shapely.geometry.shape(one["geometry"])
+        for one in found["features"]
+        if one["properties"]["kind"] == kind
     ]
 
 
@@ -140,18 +164,19 @@ def geojson_area(path: Path) -> shapely.Geometry:
 def vehicle_times(places: Sequence[Place], pulses: Sequence[Pulses]) -> Floats:
     """Return when each place was true on the vehicle's clock.
 
-    SIMSTATE has no time. The servo outputs come in the same stream and have one: a place is as
-    far from the nearest of them in time as it came apart from it, mostly in the same packet.
+    SIMSTATE has no time. The servo outputs, asked for at the same rate, are sent in the same
+    moment and have one. Which of the two is sent first is seen by which come together; the order
+    in the stream holds even where this computer was late to read it.
     """
     if places[0].at_s is not None:
         return np.array([one.at_s for one in places])
     came_s = np.array([one.came_s for one in places])
     marks_s = np.array([one.came_s for one in pulses])
     at_s = np.array([one.at_s for one in pulses])
-    after = np.clip(np.searchsorted(marks_s, came_s), 1, len(marks_s) - 1)
-    is_after = marks_s[after] - came_s <= came_s - marks_s[after - 1]
-    nearest = np.where(is_after, after, after - 1)
-    found: Floats = at_s[nearest] + came_s - marks_s[nearest]
+    after = np.array([one.pulses_before for one in places])
+    after = np.clip(after, 1, len(marks_s) - 1)
+    is_after = np.median(marks_s[after] - came_s) <= np.median(came_s - marks_s[after - 1])
+    found: Floats = at_s[after if is_after else after - 1]
     return found
 
 
@@ -194,33 +219,28 @@ class Plane:
 
 
 def _smooth(at_s: Floats, values: Floats, grid_s: Floats) -> Floats:
-    """Fit a parabola about each moment of a grid; samples are uneven and rounded to 1 cm."""
-    coarse_s = np.arange(grid_s[0], grid_s[-1], 0.01)
-    low = np.searchsorted(at_s, coarse_s - SMOOTHED_S)
-    high = np.searchsorted(at_s, coarse_s + SMOOTHED_S)
-    found = np.empty_like(coarse_s)
-    for number, moment_s in enumerate(coarse_s):
-        near = slice(low[number], high[number])
-        if high[number] - low[number] < 5:
-            found[number] = np.interp(moment_s, at_s, values)
-        else:
-            found[number] = np.polynomial.polynomial.polyfit(
-                at_s[near] - moment_s, values[near], 2
-            )[0]
-    smooth: Floats = np.interp(grid_s, coarse_s, found)
-    return smooth
+    """Fit a parabola about each hundredth of a second; samples are rounded to 1 cm."""
+    coarse_s = np.arange(grid_s[0] - SMOOTHED_S, grid_s[-1] + 2.0 * SMOOTHED_S, COARSE_S)
+    half = round(SMOOTHED_S / COARSE_S)
+    away = np.arange(-half, half + 1.0)
+    squares, fourths = (away**2).sum(), (away**4).sum()
+    kernel = fourths - squares * away**2
+    even = np.interp(coarse_s, at_s, values)
+    smooth = np.convolve(even - even[0], kernel / kernel.sum(), mode="same") + even[0]
+    found: Floats = np.interp(grid_s, coarse_s, smooth)
+    return found
 
 
 def true_path(places: Sequence[Place], at_s: Floats, plane: Plane) -> Path2d:
     """Return the way on a grid of STEP_S."""
-    order = np.argsort(at_s, kind="stable")
+    order = np.unique(at_s, return_index=True)[1]
     at_s = at_s[order]
     rows = [places[number] for number in order]
     east_m, north_m = plane.metres(
         [one.longitude_deg for one in rows], [one.latitude_deg for one in rows]
     )
     yaw_rad = np.unwrap([one.yaw_rad for one in rows])
-    grid_s = np.arange(at_s[0] + SMOOTHED_S, at_s[-1] - SMOOTHED_S, STEP_S)
+    grid_s = np.arange(at_s[0] + 3 * SMOOTHED_S, at_s[-1] - 3 * SMOOTHED_S, STEP_S)
     east_m, north_m = _smooth(at_s, east_m, grid_s), _smooth(at_s, north_m, grid_s)
     steps_m = np.hypot(np.diff(east_m), np.diff(north_m))
     along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
@@ -241,7 +261,8 @@ def flows_ml_s(pulses: Sequence[Pulses], grid_s: Floats, sprayer: Sprayer, seed:
     for output in sprayer.outputs:
         us = np.array([one.us[output - 1] for one in pulses], dtype=float)
         phase_s = draw.uniform(0.0, sprayer.frame_s)
-        frames_s = np.arange(grid_s[0] - 1.0 + phase_s, grid_s[-1] + 1.0, sprayer.frame_s)
+        first_s = sprayer.frame_s * np.floor((grid_s[0] - 1.0) / sprayer.frame_s)
+        frames_s = np.arange(first_s + phase_s, grid_s[-1] + 1.0, sprayer.frame_s)
         seen = np.searchsorted(since_s, frames_s, side="right") - 1
         wanted = sprayer.flow_ml_s(us[np.clip(seen, 0, None)])
         # Each frame's flow begins after the dead time and rises over the rise.
@@ -262,10 +283,15 @@ def judge(
     zones: Sequence[Zone],
     *,
     inside: shapely.Geometry | None = None,
+    lines: Sequence[shapely.LineString] | None = None,
     sprayer: Sprayer | None = None,
     seed: int = 1,
 ) -> Verdict:
-    """Return what a flight did; `inside` is where liquid may fall, else all zones."""
+    """Return what a flight did.
+
+    `inside` is where liquid may fall, else all zones. With `lines` only what is flown along one of
+    them counts; what is sprayed off them is `off_lines_ml`.
+    """
     sprayer = sprayer or Sprayer()
     middle = shapely.union_all([zone.outline for zone in zones]).centroid
     plane = Plane(middle.y, middle.x)
@@ -276,10 +302,14 @@ def judge(
     if allowed is None:
         allowed = shapely.union_all([zone.outline for zone in flat])
     verdict = Verdict(sprayed_l=float(flows.sum()) * STEP_S / 1000.0)
+    on_line = np.ones(len(path.at_s), dtype=bool)
+    if lines is not None:
+        on_line = along_lines(path, [plane.of(line) for line in lines])
+        verdict.off_lines_ml = float(flows[:, ~on_line].sum()) * STEP_S
     for valve, right_m in enumerate(sprayer.right_m):
         east_m = path.east_m + right_m * np.cos(path.yaw_rad)
         north_m = path.north_m - right_m * np.sin(path.yaw_rad)
-        rates = rates_at(flat, east_m, north_m)
+        rates = np.where(on_line, rates_at(flat, east_m, north_m), np.nan)
         _judge_valve(verdict, valve, path, rates, flows[valve], sprayer)
     verdict.off_target_ml = _off_target_ml(path, flows, allowed, sprayer)
     return verdict
@@ -291,6 +321,19 @@ def rates_at(zones: Sequence[Zone], east_m: Floats, north_m: Floats) -> Floats:
     for zone in zones:
         rates[shapely.contains_xy(zone.outline, east_m, north_m)] = zone.rate_l_ha
     return rates
+
+
+def along_lines(path: Path2d, lines: Sequence[shapely.LineString]) -> NDArray[np.bool_]:
+    """Return where the vehicle flies along one of the lines: near it, and as it goes."""
+    points = shapely.points(path.east_m, path.north_m)
+    moves = np.gradient(path.east_m, STEP_S), np.gradient(path.north_m, STEP_S)
+    found = np.zeros(len(points), dtype=bool)
+    for line in lines:
+        (x0, y0), (x1, y1) = line.coords[0], line.coords[-1]
+        forward = (moves[0] * (x1 - x0) + moves[1] * (y1 - y0)) / line.length
+        is_along = forward >= ALONG * np.maximum(path.speed_m_s, 0.1)
+        found |= is_along & (shapely.distance(points, line) <= ASIDE_MAX_M)
+    return found
 
 
 def _judge_valve(
@@ -368,3 +411,41 @@ def _off_target_ml(
             is_out = ~shapely.contains_xy(allowed, east_m, north_m)
             found_ml += float(flows[valve][open_now[is_out]].sum()) * STEP_S / count
     return found_ml
+
+
+def missed_and_doubled_m2(
+    places: Sequence[Place],
+    pulses: Sequence[Pulses],
+    zones: Sequence[Zone],
+    *,
+    ends: tuple[tuple[float, float], tuple[float, float]],
+    sprayer: Sprayer | None = None,
+) -> tuple[float, float]:
+    """Return how much of a pass got less than half, and more than one and a half of its rate.
+
+    `ends` are latitude and longitude of where the pass is judged from and to: a band as wide as
+    the boom, in cells of one strip by CELL_M. All that was flown counts, there and back.
+    """
+    sprayer = sprayer or Sprayer()
+    plane = Plane(*ends[0])
+    path = true_path(places, vehicle_times(places, pulses), plane)
+    flows = flows_ml_s(pulses, path.at_s, sprayer, seed=1)
+    (far_east_m,), (far_north_m,) = plane.metres([ends[1][1]], [ends[1][0]])
+    length_m = float(np.hypot(far_east_m, far_north_m))
+    east, north = far_east_m / length_m, far_north_m / length_m
+    strips = len(sprayer.right_m)
+    ml = np.zeros((int(length_m / CELL_M), strips))
+    for valve, right_m in enumerate(sprayer.right_m):
+        east_m = path.east_m + right_m * np.cos(path.yaw_rad)
+        north_m = path.north_m - right_m * np.sin(path.yaw_rad)
+        row = np.floor((east_m * east + north_m * north) / CELL_M).astype(int)
+        aside_m = east_m * north - north_m * east
+        column = np.floor(aside_m / sprayer.width_m + strips / 2).astype(int)
+        hits = (row >= 0) & (row < ml.shape[0]) & (column >= 0) & (column < strips)
+        np.add.at(ml, (row[hits], column[hits]), flows[valve][hits] * STEP_S)
+    along_m = (np.arange(ml.shape[0]) + 0.5) * CELL_M
+    flat = [Zone(plane.of(zone.outline), zone.rate_l_ha) for zone in zones]
+    wanted = rates_at(flat, along_m * east, along_m * north) * 0.1 * sprayer.width_m * CELL_M
+    share = ml / wanted[:, None]
+    cell_m2 = CELL_M * sprayer.width_m
+    return float((share < 0.5).sum()) * cell_m2, float((share > 1.5).sum()) * cell_m2

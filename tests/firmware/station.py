@@ -24,10 +24,15 @@ _E7, _MILLI = 1e-7, 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the vehicle was; `at_s` is its own clock, None where the message has none."""
+    """Where the vehicle was.
+
+    `at_s` is its own clock, None where the message has none; `pulses_before` counts the outputs'
+    messages that had come by then, which have a time.
+    """
 
     came_s: float
     at_s: float | None
+    pulses_before: int
     latitude_deg: float
     longitude_deg: float
     yaw_rad: float
@@ -144,11 +149,17 @@ class Station:
         for taker in self._takers:
             taker(message)
 
-    @staticmethod
     def _place(
-        places: list[Place], now_s: float, at_s: float | None, lat: int, lon: int, yaw_rad: float
+        self,
+        places: list[Place],
+        now_s: float,
+        at_s: float | None,
+        lat: int,
+        lon: int,
+        yaw_rad: float,
     ) -> None:
-        places.append(Place(now_s, at_s, lat * _E7, lon * _E7, yaw_rad))
+        before = len(self.log.pulses)
+        places.append(Place(now_s, at_s, before, lat * _E7, lon * _E7, yaw_rad))
 
     # -------------------------------------------------------------------------------- waiting
 

@@ -1,0 +1,94 @@
+"""The judge of the flights beside real firmwares, on flights whose truth is known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import shapely
+
+from tests.firmware.judge import Verdict, Zone, judge
+from tests.firmware.station import Place, Pulses
+
+# The valve's mean lag: dead time, half the rise, half a servo frame.
+LAG_S = 0.069 + 0.035 + 0.010
+EQUATOR_M = 111_319.49
+NORTH_M = 110_574.3
+RATES_L_HA = (15.0, 24.0, 20.0)
+ENDS_M = (20.0, 35.0, 50.0, 65.0)
+CLOCK_S = 7.0  # the vehicle's clock against ours
+
+
+def pulse_us(rate_l_ha: float, speed_m_s: float) -> int:
+    """Return the pulse for a rate; 100 % of duty are 6.096 L/min, 20 % 1.476 L/min."""
+    flow_l_min = 60.0 * 6.0 * speed_m_s * rate_l_ha / 10_000.0
+    duty, flow = (0.2, 0.4, 0.5, 0.7), (1.476, 3.024, 3.276, 4.62)
+    for number in range(3):
+        if flow_l_min <= flow[number + 1]:
+            part = (flow_l_min - flow[number]) / (flow[number + 1] - flow[number])
+            return round(1000 + 1000 * (duty[number] + part * (duty[number + 1] - duty[number])))
+    raise ValueError(f"no such flow here: {flow_l_min}")
+
+
+def flown(
+    speed_m_s: float,
+    *,
+    lag_m: float = 0.0,
+    has_changes: bool = True,
+    is_closed_outside: bool = True,
+    is_told: bool = False,
+) -> Verdict:
+    """Fly north over three zones, every change ordered so that it falls `lag_m` too late."""
+    places, pulses = [], []
+    ordered_m = [end - LAG_S * speed_m_s + lag_m for end in ENDS_M]
+    for number in range(int(85.0 / speed_m_s / 0.01)):
+        at_s = number * 0.01
+        north_m = at_s * speed_m_s
+        # On our side, as after a stall: the judge must not mind.
+        late_s = 0.003 * (number % 2) + (0.1 if 500 <= number < 510 else 0.0)
+        came_s = at_s + CLOCK_S + late_s
+        told_s = at_s if is_told else None
+        places.append(Place(came_s, told_s, number, north_m / NORTH_M, 0.0, 0.0))
+        zone = sum(north_m >= ordered for ordered in ordered_m)
+        if zone in (0, len(ENDS_M)):
+            us = 1000 if is_closed_outside else pulse_us(15.0, speed_m_s)
+        else:
+            us = pulse_us(RATES_L_HA[zone - 1 if has_changes else 0], speed_m_s)
+        pulses.append(Pulses(came_s, at_s, (1500,) * 8 + (us,) * 6 + (0, 0)))
+    half = 4.0 / EQUATOR_M
+    zones = [
+        Zone(shapely.box(-half, start / NORTH_M, half, end / NORTH_M), rate)
+        for start, end, rate in zip(ENDS_M, ENDS_M[1:], RATES_L_HA, strict=False)
+    ]
+    return judge(places, pulses, zones)
+
+
+@pytest.mark.parametrize(("speed_m_s", "lag_m"), [(4.0, 0.0), (5.0, -0.3), (5.0, 0.5)])
+def test_a_lag_is_found_as_it_was_made(speed_m_s: float, lag_m: float) -> None:
+    verdict = flown(speed_m_s, lag_m=lag_m)
+    assert len(verdict.changes) == 2 * 6
+    assert not verdict.missed
+    assert not verdict.apart
+    # Servo frames are drawn for each output: half a frame to each side, and half a sample.
+    assert verdict.lags_m == pytest.approx(lag_m, abs=0.016 * speed_m_s)
+    assert math.isclose(verdict.lags_m.mean(), lag_m, abs_tol=0.005 * speed_m_s)
+
+
+def test_a_place_with_a_time_of_its_own_is_judged_alike() -> None:
+    assert flown(5.0, is_told=True).lags_m == pytest.approx(flown(5.0).lags_m, abs=0.01)
+
+
+def test_a_change_that_never_came_is_missed() -> None:
+    verdict = flown(5.0, has_changes=False)
+    assert len(verdict.missed) == 2 * 6
+
+
+def test_what_falls_outside_is_counted() -> None:
+    inside, outside = flown(5.0), flown(5.0, is_closed_outside=False)
+    # 20 m before and 20 m behind the field at 15 L/ha on 6 m, less 0.3 s at both ends.
+    assert outside.off_target_ml == pytest.approx(
+        2 * 20.0 * 6.0 * 15.0 * 0.1 - 2 * 0.3 * 5.0 * 9.0, rel=0.02
+    )
+    # The valves are open and closed on the border by their mean: half of the rise is outside.
+    assert 0.0 < inside.off_target_ml < 20.0
+    assert inside.sprayed_l == pytest.approx(inside.prescribed_l, rel=0.01)
