@@ -1,8 +1,9 @@
 """From a bucket test to the flow curve of a nozzle set.
 
-What was caught at each duty is averaged; where flow does not rise with duty neighbours are pooled
-(isotonic regression), so that the curve is one that the controller takes. The same holds for a
-pump on a motor's output, with the width of its pulse in place of the duty.
+What was caught at each duty is averaged; where the scatter of repeated catches justifies it, a
+smoother curve stands for the means (`bucket_fit`). Where flow still does not rise with duty,
+neighbours are pooled (isotonic regression), so that the curve is one that the controller takes.
+The same holds for a pump on a motor's output, with the width of its pulse in place of the duty.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from statistics import fmean
 
+from analysis.bucket_fit import Fit, Repeats, fit_means, scatter_squared
 from analysis.bucket_scale import DUTY, Scale
 from companion.core.nozzle import FlowCurve
 
@@ -22,6 +24,10 @@ SPREAD_MAX = 0.05
 LEFT_OUT_MAX = 0.05
 # A hand on a stopwatch and a bucket is off by 0.3 s: 1.5 % of this.
 SECONDS_MIN = 20.0
+# A flow that falls by more than this with more duty, and by more than so many deviations of the
+# difference where these are known, is no scatter: the rows are mixed up, or the sprayer changed.
+FALL_MAX = 0.10
+FALL_DEVIATIONS = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,12 +49,14 @@ class Catch:
 class DutyMean:
     """All catches at one duty; spread is largest less least, over the mean.
 
-    `cv_percent` is the deviation over the mean, `left_out_percent` how far the curve of the other
-    duties is from this mean; None where there is only one catch, at the ends.
+    `curve_l_min` is what the curve has there. `cv_percent` is the deviation over the mean,
+    `left_out_percent` how far the curve of the other duties is from the curve here; None where
+    there is only one catch, at the ends.
     """
 
     duty: float
     flow_l_min: float
+    curve_l_min: float
     count: int
     seconds: float
     cv_percent: float | None
@@ -70,6 +78,7 @@ class BucketCurve:
     """The curve of one set; `repeatability_percent` is the deviation of one catch, pooled."""
 
     name: str
+    fit: Fit
     duty: tuple[float, ...]
     flow_l_min: tuple[float, ...]
     means: tuple[DutyMean, ...]
@@ -93,23 +102,27 @@ def fit_bucket(
     """Return the curve of one set; `window` is the least and the largest duty of the PWM.
 
     Raises:
-        ValueError: with fewer than two duties at which more came with more duty.
+        ValueError: with fewer than two duties at which more came with more duty, where more duty
+            gave clearly less flow, or no more than the catches scatter.
     """
     duties = sorted({catch.duty for catch in catches})
     groups = [[catch for catch in catches if catch.duty == duty] for duty in duties]
-    flows = [_mean_flow(group) for group in groups]
+    points = _repeats(groups)
+    _check_falls(points, scale)
+    fit, flows = fit_means(points)
     duty, flow, pooled = _monotone(duties, flows, [len(group) for group in groups], scale)
     if len(duty) < 2:
         raise ValueError(f"at least two {scale.plural} are needed at which the flow rises")
     curve = FlowCurve(duty=tuple(duty), flow_l_min=tuple(flow))
     left_out = [_left_out_percent(duty, flow, value) for value in duties]
     means = tuple(
-        _duty_mean(value, group, off)
+        _duty_mean(group, curve.flow_for(value), off)
         for value, group, off in zip(duties, groups, left_out, strict=True)
     )
     residuals = tuple(_residual(catch, curve) for catch in catches)
     return BucketCurve(
         name=name,
+        fit=fit,
         duty=curve.duty,
         flow_l_min=curve.flow_l_min,
         means=means,
@@ -123,6 +136,45 @@ def _mean_flow(group: Sequence[Catch]) -> float:
     """Return all that was caught over all the time it took."""
     seconds = sum(catch.seconds for catch in group)
     return 0.06 * sum(catch.millilitres for catch in group) / seconds
+
+
+def _repeats(groups: Sequence[Sequence[Catch]]) -> list[Repeats]:
+    """Return what a fit needs of each duty; a catch counts by its time."""
+    mean_s = fmean(catch.seconds for group in groups for catch in group)
+    found = []
+    for group in groups:
+        mean = _mean_flow(group)
+        found.append(
+            Repeats(
+                duty=group[0].duty,
+                flow_l_min=mean,
+                count=len(group),
+                weight=sum(catch.seconds for catch in group) / mean_s,
+                squares=sum(
+                    catch.seconds / mean_s * (catch.flow_l_min / mean - 1.0) ** 2 for catch in group
+                ),
+            )
+        )
+    return found
+
+
+def _check_falls(points: Sequence[Repeats], scale: Scale) -> None:
+    """Refuse means that no rising curve can follow.
+
+    Raises:
+        ValueError: where the flow falls by more than scatter explains.
+    """
+    variance, _ = scatter_squared(points)
+    for i, high in enumerate(points):
+        for low in points[i + 1 :]:
+            fall = 1.0 - low.flow_l_min / high.flow_l_min
+            deviation = math.sqrt((variance or 0.0) * (1.0 / high.weight + 1.0 / low.weight))
+            if fall > FALL_MAX and fall > FALL_DEVIATIONS * deviation:
+                raise ValueError(
+                    f"the flow falls from {high.flow_l_min:.3f} L/min at {scale.name} "
+                    f"{scale.say(high.duty)} to {low.flow_l_min:.3f} at {scale.say(low.duty)}; no "
+                    "curve can follow that: are rows mixed up? measure these again"
+                )
 
 
 def _monotone(
@@ -168,7 +220,7 @@ def _left_out_percent(duty: Sequence[float], flow: Sequence[float], value: float
     return 100.0 * (others.flow_for(value) / flow[index] - 1.0)
 
 
-def _duty_mean(duty: float, group: Sequence[Catch], left_out: float | None) -> DutyMean:
+def _duty_mean(group: Sequence[Catch], curve_l_min: float, left_out: float | None) -> DutyMean:
     flows = [catch.flow_l_min for catch in group]
     mean = fmean(flows)
     cv = spread = None
@@ -176,8 +228,9 @@ def _duty_mean(duty: float, group: Sequence[Catch], left_out: float | None) -> D
         cv = 100.0 * math.sqrt(sum((f - mean) ** 2 for f in flows) / (len(flows) - 1)) / mean
         spread = 100.0 * (max(flows) - min(flows)) / mean
     return DutyMean(
-        duty=duty,
+        duty=group[0].duty,
         flow_l_min=_mean_flow(group),
+        curve_l_min=curve_l_min,
         count=len(group),
         seconds=sum(catch.seconds for catch in group),
         cv_percent=cv,

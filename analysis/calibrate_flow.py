@@ -112,20 +112,26 @@ def _set(curve: BucketCurve, valves: list[str]) -> dict[str, Any]:
         "valves": valves,
         "duty": list(curve.duty),
         "flow_l_min": list(curve.flow_l_min),
+        "fit": curve.fit.as_json(len(curve.means)),
         "points": [asdict(mean) for mean in curve.means],
-        "residuals": [
-            {
-                "line": each.catch.line,
-                "duty": each.catch.duty,
-                "flow_l_min": each.catch.flow_l_min,
-                "residual_l_min": each.residual_l_min,
-                "residual_percent": each.residual_percent,
-            }
-            for each in curve.residuals
-        ],
+        "residuals": residuals(curve),
         "repeatability_percent": curve.repeatability_percent,
         "warnings": list(curve.warnings),
     }
+
+
+def residuals(curve: BucketCurve) -> list[dict[str, Any]]:
+    """Return each catch beside the curve."""
+    return [
+        {
+            "line": each.catch.line,
+            "duty": each.catch.duty,
+            "flow_l_min": each.catch.flow_l_min,
+            "residual_l_min": each.residual_l_min,
+            "residual_percent": each.residual_percent,
+        }
+        for each in curve.residuals
+    ]
 
 
 def _toml(sets: Sequence[dict[str, Any]]) -> str:
@@ -188,14 +194,12 @@ def _over(measured: float, other: float | None) -> float | None:
 def _lines(result: dict[str, Any]) -> list[str]:
     lines = []
     for each in result["sets"]:
-        repeat = each["repeatability_percent"]
-        again = "not repeated" if repeat is None else f"a catch repeats to {repeat:.1f} % (1 sd)"
-        lines.append(f"set {each['set'] or 'of all valves'}: {again}")
-        lines.append("   duty  catches   L/min    cv %  spread %  left out %")
+        lines += heading(each, f"set {each['set'] or 'of all valves'}")
+        lines.append(
+            "   duty  catches   L/min   curve    cv %  spread %  left out %  off the curve %"
+        )
         lines += [
-            f"  {point['duty']:5.3f}  {point['count']:7d}  {point['flow_l_min']:6.3f}  "
-            f"{_cell(point['cv_percent'])}  {_cell(point['spread_percent'], 8)}  "
-            f"{_cell(point['left_out_percent'], 10)}"
+            f"  {point['duty']:5.3f}  {point_cells(point, each['residuals'])}"
             for point in each["points"]
         ]
     for each in result.get("compare", ()):
@@ -208,6 +212,25 @@ def _lines(result: dict[str, Any]) -> list[str]:
             for row in each["rows"]
         ]
     return [*lines, "", result["toml"]]
+
+
+def heading(curve: dict[str, Any], name: str) -> list[str]:
+    """Say how a curve was found."""
+    repeat = curve["repeatability_percent"]
+    again = "not repeated" if repeat is None else f"a catch repeats to {repeat:.1f} % (1 sd)"
+    return [f"{name}: {again}", f"curve: {curve['fit']['words']}"]
+
+
+def point_cells(
+    point: dict[str, Any], residuals: Sequence[dict[str, Any]], *, by: str = "duty"
+) -> str:
+    """Return the cells of one duty or pulse width, each catch's deviation from the curve last."""
+    off = [each["residual_percent"] for each in residuals if each[by] == point[by]]
+    return (
+        f"{point['count']:7d}  {point['flow_l_min']:6.3f}  {point['curve_l_min']:6.3f}  "
+        f"{_cell(point['cv_percent'])}  {_cell(point['spread_percent'], 8)}  "
+        f"{_cell(point['left_out_percent'], 10)}  {' '.join(f'{each:+.1f}' for each in off)}"
+    )
 
 
 def _cell(value: float | None, width: int = 6, digits: int = 1) -> str:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.bucket_scale import PULSE_FULL_US
 from analysis.bucket_table import pump_curve_of
+from analysis.calibrate_flow import heading, point_cells, residuals
 from companion.cli.answer import answer, note
 
 if TYPE_CHECKING:
@@ -54,17 +55,20 @@ def _result(curve: BucketCurve, range_us: tuple[float, float] | None) -> dict[st
                 f"{', '.join(f'{pulse:g}' for pulse in outside)} us lie outside the range of "
                 f"[pump], {range_us[0]:g} to {range_us[1]:g} us: correct stop_us or max_us"
             )
-    points = [
-        {"us": PULSE_FULL_US * mean.duty, **{k: v for k, v in asdict(mean).items() if k != "duty"}}
-        for mean in curve.means
-    ]
     pump = {
         "us": pulses_us,
         "flow_l_min": list(curve.flow_l_min),
-        "points": points,
+        "fit": curve.fit.as_json(len(curve.means)),
+        "points": [_in_us(asdict(mean)) for mean in curve.means],
+        "residuals": [_in_us(each) for each in residuals(curve)],
         "repeatability_percent": curve.repeatability_percent,
     }
     return {"pump": pump, "sets": [], "warnings": warnings, "toml": _toml(pump)}
+
+
+def _in_us(row: dict[str, Any]) -> dict[str, Any]:
+    duty = row.pop("duty")
+    return {"us": PULSE_FULL_US * duty, **row}
 
 
 def _toml(pump: dict[str, Any]) -> str:
@@ -80,17 +84,10 @@ def _toml(pump: dict[str, Any]) -> str:
 
 def _lines(result: dict[str, Any]) -> list[str]:
     pump = result["pump"]
-    repeat = pump["repeatability_percent"]
-    again = "not repeated" if repeat is None else f"a catch repeats to {repeat:.1f} % (1 sd)"
-    lines = [f"pump: {again}", "     us  catches   L/min    cv %  spread %  left out %"]
+    lines = heading(pump, "pump")
+    lines.append("     us  catches   L/min   curve    cv %  spread %  left out %  off the curve %")
     lines += [
-        f"  {point['us']:5.0f}  {point['count']:7d}  {point['flow_l_min']:6.3f}  "
-        f"{_cell(point['cv_percent'], 6)}  {_cell(point['spread_percent'], 8)}  "
-        f"{_cell(point['left_out_percent'], 10)}"
+        f"  {point['us']:5.0f}  {point_cells(point, pump['residuals'], by='us')}"
         for point in pump["points"]
     ]
     return [*lines, "", result["toml"]]
-
-
-def _cell(value: float | None, width: int) -> str:
-    return "-".rjust(width) if value is None else f"{value:{width}.1f}"
