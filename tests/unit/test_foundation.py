@@ -69,6 +69,15 @@ def test_every_pin_is_exact_and_has_a_hash(lock: str) -> None:
 
 
 @pytest.mark.parametrize("lock", LOCKS)
+def test_every_python_has_the_same_versions(lock: str) -> None:
+    versions: dict[str, set[str]] = {}
+    for pin in pins(lock):
+        versions.setdefault(pin.name, set()).add(str(pin.specifier))
+        assert "python_" not in str(pin.marker).replace("platform_python", "")
+    assert {name: found for name, found in versions.items() if len(found) > 1} == {}
+
+
+@pytest.mark.parametrize("lock", LOCKS)
 def test_lock_file_names_no_package_index(lock: str) -> None:
     text = (ROOT / "requirements" / f"{lock}.txt").read_text()
     assert "://" not in text
