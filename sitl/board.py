@@ -1,4 +1,7 @@
-"""The servo path: from an order to the autopilot to the edges at the valves."""
+"""The servo path: from an order to the autopilot to the edges at the valves.
+
+The board of docs/driver-board.md: widths here (rules 9 to 11), pulses in `board_pulses.py`.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,11 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from companion.output.pwm import PulseEngine, needs_restart
+from sitl.board_pulses import ValvePulses, is_change, phase_of
 
 if TYPE_CHECKING:
-    from companion.core.nozzle import PwmLimits
-    from companion.output.pwm import Edge
+    from sitl.edges import BoardEdge
+    from sitl.profile import Pulsing
 
 # A servo output repeats its pulse at 50 Hz: an order waits for the next frame.
 SERVO_FRAME_S = 0.020
@@ -43,7 +46,7 @@ class DriverBoard:
 
     def __init__(
         self,
-        pwm: PwmLimits,
+        pwm: Pulsing,
         valve_count: int,
         *,
         seed: int,
@@ -59,7 +62,20 @@ class DriverBoard:
             raise ValueError(f"dither_us must lie in [0, 50], got {dither_us}")
         if not closed_us < full_us:
             raise ValueError(f"closed_us must be below full_us, got {closed_us}, {full_us}")
-        self._engine = PulseEngine(pwm, valve_count, start_s=start_s, overrun_s=overrun_s)
+        if not (valve_count > 0 and math.isfinite(start_s)):
+            raise ValueError(f"no board for {valve_count} valves from {start_s} s")
+        if not 0.0 <= overrun_s <= pwm.min_off_s:
+            raise ValueError(f"overrun_s must lie in [0, min_off_s], got {overrun_s}")
+        self._pulses = tuple(
+            ValvePulses(
+                valve,
+                pwm,
+                phase_s=start_s + phase_of(valve, valve_count) * pwm.period_s,
+                overrun_s=overrun_s,
+            )
+            for valve in range(valve_count)
+        )
+        self._made: list[BoardEdge] = []
         self._restarts = kind == "restarting"
         self._closed_us, self._span_us = closed_us, full_us - closed_us
         self._frame_s = frame_s
@@ -83,7 +99,7 @@ class DriverBoard:
     @property
     def duty(self) -> tuple[float, ...]:
         """Return the duty of each valve that is in force or will be with its next period."""
-        return self._engine.duty
+        return tuple(pulses.ordered for pulses in self._pulses)
 
     def order(self, at_s: float, valve: int, pulse_us: float) -> None:
         """Take an order of the autopilot; it shows at the board with the next servo frame."""
@@ -97,7 +113,7 @@ class DriverBoard:
         self._count += 1
         heapq.heappush(self._due, (at_s, self._count, valve, pulse_us))
 
-    def advance(self, until_s: float) -> list[Edge]:
+    def advance(self, until_s: float) -> list[BoardEdge]:
         """Return the edges at the valves since the last call up to `until_s`."""
         while self._due and self._due[0][0] <= until_s:
             at_s, _, valve, pulse_us = heapq.heappop(self._due)
@@ -107,7 +123,11 @@ class DriverBoard:
                 self._look_standstill(at_s, valve)
             else:
                 self._see(at_s, valve, pulse_us)
-        return self._engine.advance(until_s)
+        for pulses in self._pulses:
+            pulses.advance(until_s, self._made)
+        made, self._made = self._made, []
+        made.sort(key=lambda edge: edge.at_s)
+        return made
 
     def _see(self, at_s: float, valve: int, pulse_us: float) -> None:
         was_valid = self._width_us[valve] >= PULSE_MIN_US
@@ -146,7 +166,9 @@ class DriverBoard:
             self._take(at_s, valve, 0.0)
 
     def _take(self, at_s: float, valve: int, duty: float) -> None:
-        old = self._engine.duty[valve]
+        pulses = self._pulses[valve]
+        pulses.advance(at_s, self._made)
+        old = pulses.ordered
         if duty != old:
-            restart = self._restarts and needs_restart(old, duty)
-            self._engine.order(valve, duty, at_s=at_s, restart=restart)
+            is_new = self._restarts and is_change(old, duty)
+            pulses.order(at_s, duty, is_new_period=is_new, out=self._made)

@@ -16,6 +16,14 @@ class Board(StrEnum):
     FREE_RUNNING = "free-running"
 
 
+class FlowLaw(StrEnum):
+    """How the sprayer's flow runs between its measured points."""
+
+    SMOOTH = "smooth"
+    STRAIGHT = "straight"
+    OFFSET = "offset"
+
+
 class Fidelity(StrEnum):
     """How closely the valves are simulated."""
 
@@ -159,6 +167,10 @@ def fly(
     meter_rate_hz: Annotated[
         float, typer.Option(help="How often the flow meter reports; 0: there is none.")
     ] = 50.0,
+    flow_law: Annotated[
+        FlowLaw | None,
+        typer.Option(help="The true flow between measured points; default: the profile's own."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for truth, result, picture and journal.")
     ] = None,
@@ -183,6 +195,7 @@ def fly(
         seed=seed,
         speed_m_s=speed,
         meter_rate_hz=meter_rate_hz,
+        flow_law=None if flow_law is None else flow_law.value,
         out=out,
     )
     flown = fly_mission(options, note)

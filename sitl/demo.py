@@ -29,7 +29,9 @@ from sitl.demo_field import (
 )
 from sitl.demo_pool import do_all
 from sitl.demo_traces import Traces, traces_of
-from sitl.flight import FlightOptions, FlightResult, fly
+from sitl.flight import FlightOptions, FlightResult, fly, true_profile
+from sitl.flow_law import FlowLaw
+from sitl.knowledge import perfect_setup
 from sitl.profile import PlantProfile, load_profile
 from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController
 
@@ -68,6 +70,7 @@ class DemoOptions:
     seed: int = 1
     fidelity: Fidelity = "pulsed"
     output: Literal["gpio", "servo"] = "gpio"
+    flow_law: FlowLaw | None = None
 
     @property
     def shown_m_s(self) -> float:
@@ -84,6 +87,7 @@ class Job:
     seed: int
     fidelity: Fidelity
     output: Literal["gpio", "servo"]
+    flow_law: FlowLaw | None = None
     traced: bool = False
     journal_folder: Path | None = None
 
@@ -180,6 +184,7 @@ def jobs_of(options: DemoOptions, journal_folder: Path | None) -> list[Job]:
                     seed=options.seed,
                     fidelity=options.fidelity,
                     output=options.output,
+                    flow_law=options.flow_law,
                     traced=shown and method != PERFECT,
                     journal_folder=journal_folder if shown and method == SCHEDULED else None,
                 )
@@ -190,7 +195,7 @@ def jobs_of(options: DemoOptions, journal_folder: Path | None) -> list[Job]:
 def fly_one(job: Job) -> Flown:
     """Fly one flight and judge it by its truth."""
     setup, profile = demo_setup(job.speed_m_s), load_profile(PROFILE)
-    setup = replace(setup, lag=demo_lags(profile, job.output, perfect=job.method == PERFECT))
+    setup = replace(setup, lag=demo_lags(job.output))
     if job.journal_folder is None:
         result = _fly(job, setup, profile)
     else:
@@ -218,17 +223,21 @@ def _fly(
 ) -> FlightResult:
     look_ahead_s = P1_LOOK_AHEAD_S.get(job.method)
     knows = job.method == PERFECT
+    options = FlightOptions(
+        fidelity=job.fidelity,
+        output=job.output,
+        seed=job.seed,
+        knows=knows,
+        flow_law=job.flow_law,
+    )
+    profile = true_profile(profile, options)
+    if knows:
+        setup = perfect_setup(setup, profile, seed=job.seed, output_s=setup.lag.output_s)
     return fly(
         setup,
         demo_trajectory(job.speed_m_s, job.seed),
         profile,
-        FlightOptions(
-            fidelity=job.fidelity,
-            output=job.output,
-            seed=job.seed,
-            noise=not knows,
-            scatter=not knows,
-        ),
+        options,
         speed_m_s=job.speed_m_s,
         wang=None
         if look_ahead_s is None

@@ -24,6 +24,7 @@ from rich.table import Table
 
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError
+from sitl.cli import FlowLaw
 from sitl.demo_report import can_report, write_report
 
 if TYPE_CHECKING:
@@ -71,6 +72,10 @@ def demo_flights(
     output: Annotated[
         Output, typer.Option(help="Lines of this computer, or servo outputs of the autopilot.")
     ] = Output.GPIO,
+    flow_law: Annotated[
+        FlowLaw | None,
+        typer.Option(help="The true flow between measured points; default: the profile's own."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Fly the field of the first paper with all methods and compare them.
@@ -85,6 +90,7 @@ def demo_flights(
         seed=seed,
         fidelity=fidelity.value,
         output=output.value,
+        flow_law=None if flow_law is None else flow_law.value,
     )
     check(options)
     with _termination_as_interrupt(), _staging(out) as stage:

@@ -11,7 +11,6 @@ from companion.core.controller import Setup
 from companion.core.prescription import Prescription
 from companion.core.schedule import LagModel
 from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_lag, anyang_route
-from sitl.profile import PlantProfile
 from sitl.route import Route
 from sitl.trajectory import Trajectory
 from sitl.vehicle import Vehicle
@@ -55,13 +54,9 @@ def scaled(prescription: Prescription, factor: float) -> Prescription:
     )
 
 
-def demo_lags(profile: PlantProfile, output: str, *, perfect: bool = False) -> LagModel:
-    """Return the lags measured beforehand; with perfect knowledge those of the nominal valve.
-
-    The single valve, message and servo frame scatter around either.
-    """
-    measured = anyang_lag(output)
-    return replace(profile.lags(), output_s=measured.output_s) if perfect else measured
+def demo_lags(output: str) -> LagModel:
+    """Return the lags measured beforehand, on another sprayer of the make."""
+    return anyang_lag(output)
 
 
 @cache

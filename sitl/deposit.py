@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
-    from companion.core.boom import Boom
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +25,26 @@ ELEMENT_M = 0.1
 STEP_M = 0.05
 _CHUNK = 8192
 L_HA_PER_ML_M2 = 10.0
+
+
+class Nozzles(Protocol):
+    """What one valve covers: the middle of its strip in the body frame, and its width."""
+
+    @property
+    def right_m(self) -> float: ...  # noqa: D102
+    @property
+    def forward_m(self) -> float: ...  # noqa: D102
+    @property
+    def width_m(self) -> float: ...  # noqa: D102
+
+
+class Strips(Protocol):
+    """A boom as it is mounted: lengths, and nothing worked out of them."""
+
+    @property
+    def width_m(self) -> float: ...  # noqa: D102
+    @property
+    def valves(self) -> Sequence[Nozzles]: ...  # noqa: D102
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +117,7 @@ class Deposit:
         north_m: Floats,
         heading_deg: Floats,
         volume_ml: Floats,
-        boom: Boom,
+        boom: Strips,
     ) -> None:
         """Add a piece of flight: the path at some times, (n, valves) cumulative volumes then."""
         if not len(east_m) == len(north_m) == len(heading_deg) == len(volume_ml):

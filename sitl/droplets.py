@@ -111,7 +111,7 @@ def flown(
     """Return the truth of a flight whose controller hears of the wind at the nozzles."""
     profile, setup = load_profile(PROFILE), demo_setup(SPEED_M_S)
     result = fly(
-        replace(setup, lag=demo_lags(profile, "gpio"), drift=law() if corrected else None),
+        replace(setup, lag=demo_lags("gpio"), drift=law() if corrected else None),
         demo_trajectory(SPEED_M_S, seed),
         profile,
         FlightOptions(fidelity=fidelity, seed=seed),

@@ -29,19 +29,31 @@ from companion.core.types import (
     Input,
     LandedReport,
     OperatorCommand,
+    SprayPlan,
     Telemetry,
+    TimedChange,
     VehicleState,
 )
+from companion.output.pwm import PulseEngine
 from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.drives import DrivenOutput, DriveTruth, Motors, Ranges
+from sitl.knowledge import KnowingOutput, WaitingForDuties, WaitingForEdges, pwm_limits
 from sitl.leg_reports import leg_reports
 from sitl.liquid_faults import LiquidFault, LiquidSensors
 from sitl.navigation import Navigation
-from sitl.outputs import WIRE_S, AveragedOutput, GpioOutput, Output, ServoOutput
+from sitl.outputs import (
+    WIRE_S,
+    AveragedOutput,
+    Output,
+    PlanFollower,
+    ServoOutput,
+    TakesEdges,
+)
 from sitl.plants import duty_plant, edge_plant
 from sitl.wang import POLL_S, WangController
 
 if TYPE_CHECKING:
+    from sitl.flow_law import FlowLaw
     from sitl.plant import Plant
     from sitl.profile import PlantProfile
     from sitl.route import Route
@@ -57,8 +69,11 @@ MESSAGE_DELAY_S = 0.005
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightOptions:
-    """How a flight is simulated; `noise` and `scatter` off is perfect knowledge.
+    """How a flight is simulated.
 
+    `knows` is perfect knowledge: the true position, and each valve's own lag and flow, for a set-up
+    of `knowledge.perfect_setup`; the sprayer is the same, scattered one. `scatter` off makes all
+    valves alike. `flow_law` says how the flow runs between measured points; None: as the profile.
     `meter_rate_hz` above 0 has the flow meter report that often, `pressure_rate_hz` the pressure
     sensor; `liquid_faults` act on sprayers with valves. `drive_ranges_us` are stop and full pulse
     of each motor as the program has them; without them they are the plant's own.
@@ -72,6 +87,8 @@ class FlightOptions:
     estimator_lag_s: float = 0.031
     noise: bool = True
     scatter: bool = True
+    knows: bool = False
+    flow_law: FlowLaw | None = None
     meter_rate_hz: float = 0.0
     pressure_rate_hz: float = 0.0
     liquid_faults: tuple[LiquidFault, ...] = ()
@@ -116,8 +133,7 @@ def fly(
     With `mission`, the route that the trajectory flies, the controller hears which leg it is.
     `on_step` gets what each step has left, the state that it was given, and its time.
     """
-    if not options.scatter:
-        profile = replace(profile, lag_scatter=0.0, flow_scatter=0.0)
+    profile = true_profile(profile, options)
     start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     plant, output = sprayer(profile, options, start_s)
     inputs = _inputs(setup, trajectory, options)
@@ -183,6 +199,15 @@ def fly(
     )
 
 
+def true_profile(profile: PlantProfile, options: FlightOptions) -> PlantProfile:
+    """Return the sprayer as the options have it."""
+    if not options.scatter:
+        profile = replace(profile, lag_scatter=0.0, flow_scatter=0.0)
+    if options.flow_law is not None:
+        profile = replace(profile, flow_law=options.flow_law)
+    return profile
+
+
 def sprayer(profile: PlantProfile, options: FlightOptions, start_s: float) -> tuple[Plant, Output]:
     """Return a plant and the output path that drives it; a pump has no pulses."""
     plant, output = _valves(profile, options, start_s)
@@ -198,10 +223,26 @@ def _valves(profile: PlantProfile, options: FlightOptions, start_s: float) -> tu
     if options.fidelity == "averaged" or profile.pump is not None:
         averaged = duty_plant(profile, seed=options.seed, start_s=start_s)
         delay_s = WIRE_S + 0.5 * SERVO_FRAME_S if options.output == "servo" else 0.0
-        return averaged, AveragedOutput(averaged, delay_s=delay_s)
+        if not options.knows:
+            return averaged, AveragedOutput(averaged, delay_s=delay_s)
+        duties = WaitingForDuties(averaged, seed=options.seed)
+        return averaged, KnowingOutput(
+            AveragedOutput(duties, delay_s=delay_s), duties, seed=options.seed
+        )
     pulsed = edge_plant(profile, seed=options.seed, start_s=start_s)
+    if not options.knows:
+        return pulsed, _edge_output(pulsed, profile, options, start_s)
+    edges = WaitingForEdges(pulsed, seed=options.seed)
+    output = _edge_output(edges, profile, options, start_s)
+    return pulsed, KnowingOutput(output, edges, seed=options.seed)
+
+
+def _edge_output(
+    pulsed: TakesEdges, profile: PlantProfile, options: FlightOptions, start_s: float
+) -> Output:
+    """Return the output path that makes edges."""
     if options.output == "gpio":
-        return pulsed, GpioOutput(pulsed, start_s=start_s)
+        return GpioOutput(pulsed, start_s=start_s)
     board = DriverBoard(
         profile.pwm,
         profile.valve_count,
@@ -210,21 +251,22 @@ def _valves(profile: PlantProfile, options: FlightOptions, start_s: float) -> tu
         kind=options.board,
         overrun_s=profile.overrun_s if options.board == "restarting" else 0.0,
     )
-    return pulsed, ServoOutput(pulsed, board)
+    return ServoOutput(pulsed, board)
 
 
 def _inputs(setup: Setup, trajectory: Trajectory, options: FlightOptions) -> Iterator[Input]:
     """Return all that the companion receives, in the order of arrival."""
+    is_noisy = options.noise and not options.knows
     navigation = Navigation(
         trajectory,
         setup.frame,
         seed=options.seed,
         start_s=float(trajectory.time_s[0]),
         position_rate_hz=options.position_rate_hz,
-        estimator_lag_s=options.estimator_lag_s if options.noise else 0.0,
-        message_delay_s=MESSAGE_DELAY_S if options.noise else 0.0,
-        jitter_s=0.003 if options.noise else 0.0,
-        noise=options.noise,
+        estimator_lag_s=options.estimator_lag_s if is_noisy else 0.0,
+        message_delay_s=MESSAGE_DELAY_S if is_noisy else 0.0,
+        jitter_s=0.003 if is_noisy else 0.0,
+        noise=is_noisy,
     )
     start_s, end_s = float(trajectory.time_s[0]), float(trajectory.time_s[-1])
     return heapq.merge(
@@ -242,6 +284,37 @@ def _statuses(start_s: float, end_s: float) -> Iterator[Input]:
         yield GnssReport(received_s=now_s, fix=Fix.RTK_FIXED)
         yield EstimatorReport(received_s=now_s, healthy=True)
         yield LandedReport(received_s=now_s, in_air=True)
+
+
+class GpioOutput:
+    """The product's pulse engine, to the edge: judged like the rest of the product."""
+
+    def __init__(self, plant: TakesEdges, *, start_s: float) -> None:
+        profile = plant.profile
+        self._plant = plant
+        self._engine = PulseEngine(
+            pwm_limits(profile),
+            profile.valve_count,
+            start_s=start_s,
+            overrun_s=profile.overrun_s,
+        )
+        self._follower = PlanFollower(profile.valve_count)
+
+    @property
+    def orders(self) -> list[TimedChange]:
+        """Return the changes carried out so far."""
+        return self._follower.orders
+
+    def submit(self, plan: SprayPlan, *, now_s: float) -> None:
+        """Carry out what was due, then replace the future."""
+        self._follower.submit(plan, now_s=now_s)
+        self._engine.submit(plan, now_s=now_s)
+        self._plant.record(self._engine.advance(now_s))
+
+    def finish(self, end_s: float) -> None:
+        """Carry out all until `end_s`."""
+        self._follower.advance(end_s)
+        self._plant.record(self._engine.advance(end_s))
 
 
 @dataclass(slots=True)

@@ -23,13 +23,14 @@ from analysis.evaluation import Evaluation, evaluate, limit_ratio
 from companion.assembly import build_setup, deliverable, refuse_mismatch
 from companion.config import Config, load
 from companion.core.controller import Setup
-from companion.core.nozzle import NozzleSet, allowed_duty
+from companion.core.nozzle import allowed_duty
 from companion.core.rate import flow_for_rate
 from companion.errors import ConfigError
 from companion.maps.model import Problem
 from sitl.board import SERVO_FRAME_S
-from sitl.flight import FlightOptions, FlightResult, fly
+from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.input_faults import check_on_inputs, with_faults
+from sitl.knowledge import perfect_setup
 from sitl.motor_parts import check_motors, droplet_figures, fits, ranges_us
 from sitl.outputs import WIRE_S
 from sitl.profile import PROFILES, PlantProfile, load_profile
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from analysis.flight_record import Fidelity
     from companion.core.drift import Drift
     from companion.core.types import Decision, Input
+    from sitl.flow_law import FlowLaw
     from sitl.vehicle import Leg
 
 DEFAULT_SPEED_M_S = 5.0
@@ -69,6 +71,7 @@ class FlyOptions:
     seed: int = 1
     speed_m_s: float | None = None
     meter_rate_hz: float = 50.0
+    flow_law: FlowLaw | None = None
     out: Path | None = None
 
 
@@ -357,6 +360,7 @@ def _flight_options(task: Task, options: FlyOptions) -> FlightOptions:
         position_rate_hz=float(task.config.link.position_rate_hz),
         meter_rate_hz=options.meter_rate_hz,
         drive_ranges_us=ranges_us(task.config),
+        flow_law=options.flow_law,
     )
 
 
@@ -368,31 +372,20 @@ def _output(task: Task, options: FlyOptions) -> Literal["gpio", "servo"]:
 
 
 def _perfect_flight(task: Task, trajectory: Trajectory, options: FlyOptions) -> FlightResult:
-    """Fly the same path with the true position, the plant's true curves and lags, no scatter.
-
-    What is judged is the flow at the nozzle: so it makes no offset for the wind.
-    """
+    """Fly the same path and the same sprayer with all that is true of them known."""
     output_s = WIRE_S + 0.5 * SERVO_FRAME_S if _output(task, options) == "servo" else 0.0
-    profile = task.profile
-    setup = replace(
-        task.setup,
-        lag=replace(profile.lags(), output_s=output_s),
-        nozzle_sets=tuple(_true_set(nozzles, profile) for nozzles in task.setup.nozzle_sets),
-        pwm=profile.pwm,
-        drift=None,
-    )
-    perfect = replace(_flight_options(task, options), noise=False, scatter=False, meter_rate_hz=0.0)
+    perfect = replace(_flight_options(task, options), knows=True, meter_rate_hz=0.0)
+    profile = true_profile(task.profile, perfect)
     return fly(
-        setup, trajectory, profile, perfect, speed_m_s=task.speed_m_s, mission=_mission(task)
+        perfect_setup(task.setup, profile, seed=options.seed, output_s=output_s),
+        trajectory,
+        profile,
+        perfect,
+        speed_m_s=task.speed_m_s,
+        mission=_mission(task),
     )
 
 
 def _mission(task: Task) -> Route | None:
     """Return the mission whose legs the companion hears of: it does where lines are followed."""
     return None if task.setup.lines is None else task.route
-
-
-def _true_set(nozzles: NozzleSet, profile: PlantProfile) -> NozzleSet:
-    """Return the same set with the plant's own curve, where the plant has that set."""
-    same = (each for each in profile.nozzle_sets if set(each.valves) == set(nozzles.valves))
-    return next(same, nozzles)

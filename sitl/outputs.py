@@ -1,8 +1,8 @@
 """What lies between a plan and the plant in a simulated flight: the output path.
 
-`gpio` is the pulse engine itself, `servo` a pulse width on an autopilot's output, delayed by its
-frame and turned into pulses by a driver board. In averaged fidelity a change of duty acts as it
-is. All of them keep the changes that were carried out.
+`servo` is a pulse width on an autopilot's output, delayed by its frame and turned into pulses by a
+driver board; in averaged fidelity a change of duty acts as it is. (`gpio` is the product's own
+pulse engine, and stands in `flight.py`.) All of them keep the changes that were carried out.
 """
 
 from __future__ import annotations
@@ -12,14 +12,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from companion.core.types import TimedChange
-from companion.output.pwm import PulseEngine
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from companion.core.types import SprayPlan
-    from companion.output.pwm import Edge
     from sitl.board import DriverBoard
+    from sitl.edges import Edge
     from sitl.profile import PlantProfile
 
 # An order is on its way to the autopilot this long: 44 bytes over a telemetry port.
@@ -132,34 +131,6 @@ class AveragedOutput:
     def _act(self, changes: list[TimedChange]) -> None:
         for change in changes:
             self._plant.record_change(change.at_s + self._delay_s, change.valve, change.duty)
-
-
-class GpioOutput:
-    """The pulse engine, to the edge."""
-
-    def __init__(self, plant: TakesEdges, *, start_s: float) -> None:
-        profile = plant.profile
-        self._plant = plant
-        self._engine = PulseEngine(
-            profile.pwm, profile.valve_count, start_s=start_s, overrun_s=profile.overrun_s
-        )
-        self._follower = PlanFollower(profile.valve_count)
-
-    @property
-    def orders(self) -> list[TimedChange]:
-        """Return the changes carried out so far."""
-        return self._follower.orders
-
-    def submit(self, plan: SprayPlan, *, now_s: float) -> None:
-        """Carry out what was due, then replace the future."""
-        self._follower.submit(plan, now_s=now_s)
-        self._engine.submit(plan, now_s=now_s)
-        self._plant.record(self._engine.advance(now_s))
-
-    def finish(self, end_s: float) -> None:
-        """Carry out all until `end_s`."""
-        self._follower.advance(end_s)
-        self._plant.record(self._engine.advance(end_s))
 
 
 class ServoOutput:

@@ -21,8 +21,7 @@ from sitl.profile import draw_scatter, flow_table
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from companion.core.schedule import LagModel
-    from companion.output.pwm import Edge
+    from sitl.edges import Edge
     from sitl.profile import PlantProfile
 
 Floats = NDArray[np.float64]
@@ -177,10 +176,10 @@ class Plant:
                 "valves; fly it with `vrspray sitl fly`"
             )
 
-    def true_lags(self, valve: int) -> LagModel:
-        """Return this very valve's lags: for the run with perfect knowledge only."""
+    def true_shift_s(self, valve: int) -> float:
+        """Return how much later this very valve is than the nominal one."""
         self._check_perfect()
-        return self.profile.lags(self._scatter.shift_s[valve])
+        return self._scatter.shift_s[valve]
 
     def true_flow_scale(self, valve: int) -> float:
         """Return this very valve's flow over the nominal one: likewise."""

@@ -4,25 +4,89 @@ from __future__ import annotations
 
 import math
 import tomllib
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from companion.core.boom import Boom, Valve
-from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
-from companion.core.schedule import LagModel
 from companion.errors import ConfigError
+from sitl.flow_law import FLOW_LAWS, FlowLaw, flow_by_law
 from sitl.supply import Atomiser, Supply, read_atomiser
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from sitl.flow_law import Floats
 
 PROFILES = Path(__file__).parent / "profiles"
 ML_S_PER_L_MIN = 1000.0 / 60.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pulsing:
+    """What the valves can follow; `duty_max` is the last duty below fully open."""
+
+    frequency_hz: float
+    duty_min: float
+    duty_max: float
+    min_on_s: float
+    min_off_s: float
+
+    def __post_init__(self) -> None:
+        if not 0.1 <= self.frequency_hz <= 1000.0:
+            raise ValueError(f"frequency_hz must lie in [0.1, 1000], got {self.frequency_hz}")
+        if not 0.0 <= self.duty_min < self.duty_max <= 1.0:
+            raise ValueError("0 <= duty_min < duty_max <= 1 must hold")
+        if not (self.min_on_s >= 0.0 and self.min_off_s >= 0.0):
+            raise ValueError("min_on_s and min_off_s must not be negative")
+        if not self.min_on_s + self.min_off_s < self.period_s:
+            raise ValueError("min_on_s and min_off_s together must be shorter than a period")
+
+    @property
+    def period_s(self) -> float:
+        """Return the length of a PWM period."""
+        return 1.0 / self.frequency_hz
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MeasuredSet:
+    """Valves that spray together, and what a bucket test found of them: duty, and flow of all."""
+
+    valves: tuple[int, ...]
+    duty: tuple[float, ...]
+    flow_l_min: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not self.valves or len(set(self.valves)) != len(self.valves):
+            raise ValueError(f"a nozzle set needs valves, each once, got {self.valves}")
+        if len(self.duty) != len(self.flow_l_min) or len(self.duty) < 2:
+            raise ValueError("a nozzle set needs as many duties as flows, two at least")
+        for name, values in (("duty", self.duty), ("flow_l_min", self.flow_l_min)):
+            if not all(a < b for a, b in pairwise(values)):
+                raise ValueError(f"{name} must be strictly increasing, got {list(values)}")
+        if not (self.duty[0] >= 0.0 and self.duty[-1] <= 1.0):
+            raise ValueError(f"duty must lie in [0, 1], got {list(self.duty)}")
+        if not (self.flow_l_min[0] >= 0.0 and self.flow_l_min[-1] < 1e6):
+            raise ValueError(f"flow_l_min must be finite and not negative: {self.flow_l_min}")
+
+    @property
+    def flow_max_l_min(self) -> float:
+        """Return the largest measured flow."""
+        return self.flow_l_min[-1]
+
+    def flows_l_min(self, law: FlowLaw, duty: Floats) -> Floats:
+        """Return the flow of all its valves by a law for what lies between the points."""
+        return flow_by_law(law, self.duty, self.flow_l_min, duty)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Strip:
+    """The ground that one valve covers: its middle right of the boom's own, and its width."""
+
+    right_m: float
+    width_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,14 +133,15 @@ class PlantProfile:
     valves: of the whole lag, and of the flow. With a `pump` it is the pump's speed that makes the
     flow, and the edges are those of its shut-off valve. A `supply` is a pump with an order of its
     own, and what is not PWM is on-off; the curve of a pump that modulates is of its range.
+    `flow_law` is how the flow runs between the measured points.
     """
 
     name: str
     boom_width_m: float
     valve_count: int
     normally_open: bool
-    pwm: PwmLimits
-    nozzle_sets: tuple[NozzleSet, ...]
+    pwm: Pulsing
+    nozzle_sets: tuple[MeasuredSet, ...]
     dead_open_s: float
     dead_close_s: float
     ramp_s: float
@@ -87,6 +152,7 @@ class PlantProfile:
     pump: Pump | None = None
     supply: Supply | None = None
     atomisers: tuple[Atomiser, ...] = ()
+    flow_law: FlowLaw = "smooth"
 
     def __post_init__(self) -> None:
         if not self.nozzle_sets or not 0.0 < self.boom_width_m < 1000.0:
@@ -112,14 +178,26 @@ class PlantProfile:
             and self.closing_s == self.ramp_s
         ):
             raise ValueError("a pump has one valve_count, with equal edges to open and to shut")
-        self._check_drives()
+        self._check_kinds()
 
-    def _check_drives(self) -> None:
+    def _check_kinds(self) -> None:
+        if self.flow_law not in FLOW_LAWS:
+            raise ValueError(f"flow_law is one of {', '.join(FLOW_LAWS)}, got {self.flow_law!r}")
         if self.pump is not None and self.supply is not None:
             raise ValueError("[pump] and [supply] are two kinds of sprayer; give one of them")
         for atomiser in self.atomisers:
             if not set(atomiser.valves) <= set(range(self.valve_count)):
                 raise ValueError(f"atomiser {atomiser.name}: no such valves {atomiser.valves}")
+
+    @property
+    def strips(self) -> tuple[Strip, ...]:
+        """Return the strips of the valves side by side, valve 0 at the left."""
+        width_m = self.boom_width_m / self.valve_count
+        middle = 0.5 * (self.valve_count - 1)
+        return tuple(
+            Strip(right_m=(valve - middle) * width_m, width_m=width_m)
+            for valve in range(self.valve_count)
+        )
 
     @property
     def drive_count(self) -> int:
@@ -162,62 +240,6 @@ class PlantProfile:
         ramps_s = 0.5 * (self.ramp_s + self.closing_s)
         return 0.5 * (self.dead_open_s + self.dead_close_s + ramps_s)
 
-    def lags(self, shift_s: float = 0.0) -> LagModel:
-        """Return the lags of a valve that is `shift_s` later than the nominal one, no output."""
-        if self.makes_flow is not None:
-            return self._pump_lags(self.makes_flow)
-        lag_s = self.mean_lag_s + shift_s
-        return LagModel(
-            on_s=lag_s,
-            off_s=lag_s,
-            up_s=lag_s,
-            down_s=lag_s,
-            on_start_s=self.dead_open_s + shift_s,
-            off_end_s=self.dead_close_s + self.closing_s + shift_s,
-            output_s=0.0,
-        )
-
-    def _pump_lags(self, pump: Pump) -> LagModel:
-        """Return the lags of a pump: dead time and time constant, for steps of any size.
-
-        An exponential is below 2 % after ln(50) time constants.
-        """
-        up_s, down_s = pump.dead_s + pump.up_s, pump.dead_s + pump.down_s
-        if not pump.shut_off:
-            return LagModel(
-                on_s=up_s,
-                off_s=down_s,
-                up_s=up_s,
-                down_s=down_s,
-                on_start_s=pump.dead_s,
-                off_end_s=pump.dead_s + math.log(50.0) * pump.down_s,
-                output_s=0.0,
-            )
-        return LagModel(
-            on_s=self.dead_open_s + 0.5 * self.ramp_s,
-            off_s=self.dead_close_s + 0.5 * self.closing_s,
-            up_s=up_s,
-            down_s=down_s,
-            on_start_s=self.dead_open_s,
-            off_end_s=self.dead_close_s + self.closing_s,
-            output_s=0.0,
-        )
-
-    def boom(self, *, height_m: float = 3.5, forward_m: float = 0.0) -> Boom:
-        """Return the boom with its strips side by side, valve 0 at the left."""
-        width_m = self.boom_width_m / self.valve_count
-        valves = tuple(
-            Valve(
-                name=str(valve + 1),
-                right_m=(valve + 0.5) * width_m - 0.5 * self.boom_width_m,
-                forward_m=forward_m,
-                width_m=width_m,
-                channel=9 + valve,
-            )
-            for valve in range(self.valve_count)
-        )
-        return Boom(width_m=self.boom_width_m, valves=valves, height_m=height_m)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scatter:
@@ -254,13 +276,13 @@ class FlowTable:
 
     Fewer valves in use leave more pressure to each: between two measured sets the flow of a valve
     is interpolated by the number in use, and outside of them held. Tables of 4 001 duties, because
-    a curve's own inverse is too slow for every step of a flight; their error is below 1e-5.
+    a law is too slow for every step of a flight; their error is below 1e-5.
     """
 
     STEPS = 4000
 
     def __init__(self, profile: PlantProfile) -> None:
-        self._pwm = profile.pwm
+        self._pwm, self._law = profile.pwm, profile.flow_law
         self._surplus = profile.surplus_s * profile.pwm.frequency_hz
         self._tables = [self._table(profile, active) for active in range(profile.valve_count + 1)]
 
@@ -274,10 +296,10 @@ class FlowTable:
         flows += share * self._valve_flows(profile.nozzle_sets[high])
         return [float(flow) for flow in flows]
 
-    def _valve_flows(self, nozzle_set: NozzleSet) -> NDArray[np.float64]:
+    def _valve_flows(self, measured: MeasuredSet) -> Floats:
         duties = np.linspace(0.0, 1.0, self.STEPS + 1)
-        flows = np.array([nozzle_set.curve.flow_for(duty) for duty in duties.tolist()])
-        return flows * (ML_S_PER_L_MIN / len(nozzle_set.valves))
+        flows = measured.flows_l_min(self._law, duties)
+        return flows * (ML_S_PER_L_MIN / len(measured.valves))
 
     def mean_ml_s(self, duty: float, active: int) -> float:
         """Return the mean flow of one valve at `duty` while `active` valves are in use."""
@@ -285,6 +307,14 @@ class FlowTable:
         i = min(int(place), self.STEPS - 1)
         table = self._tables[active]
         return table[i] + (table[i + 1] - table[i]) * (place - i)
+
+    def duty_for(self, flow_ml_s: float, active: int) -> float:
+        """Return the duty of a mean flow of one valve; fully open where it gives no more."""
+        table = self._tables[active]
+        i = bisect_left(table, flow_ml_s)
+        if i == 0 or i > self.STEPS:
+            return min(i / self.STEPS, 1.0)
+        return (i - (table[i] - flow_ml_s) / (table[i] - table[i - 1])) / self.STEPS
 
     def open_ml_s(self, duty: float, active: int) -> float:
         """Return the flow of one open valve in a train of pulses: such that the mean is right."""
@@ -316,9 +346,10 @@ def load_profile(name: str | Path) -> PlantProfile:
 
 def _profile(table: dict[str, Any]) -> PlantProfile:
     sets = tuple(
-        NozzleSet(
+        MeasuredSet(
             valves=tuple(entry["valves"]),
-            curve=FlowCurve(duty=tuple(entry["duty"]), flow_l_min=tuple(entry["flow_l_min"])),
+            duty=tuple(entry["duty"]),
+            flow_l_min=tuple(entry["flow_l_min"]),
         )
         for entry in table.pop("nozzle_set")
     )
@@ -326,7 +357,7 @@ def _profile(table: dict[str, Any]) -> PlantProfile:
     pump, supply = table.pop("pump", None), table.pop("supply", None)
     atomisers = tuple(read_atomiser(entry) for entry in table.pop("atomiser", ()))
     return PlantProfile(
-        pwm=PwmLimits(**pwm),
+        pwm=Pulsing(**pwm),
         meter=Meter(**meter),
         nozzle_sets=sets,
         pump=None if pump is None else Pump(**pump),

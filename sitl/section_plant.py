@@ -8,13 +8,13 @@ import numpy as np
 
 from sitl.meter import MeterStream, VolumeMeter
 from sitl.plant import Faults, Floats, Plant
-from sitl.profile import ML_S_PER_L_MIN
+from sitl.profile import ML_S_PER_L_MIN, flow_table
 from sitl.section_flow import SectionFlow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from companion.output.pwm import Edge
+    from sitl.edges import Edge
     from sitl.profile import PlantProfile
     from sitl.supply import Supply
 
@@ -41,13 +41,13 @@ class SectionPlant(Plant):
             raise ValueError("valves that stick are not simulated behind a pump")
         super().__init__(profile, seed=seed, perfect=perfect, start_s=start_s)
         self._pump: Supply = supply
-        self._curve = profile.nozzle_sets[-1].curve
+        self._pump_ml_s = flow_table(profile)
         scales = np.array(self._scatter.flow_scale)
         self._flow = SectionFlow(
             (scales / scales.sum()).tolist(),
             up_s=supply.up_s,
             down_s=supply.down_s,
-            most_ml_s=supply.relief * self._curve.flow_l_min[-1] * ML_S_PER_L_MIN,
+            most_ml_s=supply.relief * profile.nozzle_sets[-1].flow_max_l_min * ML_S_PER_L_MIN,
             start_s=start_s,
             is_open=not supply.valves,
         )
@@ -74,7 +74,8 @@ class SectionPlant(Plant):
         dead_s = self._pump.spin_up_s if self._fraction == 0.0 else self._pump.dead_s
         self._fraction = fraction
         self._heard_s = max(at_s + dead_s, self._heard_s)
-        self._flow.pump(self._heard_s, self._curve.flow_for(fraction) * ML_S_PER_L_MIN)
+        count = self.profile.valve_count
+        self._flow.pump(self._heard_s, count * self._pump_ml_s.mean_ml_s(fraction, count))
 
     def record_change(self, at_s: float, valve: int, duty: float) -> None:
         """Take down that a valve is ordered to be open (above 0) or shut from `at_s` on."""

@@ -184,7 +184,7 @@ def flown(what: Disturbance, *, seed: int, fidelity: Fidelity) -> FlightRecord:
     """Return the truth of one flight whose controller knows nothing of the disturbance."""
     profile, setup = load_profile(PROFILE), demo_setup(SPEED_M_S)
     result = fly(
-        replace(setup, lag=shortened(demo_lags(profile, "gpio"), what)),
+        replace(setup, lag=shortened(demo_lags("gpio"), what)),
         demo_trajectory(SPEED_M_S, seed),
         profile,
         FlightOptions(fidelity=fidelity, seed=seed, position_rate_hz=what.rate_hz),

@@ -234,7 +234,7 @@ def record_of(job: Job) -> FlightRecord:
     if look_ahead_s is not None:
         wang = WangController(setup=setup, look_ahead_s=look_ahead_s)
     return fly(
-        replace(setup, lag=demo_lags(profile, job.way.output)),
+        replace(setup, lag=demo_lags(job.way.output)),
         demo_trajectory(job.speed_m_s, job.seed),
         profile,
         FlightOptions(output=job.way.output, seed=job.seed),

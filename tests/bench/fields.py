@@ -29,7 +29,6 @@ from companion.core.types import (
 from sitl.anyang import HEIGHT_M
 from sitl.demo_field import MAP_SPEED_M_S, START_S, demo_lags, demo_setup
 from sitl.navigation import Navigation
-from sitl.profile import load_profile
 from sitl.vehicle import Leg, Route, Vehicle
 
 PROFILE = "wang-2024"
@@ -39,7 +38,7 @@ PLOT_LENGTH_M, PLOT_WIDTH_M = 12.0, 6.0
 
 def example(speed_m_s: float = MAP_SPEED_M_S, output: str = "gpio") -> Setup:
     """Return the example with the demo's lags and its rates scaled by 5/V."""
-    lag = demo_lags(load_profile(PROFILE), output)
+    lag = demo_lags(output)
     return replace(demo_setup(speed_m_s), lag=lag)
 
 

@@ -1,13 +1,14 @@
 """Accuracy over many flights: the twin over the example's field or a hard one, two processes.
 
-The perfect-knowledge run has the same path and plant without noise, scatter and delays, and no
-driver board between core and valves: the strictest that a flight can be compared with.
+The perfect-knowledge run has the same path and the same scattered sprayer, the true position and
+each valve's own lag and flow, and no driver board between core and valves: the strictest that a
+flight can be compared with.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING
@@ -25,8 +26,8 @@ from tests.bench.sprayers import (
     PLANT,
     PLANTS,
     Output,
+    known_setup,
     options_of,
-    perfect_lag,
     sprayer_setup,
 )
 
@@ -179,8 +180,8 @@ def perfect(task: Task) -> Evaluation | None:
         return None
     profile = load_profile(task.plant)
     setup, path = place(task, "gpio")
-    known = replace(setup, lag=perfect_lag(profile, "gpio"))
-    options = FlightOptions(seed=task.seed, noise=False, scatter=False)
+    known = known_setup(setup, profile, "gpio", task.seed)
+    options = FlightOptions(seed=task.seed, knows=True)
     return evaluate(fly(known, path, profile, options, speed_m_s=task.speed_m_s).record)
 
 

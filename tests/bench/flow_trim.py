@@ -53,7 +53,7 @@ class Trimmed:
 def flown(speed_m_s: float, gain: float, seed: int, law: FlowTrim | None) -> Trimmed:
     """Fly once over the example's field."""
     table = load_profile("wang-2024")
-    setup = replace(demo_setup(speed_m_s), lag=demo_lags(table, "gpio"), flow_trim=law)
+    setup = replace(demo_setup(speed_m_s), lag=demo_lags("gpio"), flow_trim=law)
     trims: list[float] = []
     states: Counter[str] = Counter()
 

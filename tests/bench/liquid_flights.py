@@ -38,7 +38,7 @@ class Flight:
 @cache
 def watched_setup(speed_m_s: float) -> Setup:
     """Return the example with the trim on."""
-    lag = demo_lags(load_profile(PLANT), "gpio")
+    lag = demo_lags("gpio")
     return replace(demo_setup(speed_m_s), lag=lag, flow_trim=FlowTrim())
 
 

@@ -20,10 +20,10 @@ from analysis.evaluation import Evaluation, evaluate
 from companion.core.controller import Setup
 from companion.core.frame import LocalFrame
 from companion.core.interlock import Limits
-from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import Method
 from sitl.flight import FlightOptions, fly
+from sitl.knowledge import boom, measured_sets, pwm_limits
 from sitl.measure_pump import measure
 from sitl.profile import PlantProfile, load_profile
 from sitl.trajectory import Trajectory
@@ -76,14 +76,12 @@ def path(seed: int, *, speed_m_s: float = SPEED_M_S, gust_m_s: float = 1.0) -> T
 
 def setup(profile: PlantProfile, **change: object) -> Setup:
     """Return the controller's knowledge of this sprayer: its curve and its measured lags."""
-    nozzles = profile.nozzle_sets[0]
-    curve = FlowCurve(duty=nozzles.curve.duty, flow_l_min=nozzles.curve.flow_l_min)
     given: dict[str, Any] = {
         "frame": LocalFrame(36.0, 114.5),
         "prescription": field(),
-        "boom": profile.boom(),
-        "nozzle_sets": (NozzleSet(valves=(0,), curve=curve),),
-        "pwm": profile.pwm,
+        "boom": boom(profile),
+        "nozzle_sets": measured_sets(profile),
+        "pwm": pwm_limits(profile),
         "lag": measure(profile),
         "method": Method.SCHEDULED,
         "look_ahead_s": 0.0,

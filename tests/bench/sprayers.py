@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Literal
 
 from companion.core.controller import Setup
-from companion.core.nozzle import FlowCurve
 from companion.core.schedule import LagModel
 from sitl.anyang import anyang_lag
 from sitl.demo_field import MAP_SPEED_M_S, demo_setup
 from sitl.flight import FlightOptions
+from sitl.knowledge import measured_sets, perfect_setup, pwm_limits
 from sitl.profile import PlantProfile, load_profile
 
 Output = Literal["gpio", "servo", "free-running"]
@@ -35,7 +35,7 @@ def sprayer_setup(plant: str, output: Output, speed_m_s: float = MAP_SPEED_M_S) 
 
 def with_sprayer(setup: Setup, profile: PlantProfile) -> Setup:
     """Return a set-up that knows another sprayer's curve and PWM; the boom is the same."""
-    return replace(setup, nozzle_sets=profile.nozzle_sets, pwm=profile.pwm)
+    return replace(setup, nozzle_sets=measured_sets(profile), pwm=pwm_limits(profile))
 
 
 def nominal_lag(plant: str, output: Output) -> LagModel:
@@ -46,9 +46,10 @@ def nominal_lag(plant: str, output: Output) -> LagModel:
     return anyang_lag(f"{plant}-{path}", LAGS)
 
 
-def perfect_lag(profile: PlantProfile, output: Output) -> LagModel:
-    """Return the nominal valve's true lags: with neither noise nor scatter they are all."""
-    return replace(profile.lags(), output_s=nominal_lag(profile.name, output).output_s)
+def known_setup(setup: Setup, profile: PlantProfile, output: Output, seed: int) -> Setup:
+    """Return a set-up that knows the very sprayer of a seed, and the output path's mean delay."""
+    output_s = nominal_lag(profile.name, output).output_s
+    return perfect_setup(setup, profile, seed=seed, output_s=output_s)
 
 
 def scaled_lag(lag: LagModel, factor: float) -> LagModel:
@@ -59,13 +60,7 @@ def scaled_lag(lag: LagModel, factor: float) -> LagModel:
 def scaled_flow(profile: PlantProfile, gain: float) -> PlantProfile:
     """Return a sprayer that delivers `gain` times what the measured table says."""
     sets = tuple(
-        replace(
-            nozzles,
-            curve=FlowCurve(
-                duty=nozzles.curve.duty,
-                flow_l_min=tuple(gain * flow for flow in nozzles.curve.flow_l_min),
-            ),
-        )
+        replace(nozzles, flow_l_min=tuple(gain * flow for flow in nozzles.flow_l_min))
         for nozzles in profile.nozzle_sets
     )
     return replace(profile, nozzle_sets=sets)

@@ -5,9 +5,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.types import SprayPlan, TimedChange
-from companion.output.pwm import PulseEngine
+from companion.output.pwm import PulseEngine, needs_restart
+from sitl.board_pulses import ValvePulses, phase_of
+from sitl.edges import BoardEdge
+from sitl.knowledge import pwm_limits
 from sitl.plant import AveragedPlant, Plant, PulsedPlant
-from sitl.profile import load_profile
+from sitl.profile import PlantProfile, load_profile
 
 PROFILES = tuple(load_profile(name) for name in ("wang-2024", "orchard-180"))
 DUTIES = st.one_of(st.just(0.0), st.floats(0.2, 0.85), st.just(1.0))
@@ -34,7 +37,7 @@ def plants(draw: st.DrawFn) -> Plant:
         for valve in range(6):
             averaged.record_change(4.0, valve, 0.0)
         return averaged
-    engine = PulseEngine(profile.pwm, 6, start_s=0.0)
+    engine = PulseEngine(pwm_limits(profile), 6, start_s=0.0)
     plan = SprayPlan(sequence=0, issued_s=0.0, duty=duty, changes=tuple(changes), lease_until_s=4.0)
     engine.submit(plan, now_s=0.0)
     pulsed = PulsedPlant(profile, seed=seed)
@@ -68,3 +71,45 @@ def test_forgetting_changes_no_volume(plant: Plant, before_s: float) -> None:
     before_ml = plant.volume_ml(times_s)
     plant.forget(before_s)
     assert np.allclose(plant.volume_ml(times_s), before_ml, atol=1e-6)
+
+
+MOVES = st.lists(
+    st.tuples(
+        st.floats(0.0, 1.0),
+        st.one_of(st.sampled_from((0.0, 1.0)), st.floats(0.02, 1.0), st.floats(0.48, 0.52)),
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    profile=st.sampled_from(PROFILES),
+    overrun_s=st.sampled_from((0.0, 0.005)),
+    valve=st.integers(0, 5),
+    moves=MOVES,
+)
+def test_the_board_and_the_products_engine_are_two_readings_of_one_page(
+    profile: PlantProfile, overrun_s: float, valve: int, moves: list[tuple[float, float]]
+) -> None:
+    """Written apart; without a plan ahead, which no board has, they make the same edges."""
+    engine = PulseEngine(pwm_limits(profile), 6, start_s=0.0, overrun_s=overrun_s)
+    phase_s = phase_of(valve, 6) * profile.pwm.period_s
+    board = ValvePulses(valve, profile.pwm, phase_s=phase_s, overrun_s=overrun_s)
+    made: list[BoardEdge] = []
+    at_s, old = 0.0, 0.0
+    for wait_s, duty in moves:
+        at_s += wait_s
+        if duty != old:
+            is_new = needs_restart(old, duty)
+            engine.order(valve, duty, at_s=at_s, restart=is_new)
+            board.advance(at_s, made)
+            board.order(at_s, duty, is_new_period=is_new, out=made)
+        old = duty
+    # Both are asked between two moments: at one of them rounding alone would decide.
+    engine_edges = engine.advance(at_s + 1.0)
+    board.advance(at_s + 1.0, made)
+    both = [np.array([edge[:1] + edge[2:] for edge in each]) for each in (engine_edges, made)]
+    shorter = min(len(each) for each in both)
+    assert max(len(each) for each in both) - shorter <= 1
+    assert np.allclose(both[0][:shorter], both[1][:shorter], atol=1e-7)

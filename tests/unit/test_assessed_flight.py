@@ -48,7 +48,10 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     folder = tmp_path_factory.mktemp("assessed")
     task = prepare(FlyOptions(config=ANYANG / "config.toml", mission=ANYANG / "mission.waypoints"))
     trajectory = Vehicle(task.route, start_s=0.0, seed=1, acceleration_m_s2=2.5).fly_to_end()
-    options = FlightOptions(fidelity="averaged", output="servo", seed=1, meter_rate_hz=10.0)
+    # A sprayer whose law the configuration's curve has: what else is between journal and truth.
+    options = FlightOptions(
+        fidelity="averaged", output="servo", seed=1, meter_rate_hz=10.0, flow_law="straight"
+    )
     with Journal.create(folder, setup=task.setup, started_s=0.0, waits=True) as journal:
         result = simulate(
             task.setup,

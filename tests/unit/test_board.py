@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from companion.core.nozzle import PwmLimits
-from companion.output.pwm import Edge
 from sitl.board import DriverBoard
+from sitl.edges import BoardEdge as Edge
+from sitl.profile import Pulsing
 
-PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
+PWM = Pulsing(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 T = PWM.period_s
 
 
@@ -264,7 +264,7 @@ def test_a_dither_that_makes_no_sense_is_refused(dither_us: float) -> None:
 # ------------------------------------------------------------------ test vectors of the document
 
 PAGE = Path(__file__).parents[2] / "docs" / "driver-board.md"
-TEN_HZ = PwmLimits(frequency_hz=10.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
+TEN_HZ = Pulsing(frequency_hz=10.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 ROW = re.compile(r"^\| (\d+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", re.MULTILINE)
 
 
@@ -291,7 +291,7 @@ def edges_text(number: int, orders: list[tuple[float, float]], until_ms: float) 
     for at_ms, pulse_us in orders:
         one.order(at_ms / 1000.0, valve, pulse_us)
     text, is_open = [], False
-    for edge in one.advance(until_ms / 1000.0):
+    for edge in one.advance(until_ms / 1000.0 + 1e-9):
         if edge.is_open != is_open:
             is_open = edge.is_open
             text.append(f"{'+' if is_open else '-'}{edge.at_s * 1000:.1f}")
@@ -300,6 +300,17 @@ def edges_text(number: int, orders: list[tuple[float, float]], until_ms: float) 
 
 def test_the_document_has_all_its_rows() -> None:
     assert sorted(vectors()) == list(range(1, 39))
+
+
+def is_begin(said: str, made: str) -> bool:
+    """Return whether edges begin as they are said to, to a tenth of a millisecond."""
+    wanted, found = said.split(), made.split()
+    if len(found) < len(wanted) or "none" in (said, made):
+        return said == made
+    return all(
+        a[0] == b[0] and abs(float(a[1:]) - float(b[1:])) < 0.11
+        for a, b in zip(wanted, found, strict=False)
+    )
 
 
 @pytest.mark.parametrize("number", range(1, 39))
@@ -311,6 +322,6 @@ def test_the_board_does_what_the_document_says(number: int) -> None:
         # `...` stands for the edges of row 1 up to where this row goes on by itself.
         head = " ".join(edges_text(1, vectors()[1][0], 700.0).split()[:before])
         whole = said.replace("...", head)
-        if made.startswith(whole) or "..." not in said:
+        if is_begin(whole, made) or "..." not in said:
             break
-    assert made.startswith(whole)
+    assert is_begin(whole, made)

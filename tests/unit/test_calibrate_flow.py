@@ -130,8 +130,8 @@ def test_few_duties_and_wide_gaps_are_said() -> None:
 def test_table_2_is_the_twins_profile() -> None:
     for published, nozzle_set in zip(SETS, load_profile("wang-2024").nozzle_sets, strict=True):
         flows = [published.nozzles * each for each in published.nozzle_flow_l_min]
-        assert list(nozzle_set.curve.flow_l_min) == pytest.approx(flows)
-        assert nozzle_set.curve.duty == published.duty
+        assert list(nozzle_set.flow_l_min) == pytest.approx(flows)
+        assert nozzle_set.duty == published.duty
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from sitl.ballistics import Air, fall, spectrum_um
 from sitl.droplet_shift import TRUTHS, law, shift_of
 from sitl.droplets import landed, with_wind
 from sitl.flight import FlightOptions, fly
+from sitl.knowledge import lags as true_lags
 from sitl.profile import load_profile
 from sitl.route import Leg
 from sitl.route import Route as SimulatedRoute
@@ -355,7 +356,7 @@ def test_in_wind_along_a_pass_liquid_lands_on_the_boundary_with_the_offset_only(
     lags = []
     for given in (None, law()):
         flight = fly(
-            setup(lag=profile.lags(), drift=given),
+            setup(lag=true_lags(profile), drift=given),
             path,
             profile,
             FlightOptions(fidelity="averaged", noise=False, scatter=False),

@@ -13,6 +13,7 @@ from companion.core.types import Decision, Fix, Method, SprayPlan, TimedChange
 from sitl.anyang import anyang_lag
 from sitl.deposit import Deposit
 from sitl.flight import FlightOptions, FlightResult, fly
+from sitl.knowledge import lags
 from sitl.outputs import PlanFollower
 from sitl.profile import load_profile
 from sitl.route import Leg, Route
@@ -21,7 +22,7 @@ from sitl.vehicle import Vehicle
 from tests.builders import setup
 
 PROFILE = load_profile("wang-2024")
-SETUP = setup(lag=replace(PROFILE.lags(), position_s=0.036))
+SETUP = setup(lag=replace(lags(PROFILE), position_s=0.036))
 
 
 def one_pass(seed: int = 1) -> Trajectory:

@@ -24,9 +24,10 @@ from companion.core.types import FlowReport, Input, SprayPlan, Telemetry, TimedC
 from companion.errors import ConfigError
 from companion.output.pwm import PulseEngine
 from sitl.flight import FlightOptions, fly, sprayer
+from sitl.knowledge import lags, measured_sets, pwm_limits
 from sitl.measure_pump import measure
 from sitl.plant import AveragedPlant, PulsedPlant
-from sitl.profile import ML_S_PER_L_MIN, PlantProfile, load_profile
+from sitl.profile import ML_S_PER_L_MIN, PlantProfile, flow_table, load_profile
 from sitl.pump_plant import PumpFlow, PumpPlant
 from tests.bench.pump import SPEED_M_S, TUNED_S, flights, path, setup
 from tests.builders import flying
@@ -53,7 +54,7 @@ def brute_force_ml(profile: PlantProfile, orders: Orders, end_s: float, step_s: 
     """Return the volume by small steps of the differential equation, written from its text."""
     pump = profile.pump
     assert pump is not None
-    curve = profile.nozzle_sets[0].curve
+    table = flow_table(profile)
     level = opening = flow = volume = 0.0
     waiting = sorted(orders)
     heard: list[tuple[float, float]] = []  # level of the pump, when it hears of it
@@ -64,7 +65,7 @@ def brute_force_ml(profile: PlantProfile, orders: Orders, end_s: float, step_s: 
         if duty == duty_before:
             continue
         if duty > 0.0 or not pump.shut_off:
-            heard.append((at_s + pump.dead_s, curve.flow_for(duty) * ML_S_PER_L_MIN))
+            heard.append((at_s + pump.dead_s, table.mean_ml_s(duty, 1)))
         if (duty > 0.0) != (duty_before > 0.0):
             valve.append((at_s + profile.dead_open_s, duty > 0.0))
         duty_before = duty
@@ -124,10 +125,10 @@ def test_what_a_pump_was_asked_for_is_on_the_ground_or_still_in_its_lag(orders: 
     even = replace(BARE, pump=replace(BARE.pump, down_s=BARE.pump.up_s))
     plant = pumped(even, orders)
     end_s = 25.0
-    curve = even.nozzle_sets[0].curve
+    table = flow_table(even)
     ends = [*(at_s for at_s, _ in sorted(orders)[1:]), end_s - BARE.pump.dead_s]
     asked_ml = sum(
-        curve.flow_for(duty) * ML_S_PER_L_MIN * (until_s - at_s)
+        table.mean_ml_s(duty, 1) * (until_s - at_s)
         for (at_s, duty), until_s in zip(sorted(orders), ends, strict=False)
     )
     late = plant.volume_ml(np.array([end_s - 1e-4, end_s]))[:, 0]
@@ -146,7 +147,7 @@ def test_a_step_of_30_percent_stands_after_the_published_times() -> None:
 
 @pytest.mark.parametrize("profile", [PUMP, BARE], ids=["valve", "bare"])
 def test_the_rig_finds_the_pumps_true_lags(profile: PlantProfile) -> None:
-    found, true = measure(profile), profile.lags()
+    found, true = measure(profile), lags(profile)
     for name in ("on_s", "off_s", "up_s", "down_s"):
         assert getattr(found, name) == pytest.approx(getattr(true, name), abs=0.004), name
     assert found.up_s > found.down_s + 0.4
@@ -177,7 +178,7 @@ def test_a_pump_is_no_row_of_pulses_and_the_other_way_round() -> None:
 
 
 def pulses(profile: PlantProfile, changes: Sequence[TimedChange], end_s: float) -> PulsedPlant:
-    engine = PulseEngine(profile.pwm, 6, start_s=0.0, overrun_s=profile.overrun_s)
+    engine = PulseEngine(pwm_limits(profile), 6, start_s=0.0, overrun_s=profile.overrun_s)
     plan = SprayPlan(
         sequence=1, issued_s=0.0, duty=(0.0,) * 6, changes=tuple(changes), lease_until_s=end_s - 1.0
     )
@@ -193,12 +194,14 @@ def test_pulses_of_the_boom_give_its_curve(duty: float) -> None:
     plant = pulses(PINPOINT, changes, 30.0)
     ends_ml = plant.volume_ml(np.array([5.0, 25.0])).sum(axis=1)
     flow_l_min = (ends_ml[1] - ends_ml[0]) / 20.0 / ML_S_PER_L_MIN
-    assert flow_l_min == pytest.approx(PINPOINT.nozzle_sets[0].curve.flow_for(duty), rel=1e-3)
+    assert flow_l_min == pytest.approx(
+        6 * flow_table(PINPOINT).mean_ml_s(duty, 6) / ML_S_PER_L_MIN, rel=1e-3
+    )
 
 
 def test_the_booms_nozzle_stands_after_20_ms_and_ends_10_ms_after_the_coil() -> None:
     plant = PulsedPlant(replace(PINPOINT, lag_scatter=0.0, flow_scatter=0.0), seed=1)
-    engine = PulseEngine(PINPOINT.pwm, 6, start_s=0.0)
+    engine = PulseEngine(pwm_limits(PINPOINT), 6, start_s=0.0)
     engine.order(0, 0.5, at_s=1.0, restart=True)
     edges = engine.advance(1.3)
     plant.record(edges)
@@ -262,17 +265,17 @@ def test_in_still_air_a_pumps_steps_lie_within_half_a_metre() -> None:
 
 
 def test_the_rivals_look_ahead_is_the_pumps_mean_lag_and_its_own_delays() -> None:
-    lag = PUMP.lags()
+    lag = lags(PUMP)
     assert pytest.approx(0.5 * (lag.up_s + lag.down_s) + 0.42 + 0.1, abs=0.01) == TUNED_S
 
 
 @pytest.mark.parametrize("name", ["pinpoint", "pump"])
 def test_the_example_of_a_plant_knows_its_curve(name: str) -> None:
     mine, profile = build_setup(load(EXAMPLES / name / "config.toml")), load_profile(name)
-    assert mine.nozzle_sets[0].curve == profile.nozzle_sets[0].curve
-    assert mine.pwm == profile.pwm
+    assert mine.nozzle_sets[0].curve == measured_sets(profile)[0].curve
+    assert mine.pwm == pwm_limits(profile)
     assert len(mine.boom.valves) == profile.valve_count
-    true = profile.lags()
+    true = lags(profile)
     for kind in ("on_s", "off_s", "up_s", "down_s"):
         assert getattr(mine.lag, kind) == pytest.approx(getattr(true, kind), abs=0.004)
 

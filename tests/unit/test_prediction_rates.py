@@ -34,7 +34,7 @@ def one_pass() -> Trajectory:
 
 @cache
 def controller(position_s: float | None = None) -> Setup:
-    lag = demo_lags(PROFILE, "gpio")
+    lag = demo_lags("gpio")
     if position_s is not None:
         lag = replace(lag, position_s=position_s)
     return replace(demo_setup(SPEED_M_S), lag=lag)

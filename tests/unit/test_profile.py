@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from companion.errors import ConfigError
+from sitl.knowledge import boom, lags
 from sitl.profile import ML_S_PER_L_MIN, PROFILES, FlowTable, draw_scatter, load_profile
 
 WANG = load_profile("wang-2024")
@@ -15,15 +16,15 @@ WANG = load_profile("wang-2024")
 @pytest.mark.parametrize("path", sorted(PROFILES.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_shipped_profile_loads_under_its_own_name(path: Path) -> None:
     assert load_profile(path.stem).name == path.stem
-    assert load_profile(path).boom().width_m == load_profile(path.stem).boom_width_m
+    assert boom(load_profile(path)).width_m == load_profile(path.stem).boom_width_m
 
 
 def test_the_papers_sprayer_has_its_table_2() -> None:
     small, large = WANG.nozzle_sets
-    assert large.curve.flow_l_min == pytest.approx(
+    assert large.flow_l_min == pytest.approx(
         [12 * q for q in (0.123, 0.252, 0.273, 0.385, 0.421, 0.496, 0.508)]
     )
-    assert small.curve.flow_l_min == pytest.approx(
+    assert small.flow_l_min == pytest.approx(
         [8 * q for q in (0.128, 0.234, 0.277, 0.393, 0.435, 0.521, 0.534)]
     )
     assert (small.valves, large.valves) == ((0, 1, 2, 3), (0, 1, 2, 3, 4, 5))
@@ -31,14 +32,14 @@ def test_the_papers_sprayer_has_its_table_2() -> None:
 
 
 def test_the_larger_sprayer_delivers_120_to_180_l_ha_at_5_m_s() -> None:
-    curve = load_profile("orchard-180").nozzle_sets[0].curve
-    assert curve.flow_l_min[0] < 21.6 < 32.4 < curve.flow_l_min[-1]
+    measured = load_profile("orchard-180").nozzle_sets[0]
+    assert measured.flow_l_min[0] < 21.6 < 32.4 < measured.flow_l_min[-1]
 
 
 @pytest.mark.parametrize("name", ["wang-2024", "orchard-180"])
 def test_whole_lags_stay_within_an_eighth_of_a_second(name: str) -> None:
-    lags = load_profile(name).lags()
-    assert lags.on_start_s < lags.on_s < lags.off_end_s <= 0.12 + 1e-9
+    true = lags(load_profile(name))
+    assert true.on_start_s < true.on_s < true.off_end_s <= 0.12 + 1e-9
 
 
 @pytest.mark.parametrize("duty", [0.2, 0.35, 0.5, 0.77, 0.9, 1.0])
@@ -47,7 +48,9 @@ def test_the_flow_table_is_the_measured_curve_of_each_set(duty: float) -> None:
     for nozzle_set in WANG.nozzle_sets:
         count = len(nozzle_set.valves)
         flow_l_min = table.mean_ml_s(duty, count) * count / ML_S_PER_L_MIN
-        assert flow_l_min == pytest.approx(nozzle_set.curve.flow_for(duty), rel=1e-5)
+        assert flow_l_min == pytest.approx(
+            float(nozzle_set.flows_l_min("smooth", np.array([duty]))[0]), rel=1e-5
+        )
 
 
 def test_scatter_keeps_the_flow_of_every_set() -> None:

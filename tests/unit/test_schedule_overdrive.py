@@ -14,12 +14,13 @@ from hypothesis import strategies as st
 from companion.core.crossings import Crossing
 from companion.core.overdrive import Overdrive
 from companion.core.schedule import LagModel, Timing, orders, schedule
+from sitl.knowledge import measured_sets
 from sitl.profile import load_profile
 from sitl.pump_plant import PumpPlant
 from tests.bench.pump import flights
 
 PUMP = load_profile("pump")
-CURVE = PUMP.nozzle_sets[0].curve
+CURVE = measured_sets(PUMP)[0].curve
 assert PUMP.pump is not None
 LAW = Overdrive(
     up_time_s=PUMP.pump.up_s,

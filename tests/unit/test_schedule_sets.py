@@ -13,10 +13,11 @@ from companion.core.controller import Memory, Setup, step
 from companion.core.nozzle import choose_set
 from companion.core.prescription import Prescription
 from companion.core.types import TimedChange
+from sitl.knowledge import measured_sets
 from sitl.profile import load_profile
 from tests.builders import LAG, flying, plots, setup
 
-SMALL, LARGE = SETS = load_profile("wang-2024").nozzle_sets
+SMALL, LARGE = SETS = measured_sets(load_profile("wang-2024"))
 SPEED = 5.0
 STEP_S = 0.05
 

@@ -15,8 +15,9 @@ from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from companion.output.pwm import PulseEngine
 from sitl.drives import DriveFollower, Motors
 from sitl.flight import FlightOptions, sprayer
+from sitl.knowledge import lags, pwm_limits
 from sitl.plant import AveragedPlant, PulsedPlant
-from sitl.profile import ML_S_PER_L_MIN, PlantProfile, load_profile
+from sitl.profile import ML_S_PER_L_MIN, PlantProfile, flow_table, load_profile
 from sitl.pump_plant import PumpPlant
 from sitl.section_plant import SectionPlant
 from sitl.supplied_plant import SuppliedAveraged, SuppliedPulsed
@@ -51,9 +52,10 @@ def brute_force_ml(
     pulses: Pulses, edges: Edges, end_s: float, step_s: float
 ) -> tuple[list[float], float]:
     """Return each section's volume and the pump's, by small steps of the laws as they are told."""
-    supply, curve = LIKE_ONE.supply, LIKE_ONE.nozzle_sets[0].curve
+    supply, measured = LIKE_ONE.supply, LIKE_ONE.nozzle_sets[0]
+    table = flow_table(LIKE_ONE)
     assert supply is not None
-    most = supply.relief * curve.flow_l_min[-1] * ML_S_PER_L_MIN
+    most = supply.relief * measured.flow_max_l_min * ML_S_PER_L_MIN
     heard: list[tuple[float, float]] = []
     before = 0.0
     for at_s, pulse_us in sorted(pulses):
@@ -61,7 +63,7 @@ def brute_force_ml(
         if fraction != before:
             dead_s = supply.spin_up_s if before == 0.0 else supply.dead_s
             latest_s = heard[-1][0] if heard else 0.0
-            heard.append((max(at_s + dead_s, latest_s), curve.flow_for(fraction) * ML_S_PER_L_MIN))
+            heard.append((max(at_s + dead_s, latest_s), 6 * table.mean_ml_s(fraction, 6)))
             before = fraction
     moves = sorted(
         (at_s + (LIKE_ONE.dead_open_s if is_open else LIKE_ONE.dead_close_s), valve, is_open)
@@ -160,7 +162,7 @@ def test_one_open_section_of_six_gets_what_the_relief_valve_leaves_it() -> None:
     assert supply is not None
     plant = ordered(LIKE_ONE, [(0.0, 2000.0)], [(0.0, 2, True)])
     volume = plant.volume_ml(np.array([15.0, 20.0]))
-    most = supply.relief * LIKE_ONE.nozzle_sets[0].curve.flow_l_min[-1] * ML_S_PER_L_MIN / 6.0
+    most = supply.relief * LIKE_ONE.nozzle_sets[0].flow_max_l_min * ML_S_PER_L_MIN / 6.0
     assert (volume[1] - volume[0])[2] == pytest.approx(5.0 * most)
     assert (volume[1] - volume[0]).sum() == pytest.approx(5.0 * most)
 
@@ -198,7 +200,7 @@ def test_a_sprayer_without_valves_sprays_as_long_as_its_pump_gives() -> None:
     ends_ml = plant.volume_ml(np.array([0.5, 10.0, 25.0])).sum(axis=1)
     assert ends_ml[0] == 0.0
     assert ends_ml[2] == pytest.approx(plant.flow.pumped_ml(np.array([25.0]))[0])
-    assert bare.lags().off_end_s > supply.dead_s + 3.0 * supply.down_s
+    assert lags(bare).off_end_s > supply.dead_s + 3.0 * supply.down_s
     with pytest.raises(ValueError, match="constant pump has valves"):
         replace(supply, control="constant", valves=False)
 
@@ -251,7 +253,7 @@ def test_a_late_pump_costs_the_volume_of_its_lag() -> None:
 def test_supplied_pulses_never_fall_never_exceed_and_keep_the_volume_of_the_means(
     pump: Pulses, changes: Sequence[tuple[float, int, float]]
 ) -> None:
-    engine = PulseEngine(PWM_PUMP.pwm, 6, start_s=0.0, overrun_s=PWM_PUMP.overrun_s)
+    engine = PulseEngine(pwm_limits(PWM_PUMP), 6, start_s=0.0, overrun_s=PWM_PUMP.overrun_s)
     for at_s, valve, duty in sorted(changes):
         engine.order(valve, duty, at_s=at_s, restart=True)
     edges = engine.advance(9.0)
@@ -275,7 +277,7 @@ def test_supplied_pulses_never_fall_never_exceed_and_keep_the_volume_of_the_mean
 
 
 def test_both_fidelities_of_a_constant_pump_give_the_same_volume() -> None:
-    engine = PulseEngine(PWM_PUMP.pwm, 6, start_s=0.0, overrun_s=PWM_PUMP.overrun_s)
+    engine = PulseEngine(pwm_limits(PWM_PUMP), 6, start_s=0.0, overrun_s=PWM_PUMP.overrun_s)
     for valve in range(6):
         engine.order(valve, 0.6, at_s=0.5, restart=True)
     pulsed, mean = SuppliedPulsed(PWM_PUMP, seed=2), SuppliedAveraged(PWM_PUMP, seed=2)
