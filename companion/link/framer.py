@@ -2,7 +2,8 @@
 
 `MAVLink.parse_buffer` believes the length of whatever looks like a start, and throws away what it
 covers when the checksum is wrong: a stray 0xFD costs up to 280 bytes of good messages. Here a
-start that turns out not to be one costs a single byte.
+start that turns out not to be one costs a single byte, and holds nothing back: a sound frame that
+stands behind it in what has arrived says at once that it was none.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ class Framer:
         self._mav = mavlink.MAVLink(None)
         self._buffer = bytearray()
         self._oldest_s = 0.0
+        self._joint = 0  # where in the buffer the last chunk begins
         self.frame_count = 0
         self.bad_frame_count = 0
         self.refused_frame_count = 0
@@ -46,6 +48,7 @@ class Framer:
         """Return the messages that are complete with `data`; whatever it holds, never raises."""
         if self._buffer and not received_s - self._oldest_s <= STALE_S:
             self._drop(1)
+        self._joint = len(self._buffer)
         self._buffer += data
         messages = []
         while (length := self._next_length()) is not None:
@@ -67,33 +70,39 @@ class Framer:
 
     def _drop(self, count: int) -> None:
         del self._buffer[:count]
+        self._joint -= count
         self.dropped_byte_count += count
 
     def _next_length(self) -> int | None:
         """Move to the next start of a frame and return its length; None where bytes are missing."""
         while self._buffer:
-            start = _first_magic(self._buffer)
-            self._drop(start)
+            self._drop(_next_magic(self._buffer, 0))
             if not self._buffer:
                 return None
-            header = _HEADER[self._buffer[0]]
-            if len(self._buffer) < header:
+            length = _length(self._buffer)
+            if length is not None and len(self._buffer) >= length:
+                return length
+            if length is not None and not self._is_overtaken():
                 return None
-            if self._is_plausible():
-                length = header + self._buffer[1] + _CHECKSUM
-                if self._buffer[0] == _V2 and self._buffer[2] & _SIGNED:
-                    length += _SIGNATURE
-                return length if len(self._buffer) >= length else None
             self._drop(1)
         return None
 
-    def _is_plausible(self) -> bool:
-        """Whether the header is one of a message that we can check."""
-        head = self._buffer
-        if head[0] == _V1:
-            return head[5] in mavlink.mavlink_map
-        message_id = head[7] | head[8] << 8 | head[9] << 16
-        return not head[2] & ~_SIGNED and message_id in mavlink.mavlink_map
+    def _is_overtaken(self) -> bool:
+        """Whether a sound frame stands behind a start that still misses bytes: it was none.
+
+        Only one that begins where something new arrived, or ends where that ends, counts. What a
+        long frame carries (a file with frames in it) fits there by chance alone.
+        """
+        held = self._buffer
+        at = _next_magic(held, 1)
+        while at < len(held):
+            length = _length(held[at:])
+            end = len(held) + 1 if length is None else at + length
+            is_at_edge = at == self._joint or end == len(held)
+            if is_at_edge and end <= len(held) and self._decode(held[at:end]) is not None:
+                return True
+            at = _next_magic(held, at + 1)
+        return False
 
     def _decode(self, frame: bytearray) -> Any | None:
         try:
@@ -102,7 +111,24 @@ class Framer:
             return None
 
 
-def _first_magic(buffer: bytearray) -> int:
-    """Return the index of the first byte that starts a frame, or the length."""
-    found = [index for magic in (_V1, _V2) if (index := buffer.find(magic)) >= 0]
+def _next_magic(buffer: bytearray, at: int) -> int:
+    """Return the index of the next byte from `at` on that starts a frame, or the length."""
+    found = [index for magic in (_V1, _V2) if (index := buffer.find(magic, at)) >= 0]
     return min(found, default=len(buffer))
+
+
+def _length(head: bytearray) -> int | None:
+    """Return how long a frame claims to be; None for one of a message that we cannot check.
+
+    Of a head that is not complete it is the least that a frame can have.
+    """
+    header = _HEADER[head[0]]
+    if len(head) < header:
+        return header + _CHECKSUM
+    length = header + head[1] + _CHECKSUM
+    if head[0] == _V1:
+        return length if head[5] in mavlink.mavlink_map else None
+    message_id = head[7] | head[8] << 8 | head[9] << 16
+    if head[2] & ~_SIGNED or message_id not in mavlink.mavlink_map:
+        return None
+    return length + _SIGNATURE if head[2] & _SIGNED else length

@@ -30,6 +30,8 @@ from companion.link.messages import (
     TimesyncReceived,
 )
 
+# The head of a signed FILE_TRANSFER_PROTOCOL, as long as frames get: 280 bytes.
+CLAIM = bytes([0xFD, 255, 1, 0, 9, 1, 1, 110, 0, 0])
 QUADROTOR, ARDUPILOT, PX4, INVALID = 2, 3, 12, 8
 ARMED_AUTO = (QUADROTOR, ARDUPILOT, 128 | 1, 3, 4)
 
@@ -258,8 +260,8 @@ def test_a_stray_start_costs_no_message_behind_it() -> None:
 def test_a_start_without_an_end_holds_nothing_up_for_long() -> None:
     codec = Codec()
     stray = bytes([0xFD, 255, 0, 0, 1, 1, 1, 0, 0, 0])
-    assert not codec.decode(stray + HEARTBEAT, 0.0)
-    assert len(codec.decode(HEARTBEAT, 1.0)) == 2
+    assert not codec.decode(stray + HEARTBEAT + b"\x00\x01", 0.0)
+    assert len(codec.decode(b"\x02", 1.0)) == 1
 
 
 def test_a_broken_checksum_drops_the_frame_only() -> None:
@@ -295,3 +297,55 @@ def test_a_long_text_is_cut_to_fifty_bytes() -> None:
     encoder = Encoder(system_id=1, component_id=191)
     (text,) = mavlink.MAVLink(None).parse_buffer(encoder.text(6, "x" * 80))
     assert text.text == "x" * 50
+
+
+@pytest.mark.parametrize(
+    "noise", [CLAIM, CLAIM * 5, CLAIM + b"\xfe\x09", b"\xfe\xff\x00\x01\x01\x4c"]
+)
+def test_a_claimed_length_holds_nothing_back_that_came_with_it(noise: bytes) -> None:
+    codec = Codec()
+    assert len(codec.decode(noise + HEARTBEAT + position(), 1.0)) == 2
+
+
+@pytest.mark.parametrize(
+    "noise", [CLAIM, CLAIM * 5, CLAIM + b"\xfe\x09", b"\xfe\xff\x00\x01\x01\x4c"]
+)
+def test_a_claimed_length_holds_nothing_back_that_follows_it(noise: bytes) -> None:
+    codec = Codec()
+    codec.decode(HEARTBEAT, 1.0)
+    assert codec.decode(noise, 1.1) == []
+    assert len(codec.decode(position(), 1.11)) == 1
+    assert len(codec.decode(position(), 1.12)) == 1
+
+
+def test_a_claimed_length_holds_nothing_back_behind_which_a_frame_is_cut() -> None:
+    codec = Codec()
+    codec.decode(HEARTBEAT, 1.0)
+    whole = position()
+    assert codec.decode(CLAIM, 1.1) == []
+    assert len(codec.decode(whole + whole[:9], 1.11)) == 1
+    assert len(codec.decode(whole[9:], 1.12)) == 1
+
+
+def test_a_long_frame_in_pieces_is_still_one() -> None:
+    codec = Codec()
+    codec.decode(HEARTBEAT, 1.0)
+    stream = frame("rc_channels", 0, 8, *([1500] * 8), *([65535] * 10), 255) + position()
+    for size in range(1, len(stream)):
+        found = [
+            message
+            for at in range(0, len(stream), size)
+            for message in codec.decode(stream[at : at + size], 2.0)
+        ]
+        assert [type(message) for message in found] == [RcReport, Telemetry], size
+
+
+def test_a_long_frame_that_carries_others_is_not_cut_short_by_them() -> None:
+    codec = Codec()
+    codec.decode(HEARTBEAT, 1.0)
+    inside = (position() * 5)[:200]
+    carrier = frame("file_transfer_protocol", 0, 1, 191, list(inside.ljust(251, b"\x01")))
+    for cut in range(15, len(carrier) - 1):
+        if (cut - 13) % len(position()) != 0:  # cut exactly between two of them: not told apart
+            assert codec.decode(carrier[:cut], 2.0) == [], cut
+            assert codec.decode(carrier[cut:], 2.0) == [], cut

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import sys
+import threading
 from pathlib import Path
 from types import ModuleType
 
@@ -126,6 +127,57 @@ async def test_silence_is_a_fault() -> None:
 
 
 # ------------------------------------------------------------------------------- converters
+
+
+class HangingBus:
+    """A converter that no longer answers once `hangs` is set, until it is let go."""
+
+    def __init__(self, *, hangs: bool = False) -> None:
+        self.hangs = hangs
+        self.is_hanging, self.let_go = threading.Event(), threading.Event()
+
+    def open(self) -> None:
+        self.read_v()
+
+    def read_v(self) -> float:
+        if self.hangs:
+            self.is_hanging.set()
+            assert self.let_go.wait(30.0)
+        return 1.2
+
+    def close(self) -> None:
+        self.read_v()
+
+
+async def test_a_bus_that_hangs_does_not_delay_the_end() -> None:
+    source = HangingBus()
+    made = Gauge(LOOP, source, rate_hz=200.0, window_s=0.3)
+    await made.open()
+    source.hangs = True
+    assert await asyncio.to_thread(source.is_hanging.wait, 5.0)
+    try:
+        async with asyncio.timeout(5.0):
+            await made.close()
+            # What asyncio.run does at its end: it waits for the threads of its pool.
+            await asyncio.get_running_loop().shutdown_default_executor()
+        assert all(t.daemon for t in threading.enumerate() if t.name == "gauge pressure")
+    finally:
+        source.let_go.set()
+
+
+async def test_a_bus_that_hangs_from_the_beginning_is_said_and_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("companion.sensors.gauge.OPEN_MAX_S", 0.05)
+    source = HangingBus(hangs=True)
+    made = Gauge(LOOP, source, rate_hz=200.0, window_s=0.3)
+    try:
+        with pytest.raises(SensorError, match="does not answer within"):
+            await made.open()
+        async with asyncio.timeout(5.0):
+            await made.close()
+    finally:
+        source.let_go.set()
 
 
 def iio_device(root: Path, name: str = "ads1115", *, scale_name: str = "in_voltage2_scale") -> Path:
