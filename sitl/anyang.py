@@ -16,7 +16,7 @@ from typing import Literal
 from companion.core.frame import LocalFrame
 from companion.core.schedule import LagModel
 from companion.errors import ConfigError
-from sitl.stub.mission_items import MissionItem, waypoint
+from sitl.stub.mission_items import MissionItem, landing, speed, waypoint
 from sitl.stub.protocol import dialect
 from sitl.vehicle import Leg, Route
 
@@ -114,9 +114,9 @@ def anyang_items(speed_m_s: float) -> tuple[MissionItem, ...]:
     return (
         waypoint(dialect.MAV_CMD_NAV_WAYPOINT, *start, height_m=0.0),
         waypoint(dialect.MAV_CMD_NAV_TAKEOFF, *start, height_m=HEIGHT_M),
-        MissionItem(command=dialect.MAV_CMD_DO_CHANGE_SPEED, param1=1.0, param2=speed_m_s),
+        speed(speed_m_s),
         *(waypoint(dialect.MAV_CMD_NAV_WAYPOINT, *end, height_m=HEIGHT_M) for end in ends),
-        MissionItem(command=dialect.MAV_CMD_NAV_LAND),
+        landing(*ends[-1]),
     )
 
 

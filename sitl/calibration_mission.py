@@ -15,7 +15,7 @@ from companion.core.rate import rate_for_flow
 from companion.errors import ConfigError
 from sitl.calibration_layout import RUN_OUT_M, Layout, make_layout
 from sitl.mission_writing import plan, waypoint_lines
-from sitl.stub.mission_items import MissionItem, waypoint
+from sitl.stub.mission_items import MissionItem, landing, speed, waypoint
 from sitl.stub.protocol import dialect
 
 SUFFIXES = (".plan", ".waypoints")
@@ -154,12 +154,12 @@ def _items(layout: Layout, turned: _Turned) -> tuple[MissionItem, ...]:
     return (
         waypoint(dialect.MAV_CMD_NAV_WAYPOINT, *start, height_m=0.0),
         waypoint(dialect.MAV_CMD_NAV_TAKEOFF, *start, height_m=layout.height_m),
-        MissionItem(command=dialect.MAV_CMD_DO_CHANGE_SPEED, param1=1.0, param2=layout.speed_m_s),
+        speed(layout.speed_m_s),
         *(
             waypoint(dialect.MAV_CMD_NAV_WAYPOINT, *end, height_m=layout.height_m)
             for end in ends[1:]
         ),
-        MissionItem(command=dialect.MAV_CMD_NAV_LAND),
+        landing(*ends[-1]),
     )
 
 

@@ -67,10 +67,9 @@ def plan(items: tuple[MissionItem, ...]) -> dict[str, Any]:
 
 def _simple(number: int, item: MissionItem) -> dict[str, Any]:
     place = place_of(item)
+    heights = {"AMSLAltAboveTerrain": None, "Altitude": item.z_m, "AltitudeMode": 1}
     return {
-        "AMSLAltAboveTerrain": None,
-        "Altitude": item.z_m,
-        "AltitudeMode": 1,
+        **(heights if item.command in PLACES else {}),
         "autoContinue": bool(item.autocontinue),
         "command": item.command,
         "doJumpId": number,

@@ -15,7 +15,7 @@ from shapely import LineString
 
 from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
-from sitl.stub.flight_plan import plan_flight
+from sitl.stub.flight_plan import SAME_PLACE_M, plan_flight
 from sitl.stub.mission_file import read_mission
 from sitl.vehicle import Leg, Route
 
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from sitl.stub.mission_items import MissionItem
 
 SPEED_MIN_M_S, SPEED_MAX_M_S = 0.5, 20.0
-# Two places nearer than this are one: a mission often begins where its home is.
-SAME_PLACE_M = 0.01
 
 
 def read_route(

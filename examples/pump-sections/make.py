@@ -17,7 +17,7 @@ from typing import Any
 
 from companion.core.frame import LocalFrame
 from sitl.mission_writing import write_mission
-from sitl.stub.mission_items import MissionItem, waypoint
+from sitl.stub.mission_items import MissionItem, speed, waypoint
 from sitl.stub.protocol import dialect
 
 LATITUDE_DEG, LONGITUDE_DEG = 46.1503, 14.4408  # the middle, where nothing stands
@@ -107,7 +107,7 @@ def items(frame: LocalFrame) -> tuple[MissionItem, ...]:
     return (
         waypoint(go, *ends[0], height_m=0.0),
         waypoint(hop, *ends[0], height_m=HEIGHT_M),
-        MissionItem(command=dialect.MAV_CMD_DO_CHANGE_SPEED, param1=1.0, param2=SPEED_M_S),
+        speed(SPEED_M_S),
         *(waypoint(go, *end, height_m=HEIGHT_M) for end in ends[1:]),
         MissionItem(command=dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH),
     )

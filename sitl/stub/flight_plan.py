@@ -14,6 +14,8 @@ from sitl.vehicle import Leg
 
 # A waypoint farther away than this is a mistake of the test, or a place that the frame has not.
 FAR_M = 100_000.0
+# Two places nearer than this are one.
+SAME_PLACE_M = 0.01
 
 
 class Ending(Enum):
@@ -77,7 +79,7 @@ def plan_flight(
             take_off_height_m = item_height_m
             continue
         leg = _leg(item, frame, speed_m_s)
-        if leg is not None:
+        if leg is not None and not _ends_there(item, leg, legs):
             legs.append(leg)
             sequences.append(sequence)
         if item.command != dialect.MAV_CMD_NAV_WAYPOINT:
@@ -91,6 +93,14 @@ def plan_flight(
         sequences=tuple(sequences),
         ending=ending,
     )
+
+
+def _ends_there(item: MissionItem, leg: Leg, before: list[Leg]) -> bool:
+    """Return whether an item lands where the last leg ends: no way leads there."""
+    if item.command != dialect.MAV_CMD_NAV_LAND or not before:
+        return False
+    last = before[-1]
+    return math.hypot(leg.east_m - last.east_m, leg.north_m - last.north_m) < SAME_PLACE_M
 
 
 def _leg(item: MissionItem, frame: LocalFrame, speed_m_s: float) -> Leg | None:

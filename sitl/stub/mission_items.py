@@ -58,7 +58,7 @@ class MissionItem:
     """
 
     command: int
-    frame: int = dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT
+    frame: int = dialect.MAV_FRAME_MISSION
     param1: float = 0.0
     param2: float = 0.0
     param3: float = 0.0
@@ -90,10 +90,26 @@ def waypoint(
     """Return an item at a place, with its height above home."""
     return MissionItem(
         command=command,
+        frame=dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT,
         x_e7=round(latitude_deg * 1e7),
         y_e7=round(longitude_deg * 1e7),
         z_m=height_m,
     )
+
+
+def speed(speed_m_s: float) -> MissionItem:
+    """Return the item that sets the ground speed and leaves the throttle alone."""
+    return MissionItem(
+        command=dialect.MAV_CMD_DO_CHANGE_SPEED, param1=1.0, param2=speed_m_s, param3=-1.0
+    )
+
+
+def landing(latitude_deg: float, longitude_deg: float) -> MissionItem:
+    """Return a landing at a place.
+
+    It has coordinates: 0, 0 means "here" to ArduPilot, and PX4 flies there.
+    """
+    return waypoint(dialect.MAV_CMD_NAV_LAND, latitude_deg, longitude_deg, height_m=0.0)
 
 
 def item_of(message: Message) -> MissionItem:

@@ -24,7 +24,7 @@ def mission(*legs: tuple[float, float], land: bool = True) -> tuple[MissionItem,
         place(dialect.MAV_CMD_NAV_WAYPOINT, 0.0, 0.0, 0.0),
         place(dialect.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0),
         *(place(dialect.MAV_CMD_NAV_WAYPOINT, east, north) for east, north in legs),
-        *((MissionItem(command=dialect.MAV_CMD_NAV_LAND),) if land else ()),
+        *((place(dialect.MAV_CMD_NAV_LAND, *legs[-1], 0.0),) if land else ()),
     )
 
 

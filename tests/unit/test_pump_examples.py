@@ -13,7 +13,7 @@ from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
 from sitl.fly import FlyOptions, prepare
 from sitl.mission_writing import write_mission
-from sitl.stub.mission_items import MissionItem, waypoint
+from sitl.stub.mission_items import speed, waypoint
 from sitl.stub.protocol import dialect
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -39,7 +39,7 @@ def two_zones(tmp_path_factory: pytest.TempPathFactory) -> Path:
     items = (
         waypoint(go, *start, height_m=0.0),
         waypoint(hop, *start, height_m=3.5),
-        MissionItem(command=dialect.MAV_CMD_DO_CHANGE_SPEED, param1=1.0, param2=5.0),
+        speed(5.0),
         waypoint(go, *last, height_m=3.5),
     )
     write_mission(items, folder)
