@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from sitl.stub.mission_items import PLACES, MissionItem
+from sitl.stub.protocol import dialect
 
 CRUISE_M_S, HOVER_M_S = 5.0, 5.0
 ARDUPILOT, COPTER = 3, 2  # MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_TYPE_QUADROTOR
+OPEN_YAW = (dialect.MAV_CMD_NAV_WAYPOINT, dialect.MAV_CMD_NAV_TAKEOFF, dialect.MAV_CMD_NAV_LAND)
 ABSOLUTE = 0  # MAV_FRAME_GLOBAL: the frame of home
 
 
@@ -68,13 +70,15 @@ def plan(items: tuple[MissionItem, ...]) -> dict[str, Any]:
 def _simple(number: int, item: MissionItem) -> dict[str, Any]:
     place = place_of(item)
     heights = {"AMSLAltAboveTerrain": None, "Altitude": item.z_m, "AltitudeMode": 1}
+    # A yaw of 0 is the north to PX4; null leaves it to the autopilot.
+    yaw_deg = item.param4 if item.param4 or item.command not in OPEN_YAW else None
     return {
         **(heights if item.command in PLACES else {}),
         "autoContinue": bool(item.autocontinue),
         "command": item.command,
         "doJumpId": number,
         "frame": item.frame,
-        "params": [item.param1, item.param2, item.param3, item.param4, *place, item.z_m],
+        "params": [item.param1, item.param2, item.param3, yaw_deg, *place, item.z_m],
         "type": "SimpleItem",
     }
 

@@ -15,7 +15,7 @@ from sitl.stub.autopilot import Autopilot
 from sitl.stub.firmware import Firmware
 from sitl.stub.flight_plan import starts_with_take_off
 from sitl.stub.mission_file import read_mission
-from sitl.stub.mission_items import MissionItem, item_message
+from sitl.stub.mission_items import PLACE_FRAMES, MissionItem, item_message
 from sitl.stub.parameters import SPEED_MAX_M_S, SPEED_MIN_M_S
 from sitl.stub.protocol import dialect
 
@@ -37,6 +37,11 @@ def mission_items(
             raise ConfigError(
                 f"{path}: item {number}: {firmware.name} takes no command "
                 f"{item.command} in frame {item.frame}"
+            )
+        if firmware.zero_is_a_place and item.frame in PLACE_FRAMES and not item.has_place:
+            raise ConfigError(
+                f"{path}: item {number}: {firmware.name} would fly to latitude 0, longitude 0; "
+                "give it real coordinates"
             )
     return items
 

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from missions.upload.items import (
     FENCE_FIRST,
     FENCE_LAST,
+    MISSION_FRAME,
     PLACES,
+    RELATIVE,
     SAME_FRAME,
     TAKEOFF,
     TERRAIN,
@@ -20,11 +22,17 @@ from missions.upload.items import (
 )
 
 FIRMWARES: dict[Firmware, str] = {"ardupilot": "ArduPilot", "px4": "PX4"}
-# PX4 1.14 and newer: not in the list that ends an upload, or not in the one that ends a start.
+# Measured on ArduCopter 4.7 and PX4 1.16. 112 and 114 end PX4's check before the start instead.
 REFUSED: dict[Firmware, frozenset[int]] = {
-    "ardupilot": frozenset({187}),
-    "px4": frozenset({82, 112, 114, 115, 181, 183, 215, 216}),
+    "ardupilot": frozenset({95, 113, 176, 187, 214}),
+    "px4": frozenset(
+        {18, 82, 92, 94, 95, 112, 113, 114, 115, 176, 181, 182, 183, 184, 191, 193, 207, 212}
+    )
+    | frozenset({215, 216, 222}),
 }
+# PX4 takes one list of commands in frames with places, another in frame 2, and nothing in both.
+PX4_PLACED = frozenset({16, 17, 19, 21, 22, 31, 84, 85, 195})
+PX4_PLACELESS = frozenset({20, 93, 177, 178, 179, 187, 189, 197, 206, 211, 214, 2000, 2500})
 FIXES = {
     216: "plan without --sprayer: valves follow the map by position",
     183: "valves follow the map by position: leave it out",
@@ -50,12 +58,43 @@ def refusal(file: MissionFile, firmware: Firmware) -> str | None:
         if item.command in REFUSED[firmware]:
             fix = FIXES.get(item.command, "leave it out")
             return f"{file.path}: item {number}: {name} takes no {item.name}; {fix}"
-        if firmware == "px4" and SAME_FRAME.get(item.frame) == TERRAIN:
-            return (
-                f"{file.path}: item {number}: PX4 takes no height above terrain; "
-                "plan heights above home"
-            )
+        wrong = _wrong_frame(item, firmware)
+        if wrong is not None:
+            return f"{file.path}: item {number}: {name} takes {wrong}"
     return None
+
+
+def _wrong_frame(item: WireItem, firmware: Firmware) -> str | None:
+    """Return what of an item's frame the firmware refuses, and what to do."""
+    if firmware == "px4" and SAME_FRAME.get(item.frame) == TERRAIN:
+        return "no height above terrain; plan heights above home"
+    if item.frame not in SAME_FRAME and item.frame != MISSION_FRAME:
+        if firmware == "px4" or item.command in PLACES:
+            return f"no {item.name} in frame {item.frame}; write frame {_frame_for(item)}"
+        return None
+    if firmware == "px4":
+        has_place = item.frame in SAME_FRAME
+        if item.command in (PX4_PLACELESS if has_place else PX4_PLACED):
+            return f"{item.name} in frame {_frame_for(item)} only, not in {item.frame}"
+    return None
+
+
+def _frame_for(item: WireItem) -> int:
+    return MISSION_FRAME if item.command in PX4_PLACELESS else RELATIVE
+
+
+def blame(file: MissionFile, firmware: Firmware, asked: int | None) -> str | None:
+    """Return which item ended an upload: a vehicle refuses the one that it last asked for.
+
+    It says no more than a number, PX4 not even that.
+    """
+    number = None if asked is None else asked + (firmware == "px4")
+    if number is None or not 1 <= number <= len(file.items):
+        return None
+    item = file.items[number - 1]
+    numbers = ", ".join(f"{value:g}" for value in item.params)
+    place = f" at {item.x / 1e7:.7f}, {item.y / 1e7:.7f}" if item.x or item.y else ""
+    return f"item {number} ({item.name} in frame {item.frame}, parameters {numbers}{place})"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

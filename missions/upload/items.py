@@ -13,6 +13,8 @@ WAYPOINT, TAKEOFF = 16, 22
 FENCE_FIRST, FENCE_LAST = 5000, 5004
 # Frames with a place, each with the one that means the same (the INT twins are deprecated).
 GLOBAL, RELATIVE, TERRAIN = 0, 3, 10
+# MAV_FRAME_MISSION: of what is not somewhere.
+MISSION_FRAME = 2
 SAME_FRAME = {0: 0, 5: 0, 3: 3, 6: 3, 10: 10, 11: 10}
 # Commands whose last three numbers are a place that the vehicle keeps.
 PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 84, 85, 179, 189, 195, 201, 5000, 5001, 5002})

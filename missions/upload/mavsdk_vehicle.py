@@ -12,9 +12,8 @@ from typing import Any
 
 from companion.errors import LinkError
 from companion.link.transport import parse_url
-from missions.errors import UploadError
 from missions.upload.items import Firmware, WireItem
-from missions.upload.transfer import NotNowError, Progress, What
+from missions.upload.transfer import NotNowError, Progress, RefusedError, What
 
 _logger = logging.getLogger(__name__)
 
@@ -23,6 +22,7 @@ ARMED_FLAG = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 # An autopilot's heartbeat comes once a second.
 HEARTBEAT_S = 5.0
 AUTOPILOT_COMPONENT = 1
+REQUESTS = ("MISSION_REQUEST_INT", "MISSION_REQUEST")
 # Not the vehicle's will but the way there: another attempt may go through.
 PASSING = ("TIMEOUT", "BUSY", "TRANSFER_CANCELLED", "PROTOCOL_ERROR", "INVALID_SEQUENCE", "ERROR")
 REASONS = {
@@ -120,17 +120,38 @@ class MavsdkVehicle:
         from mavsdk.plugins.mission_raw import MissionPlan, MissionRawError
 
         raw = [_raw(number, item, what) for number, item in enumerate(items)]
+        asked: list[int] = []
         try:
             if what == "fence":
                 await self._raw.upload_geofence(raw)
                 progress(what, 1.0)
                 return
             uploading = self._raw.upload_mission_with_progress(MissionPlan(raw))
-            async with aclosing(uploading) as steps:
+            async with self._requests(asked), aclosing(uploading) as steps:
                 async for result, data in steps:
                     progress(what, 1.0 if result.name == "SUCCESS" else float(data.progress))
         except MissionRawError as error:
-            raise _reason(error.result.name, what, len(items)) from error
+            last = asked[-1] if asked else None
+            raise _reason(error.result.name, what, len(items), asked=last) from error
+
+    @asynccontextmanager
+    async def _requests(self, asked: list[int]) -> AsyncIterator[None]:
+        """Collect the numbers of the items that the vehicle asks for: MAVSDK does not tell."""
+
+        async def listen(name: str) -> None:
+            async with aclosing(self._direct.subscribe_message(name)) as messages:
+                async for message in messages:
+                    asked.append(int(json.loads(message.fields_json)["seq"]))
+
+        listeners = [asyncio.create_task(listen(name)) for name in REQUESTS]
+        await asyncio.sleep(0)  # they subscribe
+        try:
+            yield
+        finally:
+            await asyncio.sleep(0)  # the last request is in its queue
+            for listener in listeners:
+                listener.cancel()
+            await asyncio.gather(*listeners, return_exceptions=True)
 
     async def read(self, what: What) -> tuple[WireItem, ...]:
         """Read back what is there."""
@@ -148,13 +169,15 @@ class MavsdkVehicle:
         return tuple(_item(each) for each in found)
 
 
-def _reason(name: str, what: What, count: int) -> Exception:
+def _reason(name: str, what: What, count: int, *, asked: int | None = None) -> Exception:
     """Return the error for a result of MAVSDK."""
     if name in PASSING:
         return NotNowError(f"the transfer broke off ({name})")
     reason = REASONS.get(name, name.lower()).format(count=count, what=what)
     more = "; --no-fence uploads the mission alone" if what == "fence" else ""
-    return UploadError(f"the vehicle refuses the {what}: {reason}{more}")
+    if name == "UNSUPPORTED" and asked is not None:
+        reason = "it does not take this item"
+    return RefusedError(f"the vehicle refuses the {what}: {reason}{more}", asked)
 
 
 def _raw(number: int, item: WireItem, what: What) -> Any:

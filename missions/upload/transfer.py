@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from missions.errors import UploadError
-from missions.upload.checks import FIRMWARES, Compared, compare, refusal
+from missions.upload.checks import FIRMWARES, Compared, blame, compare, refusal
 from missions.upload.items import Firmware, MissionFile, WireItem
+from missions.upload.places import misplaced
 
 What = Literal["mission", "fence"]
 Progress = Callable[[What, float], None]
@@ -23,10 +24,18 @@ class NotNowError(Exception):
     """A transfer broke off; it may go through when it is tried again."""
 
 
+class RefusedError(UploadError):
+    """The vehicle refuses; `asked` is the number of the item that it last asked for."""
+
+    def __init__(self, text: str, asked: int | None = None) -> None:
+        super().__init__(text)
+        self.asked = asked
+
+
 class Vehicle(Protocol):
     """A vehicle on a link.
 
-    `send` and `read` raise `NotNowError` where another attempt may help, and `UploadError` where
+    `send` and `read` raise `NotNowError` where another attempt may help, and `RefusedError` where
     the vehicle says no.
     """
 
@@ -69,7 +78,9 @@ async def put(
         UploadError: the vehicle will not have it, or must not be given it now.
         TransferError: it did not get there, or is not what was sent.
     """
-    reason = refusal(file, vehicle.firmware)
+    reason = refusal(file, vehicle.firmware) or misplaced(
+        file, vehicle.firmware, with_fence=with_fence
+    )
     if reason is not None:
         raise UploadError(reason)
     fence = file.fence if with_fence else ()
@@ -81,7 +92,13 @@ async def put(
     for what, items in parts:
         if items:
             await _refuse_armed(vehicle, while_armed=while_armed)
-            tried, compared = await _put_one(vehicle, what, items, progress)
+            try:
+                tried, compared = await _put_one(vehicle, what, items, progress)
+            except RefusedError as error:
+                named = blame(file, vehicle.firmware, error.asked) if what == "mission" else None
+                raise UploadError(
+                    f"{file.path}: {named}: {error}" if named else str(error)
+                ) from error
             attempts = max(attempts, tried)
             left_out += compared.left_out
     return Uploaded(

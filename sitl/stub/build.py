@@ -66,6 +66,7 @@ def build_autopilot(
         home_altitude_m=options.home_altitude_m,
         gust_m_s=options.gust_m_s,
         seed=options.seed,
+        zero_is_a_place=firmware.zero_is_a_place,
     )
     flight.set_items(options.items, start_s)
     faults = FaultClock((*scenario.faults, *options.faults), start_s=start_s)

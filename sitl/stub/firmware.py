@@ -31,6 +31,7 @@ class Firmware:
     `commands_at_once` are answered by the receiver itself; the others of a firmware with a
     `queue_depth` go through a queue that is emptied `commands_per_s` times a second.
     `first_item` is how many items of the flight's list the wire does not count: home, on PX4.
+    `zero_is_a_place` tells PX4, which flies to 0, 0, from ArduPilot, to which that means "here".
     """
 
     name: str
@@ -50,6 +51,7 @@ class Firmware:
     queue_depth: int | None = None
     commands_per_s: float = 30.0
     first_item: int = 0
+    zero_is_a_place: bool = False
     busy_factor: float = 1.0
     interval_kinds_max: int | None = None
     timesync_s: float = 10.0

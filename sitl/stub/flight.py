@@ -46,6 +46,7 @@ class Flight:
         home_altitude_m: float,
         gust_m_s: float = 1.0,
         seed: int = 0,
+        zero_is_a_place: bool = False,
     ) -> None:
         self.world = world
         self.frame = frame
@@ -59,6 +60,7 @@ class Flight:
         self.events: list[FlightEvent] = []
         self._parameters = parameters
         self._gust_m_s = gust_m_s
+        self._zero_is_a_place = zero_is_a_place
         self._seed = seed
         self._plan: FlightPlan | None = None
         self._leg = 0
@@ -206,6 +208,7 @@ class Flight:
             first_sequence=first_sequence,
             speed_m_s=self._parameters.speed_m_s("cruise"),
             home_altitude_m=self.home_altitude_m,
+            zero_is_a_place=self._zero_is_a_place,
         )
 
     def _climb(self, height_m: float, now_s: float) -> None:

@@ -56,10 +56,12 @@ def plan_flight(
     first_sequence: int,
     speed_m_s: float,
     home_altitude_m: float,
+    zero_is_a_place: bool = False,
 ) -> FlightPlan:
     """Return what is flown from the item `first_sequence` on.
 
-    The whole route keeps one height, that of its first waypoint.
+    The whole route keeps one height, that of its first waypoint. To PX4, 0, 0 is a place
+    (`zero_is_a_place`), and it flies off towards it.
     """
     take_off_height_m: float | None = None
     height_m: float | None = None
@@ -78,7 +80,7 @@ def plan_flight(
         if item.command == dialect.MAV_CMD_NAV_TAKEOFF:
             take_off_height_m = item_height_m
             continue
-        leg = _leg(item, frame, speed_m_s)
+        leg = _leg(item, frame, speed_m_s, zero_is_a_place=zero_is_a_place)
         if leg is not None and not _ends_there(item, leg, legs):
             legs.append(leg)
             sequences.append(sequence)
@@ -103,13 +105,27 @@ def _ends_there(item: MissionItem, leg: Leg, before: list[Leg]) -> bool:
     return math.hypot(leg.east_m - last.east_m, leg.north_m - last.north_m) < SAME_PLACE_M
 
 
-def _leg(item: MissionItem, frame: LocalFrame, speed_m_s: float) -> Leg | None:
+def _leg(
+    item: MissionItem, frame: LocalFrame, speed_m_s: float, *, zero_is_a_place: bool
+) -> Leg | None:
     """Return the way to an item's place; none for an item without one."""
     if item.command == dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH:
         return home_leg(speed_m_s)
     if not item.has_place:
-        return None
+        return _leg_to_zero(frame, speed_m_s) if zero_is_a_place else None
     east_m, north_m = frame.to_local(item.latitude_deg, item.longitude_deg)
     if not math.hypot(east_m, north_m) < FAR_M:
         return None
     return Leg(east_m=east_m, north_m=north_m, speed_m_s=speed_m_s, kind="spray")
+
+
+def _leg_to_zero(frame: LocalFrame, speed_m_s: float) -> Leg:
+    """Return the way towards latitude 0, longitude 0, as far as the local frame goes."""
+    latitude, longitude = math.radians(frame.latitude_deg), math.radians(frame.longitude_deg)
+    course = math.atan2(-math.sin(longitude), -math.sin(latitude) * math.cos(longitude))
+    return Leg(
+        east_m=FAR_M * math.sin(course),
+        north_m=FAR_M * math.cos(course),
+        speed_m_s=speed_m_s,
+        kind="transit",
+    )

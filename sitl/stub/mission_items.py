@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from sitl.stub.protocol import Message, dialect
@@ -26,12 +27,18 @@ ACTIONS = frozenset(
 )
 FLOWN = PLACES | ACTIONS | {dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH}
 SUPPORTED = FLOWN - {dialect.MAV_CMD_DO_SET_ACTUATOR}
-# mavlink_mission.cpp of PX4 1.14 to 1.16: what is not there ends the upload.
-SUPPORTED_BY_PX4 = FLOWN - {
-    dialect.MAV_CMD_DO_SET_SERVO,
-    dialect.MAV_CMD_DO_SPRAYER,
-    dialect.MAV_CMD_CONDITION_YAW,
-}
+# Measured on PX4 1.16, as in mavlink_mission.cpp: one list for frames with places, one for frame 2.
+PX4_IN_PLACE_FRAMES = frozenset(
+    {dialect.MAV_CMD_NAV_WAYPOINT, dialect.MAV_CMD_NAV_LAND, dialect.MAV_CMD_NAV_TAKEOFF}
+)
+PX4_IN_MISSION_FRAME = frozenset(
+    {
+        dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH,
+        dialect.MAV_CMD_DO_CHANGE_SPEED,
+        dialect.MAV_CMD_DO_SET_HOME,
+        dialect.MAV_CMD_DO_SET_ACTUATOR,
+    }
+)
 
 ACTION_NAMES = {
     dialect.MAV_CMD_DO_CHANGE_SPEED: "ChangeSpeed",
@@ -48,6 +55,8 @@ FRAMES = ABSOLUTE_FRAMES | {
     dialect.MAV_FRAME_MISSION,
 }
 PLACE_FRAMES = FRAMES - {dialect.MAV_FRAME_MISSION}
+# ArduPilot: places on the Earth, and heights that its Location holds (LOCATION_ALT_MAX_M).
+LATITUDE_MAX_E7, LONGITUDE_MAX_E7, HEIGHT_MAX_M = 900_000_000, 1_800_000_000, 83_000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +79,7 @@ class MissionItem:
 
     @property
     def has_place(self) -> bool:
-        """Return whether the item names a place on the ground."""
+        """Return whether the item names a place on the ground, as ArduPilot takes 0, 0."""
         return self.command in PLACES and (self.x_e7 != 0 or self.y_e7 != 0)
 
     @property
@@ -158,19 +167,36 @@ def refused_by_ardupilot(message: Message) -> int | None:
     """Return why ArduPilot refuses an item; item 0 is home and is never looked at."""
     if message.seq == 0:
         return None
-    return _refusal(message, SUPPORTED, FRAMES)
+    refusal: int | None = None
+    if message.command not in SUPPORTED:
+        refusal = dialect.MAV_MISSION_UNSUPPORTED
+    elif message.command in PLACES and message.frame not in FRAMES:
+        refusal = dialect.MAV_MISSION_UNSUPPORTED_FRAME
+    else:
+        refusal = _wrong_number(message)
+    return refusal
+
+
+def _wrong_number(message: Message) -> int | None:
+    """Return the MAV_MISSION_RESULT that names the number ArduPilot does not take."""
+    for index, value in enumerate((message.param1, message.param2, message.param3)):
+        if not math.isfinite(value):
+            return int(dialect.MAV_MISSION_INVALID_PARAM1 + index)
+    if message.command not in PLACES:
+        return None
+    if not abs(message.x) <= LATITUDE_MAX_E7:
+        return int(dialect.MAV_MISSION_INVALID_PARAM5_X)
+    if not abs(message.y) <= LONGITUDE_MAX_E7:
+        return int(dialect.MAV_MISSION_INVALID_PARAM6_Y)
+    return None if abs(message.z) <= HEIGHT_MAX_M else int(dialect.MAV_MISSION_INVALID_PARAM7)
 
 
 def refused_by_px4(message: Message) -> int | None:
-    """Return why PX4 refuses an item; one with a place needs a frame that has places."""
-    places = message.command in PLACES
-    return _refusal(message, SUPPORTED_BY_PX4, PLACE_FRAMES if places else FRAMES)
-
-
-def _refusal(message: Message, commands: frozenset[int], frames: frozenset[int]) -> int | None:
-    refusal: int | None = None
-    if message.command not in commands:
-        refusal = dialect.MAV_MISSION_UNSUPPORTED
-    elif message.frame not in frames:
-        refusal = dialect.MAV_MISSION_UNSUPPORTED_FRAME
-    return refusal
+    """Return why PX4 refuses an item: it looks at the command and its frame, and no further."""
+    if message.frame in PLACE_FRAMES:
+        taken = message.command in PX4_IN_PLACE_FRAMES
+    elif message.frame == dialect.MAV_FRAME_MISSION:
+        taken = message.command in PX4_IN_MISSION_FRAME
+    else:
+        return int(dialect.MAV_MISSION_UNSUPPORTED_FRAME)
+    return None if taken else int(dialect.MAV_MISSION_UNSUPPORTED)

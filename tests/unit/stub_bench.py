@@ -19,12 +19,13 @@ def place(command: int, east_m: float, north_m: float, height_m: float = 3.5) ->
 
 
 def mission(*legs: tuple[float, float], land: bool = True) -> tuple[MissionItem, ...]:
-    """Home, take-off, the legs, and a landing."""
+    """Home, take-off, the legs, and a landing where the last one ends."""
+    end = legs[-1] if legs else (0.0, 0.0)
     return (
         place(dialect.MAV_CMD_NAV_WAYPOINT, 0.0, 0.0, 0.0),
         place(dialect.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0),
         *(place(dialect.MAV_CMD_NAV_WAYPOINT, east, north) for east, north in legs),
-        *((place(dialect.MAV_CMD_NAV_LAND, *legs[-1], 0.0),) if land else ()),
+        *((place(dialect.MAV_CMD_NAV_LAND, *end, 0.0),) if land else ()),
     )
 
 

@@ -18,6 +18,7 @@ from sitl.fly_files import fly_lines
 from sitl.mission_writing import write_mission
 from sitl.routes import read_route
 from sitl.stub.mission_file import read_mission
+from sitl.stub.mission_items import landing
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 ANYANG = EXAMPLES / "anyang"
@@ -35,7 +36,8 @@ def short_mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One pass over the example field."""
     folder = tmp_path_factory.mktemp("mission")
     items = anyang_items(5.0)
-    write_mission((*items[:4], items[-1]), folder)
+    end = landing(items[3].latitude_deg, items[3].longitude_deg)
+    write_mission((*items[:4], end), folder)
     return folder / "mission.waypoints"
 
 
@@ -177,7 +179,8 @@ def tiny_mission(folder: Path) -> Path:
         x_e7=round(first.x_e7 + 0.4 * (last.x_e7 - first.x_e7)),
         y_e7=round(first.y_e7 + 0.4 * (last.y_e7 - first.y_e7)),
     )
-    write_mission((*items[:3], near, items[-1]), folder)
+    end = landing(near.latitude_deg, near.longitude_deg)
+    write_mission((*items[:3], near, end), folder)
     return folder / "mission.waypoints"
 
 

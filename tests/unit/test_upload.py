@@ -16,7 +16,14 @@ from missions.errors import UploadError
 from missions.upload.checks import compare, refusal
 from missions.upload.items import Firmware, MissionFile, WireItem
 from missions.upload.reading import read_mission_file
-from missions.upload.transfer import NotNowError, Progress, TransferError, What, put
+from missions.upload.transfer import (
+    NotNowError,
+    Progress,
+    RefusedError,
+    TransferError,
+    What,
+    put,
+)
 
 HOME = WireItem(command=16, frame=0, x=480_000_000, y=110_000_000)
 OPEN = math.nan
@@ -27,8 +34,8 @@ ITEMS = (
     WireItem(command=20, frame=2),
 )
 CORNERS = tuple(
-    WireItem(command=5001, frame=0, params=(3, 0, 0, 0), x=480_000_000 + n, y=110_000_000)
-    for n in range(3)
+    WireItem(command=5001, frame=0, params=(3, 0, 0, 0), x=x, y=y)
+    for x, y in ((479_990_000, 109_990_000), (480_020_000, 110_000_000), (479_990_000, 110_020_000))
 )
 FILE = MissionFile(path=Path("m.plan"), home=HOME, items=ITEMS, fence=CORNERS)
 
@@ -122,6 +129,17 @@ def test_a_wrong_link_is_refused_by_name(
 @pytest.mark.parametrize(
     ("item", "firmware", "says"),
     [
+        (
+            WireItem(command=178, frame=3, params=(1, 5, -1, 0)),
+            "px4",
+            "item 5: PX4 takes DO_CHANGE_SPEED in frame 2 only, not in 3",
+        ),
+        (WireItem(command=20, frame=3), "px4", "PX4 takes RETURN_TO_LAUNCH in frame 2 only"),
+        (WireItem(command=21, frame=2), "px4", "PX4 takes LAND in frame 3 only, not in 2"),
+        (WireItem(command=178, frame=1), "px4", "PX4 takes no DO_CHANGE_SPEED in frame 1"),
+        (WireItem(command=16, frame=4), "ardupilot", "no WAYPOINT in frame 4; write frame 3"),
+        (WireItem(command=178, frame=3), "ardupilot", None),
+        (WireItem(command=113, frame=2), "ardupilot", "ArduPilot takes no command 113"),
         (WireItem(command=216, frame=2), "px4", "item 5: PX4 takes no DO_SPRAYER; plan without"),
         (WireItem(command=16, frame=10), "px4", "item 5: PX4 takes no height above terrain"),
         (WireItem(command=187, frame=2), "ardupilot", "ArduPilot takes no DO_SET_ACTUATOR"),
@@ -134,6 +152,81 @@ def test_what_a_firmware_refuses_is_known_before_it_is_asked(
 ) -> None:
     found = refusal(replace(FILE, items=(*ITEMS, item)), firmware)
     assert found is None if says is None else says in (found or "")
+
+
+@pytest.mark.parametrize(
+    ("item", "firmware", "says"),
+    [
+        (WireItem(command=21, frame=3), "px4", r"item 5 \(LAND\): it is at 0, 0, .*Atlantic"),
+        (WireItem(command=16, frame=6, z_m=3.5), "px4", r"item 5 \(WAYPOINT\): it is at 0, 0"),
+        (WireItem(command=21, frame=3), "ardupilot", None),
+        (WireItem(command=21, frame=3, x=480_000_000, y=110_700_000), "ardupilot", "than 5 km"),
+        (WireItem(command=16, frame=3, x=-480_000_000, y=-690_000_000), "px4", "than 5 km"),
+        (WireItem(command=16, frame=2, x=36, y=114, z_m=3.5), "ardupilot", "frame 2 has none"),
+        (WireItem(command=21, frame=3, x=480_001_000, y=110_001_000), "px4", None),
+        (WireItem(command=20, frame=2), "px4", None),
+    ],
+)
+async def test_an_item_that_leads_away_is_refused_before_anything_is_sent(
+    item: WireItem, firmware: Firmware, says: str | None
+) -> None:
+    vehicle = Fake(firmware)
+    file = replace(FILE, items=(*ITEMS, item), fence=())
+    if says is None:
+        assert (await put(vehicle, file, progress=nothing)).items == 5
+        return
+    with pytest.raises(UploadError, match=says):
+        await put(vehicle, file, progress=nothing)
+    assert vehicle.kept == {}
+
+
+def corners(command: int, *places: tuple[int, int]) -> tuple[WireItem, ...]:
+    return tuple(
+        WireItem(command=command, frame=0, params=(len(places), 0, 0, 0), x=x, y=y)
+        for x, y in places
+    )
+
+
+AROUND = corners(
+    5001,
+    (479_990_000, 109_990_000), (480_010_000, 109_990_000), (480_010_000, 110_010_000),
+    (479_990_000, 110_010_000),
+)  # fmt: skip
+LESS = corners(
+    5001, (479_990_000, 109_990_000), (480_000_500, 109_990_000), (480_000_500, 110_010_000)
+)
+POND = corners(
+    5002, (480_000_900, 110_000_900), (480_001_100, 110_000_900), (480_001_000, 110_001_100)
+)
+CIRCLE = WireItem(command=5003, frame=0, params=(8.0, 0, 0, 0), x=480_000_000, y=110_000_000)
+
+
+@pytest.mark.parametrize(
+    ("fence", "says"),
+    [
+        (AROUND, None),
+        (LESS, r"item 3 \(WAYPOINT\): it is outside the fence"),
+        ((*AROUND, *POND), r"item 3 \(WAYPOINT\): it is where the fence forbids it"),
+        ((CIRCLE,), "item 3 .*outside the fence"),
+        ((replace(CIRCLE, params=(80.0, 0, 0, 0)),), None),
+    ],
+)
+async def test_an_item_outside_the_fence_of_its_file_is_refused(
+    fence: tuple[WireItem, ...], says: str | None
+) -> None:
+    file = replace(FILE, fence=fence)
+    if says is not None:
+        with pytest.raises(UploadError, match=says):
+            await put(Fake(), file, progress=nothing)
+    assert (await put(Fake(), file, with_fence=says is None, progress=nothing)).items == 4
+
+
+@pytest.mark.parametrize(("firmware", "asked"), [("px4", 2), ("ardupilot", 3)])
+async def test_the_item_that_the_vehicle_refuses_is_named(firmware: Firmware, asked: int) -> None:
+    vehicle = Fake(firmware)
+    vehicle.refuses_at = asked
+    with pytest.raises(UploadError, match=r"m.plan: item 3 \(WAYPOINT in frame 3, .*48.0001"):
+        await put(vehicle, replace(FILE, fence=()), progress=nothing)
 
 
 def changed(number: int, **changes: Any) -> list[WireItem]:
@@ -178,6 +271,7 @@ class Fake:
         self.armed: bool | None = False
         self.breaks = 0
         self.forgets = 0
+        self.refuses_at: int | None = None
         self.kept: dict[str, tuple[WireItem, ...]] = {}
 
     async def is_armed(self) -> bool | None:
@@ -187,6 +281,8 @@ class Fake:
         if self.breaks:
             self.breaks -= 1
             raise NotNowError("the transfer broke off (TIMEOUT)")
+        if self.refuses_at is not None:
+            raise RefusedError("the vehicle refuses the mission", self.refuses_at)
         self.kept[what] = tuple(items)
         progress(what, 1.0)
 

@@ -1,0 +1,105 @@
+"""Whether a mission stays where its field is: items at 0, 0, far away, or outside its own fence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from statistics import median
+
+import shapely
+
+from companion.core.frame import LocalFrame
+from missions.upload.items import (
+    FENCE_FIRST,
+    FENCE_LAST,
+    PLACES,
+    SAME_FRAME,
+    Firmware,
+    MissionFile,
+    WireItem,
+)
+
+# A sortie of a spraying aircraft is smaller than this; another field is mostly farther away.
+FAR_M = 5000.0
+# Corners are kept to 2 cm, and a line along the fence may be drawn on it.
+ON_FENCE_M = 0.1
+POLYGON_IN, POLYGON_OUT, CIRCLE_IN, CIRCLE_OUT = 5001, 5002, 5003, 5004
+DEGREES = 1e-7
+
+Numbered = tuple[int, WireItem]
+
+
+def misplaced(file: MissionFile, firmware: Firmware, *, with_fence: bool) -> str | None:
+    """Return which item leads away from the field, and what to do; None where none does."""
+    placed = [
+        (number, item)
+        for number, item in enumerate(file.items, start=1)
+        if item.command in PLACES and not FENCE_FIRST <= item.command <= FENCE_LAST
+    ]
+    for number, item in placed:
+        if item.frame not in SAME_FRAME and (item.x or item.y):
+            return (
+                f"{file.path}: item {number} ({item.name}): it has a place, and frame "
+                f"{item.frame} has none; write frame 3"
+            )
+        if firmware == "px4" and item.frame in SAME_FRAME and not (item.x or item.y):
+            return (
+                f'{file.path}: item {number} ({item.name}): it is at 0, 0, which means "here" to '
+                "ArduPilot; PX4 would fly to the Atlantic. Give it real coordinates"
+            )
+    somewhere = [(number, item) for number, item in placed if item.x or item.y]
+    return next(_away(file, somewhere, with_fence=with_fence), None)
+
+
+def _away(file: MissionFile, placed: Sequence[Numbered], *, with_fence: bool) -> Iterator[str]:
+    """Yield what is said of items far from the others or outside the fence."""
+    if not placed:
+        return
+    known = [item for item in (file.home, *(item for _, item in placed)) if item.x or item.y]
+    middle = LocalFrame(
+        median(item.x for item in known) * DEGREES, median(item.y for item in known) * DEGREES
+    )
+    for number, item in placed:
+        if not math.hypot(*middle.to_local(item.x * DEGREES, item.y * DEGREES)) <= FAR_M:
+            yield (
+                f"{file.path}: item {number} ({item.name}): {item.x * DEGREES:.7f}, "
+                f"{item.y * DEGREES:.7f} is more than {FAR_M / 1000.0:g} km from the field; "
+                "correct its place"
+            )
+    if with_fence and file.fence:
+        inside, outside = _fence(file.fence, middle)
+        for number, item in placed:
+            point = shapely.Point(*middle.to_local(item.x * DEGREES, item.y * DEGREES))
+            if inside is not None and not inside.covers(point):
+                where = "outside the fence"
+            elif outside.covers(point):
+                where = "where the fence forbids it"
+            else:
+                continue
+            yield (
+                f"{file.path}: item {number} ({item.name}): it is {where} of the same file; "
+                "correct one of them, or say --no-fence"
+            )
+
+
+def _fence(
+    fence: Sequence[WireItem], frame: LocalFrame
+) -> tuple[shapely.Geometry | None, shapely.Geometry]:
+    """Return where the fence wants the vehicle, None for anywhere, and where it forbids it."""
+    shapes: dict[bool, list[shapely.Geometry]] = {True: [], False: []}
+    rest = list(fence)
+    while rest:
+        item = rest[0]
+        local = [frame.to_local(one.x * DEGREES, one.y * DEGREES) for one in rest]
+        if item.command in (POLYGON_IN, POLYGON_OUT):
+            count = max(int(item.params[0]), 1)
+            ring = shapely.Polygon(local[:count]) if count >= 3 <= len(local) else shapely.Point()
+            shapes[item.command == POLYGON_IN].append(ring.buffer(0.0))
+        else:
+            count = 1
+            if item.command in (CIRCLE_IN, CIRCLE_OUT):
+                circle = shapely.Point(*local[0]).buffer(item.params[0], quad_segs=64)
+                shapes[item.command == CIRCLE_IN].append(circle)
+        rest = rest[count:]
+    wanted = shapely.union_all(shapes[True]).buffer(ON_FENCE_M) if shapes[True] else None
+    return wanted, shapely.union_all(shapes[False]).buffer(-ON_FENCE_M)
