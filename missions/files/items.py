@@ -80,7 +80,10 @@ def _speed(speed_m_s: float) -> Item:
 
 def _fixed_yaw(plan: Plan) -> float | None:
     """Return the yaw that a strafing aircraft keeps: along the inner lines."""
-    return plan.angle_deg % 360.0 if plan.settings.turn == "strafe" else None
+    if plan.settings.turn != "strafe":
+        return None
+    # The north is 360: a waypoint file has 0 where the yaw is left open.
+    return plan.angle_deg % 360.0 or 360.0
 
 
 def _placed(plan: Plan, command: int, stop: Stop, *, yaw_deg: float | None = None) -> Item:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 Firmware = Literal["ardupilot", "px4"]
 Params = tuple[float, float, float, float]
 
-WAYPOINT, TAKEOFF = 16, 22
+WAYPOINT, LAND, TAKEOFF = 16, 21, 22
 FENCE_FIRST, FENCE_LAST = 5000, 5004
 # Frames with a place, each with the one that means the same (the INT twins are deprecated).
 GLOBAL, RELATIVE, TERRAIN = 0, 3, 10
@@ -58,5 +59,18 @@ class MissionFile:
     fence: tuple[WireItem, ...] = ()
 
     def items_for(self, firmware: Firmware) -> tuple[WireItem, ...]:
-        """Return what travels: ArduPilot numbers home, PX4 has no home in its mission."""
-        return (self.home, *self.items) if firmware == "ardupilot" else self.items
+        """Return what travels: ArduPilot numbers home, PX4 has no home in its mission.
+
+        A waypoint file has 0 where a yaw is left open, which PX4 would take for the north.
+        """
+        if firmware == "ardupilot":
+            return (self.home, *self.items)
+        if self.path.suffix.casefold() == ".plan":
+            return self.items
+        return tuple(_with_open_yaw(item) for item in self.items)
+
+
+def _with_open_yaw(item: WireItem) -> WireItem:
+    if item.command not in (WAYPOINT, LAND, TAKEOFF) or item.params[3]:
+        return item
+    return replace(item, params=(*item.params[:3], math.nan))

@@ -221,6 +221,15 @@ async def test_an_item_outside_the_fence_of_its_file_is_refused(
     assert (await put(Fake(), file, with_fence=says is None, progress=nothing)).items == 4
 
 
+def test_the_zero_yaw_of_a_waypoint_file_is_left_open_for_px4_only() -> None:
+    items = (*ITEMS, WireItem(command=16, frame=3, x=480_001_000, y=110_001_000, z_m=3.5))
+    file = replace(FILE, path=Path("m.waypoints"), items=items)
+    assert math.isnan(file.items_for("px4")[-1].params[3])
+    assert file.items_for("px4")[2].params[3] == 30.0
+    assert file.items_for("ardupilot")[-1].params[3] == 0.0
+    assert replace(file, path=Path("m.plan")).items_for("px4")[-1].params[3] == 0.0
+
+
 @pytest.mark.parametrize(("firmware", "asked"), [("px4", 2), ("ardupilot", 3)])
 async def test_the_item_that_the_vehicle_refuses_is_named(firmware: Firmware, asked: int) -> None:
     vehicle = Fake(firmware)
