@@ -96,13 +96,30 @@ async def test_an_armed_vehicle_keeps_its_mission_unless_told(tmp_path: Path) ->
 async def test_a_fence_beyond_the_vehicles_room_leaves_its_mission_alone(tmp_path: Path) -> None:
     file = sorties(tmp_path, 1)[0]
     content = json.loads(file.read_text())
-    ring = [[48.0 + number * 1e-5, 11.0 + number**2 * 1e-6] for number in range(65)]
+    home = content["mission"]["plannedHomePosition"]
+    ring = [
+        [home[0] + 0.01 * math.cos(corner), home[1] + 0.01 * math.sin(corner)]
+        for corner in (math.tau * number / 65 for number in range(65))
+    ]
     content["geoFence"]["polygons"] = [{"inclusion": True, "polygon": ring, "version": 1}]
     file.write_text(json.dumps(content))
     async with stub_on_a_port("ardupilot") as (server, url):
         before = server.autopilot.flight.items
         with pytest.raises(UploadError, match=r"no room for 65 items.*--no-fence"):
             await upload(file, url)
+        assert server.autopilot.flight.items == before
+
+
+@both
+async def test_the_item_that_the_vehicle_refuses_is_named(autopilot: str, tmp_path: Path) -> None:
+    file = sorties(tmp_path, 1)[0]
+    content = json.loads(file.read_text())
+    content["mission"]["items"][4] |= {"command": 2000, "frame": 2}  # which the stub does not fly
+    file.write_text(json.dumps(content))
+    async with stub_on_a_port(autopilot) as (server, url):
+        before = server.autopilot.flight.items
+        with pytest.raises(UploadError, match=r"item 5 \(command 2000 in frame 2, .*this item"):
+            await upload(file, url, with_fence=False)
         assert server.autopilot.flight.items == before
 
 
