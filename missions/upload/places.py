@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from statistics import median
 
 import shapely
+from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
 from missions.upload.items import (
@@ -84,9 +85,9 @@ def _away(file: MissionFile, placed: Sequence[Numbered], *, with_fence: bool) ->
 
 def _fence(
     fence: Sequence[WireItem], frame: LocalFrame
-) -> tuple[shapely.Geometry | None, shapely.Geometry]:
+) -> tuple[BaseGeometry | None, BaseGeometry]:
     """Return where the fence wants the vehicle, None for anywhere, and where it forbids it."""
-    shapes: dict[bool, list[shapely.Geometry]] = {True: [], False: []}
+    shapes: dict[bool, list[BaseGeometry]] = {True: [], False: []}
     rest = list(fence)
     while rest:
         item = rest[0]
