@@ -157,7 +157,7 @@ def compared(curves: Sequence[BucketCurve]) -> list[dict[str, Any]]:
         rows = []
         for duty, measured in zip(curve.duty, curve.flow_l_min, strict=True):
             table, law = published.table_flow_l_min(duty), published.law_flow_l_min(duty)
-            in_law = published.flow_min_l_min <= law <= published.flow_max_l_min
+            in_law = published.law.flow_min_l_min <= law <= published.law.flow_max_l_min
             rows.append(
                 {
                     "duty": duty,

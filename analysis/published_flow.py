@@ -9,6 +9,8 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass
 
+from companion.core.nozzle import FLOW_LAWS, FlowLaw
+
 # Beyond this share of the flow, law and table are said to disagree.
 DISAGREE_FROM = 0.03
 SET_NAME = "wang-2024"
@@ -16,26 +18,20 @@ SET_NAME = "wang-2024"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishedSet:
-    """One nozzle set of P1: its column of Table 2 and its branch of Eq. 2.
+    """One nozzle set of P1: its column of Table 2 and its branch of Eq. 2."""
 
-    Eq. 2: duty [%] = `slope` * flow [L/min] + `offset`, from `flow_min` to `flow_max` L/min.
-    """
-
-    nozzles: int
+    law: FlowLaw
     duty: tuple[float, ...]
     nozzle_flow_l_min: tuple[float, ...]
-    slope: float
-    offset: float
-    flow_min_l_min: float
-    flow_max_l_min: float
 
-    def law_duty(self, flow_l_min: float) -> float:
-        """Return the duty, 0 to 1, that Eq. 2 orders for a flow."""
-        return (self.slope * flow_l_min + self.offset) / 100.0
+    @property
+    def nozzles(self) -> int:
+        """Return how many nozzles spray."""
+        return self.law.nozzles
 
     def law_flow_l_min(self, duty: float) -> float:
         """Return the flow for which Eq. 2 orders a duty."""
-        return (100.0 * duty - self.offset) / self.slope
+        return (100.0 * duty - self.law.offset) / self.law.slope
 
     def table_flow_l_min(self, duty: float) -> float | None:
         """Return the flow of all nozzles at a duty by Table 2; None outside the table."""
@@ -58,23 +54,16 @@ class Disagreement:
     excess_percent: float
 
 
+_EQ_2 = {law.nozzles: law for law in FLOW_LAWS["wang-2024-eq2"]}
 EIGHT = PublishedSet(
-    nozzles=8,
+    law=_EQ_2[8],
     duty=(0.2, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0),
     nozzle_flow_l_min=(0.128, 0.234, 0.277, 0.393, 0.435, 0.521, 0.534),
-    slope=18.73,
-    offset=17.557,
-    flow_min_l_min=2.0,
-    flow_max_l_min=4.0,
 )
 TWELVE = PublishedSet(
-    nozzles=12,
+    law=_EQ_2[12],
     duty=(0.2, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0),
     nozzle_flow_l_min=(0.123, 0.252, 0.273, 0.385, 0.421, 0.496, 0.508),
-    slope=17.67,
-    offset=-9.874,
-    flow_min_l_min=4.0,
-    flow_max_l_min=6.0,
 )
 SETS = (EIGHT, TWELVE)
 
@@ -85,7 +74,7 @@ def excess_percent(published: PublishedSet, flow_l_min: float) -> float | None:
     >>> round(excess_percent(EIGHT, 2.0), 1)
     22.4
     """
-    found = published.table_flow_l_min(published.law_duty(flow_l_min))
+    found = published.table_flow_l_min(published.law.duty(flow_l_min))
     return None if found is None else 100.0 * (found / flow_l_min - 1.0)
 
 
@@ -94,11 +83,12 @@ def disagreements(published: PublishedSet) -> list[Disagreement]:
 
     Between these the excess has no extreme: there it is (a + b flow) / flow.
     """
-    flows = {published.flow_min_l_min, published.flow_max_l_min}
+    law = published.law
+    flows = {law.flow_min_l_min, law.flow_max_l_min}
     flows |= {published.law_flow_l_min(duty) for duty in published.duty}
     rows = []
     for flow in sorted(flows):
-        if not published.flow_min_l_min <= flow <= published.flow_max_l_min:
+        if not law.flow_min_l_min <= flow <= law.flow_max_l_min:
             continue
         excess = excess_percent(published, flow)
         if excess is None or not abs(excess) > 100.0 * DISAGREE_FROM:
@@ -107,7 +97,7 @@ def disagreements(published: PublishedSet) -> list[Disagreement]:
             Disagreement(
                 nozzles=published.nozzles,
                 asked_l_min=flow,
-                duty=published.law_duty(flow),
+                duty=law.duty(flow),
                 table_l_min=flow * (1.0 + excess / 100.0),
                 excess_percent=excess,
             )

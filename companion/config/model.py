@@ -136,18 +136,20 @@ class Config(tables.Table):
         )
 
     def nozzle_sets(self) -> tuple[NozzleSet, ...]:
-        """Return the measured sets, from the smallest to the largest flow."""
+        """Return the sets, from the smallest to the largest flow."""
         of_pump = motors.pump_set(self)
         if of_pump is not None:
             return (of_pump,)
         index = {valve.name: number for number, valve in enumerate(self.valve)}
-        sets = [
-            NozzleSet(
-                valves=tuple(sorted(index[name] for name in table.valves)),
-                curve=FlowCurve(duty=table.duty, flow_l_min=table.flow_l_min),
+        sets = []
+        for table in self.nozzle_set:
+            duty, flow_l_min = table.points(self.valve)
+            sets.append(
+                NozzleSet(
+                    valves=tuple(sorted(index[name] for name in table.valves)),
+                    curve=FlowCurve(duty=duty, flow_l_min=flow_l_min),
+                )
             )
-            for table in self.nozzle_set
-        ]
         return tuple(sorted(sets, key=lambda nozzles: nozzles.flow_max_l_min))
 
     def pwm_limits(self) -> PwmLimits:

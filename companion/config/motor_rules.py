@@ -197,7 +197,8 @@ def _flows(config: Config) -> tuple[float, float]:
     if pump is not None and makes_flow(config):
         flows = [pump_curve(pump).flow_l_min] if pump.us and pump.flow_l_min else []
     else:
-        flows = [table.flow_l_min for table in config.nozzle_set if table.flow_l_min]
+        each_set = [table.points(config.valve)[1] for table in config.nozzle_set]
+        flows = [points for points in each_set if points]
     if not flows:
         return 0.0, 0.0
     return min(each[0] for each in flows), max(each[-1] for each in flows)

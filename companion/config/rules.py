@@ -15,10 +15,11 @@ from companion.config.line_rules import line_contradictions, line_warnings
 from companion.config.motor_rules import motor_contradictions, motor_warnings
 from companion.config.motors import makes_flow
 from companion.config.sensor_rules import sensor_contradictions
-from companion.core.nozzle import FlowCurve
+from companion.core.nozzle import FLOW_LAWS, FlowCurve
 
 if TYPE_CHECKING:
     from companion.config.model import Config
+    from companion.config.sprayer_tables import NozzleSetTable
 
 # MAV_CMD_DO_SET_SERVO: ArduPilot has at most 32 outputs (SERVO1 to SERVO32).
 SERVO_OUTPUTS = 32
@@ -94,6 +95,13 @@ def without_effect(config: Config) -> Rule:
             key="flow_trim.enabled",
             text="no flow meter is configured (flow_meter.source): the trim stays 1",
         )
+    for number, table in enumerate(config.nozzle_set):
+        if table.preset is not None:
+            yield Contradiction(
+                key=f"nozzle_set[{number}].preset",
+                text="a published law: its own authors measured up to 22 % more flow than it says; "
+                "measure yours (vrspray calibrate flow)",
+            )
     for key, text in chain(line_warnings(config), motor_warnings(config)):
         yield Contradiction(key=key, text=text)
     settings = {
@@ -189,7 +197,9 @@ def _nozzle_sets(config: Config) -> Rule:
         if len(set(table.valves)) != len(table.valves):
             yield Contradiction(key=f"{key}.valves", text="a valve stands twice; name it once")
         used.update(table.valves)
-        if not makes_flow(config):
+        if table.preset is not None and not unknown:
+            yield from _preset(config, table, key)
+        elif not makes_flow(config):
             yield from _curve(table.duty, table.flow_l_min, key)
     for number, name in enumerate(names):
         if name not in used:
@@ -197,6 +207,24 @@ def _nozzle_sets(config: Config) -> Rule:
                 key=f"valve[{number}].name",
                 text="in no nozzle_set.valves, so it would never open; add it or remove the valve",
             )
+
+
+def _preset(config: Config, table: NozzleSetTable, key: str) -> Rule:
+    if table.duty or table.flow_l_min or makes_flow(config):
+        other = "the curve of the pump" if makes_flow(config) else "a row of measured points"
+        yield Contradiction(
+            key=f"{key}.preset", text=f"{other} says the flow already; remove one of the two"
+        )
+        return
+    if table.points(config.valve) == ((), ()):
+        counts = " or ".join(str(law.nozzles) for law in FLOW_LAWS[table.preset or ""])
+        has = table.nozzles(config.valve)
+        yield Contradiction(
+            key=f"{key}.preset",
+            text=f'"{table.preset}" is of {counts} nozzles, this set has '
+            f"{'no valve.nozzles for each' if has is None else has}; correct valve[...].nozzles, "
+            "or write measured points",
+        )
 
 
 def _curve(duty: tuple[float, ...], flow_l_min: tuple[float, ...], key: str) -> Rule:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat
 
 from companion.config.tables import Duty, Table, Text, Width
+from companion.core.nozzle import FLOW_LAWS
 
 Lag = Annotated[FiniteFloat, Field(ge=0.0, le=30.0)]
 Offset = Annotated[FiniteFloat, Field(ge=-50.0, le=50.0)]
@@ -33,7 +35,10 @@ class ValveTable(Table):
         default=None, ge=0, le=1023, description="servo output 1 to 32, or GPIO line"
     )
     nozzles: int | None = Field(
-        default=None, ge=1, le=1000, description="how many it feeds; information"
+        default=None,
+        ge=1,
+        le=1000,
+        description="how many it feeds; information, but with nozzle_set.preset",
     )
     width_m: Width | None = Field(
         default=None,
@@ -56,7 +61,7 @@ class PwmTable(Table):
 
 
 class NozzleSetTable(Table):
-    """Valves that spray together, and what they deliver; all of it measured."""
+    """Valves that spray together, and what they deliver: measured, or a published law."""
 
     valves: Annotated[tuple[Text, ...], Field(strict=False, min_length=1, max_length=1000)] = Field(
         description="names of the valves"
@@ -68,6 +73,26 @@ class NozzleSetTable(Table):
         tuple[Annotated[FiniteFloat, Field(ge=0, le=10_000)], ...],
         Field(strict=False, min_length=2, max_length=1000),
     ] = Field(default=(), description="flow of the whole set at these duties, increasing")
+    preset: Literal["wang-2024-eq2"] | None = Field(
+        default=None,
+        description="a published law instead of measured points; needs `valve.nozzles`",
+    )
+
+    def nozzles(self, valves: Sequence[ValveTable]) -> int | None:
+        """Return how many nozzles the set has; None where a valve does not say."""
+        counts = [valve.nozzles for valve in valves if valve.name in self.valves]
+        known = [count for count in counts if count is not None]
+        return sum(known) if len(known) == len(counts) else None
+
+    def points(self, valves: Sequence[ValveTable]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return duties and flows, as written or the preset's; empty where there are none."""
+        if self.preset is None:
+            return self.duty, self.flow_l_min
+        count = self.nozzles(valves)
+        for law in FLOW_LAWS[self.preset]:
+            if law.nozzles == count:
+                return law.curve.duty, law.curve.flow_l_min
+        return (), ()
 
 
 class LagTable(Table):

@@ -1,7 +1,7 @@
 """From flow to duty: what the nozzle sets were measured to deliver.
 
 The curve is measured, not assumed: flow against duty is not a straight line (P1 Table 2), and
-P1's Eq. 2 contradicts its own table by up to 22 % of flow.
+P1's Eq. 2 contradicts its own table by up to 22 % of flow. It is here as a preset, `FLOW_LAWS`.
 """
 
 from __future__ import annotations
@@ -138,6 +138,60 @@ class NozzleSet:
     def flow_max_l_min(self) -> float:
         """Return the largest measured flow."""
         return self.curve.flow_l_min[-1]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowLaw:
+    """A published straight line from the flow of a set of so many nozzles to its duty.
+
+    duty [%] = `slope` * flow [L/min] + `offset`, stated from `flow_min_l_min` to `flow_max_l_min`;
+    `curve_l_min` is what a controller uses of it.
+    """
+
+    nozzles: int
+    slope: float
+    offset: float
+    flow_min_l_min: float
+    flow_max_l_min: float
+    curve_l_min: tuple[float, float]
+
+    def duty(self, flow_l_min: float) -> float:
+        """Return the duty, 0 to 1, that the law has for a flow.
+
+        >>> round(FLOW_LAWS["wang-2024-eq2"][1].duty(5.0), 5)
+        0.78476
+        """
+        return (self.slope * flow_l_min + self.offset) / 100.0
+
+    @property
+    def curve(self) -> FlowCurve:
+        """Return the law as a curve of two points: exact between them, held beyond them."""
+        low, high = self.curve_l_min
+        return FlowCurve(duty=(self.duty(low), self.duty(high)), flow_l_min=(low, high))
+
+
+# P1 Eq. 2: twelve nozzles from 4 to 6 L/min, eight (valves 5 and 6 closed) from 2 to below 4. Where
+# they meet each goes on as far as the hysteresis of `choose_set` needs it: 3.7 down, 4.1 up.
+FLOW_LAWS = {
+    "wang-2024-eq2": (
+        FlowLaw(
+            nozzles=8,
+            slope=18.73,
+            offset=17.557,
+            flow_min_l_min=2.0,
+            flow_max_l_min=4.0,
+            curve_l_min=(2.0, 4.1),
+        ),
+        FlowLaw(
+            nozzles=12,
+            slope=17.67,
+            offset=-9.874,
+            flow_min_l_min=4.0,
+            flow_max_l_min=6.0,
+            curve_l_min=(3.7, 6.0),
+        ),
+    )
+}
 
 
 # P1: eight nozzles below 4 L/min, twelve above; the hysteresis keeps a flow near 4 from

@@ -163,7 +163,7 @@ def test_the_largest_disagreements_lie_at_2_l_min_and_at_a_duty_of_90_percent() 
 
 def test_law_and_its_inverse_agree() -> None:
     for published in SETS:
-        assert published.law_flow_l_min(published.law_duty(3.3)) == pytest.approx(3.3)
+        assert published.law_flow_l_min(published.law.duty(3.3)) == pytest.approx(3.3)
 
 
 # ------------------------------------------------------------------------------- the command line

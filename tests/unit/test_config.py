@@ -10,6 +10,7 @@ import pytest
 from companion.config import Config, load
 from companion.config.rules import mismatches, without_effect
 from companion.config.wording import allowed_text
+from companion.core.nozzle import choose_set
 from companion.core.types import Fix, Method
 from companion.errors import ConfigError
 
@@ -66,6 +67,78 @@ def test_example_becomes_types_of_the_core() -> None:
     assert config.look_ahead_s() == pytest.approx(0.97)
     assert config.limits().fix is Fix.RTK_FLOAT
     assert config.limits().modes == {"AUTO"}
+
+
+SET = """[[nozzle_set]]
+valves = ["1", "2", "3", "4", "5", "6"]
+duty = [0.2, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0]
+flow_l_min = [1.476, 3.024, 3.276, 4.62, 5.052, 5.952, 6.096]
+"""
+PRESETS = """[[nozzle_set]]
+valves = ["1", "2", "3", "4", "5", "6"]
+preset = "wang-2024-eq2"
+[[nozzle_set]]
+valves = ["1", "2", "3", "4"]
+preset = "wang-2024-eq2"
+"""
+
+
+def with_sets(folder: Path, sets: str) -> Path:
+    text = EXAMPLE.read_text(encoding="utf-8")
+    assert SET in text
+    path = folder / "config.toml"
+    path.write_text(text.replace(SET, sets), encoding="utf-8")
+    return path
+
+
+def test_the_published_law_is_a_preset_for_both_of_its_sets(tmp_path: Path) -> None:
+    config = load(with_sets(tmp_path, PRESETS))
+    eight, twelve = config.nozzle_sets()
+    assert (eight.valves, twelve.valves) == ((0, 1, 2, 3), (0, 1, 2, 3, 4, 5))
+    # Wang et al. 2024, Eq. 2: 18.73 Q + 17.557 and 17.67 Q - 9.874, in percent.
+    for flow in (2.0, 3.0, 3.99):
+        assert 100.0 * eight.curve.duty_for(flow) == pytest.approx(18.73 * flow + 17.557)
+    for flow in (4.0, 5.0, 6.0):
+        assert 100.0 * twelve.curve.duty_for(flow) == pytest.approx(17.67 * flow - 9.874)
+    # Outside: held at the ends, closed below half of the least.
+    assert twelve.curve.duty_for(7.0) == twelve.curve.duty_for(6.0)
+    assert eight.curve.duty_for(1.5) == eight.curve.duty_for(2.0)
+    assert eight.curve.duty_for(0.9) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("flow_l_min", "current", "expected"),
+    [(4.09, 0, 0), (4.11, 0, 1), (3.71, 1, 1), (3.69, 1, 0), (2.0, 1, 0), (6.0, 0, 1)],
+)
+def test_the_published_laws_sets_change_with_hysteresis(
+    tmp_path: Path, flow_l_min: float, current: int, expected: int
+) -> None:
+    sets = load(with_sets(tmp_path, PRESETS)).nozzle_sets()
+    assert choose_set(sets, flow_l_min, current=current) == expected
+    assert sets[expected].curve.delivers(flow_l_min)
+
+
+def test_a_published_law_is_warned_of(tmp_path: Path) -> None:
+    found = list(without_effect(load(with_sets(tmp_path, PRESETS))))
+    assert [each.key for each in found] == ["nozzle_set[0].preset", "nozzle_set[1].preset"]
+    assert "measure yours" in found[0].text
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("nozzles = 2\n", "nozzles = 1\n"), "is of 8 or 12 nozzles, this set has 6"),
+        (("nozzles = 2\n", ""), "this set has no valve.nozzles for each"),
+        (('"5", "6"]\n', '"5", "6"]\nduty = [0.2, 1.0]\n'), "says the flow already"),
+        (("wang-2024-eq2", "wang-2025"), "nozzle_set[0].preset"),
+    ],
+)
+def test_a_published_law_for_another_sprayer_is_refused(
+    tmp_path: Path, change: tuple[str, str], said: str
+) -> None:
+    path = with_sets(tmp_path, PRESETS)
+    path.write_text(path.read_text(encoding="utf-8").replace(*change), encoding="utf-8")
+    assert said in refusal(path)
 
 
 def test_every_lag_reaches_the_core_under_its_own_name(tmp_path: Path) -> None:
