@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.report.legal_fields import Facts
 
@@ -55,6 +56,7 @@ def facts_of(
         height_m=_mean(flight.height_m[spraying]),
         speed_m_s=_mean(flight.speed_m_s[spraying]),
         wind_m_s=_wind(flight, treated),
+        wind_note=wind_note(flight),
         training=flight.training,
         is_closed=flight.is_closed,
         lost_rows=flight.lost + unread,
@@ -89,7 +91,24 @@ def _wind(flight: AppliedFlight, treated: Treated) -> float | None:
     if series is None or treated.first_s is None or treated.last_s is None:
         return None
     inside = (series.time_s >= treated.first_s) & (series.time_s <= treated.last_s)
-    return _mean(series.value[inside])
+    return _mean(series.value[inside & _is_estimate(series.value)])
+
+
+def _is_estimate(wind_m_s: Floats) -> NDArray[np.bool_]:
+    """Return which winds are estimates: not exactly 0, and not the same as the one before.
+
+    The companion says so itself now; journals of before hold what the autopilot told.
+    """
+    moves = np.concatenate(([False], wind_m_s[1:] != wind_m_s[:-1]))
+    return np.asarray(np.isfinite(wind_m_s) & (wind_m_s != 0.0) & moves)
+
+
+def wind_note(flight: AppliedFlight) -> str:
+    """Return that the autopilot told winds and knew none; empty where it told none, or knew it."""
+    series = flight.wind_m_s
+    if series is None or _is_estimate(series.value).any():
+        return ""
+    return "the wind in flight is not known: the autopilot told exactly 0, or always the same"
 
 
 def _mean(values: Floats) -> float | None:

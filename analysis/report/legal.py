@@ -196,6 +196,8 @@ def _remarks(told: Told, facts: Facts) -> Iterator[str]:
         yield "times are as the operator gave them"
     if not facts.is_closed:
         yield "the journal was cut; up to its last second may be missing"
+    if facts.wind_note:
+        yield facts.wind_note
     if facts.training is None:
         yield "whether product or water was sprayed is not in the journal"
     if is_told(told.values.get("application.remarks")):

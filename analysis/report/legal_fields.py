@@ -41,6 +41,7 @@ class Facts:
     height_m: float | None
     speed_m_s: float | None
     wind_m_s: float | None
+    wind_note: str
     training: str | None
     is_closed: bool
     lost_rows: int

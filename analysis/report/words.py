@@ -11,6 +11,7 @@ from analysis.assess.rate_wishes import rate_wishes
 from analysis.flown.holes import UNREAD
 from analysis.flown.unknown import GAP_S
 from analysis.report.clock import duration_text
+from analysis.report.facts import wind_note
 from companion.core.types import Inhibit
 
 if TYPE_CHECKING:
@@ -128,6 +129,7 @@ def warnings_of(
         *_inhibited(flight, assessment, treated),
         *held_ground(assessment),
         *_wishes(flight, clock),
+        *_wind(flight),
         *_flow(assessment, why_not_evaluated),
         *_records(records),
     ]
@@ -168,6 +170,13 @@ def _journal(flight: AppliedFlight, clock: Clock) -> Iterator[Caution]:
         yield _warning("rows-lost", f"{flight.lost} rows of the journal are lost.")
     if not clock.is_verified:
         yield _warning("clock", "Times are by the clock of the companion, which nobody verified.")
+
+
+def _wind(flight: AppliedFlight) -> Iterator[Caution]:
+    note = wind_note(flight)
+    if note:
+        fix = "Measure it on the ground and give it (application.wind_m_s)."
+        yield _note("wind-unknown", f"{note[0].upper()}{note[1:]}. {fix}")
 
 
 def _inhibited(

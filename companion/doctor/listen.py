@@ -225,7 +225,7 @@ def _heard(
     vehicle = link.component.codec.vehicle
     heartbeat, position = ear.latest(HeartbeatReport), ear.latest(Telemetry)
     gnss, estimator = ear.latest(GnssReport), ear.latest(EstimatorReport)
-    rc = ear.latest(RcReport)
+    rc, wind = ear.latest(RcReport), ear.latest(WindReport)
     # Not its greeting and not its counts.
     said = tuple(text for text in troubles if not text.startswith(("vehicle: ", "in ")))
     heard = Heard(
@@ -240,7 +240,7 @@ def _heard(
         if position is None
         else Position(latitude_deg=position.latitude_deg, longitude_deg=position.longitude_deg),
         rc_pulse_us=() if rc is None else rc.pulse_us,
-        has_wind=ear.latest(WindReport) is not None,
+        has_wind=wind is not None and wind.speed_m_s is not None,
         is_clock_known=link.component.clock.offset_s is not None,
         outputs_us=ear.outputs_us(),
         is_closed_ordered=is_ordered,

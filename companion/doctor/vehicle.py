@@ -153,6 +153,9 @@ def _wind(heard: Heard, *, required: bool) -> Check:
     if not required:
         return not_applicable("wind", "safety.wind_required is false")
     if not heard.has_wind:
-        fix = "have the autopilot send it, or write safety.wind_required = false and measure it"
-        return fail("wind", "no wind report, without which nothing is sprayed", fix)
+        fix = (
+            "have the autopilot estimate it (exactly 0 is no estimate), or write "
+            "safety.wind_required = false and measure it"
+        )
+        return fail("wind", "no wind is known, without which nothing is sprayed", fix)
     return ok("wind", "reported by the autopilot")

@@ -36,6 +36,7 @@ from companion.link.signing import Signing
 from companion.link.statistics import Meter
 from companion.link.streams import StreamRequest, StreamSupervisor, wanted_streams
 from companion.link.tank import Tank
+from companion.link.wind import WindWatch
 
 _POSITION = 33
 _TIMESYNC_S = 1.0
@@ -103,6 +104,7 @@ class Component:
             is_used=options.use_mission,
             is_needed=options.need_mission,
         )
+        self._wind = WindWatch()
         self._flies_mission = False
         self._supervisor: StreamSupervisor | None = None
         self._boot_s: float | None = None
@@ -176,7 +178,7 @@ class Component:
                 self._meet(received_s)
             if _is_input(message):
                 self._look_at(message)
-                inputs.append(message)
+                inputs.append(self._wind.take(message))
             elif isinstance(message, CommandReceived):
                 inputs.extend(self._service.obey(message))
             elif isinstance(message, ParamAsked | ParamSet):

@@ -71,6 +71,8 @@ class Gauge:
                 "wiring of its bus"
             )
         if error is not None:
+            self._ended = None
+            self._ending.set()
             raise error
         self._begun_s = self._clock()
 
@@ -88,23 +90,21 @@ class Gauge:
                 loop.call_soon_threadsafe(call, *args)
 
         try:
+            self._source.open()
+        except SensorError as error:
+            post(_settle, opened, error)
+            return
+        post(_settle, opened, None)
+        while not ending.is_set():
             try:
-                self._source.open()
-            except SensorError as error:
-                post(_settle, opened, error)
-                return
-            post(_settle, opened, None)
-            while not ending.is_set():
-                try:
-                    volts = self._source.read_v()
-                except OSError as error:
-                    post(self._failed, str(error))
-                else:
-                    post(self.take, self._clock(), volts)
-                ending.wait(1.0 / self._rate_hz)
-            self._source.close()
-        finally:
-            post(ended.set)
+                volts = self._source.read_v()
+            except OSError as error:
+                post(self._failed, str(error))
+            else:
+                post(self.take, self._clock(), volts)
+            ending.wait(1.0 / self._rate_hz)
+        self._source.close()
+        post(ended.set)
 
     def _failed(self, text: str) -> None:
         self._error = f"{self._loop.name}: converter does not answer: {text}"

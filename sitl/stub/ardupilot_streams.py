@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from sitl.stub.firmware import Builder
 from sitl.stub.mission import current
 from sitl.stub.protocol import Message, dialect
-from sitl.stub.streams import COMMON, HEALTHY, LOST, version_word
+from sitl.stub.streams import COMMON, HEALTHY, LOST, estimated, version_word
 
 if TYPE_CHECKING:
     from sitl.stub.autopilot import Autopilot
@@ -41,9 +41,11 @@ def autopilot_version(autopilot: Autopilot, _now_s: float) -> Message:
     )
 
 
-def wind(autopilot: Autopilot, _now_s: float) -> Message:
-    """Return WIND: the direction it comes from."""
-    east_m_s, north_m_s = autopilot.wind_towards_m_s
+def wind(autopilot: Autopilot, now_s: float) -> Message:
+    """Return WIND: the direction it comes from; exactly 0 where none is estimated."""
+    if not autopilot.parameters["EK3_DRAG_BCOEF_X"] > 0.0:
+        return dialect.MAVLink_wind_message(0.0, 0.0, 0.0)
+    east_m_s, north_m_s = estimated(autopilot.wind_towards_m_s, now_s)
     from_deg = math.degrees(math.atan2(-east_m_s, -north_m_s)) % 360.0
     return dialect.MAVLink_wind_message(from_deg, math.hypot(east_m_s, north_m_s), 0.0)
 
@@ -93,14 +95,8 @@ BUILDERS: Mapping[int, Builder] = {
 
 
 def withholds(autopilot: Autopilot, message_id: int, _now_s: float) -> bool:
-    """Return whether a message is not sent now.
-
-    WIND, without an estimate of the airspeed; BATTERY_STATUS, without a monitor.
-    """
-    if message_id == dialect.MAVLINK_MSG_ID_BATTERY_STATUS:
-        return not autopilot.batteries()
-    is_wind = message_id == dialect.MAVLINK_MSG_ID_WIND
-    return bool(is_wind and not autopilot.parameters["EK3_DRAG_BCOEF_X"] > 0.0)
+    """Return whether a message is not sent now: BATTERY_STATUS, without a monitor."""
+    return message_id == dialect.MAVLINK_MSG_ID_BATTERY_STATUS and not autopilot.batteries()
 
 
 def second_servo_output(autopilot: Autopilot, now_s: float) -> Message | None:

@@ -12,7 +12,7 @@ from sitl.stub.faults import FaultKind
 from sitl.stub.firmware import Builder
 from sitl.stub.protocol import Message, dialect
 from sitl.stub.px4_modes import base_mode, custom_mode
-from sitl.stub.streams import COMMON, HEALTHY, LOST, version_word
+from sitl.stub.streams import COMMON, HEALTHY, LOST, estimated, version_word
 
 if TYPE_CHECKING:
     from sitl.stub.autopilot import Autopilot
@@ -72,7 +72,7 @@ def estimator_status(autopilot: Autopilot, now_s: float) -> Message:
 
 def wind_cov(autopilot: Autopilot, now_s: float) -> Message:
     """Return WIND_COV: where it blows to."""
-    east_m_s, north_m_s = autopilot.wind_towards_m_s
+    east_m_s, north_m_s = estimated(autopilot.wind_towards_m_s, now_s)
     return dialect.MAVLink_wind_cov_message(
         autopilot.boot_ms(now_s) * 1000, north_m_s, east_m_s, 0.0, 0.3, 0.0, 60.0, 0.3, 0.0
     )

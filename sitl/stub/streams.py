@@ -170,6 +170,14 @@ def system_time(autopilot: Autopilot, now_s: float) -> Message:
     return dialect.MAVLink_system_time_message(utc_us, autopilot.boot_ms(now_s))
 
 
+def estimated(wind_m_s: tuple[float, float], now_s: float) -> tuple[float, float]:
+    """Return a wind as an estimator tells it: its last digits never stand still."""
+    return (
+        wind_m_s[0] + 0.02 * math.sin(0.7 * now_s),
+        wind_m_s[1] + 0.02 * math.cos(0.7 * now_s),
+    )
+
+
 def version_word(version: tuple[int, int, int]) -> int:
     """Return a version as AUTOPILOT_VERSION has it, marked as a release."""
     major, minor, patch = version

@@ -5,14 +5,16 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 from dataclasses import replace
 from datetime import UTC
 from pathlib import Path
 
+import numpy as np
 import pytest
 import shapely
 
-from analysis.flown.applied_flight import AppliedFlight
+from analysis.flown.applied_flight import AppliedFlight, Series
 from analysis.flown.read_applied import read_applied
 from analysis.report.clock import Clock
 from analysis.report.facts import ends_spraying, facts_of
@@ -21,6 +23,7 @@ from analysis.report.legal_fields import Facts
 from analysis.report.record_files import record_csv, record_json
 from analysis.report.told import told_in, told_with
 from analysis.report.treated import treated_of
+from analysis.report.words import warnings_of
 from companion.config.application_table import PROFILES
 from companion.errors import ConfigError
 from tests.unit.report_flight import EU_TOLD, fly
@@ -115,6 +118,37 @@ def test_a_pilot_who_met_the_requirements_after_the_flight_had_not(facts: Facts)
 def test_a_day_that_never_was_in_a_journal_is_not_believed() -> None:
     said = {**EU_TOLD, "application.start_time": "2026-02-31T06:30:00Z"}
     assert told_in({"application_json": json.dumps(said)}) == EU_TOLD
+
+
+@pytest.mark.parametrize(
+    ("wind_m_s", "known"),
+    [
+        ([0.0, 0.0, 0.0, 0.0], None),  # what ArduCopter tells while it estimates none
+        ([3.0, 3.0, 3.0, 3.0], None),  # an estimate that stopped
+        ([math.nan] * 4, None),
+        ([2.0, 3.0, 3.0, 4.0], 3.5),
+        ([0.0, 3.0, math.nan, 4.0], 3.5),
+    ],
+)
+def test_a_wind_that_is_no_estimate_is_not_known_and_the_record_says_so(
+    flight: AppliedFlight, wind_m_s: list[float], known: float | None
+) -> None:
+    treated = treated_of(flight)
+    assert treated.first_s is not None
+    assert treated.last_s is not None
+    time_s = np.linspace(treated.first_s, treated.last_s, 4)
+    blown = replace(flight, wind_m_s=Series(time_s=time_s, value=np.array(wind_m_s)))
+    facts = facts_of(blown, treated, clock(), volume_l=0.5, volume_by="model", prescribed_l=0.48)
+    assert facts.wind_m_s == known
+    record = legal_record("generic", told_with({}), facts)
+    assert any("the wind in flight is not known" in text for text in record.remarks) is (
+        known is None
+    )
+    assert ("wind_m_s" in record.missing) is (known is None)
+    codes = [each.code for each in warnings_of(
+        blown, None, clock(), [], treated=treated, unread=[], why_not_evaluated=""
+    )]  # fmt: skip
+    assert ("wind-unknown" in codes) is (known is None)
 
 
 def test_wind_that_was_measured_in_flight_needs_no_saying(facts: Facts) -> None:
