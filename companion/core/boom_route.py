@@ -12,18 +12,22 @@ from companion.core.boom import Boom
 from companion.core.crossings import Crossing, Route
 
 
-def boom_route(routes: tuple[Route, ...], boom: Boom, *, merge_s: float = 0.0) -> Route:
+def boom_route(
+    routes: tuple[Route, ...], boom: Boom, *, merge_s: float = 0.0, shuts_outside: bool = False
+) -> Route:
     """Return the mean rate over the boom; None where every strip is closed.
 
     Sections cross a slanting boundary one after the other. Steps between two flows that are nearer
     to each other than `merge_s` become one, at the moment at which it carries the same volume.
+    Where every strip is closed, the boom is outside as soon as one of them is; with
+    `shuts_outside` it is closed there.
 
     >>> from companion.core.boom import Valve
     >>> boom = Boom(width_m=4.0, valves=tuple(
     ...     Valve(name=name, right_m=0.0, forward_m=0.0, width_m=w) for name, w in (("1", 1.0),
     ...                                                                             ("2", 3.0))))
-    >>> left = (Crossing(0.0, None, False, 5.0), Crossing(1.0, 20.0, True, 5.0))
-    >>> right = (Crossing(0.0, None, False, 5.0), Crossing(1.5, 20.0, True, 5.0))
+    >>> left = (Crossing(0.0, None, True, 5.0), Crossing(1.0, 20.0, False, 5.0))
+    >>> right = (Crossing(0.0, None, True, 5.0), Crossing(1.5, 20.0, False, 5.0))
     >>> [(step.at_s, step.rate_l_ha) for step in boom_route((left, right), boom)]
     [(0.0, None), (1.0, 5.0), (1.5, 20.0)]
     """
@@ -34,22 +38,25 @@ def boom_route(routes: tuple[Route, ...], boom: Boom, *, merge_s: float = 0.0) -
         for crossing in route[1:]:
             crossings.setdefault(crossing.at_s, []).append((valve, crossing))
     rates = [route[0].rate_l_ha or 0.0 for route in routes]
+    is_outside = [route[0].outside for route in routes]
 
-    def mean() -> float | None:
+    def whole(at_s: float, speed_m_s: float) -> Crossing:
         rate = sum(rate * width for rate, width in zip(rates, widths, strict=True)) / whole_m
-        return rate if rate > 0.0 else None
+        outside = any(is_outside)
+        if rate > 0.0 and not (outside and shuts_outside):
+            return Crossing(at_s, rate, False, speed_m_s)
+        return Crossing(at_s, None, outside, speed_m_s)
 
     first = routes[len(routes) // 2][0]
-    made = [Crossing(first.at_s, mean(), False, first.speed_m_s)]
+    made = [whole(first.at_s, first.speed_m_s)]
     for at_s in sorted(crossings):
         here = crossings[at_s]
         for valve, crossing in here:
             rates[valve] = crossing.rate_l_ha or 0.0
-        rate = mean()
-        if rate != made[-1].rate_l_ha:
-            speed_m_s = sum(crossing.speed_m_s for _, crossing in here) / len(here)
-            border = any(crossing.border for _, crossing in here)
-            made.append(Crossing(at_s, rate, border, speed_m_s))
+            is_outside[valve] = crossing.outside
+        now = whole(at_s, sum(crossing.speed_m_s for _, crossing in here) / len(here))
+        if not now.is_as(made[-1]):
+            made.append(now)
     return _merged(tuple(made), merge_s) if merge_s > 0.0 else tuple(made)
 
 
@@ -92,9 +99,11 @@ def bridged(route: Route, gap_s: float) -> Route:
     made: list[Crossing] = [route[0]]
     for i in range(1, len(route)):
         step = route[i]
-        follows_s = route[i + 1].at_s if i + 1 < len(route) else float("inf")
-        if step.rate_l_ha is None and follows_s - step.at_s < gap_s:
-            continue
-        if step.rate_l_ha != made[-1].rate_l_ha:
+        if step.rate_l_ha is None and made[-1].rate_l_ha is not None:
+            again = (each.at_s for each in route[i:] if each.rate_l_ha is not None)
+            follows_s = next(again, float("inf"))
+            if follows_s - step.at_s < gap_s:
+                continue
+        if not step.is_as(made[-1]):
             made.append(step)
     return tuple(made)

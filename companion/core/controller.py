@@ -20,7 +20,7 @@ from companion.core.interlock import Held, closed_plan, guard, inhibits, settled
 from companion.core.pump import DRY, PumpMemory, on_off
 from companion.core.rate import flow_for_rate, overridden
 from companion.core.routes import routes_ahead
-from companion.core.schedule import Dosing, ValveSchedule, schedule
+from companion.core.schedule import Dosing, ValveSchedule, schedule, sticky_border_s
 from companion.core.sets import SetOfRate, dosing_by_valve, sets_ahead
 from companion.core.setup import Setup
 from companion.core.sprayer_state import BOOT, Machine, shown
@@ -97,6 +97,7 @@ def step(
     dosing = dosing_by_valve(setup.nozzle_sets, index, set_of_rate, dose)
     soon_m_s = speed_soon(setup, state, speed_m_s)
     overdrive = overdrive_of(setup, index)
+    sticky_s = sticky_border_s(setup.border_buffer_m, speed_m_s)
     valves = []
     own_ways, pump_memory = ways(setup, routes, memory.pump, now_s)
     for valve, route in enumerate(own_ways):
@@ -113,6 +114,7 @@ def step(
                 now_s=now_s,
                 until_s=until_s,
                 overdrive=overdrive,
+                sticky_border_s=sticky_s,
             )
         )
     plan = SprayPlan(

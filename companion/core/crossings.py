@@ -37,14 +37,21 @@ START_NUDGE_M = 1e-6
 class Crossing(NamedTuple):
     """From `at_s` on the footprint is prescribed `rate_l_ha`; None is closed.
 
-    `border` marks a change that the border rule makes (nothing may fall outside), `speed_m_s` is
-    the footprint's own speed there.
+    `outside` says that nothing may fall from here on: part of the strip is beyond the border. Its
+    rate is None then; ground that is closed for another reason may lie on either side of it.
+    `speed_m_s` is the footprint's own speed there.
     """
 
     at_s: float
     rate_l_ha: float | None
-    border: bool
+    outside: bool
     speed_m_s: float
+
+    def is_as(self, other: Crossing) -> bool:
+        """Return whether the same holds as from another crossing on."""
+        if self.rate_l_ha != other.rate_l_ha:
+            return False
+        return self.rate_l_ha is not None or self.outside == other.outside
 
 
 # A valve's future: the first entry holds at the start of the path, the others are crossings.
@@ -295,7 +302,11 @@ def _combine(
     speeds: list[float],
     border: Border,
 ) -> Route:
-    """Return one timeline of rates, closed where the border rule says so."""
+    """Return one timeline of rates, closed where the border rule says so.
+
+    Which ground is outside is told by the intervals alone: where a zone ends at the border, the
+    times of the two differ by rounding, and the one that comes first says nothing.
+    """
     if not closed:
         return tuple(Crossing(at_s, rate, False, speed) for at_s, rate, speed in rates)
     strict = border == "inside"
@@ -303,13 +314,12 @@ def _combine(
     start_s, end_s = paths.time_s[0], paths.time_s[-1]
     pace = {at_s: speed for at_s, _, speed in rates}
     route: list[Crossing] = []
-    shut_before = False
     for at_s in sorted(ends | set(pace) | {start_s}):
         shut = any(begin <= at_s < end for begin, end in closed)
         rate = None if shut else _value_at(rates, at_s)
-        if not route or rate != route[-1].rate_l_ha:
+        outside = strict and shut
+        if not route or rate != route[-1].rate_l_ha or outside != route[-1].outside:
             share = (at_s - start_s) / (end_s - start_s)
             speed = pace.get(at_s, speeds[0] + share * (speeds[1] - speeds[0]))
-            route.append(Crossing(at_s, rate, strict and shut != shut_before, speed))
-        shut_before = shut
+            route.append(Crossing(at_s, rate, outside, speed))
     return tuple(route)

@@ -18,7 +18,7 @@ from companion.core.drive_plans import (
 )
 from companion.core.pump import Pumping, PumpMemory, pump_route, sections
 from companion.core.rate import flow_for_rate, overridden
-from companion.core.schedule import ValveSchedule, rate_at, schedule
+from companion.core.schedule import ValveSchedule, rate_at, schedule, sticky_border_s
 from companion.core.types import DrivePlan, SprayPlan, VehicleState
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def with_drives(
             _pump(
                 setup.pumping, state, plan, routes,
                 in_force=fraction_in_force(before, 0, now_s),
-                speed_m_s=speed_m_s, skew=skew / gain,
+                speed_m_s=speed_m_s, skew=skew / gain, border_buffer_m=setup.border_buffer_m,
             )
         )  # fmt: skip
     elif setup.pump is not None:
@@ -99,6 +99,7 @@ def _pump(
     in_force: float,
     speed_m_s: float,
     skew: float,
+    border_buffer_m: float,
 ) -> DrivePlan:
     found = schedule(
         pump_route(pumping, routes),
@@ -110,6 +111,7 @@ def _pump(
         now_s=plan.issued_s,
         until_s=plan.lease_until_s,
         overdrive=overdrive_of(pumping, 0),
+        sticky_border_s=sticky_border_s(border_buffer_m, speed_m_s),
     )
     drive = as_drive(in_force, found.changes)
     return behind_path(plan, drive) if pumping.pump.way == "valves" else drive

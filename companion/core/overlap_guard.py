@@ -99,13 +99,9 @@ def guarded(
     if treated is None or _is_far(setup, treated, state):
         return routes
     paths = predict(state, boom.right_m, boom.forward_m, back_s=setup.back_s, ahead_s=setup.ahead_s)
-    lag = setup.lag
-    # So near to a border its stricter rule holds for the guard's changes too.
-    strict_s = 2.0 * max(lag.on_s - lag.on_start_s, lag.off_end_s - lag.off_s) + 0.05
     spans = treated_spans(treated, paths, boom, share=guard.switch_off_percent / 100.0)
     return tuple(
-        cut(route, own, strict_s=strict_s) if own else route
-        for route, own in zip(routes, spans, strict=True)
+        cut(route, own) if own else route for route, own in zip(routes, spans, strict=True)
     )
 
 
@@ -192,14 +188,13 @@ def _spans(own: Bools, times: Floats) -> Spans:
     return list(zip(at_s[::2], at_s[1::2], strict=True))
 
 
-def cut(route: Route, spans: Spans, *, strict_s: float) -> Route:
+def cut(route: Route, spans: Spans) -> Route:
     """Return the route closed within the spans, and between them where it is hardly open.
 
-    A change less than `strict_s` from where the border closes the route is by the border's rule:
-    nothing may fall outside because there is treated ground at the edge.
+    What lies outside stays marked as such: the border's rule holds whatever is treated at the edge.
 
     >>> route = (Crossing(0.0, 20.0, False, 5.0), Crossing(4.0, None, True, 5.0))
-    >>> [(step.at_s, step.rate_l_ha) for step in cut(route, [(1.0, 2.0)], strict_s=0.1)]
+    >>> [(step.at_s, step.rate_l_ha) for step in cut(route, [(1.0, 2.0)])]
     [(0.0, 20.0), (1.0, None), (2.0, 20.0), (4.0, None)]
     """
     times = {step.at_s for step in route}
@@ -212,18 +207,10 @@ def cut(route: Route, spans: Spans, *, strict_s: float) -> Route:
         own = route[number]
         is_shut = any(begin_s <= at_s < end_s for begin_s, end_s in spans)
         rate = None if is_shut else own.rate_l_ha
-        if made and made[-1].rate_l_ha == rate:
-            continue
-        if own.at_s == at_s:
-            made.append(own._replace(rate_l_ha=rate))
-        else:
-            is_strict = _is_near_border(route, at_s, strict_s)
-            made.append(Crossing(at_s, rate, is_strict, own.speed_m_s))
+        here = own._replace(at_s=at_s, rate_l_ha=rate)
+        if not (made and here.is_as(made[-1])):
+            made.append(here)
     return _without_slivers(made, spans)
-
-
-def _is_near_border(route: Route, at_s: float, strict_s: float) -> bool:
-    return any(step.border and abs(step.at_s - at_s) <= strict_s for step in route)
 
 
 def _without_slivers(made: list[Crossing], spans: Spans) -> Route:
@@ -242,6 +229,6 @@ def _without_slivers(made: list[Crossing], spans: Spans) -> Route:
             and (ahead.at_s - step.at_s) * step.speed_m_s < STRETCH_MIN_M
         ):
             continue
-        if step.rate_l_ha != kept[-1].rate_l_ha:
+        if not step.is_as(kept[-1]):
             kept.append(step)
     return tuple(kept)

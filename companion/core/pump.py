@@ -178,7 +178,11 @@ def _on_off(route: Route, dwell_s: float) -> Route:
     made: list[Crossing] = []
     for step in route:
         is_open = bool(step.rate_l_ha)
-        if not made or (made[-1].rate_l_ha is not None) != is_open:
+        if (
+            not made
+            or (made[-1].rate_l_ha is not None) != is_open
+            or made[-1].outside != step.outside
+        ):
             made.append(step if is_open else step._replace(rate_l_ha=None))
     return resolve(tuple(made), dwell_s)[0]
 
@@ -197,15 +201,20 @@ def _start_s(route: Route, now_s: float) -> float:
 
 
 def _opened_early(route: Route, now_s: float, pumping: Pumping) -> Route:
-    """Return the route with its next opening sooner: what lies ahead of it is shut anyway."""
-    made: list[Crossing] = list(route)
+    """Return the route with its next opening sooner: what lies ahead of it is shut anyway.
+
+    Outside too: what comes out is the pump's, and its start is bound to the border.
+    """
     for i, step in enumerate(route):
         if i and step.rate_l_ha is not None and step.at_s > now_s:
-            by_s = pumping.early_border_s if step.border else pumping.early_s
-            at_s = max(step.at_s - by_s, route[i - 1].at_s)
-            made[i] = step._replace(at_s=at_s)
-            break
-    return tuple(made)
+            first = i - 1
+            while first > 0 and route[first - 1].rate_l_ha is None:
+                first -= 1
+            by_s = pumping.early_border_s if route[i - 1].outside else pumping.early_s
+            at_s = max(step.at_s - by_s, route[first].at_s)
+            shut = (each for each in route[first + 1 : i] if each.at_s < at_s)
+            return (*route[: first + 1], *shut, step._replace(at_s=at_s), *route[i + 1 :])
+    return route
 
 
 def on_off(rate_l_ha: float, speed_m_s: float) -> float:  # noqa: ARG001
@@ -219,9 +228,9 @@ def pump_route(pumping: Pumping, routes: tuple[Route, ...]) -> Route:
     dwell_s = pumping.valve_timing.dwell_min_s
     merge_s = max(MERGE_SHARE * max(lag.up_time_s, lag.down_time_s), MERGE_MIN_S)
     sprayed = tuple(_where_open(route, _on_off(route, dwell_s)) for route in routes)
+    if pumping.pump.way == "always":  # nothing shuts the one nozzle that is outside
+        return boom_route(sprayed, pumping.boom, merge_s=merge_s, shuts_outside=True)
     whole = boom_route(sprayed, pumping.boom, merge_s=merge_s)
-    if pumping.pump.way == "always":
-        return whole
     return bridged(whole, timing.on_s)
 
 
@@ -231,6 +240,7 @@ def _where_open(route: Route, on: Route) -> Route:
     made: list[Crossing] = []
     for at_s in sorted(steps):
         rate = (rate_at(route, at_s) or None) if _is_open_at(on, at_s) else None
-        if not made or rate != made[-1].rate_l_ha:
-            made.append(steps[at_s]._replace(rate_l_ha=rate))
+        here = steps[at_s]._replace(rate_l_ha=rate)
+        if not (made and here.is_as(made[-1])):
+            made.append(here)
     return tuple(made)

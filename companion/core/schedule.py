@@ -2,13 +2,15 @@
 
 A change of rate is ordered at crossing - lag(kind) - output delay, so that the volume-equivalent
 step lies on the crossing. At the border the rule is stricter: off is complete before the strip's
-first contact with the outside, on begins after its last. The schedule keeps no state of its own:
+first contact with the outside, on begins after its last, and no other order holds between the two
+(`shut_spans`). The schedule keeps no state of its own:
 it is computed anew in every step from a path that begins a little in the past, so that a change
 already ordered is found again and not ordered twice.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -37,6 +39,8 @@ TRIM_HOLD_S = 0.03
 # How far ahead of its time a change that was already ordered is left alone when the prediction
 # moves it back: without this, noise would revert it for a moment and order it again.
 STICKY_S = 0.1
+# At the border this long, as a way: what the buffer leaves, or what a position is known to.
+STICKY_BORDER_M = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,12 +130,12 @@ class Timing:
         """Return the longest lead of all."""
         return max(self.on_s, self.off_s, self.up_s, self.down_s, self.border_off_s)
 
-    def lead_s(self, before: float, after: float, *, border: bool) -> float:
-        """Return the lead of a change from one duty to another."""
-        if before <= 0.0:
-            return self.border_on_s if border else self.on_s
+    def lead_s(self, before: float, after: float) -> float:
+        """Return the lead of a change from one duty to another inside the field."""
         if after <= 0.0:
-            return self.border_off_s if border else self.off_s
+            return self.off_s
+        if before <= 0.0:
+            return self.on_s
         return self.up_s if after > before else self.down_s
 
 
@@ -140,12 +144,16 @@ Dosing = Callable[[float, float], float]
 
 
 class Order(NamedTuple):
-    """A change of one valve with the moment at which it is due; `driven` past its target."""
+    """A change of one valve with the moment at which it is due.
+
+    `driven` is one past its target, `bound` one that the border allows no sooner.
+    """
 
     at_s: float
     duty: float
     rate_l_ha: float | None
     driven: bool = False
+    bound: bool = False
 
 
 class ValveSchedule(NamedTuple):
@@ -180,7 +188,7 @@ def _resolve_once(route: Route, dwell_min_s: float) -> tuple[Route, int]:
     while i < len(route):
         crossing = route[i]
         following = route[i + 1] if i + 1 < len(route) else None
-        stay_s = float("inf") if following is None else following.at_s - crossing.at_s
+        stay_s = math.inf if following is None else following.at_s - crossing.at_s
         before = kept[-1].rate_l_ha
         if (
             following is None
@@ -188,7 +196,7 @@ def _resolve_once(route: Route, dwell_min_s: float) -> tuple[Route, int]:
             or crossing.rate_l_ha is None
             or not dwell_min_s > 0.0
         ):
-            if crossing.rate_l_ha != before:
+            if not crossing.is_as(kept[-1]):
                 kept.append(crossing)
             i += 1
             continue
@@ -201,11 +209,10 @@ def _resolve_once(route: Route, dwell_min_s: float) -> tuple[Route, int]:
         else:
             rate = crossing.rate_l_ha
             merged = before if abs(rate - before) <= abs(rate - after) else after
-        if merged is None and before is not None:
-            # close already here: the rest of the way to the closed ground is too short
-            kept.append(Crossing(crossing.at_s, None, following.border, crossing.speed_m_s))
-        elif merged != before:
-            kept.append(Crossing(crossing.at_s, merged, crossing.border, crossing.speed_m_s))
+        # where nothing is left it closes here: the way to the closed ground is too short
+        crossing = crossing._replace(rate_l_ha=merged)
+        if not crossing.is_as(kept[-1]):
+            kept.append(crossing)
         i += 1
     return tuple(kept), dropped
 
@@ -216,25 +223,87 @@ def orders(
     """Return the orders of one valve along its route, in order of time.
 
     The first has no time: it held before the path began. An order that would be due before the
-    one ahead of it takes its place: the plant could not follow both.
+    one ahead of it takes its place: the plant could not follow both. But none opens a valve sooner
+    than what it opens for, or keeps one open over closed ground; and the border has the last word.
     """
+    made = _by_kind(route, timing, dosing, overdrive)
+    for begin_s, end_s in shut_spans(route, timing):
+        made = _shut_between(made, begin_s, end_s)
+    return made
+
+
+def _by_kind(
+    route: Route, timing: Timing, dosing: Dosing, overdrive: Overdrive | None
+) -> list[Order]:
+    """Return the orders as they would be inside a field, each ahead by the lag of its kind."""
     first = route[0]
     duty = 0.0 if first.rate_l_ha is None else dosing(first.rate_l_ha, first.speed_m_s)
-    made = [Order(float("-inf"), duty, first.rate_l_ha)]
+    made = [Order(-math.inf, duty, first.rate_l_ha)]
     for crossing in route[1:]:
         rate = crossing.rate_l_ha
         duty = 0.0 if rate is None else dosing(rate, crossing.speed_m_s)
-        at_s = crossing.at_s - timing.lead_s(made[-1].duty, duty, border=crossing.border)
+        at_s = crossing.at_s - timing.lead_s(made[-1].duty, duty)
         drive = None if overdrive is None else overdrive.between(made[-1].duty, duty)
         if drive is not None:
             at_s += drive.saved_s
         while len(made) > 1 and (made[-1].at_s >= at_s or made[-1].driven):
+            if duty > 0.0 and (made[-1].duty > 0.0) != (made[-2].duty > 0.0):
+                # What opens or closes here stays: this one comes with it, or once it has closed.
+                at_s, drive = made[-1].at_s, None
+                if made[-1].duty > 0.0:
+                    made.pop()
+                else:
+                    at_s += timing.dwell_min_s
+                break
             made.pop()
         if drive is not None:
             made.append(Order(at_s, drive.duty, rate, driven=True))
             at_s += drive.for_s
         made.append(Order(at_s, duty, rate))
     return made
+
+
+def shut_spans(route: Route, timing: Timing) -> list[tuple[float, float]]:
+    """Return from when until when the border has a valve ordered shut, in order of time.
+
+    The last flow ends before the first contact with the outside and the first one begins after
+    the last contact; a closing is given the time to be one, however narrow the ground is.
+    """
+    found: list[tuple[float, float]] = []
+    since_s: float | None = None
+    for crossing in route:
+        if crossing.outside and since_s is None:
+            since_s = crossing.at_s - timing.border_off_s if crossing is not route[0] else -math.inf
+        elif not crossing.outside and since_s is not None:
+            end_s = max(crossing.at_s - timing.border_on_s, since_s + timing.dwell_min_s)
+            _add_span(found, since_s, end_s)
+            since_s = None
+    if since_s is not None:
+        _add_span(found, since_s, math.inf)
+    return found
+
+
+def _add_span(found: list[tuple[float, float]], begin_s: float, end_s: float) -> None:
+    if found and begin_s <= found[-1][1]:
+        begin_s, end_s = found[-1][0], max(found.pop()[1], end_s)
+    found.append((begin_s, end_s))
+
+
+def _shut_between(made: list[Order], begin_s: float, end_s: float) -> list[Order]:
+    """Return the orders with nothing but closed between two times, and what then holds after it."""
+    held = [order for order in made if order.at_s < begin_s]
+    held.append(Order(begin_s, 0.0, None))
+    if end_s == math.inf:
+        return held
+    following = len(made)
+    while made[following - 1].at_s > end_s:
+        following -= 1
+    if made[following - 1].driven:  # a valve that opens is not driven
+        following += 1
+    stands = made[following - 1]
+    if stands.rate_l_ha is not None:
+        held.append(Order(end_s, stands.duty, stands.rate_l_ha, bound=True))
+    return held + made[following:]
 
 
 def schedule(
@@ -248,11 +317,13 @@ def schedule(
     now_s: float,
     until_s: float,
     overdrive: Overdrive | None = None,
+    sticky_border_s: float = 0.0,
 ) -> ValveSchedule:
     """Return the changes of one valve from `now_s` until the lease ends.
 
     `in_force` is the duty that the last plan has brought about by now, `speed_soon_m_s` the
-    footprint's speed when a trim ordered now would act.
+    footprint's speed when a trim ordered now would act. What opened at the border stays open when
+    it turns out to be due up to `sticky_border_s` later.
     """
     if len(route) == 1 and _holds(route[0], dosing, speed_soon_m_s, in_force):
         return ValveSchedule((), False, 0, route[0].rate_l_ha)  # in the middle of a zone
@@ -264,7 +335,9 @@ def schedule(
         made = orders(resolved, timing, dosing, overdrive)
         while due + 1 < len(made) and made[due + 1].at_s <= now_s:
             due += 1
-        if due + 1 < len(made) and _already_ordered(made[due], made[due + 1], in_force, now_s):
+        if due + 1 < len(made) and _already_ordered(
+            made[due], made[due + 1], in_force, now_s, sticky_border_s
+        ):
             due += 1
         rate = made[due].rate_l_ha
     duty = 0.0 if rate is None else dosing(rate, speed_soon_m_s)
@@ -279,7 +352,7 @@ def schedule(
         if restart:
             changes.append(TimedChange(at_s=now_s, valve=valve, duty=duty))
         else:
-            next_s = made[due + 1].at_s if due + 1 < len(made) else float("inf")
+            next_s = made[due + 1].at_s if due + 1 < len(made) else math.inf
             changes.extend(_trims(valve, in_force, duty, now_s, next_s - TRIM_HOLD_S))
     changes.extend(
         TimedChange(at_s=order.at_s, valve=valve, duty=order.duty)
@@ -309,9 +382,25 @@ def _holds(zone: Crossing, dosing: Dosing, speed_m_s: float, in_force: float) ->
     return abs(duty - in_force) < DUTY_STEP and (duty == 0.0) == (in_force == 0.0)
 
 
-def _already_ordered(now: Order, following: Order, in_force: float, now_s: float) -> bool:
-    """Whether the next order stands already and is only a moment ahead of its time."""
-    if not following.at_s - now_s < STICKY_S:
+def sticky_border_s(border_buffer_m: float, speed_m_s: float) -> float:
+    """Return for how long ahead of its time an opening at the border is left alone.
+
+    >>> sticky_border_s(0.1, 5.0), sticky_border_s(0.0, 5.0)
+    (0.02, 0.004)
+    """
+    return max(border_buffer_m, STICKY_BORDER_M) / max(speed_m_s, 0.1)
+
+
+def _already_ordered(
+    now: Order, following: Order, in_force: float, now_s: float, sticky_border_s: float
+) -> bool:
+    """Whether the next order stands already and is only a moment ahead of its time.
+
+    Of two that ask for the same, one behind and one ahead of what lies between them, it is the
+    nearer one that stands: a short closing that is only just due is not skipped.
+    """
+    most_s = min(STICKY_S, sticky_border_s) if following.bound else STICKY_S
+    if not following.at_s - now_s < min(most_s, now_s - now.at_s):
         return False
     to_next = abs(following.duty - in_force)
     return to_next <= 0.03 * max(following.duty, in_force) and to_next < abs(now.duty - in_force)

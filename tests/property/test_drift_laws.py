@@ -157,7 +157,7 @@ def test_an_offset_of_nothing_changes_nothing(state: VehicleState) -> None:
     for one, other in zip(routes(state, None, 0.1), routes(state, (0.0, 0.0), 0.1), strict=True):
         assert [crossing.rate_l_ha for crossing in one] == [c.rate_l_ha for c in other]
         for mine, its in zip(one, other, strict=True):
-            assert mine.border == its.border
+            assert mine.outside == its.outside
             assert abs(mine.at_s - its.at_s) < 1e-9
 
 

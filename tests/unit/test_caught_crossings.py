@@ -90,7 +90,7 @@ def test_a_strip_beside_the_border_keeps_the_buffer(north_m: float, rate: float 
     assert [value for _, value in found] == [rate]
 
 
-def test_only_the_crossings_that_the_border_makes_are_the_borders() -> None:
+def test_only_ground_beyond_the_border_is_outside() -> None:
     zones = [
         Zone(name="a", polygon=shapely.box(0, 0, 10, 6), rate_l_ha=20.0),
         Zone(name="none", polygon=shapely.box(10, 0, 12, 6), rate_l_ha=0.0),
@@ -100,7 +100,7 @@ def test_only_the_crossings_that_the_border_makes_are_the_borders() -> None:
         Prescription(zones), flying(10.0, 8.0), one_valve(), back_s=0.3, ahead_s=2.0,
         border="inside", border_buffer_m=0.1, across="centre",
     )  # fmt: skip
-    assert [(crossing.rate_l_ha, crossing.border) for crossing in found] == [
+    assert [(crossing.rate_l_ha, crossing.outside) for crossing in found] == [
         (20.0, False),
         (0.0, False),
         (20.0, False),

@@ -18,7 +18,7 @@ from companion.core.coverage import Coverage
 from companion.core.crossings import Crossing, Route
 from companion.core.overlap_guard import STRETCH_MIN_M, OverlapGuard, cut, wake_m
 from companion.core.prescription import Prescription
-from companion.core.schedule import rate_at
+from companion.core.schedule import orders, rate_at
 from companion.core.swath import SNAPSHOTS_MAX
 from companion.core.types import TimedChange
 from tests.builders import LAG, along, flying, plots, setup
@@ -259,8 +259,8 @@ RATES = st.sampled_from([None, 10.0, 20.0])
 def routes(draw: st.DrawFn) -> Route:
     at_s, found = 0.0, []
     for _ in range(draw(st.integers(1, 6))):
-        border = draw(st.booleans())
-        found.append(Crossing(at_s, draw(RATES), border, SPEED))
+        rate = draw(RATES)
+        found.append(Crossing(at_s, rate, rate is None and draw(st.booleans()), SPEED))
         at_s += draw(st.floats(0.02, 2.0))
     return tuple(found)
 
@@ -276,7 +276,7 @@ def spans(draw: st.DrawFn) -> list[tuple[float, float]]:
 def test_what_was_closed_stays_closed_and_treated_ground_is(
     route: Route, own: list[tuple[float, float]], at_s: float
 ) -> None:
-    made = cut(route, own, strict_s=0.1)
+    made = cut(route, own)
     rate = rate_at(made, at_s)
     assert rate is None or rate == rate_at(route, at_s)
     if any(begin <= at_s < end for begin, end in own):
@@ -290,7 +290,7 @@ def test_what_was_closed_stays_closed_and_treated_ground_is(
 def test_it_closes_beside_treated_ground_only_what_is_too_short(
     route: Route, own: list[tuple[float, float]]
 ) -> None:
-    made = cut(route, own, strict_s=0.1)
+    made = cut(route, own)
     times = sorted({step.at_s for step in (*route, *made)})
     for begin, end in itertools.pairwise(times):
         middle = 0.5 * (begin + end)
@@ -300,14 +300,25 @@ def test_it_closes_beside_treated_ground_only_what_is_too_short(
             assert (end - begin) * SPEED < STRETCH_MIN_M
 
 
-def test_a_change_at_the_border_is_by_the_borders_rule() -> None:
-    route = (Crossing(0.0, None, False, SPEED), Crossing(2.0, 20.0, True, SPEED))
-    opens = cut(route, [(1.0, 2.05)], strict_s=0.1)[-1]
-    assert (opens.at_s, opens.border) == (2.05, True)
-    later = cut(route, [(1.0, 2.5)], strict_s=0.1)[-1]
-    assert (later.at_s, later.border) == (2.5, False)
+def test_treated_ground_at_the_edge_leaves_the_border_its_rule() -> None:
+    route = (
+        Crossing(0.0, None, True, SPEED), Crossing(2.0, 20.0, False, SPEED),
+        Crossing(5.0, None, True, SPEED),
+    )  # fmt: skip
+    timing = setup().timing
+    # Treated to just inside the border, and far beyond it: by the first flow, by the volume.
+    for end_s, at_s in ((2.01, 2.0 - timing.border_on_s), (2.5, 2.5 - timing.on_s)):
+        opens = next(o for o in orders(cut(route, [(1.0, end_s)]), timing, dosing) if o.duty)
+        assert opens.at_s == pytest.approx(at_s)
+    for begin_s, at_s in ((4.99, 5.0 - timing.border_off_s), (4.5, 4.5 - timing.off_s)):
+        closes = orders(cut(route, [(begin_s, 6.0)]), timing, dosing)[-1 if begin_s > 4.9 else -2]
+        assert (closes.at_s, closes.duty) == (pytest.approx(at_s), 0.0)
+
+
+def dosing(rate_l_ha: float, speed_m_s: float) -> float:
+    return rate_l_ha * speed_m_s / 200.0
 
 
 def test_without_spans_a_route_is_itself() -> None:
     route = (Crossing(0.0, 20.0, False, SPEED), Crossing(2.0, None, True, SPEED))
-    assert cut(route, [], strict_s=0.1) == route
+    assert cut(route, []) == route
