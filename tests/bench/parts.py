@@ -9,7 +9,14 @@ from functools import partial
 from typing import TypeVar
 
 from sitl.demo_pool import do_all
-from tests.bench import flow_trim, identification, identification_figures, identified, pump
+from tests.bench import (
+    flow_laws,
+    flow_trim,
+    identification,
+    identification_figures,
+    identified,
+    pump,
+)
 from tests.bench.accuracy import UNKNOWN_FACTOR, accuracy
 from tests.bench.figures import Figure
 from tests.bench.flights import (
@@ -34,6 +41,7 @@ UNKNOWN_SECTION = "A sprayer that the controller does not know"
 IDENTIFICATION_SECTION = "Identified lags"
 TRIM_SECTION = "Closed loop on flow"
 PUMP_SECTION = "A pump that makes the flow"
+LAW_SECTION = "Three laws of the flow"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,6 +176,11 @@ def _pump(options: Options) -> list[Figure]:
     return pump.figures(done, section=PUMP_SECTION)
 
 
+def _flow_laws(options: Options) -> list[Figure]:
+    done = _each(flow_laws.fly_task, flow_laws.tasks(options.seeds), options, "flow laws")
+    return flow_laws.figures(done, section=LAW_SECTION)
+
+
 def _core(options: Options) -> list[Figure]:
     return core_times(seed=options.seed, is_quick=options.is_quick)
 
@@ -191,6 +204,7 @@ PARTS: tuple[Part, ...] = (
     Part(name="gpio-edges", section=TIMINGS, run=_edges),
     Part(name="field", section=FIELD_SECTION, run=_field),
     Part(name="pinpoint", section=FIELD_SECTION, run=_pinpoint),
+    Part(name="flow-laws", section=LAW_SECTION, run=_flow_laws),
     Part(name="identified", section=IDENTIFIED_SECTION, run=_identified),
     Part(name="unknown", section=UNKNOWN_SECTION, run=_unknown),
     Part(name="flow-trim", section=TRIM_SECTION, run=_flow_trim),

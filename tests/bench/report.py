@@ -22,10 +22,12 @@ changes of rate, flights. The alternative is another way to do the same, measure
 Accuracy is that of the twin (pulsed, with noise and scatter) at the nozzle, judged by
 `analysis/evaluation.py` ([metrics](metrics.md)). *Nominal* lags are those measured beforehand on
 other sprayers of the make; *identified* ones come from one calibration mission that the same
-sprayer flew before, by its own meter. Perfect knowledge is the same path and plant without noise,
-scatter or delays, with no driver board in between, for every output. The board of `servo` restarts
-its period at a change of zone, `free-running` does not. Where the deposit lands also depends on
-wind, tilt and droplets.
+sprayer flew before, by its own meter. Perfect knowledge is the same path and the same
+scattered sprayer with the true position and each valve's own lag and flow known, with no driver
+board in between, for every output. Where nothing else is said the sprayer's flow runs smoothly
+between the measured points, which is not how the program reads them ([plants](plants.md)). The
+board of `servo` restarts its period at a change of zone, `free-running` does not. Where the
+deposit lands also depends on wind, tilt and droplets.
 
 ## Summary
 

@@ -10,14 +10,15 @@ import pytest
 import shapely
 
 from analysis.evaluation import Evaluation, evaluate
-from analysis.flight_record import Fidelity, FlightRecord
+from analysis.flight_record import Fidelity
 from companion.core.frame import LocalFrame
 from sitl.anyang import EXAMPLE
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.flow_law import FlowLaw
 from sitl.profile import load_profile
-from tests.second_judge import Ground, Truth, Verdict, flat, judge
+from tests.bench.flow_laws import second
+from tests.second_judge import Ground, Verdict, flat
 
 WANG = load_profile("wang-2024")
 PASS_S = 36.0  # the first pass: twenty changes are enough to tell
@@ -36,22 +37,7 @@ def judged(fidelity: Fidelity, law: FlowLaw, *, until_s: float = PASS_S) -> Judg
     options = FlightOptions(fidelity=fidelity, flow_law=law)
     record = fly(setup, cut, WANG, options, speed_m_s=5.0).record
     origin = (setup.frame.latitude_deg, setup.frame.longitude_deg)
-    ground = Ground(EXAMPLE / "prescription.shp", "rate", EXAMPLE / "boundary.geojson", origin)
-    return Judged(evaluate(record), judge(truth_of(record, origin), ground))
-
-
-def truth_of(record: FlightRecord, origin_deg: tuple[float, float]) -> Truth:
-    """Return the raw truth: the strips are the sprayer's own, not those of the set-up."""
-    return Truth(
-        time_s=record.time_s,
-        east_m=record.east_m,
-        north_m=record.north_m,
-        heading_deg=record.heading_deg,
-        volume_ml=record.volume_ml,
-        strips=tuple((strip.right_m, 0.0, strip.width_m) for strip in WANG.strips),
-        origin_deg=origin_deg,
-        period_s=WANG.pwm.period_s,
-    )
+    return Judged(evaluate(record), second(record, origin))
 
 
 @pytest.fixture(scope="module")
