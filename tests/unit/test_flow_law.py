@@ -66,9 +66,9 @@ def test_a_profile_says_its_law_and_a_flight_may_say_another(tmp_path: Path) -> 
     assert WANG.flow_law == "smooth"
     text = (PROFILES / "wang-2024.toml").read_text(encoding="utf-8")
     path = tmp_path / "mine.toml"
-    path.write_text(text.replace("[pwm]", 'flow_law = "offset"\n[pwm]', 1), encoding="utf-8")
+    path.write_text(text.replace('"smooth"', '"offset"'), encoding="utf-8")
     assert load_profile(path).flow_law == "offset"
-    path.write_text(text.replace("[pwm]", 'flow_law = "cubic"\n[pwm]', 1), encoding="utf-8")
+    path.write_text(text.replace('"smooth"', '"cubic"'), encoding="utf-8")
     with pytest.raises(ConfigError, match="flow_law is one of smooth, straight, offset"):
         load_profile(path)
 
