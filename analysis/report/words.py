@@ -29,8 +29,8 @@ Severity = Literal["mark", "warning", "note"]
 POSITION = frozenset(
     {
         Inhibit.NO_POSITION, Inhibit.STALE_POSITION, Inhibit.INVALID_POSITION,
-        Inhibit.POSITION_FROZEN, Inhibit.FIX_TOO_LOW, Inhibit.ACCURACY_TOO_LOW,
-        Inhibit.ESTIMATOR_UNHEALTHY,
+        Inhibit.POSITION_FROZEN, Inhibit.CLOCK_DISAGREES, Inhibit.FIX_TOO_LOW,
+        Inhibit.ACCURACY_TOO_LOW, Inhibit.ESTIMATOR_UNHEALTHY,
     }
 )  # fmt: skip
 LATCHED = frozenset(

@@ -1,39 +1,128 @@
 """When a position was sent, on our clock: by TIMESYNC where it is answered, else by the arrivals.
 
-The mean of the arrivals has the mean delay of the way in it (5 ms and more at 57 600 baud); what
-TIMESYNC says has not. The difference is kept as `delay_s`, so that a TIMESYNC that falls silent
-leaves the last known delay and makes no jump, and one that comes back moves the time slowly.
+The autopilot's clock runs at a rate of its own: a simulation's may be slow by a percent. So both
+the arrivals of positions and the exchanges of TIMESYNC are fitted by a straight line, offset and
+rate, that forgets what is old. The arrivals have the mean delay of the way in them (5 ms and more
+at 57 600 baud); the exchanges have not. The difference is kept as `delay_s`, so that a TIMESYNC
+that falls silent leaves the last known delay and makes no jump, and one that comes back moves the
+time slowly.
+
+An exchange is wrong by half of its round trip at most. One that is further than that from what
+the ones before it foretell shows a clock that was set, and so do positions that come before they
+can have been sent. Until the clock is known again `is_doubtful` says so, and nothing is sprayed.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from companion.core.order import BOOT_WRAP_S, ROUND_TRIP_MAX_S
 from companion.core.types import ClockReport, Telemetry
 
 # Arrivals later than this against the mean are late messages; the mean is not moved by more. One
 # that much earlier says that the mean rests on late ones: it begins anew.
 CLOCK_STEP_S = 0.02
 CLOCK_RESET_S = 1.0
-# An exchange that took longer than this could be wrong by half of it and is no measurement.
-ROUND_TRIP_MAX_S = 0.25
 # Answers come once a second; after five that failed the arrivals alone count.
 REPORT_AGE_MAX_S = 5.0
-# Later than this in the mean is no link's delay but another clock (an answer in UTC, a reboot).
-DELAY_MAX_S = 0.5
+# A position takes no longer on its way than a question and its answer, and what the autopilot
+# and the routers make it wait. More in the mean says that the two clocks disagree.
+WAIT_MAX_S = 0.1
 # No position arrives before it was sent; the autopilot's time has whole milliseconds.
 EARLY_MAX_S = 0.005
 # How fast the time may be moved while spraying, in seconds a second: at 5 m/s 2.5 cm in a second
 # and 2.5 mm between two positions at 10 Hz.
 SLEW = 0.005
 
+# How fast the lines forget: a fit over so many seconds.
+ARRIVALS_FADE_S = 10.0
+EXCHANGES_FADE_S = 6.0
+# Where round trips differ, good ones are rare: then longer, in seconds for each second too long.
+FADE_BY_ROUND_TRIP = 300.0
+# What is expected of a rate before it was seen: real crystals are a thousand times better, and
+# simulations on a busy computer as bad as this.
+RATE_SD = 0.005
+# How well the arrivals tell the rate of the exchanges, whose way may slow down and recover.
+RATE_BY_ARRIVALS_SD = 0.003
+# More than this is no clock's rate. Nothing is sprayed by such a clock.
+RATE_MAX = 0.03
+# Jitter of arrivals and exchanges at their best.
+ARRIVAL_SD_S = 0.002
+EXCHANGE_SD_S = 0.0005
+# How uneven the two ways of the quickest exchange may be, as a share of its round trip.
+UNEVEN = 0.25
+# A late message tells no more than this of the jitter; one that is early by more than so many
+# times the jitter is no jitter.
+JITTER_MAX_S = 0.25
+JITTERS_MAX = 4.0
+# What two exchanges may be apart besides their round trips: jitter, and a rate that wanders.
+EXCHANGE_STEP_S = 0.003
+WANDER = 0.003
+# So many exchanges have to agree before a clock that was set is believed.
+AGREE_COUNT = 3
+# All positions of so long were late, by so much: the clock was set back, or the way has changed.
+LATE_DOUBT_S = 0.05
+LATE_FOR_S = 0.3
+# Where nobody answers TIMESYNC, arrivals that begin anew, or stay late, are believed after this.
+SETTLE_S = 1.5
+# A clock that begins anew within so many arrivals, so often in turn, runs like none.
+RESTART_COUNT = 5
+RESTARTS_MAX = 3
+LATE_SETTLE_S = 5.0
+
+
+class Line(NamedTuple):
+    """A straight line through offsets over our time, fitted by weight, the old ones fading."""
+
+    at_s: float
+    weight: float
+    mean_at_s: float
+    mean_offset_s: float
+    spread: float  # weighted sum of squared times
+    joint: float  # the same of times and offsets
+
+    def rate(self, expected: float, expected_sd: float) -> float:
+        """Return its slope, drawn towards what was expected as long as it is hardly known."""
+        trust = expected_sd**-2
+        return (self.joint + trust * expected) / (self.spread + trust)
+
+    def at(self, now_s: float, rate: float) -> float:
+        """Return the offset at `now_s`, by a slope."""
+        return self.mean_offset_s + rate * (now_s - self.mean_at_s)
+
+    def moved(self, by_s: float) -> Line:
+        """Return the line with all its offsets moved."""
+        return self._replace(mean_offset_s=self.mean_offset_s + by_s)
+
+
+def _begun(at_s: float, offset_s: float, sd_s: float) -> Line:
+    return Line(at_s, sd_s**-2, at_s, offset_s, 0.0, 0.0)
+
+
+def _longer(line: Line, at_s: float, offset_s: float, sd_s: float, fade_s: float) -> Line:
+    """Return the line with one more point."""
+    kept = math.exp(-max(at_s - line.at_s, 0.0) / fade_s)
+    old, new = line.weight * kept, sd_s**-2
+    share = new / (old + new)
+    by_s, by_offset_s = at_s - line.mean_at_s, offset_s - line.mean_offset_s
+    return Line(
+        at_s=at_s,
+        weight=old + new,
+        mean_at_s=line.mean_at_s + share * by_s,
+        mean_offset_s=line.mean_offset_s + share * by_offset_s,
+        spread=line.spread * kept + old * share * by_s * by_s,
+        joint=line.joint * kept + old * share * by_s * by_offset_s,
+    )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
     """Mean of arrival time minus the autopilot's time, and how much of it is the way here.
 
-    `received_s` and `boot_s` are both times of the newest arrival.
+    `received_s` and `boot_s` are both times of the newest arrival, when `offset_s` holds; it
+    changes by `rate` seconds a second.
     """
 
     offset_s: float
@@ -41,34 +130,75 @@ class Clock:
     delay_s: float = 0.0
     received_s: float = 0.0
     boot_s: float = 0.0
+    rate: float = 0.0
+    jitter_s: float = ARRIVAL_SD_S
+    arrivals: Line | None = None
+    exchanges: Line | None = None
+    round_trip_s: float = ROUND_TRIP_MAX_S  # of the quickest exchange of late
+    disagree_left: int = 0
+    doubtful_until_s: float = -math.inf
+    restarts: int = 0  # how often in turn it began anew after a few arrivals
+    late_since_s: float | None = None
+    agreed_s: float = -math.inf  # when an exchange last agreed with the ones before it
 
     @property
     def sent_offset_s(self) -> float:
         """Return what to add to the autopilot's time to have ours."""
         return self.offset_s - self.delay_s
 
+    def is_doubtful(self, now_s: float) -> bool:
+        """Whether the autopilot's time may be another than it seems."""
+        has_exchanges = now_s - self.agreed_s <= REPORT_AGE_MAX_S
+        late_s = self.late_since_s
+        is_late = late_s is not None and now_s - late_s > LATE_FOR_S and self.agreed_s < late_s
+        return (
+            (self.disagree_left > 0 and has_exchanges)
+            or now_s < self.doubtful_until_s
+            or is_late
+            or not abs(self.rate) <= RATE_MAX
+        )
+
+
+def unwrapped(report: ClockReport, near_s: float) -> ClockReport:
+    """Return an exchange in the 32 bits of the positions' time, nearest to an offset."""
+    turns = (near_s - report.offset_s) / BOOT_WRAP_S
+    if not abs(turns) < 1e6 or round(turns) == 0:
+        return report
+    return replace(report, offset_s=report.offset_s + round(turns) * BOOT_WRAP_S)
+
+
+def is_measured(report: ClockReport | None, now_s: float) -> bool:
+    """Whether an exchange is young and quick enough to say anything."""
+    return (
+        report is not None
+        and 0.0 <= report.round_trip_s <= ROUND_TRIP_MAX_S
+        and abs(now_s - report.received_s) <= REPORT_AGE_MAX_S
+        and math.isfinite(report.offset_s)
+    )
+
 
 def is_believed(report: ClockReport | None, clock: Clock, now_s: float) -> bool:
-    """Whether an answer is young, quick, and agrees with when the positions arrive."""
-    if report is None:
+    """Whether an exchange is young, quick, and agrees with when the positions arrive."""
+    if report is None or not is_measured(report, now_s):
         return False
-    late_s = clock.offset_s - report.offset_s
-    return (
-        0.0 <= report.round_trip_s <= ROUND_TRIP_MAX_S
-        and abs(now_s - report.received_s) <= REPORT_AGE_MAX_S
-        and -EARLY_MAX_S - 0.5 * report.round_trip_s <= late_s <= DELAY_MAX_S
-    )
+    late_s = clock.offset_s - clock.rate * (now_s - report.received_s) - report.offset_s
+    early_s = EARLY_MAX_S + 0.5 * report.round_trip_s
+    return -early_s <= late_s <= report.round_trip_s + WAIT_MAX_S
 
 
 class Ticked(NamedTuple):
     """The clock after an arrival, whether it rests on TIMESYNC, and how far it was put right.
 
     What `moved_s` says is a better knowledge of the clock and no motion: known times move with it.
+    `is_set`: the autopilot's clock was set, and what was known is by another time. `is_refused`:
+    an exchange was measured that cannot be true beside the positions.
     """
 
     clock: Clock
     is_synced: bool
     moved_s: float
+    is_set: bool = False
+    is_refused: bool = False
 
 
 def tick(
@@ -78,39 +208,148 @@ def tick(
 
     `at_once`: nothing is sprayed that a jump could harm.
     """
-    clock = _arrived(before, item, report)
     now_s = item.received_s
+    if report is not None:
+        near_s = item.received_s - item.boot_s if before is None else before.offset_s
+        report = unwrapped(report, near_s)
+    clock, is_set = _arrived(before, item, report, at_once=at_once)
+    is_refused = is_measured(report, now_s) and not is_believed(report, clock, now_s)
+    passed_s = 0.0 if before is None else now_s - before.received_s
     if report is None or not is_believed(report, clock, now_s):
-        anew = before is not None and clock.count == 1
-        moved_s = clock.offset_s - before.offset_s if before is not None and anew else 0.0
-        return Ticked(clock, False, moved_s if abs(moved_s) < CLOCK_RESET_S else 0.0)
-    wanted_s = min(report.offset_s, clock.offset_s)
-    used_s = wanted_s
-    if before is not None and not at_once:
-        reach_s = SLEW * min(max(now_s - before.received_s, 0.0), 1.0)
-        step_s = wanted_s - before.sent_offset_s
-        used_s = before.sent_offset_s + min(max(step_s, -reach_s), reach_s)
-    moved_s = 0.0 if before is None else used_s - before.sent_offset_s
-    return Ticked(replace(clock, delay_s=clock.offset_s - used_s), True, moved_s)
+        moved_s = 0.0
+        if before is not None and clock.count == 1 and not is_set:
+            moved_s = clock.offset_s - before.offset_s - before.rate * passed_s
+        return Ticked(clock, False, moved_s, is_set, is_refused)
+    if clock.exchanges is None or report.received_s > clock.exchanges.at_s:
+        clock = _exchanged(clock, report)
+        is_set = is_set or clock.disagree_left == AGREE_COUNT
+    assert clock.exchanges is not None
+    rate = clock.exchanges.rate(clock.rate, RATE_BY_ARRIVALS_SD)
+    wanted_s = min(clock.exchanges.at(now_s, rate), clock.offset_s)
+    used_s, moved_s = wanted_s, 0.0
+    if before is not None and not is_set:
+        known_s = before.sent_offset_s + rate * passed_s
+        if not (at_once or clock.disagree_left > 0):
+            reach_s = SLEW * min(max(passed_s, 0.0), 1.0)
+            used_s = known_s + min(max(wanted_s - known_s, -reach_s), reach_s)
+        moved_s = used_s - known_s
+    clock = replace(clock, delay_s=clock.offset_s - used_s, rate=rate)
+    return Ticked(clock, True, moved_s, is_set, is_refused)
 
 
-def _arrived(clock: Clock | None, item: Telemetry, report: ClockReport | None) -> Clock:
-    seen_s = item.received_s - item.boot_s
-    if clock is None:
-        return Clock(offset_s=seen_s, count=1, received_s=item.received_s, boot_s=item.boot_s)
-    near = -CLOCK_STEP_S <= seen_s - clock.offset_s < CLOCK_RESET_S
-    if not near and not (seen_s > clock.offset_s and is_believed(report, clock, item.received_s)):
-        return replace(
-            clock, offset_s=seen_s, count=1, received_s=item.received_s, boot_s=item.boot_s
-        )
-    step_s = min(max(seen_s - clock.offset_s, -CLOCK_STEP_S), CLOCK_STEP_S)
+def _arrived(
+    clock: Clock | None, item: Telemetry, report: ClockReport | None, *, at_once: bool
+) -> tuple[Clock, bool]:
+    """Return the clock with one more arrival, and whether it was set."""
+    now_s, seen_s = item.received_s, item.received_s - item.boot_s
+    if clock is None or clock.arrivals is None:
+        return _anew(None, item), False
+    slope = clock.arrivals.rate(0.0, RATE_SD)
+    late_s = seen_s - clock.arrivals.at(now_s, slope)
+    off_s2 = min(abs(late_s), JITTER_MAX_S) ** 2
+    jitter_s = max(ARRIVAL_SD_S, math.sqrt(0.95 * clock.jitter_s**2 + 0.05 * off_s2))
+    if late_s < -CLOCK_STEP_S:
+        # It cannot have come before it was sent: the mean rests on late ones, or the clock was set.
+        restarts = clock.restarts + 1 if clock.count < RESTART_COUNT else 0
+        is_much = late_s < -max(LATE_DOUBT_S, JITTERS_MAX * clock.jitter_s)
+        is_much = is_much or restarts >= RESTARTS_MAX
+        until_s = now_s + SETTLE_S if is_much and not at_once else clock.doubtful_until_s
+        anew = replace(_anew(clock, item), jitter_s=jitter_s, doubtful_until_s=until_s)
+        return replace(anew, restarts=restarts), False
+    since_s = None
+    if late_s > LATE_DOUBT_S:
+        since_s = now_s if clock.late_since_s is None else clock.late_since_s
+        if _is_set_back(clock, item, report, since_s, late_s, at_once=at_once):
+            return _anew(clock, item), True
     count = min(clock.count + 1, 100)
-    return Clock(
-        offset_s=clock.offset_s + step_s / count,
+    if late_s > CLOCK_STEP_S:
+        line = clock.arrivals.moved(CLOCK_STEP_S / count)
+    else:
+        line = _longer(clock.arrivals, now_s, seen_s, clock.jitter_s, ARRIVALS_FADE_S)
+    slope = line.rate(0.0, RATE_SD)
+    arrived = replace(
+        clock,
+        offset_s=line.at(now_s, slope),
         count=count,
-        delay_s=clock.delay_s,
+        received_s=now_s,
+        boot_s=item.boot_s,
+        rate=slope,
+        jitter_s=jitter_s,
+        arrivals=line,
+        late_since_s=since_s,
+    )
+    return arrived, False
+
+
+def _is_set_back(
+    clock: Clock,
+    item: Telemetry,
+    report: ClockReport | None,
+    since_s: float,
+    late_s: float,
+    *,
+    at_once: bool,
+) -> bool:
+    """Whether positions that are late are so because the clock was set back.
+
+    TIMESYNC tells: no late way makes an exchange agree with them. Without it nobody can tell a
+    clock that was set back by less than a second from a way that has become longer; both are
+    taken for the new usual after a while, during which nothing is sprayed.
+    """
+    now_s = item.received_s
+    if report is not None and is_measured(report, now_s):
+        now = _anew(clock, item)
+        is_new = report.received_s > since_s
+        return is_new and is_believed(report, now, now_s) and report.offset_s > clock.offset_s
+    return now_s - since_s >= LATE_SETTLE_S and (late_s < CLOCK_RESET_S or at_once)
+
+
+def _anew(clock: Clock | None, item: Telemetry) -> Clock:
+    """Return a clock that knows one arrival, and of the one before it what still holds."""
+    seen_s = item.received_s - item.boot_s
+    anew = Clock(
+        offset_s=seen_s,
+        count=1,
         received_s=item.received_s,
         boot_s=item.boot_s,
+        arrivals=_begun(item.received_s, seen_s, ARRIVAL_SD_S),
+    )
+    if clock is None:
+        return anew
+    return replace(
+        anew,
+        delay_s=0.0,
+        exchanges=clock.exchanges,
+        round_trip_s=clock.round_trip_s,
+        disagree_left=clock.disagree_left,
+        agreed_s=clock.agreed_s,
+    )
+
+
+def _exchanged(clock: Clock, report: ClockReport) -> Clock:
+    """Return the clock with one more exchange that is believed beside the positions."""
+    line, at_s, offset_s = clock.exchanges, report.received_s, report.offset_s
+    quickest_s = report.round_trip_s
+    if line is not None:
+        more_s = max(report.round_trip_s - clock.round_trip_s, 0.0)
+        quickest_s = min(report.round_trip_s, clock.round_trip_s + 0.02 * more_s)
+    slow_s = report.round_trip_s - quickest_s
+    sd_s = EXCHANGE_SD_S + UNEVEN * report.round_trip_s + 0.5 * slow_s
+    fade_s = EXCHANGES_FADE_S + FADE_BY_ROUND_TRIP * slow_s
+    begun = replace(
+        clock, exchanges=_begun(at_s, offset_s, sd_s), round_trip_s=quickest_s, agreed_s=at_s
+    )
+    if line is None:
+        return begun
+    wander = WANDER if clock.count >= 20 else RATE_MAX
+    apart_s = offset_s - line.at(at_s, line.rate(clock.rate, RATE_BY_ARRIVALS_SD))
+    bound_s = 0.5 * (report.round_trip_s + quickest_s) + EXCHANGE_STEP_S
+    if not abs(apart_s) <= bound_s + wander * (at_s - line.at_s):
+        return replace(begun, disagree_left=AGREE_COUNT, agreed_s=clock.agreed_s)
+    return replace(
+        begun,
+        exchanges=_longer(line, at_s, offset_s, sd_s, fade_s),
+        disagree_left=max(clock.disagree_left - 1, 0),
     )
 
 

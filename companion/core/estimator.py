@@ -17,6 +17,7 @@ from companion.core.clock import Clock, on_time_s, tick
 from companion.core.frozen import Stand, look
 from companion.core.leg import Approach, Leg, approach, learned, leg_of, stop_ahead, way_of
 from companion.core.motion import BRIDGED_MAX_S, Axis
+from companion.core.order import Order, Place, noted, sorted_in
 from companion.core.rate import is_override
 from companion.core.types import (
     BatteryReport,
@@ -63,6 +64,7 @@ MISSION_MODES = frozenset({"AUTO", "MISSION"})
 RC_HIGH_US = 1700
 RC_LOW_US = 1300
 RC_SIGNAL_MAX_US = 2300
+_NOTHING_HEARD = Order()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,6 +75,8 @@ class Track:
     stand: Stand | None = None
     clock: Clock | None = None
     clock_report: ClockReport | None = None
+    clock_refused: bool = False  # the last exchange cannot be true beside the positions
+    order: Order = _NOTHING_HEARD
     position_valid: bool = False
     position_received_s: float = -math.inf
     speed: SpeedReport | None = None
@@ -103,6 +107,9 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
     """Return `track` with one more input; whatever is no number is kept out of the filter."""
     if isinstance(item, Telemetry):
         return _observe_position(track, item, setup)
+    order = noted(track.order, item)
+    if order is not track.order:
+        track = replace(track, order=order)
     by_setup = _BY_SETUP.get(type(item))
     if by_setup is not None:
         return by_setup(track, item, setup)
@@ -262,42 +269,52 @@ _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
 
 
 def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
+    order, kind = sorted_in(track.order, item)
+    if kind is Place.AGAIN:
+        return replace(track, order=order)  # a copy, or not yet known to be anything else
+    track = replace(track, order=order)
+    if kind is Place.ANEW:
+        track = _restarted(track)
     place = _place(item, setup)
     if place is None:
         return replace(track, position_valid=False, position_received_s=item.received_s)
     before = track.motion
-    if before is not None and item.boot_s <= before.boot_s:
-        if item.boot_s == before.boot_s:
-            return track  # repeated: nothing new
-        if item.boot_s > before.boot_s - 0.5:
-            return replace(track, position_valid=False)  # time went back: until the next is newer
-        before = None  # the autopilot's clock went back: it was restarted
-        track = replace(track, clock=None, clock_report=None, stand=None)
     stand = _stand(track, item)
     if before is not None and stand.is_frozen:
         # It is kept out of the filters, and what comes after it has to be confirmed.
         still = replace(before, boot_s=item.boot_s, confirm_left=CONFIRM_COUNT)
         return replace(track, motion=still, stand=stand)
     at_once = not track.enabled or before is None
-    clock, is_synced, moved_s = tick(track.clock, item, track.clock_report, at_once=at_once)
-    if is_synced:
-        # Its age counts from its sending, for the limit on it too.
-        sent_s = item.boot_s + clock.sent_offset_s
-        item = replace(item, received_s=min(item.received_s, sent_s))
-    if before is not None and moved_s != 0.0:
-        before = replace(before, time_s=before.time_s + moved_s)
+    ticked = tick(track.clock, item, track.clock_report, at_once=at_once)
+    clock = ticked.clock
+    # Its age counts from its sending, for the limit on it too.
+    sent_s = item.boot_s + clock.sent_offset_s
+    item = replace(item, received_s=min(item.received_s, sent_s))
+    if ticked.is_set:
+        before = None
+    if before is not None and ticked.moved_s != 0.0:
+        before = replace(before, time_s=before.time_s + ticked.moved_s)
     time_s = item.boot_s + clock.sent_offset_s - setup.lag.position_s
     motion = begun(item, place, time_s) if before is None else followed(before, item, place, time_s)
     return replace(
         track,
         motion=motion,
         clock=clock,
+        clock_refused=ticked.is_refused,
         flow=_dated(track, clock),
         counted=None,
         stand=stand,
         position_valid=motion.confirm_left == 0,
         position_received_s=item.received_s,
         braking_m_s2=_learned_braking(track, motion, item.received_s),
+    )
+
+
+def _restarted(track: Track) -> Track:
+    """Forget what was known by the autopilot's old clock, but an exchange with the new one."""
+    exchange = track.order.exchange
+    return replace(
+        track, motion=None, clock=None, clock_report=exchange, clock_refused=False, stand=None
     )
 
 
@@ -359,6 +376,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         position_received_s=motion.received_s,
         position_valid=track.position_valid,
         position_frozen=track.stand is not None and track.stand.is_frozen,
+        clock_agrees=_clock_agrees(track, now_s),
         checked_speed_m_s=checked,
         fix=None if gnss is None else gnss.fix,
         horizontal_accuracy_m=None if gnss is None else gnss.horizontal_accuracy_m,
@@ -387,6 +405,12 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         way=track.way,
         way_before=track.way_before,
     )
+
+
+def _clock_agrees(track: Track, now_s: float) -> bool:
+    """Return whether all that is known of the autopilot's clock goes together."""
+    clock = track.clock
+    return clock is not None and not track.clock_refused and not clock.is_doubtful(now_s)
 
 
 def _learned_braking(track: Track, motion: Motion, now_s: float) -> float | None:

@@ -215,7 +215,7 @@ class RateOverride:
 class ClockReport:
     """What TIMESYNC says of the autopilot's clock: add `offset_s` to its time to have ours.
 
-    Of the last exchanges the one with the shortest round trip; `received_s` is that of the newest.
+    One exchange, wrong by half of its round trip at most.
     """
 
     received_s: float
@@ -225,10 +225,14 @@ class ClockReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UtcReport:
-    """The time of day by the autopilot (SYSTEM_TIME), seconds since 1970; for the record only."""
+    """The time of day by the autopilot (SYSTEM_TIME), seconds since 1970.
+
+    For the record; with the time since boot beside it, it shows a clock that has begun anew.
+    """
 
     received_s: float
     utc_s: float
+    boot_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -175,6 +175,8 @@ def _position(
         found.append(Inhibit.INVALID_POSITION)
     if state.position_frozen is not False:
         found.append(Inhibit.POSITION_FROZEN)
+    if state.clock_agrees is not True:
+        found.append(Inhibit.CLOCK_DISAGREES)
     west, south, east, north = field_bounds_m
     reach = limits.distance_max_m
     if not (

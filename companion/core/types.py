@@ -95,6 +95,7 @@ class Inhibit(StrEnum):
     STALE_POSITION = "stale-position"
     INVALID_POSITION = "invalid-position"
     POSITION_FROZEN = "position-frozen"
+    CLOCK_DISAGREES = "clock-disagrees"  # when the positions are from is not known
     FAR_FROM_FIELD = "far-from-field"
     NO_HEARTBEAT = "no-heartbeat"
     STALE_HEARTBEAT = "stale-heartbeat"
@@ -234,6 +235,7 @@ class VehicleState:
     operator_wishes: int = 0  # how often the operator has enabled anew, or disabled
     way: Way | None = None  # None: it is not used, or nothing was heard of it
     way_before: Way | None = None  # the one that it was before, last heard of then
+    clock_agrees: bool = True  # what is known of the autopilot's clock goes together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -241,7 +241,7 @@ def _heard(
         else Position(latitude_deg=position.latitude_deg, longitude_deg=position.longitude_deg),
         rc_pulse_us=() if rc is None else rc.pulse_us,
         has_wind=wind is not None and wind.speed_m_s is not None,
-        is_clock_known=link.component.clock.offset_s is not None,
+        is_clock_known=link.component.clock.is_known,
         outputs_us=ear.outputs_us(),
         is_closed_ordered=is_ordered,
         order_results=tuple(ear.results),

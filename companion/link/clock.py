@@ -1,36 +1,26 @@
-"""How far the autopilot's clock is from ours, and how long its positions are on the way.
+"""Questions of the time and their answers: how far the autopilot's clock is from ours.
 
 TIMESYNC (mavlink.io/en/services/timesync.html): we send our time, the answer brings it back with
-the autopilot's. The exchange with the shortest round trip has the smallest error: at most half of
-it, where one direction takes all of the time.
+the autopilot's. An exchange is wrong by at most half of its round trip, where one direction takes
+all of the time. What follows from many of them is the core's to say (`companion/core/clock.py`).
 """
 
 from __future__ import annotations
 
 from collections import deque
-from typing import NamedTuple
 
 from companion.core.types import ClockReport
 
 _KEPT = 60
-# What two crystals may drift apart: an exchange loses that much of its worth with its age.
-_DRIFT = 50e-6
 
 
-class _Exchange(NamedTuple):
-    round_trip_s: float
-    offset_s: float
-    received_s: float
-
-
-class ClockOffset:
-    """Estimates `ours - theirs` [s] from the quickest of the last exchanges."""
+class ClockExchanges:
+    """Matches answers with questions, and keeps how quick the last ones were."""
 
     def __init__(self) -> None:
         self._asked_ns: deque[int] = deque(maxlen=8)
-        self._exchanges: deque[_Exchange] = deque(maxlen=_KEPT)
-        self._is_new = False
-        self.position_delay_s: float | None = None
+        self._round_trips_s: deque[float] = deque(maxlen=_KEPT)
+        self._news: list[ClockReport] = []
 
     def ask(self, now_s: float) -> int:
         """Return the number to send, which the answer will bring back."""
@@ -48,52 +38,22 @@ class ClockOffset:
         if not round_trip_s >= 0.0:
             return
         offset_s = 0.5 * (asked_s + received_s) - tc1_ns * 1e-9
-        self._exchanges.append(_Exchange(round_trip_s, offset_s, received_s))
-        self._is_new = True
+        self._round_trips_s.append(round_trip_s)
+        self._news.append(
+            ClockReport(received_s=received_s, offset_s=offset_s, round_trip_s=round_trip_s)
+        )
 
-    def take_report(self) -> list[ClockReport]:
-        """Return what is known, once after each answer: an input of the core."""
-        best = self._best()
-        if best is None or not self._is_new:
-            return []
-        self._is_new = False
-        return [
-            ClockReport(
-                received_s=self._exchanges[-1].received_s,
-                offset_s=best.offset_s,
-                round_trip_s=best.round_trip_s,
-            )
-        ]
+    def take_reports(self) -> list[ClockReport]:
+        """Return every exchange once: inputs of the core."""
+        news, self._news = self._news, []
+        return news
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the autopilot has answered at all."""
+        return bool(self._round_trips_s)
 
     @property
     def round_trip_s(self) -> float | None:
-        """Return the round trip of the best of the last exchanges."""
-        best = self._best()
-        return None if best is None else best.round_trip_s
-
-    @property
-    def offset_s(self) -> float | None:
-        """Return what to add to the autopilot's time since boot to have ours."""
-        best = self._best()
-        return None if best is None else best.offset_s
-
-    def position(self, boot_s: float, received_s: float) -> None:
-        """Take the time stamps of a position; keeps how late it came, slowly averaged."""
-        offset_s = self.offset_s
-        if offset_s is None:
-            return
-        delay_s = received_s - (boot_s + offset_s)
-        before_s = self.position_delay_s
-        self.position_delay_s = (
-            delay_s if before_s is None else before_s + (delay_s - before_s) / 20
-        )
-
-    def _best(self) -> _Exchange | None:
-        """Return the exchange with the smallest possible error, drift with its age included."""
-        if not self._exchanges:
-            return None
-        now_s = self._exchanges[-1].received_s
-        return min(
-            self._exchanges,
-            key=lambda each: 0.5 * each.round_trip_s + _DRIFT * (now_s - each.received_s),
-        )
+        """Return the quickest round trip of late."""
+        return min(self._round_trips_s, default=None)

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from typing import TypeGuard, get_args
 
 from companion.core.lines import MISSION_MODES
+from companion.core.order import Order, Place, noted, sorted_in
 from companion.core.types import Decision, HeartbeatReport, Input, Telemetry
 from companion.link.announcer import Announcer
-from companion.link.clock import ClockOffset
+from companion.link.clock import ClockExchanges
 from companion.link.codec import Codec
 from companion.link.commands import REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, Desk
 from companion.link.encode import Encoder
@@ -40,7 +41,6 @@ from companion.link.wind import WindWatch
 
 _POSITION = 33
 _TIMESYNC_S = 1.0
-_REBOOT_S = 1.0
 _INPUTS = get_args(Input)
 
 
@@ -107,8 +107,8 @@ class Component:
         self._wind = WindWatch()
         self._flies_mission = False
         self._supervisor: StreamSupervisor | None = None
-        self._boot_s: float | None = None
-        self.clock = ClockOffset()
+        self._order = Order()
+        self.clock = ClockExchanges()
         self._timesync_s = float("-inf")
         self.met_s: float | None = None
         self.is_answered = False
@@ -189,7 +189,9 @@ class Component:
                 inputs.extend(self._mission.take(message))
             else:
                 self._answer(message)
-        inputs.extend(self.clock.take_report())
+        for report in self.clock.take_reports():
+            self._order = noted(self._order, report)
+            inputs.append(report)
         return inputs
 
     def tick(self, decision: Decision | None, now_s: float) -> None:
@@ -260,16 +262,22 @@ class Component:
             self._desk.is_armed = item.armed
             self._flies_mission = item.mode in MISSION_MODES
             self.outputs.armed(item.armed)
-        elif isinstance(item, Telemetry):
+        if isinstance(item, Telemetry):
             self._watch_boot(item)
+        else:
+            self._order = noted(self._order, item)
 
     def _watch_boot(self, item: Telemetry) -> None:
         """Notice a reboot, after which an autopilot has forgotten what was asked of it."""
-        if self._boot_s is not None and item.boot_s < self._boot_s - _REBOOT_S:
+        self._order, place = sorted_in(self._order, item)
+        if place is Place.ANEW:
             self._meet(item.received_s)
-            self.clock = ClockOffset()
-        self._boot_s = item.boot_s
-        self.clock.position(item.boot_s, item.received_s)
+        elif place is Place.AGAIN and self.meter.copied(item.received_s):
+            self.warn("positions come twice or late")
+            text = (
+                f"{self.meter.copied_positions} positions came twice or too late and were dropped"
+            )
+            self._service.tell_event(item.received_s, "link", f"{text}: two radios, or a loop?")
 
     def _answer(self, message: Message) -> None:
         if isinstance(message, AckReceived):
@@ -302,7 +310,7 @@ class Component:
             return
         if self.codec.is_autopilot(message.sender.system_id, message.sender.component_id):
             self.clock.answer(message.tc1_ns, message.ts1_ns, message.received_s)
-            self.is_answered = self.is_answered or self.clock.offset_s is not None
+            self.is_answered = self.is_answered or self.clock.is_known
 
     def _take_ping(self, ping: PingReceived) -> None:
         if (ping.target_system, ping.target_component) == (0, 0):

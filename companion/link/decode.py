@@ -176,7 +176,8 @@ def _utc(m: Any, received_s: float) -> UtcReport | None:
     """Return the time of day; None while the autopilot has none (0, or the day it was built)."""
     utc_s = m.time_unix_usec / 1e6
     known = _UTC_MIN_S < utc_s < _UTC_MAX_S
-    return UtcReport(received_s=received_s, utc_s=utc_s) if known else None
+    boot_s = m.time_boot_ms / 1000.0
+    return UtcReport(received_s=received_s, utc_s=utc_s, boot_s=boot_s) if known else None
 
 
 def _rc(m: Any, received_s: float) -> RcReport:

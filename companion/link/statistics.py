@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 from companion.link.codec import AUTOPILOT_COMPONENT, Codec
@@ -24,6 +25,7 @@ class LinkStatistics:
     bytes_out_per_s: float | None
     position_hz: float | None
     round_trip_s: float | None
+    copied_positions: int = 0
 
     def line(self) -> str:
         """Return it in one line, for the record of a flight and the log."""
@@ -36,6 +38,8 @@ class LinkStatistics:
             f"refused {self.refused_frames}",
             f"unsent {self.unsent_frames}",
         ]
+        if self.copied_positions:
+            parts.append(f"positions twice or too late {self.copied_positions}")
         if self.lost_percent is not None:
             parts.append(f"lost {self.lost_percent:.2f} % of the autopilot's")
         if self.position_hz is not None:
@@ -49,6 +53,12 @@ def _rate(rate: float | None, unit: str) -> str:
     return "" if rate is None else f" ({rate:.1f}{unit})"
 
 
+# So many positions that came twice or too late, in so long, are told; once in a minute.
+COPIES_MANY = 20
+COPIES_IN_S = 10.0
+COPIES_AGAIN_S = 60.0
+
+
 class Meter:
     """Counts what goes out, and compares counts with those of the last time it was read."""
 
@@ -56,6 +66,9 @@ class Meter:
         self.bytes_out = 0
         self.frames_out = 0
         self.unsent_frames = 0
+        self.copied_positions = 0
+        self._copied_s: deque[float] = deque(maxlen=COPIES_MANY)
+        self._copies_told_s = float("-inf")
         self._before: dict[str, tuple[float, int, int, int]] = {}
 
     def sent(self, size: int, *, has_left: bool) -> None:
@@ -65,6 +78,17 @@ class Meter:
             self.bytes_out += size
         else:
             self.unsent_frames += 1
+
+    def copied(self, now_s: float) -> bool:
+        """Count a position that came twice or too late; return whether many are to be told of."""
+        self.copied_positions += 1
+        self._copied_s.append(now_s)
+        if len(self._copied_s) < COPIES_MANY or now_s - self._copied_s[0] > COPIES_IN_S:
+            return False
+        if now_s - self._copies_told_s < COPIES_AGAIN_S:
+            return False
+        self._copies_told_s = now_s
+        return True
 
     def read(
         self,
@@ -103,4 +127,5 @@ class Meter:
             bytes_out_per_s=rates[2],
             position_hz=position_hz,
             round_trip_s=round_trip_s,
+            copied_positions=self.copied_positions,
         )

@@ -16,6 +16,7 @@ from companion.core.estimator import Track, estimate, observe
 from companion.core.interlock import Limits, closed_plan, guard, inhibits
 from companion.core.schedule import Timing, orders, resolve, schedule
 from companion.core.types import (
+    ClockReport,
     HeartbeatReport,
     Inhibit,
     SprayPlan,
@@ -103,22 +104,36 @@ def test_an_autopilot_that_restarted_within_a_second_has_a_clock_of_its_own() ->
     given, track = setup(), Track()
     for i in range(20):
         track = observe(track, position(0.1 * i, 10.0 + 0.1 * i, 0.5 * i), given)
-    # Up for 1.9 s; 0.1 s later it says 1.2 s: neither a late message nor a second's difference.
-    track = observe(track, position(1.2, 12.0, 10.0), given)
-    state = estimate(track, 12.0)
-    assert state is not None
-    assert state.east_m == pytest.approx(10.0, abs=1e-6)
-    assert not state.position_valid
+    # Up for 1.9 s; 0.1 s later it says 1.2 s: that may be a copy, until TIMESYNC says the same.
+    for i in range(4):
+        if i == 2:
+            track = observe(
+                track, ClockReport(received_s=12.15, offset_s=10.8, round_trip_s=0.01), given
+            )
+        track = observe(track, position(1.2 + 0.1 * i, 12.0 + 0.1 * i, 10.0 + 0.5 * i), given)
+        state = estimate(track, 12.0 + 0.1 * i)
+        assert state is not None
+        assert state.east_m == pytest.approx(10.0 + 0.5 * i, abs=1e-6)
+        assert state.position_valid == (i < 2)
 
 
-def test_a_clock_that_jumps_by_more_than_a_second_is_begun_anew() -> None:
+def test_a_clock_that_is_seconds_late_is_old_until_it_has_stayed_so() -> None:
     given, track = setup(), Track()
     for i in range(20):
         track = observe(track, position(0.1 * i, 10.0 + 0.1 * i, 0.5 * i), given)
-    track = observe(track, position(2.0, 17.0, 10.0), given)
-    state = estimate(track, 17.1)
-    assert state is not None
-    assert state.east_m == pytest.approx(10.5, abs=1e-6)
+    for i in range(70):
+        # Five seconds late, with nobody to say whether it is the clock or the way.
+        now_s = 17.0 + 0.1 * i
+        track = observe(track, position(2.0 + 0.1 * i, now_s, 10.0 + 0.5 * i), given)
+        state = estimate(track, now_s)
+        assert state is not None
+        if i < 45:
+            assert state.position_received_s == pytest.approx(now_s - 5.0, abs=0.2)
+            assert state.clock_agrees == (i < 3)
+    # Nothing is enabled and it has lasted for five seconds: that is its time now.
+    assert state.position_received_s == pytest.approx(now_s)
+    assert state.east_m == pytest.approx(10.0 + 0.5 * 69, abs=1e-6)
+    assert state.clock_agrees
 
 
 def test_a_heartbeat_and_a_position_are_as_old_as_they_are() -> None:

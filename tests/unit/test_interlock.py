@@ -34,6 +34,7 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
     ],
     Inhibit.INVALID_POSITION: [{"position_valid": False}],
     Inhibit.POSITION_FROZEN: [{"position_frozen": True}, {"position_frozen": None}],
+    Inhibit.CLOCK_DISAGREES: [{"clock_agrees": False}, {"clock_agrees": None}],
     Inhibit.FAR_FROM_FIELD: [
         {"east_m": 20_049.0},
         {"north_m": NAN},

@@ -183,6 +183,7 @@ def test_what_was_written_before_gets_the_autopilot_s_time_at_the_end(tmp_path: 
 class SystemTime:
     def __init__(self, utc_s: float) -> None:
         self.time_unix_usec = round(utc_s * 1e6)
+        self.time_boot_ms = 12_500
 
 
 @pytest.mark.parametrize("utc_s", [0.0, 1_500_000_000.0, 5e9])
@@ -191,7 +192,9 @@ def test_a_time_that_is_none_yet_is_no_report(utc_s: float) -> None:
 
 
 def test_a_time_of_satellites_is_a_report() -> None:
-    assert FROM_VEHICLE[2](SystemTime(UTC_S), 1.0) == UtcReport(received_s=1.0, utc_s=UTC_S)
+    assert FROM_VEHICLE[2](SystemTime(UTC_S), 1.0) == UtcReport(
+        received_s=1.0, utc_s=UTC_S, boot_s=12.5
+    )
 
 
 # ---------------------------------------------------------------------------------- the rest

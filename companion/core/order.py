@@ -1,0 +1,167 @@
+"""Which positions are new, which are copies, and when the autopilot's clock has begun anew.
+
+Two radios, a router's loop and Wi-Fi bring positions late and twice. Such a copy has an older time
+since boot, and so has the first position after a reboot; they are told apart by evidence. While
+the stream goes on, whatever is older is a copy. Where it has stopped, older positions are a new
+run of the clock only if they follow each other in step with our clock, and
+
+- their time since boot is shorter than the silence before them: nobody said it before that; or
+- a TIMESYNC exchange since then, which no late path can have made, agrees with them; or
+- SYSTEM_TIME gives the new times another time of day than the old ones had; or
+- the vehicle is disarmed, and they have gone on for some seconds.
+
+Until then they are dropped, and the last good position ages. The link uses the same rules to see
+that an autopilot has forgotten what was asked of it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import NamedTuple
+
+from companion.core.inputs import ClockReport, HeartbeatReport, Input, Telemetry, UtcReport
+
+# A clock that jumped ahead by more than this is another run of it; nothing comes before it is sent.
+AHEAD_MAX_S = 1.0
+# Positions of one run arrive in step with our clock to this.
+STEP_MAX_S = 0.25
+# A run is believed after so many positions, none of the old one between them.
+RUN_COUNT = 3
+# A reboot takes longer than this between the last position and the new clock's zero.
+RESTART_SLACK_S = 1.0
+# A run that is only believed because nothing flies has to last so long.
+DISARMED_RUN_S = 3.0
+# A run that pauses for longer begins anew.
+RUN_GAP_MAX_S = 2.0
+# An exchange that took longer than this could be wrong by half of it and is no measurement.
+ROUND_TRIP_MAX_S = 0.25
+# `time_boot_ms` has 32 bits, which begin anew after 50 days; TIMESYNC has 64.
+BOOT_WRAP_S = 2**32 / 1000.0
+_RUNS_MAX = 4
+# The mean arrival follows a clock that is 5 % off at 10 positions a second.
+_FOLLOW = 0.2
+_FOLLOW_MAX_S = 0.05
+
+
+class Run(NamedTuple):
+    """Positions that follow each other and do not belong to the stream so far."""
+
+    offset_s: float  # arrival less time since boot
+    boot_s: float
+    first_boot_s: float
+    first_s: float
+    last_s: float
+    positions: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """The stream of positions so far, and what may be another run of the autopilot's clock."""
+
+    boot_s: float | None = None
+    received_s: float = -math.inf
+    offset_s: float = 0.0
+    runs: tuple[Run, ...] = ()
+    exchange: ClockReport | None = None
+    epoch_s: float | None = None  # the time of day at which the clock was zero
+    utc: UtcReport | None = None  # the last one that gives another
+    disarmed_s: float = -math.inf
+
+
+class Place(Enum):
+    """What a position is in the stream."""
+
+    NEXT = "next"
+    AGAIN = "again"  # older than what is known, or the same: dropped
+    ANEW = "anew"  # the first that is believed of another run of the clock
+
+
+def noted(order: Order, item: Input) -> Order:
+    """Return the order with one more piece of evidence; most inputs are none."""
+    if isinstance(item, ClockReport):
+        is_sound = 0.0 <= item.round_trip_s <= ROUND_TRIP_MAX_S and math.isfinite(item.offset_s)
+        return replace(order, exchange=item) if is_sound else order
+    if isinstance(item, HeartbeatReport):
+        return order if item.armed else replace(order, disarmed_s=item.received_s)
+    if isinstance(item, UtcReport):
+        return _noted_utc(order, item)
+    return order
+
+
+def _noted_utc(order: Order, item: UtcReport) -> Order:
+    if item.boot_s is None or not math.isfinite(item.utc_s):
+        return order
+    epoch_s = item.utc_s - item.boot_s
+    if order.epoch_s is not None and not abs(epoch_s - order.epoch_s) <= STEP_MAX_S:
+        order = replace(order, utc=item)
+    in_step = abs(item.received_s - item.boot_s - order.offset_s) <= STEP_MAX_S
+    if order.boot_s is not None and in_step:
+        order = replace(order, epoch_s=epoch_s)
+    return order
+
+
+def sorted_in(order: Order, item: Telemetry) -> tuple[Order, Place]:
+    """Return the order after one more position, and what that is."""
+    seen_s = item.received_s - item.boot_s
+    if not math.isfinite(seen_s):
+        return order, Place.NEXT  # no number, which is for others to judge
+    if order.boot_s is None:
+        return _followed(order, item, seen_s), Place.NEXT
+    if item.boot_s > order.boot_s and seen_s >= order.offset_s - AHEAD_MAX_S:
+        off_s = seen_s - order.offset_s
+        if off_s >= -_FOLLOW_MAX_S:
+            seen_s = order.offset_s + _FOLLOW * min(off_s, _FOLLOW_MAX_S)
+        return _followed(order, item, seen_s), Place.NEXT
+    if item.boot_s == order.boot_s:
+        return order, Place.AGAIN
+    run, others = _run(order.runs, item, seen_s)
+    if _is_believed(order, run):
+        exchange = order.exchange
+        if exchange is not None and exchange.received_s <= run.first_s:
+            exchange = None  # with the clock as it was
+        anew = replace(order, exchange=exchange, epoch_s=None, utc=None)
+        return _followed(anew, item, run.offset_s), Place.ANEW
+    return replace(order, runs=(*others, run)[-_RUNS_MAX:]), Place.AGAIN
+
+
+def _followed(order: Order, item: Telemetry, offset_s: float) -> Order:
+    return replace(
+        order, boot_s=item.boot_s, received_s=item.received_s, offset_s=offset_s, runs=()
+    )
+
+
+def _run(runs: tuple[Run, ...], item: Telemetry, seen_s: float) -> tuple[Run, tuple[Run, ...]]:
+    """Return the run that a position continues or begins, and the others."""
+    for run in runs:
+        in_step = abs(seen_s - run.offset_s) <= STEP_MAX_S and item.boot_s >= run.boot_s
+        if in_step and item.received_s - run.last_s <= RUN_GAP_MAX_S:
+            now = run._replace(
+                # The quickest arrival has the least of the way in it.
+                offset_s=min(run.offset_s, seen_s),
+                boot_s=item.boot_s,
+                last_s=item.received_s,
+                positions=run.positions + (item.boot_s > run.boot_s),
+            )
+            return now, tuple(other for other in runs if other is not run)
+    begun = Run(seen_s, item.boot_s, item.boot_s, item.received_s, item.received_s, 1)
+    return begun, runs
+
+
+def _is_believed(order: Order, run: Run) -> bool:
+    """Whether a run is the clock begun anew, and no copies of what was sent before."""
+    if run.positions < RUN_COUNT:
+        return False
+    if run.offset_s < order.offset_s - AHEAD_MAX_S:
+        return True  # ahead of all that was heard: nothing is a copy of the future
+    exchange, utc = order.exchange, order.utc
+    if exchange is not None and exchange.received_s > run.first_s:
+        apart_s = math.remainder(exchange.offset_s - run.offset_s, BOOT_WRAP_S)
+        return abs(apart_s) <= STEP_MAX_S + exchange.round_trip_s
+    if run.first_boot_s <= run.first_s - order.received_s + RESTART_SLACK_S:
+        return True
+    if utc is not None and utc.boot_s is not None and utc.received_s >= run.first_s:
+        return abs(utc.received_s - utc.boot_s - run.offset_s) <= STEP_MAX_S
+    is_disarmed = order.disarmed_s > run.first_s
+    return is_disarmed and run.last_s - run.first_s >= DISARMED_RUN_S
