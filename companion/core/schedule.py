@@ -267,7 +267,8 @@ def shut_spans(route: Route, timing: Timing) -> list[tuple[float, float]]:
     """Return from when until when the border has a valve ordered shut, in order of time.
 
     The last flow ends before the first contact with the outside and the first one begins after
-    the last contact; a closing is given the time to be one, however narrow the ground is.
+    the last contact; a closing is given the time to be one, however narrow the ground is. One span
+    may reach into the next, which begins later and ends later.
     """
     found: list[tuple[float, float]] = []
     since_s: float | None = None
@@ -276,17 +277,11 @@ def shut_spans(route: Route, timing: Timing) -> list[tuple[float, float]]:
             since_s = crossing.at_s - timing.border_off_s if crossing is not route[0] else -math.inf
         elif not crossing.outside and since_s is not None:
             end_s = max(crossing.at_s - timing.border_on_s, since_s + timing.dwell_min_s)
-            _add_span(found, since_s, end_s)
+            found.append((since_s, end_s))
             since_s = None
     if since_s is not None:
-        _add_span(found, since_s, math.inf)
+        found.append((since_s, math.inf))
     return found
-
-
-def _add_span(found: list[tuple[float, float]], begin_s: float, end_s: float) -> None:
-    if found and begin_s <= found[-1][1]:
-        begin_s, end_s = found[-1][0], max(found.pop()[1], end_s)
-    found.append((begin_s, end_s))
 
 
 def _shut_between(made: list[Order], begin_s: float, end_s: float) -> list[Order]:

@@ -13,9 +13,10 @@ from companion.config.load import load
 from companion.core.controller import Memory, Setup, step
 from companion.core.crossings import Crossing, Route
 from companion.core.lines import Lines
+from companion.core.overdrive import Overdrive
 from companion.core.prescription import Prescription, Zone
 from companion.core.pump import Way as PumpWay
-from companion.core.schedule import LagModel, Timing, orders, schedule, shut_spans
+from companion.core.schedule import LagModel, Order, Timing, orders, schedule, shut_spans
 from tests.border_flight import Way, flows, orders_of, pump_orders_of, spilled_by_valve, spilled_s
 from tests.builders import plots, setup
 from tests.pump_flight import PUMP_LAG, pump_setup
@@ -129,6 +130,23 @@ def test_ground_closed_for_two_reasons_is_closed_for_the_border_whichever_comes_
         assert opened.at_s == pytest.approx(4.0 - 0.05)
 
 
+def test_a_valve_that_opens_at_the_border_is_not_driven_past_its_target() -> None:
+    law = Overdrive(
+        up_time_s=1.0, down_time_s=1.0, duty_min=0.0, duty_max=1.0, flow_for=lambda duty: duty
+    )
+    drive = law.between(0.5, 0.75)
+    assert drive is not None
+    # Between the opening by the volume, 0.41 s ahead of 2 s, and that of the border.
+    timing = replace(TIMING, up_s=2.3 - 1.62 + drive.saved_s)
+    route = (
+        Crossing(0.0, None, True, 5.0), Crossing(2.0, 20.0, False, 5.0),
+        Crossing(2.3, 30.0, False, 5.0),
+    )  # fmt: skip
+    assert orders(route, timing, dosing, law)[1:] == [
+        Order(pytest.approx(2.0 - 0.36), 0.75, 30.0, bound=True)
+    ]
+
+
 # -------------------------------------------------------------------------- planned anew each step
 
 OPENING: Route = (Crossing(0.0, None, True, 5.0), Crossing(2.0, 20.0, False, 5.0))
@@ -194,26 +212,41 @@ def test_a_pump_with_sections_keeps_to_the_border_behind_short_zones(
 ) -> None:
     # The east end slants: the sections leave one after the other.
     ground = shapely.Polygon([(0.0, -3.0), (16.0, -3.0), (13.0, 9.0), (-2.0, 9.0)])
+    rows = rows_of((1.0, 15.0), (2.0, 22.0), (20.0, 15.0))
+    assert not spilled_behind_pump(pump_way, rows, ground, speed_m_s)
+
+
+def test_a_section_is_shut_for_the_border_where_a_rate_of_0_lies_before_it() -> None:
+    rows = rows_of((10.0, 15.0), (0.5, 0.0))
+    slow = replace(LATE_LAG, on_start_s=0.1, off_end_s=0.3)
+    assert not spilled_behind_pump("return", rows, shapely.box(0.0, -3.0, 10.5, 9.0), 5.0, lag=slow)
+
+
+def spilled_behind_pump(
+    pump_way: PumpWay, rows: Prescription, ground: shapely.Polygon, speed_m_s: float, **lag: object
+) -> list[float]:
+    """Return when a pump's flow came out of a strip that was partly outside."""
     made = pump_setup(
         [20.0], pump_way, border="inside", border_buffer_m=0.0,
-        prescription=Prescription(
-            rows_of((1.0, 15.0), (2.0, 22.0), (20.0, 15.0)).zones, boundary=ground
-        ),
+        prescription=Prescription(rows.zones, boundary=ground), **lag,
     )  # fmt: skip
     way = Way(east_m=-25.0, speed_m_s=speed_m_s, **EASTWARDS)
     seconds = 45.0 / speed_m_s
     first_s, last_s = PUMP_LAG.on_start_s, PUMP_LAG.off_end_s
-    flow = flows(pump_orders_of(made, way, seconds), first_s=first_s, last_s=last_s)
-    assert flow
-    valve_s = made.lag.on_s
-    for strip, orders_ in zip(made.boom.valves, orders_of(made, way, seconds), strict=True):
-        spans = flow
+    pumped = flows(pump_orders_of(made, way, seconds), first_s=first_s, last_s=last_s)
+    found: list[float] = []
+    for strip, each in zip(made.boom.valves, orders_of(made, way, seconds), strict=True):
+        spans = pumped
         if pump_way != "always":
-            is_open = flows(orders_, first_s=valve_s, last_s=valve_s)
-            spans = [(max(a, c), min(b, d)) for a, b in flow for c, d in is_open
+            out_s = made.lag.output_s
+            is_open = flows(
+                each, first_s=out_s + made.lag.on_start_s, last_s=out_s + made.lag.off_end_s
+            )
+            spans = [(max(a, c), min(b, d)) for a, b in pumped for c, d in is_open
                      if min(b, d) > max(a, c)]  # fmt: skip
-            assert spans
-        assert spilled_s(
+        assert spans
+        found += spilled_s(
             ground, way, spans, right_m=strip.right_m, forward_m=strip.forward_m,
             half_m=strip.width_m / 2.0, until_s=seconds,
-        ) == []  # fmt: skip
+        )  # fmt: skip
+    return found

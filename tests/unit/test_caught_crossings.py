@@ -108,6 +108,19 @@ def test_only_ground_beyond_the_border_is_outside() -> None:
     ]
 
 
+def test_ground_without_a_zone_is_closed_and_not_outside() -> None:
+    zones = [Zone(name="a", polygon=shapely.box(0, 0, 10, 6), rate_l_ha=20.0)]
+    (found,) = find_routes(
+        Prescription(zones, boundary=shapely.box(0, 0, 12, 6)), flying(10.0, 8.0), one_valve(),
+        back_s=0.3, ahead_s=2.0, border="inside", border_buffer_m=0.1, across="centre",
+    )  # fmt: skip
+    assert [(crossing.rate_l_ha, crossing.outside) for crossing in found] == [
+        (20.0, False),
+        (None, False),
+        (None, True),
+    ]
+
+
 def test_a_braking_aircraft_meets_the_boundary_when_its_motion_takes_it_there() -> None:
     zones = [
         Zone(name="a", polygon=shapely.box(0, 0, 12, 6), rate_l_ha=20.0),
