@@ -14,6 +14,8 @@ from companion.core.types import Telemetry
 
 # The same place to the last bit (1.1 cm) while somebody claims that the vehicle went this far.
 FROZEN_M = 0.15
+# A slower claim is the noise of one that stands (PX4 tells up to 0.2 m/s at rest): no way is gone.
+STANDING_M_S = 0.3
 # Exactly no velocity in the message after at least this much, and what brakes take off until then:
 # no vehicle stops between two messages. Slower than it nothing is sprayed (`speed_min_m_s`).
 STOP_M_S = 0.8
@@ -50,7 +52,8 @@ def look(
     same = (item.latitude_deg, item.longitude_deg) == before[:2]
     dt_s = item.boot_s - before.boot_s
     said_m_s = _said(item)
-    claims = [claim for claim in (said_m_s, reported_m_s) if claim is not None and claim > 0.0]
+    told = (said_m_s, reported_m_s)
+    claims = [claim for claim in told if claim is not None and claim > STANDING_M_S]
     way_m = before.way_m + max(claims, default=0.0) * dt_s if same else 0.0
     most_m_s = STOP_M_S + BRAKE_MAX_M_S2 * dt_s
     is_frozen = (same and (before.is_frozen or way_m > FROZEN_M)) or (

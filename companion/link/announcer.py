@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 
+from companion.core.sprayer_state import ENVELOPE
 from companion.core.types import Decision, Inhibit, SprayerState
 from companion.link.encode import (
     STATE_ACTIVE,
@@ -19,13 +20,17 @@ HEARTBEAT_S = 1.0
 LIVE_S = 0.1
 VALUES_S = 1.0
 TEXT_S = 1.0
+# A change is told once it has lasted: what comes and goes is none. What each turn of a flight goes
+# through (too slow, too high) has to last for longer than a turn does.
+SETTLED_S = 1.0
+TURN_S = 10.0
 # Who connects in the middle of a flight learns within this why nothing is sprayed.
 REMIND_S = 30.0
 # What no product is sprayed with is marked; as numbers for ground stations.
 TRAINING = {"water": 1.0, "dry": 2.0, "ground": 3.0}
 _LINE_MAX = 50
 _LINES_MAX = 2
-_PREFIX = "Spray: "
+_PREFIX, _OFF = "Spray: ", "Spray off: "
 _WAITING_MAX = 8
 
 _INFO, _NOTICE, _WARNING, _ERROR = 6, 5, 4, 3  # MAV_SEVERITY
@@ -39,6 +44,29 @@ _LOUD = frozenset(
         Inhibit.SPEED_DISAGREES,
     }
 )
+
+# What a reason is called on the operator's screen, where its own name does not say it.
+_WORDS = {
+    Inhibit.ESTOP: "emergency stop",
+    Inhibit.REARM_NEEDED: "disable, then enable again",
+    Inhibit.STALE_POSITION: "position too old",
+    Inhibit.INVALID_POSITION: "position not confirmed",
+    Inhibit.STALE_HEARTBEAT: "heartbeat lost",
+    Inhibit.NOT_ACTIVE: "vehicle not active",
+    Inhibit.WRONG_MODE: "wrong flight mode",
+    Inhibit.NOT_IN_AIR: "not flying",
+    Inhibit.FIX_TOO_LOW: "GNSS fix too poor",
+    Inhibit.ACCURACY_TOO_LOW: "GNSS accuracy too poor",
+    Inhibit.ESTIMATOR_UNHEALTHY: "EKF unhealthy",
+    Inhibit.SPEED_BELOW_MIN: "too slow",
+    Inhibit.SPEED_ABOVE_MAX: "too fast",
+    Inhibit.SPEED_DISAGREES: "speeds disagree",
+    Inhibit.SPEED_UNCHECKED: "speed not checked",
+    Inhibit.HEIGHT_BELOW_MIN: "too low",
+    Inhibit.HEIGHT_ABOVE_MAX: "too high",
+    Inhibit.WIND_ABOVE_MAX: "too much wind",
+    Inhibit.RC_SWITCH: "RC switch off",
+}
 
 # As numbers for ground stations: 0 boot, 1 safe, 2 ready, 3 armed, 4 spraying, 5 fault, 6 estop.
 _NUMBER = {state: float(number) for number, state in enumerate(SprayerState)}
@@ -85,7 +113,8 @@ class Announcer:
         self._heartbeat, self._live = _Beat(HEARTBEAT_S), _Beat(LIVE_S)
         self._values = _Beat(VALUES_S)
         self._said: frozenset[Inhibit] | None = None
-        self._said_s = float("-inf")
+        self._seen: frozenset[Inhibit] = frozenset()
+        self._said_s = self._seen_s = float("-inf")
         self._waiting: deque[tuple[int, str]] = deque(maxlen=_WAITING_MAX)
         self._noted_s = float("-inf")
         self.tank_l: float | None = None
@@ -138,14 +167,29 @@ class Announcer:
                 yield self._encoder.text(severity, line)
 
     def _text(self, decision: Decision, now_s: float) -> Iterator[bytes]:
-        is_held = bool(decision.inhibits) and Inhibit.NOT_ENABLED not in decision.inhibits
-        is_new = decision.inhibits != self._said or (is_held and now_s - self._said_s >= REMIND_S)
-        if not is_new or now_s - self._said_s < TEXT_S:
+        if decision.inhibits != self._seen:
+            self._seen, self._seen_s = decision.inhibits, now_s
+        if not self._is_news(decision.inhibits, now_s) or now_s - self._said_s < TEXT_S:
             return
         self._said, self._said_s = decision.inhibits, now_s
         severity = _WARNING if decision.inhibits & _LOUD else _INFO
-        for line in lines(reasons(decision.inhibits)):
+        for line in reasons(decision.inhibits):
             yield self._encoder.text(severity, line)
+
+    def _is_news(self, now: frozenset[Inhibit], now_s: float) -> bool:
+        """Return whether the reasons are to be told: one line for each change that is one."""
+        if self._said is None:
+            return True
+        is_old = now_s - self._said_s >= REMIND_S
+        if now == self._said:
+            return is_old and bool(now) and Inhibit.NOT_ENABLED not in now
+        change = now ^ self._said
+        if change & now & _LOUD:
+            return True
+        if change <= ENVELOPE:
+            return now_s - self._seen_s >= TURN_S
+        # What goes on coming and going is told now and then.
+        return is_old or now_s - self._seen_s >= SETTLED_S
 
     def named_values(self, decision: Decision, now_s: float) -> Iterator[bytes]:
         """Yield what any ground station can show or plot."""
@@ -170,8 +214,8 @@ class Announcer:
 def lines(text: str) -> list[str]:
     """Return `text` in lines that a station shows whole; what does not fit two is counted.
 
-    >>> lines("closed: not-enabled, no-position, no-heartbeat")
-    ['Spray: closed: not-enabled, no-position,', 'Spray: no-heartbeat']
+    >>> lines("no watchdog on autopilot: valves stay open if companion stops")
+    ['Spray: no watchdog on autopilot: valves stay open', 'Spray: if companion stops']
     """
     room = _LINE_MAX - len(_PREFIX)
     words, found = text.split(" "), [""]
@@ -188,12 +232,25 @@ def lines(text: str) -> list[str]:
     return [_PREFIX + line for line in found if line]
 
 
-def reasons(inhibits: frozenset[Inhibit]) -> str:
-    """Return why it does not spray, in the order of the enumeration.
+def reasons(inhibits: frozenset[Inhibit]) -> list[str]:
+    """Return why it does not spray, in the order of the enumeration; two lines at most.
 
-    >>> reasons(frozenset({Inhibit.NOT_ARMED, Inhibit.NOT_ENABLED}))
-    'closed: not-enabled, not-armed'
+    >>> reasons(frozenset({Inhibit.NOT_ENABLED, Inhibit.SPEED_BELOW_MIN}))
+    ['Spray off: not enabled, too slow']
+    >>> reasons(frozenset())
+    ['Spray: ready']
     """
     if not inhibits:
-        return "ready"
-    return "closed: " + ", ".join(inhibit for inhibit in Inhibit if inhibit in inhibits)
+        return [f"{_PREFIX}ready"]
+    words = [_WORDS.get(one, one.replace("-", " ")) for one in Inhibit if one in inhibits]
+    found = [f"{_OFF}{words[0]}"]
+    for number, word in enumerate(words[1:], start=1):
+        more = f" +{len(words) - number}"
+        if len(found[-1]) + 2 + len(word) <= _LINE_MAX - (len(found) == _LINES_MAX) * len(more):
+            found[-1] += f", {word}"
+        elif len(found) < _LINES_MAX:
+            found.append(f"{_OFF}{word}")
+        else:
+            found[-1] += more
+            break
+    return found

@@ -10,6 +10,8 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
 _SAMPLE_S = 0.5
 _WINDOW_S = 3.0
 # So much of a wanted rate counts as all of it.
@@ -83,6 +85,15 @@ def wanted_streams(
         *([Stream(message_id=147, rate_hz=10.0, group=_EXTRA3)] if with_battery else []),
         *([Stream(message_id=42, rate_hz=2.0, group=_EXTENDED_STATUS)] if with_mission else []),
     )
+
+
+def _name(message_id: int) -> str:
+    """Return what a message is called.
+
+    >>> _name(65)
+    'RC_CHANNELS'
+    """
+    return str(mavlink.mavlink_map[message_id].msgname)
 
 
 @dataclass(slots=True)
@@ -182,9 +193,9 @@ class StreamSupervisor:
             said["fought"] = "another station changes our stream rates"
         if missing:
             verb = "refused" if any(watch.is_refused for watch in missing) else "not sent as asked"
-            numbers = " ".join(str(watch.stream.message_id) for watch in missing[:4])
-            more = " ..." if len(missing) > 4 else ""
-            said["missing"] = f"{verb}: {numbers}{more}"
+            names = " ".join(_name(watch.stream.message_id) for watch in missing[:3])
+            more = " ..." if len(missing) > 3 else ""
+            said["missing"] = f"{verb}: {names}{more}"
         for key, text in said.items():
             if key not in self._told:
                 self._told.add(key)

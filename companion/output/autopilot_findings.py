@@ -104,8 +104,8 @@ def dead_man(options: ServoOptions, known: Known, *, is_px4: bool) -> Finding | 
     """
     if options.dither_us or (not is_px4 and known.get(_WATCHDOG) == 1.0):
         return None
-    what = "output.dither_us is 0" if is_px4 else f"no watchdog script ({_WATCHDOG})"
-    return _warning(f"{what}: valves stay open if I die")
+    what = "output.dither_us is 0" if is_px4 else "no watchdog on autopilot"
+    return _warning(f"WARNING {what}: valves stay open if companion stops")
 
 
 def _merged(found: Sequence[Finding]) -> Iterator[Finding]:
@@ -194,17 +194,17 @@ def _pin(options: ServoOptions, known: Known, channel: int, name: str) -> Iterat
     disarmed = known.get(name.format("DIS"))
     if disarmed is not None and disarmed != rest_us:
         text = f"{name.format('DIS')} is {disarmed:g}: set it to {rest_us}"
-        if not is_return and _is_open(options, disarmed, drive):
+        if not is_return and is_open(options, disarmed, drive):
             yield _fault(f"{text}, else disarming opens")
         else:
             yield _warning(text)
     failed = known.get(name.format("FAIL"))
-    is_active = failed is not None and not is_return and _is_open(options, failed, drive)
+    is_active = failed is not None and not is_return and is_open(options, failed, drive)
     if failed is not None and failed >= 0.0 and is_active:
         yield _warning(f"{name.format('FAIL')} is {failed:g}, which opens: set it to {rest_us}")
 
 
-def _is_open(options: ServoOptions, pulse_us: float, drive: DriveOutput | None) -> bool:
+def is_open(options: ServoOptions, pulse_us: float, drive: DriveOutput | None) -> bool:
     """Return whether a pulse opens a valve: it lies on the side of `full_us`, or is no number."""
     if drive is not None:
         return not pulse_us <= drive.stop_us

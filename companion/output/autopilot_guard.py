@@ -14,6 +14,7 @@ from companion.output.autopilot_check import OutputCheck, Reading, ardupilot_pla
 from companion.output.autopilot_findings import (
     dead_man,
     findings,
+    is_open,
     more_parameters,
     px4_pins,
     px4_places,
@@ -56,6 +57,8 @@ class OutputGuard:
         self._is_px4 = False
         self._met_s: float | None = None
         self._live_s: float | None = None
+        self._judged_s: float | None = None  # None: the parameters are still being read
+        self._is_judged = False
         self._rest_since_s: float | None = None
         self._wiring: str | None = None
         self._refused: str | None = None
@@ -75,6 +78,7 @@ class OutputGuard:
     def met(self, *, is_px4: bool, now_s: float) -> tuple[str, ...]:
         """Take that a vehicle was met, or met again; return the parameters to read."""
         self._is_px4, self._met_s = is_px4, now_s
+        self._is_judged, self._judged_s = False, None
         self._known.clear()
         self._check.forget()
         self._wiring = px4_wiring(self._options) if is_px4 else None
@@ -90,6 +94,7 @@ class OutputGuard:
             return more
         if self._is_px4:
             self._check.look_at(px4_places(self._options.outputs, self._known))
+        self._is_judged = True
         found = findings(self._options, self._known, is_px4=self._is_px4)
         missing = dead_man(self._options, self._known, is_px4=self._is_px4)
         found += [] if missing is None else [missing]
@@ -108,6 +113,7 @@ class OutputGuard:
     def armed(self, is_armed: bool, now_s: float) -> None:
         """Take whether the vehicle is armed: PX4's outputs follow no order while it is not."""
         self._live_s = now_s + _LIVE_AFTER_S if is_armed else None
+        self._rest_since_s = None
         if self._is_px4:
             self._check.forget()
 
@@ -137,8 +143,15 @@ class OutputGuard:
         return verdict.again
 
     def look(self, now_s: float) -> None:
-        """Say once that nothing tells what the outputs do."""
+        """Say once that nothing tells what the outputs do.
+
+        Which report shows an actuator of PX4 is known once the parameters have been read.
+        """
+        if self._is_judged and self._judged_s is None:
+            self._judged_s = now_s
         since_s = self._live_s if self._is_px4 else self._met_s
+        if since_s is not None and self._is_px4:
+            since_s = None if self._judged_s is None else max(since_s, self._judged_s)
         if since_s is None or now_s - since_s < _REPORT_WAIT_S or self._check.is_possible:
             return
         self._tell("SERVO_OUTPUT_RAW of these outputs does not come: they are not checked")
@@ -160,11 +173,17 @@ class OutputGuard:
         return at_s - self._rest_since_s < _REST_MAX_S
 
     def _is_at_rest(self, reading: Reading) -> bool:
+        """Return whether an output of PX4 shows its disarmed value; unknown, one that closes."""
+        if not self._is_px4:
+            return False
         channel = self._options.outputs[reading.output]
-        return any(
-            self._known.get(f"PWM_{group}_DIS{number}") == reading.pulse_us
-            for group, number in (px4_pins(channel, self._known) if self._is_px4 else ())
-        )
+        pins = px4_pins(channel, self._known)
+        told = [self._known.get(f"PWM_{group}_DIS{number}") for group, number in pins]
+        known = [value for value in told if value is not None]
+        if known:
+            return reading.pulse_us in known
+        is_valve = channel in self._options.channels
+        return is_valve and not is_open(self._options, reading.pulse_us, None)
 
     def _words(self, reading: Reading) -> str:
         """Return what is seen and what to do about it."""

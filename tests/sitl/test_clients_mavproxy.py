@@ -21,7 +21,7 @@ async def speak_to_the_companion(shown: Console) -> None:
     """Have parameters and commands of the companion's answered; spraying is enabled after it."""
     shown.type("vehicle 1:191")
     shown.type("set param_ftp 0")
-    await shown.until(lambda: "Spray: closed: not-enabled" in shown.said)
+    await shown.until(lambda: "Spray off: not enabled" in shown.said)
     await shown.answers("param fetch", "Received 8 parameters")
     await shown.answers("param show SPR_TANK_L", "SPR_TANK_L  ")
     await shown.answers("param set SPR_RATE_PCT 95", "rate 95 %")

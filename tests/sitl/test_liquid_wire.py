@@ -79,7 +79,7 @@ async def test_a_stuck_valve_is_found_within_seconds_by_the_autopilots_meter_and
     async with process(*serve) as vehicle:
         await until_said(vehicle, "waiting for a companion")
         async with process("run", "--config", str(folder / "config.toml"), *options) as companion:
-            await until_said(vehicle, "Spray: closed: valve-stuck-open")
+            await until_said(vehicle, "Spray off: valve stuck open")
             # A few positions more: it stays closed where the map asks for liquid.
             for _ in range(2):
                 await until_said(vehicle, "flying: ")

@@ -112,7 +112,7 @@ async def flight() -> AsyncIterator[Flight]:
 
 async def test_it_begins_closed_and_stays_so_until_it_is_enabled(flight: Flight) -> None:
     await flight.peer.until(lambda: flight.peer.is_all_closed)
-    await flight.peer.until(lambda: "Spray: closed: not-enabled" in flight.peer.texts())
+    await flight.peer.until(lambda: "Spray off: not enabled" in flight.peer.texts())
     assert not flight.peer.is_spraying
     flight.peer.enable()
     await flight.peer.until(lambda: len(flight.peer.open_channels) == 6)
@@ -188,7 +188,7 @@ async def test_a_refused_order_closes_for_good_and_is_told_once(flight: Flight) 
     flight.peer.enable(False)
     flight.peer.enable(True)
     await flight.peer.until(lambda: any("servo order" in text for text in flight.peer.texts()))
-    await flight.peer.until(lambda: any("output-fault" in text for text in flight.peer.texts()))
+    await flight.peer.until(lambda: any("output fault" in text for text in flight.peer.texts()))
     since = len(flight.peer.orders) - 6
     await flight.peer.until(lambda: len(flight.peer.orders) > since + 7)  # seldom refreshed
     assert all(order.pulse_us == 1000 for order in flight.peer.orders[since:])
@@ -305,7 +305,7 @@ async def test_a_restart_is_disabled(flight: Flight) -> None:
     again.start()
     flight.peer.outputs.clear()
     flight.peer.messages.clear()
-    await flight.peer.until(lambda: "Spray: closed: not-enabled" in flight.peer.texts())
+    await flight.peer.until(lambda: "Spray off: not enabled" in flight.peer.texts())
     assert not flight.peer.is_spraying
     os.kill(os.getpid(), signal.SIGTERM)
     await again.result()

@@ -344,7 +344,7 @@ async def test_a_refusal_is_explained_by_the_parameters() -> None:
     assert executor.fault == "servo order failed: is SERVOn_FUNCTION 0?"
     executor.learned({"SERVO9_FUNCTION": 0.0, "SERVO10_FUNCTION": 33.0, "SPRAY_ENABLE": None})
     assert executor.fault == "SERVO10_FUNCTION is 33: orders are refused; set it to 0"
-    assert [text for text in said if "SPRW" not in text] == []
+    assert [text for text in said if "no watchdog" not in text] == []
     await executor.stop()
 
 

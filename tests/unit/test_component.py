@@ -18,6 +18,7 @@ from companion.core.types import (
     SprayPlan,
     Telemetry,
 )
+from companion.link.announcer import reasons
 from companion.link.component import Component, ComponentOptions
 from companion.link.decode import FROM_ANYONE, FROM_VEHICLE
 from companion.link.vehicle_link import VehicleLink
@@ -385,27 +386,59 @@ def inhibited(*inhibits: Inhibit) -> Decision:
 def test_reasons_are_told_when_they_change_and_not_otherwise(peer: Peer, met: Component) -> None:
     for turn in range(60):
         met.tick(inhibited(Inhibit.NOT_ENABLED, Inhibit.NOT_ARMED), turn * 0.05)
-    for turn in range(60, 90):
+    for turn in range(60, 75):
         met.tick(OPEN, turn * 0.05)
-    assert peer.texts() == ["Spray: closed: not-enabled, not-armed", "Spray: ready"]
+    assert peer.texts() == ["Spray off: not enabled, not armed"]
+    for turn in range(75, 110):
+        met.tick(OPEN, turn * 0.05)
+    assert peer.texts() == ["Spray off: not enabled, not armed", "Spray: ready"]
 
 
-def test_reasons_that_flicker_are_told_once_a_second(peer: Peer, met: Component) -> None:
+def test_reasons_that_flicker_are_told_now_and_then(peer: Peer, component: Component) -> None:
+    for turn in range(1200):
+        flicker = Inhibit.POSITION_FROZEN if turn % 12 > 5 else Inhibit.STALE_POSITION
+        component.tick(inhibited(flicker), turn * 0.05)
+    assert 1 <= len(peer.texts()) <= 3
+
+
+def test_turns_of_a_flight_are_no_news_and_a_long_stand_is(
+    peer: Peer, component: Component
+) -> None:
+    for turn in range(20 * 300):
+        now_s = turn * 0.05
+        slow = {Inhibit.SPEED_BELOW_MIN} if now_s % 20.0 > 15.0 else set()
+        component.tick(inhibited(*slow), now_s)
+    assert peer.texts() == ["Spray: ready"]
+    for turn in range(20 * 12):
+        component.tick(inhibited(Inhibit.SPEED_BELOW_MIN), 300.0 + turn * 0.05)
+    assert peer.texts() == ["Spray: ready", "Spray off: too slow"]
+
+
+def test_what_somebody_has_to_see_to_is_told_at_once(peer: Peer, met: Component) -> None:
     for turn in range(100):
-        flicker = Inhibit.SPEED_BELOW_MIN if turn % 2 else Inhibit.STALE_POSITION
-        met.tick(inhibited(flicker), turn * 0.05)
-    assert 4 <= len(peer.texts()) <= 6
+        met.tick(OPEN, turn * 0.05)
+    met.tick(inhibited(Inhibit.OUTPUT_FAULT), 5.0)
+    assert peer.texts() == ["Spray: ready", "Spray off: output fault"]
+
+
+def test_every_reason_is_said_in_plain_words() -> None:
+    for inhibit in Inhibit:
+        (line,) = reasons(frozenset({inhibit}))
+        assert line.startswith("Spray off: ")
+        assert len(line) <= 50
+        assert "-" not in line
 
 
 def test_all_reasons_at_once_are_two_lines_that_count_the_rest(peer: Peer, met: Component) -> None:
     met.tick(inhibited(*Inhibit), 0.0)
     texts = peer.texts()
-    assert [text[:7] for text in texts] == ["Spray: "] * 2
+    assert [text[:11] for text in texts] == ["Spray off: "] * 2
     assert all(len(text) <= 50 for text in texts)
-    told = "".join(texts)
-    first = [inhibit for inhibit in Inhibit if inhibit in told]
-    assert first == list(Inhibit)[: len(first)]
-    assert int(texts[1].rpartition("+")[2]) == len(Inhibit) - len(first)
+    told = ", ".join(text[11:].rpartition(" +")[0] or text[11:] for text in texts).split(", ")
+    names = [reasons(frozenset({inhibit}))[0][11:] for inhibit in Inhibit]
+    assert ", ".join(told) in ", ".join(names)
+    rest = int(texts[1].rpartition("+")[2])
+    assert len(", ".join(told)) + len(", ".join(names[-rest:])) + 2 == len(", ".join(names))
 
 
 def test_why_an_enabled_sprayer_is_closed_is_said_again_every_half_minute(
@@ -413,7 +446,7 @@ def test_why_an_enabled_sprayer_is_closed_is_said_again_every_half_minute(
 ) -> None:
     for turn in range(2 * 61):
         component.tick(inhibited(Inhibit.STALE_POSITION), turn * 0.5)
-    assert peer.texts() == ["Spray: closed: stale-position"] * 3
+    assert peer.texts() == ["Spray off: position too old"] * 3
     peer.sent.clear()
     for turn in range(2 * 61):
         component.tick(inhibited(Inhibit.NOT_ENABLED), 100.0 + turn * 0.5)

@@ -425,6 +425,18 @@ def test_a_vehicle_that_brakes_stands_and_goes_on_is_never_frozen(
         assert not state.position_frozen, (now_s, speed)
 
 
+@pytest.mark.parametrize("noise_m_s", [0.02, 0.1, 0.29])
+def test_a_vehicle_that_stands_is_not_frozen_by_the_noise_of_its_speed(noise_m_s: float) -> None:
+    track = Track()
+    for number in range(600):
+        now_s = 0.1 * number
+        track = observe(track, SpeedReport(received_s=now_s, ground_speed_m_s=noise_m_s), SETUP)
+        track = observe(track, at(now_s, 114.5, noise_m_s), SETUP)
+        state = estimate(track, now_s)
+        assert state is not None
+        assert not state.position_frozen, now_s
+
+
 # --------------------------------------------------------------- no number, nothing, too old
 
 

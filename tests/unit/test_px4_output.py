@@ -19,6 +19,7 @@ from companion.link.component import Component, ComponentOptions
 from companion.link.encode import Encoder
 from companion.link.parameter_reader import ParameterReader
 from companion.output.autopilot_findings import px4_wiring, wanted_parameters
+from companion.output.autopilot_guard import OutputGuard
 from companion.output.servo import ServoExecutor, ServoOptions
 from tests.builders import now, plan
 
@@ -242,6 +243,60 @@ async def test_px4_is_compared_only_while_it_is_armed() -> None:
     assert executor.fault is not None
     assert executor.fault.startswith("actuator 1 reads 900 us, ordered 1000")
     await executor.stop()
+
+
+def learned(executor: ServoExecutor, **pins: float | None) -> None:
+    """Have the parameters read, of which PX4's simulation has no PWM_MAIN_DISn."""
+    known: dict[str, float | None] = dict.fromkeys(wanted_parameters(OPTIONS, is_px4=True))
+    known |= {f"PWM_MAIN_FUNC{8 + n}": 300.0 + n for n in CHANNELS}
+    more = executor.learned(known)
+    assert executor.learned(dict.fromkeys(more) | pins) == ()
+
+
+async def test_disarming_is_no_fault_where_the_disarmed_value_is_not_known() -> None:
+    way = Joint()
+    executor = await way.executor()
+    learned(executor)
+    executor.armed(True)
+    for k in range(15):  # the heartbeat says so up to a second later
+        executor.reported(0, report(c9=900, c10=900, c11=900), now() + 1.0 + 0.1 * k)
+        assert executor.fault is None
+    executor.armed(False)
+    executor.armed(True)
+    for k in range(5):
+        executor.reported(0, report(c9=1500, c10=1000, c11=1000), now() + 1.0 + 0.1 * k)
+    assert executor.fault is not None  # what opens is a fault at once
+    await executor.stop()
+
+
+async def test_a_killed_output_is_still_a_fault_where_the_disarmed_value_is_not_known() -> None:
+    way = Joint()
+    executor = await way.executor()
+    learned(executor)
+    executor.armed(True)
+    for k in range(25):
+        executor.reported(0, report(c9=900, c10=900, c11=900), now() + 1.0 + 0.1 * k)
+    assert executor.fault is not None
+    await executor.stop()
+
+
+async def test_that_no_output_is_told_is_not_said_while_parameters_are_read() -> None:
+    said: list[str] = []
+    guard = OutputGuard(OPTIONS, said.append)
+    known: dict[str, float | None] = dict.fromkeys(guard.met(is_px4=True, now_s=0.0))
+    known |= {f"PWM_MAIN_FUNC{8 + n}": 300.0 + n for n in CHANNELS}
+    guard.armed(True, 0.0)
+    guard.look(60.0)
+    more = guard.learned(known)
+    guard.look(70.0)
+    assert said == []
+    guard.learned(dict.fromkeys(more))
+    said.clear()
+    guard.look(71.0)
+    guard.look(75.9)
+    assert said == []
+    guard.look(76.1)
+    assert [text[:16] for text in said] == ["SERVO_OUTPUT_RAW"]
 
 
 def test_parameters_are_read_at_a_pace_and_given_up_in_the_end() -> None:
