@@ -1,0 +1,91 @@
+"""`vrspray doctor` with all its options beside a real ArduCopter that is ready to fly."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.firmware.fields import HOME, write_pass
+from tests.firmware.firmware import vrspray
+from tests.firmware.flights import OPEN_US, ready_copter
+from tests.firmware.station import Station
+from tests.sitl.doctor_bench import guided
+
+pytestmark = [pytest.mark.firmware, pytest.mark.timeout(300)]
+
+
+def checks(*options: str) -> tuple[int, dict[str, dict[str, Any]]]:
+    """Run the doctor; return its exit code and its checks by name."""
+    found = vrspray("doctor", *options, "--json")
+    assert found.stdout, found.stderr
+    return found.returncode, {one["name"]: one for one in json.loads(found.stdout)["checks"]}
+
+
+@asynccontextmanager
+async def logged(station: Station) -> AsyncIterator[None]:
+    """Log what the vehicle sends while something else is waited for."""
+
+    async def pump() -> None:
+        while True:
+            station.pump(0.0)
+            await asyncio.sleep(0.005)
+
+    pumping = asyncio.create_task(pump())
+    try:
+        yield
+    finally:
+        pumping.cancel()
+        await asyncio.gather(pumping, return_exceptions=True)
+
+
+async def test_doctor_finds_a_ready_vehicle_ready(
+    firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
+) -> None:
+    config = write_pass(tmp_path / "field")
+    chosen = ("--config", str(config))
+    with ready_copter(tmp_path / "copter", firmwares, HOME) as vehicle:
+        station = vehicle.station
+        code, found = checks(*chosen, "--wait-s", "20")
+        failed = [one for one in found.values() if one["status"] == "fail"]
+        warned = [one["name"] for one in found.values() if one["status"] == "warn"]
+        tell(f"nothing failed; to be seen to: {', '.join(warned)}")
+        assert (code, failed) == (0, [])
+        for name in ("link", "heartbeat", "streams", "vehicle-clock", "fix", "estimator"):
+            assert found[name]["status"] == "ok", found[name]
+        for name in ("output-parameters", "watchdog-script", "closed-order"):
+            assert found[name]["status"] == "ok", found[name]
+
+        code, found = checks(*chosen, "--no-link", "--set", "lag.on_s=0.11")
+        assert code == 0
+        assert found["heartbeat"]["status"] == "not-applicable"
+
+        code, found = checks(*chosen, "--watchdogs")
+        tell(found["script-closes"]["text"])
+        assert found["script-closes"]["status"] == "ok"
+
+        refused = vrspray("doctor", *chosen, "--click", "--wet")
+        assert refused.returncode == 2
+        assert "needs a flow meter" in refused.stderr
+
+        station.log.clear_flight()
+        async with logged(station), guided(config, 14550, "--click") as doctor:
+            for number in range(1, 7):
+                await doctor.answer(f"valve {number} ({number} of 6): Enter clicks", "\n")
+                await doctor.answer(f"did valve {number} click?", "y\n")
+            code, clicks = await doctor.ended()
+        assert (code, [one["status"] for one in clicks["checks"][:6]]) == (0, ["ok"] * 6)
+        assert [openings(station, output) for output in range(9, 15)] == [2] * 6
+        assert not any(us > OPEN_US for us in station.log.pulses[-1].us[8:14])
+
+
+def openings(station: Station, output: int) -> int:
+    """Return how often an output went from closed to open."""
+    us = [one.us[output - 1] for one in station.log.pulses]
+    return sum(before <= OPEN_US < after for before, after in pairwise([1000, *us]))
