@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 from typer.core import TyperGroup
 
+from companion.cli.beside import give_way
 from companion.errors import ActuatorError, MapError, UnreadableError, VrsprayError
 
 if TYPE_CHECKING:
@@ -133,7 +134,9 @@ def _root(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and leave with its exit code."""
-    sys.exit(execute(sys.argv[1:] if arguments is None else arguments))
+    given = sys.argv[1:] if arguments is None else arguments
+    give_way(given)
+    sys.exit(execute(given))
 
 
 def execute(arguments: Sequence[str]) -> int:

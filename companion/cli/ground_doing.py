@@ -14,6 +14,7 @@ import typer
 
 from companion import ground, runtime
 from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.beside import shown
 from companion.cli.ground_tasks import (
     GroundOptionError,
     Piece,
@@ -162,7 +163,8 @@ def _perform(config: Config, given: tuple[str, ...], piece: Piece, hand: Hand) -
                 on_ready=lambda: note(hand.invitation),
             )
 
-    return runtime.execute(main)
+    with shown():
+        return runtime.execute(main)
 
 
 def _result(config: Config, piece: Piece, outcome: GroundOutcome) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import typer
 from companion import runtime
 from companion.assembly import build_setup, deliverable, refuse_mismatch
 from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.beside import shown
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.notify import Notifier
 from companion.cli.output_parts import build_outputs
@@ -114,7 +115,7 @@ def run_companion(
     follow(journal, link, executor)
     notifier = Notifier.from_environment(os.environ, pid=os.getpid())
     try:
-        with journal, notifier:
+        with journal, notifier, shown():
             runtime.execute(
                 lambda: runtime.run(
                     setup,
