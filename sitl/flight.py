@@ -37,6 +37,7 @@ from companion.core.types import (
 from companion.output.pwm import PulseEngine
 from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.drives import DrivenOutput, DriveTruth, Motors, Ranges
+from sitl.earth import Earth
 from sitl.knowledge import KnowingOutput, WaitingForDuties, WaitingForEdges, pwm_limits
 from sitl.leg_reports import leg_reports
 from sitl.liquid_faults import LiquidFault, LiquidSensors
@@ -259,7 +260,7 @@ def _inputs(setup: Setup, trajectory: Trajectory, options: FlightOptions) -> Ite
     is_noisy = options.noise and not options.knows
     navigation = Navigation(
         trajectory,
-        setup.frame,
+        Earth(setup.frame.latitude_deg, setup.frame.longitude_deg),
         seed=options.seed,
         start_s=float(trajectory.time_s[0]),
         position_rate_hz=options.position_rate_hz,

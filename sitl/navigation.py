@@ -14,7 +14,7 @@ from sitl.trajectory import Trajectory
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from companion.core.frame import LocalFrame
+    from sitl.earth import Earth
     from sitl.trajectory import Truth
 
 # RTK: white noise, and a part that wanders; from the accuracy that receivers state (1 cm + 1 ppm).
@@ -43,7 +43,7 @@ class Navigation:
     def __init__(
         self,
         source: TruthSource,
-        frame: LocalFrame,
+        earth: Earth,
         *,
         seed: int,
         start_s: float = 0.0,
@@ -57,7 +57,7 @@ class Navigation:
         if not (0.1 <= position_rate_hz <= 1000.0 and message_delay_s >= 0.0 and jitter_s >= 0.0):
             raise ValueError("rate, delay and jitter of the position must be sensible")
         self._source = source
-        self._frame = frame
+        self._earth = earth
         self._period_s = 1.0 / position_rate_hz
         self._lag_s, self._delay_s, self._jitter_s = estimator_lag_s, message_delay_s, jitter_s
         self._noise = 1.0 if noise else 0.0
@@ -92,7 +92,8 @@ class Navigation:
         draws = self._position_rng.standard_normal((len(times_s), _DRAWS))
         truths = self._truths(times_s)
         east_m, north_m = self._positions(truths, draws)
-        latitudes, longitudes = self._frame.to_geographic_all(east_m, north_m)
+        places = self._earth.to_geographic_all(east_m, north_m)
+        latitudes, longitudes = (np.asarray(each).tolist() for each in places)
         velocity = (draws[:, 4:7] * (VELOCITY_SD_M_S * self._noise)).tolist()
         jitter = draws[:, 7].tolist()
         for i, truth in enumerate(truths):

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from companion.core.estimator import Track, estimate, observe
 from companion.core.types import Telemetry
 from sitl.demo_field import demo_setup, demo_trajectory
+from sitl.earth import Earth
 from sitl.navigation import Navigation
 from sitl.vehicle import DRAG_1_S, SPEED_GAIN_1_S
 
@@ -75,8 +76,9 @@ def our_error_m_s(speed_m_s: float, seed: int, acts_s: float = ACTS_S) -> float:
     """Return the mean absolute error of the speed that the core foretells, in cruise."""
     setup, path = demo_setup(speed_m_s), demo_trajectory(speed_m_s, seed)
     start_s, end_s = float(path.time_s[0]), float(path.time_s[-1])
+    earth = Earth(setup.frame.latitude_deg, setup.frame.longitude_deg)
     navigation = Navigation(
-        path, setup.frame, seed=seed, start_s=start_s, position_rate_hz=RATE_HZ,
+        path, earth, seed=seed, start_s=start_s, position_rate_hz=RATE_HZ,
         estimator_lag_s=ESTIMATOR_LAG_S, message_delay_s=MESSAGE_DELAY_S, jitter_s=JITTER_S,
     )  # fmt: skip
 

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.evaluation import Evaluation, FlightMeta, FlightRecord, evaluate
-from companion.core.frame import LocalFrame
 from companion.core.types import TimedChange
+from sitl.earth import Earth
 from sitl.profile import load_profile
 
 if TYPE_CHECKING:
@@ -23,7 +23,8 @@ def evaluate_truth(folder: Path, setup: Setup, *, closed_us: float, full_us: flo
     summary: dict[str, Any] = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     profile = load_profile(summary["profile"])
     with np.load(folder / "truth.npz") as arrays:
-        east_m, north_m = _in_frame(arrays, summary["origin"], setup.frame)
+        flat = Earth(setup.frame.latitude_deg, setup.frame.longitude_deg)
+        east_m, north_m = _in_frame(arrays, summary["origin"], flat)
         record = FlightRecord(
             time_s=arrays["time_s"],
             east_m=east_m,
@@ -49,10 +50,10 @@ def evaluate_truth(folder: Path, setup: Setup, *, closed_us: float, full_us: flo
 
 
 def _in_frame(
-    arrays: Any, origin: dict[str, float], frame: LocalFrame
+    arrays: Any, origin: dict[str, float], frame: Earth
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Return the path in the frame of the map; the stub's own begins at its home."""
-    home = LocalFrame(origin["latitude_deg"], origin["longitude_deg"])
+    home = Earth(origin["latitude_deg"], origin["longitude_deg"])
     latitudes, longitudes = home.to_geographic_all(arrays["east_m"], arrays["north_m"])
     return frame.to_local_all(latitudes, longitudes)
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from companion.core.frame import LocalFrame
 from companion.core.types import SpeedReport, Telemetry
+from sitl.earth import Earth
 from sitl.navigation import Navigation
 from sitl.vehicle import Truth
 
@@ -115,3 +116,14 @@ def test_asking_in_pieces_changes_no_message() -> None:
 def test_wrong_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="rate"):
         Navigation(Straight(), FRAME, seed=1, position_rate_hz=float("nan"))
+
+
+@pytest.mark.parametrize("latitude_deg", [-52.0, 0.0, 36.0, 65.0])
+def test_the_twins_earth_is_the_programs_to_a_millimetre(latitude_deg: float) -> None:
+    """Two ways to lay the ellipsoid flat, written apart."""
+    earth, frame = Earth(latitude_deg, 114.5), LocalFrame(latitude_deg, 114.5)
+    east_m, north_m = np.random.default_rng(1).uniform(-10_000.0, 10_000.0, (2, 300))
+    theirs = frame.to_local_all(*earth.to_geographic_all(east_m, north_m))
+    assert np.abs(np.array(theirs) - (east_m, north_m)).max() < 0.001
+    back = earth.to_local_all(*frame.to_geographic_all(east_m.tolist(), north_m.tolist()))
+    assert np.abs(np.array(back) - (east_m, north_m)).max() < 0.001
