@@ -164,7 +164,7 @@ class Autopilot:
 
     def boot_ns(self, now_s: float) -> int:
         """Return nanoseconds since boot, the time of TIMESYNC."""
-        return round(self._uptime_s(now_s) * 1e9)
+        return round(self._impairment.clock_s(self._uptime_s(now_s), now_s) * 1e9)
 
     def _uptime_s(self, now_s: float) -> float:
         return (now_s - self._boot_s) * self._clock_rate

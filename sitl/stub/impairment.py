@@ -46,17 +46,17 @@ class Impairment:
             frame = bytes(burst) + frame
         return frame
 
-    def boot_ms(self, uptime_s: float, now_s: float) -> int:
-        """Return the 32 bits of milliseconds since boot, wrapped or set back by a fault."""
-        uptime_ms = round(uptime_s * 1000.0)
+    def clock_s(self, uptime_s: float, now_s: float) -> float:
+        """Return the time since boot, about to wrap or set back by a fault; TIMESYNC tells it."""
         wrap = self._faults.active(FaultKind.CLOCK_WRAP, now_s)
         if wrap is not None:
-            begin_s = self._faults.elapsed_s(wrap, now_s)
-            uptime_ms = int((begin_s - wrap.delay_s) * 1000.0)
+            uptime_s = _WRAP_MS / 1000.0 + self._faults.elapsed_s(wrap, now_s) - wrap.delay_s
         back = self._faults.active(FaultKind.CLOCK_BACKWARDS, now_s)
-        if back is not None:
-            uptime_ms = max(uptime_ms - int(back.delay_s * 1000.0), 0)
-        return uptime_ms % _WRAP_MS
+        return uptime_s if back is None else max(uptime_s - back.delay_s, 0.0)
+
+    def boot_ms(self, uptime_s: float, now_s: float) -> int:
+        """Return the 32 bits of milliseconds since boot that messages have."""
+        return round(self.clock_s(uptime_s, now_s) * 1000.0) % _WRAP_MS
 
     def _unknown(self) -> bytes:
         """Return a frame with an id that no dialect has; nobody can check it."""

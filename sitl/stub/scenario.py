@@ -29,7 +29,7 @@ _KNOWN: dict[str, tuple[str, ...]] = {
 }
 _LIMITS: dict[str, tuple[float, float]] = {
     "commands_per_s": (1.0, 1000.0),
-    "drift_ppm": (-10_000.0, 10_000.0),
+    "drift_ppm": (-30_000.0, 30_000.0),
     "uptime_s": (0.0, 1e8),
     "speed_m_s": (0.0, 30.0),
     "from_deg": (0.0, 360.0),

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from sitl.demo_pool import do_all
 from tests.bench import (
+    clocks,
     flow_laws,
     flow_trim,
     identification,
@@ -181,6 +182,10 @@ def _flow_laws(options: Options) -> list[Figure]:
     return flow_laws.figures(done, section=LAW_SECTION)
 
 
+def _clocks(options: Options) -> list[Figure]:
+    return clocks.clock_figures(seed=options.seed, count=options.count)
+
+
 def _core(options: Options) -> list[Figure]:
     return core_times(seed=options.seed, is_quick=options.is_quick)
 
@@ -209,6 +214,7 @@ PARTS: tuple[Part, ...] = (
     Part(name="unknown", section=UNKNOWN_SECTION, run=_unknown),
     Part(name="flow-trim", section=TRIM_SECTION, run=_flow_trim),
     Part(name="pump", section=PUMP_SECTION, run=_pump),
+    Part(name="clocks", section=clocks.SECTION, run=_clocks),
     *(
         Part(name=name, section=CONDITIONS_SECTION, run=partial(_condition, name=name))
         for name in condition_names()

@@ -1,7 +1,7 @@
 """P1's whole field over the wire on a clock of its own: exact times on however busy a computer.
 
     python -m tests.bench.wire_clock [--autopilot px4] [--board free-running] [--seed 1]
-                                     [--flights 3] [--as-measured]
+                                     [--flights 3] [--as-measured] [--drift-ppm -10000]
 
 The whole companion (link, core, executor) and the stub, byte by byte as `tests.bench.wire` has
 them, but in one process whose event loop jumps to whatever is due next: nothing is late, computing
@@ -148,13 +148,20 @@ def fly(config: Path, options: ServeOptions) -> tuple[dict[str, Any], str | None
 
 
 def whole_field(
-    autopilot: str, board: str, seed: int, *, is_rtk: bool = True, dither_us: int = 0
+    autopilot: str,
+    board: str,
+    seed: int,
+    *,
+    is_rtk: bool = True,
+    dither_us: int = 0,
+    drift_ppm: float = 0.0,
 ) -> dict[str, Any]:
     """Fly the example's field once and return what counts of it."""
     with tempfile.TemporaryDirectory(prefix="wire-") as name:
         folder = Path(name)
         scenario = folder / "scenario.toml"
-        scenario.write_text(RTK if is_rtk else "", encoding="utf-8")
+        clock = f"[clock]\ndrift_ppm = {drift_ppm!r}\n" if drift_ppm else ""
+        scenario.write_text((RTK if is_rtk else "") + clock, encoding="utf-8")
         config = example(folder / "anyang", autopilot=autopilot, port=14550, dither_us=dither_us)
         options = ServeOptions(
             autopilot=autopilot,
@@ -173,6 +180,7 @@ def whole_field(
         "seed": seed,
         "rtk": is_rtk,
         "dither_us": dither_us,
+        "drift_ppm": drift_ppm,
         "state": found["state"],
         "orders": found["orders"],
         "lag_distance_m": lag,
@@ -198,6 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--as-measured", action="store_true", help="PX4's position as measured: 0.1 m of bias"
     )
+    parser.add_argument("--drift-ppm", type=float, default=0.0, help="the vehicle's clock is fast")
     given = parser.parse_args(arguments)
     flights = [
         whole_field(
@@ -206,6 +215,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             seed,
             is_rtk=not given.as_measured,
             dither_us=given.dither_us,
+            drift_ppm=given.drift_ppm,
         )
         for seed in range(given.seed, given.seed + given.flights)
     ]
