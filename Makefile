@@ -5,17 +5,20 @@ PYTHON ?= python3
 SEED ?=
 ARGS ?=
 WORKERS ?= 3
+FLIGHT_WORKERS ?= 4
+# Each Python needs its own: make PYTHON=python3.13 VENV=.venv-3.13 test
+VENV ?= .venv
 
-BIN := .venv/bin
+BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 LOCKS := requirements/build.txt requirements/dev.txt
-INSTALLED := .venv/.installed
+INSTALLED := $(VENV)/.installed
 COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --no-header --no-annotate --quiet $(ARGS)
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs lock clean
+.PHONY: help setup demo test test-computing test-flights lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs lock clean
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -25,10 +28,23 @@ setup: $(INSTALLED) ## the virtual environment, from the lock files
 demo: $(INSTALLED) ## fly the demo; pictures and figures in demo-out
 	$(BIN)/vrspray demo --out demo-out $(ARGS)
 
-# Each of the processes that tests start would else compile all it imports.
-test: export PYTHONDONTWRITEBYTECODE :=
+# Computing fills the cores; flights go by the wall clock, need little and want it at once. Apart
+# from each other, both are quicker. Each of the processes that tests start would else compile all
+# it imports.
+test test-computing test-flights: export PYTHONDONTWRITEBYTECODE :=
 test: $(INSTALLED) ## all tests (ARGS="-k lag" for some; WORKERS=0 for one process)
-	$(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+ifeq ($(strip $(ARGS)),)
+	@$(MAKE) --no-print-directory --keep-going test-computing && computed=0 || computed=1; \
+		$(MAKE) --no-print-directory test-flights && exit $$computed
+else
+	PYTHONDEVMODE=1 $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+endif
+
+test-computing: $(INSTALLED) ## of these all but the flights in real time
+	PYTHONDEVMODE=1 $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --ignore tests/sitl $(ARGS)
+
+test-flights: $(INSTALLED) ## of these the flights in real time: leave them two idle cores
+	$(BIN)/pytest --numprocesses $(FLIGHT_WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS) tests/sitl
 
 lint: format-check ruff mypy imports ## format, ruff, mypy, import rules
 
@@ -77,13 +93,13 @@ lock: | $(BIN)/python ## choose and pin versions anew (ARGS=--upgrade for the ne
 
 clean: ## everything that was made, but for the environment and recorded flights
 	rm -rf demo-out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
-	find . -name __pycache__ -not -path './.venv/*' -prune -exec rm -rf {} +
+	find . -name __pycache__ -not -path './.venv*/*' -prune -exec rm -rf {} +
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "vrspray needs Python >= 3.11: make PYTHON=/path/to/python3.11 ..." >&2; exit 1; }
-	@echo "Setting up .venv (once) ..." >&2
-	@$(PYTHON) -m venv .venv || { rm -rf .venv; exit 1; }
+	@echo "Setting up $(VENV) (once) ..." >&2
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); exit 1; }
 
 # The project itself goes in without isolation, so that its build tool is a pinned one as well.
 $(INSTALLED): pyproject.toml $(LOCKS) | $(BIN)/python

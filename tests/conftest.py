@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import multiprocessing.resource_tracker
 import os
 import signal
+import tempfile
 import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import suppress
@@ -27,6 +29,34 @@ settings.register_profile(
     "thorough", max_examples=5000, deadline=None, suppress_health_check=_NOT_TIMED
 )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
+
+
+# Children say there what they leave open. Their own warnings stay as they are in use.
+_LEFT_OPEN = tempfile.TemporaryDirectory(prefix="vrspray-left-open-")
+
+
+def pytest_configure() -> None:
+    """Have the Python processes that tests start tell of what they leave open."""
+    os.environ["VRSPRAY_LEFT_OPEN"] = _LEFT_OPEN.name
+    ours = str(Path(__file__).parent / "child_python")
+    given = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [ours, *given]))
+    # Theirs would speak of asyncio's slow steps on stderr.
+    os.environ.pop("PYTHONDEVMODE", None)
+
+
+def pytest_unconfigure() -> None:
+    """Remove the place where children tell."""
+    _LEFT_OPEN.cleanup()
+
+
+# Modules that take longest begin first: the other processes have enough to do meanwhile.
+LONGEST = ("test_mission_chain.py", "test_run_flight.py", "test_ground.py", "test_px4_flight.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the modules that take longest first."""
+    items.sort(key=lambda item: item.path.name not in LONGEST)
 
 
 @pytest.fixture
@@ -62,6 +92,28 @@ def no_process_left_behind() -> Iterator[None]:
             os.kill(pid, signal.SIGKILL)
             os.waitpid(pid, 0)
     assert not left, f"child processes left behind: {sorted(left)}"
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_open_by_children(no_process_left_behind: None) -> Iterator[None]:
+    """Fail a test whose child process left a file, a socket or a database to the collector."""
+    yield
+    told = []
+    for note in Path(_LEFT_OPEN.name).iterdir():
+        told.append(note.read_text())
+        note.unlink()
+    assert not told, "".join(told)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def nothing_left_open() -> Iterator[None]:
+    """Collect after every module: what it left open is told of there, and not by chance elsewhere.
+
+    What lives on by then is not looked at again, which makes the next collection a short one.
+    """
+    yield
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
