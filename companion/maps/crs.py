@@ -46,10 +46,7 @@ def parse_crs(text: str, *, path: Path, source: str) -> CRS:
         # `+init=` names a file of the computer, which a map has no business to.
         if len(text) > _TEXT_MAX or "init=" in text:
             raise ValueError("too long" if len(text) > _TEXT_MAX else "it refers to a file")
-        crs = CRS.from_user_input(text.strip()).to_2d()
-        if not (crs.is_geographic or crs.is_projected):
-            raise ValueError(f"{crs.name} is neither geographic nor projected")
-        Transformer.from_crs(crs, WGS84, always_xy=True)
+        return _known(text.strip())
     except (CRSError, ProjError, ValueError) as error:
         reason = str(error).split("(Internal")[0].strip(" :")
         if isinstance(error, UnicodeError) or reason.startswith("Invalid projection"):
@@ -60,6 +57,15 @@ def parse_crs(text: str, *, path: Path, source: str) -> CRS:
             fix="give it with --crs, for example --crs EPSG:4326",
             code="wrong-crs",
         ) from None
+
+
+@lru_cache(maxsize=32)
+def _known(text: str) -> CRS:
+    """Return the CRS of a text; long ones take PROJ 10 ms, and the files of a field repeat them."""
+    crs = CRS.from_user_input(text).to_2d()
+    if not (crs.is_geographic or crs.is_projected):
+        raise ValueError(f"{crs.name} is neither geographic nor projected")
+    Transformer.from_crs(crs, WGS84, always_xy=True)
     return crs
 
 
