@@ -6,6 +6,8 @@ SEED ?=
 ARGS ?=
 WORKERS ?= 3
 FLIGHT_WORKERS ?= 4
+# What goes by the wall clock.
+IN_REAL_TIME := tests/contract tests/sitl
 # Each Python needs its own: make PYTHON=python3.13 VENV=.venv-3.13 test
 VENV ?= .venv
 
@@ -41,10 +43,10 @@ else
 endif
 
 test-computing: $(INSTALLED) ## of these all but the flights in real time
-	PYTHONDEVMODE=1 $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --ignore tests/sitl $(ARGS)
+	PYTHONDEVMODE=1 $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(IN_REAL_TIME:%=--ignore %) $(ARGS)
 
 test-flights: $(INSTALLED) ## of these the flights in real time: leave them two idle cores
-	$(BIN)/pytest --numprocesses $(FLIGHT_WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS) tests/sitl
+	$(BIN)/pytest --numprocesses $(FLIGHT_WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS) $(IN_REAL_TIME)
 
 lint: format-check ruff mypy imports ## format, ruff, mypy, import rules
 
