@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from analysis.evaluation import P1_RESULTS, Evaluation, evaluate, limit_ratio
+from analysis.evaluation import P1_RESULTS, Evaluation, evaluate, limit_ratio, whole_boom
 from analysis.flight_record import Fidelity
 from companion.assembly import deliverable
 from companion.core.controller import Setup
@@ -33,7 +33,7 @@ from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.flow_law import FlowLaw
 from sitl.knowledge import perfect_setup
 from sitl.profile import PlantProfile, load_profile
-from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController
+from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
 
 __all__ = [
     "METHODS",
@@ -210,11 +210,13 @@ def fly_one(job: Job) -> Flown:
             training="simulated",
         ) as journal:
             result = _fly(job, setup, profile, journal)
+    # P1's controller closes valves where it changes its nozzle set: one strip, as P1 judged it.
+    record = whole_boom(result.record) if job.method in P1_LOOK_AHEAD_S else result.record
     return Flown(
         job=job,
-        evaluation=evaluate(result.record),
+        evaluation=evaluate(record),
         simulated_s=result.simulated_s,
-        traces=traces_of(result.record, setup) if job.traced else None,
+        traces=traces_of(record, setup) if job.traced else None,
     )
 
 
@@ -233,15 +235,17 @@ def _fly(
     profile = true_profile(profile, options)
     if knows:
         setup = perfect_setup(setup, profile, seed=job.seed, output_s=setup.lag.output_s)
+    wang = None
+    if look_ahead_s is not None:
+        wang = WangController(setup=setup, look_ahead_s=look_ahead_s)
+        setup = replace(setup, nozzle_sets=table_2_sets())
     return fly(
         setup,
         demo_trajectory(job.speed_m_s, job.seed),
         profile,
         options,
         speed_m_s=job.speed_m_s,
-        wang=None
-        if look_ahead_s is None
-        else WangController(setup=setup, look_ahead_s=look_ahead_s),
+        wang=wang,
         method=job.method,
         observer=None if journal is None else journal.record_decision,
         on_input=None if journal is None else journal.record_input,

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from analysis.settled import ordered_ml_s
 from analysis.smoothing import boxed, rise_over
 from companion.core.rate import flow_for_rate
 from sitl.anyang import anyang_passes
@@ -118,22 +119,17 @@ def traces_of(record: FlightRecord, setup: Setup) -> Traces:
         prescribed_l_min=np.nan_to_num(rates)
         * flow_for_rate(1.0, 1.0, setup.boom.width_m)
         * speed_m_s,
-        ordered_l_min=_ordered_l_min(record, setup, record.time_s[chosen]),
+        ordered_l_min=_ordered_l_min(record, record.time_s[chosen]),
         applied_l_min=L_MIN_PER_ML_S * applied,
         applied_l_ha=_raster(record, axes),
     )
 
 
-def _ordered_l_min(record: FlightRecord, setup: Setup, time_s: Floats) -> Floats:
+def _ordered_l_min(record: FlightRecord, time_s: Floats) -> Floats:
     """Return the flow that the orders stand for, by the measured curve of the set in use."""
-    nozzles = setup.nozzle_sets[-1]
-    total = np.zeros(len(time_s))
-    for valve in nozzles.valves:
-        orders = [order for order in record.orders if order.valve == valve]
-        flow = np.array([0.0, *(nozzles.curve.flow_for(order.duty) for order in orders)])
-        at_s = np.array([order.at_s for order in orders])
-        total += flow[np.searchsorted(at_s, time_s, side="right")] / len(nozzles.valves)
-    return total
+    at_s, total_ml_s = ordered_ml_s(record.orders, record.nozzle_sets)
+    found: Floats = L_MIN_PER_ML_S * total_ml_s[np.searchsorted(at_s, time_s, side="right")]
+    return found
 
 
 def _raster(record: FlightRecord, axes: FieldAxes) -> Floats:

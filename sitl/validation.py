@@ -17,7 +17,7 @@ import typer
 
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError, VrsprayError
-from sitl.validation_flights import SPEEDS_M_S, WAYS, Validation, validate
+from sitl.validation_flights import EVERY_WAY, SPEEDS_M_S, Validation, validate
 from sitl.validation_page import COMMAND, summary_lines, write_page
 
 IMAGES = "images"
@@ -56,7 +56,7 @@ def validation(
     result = validate(
         range(1, seeds + 1),
         processes=processes,
-        on_flown=_Told(len(WAYS) * len(SPEEDS_M_S) * seeds).one,
+        on_flown=_Told(len(EVERY_WAY) * len(SPEEDS_M_S) * seeds).one,
     )
     if out is not None:
         command = f"{COMMAND} {shlex.join(sys.argv[1:])}".strip()

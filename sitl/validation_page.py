@@ -14,12 +14,22 @@ from analysis.published import (
     p1_accuracy_percent,
 )
 from companion.errors import ConfigError
-from sitl.validation_flights import BOUND_M, BOUND_SPEED_M_S, WAYS, Row, Validation
+from sitl.validation_flights import (
+    BOUND_M,
+    BOUND_SPEED_M_S,
+    BY_TABLE,
+    EVERY_WAY,
+    LOOK_AHEAD,
+    WAYS,
+    Row,
+    Validation,
+)
 
 if TYPE_CHECKING:
     from analysis.published import P1LagDistance
 
 COMMAND = "python -m sitl.validation"
+SET_CHANGE_L_MIN = 4.0
 Table = list[tuple[str, ...]]
 
 INTRODUCTION = """\
@@ -27,11 +37,14 @@ INTRODUCTION = """\
 
 Does the [simulated sprayer](sitl.md) behave as the real one of Wang et al. 2024 (P1, Journal of
 Agricultural Engineering LV:1547) did? P1's own controller, emulated (`sitl/wang.py`: positions
-polled at 5 Hz, 0.42 s of program time, valves that take a new duty with their next period), flies
+polled at 5 Hz, 0.42 s of program time, duties by P1's Eq. 2 with eight nozzles below 4 L/min and
+twelve above, valves that take a new duty with their next period and stay open above 90 %), flies
 P1's field on the plant `wang-2024` with P1's ten rates at P1's three speeds: without compensation
 (`none`), with the look-ahead of 0.71 s that P1's distances speak for, and with the 0.97 s that P1
-states. Then `scheduled` flies the same paths, by GPIO and by servo output through the restarting
-[driver board](driver-board.md). Pulses, noise, scatter between valves and gusts are on.
+states. `look-ahead, by Table 2` is the first of them with duties from P1's measured table and all
+twelve nozzles: what differs between the two is what Eq. 2 costs. Then `scheduled` flies the same
+paths, by GPIO and by servo output through the restarting [driver board](driver-board.md). Pulses,
+noise, scatter between valves and gusts are on.
 """
 
 LAG_TEXT = """\
@@ -47,7 +60,8 @@ our first, of single changes, and our second, of many more changes to a rate.
 OURS_TEXT = """\
 A sharp step at the boundary itself scores 0.4 of a period's distance, 0.18 m at 5 m/s: the mean
 over one period needs that to arrive. So `scheduled` cannot have 0 above. This is its distance to
-the volume-equivalent step, valve by valve, which has none of it. A distance longer than a plot
+the volume-equivalent step, which has none of it: valve by valve, and of P1's controller that of the
+whole boom, because a change of nozzles closes valves. A distance longer than a plot
 (12 m) is none: there the measurement failed, its two lines met far away. It is left in, and in the
 means, as it came.
 """
@@ -66,8 +80,16 @@ ACCURACY_TEXT = """\
 
 P1's Table 5, and the same from the twin: Eqs. 18 and 19 over all data points on the ground of one
 rate [L/ha], transitions included. P1 does not say whether its table is with compensation; without,
-the twin's means are 7 to 12 points below it. *All* is the mean over the ten rates, *by flight* the
+the twin's means are 12 to 14 points below it. *All* is the mean over the ten rates, *by flight* the
 lowest and the highest mean over all data points of a flight.
+"""
+
+EQ_2_TEXT = """\
+### What P1's Eq. 2 explains of it
+
+What is missing to 100 %, in points: of P1; of the look-ahead of 0.71 s on the twin, whose valves
+deliver P1's Table 2, with duties from that table; and of the same with duties from Eq. 2. *Low* are
+the rates that Eq. 2 sprays with eight nozzles (below 4 L/min), *high* the others.
 """
 
 READING = """\
@@ -78,18 +100,25 @@ READING = """\
   little later: its valves take a new duty one after the other over a whole period, and the total
   is complete only with the last. At 6 m/s it is later by more: P1's distance grew less than its
   speed did, and no constant delay does that.
-- **The twin with 0.71 s sprays more accurately than P1 did, and P1's trends are not in it.** P1's
-  accuracy rises with rate and speed, and P1 gives its flow meter as the probable reason, better at
-  a higher flow. The twin is judged by its true flow and true position, P1 by what meter and
-  receiver logged. How much of the difference this explains is not known, and no noise was added to
-  make it go away: of the accuracy, the twin confirms the order of the methods, not P1's figures.
-- **The twin with 0.97 s comes near P1's accuracy, but not by P1's way**: its changes come too early
-  by more than P1's were too late, and the distances are what P1 measured on the ground.
+- **Eq. 2 explains more than P1's loss, and P1's trends.** With duties from its measured table P1's
+  controller loses half to two thirds of what P1 lost, much the same at every rate. With those of
+  Eq. 2 accuracy rises with rate and with speed, as in P1's Table 5: eight nozzles give too much, by
+  Table 2 up to 22 % at 2 L/min, and the slower the flight, the more rates they spray. But at 4 and
+  5 m/s it loses more than P1 did, by the rates of eight nozzles: P1's sprayer in the field cannot
+  have been both Table 2's and Eq. 2's. With twelve nozzles its loss is near P1's. P1 itself gives
+  its flow meter as the probable reason for the trend, better at a higher flow; the twin is judged
+  by its true flow and position, and no noise was added to come nearer.
+- **At Eq. 2's jumps a change may not settle at all.** At 4 L/min the duty goes from 92.5 % of eight
+  nozzles, which stay open, to 60.8 % of twelve, and P1 states no hysteresis: in gusts a flow near 4
+  L/min goes back and forth. Some 1 % of the changes are missed for it, and some settle late. P1
+  reports none. With duties by Table 2 every change settles.
+- **The twin with 0.97 s is not P1's way**: its changes come too early by more than P1's were too
+  late, and the distances are what P1 measured on the ground.
 - **At 6 m/s the highest rate is at the valves' limit**: 27.8 L/ha are 6.0 of 6.1 L/min. Where a
   gust asks for more, the flow falls short, and a change may count as settled only metres later.
-- **P1's nozzle sets are not emulated.** Below 4 L/min P1 closed valves 5 and 6; here all six work
-  throughout, with a lower duty, by P1's measured flow (its Table 2). P1's line from flow to duty
-  for fewer nozzles contradicts that table by up to 22 %.
+- **Where eight nozzles spray, the boom is judged as one strip**, as P1 judged it; it found that
+  closing valves 5 and 6 did little to the evenness across. By single valves that ground would be
+  bare.
 - **Rates are the same at all speeds here**, as in P1's Table 5 (at 4 to 6 m/s they fill the 2 to
   6 L/min of its valves). [Demo](demo.md) and [performance](performance.md) scale them by speed:
   their figures at 4 and 6 m/s are of other flows.
@@ -101,7 +130,7 @@ READING = """\
 def summary_lines(result: Validation) -> list[str]:
     """Return the tables for a terminal."""
     lines = [*_plain(_lag_table(result)), "", *_plain(_ours_table(result)), ""]
-    lines += [*_plain(_accuracy_table(result)), ""]
+    lines += [*_plain(_accuracy_table(result)), "", *_plain(_eq_2_table(result)), ""]
     lines += [
         f"{method} at {BOUND_SPEED_M_S:g} m/s within {BOUND_M:g} m of P1: {'yes' if held else 'NO'}"
         for method, held in result.bounds().items()
@@ -134,6 +163,8 @@ def write_page(result: Validation, folder: Path, *, pictures: Sequence[str], com
         ACCURACY_TEXT,
         *images[1:],
         _markdown(_accuracy_table(result)),
+        EQ_2_TEXT,
+        _markdown(_eq_2_table(result)),
         READING,
     ]
     try:
@@ -216,13 +247,41 @@ def _accuracy_table(result: Validation) -> Table:
     for speed, published in P1_SPRAYING_ACCURACY_PERCENT.items():
         mean = p1_accuracy_percent(speed)
         table.append(("P1, Table 5", f"{speed:g} m/s", *_cells(published), *_cells([mean]), "-"))
-    for way in WAYS:
+    for way in EVERY_WAY:
         for row in (row for row in result.rows if row.way == way):
             cells = row.cells_percent()
             low, high = row.seed_accuracy_percent
             ends = (*_cells([mean_of(cells)]), f"{low:.2f} to {high:.2f}")
             table.append((way.name, f"{row.speed_m_s:g} m/s", *_cells(cells), *ends))
     return table
+
+
+def _eq_2_table(result: Validation) -> Table:
+    """Return what is lost of the accuracy: by P1, with its table, with its law."""
+    head = ("Speed", "Who", "Loss, all [points]", "low rates", "high rates")
+    table: Table = [head]
+    for speed, published in P1_SPRAYING_ACCURACY_PERCENT.items():
+        flown = {row.way for row in result.rows if row.speed_m_s == speed}
+        if not {BY_TABLE, LOOK_AHEAD} <= flown:
+            continue
+        lines: dict[str, Sequence[float | None]] = {"P1": published}
+        for way in (BY_TABLE, LOOK_AHEAD):
+            lines[way.name] = result.row(way, speed).cells_percent()
+        # 60 B V / 10 000 of P1's Eq. 1, with B = 6 m.
+        low = [rate * 0.036 * speed < SET_CHANGE_L_MIN for rate in P1_RATES_L_HA]
+        for who, cells in lines.items():
+            parts = (
+                cells,
+                [cell for cell, is_low in zip(cells, low, strict=True) if is_low],
+                [cell for cell, is_low in zip(cells, low, strict=True) if not is_low],
+            )
+            lost = [_lost(mean_of(part)) for part in parts]
+            table.append((f"{speed:g} m/s", who, *lost))
+    return table
+
+
+def _lost(percent: float | None) -> str:
+    return "-" if percent is None else f"{100.0 - percent:.2f}"
 
 
 def mean_of(cells: Sequence[float | None]) -> float | None:

@@ -59,7 +59,7 @@ def lag_figure(result: Validation) -> Figure:
     axes = figure.subplots()
     figure.subplots_adjust(left=0.065, right=0.985, top=0.8, bottom=0.075)
     places = {speed: float(i) for i, speed in enumerate(result.speeds_m_s)}
-    for row in result.rows:
+    for row in (row for row in result.rows if row.way in WAYS):
         x = places[row.speed_m_s] + 0.17 * (WAYS.index(row.way) - 0.5 * (len(WAYS) - 1))
         _lag(axes, x, row)
         _published(axes, x + 0.055, row)

@@ -8,17 +8,17 @@ flight can be compared with.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING
 
-from analysis.evaluation import Evaluation, evaluate, limit_ratio
+from analysis.evaluation import Evaluation, evaluate, limit_ratio, whole_boom
 from sitl.demo_field import demo_trajectory
 from sitl.demo_pool import do_all
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
-from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController
+from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
 from tests.bench.conditions import CONDITIONS, condition_of, laid_out
 from tests.bench.sprayers import (
     BOTH,
@@ -154,7 +154,7 @@ def fly_task(task: Task) -> list[Flown]:
     setup, path = place(task, "gpio")
     for method, look_ahead_s in PAPER_METHODS.items() if task.with_paper else ():
         theirs = fly(
-            setup,
+            replace(setup, nozzle_sets=table_2_sets()),
             path,
             profile,
             options_of("gpio", seed),
@@ -162,7 +162,7 @@ def fly_task(task: Task) -> list[Flown]:
             wang=WangController(setup=setup, look_ahead_s=look_ahead_s),
             method=method,
         )
-        results.append(keep(evaluate(theirs.record), output="gpio"))
+        results.append(keep(evaluate(whole_boom(theirs.record)), output="gpio"))
     return results
 
 

@@ -28,7 +28,7 @@ from sitl.measure_pump import measure
 from sitl.profile import PlantProfile, load_profile
 from sitl.trajectory import Trajectory
 from sitl.vehicle import Leg, Route, Vehicle
-from sitl.wang import LOOK_AHEAD_S, PROGRAM_S, WangController
+from sitl.wang import LOOK_AHEAD_S, PROGRAM_S, WangController, curve_duties
 from tests.bench.figures import Figure
 
 SEEDS = (1, 2, 3, 4, 5)
@@ -105,7 +105,7 @@ def flights(
     for method in methods:
         wang = None
         if method != "scheduled":
-            wang = WangController(setup=mine, look_ahead_s=ahead_s[method])
+            wang = WangController(setup=mine, look_ahead_s=ahead_s[method], dose=curve_duties(mine))
         result = fly(mine, way, profile, options, speed_m_s=SPEED_M_S, wang=wang, method=method)
         found[method] = evaluate(result.record)
     return found
