@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -246,11 +247,24 @@ def test_table_has_p1_s_own_figures_beside_ours(shown: Shown) -> None:
 
 
 def test_sentence_says_what_was_missed(shown: Shown) -> None:
-    assert "missed" not in sentence(shown.result)
-    none = shown.result.flights[0]
-    worse = replace(none, evaluation=replace(none.evaluation, missed=7))
-    result = replace(shown.result, flights=(worse, *shown.result.flights[1:]))
-    assert "7 changes missed, and" in sentence(result)
+    # P1's Eq. 2 misses a change where its nozzle sets change; the others miss none.
+    by_eq_2 = ("none", "look-ahead", "look-ahead-stated")
+    ours = [one for one in shown.result.flights if one.job.method not in by_eq_2]
+    assert [one.evaluation.missed for one in ours] == [0] * len(ours)
+
+    def missing(count: int) -> str:
+        flights = [
+            replace(one, evaluation=replace(one.evaluation, missed=count))
+            for one in shown.result.flights[:1]
+        ]
+        flights += [
+            replace(one, evaluation=replace(one.evaluation, missed=0))
+            for one in shown.result.flights[1:]
+        ]
+        return sentence(replace(shown.result, flights=tuple(flights)))
+
+    assert "missed" not in missing(0)
+    assert "7 changes missed, and" in missing(7)
 
 
 def test_page_needs_nothing_from_elsewhere(shown: Shown, tmp_path: Path) -> None:
@@ -262,7 +276,8 @@ def test_page_needs_nothing_from_elsewhere(shown: Shown, tmp_path: Path) -> None
     assert all(20_000 < size <= 250_000 for size in sizes), sizes
     text = page(shown.result, [tmp_path / name for name in names])
     assert text.count("data:image/png;base64,") == 3
-    assert "http" not in text
+    # Any four letters may stand in a picture's base64 by chance.
+    assert "http" not in re.sub("base64,[A-Za-z0-9+/=]+", "", text)
     assert "{" not in text.partition("</style>")[2]
 
 
