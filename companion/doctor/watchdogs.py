@@ -16,7 +16,7 @@ CLOSED_MAX_S = 0.35
 SCRIPT_MAX_S = 0.35
 _UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
 _BUSY = "see what else this computer does: vrspray doctor (real-time, cpu-governor, throttling)"
-_SCRIPT = "docs/ardupilot.md: install the script anew, and set SPRW_TIMEOUT_MS to 300"
+_SCRIPT = "install the script anew, and set SPRW_TIMEOUT_MS to 300: deploy/ardupilot/README.md"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,6 +6,7 @@ import ctypes
 import fcntl
 import os
 import select
+import shutil
 import signal
 import socket
 import subprocess
@@ -158,11 +159,30 @@ def px4(
     folder.mkdir(parents=True, exist_ok=True)
     station = Station("udp", 14550)
     try:
-        command = (firmware / "px4.sh", folder, latitude, longitude, height)
+        started = _with_links(firmware, folder / "firmware")
+        command = (started / "px4.sh", folder, latitude, longitude, height)
         with process(command, folder / "px4.txt"):
             yield station
     finally:
         station.close()
+
+
+def _with_links(firmware: Path, copy: Path) -> Path:
+    """Return where PX4 starts: its start script calls `px4-...`, links to `px4`.
+
+    A copy of the folder that has lost them is given them again, in a copy of its own.
+    """
+    if os.access(firmware / "px4" / "bin" / "px4-param", os.X_OK):
+        return firmware
+    shutil.copytree(firmware / "px4", copy / "px4", copy_function=shutil.copy)
+    shutil.copy(firmware / "px4.sh", copy)
+    for folder, _, _ in os.walk(copy):
+        Path(folder).chmod(0o755)
+    for lost in copy.glob("px4/*/px4-*"):
+        if lost.read_bytes() == b"px4":
+            lost.unlink()
+            lost.symlink_to("px4")
+    return copy
 
 
 def _connected(vehicle: subprocess.Popen[bytes], opened: Callable[[], Station]) -> Station:

@@ -11,11 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tests.firmware import firmware
+from tests.firmware.fields import HOME_DEG
 from tests.firmware.station import COMPANION, MissionItem, NoAnswerError, Station
 
 SIMSTATE, SERVO_OUTPUT_RAW, GLOBAL_POSITION_INT, RC_CHANNELS = 164, 36, 33, 65
 DO_SPRAYER, DO_SET_MODE, ARM, MISSION_START = 216, 176, 400, 300
 AUTO, GUIDED, LAND = 3.0, 4.0, 9.0
+PX4_MISSION = (1.0, 4.0, 4.0)
+HIL_STATE_QUATERNION, INT32 = 115, 6
 ACCEPTED = 0
 TRUTH_HZ, OUTPUTS_HZ, POSITION_HZ = 100.0, 100.0, 20.0
 # Until the estimator has its position the simulation may run as fast as it can: nobody watches.
@@ -60,6 +63,39 @@ def ready_copter(
         station.until(lambda: station.said("is using GPS"), "position", READY_WITHIN_S)
         station.set_parameter("SIM_SPEEDUP", 1.0)
         yield vehicle
+
+
+@contextmanager
+def ready_px4(folder: Path, where: Path) -> Iterator[Vehicle]:
+    """PX4 with six actuators on its outputs 9 to 14, waiting until it may be armed."""
+    place = (*map(str, HOME_DEG), "60")
+    with firmware.px4(where, folder, *place) as station:
+        vehicle = Vehicle(station, folder)
+        told = folder / "px4.txt"  # on its console only
+        station.until(
+            lambda: b"Ready for takeoff" in told.read_bytes(), "readiness", READY_WITHIN_S
+        )
+        for number in range(6):
+            (raw,) = struct.unpack("<f", struct.pack("<i", 301 + number))
+            station.set_parameter(f"PWM_MAIN_FUNC{9 + number}", raw, kind=INT32)
+        for message, rate_hz in (
+            (HIL_STATE_QUATERNION, TRUTH_HZ),
+            (SERVO_OUTPUT_RAW, OUTPUTS_HZ),
+            (GLOBAL_POSITION_INT, OUTPUTS_HZ),
+        ):
+            station.ask_for(message, rate_hz)
+        yield vehicle
+
+
+def start_px4(vehicle: Vehicle, items: Sequence[MissionItem] | None) -> None:
+    """Upload the mission, if there is one (home is no item of PX4's); arm in it, enable."""
+    station = vehicle.station
+    if items is not None:
+        station.upload(items)
+    assert station.command(DO_SET_MODE, *PX4_MISSION) == ACCEPTED
+    assert station.command(ARM, 1.0) == ACCEPTED
+    station.until(lambda: station.is_armed, "arming")
+    enable(station)
 
 
 def until_heard(station: Station, started: subprocess.Popen[bytes], log: Path) -> None:

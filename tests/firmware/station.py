@@ -135,7 +135,7 @@ class Station:
         elif kind == "HIL_STATE_QUATERNION":
             w, x, y, z = message.attitude_quaternion
             yaw_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-            at_s = message.time_usec * 1e-6
+            at_s = message.time_usec * 1e-6 or None  # PX4 leaves it out
             self._place(self.log.places, now_s, at_s, message.lat, message.lon, yaw_rad)
         elif kind == "GLOBAL_POSITION_INT":
             yaw_rad = math.radians(message.hdg * 1e-2)
@@ -263,6 +263,12 @@ class Station:
 
     def upload(self, items: Sequence[MissionItem]) -> None:
         """Put a mission on the vehicle."""
+        result, last = self.try_upload(items)
+        assert result == 0, f"mission refused at item {last}: MAV_MISSION_RESULT {result}"
+
+    def try_upload(self, items: Sequence[MissionItem]) -> tuple[int, int]:
+        """Offer a mission; return MAV_MISSION_RESULT and the last item that was asked for."""
+        last = -1
         asked: list[int] = []
         over: list[int] = []
 
@@ -279,10 +285,36 @@ class Station:
                 self.until(lambda: bool(asked or over), "request of a mission item", 10.0)
                 for seq in asked:
                     self.send(items[seq].message(seq))
+                    last = seq
                 asked.clear()
         finally:
             self._takers.remove(take)
-        assert over[0] == 0, f"mission refused: MAV_MISSION_RESULT {over[0]}"
+        return over[0], last
+
+    def mission(self) -> list[MissionItem]:
+        """Return the mission that is on the vehicle."""
+        count = self._answered(
+            dialect.MAVLink_mission_request_list_message(1, AUTOPILOT, 0),
+            lambda came: came.get_type() == "MISSION_COUNT",
+            "the mission",
+            within_s=10.0,
+        ).count
+        found = []
+        for seq in range(count):
+            item = self._answered(
+                dialect.MAVLink_mission_request_int_message(1, AUTOPILOT, seq, 0),
+                lambda came, seq=seq: (  # type: ignore[misc]
+                    came.get_type() == "MISSION_ITEM_INT" and came.seq == seq
+                ),
+                f"mission item {seq}",
+                within_s=10.0,
+            )
+            values = (item.param1, item.param2, item.param3, item.param4)
+            found.append(
+                MissionItem(item.command, item.x * _E7, item.y * _E7, item.z, item.frame, values)
+            )
+        self.send(dialect.MAVLink_mission_ack_message(1, AUTOPILOT, 0, 0))
+        return found
 
     @property
     def is_armed(self) -> bool:

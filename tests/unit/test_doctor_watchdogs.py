@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
@@ -152,6 +153,13 @@ async def test_a_moved_output_is_ordered_closed_whatever_happens() -> None:
         )
     assert link.orders == [1004, 1000]
     assert link.is_closed
+
+
+def test_the_page_that_a_failed_trial_names_says_what_to_set() -> None:
+    fix = script_check(ScriptTrial(open_s=0.36, closed_s=0.5)).fix or ""
+    page = Path(__file__).parents[2] / fix.rpartition(": ")[2]
+    assert "SPRW_TIMEOUT_MS" in fix
+    assert "`SPRW_TIMEOUT_MS`" in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

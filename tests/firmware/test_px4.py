@@ -1,0 +1,134 @@
+"""Beside a real PX4: its changes are held to what it tells; against the truth they are reported."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.firmware.fields import HOME_DEG, pass_items, write_pass
+from tests.firmware.firmware import companion
+from tests.firmware.flights import ready_px4, start_px4, until_heard, until_landed
+from tests.firmware.judge import Plane, Verdict, geojson_area, geojson_zones, judge
+from tests.firmware.station import Log, MissionItem, Place
+
+pytestmark = [pytest.mark.firmware, pytest.mark.timeout(300)]
+
+MEAN_MAX_M, WORST_MAX_M, OFF_TARGET_MAX_ML = 0.05, 0.25, 0.1
+RUN = ("--set", "link.url=udpin:127.0.0.1:14540", "--set", "safety.fix=3d")
+OPEN = (0.0, 0.0, 0.0, math.nan)
+
+
+def px4_items(speed_m_s: float, *, passes: int = 1) -> list[MissionItem]:
+    """Return the mission of the pass without home, the yaw left open."""
+    items = pass_items(speed_m_s, passes=passes)[1:]
+    return [replace(item, values=OPEN) if item.frame != 2 else item for item in items]
+
+
+def with_yaw_of(places: Sequence[Place], others: Sequence[Place]) -> list[Place]:
+    """Return places with the headings of others, by when they came."""
+    came_s = [one.came_s for one in others]
+    yaw_rad = np.unwrap([one.yaw_rad for one in others])
+    return [
+        replace(place, yaw_rad=float(np.interp(place.came_s, came_s, yaw_rad))) for place in places
+    ]
+
+
+def estimate_errors(log: Log) -> str:
+    """Return how far what PX4 tells is from the truth while it flies: along, aside, heading."""
+    plane = Plane(*HOME_DEG)
+    told_s = np.array([one.came_s for one in log.told])
+    rows = {
+        name: np.column_stack(
+            [
+                *plane.metres(
+                    [one.longitude_deg for one in places], [one.latitude_deg for one in places]
+                ),
+                np.unwrap([one.yaw_rad for one in places]),
+            ]
+        )
+        for name, places in (("told", log.told), ("true", log.places))
+    }
+    true_s = [one.came_s for one in log.places]
+    true = np.column_stack([np.interp(told_s, true_s, rows["true"][:, n]) for n in range(3)])
+    moves = np.gradient(true[:, :2], told_s, axis=0)
+    speed = np.hypot(*moves.T)
+    flies = speed > 3.0
+    ahead = moves[flies] / speed[flies, None]
+    off = (rows["told"] - true)[flies]
+    along = (off[:, :2] * ahead).sum(axis=1)
+    aside = off[:, 0] * ahead[:, 1] - off[:, 1] * ahead[:, 0]
+    turned = np.degrees((off[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)
+    crab = np.degrees(true[flies, 2]) - np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1]))
+    crab = (crab + 180.0) % 360.0 - 180.0
+    parts = (
+        ("along m", along),
+        ("right m", aside),
+        ("heading deg", turned),
+        ("nose off course deg", crab),
+    )
+    return "told minus true: " + ", ".join(
+        f"{name} {values.mean():+.3f} (sd {values.std():.3f}, "
+        f"{values.min():+.2f} to {values.max():+.2f})"
+        for name, values in parts
+    )
+
+
+def verdicts(log: Log, config: Path) -> dict[str, Verdict]:
+    """Return what the flight did: by what PX4 tells, by the truth, and by one half of each."""
+    zones = geojson_zones(config.parent / "zones.geojson")
+    inside = geojson_area(config.parent / "boundary.geojson")
+    ways = {
+        "told": log.told,
+        "told, true heading": with_yaw_of(log.told, log.places),
+        "true, told heading": with_yaw_of(log.places, log.told),
+        "true": log.places,
+    }
+    return {name: judge(places, log.pulses, zones, inside=inside) for name, places in ways.items()}
+
+
+def fly_pass(
+    firmwares: Path,
+    folder: Path,
+    items: Sequence[MissionItem],
+    tell: Callable[[object], None],
+) -> dict[str, Verdict]:
+    """Fly passes over eight zones and judge them in four ways."""
+    config = write_pass(folder / "field", config="px4.toml")
+    with ready_px4(folder / "px4", firmwares) as vehicle:
+        with companion(folder, "--config", str(config), *RUN) as started:
+            until_heard(vehicle.station, started, folder / "companion.txt")
+            vehicle.station.log.clear_flight()
+            start_px4(vehicle, items)
+            until_landed(vehicle, 150.0)
+        found = verdicts(vehicle.station.log, config)
+        tell(estimate_errors(vehicle.station.log))
+    for name, verdict in found.items():
+        tell(f"{name}: {verdict}")
+    return found
+
+
+def test_each_change_falls_where_px4_believes_its_boundary(
+    firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
+) -> None:
+    found = fly_pass(firmwares, tmp_path, px4_items(5.0), tell)
+    told = found["told"]
+    assert len(told.changes) == 7 * 6
+    assert not told.missed
+    assert told.mean_abs_m <= MEAN_MAX_M
+    assert told.worst_m <= WORST_MAX_M
+    assert told.off_target_ml <= OFF_TARGET_MAX_ML
+
+
+def test_two_passes_are_held_to_what_it_tells(
+    firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
+) -> None:
+    found = fly_pass(firmwares, tmp_path, px4_items(5.0, passes=2), tell)
+    told = found["told"]
+    assert not told.missed
+    assert told.mean_abs_m <= MEAN_MAX_M
+    assert told.worst_m <= WORST_MAX_M
