@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from missions.upload.items import (
     FENCE_FIRST,
     FENCE_LAST,
+    LAND,
     MISSION_FRAME,
     PLACES,
     RELATIVE,
@@ -41,9 +42,9 @@ FIXES = {
 # 2e-7 degrees are 2 cm: PX4 keeps degrees as floating point. ArduPilot keeps whole centimetres.
 PLACE_E7, HEIGHT_M, PARAM = 2, 0.011, 1e-3
 YAW = 3
-# Copters of ArduPilot take no radius and no yaw from a waypoint.
+# Copters of ArduPilot take no radius and no yaw from a waypoint; a LAND reads back with a yaw of 1.
 NOT_KEPT: dict[Firmware, dict[int, tuple[int, ...]]] = {
-    "ardupilot": {WAYPOINT: (1, 2, 3), TAKEOFF: (0, 1, 2, 3)},
+    "ardupilot": {WAYPOINT: (1, 2, 3), LAND: (3,), TAKEOFF: (0, 1, 2, 3)},
     "px4": {WAYPOINT: (2,), TAKEOFF: (1, 2)},
 }
 
@@ -121,6 +122,8 @@ def compare(sent: Sequence[WireItem], back: Sequence[WireItem], firmware: Firmwa
     for number, (one, other) in enumerate(pairs, start=1):
         for index, text in _differences(one, other):
             is_lost = index in NOT_KEPT[firmware].get(one.command, ())
+            if is_lost and (math.isnan(one.params[index]) or one.params[index] == 0.0):
+                continue  # it was left open: what stands there instead means nothing
             (left_out if is_lost else differences).append(f"item {number} ({one.name}): {text}")
     return Compared(differences=tuple(differences), left_out=tuple(left_out))
 

@@ -265,6 +265,13 @@ def test_another_mission_is_not_the_same(back: Sequence[WireItem], says: str) ->
     assert says in compare(ITEMS, back, "px4").differences[0]
 
 
+@pytest.mark.parametrize("yaw", [OPEN, 0.0])
+def test_a_landing_reads_back_from_arducopter_with_a_yaw_of_its_own(yaw: float) -> None:
+    sent = WireItem(command=21, frame=3, params=(0, 0, 0, yaw), x=480_001_000, y=110_001_000)
+    found = compare((HOME, sent), (HOME, replace(sent, params=(0, 0, 0, 1.0))), "ardupilot")
+    assert (found.differences, found.left_out) == ((), ())
+
+
 def test_a_corner_of_the_fence_has_a_place_and_no_height() -> None:
     lower = [replace(corner, z_m=9.0) for corner in CORNERS]
     assert compare(CORNERS, lower, "ardupilot").differences == ()
