@@ -97,3 +97,11 @@ def test_a_link_with_jitter_is_no_clock_that_is_set(jitter_s: float) -> None:
     assert len(times) > 0.97 * 60.0 * 20.0
     settled = np.array(off)[np.array(times) > 5.0]
     assert np.abs(settled).max() <= 0.5 * SPEED_M_S * jitter_s
+
+
+@pytest.mark.parametrize("held_up_s", [0.009, 0.036])
+def test_an_autopilot_that_was_held_up_as_it_answered_closes_nothing(held_up_s: float) -> None:
+    # A short way, as on one computer: nothing of the hold-up hides in the round trip.
+    times, off = shifts_m(Vehicle(held_up_s=held_up_s, way_s=0.0003, jitter_s=0.0005))
+    assert len([now_s for now_s in times if now_s > 5.0]) == 55 * 20
+    assert np.abs(np.array(off)[np.array(times) > 5.0]).max() <= SHIFT_MAX_M
