@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.core.types import Decision, EstopReport, Input, OperatorCommand, RateOverride
-from companion.link.messages import CommandReceived
+from companion.link.messages import CommandReceived, Sender
 from companion.link.parameters import RATE_PERCENT, VALUES_HZ, Parameters
 from companion.link.tank import Tank
 
@@ -28,6 +28,8 @@ VALUES_HZ_MIN, VALUES_HZ_MAX = 0.2, 5.0
 # some seconds (QGroundControl 3 times, 3 s apart); a second radio or a router is some seconds late.
 REPEATED_MAX_S = 30.0
 LATE_MAX_S = 5.0
+# A COMMAND_INT that is repeated does not say so: for so long after a stop none enables.
+UNTOLD_MAX_S = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,6 +58,8 @@ class Desk:
     is_enabled: bool = False
     # When the consent last went, by whatever took it; None: it was given anew since.
     stopped_s: float | None = None
+    # Who gave the last ENABLE, and its frame's number.
+    enabled_by: tuple[Sender, int] | None = None
     # The sensor that counts the tank, where there is one; whether it takes this many litres.
     on_refilled: Callable[[float], bool] | None = None
 
@@ -76,9 +80,12 @@ class Desk:
         if self.stopped_s is None:
             return False
         since_s = command.received_s - self.stopped_s
-        if command.confirmation > 0 and since_s < REPEATED_MAX_S:
+        if command.confirmation is None and since_s < UNTOLD_MAX_S:
             return True
-        return command.is_late and since_s < LATE_MAX_S
+        if (command.confirmation or 0) > 0 and since_s < REPEATED_MAX_S:
+            return True
+        is_copy = (command.sender, command.sequence) == self.enabled_by
+        return command.is_late and since_s < (REPEATED_MAX_S if is_copy else LATE_MAX_S)
 
     def obey(self, command: CommandReceived) -> Answer:
         """Return the answer; whatever we do not know is unsupported."""
@@ -103,6 +110,8 @@ def _sprayer(desk: Desk, command: CommandReceived) -> Answer:
     if enable and desk.is_old(command):
         return Answer(result=REJECTED_FOR_NOW, text="late enable not taken: enable again")
     desk.stopped_s = None if enable else command.received_s
+    if enable:
+        desk.enabled_by = (command.sender, command.sequence)
     wish = OperatorCommand(received_s=command.received_s, enable=enable, source="command")
     return Answer(result=ACCEPTED, inputs=(wish,))
 

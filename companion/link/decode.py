@@ -214,7 +214,8 @@ def _command(m: Any, received_s: float) -> CommandReceived:
         command=m.command,
         param1=finite(m.param1),
         param2=finite(m.param2),
-        confirmation=getattr(m, "confirmation", 0),  # COMMAND_INT has none
+        confirmation=getattr(m, "confirmation", None),  # COMMAND_INT has none
+        sequence=m.get_seq(),
     )
 
 

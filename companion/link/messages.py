@@ -20,8 +20,8 @@ class Sender:
 class CommandReceived:
     """COMMAND_LONG or COMMAND_INT, whoever it is for; parameters 3 to 7 are not kept.
 
-    `confirmation` counts retransmissions (COMMAND_INT does not); `is_late`: its sender has said
-    something newer, or the same, before.
+    `confirmation` counts retransmissions; COMMAND_INT has none: None. `sequence` is the frame's
+    number; `is_late`: its sender has said something newer, or the same, before.
     """
 
     received_s: float
@@ -31,7 +31,8 @@ class CommandReceived:
     command: int
     param1: float | None
     param2: float | None
-    confirmation: int = 0
+    confirmation: int | None = 0
+    sequence: int = 0
     is_late: bool = False
 
 

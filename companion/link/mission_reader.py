@@ -191,7 +191,8 @@ class MissionReader:
         if is_ours and not is_autopilot:
             return  # nobody else has a mission of the vehicle to give
         if not is_ours:
-            self._stand_back(message)
+            if is_autopilot or self._is_to_vehicle(message):
+                self._stand_back(message)
         elif not self._is_waiting:
             return
         elif message.step is MissionStep.COUNT and self._count is None:
@@ -202,6 +203,13 @@ class MissionReader:
         elif message.step is MissionStep.ENDED:  # refused
             self._begin_anew()
             self._pause_until_s = message.received_s + _QUIET_S
+
+    def _is_to_vehicle(self, message: MissionTransfer) -> bool:
+        """Whether its autopilot takes a message for its own; other vehicles' missions are not."""
+        return message.target_system in (0, self._vehicle) and message.target_component in (
+            0,
+            AUTOPILOT_COMPONENT,
+        )
 
     def _stand_back(self, message: MissionTransfer) -> None:
         """Leave the wire to somebody else; what he writes is not what we know."""

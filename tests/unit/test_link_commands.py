@@ -159,6 +159,31 @@ def test_a_copy_of_an_order_in_integers_enables_nothing_after_a_stop(
     assert component.receive(enable, 2.6) == []
 
 
+def test_an_order_in_integers_does_not_say_that_it_is_repeated_and_waits_after_a_stop(
+    peer: Peer, component: Component
+) -> None:
+    def enabled(at_s: float) -> bool:
+        order = peer.ground("command_int", VEHICLE, 191, 0, 216, 0, 0, 1.0, 0, 0, 0, 0, 0, 0.0)
+        return bool(component.receive(order, at_s))
+
+    assert enabled(2.0)
+    component.receive(peer.command(216, 0.0), 3.0)
+    assert not enabled(4.0)
+    assert not enabled(12.9)
+    assert enabled(13.1)
+
+
+def test_a_very_late_copy_of_the_enable_that_was_taken_enables_nothing_after_a_stop(
+    peer: Peer, component: Component
+) -> None:
+    assert enables(peer, component, 2.0, sequence=50)
+    component.receive(peer.command(216, 0.0, sequence=51), 2.5)
+    for sequence in range(52, 72):
+        component.receive(peer.command(511, 0.0, sequence=sequence), sequence - 49.0)
+    assert not enables(peer, component, 22.6, sequence=50)
+    assert enables(peer, component, 22.7, sequence=72)
+
+
 def test_a_station_that_begins_anew_is_late_for_a_moment_only(
     peer: Peer, component: Component
 ) -> None:

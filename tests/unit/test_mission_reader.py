@@ -375,6 +375,33 @@ def test_what_is_being_written_is_not_what_was_read() -> None:
     assert bench.current() == ()
 
 
+@pytest.mark.parametrize(
+    ("sender", "to"),
+    [((7, 1), (255, 190)), ((255, 190), (7, 1)), ((7, 100), (7, 1)), ((255, 190), (1, 100))],
+)
+def test_what_is_written_to_or_read_from_somebody_else_is_not_this_mission(
+    sender: tuple[int, int], to: tuple[int, int]
+) -> None:
+    # Two vehicles on one network: the other one's transfers are heard too.
+    bench = known()
+    for step in (MissionStep.UPLOAD, MissionStep.COUNT, MissionStep.DOWNLOAD):
+        bench.transfer(step, sender=sender, to=to)
+    assert bench.current() != ()
+    bench = Bench(is_needed=True)
+    bench.current()
+    for _ in range(40):
+        bench.transfer(MissionStep.UPLOAD, sender=sender, to=to)
+        bench.run(0.1)
+    assert bench.reader.items == MISSION
+
+
+@pytest.mark.parametrize("to", [(1, 1), (1, 0), (0, 0), (0, 1)])
+def test_what_is_written_to_everyone_is_written_to_the_vehicle(to: tuple[int, int]) -> None:
+    bench = known()
+    bench.transfer(MissionStep.UPLOAD, sender=(255, 190), to=to)
+    assert bench.current() == ()
+
+
 def test_silence_is_asked_again_and_given_up_with_one_warning() -> None:
     bench = Bench()
     bench.answers = False
