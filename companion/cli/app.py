@@ -133,10 +133,14 @@ def _root(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line and leave with its exit code."""
-    given = sys.argv[1:] if arguments is None else arguments
-    give_way(given)
-    sys.exit(execute(given))
+    """Run the command line and leave with its exit code.
+
+    Without `arguments` the process is this command's own, and its priority may be lowered for good.
+    """
+    if arguments is None:
+        arguments = sys.argv[1:]
+        give_way(arguments)
+    sys.exit(execute(arguments))
 
 
 def execute(arguments: Sequence[str]) -> int:

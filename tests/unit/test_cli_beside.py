@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.app import COMMANDS
+from companion.cli.app import COMMANDS, main
 from companion.cli.beside import NICENESS, PATIENT, running, shown
 
 # Waits for a line, so that the test says when it ends.
@@ -18,7 +18,7 @@ ASKED = (
     "import atexit, os, sys\n"
     "from companion.cli.app import main\n"
     "atexit.register(lambda: print('nice', os.nice(0)))\n"
-    "main(sys.argv[1:])"
+    "main()"
 )
 
 
@@ -54,6 +54,13 @@ def test_this_process_is_not_another() -> None:
 @pytest.mark.parametrize("command", ["doctor", "run"])
 def test_what_flies_or_tries_hardware_keeps_its_priority(command: str) -> None:
     assert niceness(command, "--help")[0] == os.nice(0)
+
+
+def test_a_caller_within_a_process_keeps_its_priority() -> None:
+    before = os.nice(0)
+    with pytest.raises(SystemExit):
+        main(["map", "--help"])
+    assert os.nice(0) == before
 
 
 def test_every_patient_command_exists() -> None:

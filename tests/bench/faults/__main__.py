@@ -110,7 +110,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("--flights and --lanes are at least 1")
     flown = Campaign(campaign(given.flights, given.seed, only=given.only), given.flights)
     began_s, interrupted = time.monotonic(), False
-    _stand_apart()
     try:
         asyncio.run(_fly_all(flown, given.lanes))
     except KeyboardInterrupt:
@@ -149,4 +148,5 @@ def _print(found: dict[str, Any], *, as_json: bool) -> None:
 
 
 if __name__ == "__main__":
+    _stand_apart()
     sys.exit(main())
