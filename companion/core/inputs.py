@@ -120,6 +120,7 @@ class RcReport:
 
     received_s: float
     pulse_us: tuple[int, ...]
+    boot_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,7 +5,7 @@ No I/O: bytes and times come in, bytes go out through `send`, which says whether
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TypeGuard, get_args
 
@@ -30,6 +30,7 @@ from companion.link.messages import (
 )
 from companion.link.mission_messages import MissionCurrent, MissionTransfer
 from companion.link.mission_reader import MissionReader
+from companion.link.news import News
 from companion.link.outputs import ORDERS, Outputs
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent, Service
@@ -108,6 +109,7 @@ class Component:
         self._flies_mission = False
         self._supervisor: StreamSupervisor | None = None
         self._order = Order()
+        self._news = News()
         self.clock = ClockExchanges()
         self._timesync_s = float("-inf")
         self.met_s: float | None = None
@@ -168,12 +170,7 @@ class Component:
     def receive(self, data: bytes, received_s: float) -> list[Input]:
         """Return the inputs in `data`, and answer what wants an answer."""
         inputs: list[Input] = []
-        codec = self.codec
-        before = (codec.frame_count, codec.vehicle_frame_count)
-        messages = codec.decode(data, received_s)
-        if self.on_valid is not None and codec.frame_count > before[0]:
-            self.on_valid(codec.vehicle_frame_count > before[1])
-        for message in messages:
+        for message in self._heard(data, received_s):
             if self._supervisor is None and self.is_vehicle_known:
                 self._meet(received_s)
             if _is_input(message):
@@ -193,6 +190,17 @@ class Component:
             self._order = noted(self._order, report)
             inputs.append(report)
         return inputs
+
+    def _heard(self, data: bytes, received_s: float) -> Iterator[Message]:
+        """Yield what is news, one after the other, and say that something valid came."""
+        codec = self.codec
+        before = (codec.frame_count, codec.vehicle_frame_count)
+        messages = codec.decode(data, received_s)
+        if self.on_valid is not None and codec.frame_count > before[0]:
+            self.on_valid(codec.vehicle_frame_count > before[1])
+        for message in messages:
+            if not self._news.is_old(message, self._order):
+                yield message
 
     def tick(self, decision: Decision | None, now_s: float) -> None:
         """Send what is due; called at every step of the control loop, at least at 20 Hz."""
@@ -271,6 +279,7 @@ class Component:
         """Notice a reboot, after which an autopilot has forgotten what was asked of it."""
         self._order, place = sorted_in(self._order, item)
         if place is Place.ANEW:
+            self._news.begin_anew()
             self._meet(item.received_s)
         elif place is Place.AGAIN and self.meter.copied(item.received_s):
             self.warn("positions come twice or late")

@@ -183,12 +183,13 @@ def _utc(m: Any, received_s: float) -> UtcReport | None:
 def _rc(m: Any, received_s: float) -> RcReport:
     raw = (getattr(m, f"chan{channel}_raw") for channel in range(1, 19))
     pulses = tuple(0 if pulse == _UINT16_MAX else pulse for pulse in raw)
-    return RcReport(received_s=received_s, pulse_us=pulses)
+    return RcReport(received_s=received_s, pulse_us=pulses, boot_s=m.time_boot_ms / 1000.0 or None)
 
 
 def _servo(m: Any, received_s: float) -> ServoOutput:
     pulses = tuple(getattr(m, f"servo{channel}_raw") for channel in range(1, 17))
-    return ServoOutput(received_s=received_s, port=m.port, pulse_us=pulses)
+    boot_s = m.time_usec / 1e6 or None
+    return ServoOutput(received_s=received_s, port=m.port, pulse_us=pulses, boot_s=boot_s)
 
 
 def _ack(m: Any, received_s: float) -> AckReceived:

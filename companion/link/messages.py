@@ -110,6 +110,7 @@ class ServoOutput:
     received_s: float
     port: int
     pulse_us: tuple[int, ...]
+    boot_s: float | None = None
 
 
 Message = (

@@ -187,8 +187,9 @@ def test_the_estimator_of_px4_counts_too(flags: int, ratio: float, healthy: bool
 
 
 def test_channels_without_signal_are_zero() -> None:
-    message = one(frame("rc_channels", 0, 8, *([1500] * 8), *([65535] * 10), 255))
-    assert message == RcReport(received_s=2.5, pulse_us=(1500,) * 8 + (0,) * 10)
+    message = one(frame("rc_channels", 500, 8, *([1500] * 8), *([65535] * 10), 255))
+    channels = (1500,) * 8 + (0,) * 10
+    assert message == RcReport(received_s=2.5, pulse_us=channels, boot_s=0.5)
 
 
 def test_outputs_are_read_back_first_channel_first() -> None:
