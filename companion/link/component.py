@@ -279,8 +279,8 @@ class Component:
         """Notice a reboot, after which an autopilot has forgotten what was asked of it."""
         self._order, place = sorted_in(self._order, item)
         if place is Place.ANEW:
-            self._news.begin_anew()
             self._meet(item.received_s)
+            self._news.begin_anew()
         elif place is Place.AGAIN and self.meter.copied(item.received_s):
             self.warn("positions come twice or late")
             text = (
