@@ -47,6 +47,12 @@ class Oracle:
         before = self.newest.get(type(item))
         if isinstance(item, WindReport) and item.speed_m_s is None:
             return  # says nothing of the wind: what was known of it before stays
+        if (
+            isinstance(item, Telemetry)
+            and isinstance(before, Telemetry)
+            and _is_stray(item, before)
+        ):
+            return
         self.newest[type(item)] = item
         if isinstance(item, OperatorCommand):
             self.enabled = item.enable
@@ -69,6 +75,16 @@ class Oracle:
             item = self.newest.get(kind)
             if item is not None and not _is_good(item):
                 yield f"{item}"
+
+
+def _is_stray(item: Telemetry, before: Telemetry) -> bool:
+    """Whether a position does not go on from a fresh one: a late copy, or of another clock.
+
+    It is dropped, good or bad; where the stream has stopped, what comes then is judged.
+    """
+    passed_s = item.received_s - before.received_s
+    ahead_s = (item.boot_s - before.boot_s) - passed_s
+    return passed_s <= _AGES_S[Telemetry] and not (item.boot_s > before.boot_s and ahead_s <= 1.0)
 
 
 _GOOD: dict[type, Callable[[Any], bool]] = {

@@ -32,11 +32,13 @@ class Wire:
 
     def __init__(self, **options: object) -> None:
         self.told: list[tuple[int, int]] = []
+        self.heard = asyncio.Event()
         given: dict[str, object] = {"channels": (9,), "drives": (PUMP,)}
         self.executor = ServoExecutor(ServoOptions(**(given | options)), self.order)  # type: ignore[arg-type]
 
     def order(self, channel: int, pulse_us: int) -> bool:
         self.told.append((channel, pulse_us))
+        self.heard.set()
         return True
 
     def last(self, channel: int) -> int:
@@ -91,8 +93,10 @@ async def test_a_drive_is_said_again_from_time_to_time() -> None:
     await wire.executor.start()
     wire.executor.submit(with_drives(plan(1, 1.0), 0.5))
     before = len(wire.told)
-    await asyncio.sleep(0.2)
-    assert (5, 1500) in wire.told[before:]
+    async with asyncio.timeout(10.0):
+        while (5, 1500) not in wire.told[before:]:
+            wire.heard.clear()
+            await wire.heard.wait()
     await wire.executor.stop()
 
 
