@@ -280,7 +280,7 @@ class Component:
         self._order, place = sorted_in(self._order, item)
         if place is Place.ANEW:
             self._meet(item.received_s)
-            self._news.begin_anew()
+            self._news.begin_anew(item.received_s)
         elif place is Place.AGAIN and self.meter.copied(item.received_s):
             self.warn("positions come twice or late")
             text = (

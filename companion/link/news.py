@@ -15,6 +15,8 @@ from companion.link.messages import Message, ServoOutput
 
 # SERVO_OUTPUT_RAW counts microseconds in 32 bits, which begin anew after 72 minutes.
 _MICROS_WRAP_S = 2**32 / 1e6
+# For so long after a restart something of before it may still come.
+_LATE_MAX_S = 30.0
 
 
 class News:
@@ -22,15 +24,17 @@ class News:
 
     def __init__(self) -> None:
         self._newest: dict[str, float] = {}
+        self._wary_until_s = -math.inf
 
-    def begin_anew(self) -> None:
+    def begin_anew(self, now_s: float) -> None:
         """Forget it: the autopilot's clock has begun anew."""
         self._newest.clear()
+        self._wary_until_s = now_s + _LATE_MAX_S
 
     def is_old(self, message: Message, order: Order) -> bool:
         """Return whether something newer is known; what has no time is as new as it comes.
 
-        What is ahead of the positions is of the clock before it began anew.
+        After a restart what is ahead of the positions is of the clock before it.
         """
         if not isinstance(message, RcReport | ServoOutput) or message.boot_s is None:
             return False
@@ -38,7 +42,7 @@ class News:
         kind, wrap_s = "rc", BOOT_WRAP_S
         if isinstance(message, ServoOutput):
             kind, wrap_s = f"port {message.port}", _MICROS_WRAP_S
-        if order.boot_s is not None:
+        if order.boot_s is not None and message.received_s < self._wary_until_s:
             now_s = order.boot_s + message.received_s - order.received_s
             if math.remainder(boot_s - now_s, wrap_s) > AHEAD_MAX_S:
                 return True

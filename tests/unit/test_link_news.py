@@ -92,6 +92,16 @@ def test_an_old_output_is_no_fault_and_the_microseconds_begin_anew() -> None:
     assert seen == [False, False, True, False, False, True, False, False]
 
 
+def test_outputs_that_count_from_elsewhere_are_checked_all_the_same() -> None:
+    news, order = News(), Order(boot_s=300.0, received_s=10.0)
+    assert not news.is_old(outputs(500.0), order)
+    assert news.is_old(outputs(499.0), order)
+    news.begin_anew(-10.0)
+    assert news.is_old(outputs(500.0), order)
+    news.begin_anew(-20.0)
+    assert not news.is_old(outputs(500.0), order)
+
+
 def test_what_has_no_time_is_news() -> None:
     news, order = News(), Order(boot_s=3000.0, received_s=10.0)
     assert not news.is_old(outputs(3000.0), order)
