@@ -10,6 +10,11 @@ time slowly.
 An exchange is wrong by half of its round trip at most. One that is further than that from what
 the ones before it foretell shows a clock that was set, and so do positions that come before they
 can have been sent. Until the clock is known again `is_doubtful` says so, and nothing is sprayed.
+
+An autopilot that was held up, as a simulation is on a busy computer, answers now and then by a
+clock that is catching up, or goes on some tens of milliseconds behind. Such an exchange is a stray:
+it is not used and closes nothing, until three in turn agree with each other. Then the clock is
+another, and is theirs, if the positions can have come by it.
 """
 
 from __future__ import annotations
@@ -25,17 +30,19 @@ from companion.core.types import ClockReport, Telemetry
 # that much earlier says that the mean rests on late ones: it begins anew.
 CLOCK_STEP_S = 0.02
 CLOCK_RESET_S = 1.0
-# Answers come once a second; after five that failed the arrivals alone count.
+# Answers come five times a second, or once; after so long without one the arrivals alone count.
 REPORT_AGE_MAX_S = 5.0
 # A position takes no longer on its way than a question and its answer, and what the autopilot
 # and the routers make it wait. More in the mean says that the two clocks disagree.
 WAIT_MAX_S = 0.1
 # No position arrives before it was sent; the autopilot's time has whole milliseconds.
 EARLY_MAX_S = 0.005
-# An autopilot that was held up answers by a clock that is catching up: beside a real ArduCopter in
-# simulation on a busy computer 9 to 36 ms. One such answer is let pass; a second in turn, or a
-# larger one, says that the clocks disagree.
+# An exchange that is off by no more than this is a stray; by more, the clock was set.
 HELD_UP_MAX_S = 0.1
+# By less than this strays close nothing before they are understood: 0.25 m at 5 m/s, for 0.4 s.
+STRAY_S = 0.05
+# Strays go on for no longer than this without doubt.
+STRAYS_MAX_S = 1.5
 # How fast the time may be moved while spraying, in seconds a second: at 5 m/s 2.5 cm in a second
 # and 2.5 mm between two positions at 10 Hz.
 SLEW = 0.005
@@ -68,7 +75,7 @@ WANDER = 0.003
 AGREE_COUNT = 3
 # All positions of so long were late, by so much: the clock was set back, or the way has changed.
 LATE_DOUBT_S = 0.05
-LATE_FOR_S = 0.3
+LATE_FOR_S = 0.2
 # Where nobody answers TIMESYNC, arrivals that begin anew, or stay late, are believed after this.
 SETTLE_S = 1.5
 # A clock that begins anew within so many arrivals, so often in turn, runs like none.
@@ -121,6 +128,20 @@ def _longer(line: Line, at_s: float, offset_s: float, sd_s: float, fade_s: float
     )
 
 
+class Strays(NamedTuple):
+    """Exchanges in turn that do not go with the clock, but with each other."""
+
+    line: Line
+    agreeing: int
+    off_s: float  # how far the newest is off what is known
+    least_s: float = math.inf  # arrival less the autopilot's time, the least since the first
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether they are too many, or too far off, to be let pass."""
+        return self.agreeing >= AGREE_COUNT or (self.agreeing > 1 and abs(self.off_s) > STRAY_S)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
     """Mean of arrival time minus the autopilot's time, and how much of it is the way here.
@@ -144,7 +165,8 @@ class Clock:
     restarts: int = 0  # how often in turn it began anew after a few arrivals
     late_since_s: float | None = None
     agreed_s: float = -math.inf  # when an exchange last agreed with the ones before it
-    held_up_s: float | None = None  # when an answer came that only a hold-up explains
+    heard_s: float = -math.inf  # when the newest exchange came that was looked at
+    strays: Strays | None = None
 
     @property
     def sent_offset_s(self) -> float:
@@ -156,8 +178,13 @@ class Clock:
         has_exchanges = now_s - self.agreed_s <= REPORT_AGE_MAX_S
         late_s = self.late_since_s
         is_late = late_s is not None and now_s - late_s > LATE_FOR_S and self.agreed_s < late_s
+        strays = self.strays
+        is_astray = strays is not None and (
+            strays.is_doubtful or self.heard_s - self.agreed_s > STRAYS_MAX_S
+        )
         return (
             (self.disagree_left > 0 and has_exchanges)
+            or (is_astray and now_s - self.heard_s <= REPORT_AGE_MAX_S)
             or now_s < self.doubtful_until_s
             or is_late
             or not abs(self.rate) <= RATE_MAX
@@ -190,18 +217,10 @@ def is_believed(report: ClockReport | None, clock: Clock, now_s: float) -> bool:
 
 
 def _is_refused(report: ClockReport | None, clock: Clock, now_s: float) -> bool:
-    """Whether an exchange was measured that not even an autopilot held up once could have sent."""
-    if report is None or not is_measured(report, now_s) or is_believed(report, clock, now_s):
+    """Whether an exchange was measured that not even an autopilot held up could have sent."""
+    if report is None or not is_measured(report, now_s):
         return False
-    is_second = clock.held_up_s is not None and report.received_s > clock.held_up_s
-    return is_second or not _is_possible(report, clock, now_s, early_max_s=HELD_UP_MAX_S)
-
-
-def _held_up_s(report: ClockReport, clock: Clock, now_s: float) -> float | None:
-    """Return when the first of the exchanges in turn came that are not believed."""
-    if is_believed(report, clock, now_s):
-        return None
-    return report.received_s if clock.held_up_s is None else clock.held_up_s
+    return not _is_possible(report, clock, now_s, early_max_s=HELD_UP_MAX_S)
 
 
 def _is_possible(report: ClockReport, clock: Clock, now_s: float, *, early_max_s: float) -> bool:
@@ -238,29 +257,35 @@ def tick(
         report = unwrapped(report, near_s)
     clock, is_set = _arrived(before, item, report, at_once=at_once)
     is_refused = _is_refused(report, clock, now_s)
-    if report is not None and is_measured(report, now_s):
-        clock = replace(clock, held_up_s=_held_up_s(report, clock, now_s))
     passed_s = 0.0 if before is None else now_s - before.received_s
-    if report is None or not is_believed(report, clock, now_s):
+    is_adopted = False
+    if report is not None and is_measured(report, now_s) and report.received_s > clock.heard_s:
+        was_astray = clock.strays is not None
+        clock = replace(_heard(clock, report, now_s, is_set=is_set), heard_s=report.received_s)
+        is_set = is_set or clock.disagree_left == AGREE_COUNT
+        is_adopted = was_astray and clock.strays is None and clock.agreed_s == report.received_s
+    if is_refused or not _has_exchanges(report, clock, now_s):
         moved_s = 0.0
         if before is not None and clock.count == 1 and not is_set:
             moved_s = clock.offset_s - before.offset_s - before.rate * passed_s
         return Ticked(clock, False, moved_s, is_set, is_refused)
-    if clock.exchanges is None or report.received_s > clock.exchanges.at_s:
-        clock = _exchanged(clock, report)
-        is_set = is_set or clock.disagree_left == AGREE_COUNT
     assert clock.exchanges is not None
     rate = clock.exchanges.rate(clock.rate, RATE_BY_ARRIVALS_SD)
     wanted_s = min(clock.exchanges.at(now_s, rate), clock.offset_s)
     used_s, moved_s = wanted_s, 0.0
     if before is not None and not is_set:
         known_s = before.sent_offset_s + rate * passed_s
-        if not (at_once or clock.disagree_left > 0):
+        if not (at_once or is_adopted or clock.disagree_left > 0):
             reach_s = SLEW * min(max(passed_s, 0.0), 1.0)
             used_s = known_s + min(max(wanted_s - known_s, -reach_s), reach_s)
         moved_s = used_s - known_s
     clock = replace(clock, delay_s=clock.offset_s - used_s, rate=rate)
     return Ticked(clock, True, moved_s, is_set, is_refused)
+
+
+def _has_exchanges(report: ClockReport | None, clock: Clock, now_s: float) -> bool:
+    """Whether the time can be taken from the exchanges."""
+    return clock.exchanges is not None and is_measured(report, now_s)
 
 
 def _arrived(
@@ -293,6 +318,9 @@ def _arrived(
     else:
         line = _longer(clock.arrivals, now_s, seen_s, clock.jitter_s, ARRIVALS_FADE_S)
     slope = line.rate(0.0, RATE_SD)
+    strays = clock.strays
+    if strays is not None:
+        strays = strays._replace(least_s=min(strays.least_s, seen_s))
     arrived = replace(
         clock,
         offset_s=line.at(now_s, slope),
@@ -303,6 +331,7 @@ def _arrived(
         jitter_s=jitter_s,
         arrivals=line,
         late_since_s=since_s,
+        strays=strays,
     )
     return arrived, False
 
@@ -349,13 +378,15 @@ def _anew(clock: Clock | None, item: Telemetry) -> Clock:
         round_trip_s=clock.round_trip_s,
         disagree_left=clock.disagree_left,
         agreed_s=clock.agreed_s,
-        held_up_s=clock.held_up_s,
+        heard_s=clock.heard_s,
+        strays=None if clock.strays is None else clock.strays._replace(least_s=seen_s),
     )
 
 
-def _exchanged(clock: Clock, report: ClockReport) -> Clock:
-    """Return the clock with one more exchange that is believed beside the positions."""
+def _heard(clock: Clock, report: ClockReport, now_s: float, *, is_set: bool) -> Clock:
+    """Return the clock with one more exchange: used, a stray, or the first of another clock."""
     line, at_s, offset_s = clock.exchanges, report.received_s, report.offset_s
+    is_possible = is_believed(report, clock, now_s)
     quickest_s = report.round_trip_s
     if line is not None:
         more_s = max(report.round_trip_s - clock.round_trip_s, 0.0)
@@ -363,21 +394,68 @@ def _exchanged(clock: Clock, report: ClockReport) -> Clock:
     slow_s = report.round_trip_s - quickest_s
     sd_s = EXCHANGE_SD_S + UNEVEN * report.round_trip_s + 0.5 * slow_s
     fade_s = EXCHANGES_FADE_S + FADE_BY_ROUND_TRIP * slow_s
-    begun = replace(
-        clock, exchanges=_begun(at_s, offset_s, sd_s), round_trip_s=quickest_s, agreed_s=at_s
-    )
-    if line is None:
-        return begun
-    wander = WANDER if clock.count >= 20 else RATE_MAX
-    apart_s = offset_s - line.at(at_s, line.rate(clock.rate, RATE_BY_ARRIVALS_SD))
+    begun = _begun(at_s, offset_s, sd_s)
+    if line is None and is_possible:
+        return replace(clock, exchanges=begun, round_trip_s=quickest_s, agreed_s=at_s, strays=None)
     bound_s = 0.5 * (report.round_trip_s + quickest_s) + EXCHANGE_STEP_S
-    if not abs(apart_s) <= bound_s + wander * (at_s - line.at_s):
-        return replace(begun, disagree_left=AGREE_COUNT, agreed_s=clock.agreed_s)
-    return replace(
-        begun,
-        exchanges=_longer(line, at_s, offset_s, sd_s, fade_s),
-        disagree_left=max(clock.disagree_left - 1, 0),
-    )
+    late_s = clock.offset_s - clock.rate * (now_s - at_s) - offset_s
+    if line is None:
+        return _strayed(clock, report, begun, off_s=-late_s, bound_s=bound_s)
+    apart_s = offset_s - line.at(at_s, line.rate(clock.rate, RATE_BY_ARRIVALS_SD))
+    passed_s = at_s - line.at_s
+    wander_s = WANDER * max(passed_s, 1.0) if clock.count >= 20 else RATE_MAX * passed_s
+    is_apart = not abs(apart_s) <= bound_s + wander_s
+    if is_possible and not is_apart:
+        return replace(
+            clock,
+            exchanges=_longer(line, at_s, offset_s, sd_s, fade_s),
+            round_trip_s=quickest_s,
+            agreed_s=at_s,
+            disagree_left=max(clock.disagree_left - 1, 0),
+            # Three that agree are a better reason than the time that passed without any.
+            doubtful_until_s=-math.inf if clock.disagree_left == 1 else clock.doubtful_until_s,
+            strays=None,
+        )
+    is_set = is_set or now_s < clock.doubtful_until_s or abs(apart_s) + bound_s > HELD_UP_MAX_S
+    if is_possible and is_set:
+        return replace(
+            clock,
+            exchanges=begun,
+            round_trip_s=quickest_s,
+            disagree_left=AGREE_COUNT,
+            strays=None,
+        )
+    off_s = max(apart_s, -late_s, key=abs)
+    return _strayed(clock, report, begun, off_s=off_s, bound_s=bound_s)
+
+
+def _strayed(
+    clock: Clock, report: ClockReport, begun: Line, *, off_s: float, bound_s: float
+) -> Clock:
+    """Return the clock with one more stray, or by the strays, if three agree and can be true."""
+    at_s, before = report.received_s, clock.strays
+    strays = Strays(begun, 1, off_s)
+    if before is not None:
+        apart_s = report.offset_s - before.line.at(at_s, clock.rate)
+        if abs(apart_s) <= bound_s + WANDER:
+            sd_s = begun.weight**-0.5
+            line = _longer(before.line, at_s, report.offset_s, sd_s, EXCHANGES_FADE_S)
+            strays = Strays(line, before.agreeing + 1, off_s, before.least_s)
+    least_s = strays.least_s
+    if strays.agreeing < AGREE_COUNT or not math.isfinite(least_s):
+        return replace(clock, strays=strays)
+    late_s = least_s - strays.line.at(at_s, clock.rate)
+    early_s = EARLY_MAX_S + 0.5 * report.round_trip_s
+    if not -early_s <= late_s <= report.round_trip_s + WAIT_MAX_S:
+        return replace(clock, strays=strays)
+    adopted = replace(clock, exchanges=strays.line, agreed_s=at_s, disagree_left=0, strays=None)
+    if least_s > clock.offset_s and clock.arrivals is not None:
+        # The mean that hardly follows late messages did not follow these.
+        by_s = least_s - clock.offset_s
+        adopted = replace(
+            adopted, offset_s=least_s, arrivals=clock.arrivals.moved(by_s), late_since_s=None
+        )
+    return adopted
 
 
 def on_time_s(received_s: float, before: Clock | None, after: Clock) -> float:

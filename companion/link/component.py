@@ -41,7 +41,8 @@ from companion.link.tank import Tank
 from companion.link.wind import WindWatch
 
 _POSITION = 33
-_TIMESYNC_S = 1.0
+# How often the time is asked for, in seconds; where answers are slow, bytes are dear.
+_TIMESYNC_S, _TIMESYNC_SLOW_S, _QUICK_S = 0.2, 1.0, 0.05
 _INPUTS = get_args(Input)
 
 
@@ -218,7 +219,9 @@ class Component:
         if trouble is not None:
             self.warn(trouble)
             self._service.tell_event(now_s, "streams", trouble)
-        if now_s - self._timesync_s >= _TIMESYNC_S:
+        round_trip_s = self.clock.round_trip_s
+        is_quick = round_trip_s is not None and round_trip_s <= _QUICK_S
+        if now_s - self._timesync_s >= (_TIMESYNC_S if is_quick else _TIMESYNC_SLOW_S):
             self._timesync_s = now_s
             self._send(self._encoder.timesync(0, self.clock.ask(now_s)))
 

@@ -41,6 +41,7 @@ class Vehicle:
     hz: float = 20.0
     has_timesync: bool = True
     held_up_s: float = 0.0  # how far its clock is behind when it answers, now and then
+    asks_s: float = 1.0  # how often it is asked for its time
     seed: int = 1
 
     def boot_s(self, now_s: float) -> float:
@@ -58,7 +59,7 @@ class Vehicle:
             late_s, there_s, back_s = (self.way_s + self.jitter_s * rng.random(3)).tolist()
             if self.has_timesync and sent_s >= ask_s:
                 track = observe(track, self.exchange(ask_s, there_s, back_s), SETUP)
-                ask_s += 1.0
+                ask_s += self.asks_s
             latitude, longitude = SETUP.frame.to_geographic(SPEED_M_S * sent_s, 3.0)
             item = replace(
                 ONE,
