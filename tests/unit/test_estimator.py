@@ -425,7 +425,7 @@ def test_an_answer_that_cannot_be_true_is_not_believed(change: dict[str, float])
     assert told.motion == plain.motion
     assert told.clock is not None
     # That it came is known, for the one after it to be judged by; nothing else is.
-    assert replace(told.clock, held_up_s=None) == plain.clock
+    assert replace(told.clock, heard_s=-math.inf, strays=None) == plain.clock
 
 
 def test_a_reboot_forgets_what_was_known_of_the_clock() -> None:
