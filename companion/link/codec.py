@@ -9,6 +9,7 @@ from companion.link.census import AUTOPILOT_COMPONENT, Census, Vehicle
 from companion.link.decode import FROM_ANYONE, FROM_VEHICLE
 from companion.link.framer import Accept, Framer
 from companion.link.messages import CommandReceived, Message
+from companion.link.signing import RADIO_STATUS
 
 _HEARTBEAT = 0
 _SENDERS_MAX = 64
@@ -56,6 +57,8 @@ class Codec:
         self._senders: dict[tuple[int, int], _Sequence] = {}
         self.vehicle_counts: dict[int, int] = {}
         self.ignored_count = 0
+        # Frames that show who speaks from an address; a radio's report is signed by nobody.
+        self.named_frame_count = 0
         self.vehicle_frame_count = 0
         self.byte_count = 0
 
@@ -119,8 +122,10 @@ class Codec:
         message_id: int = raw.get_msgId()
         if message_id == _HEARTBEAT:
             self.census.heartbeat(*sender, kind=raw.type, autopilot=raw.autopilot, now_s=received_s)
-        if self.vehicle is not None and sender[0] == self.vehicle.system_id:
-            self.vehicle_frame_count += 1
+        if message_id != RADIO_STATUS:
+            self.named_frame_count += 1
+            if self.vehicle is not None and sender[0] == self.vehicle.system_id:
+                self.vehicle_frame_count += 1
         if message_id in FROM_ANYONE:
             message = FROM_ANYONE[message_id](raw, received_s)
             if is_late and isinstance(message, CommandReceived):

@@ -195,9 +195,9 @@ class Component:
     def _heard(self, data: bytes, received_s: float) -> Iterator[Message]:
         """Yield what is news, one after the other, and say that something valid came."""
         codec = self.codec
-        before = (codec.frame_count, codec.vehicle_frame_count)
+        before = (codec.named_frame_count, codec.vehicle_frame_count)
         messages = codec.decode(data, received_s)
-        if self.on_valid is not None and codec.frame_count > before[0]:
+        if self.on_valid is not None and codec.named_frame_count > before[0]:
             self.on_valid(codec.vehicle_frame_count > before[1])
         for message in messages:
             if not self._news.is_old(message, self._order):

@@ -227,6 +227,9 @@ async def test_strangers_do_not_displace_the_vehicle_on_udpin(is_signed: bool) -
     station, stranger = Station(), mavlink.MAVLink(None, srcSystem=66, srcComponent=190)
     said = station.heartbeat()
     unsigned = bytes(stranger.heartbeat_encode(6, 8, 0, 0, 4).pack(stranger))
+    # A radio's report is believed unsigned, and could claim to be of the vehicle's system.
+    radio = mavlink.MAVLink(None, srcSystem=1, srcComponent=68)
+    report = bytes(radio.radio_status_encode(200, 200, 90, 40, 40, 0, 0).pack(radio))
 
     async def says(socket: asyncio.DatagramTransport, frame: bytes) -> None:
         arrived.clear()
@@ -240,6 +243,7 @@ async def test_strangers_do_not_displace_the_vehicle_on_udpin(is_signed: bool) -
     for number, (socket, _) in enumerate(others):
         # Noise, a frame without a signature (or of another system), the vehicle's own once more.
         await says(socket, [b"noise", unsigned, said if is_signed else unsigned][number % 3])
+        await says(socket, report)
     before = inbox.heard
     assert link.component.outputs.order(9, 1000)
     async with asyncio.timeout(5.0):
