@@ -39,9 +39,9 @@ WAIT_MAX_S = 0.1
 EARLY_MAX_S = 0.005
 # An exchange that is off by no more than this is a stray; by more, the clock was set.
 HELD_UP_MAX_S = 0.1
-# By less than this strays close nothing before they are understood: 0.25 m at 5 m/s, for 0.4 s.
+# By less than this strays close nothing for a while: 0.25 m at 5 m/s, if they were right.
 STRAY_S = 0.05
-# Strays go on for no longer than this without doubt.
+# No longer than this: seven exchanges, or two where they come once a second.
 STRAYS_MAX_S = 1.5
 # How fast the time may be moved while spraying, in seconds a second: at 5 m/s 2.5 cm in a second
 # and 2.5 mm between two positions at 10 Hz.
@@ -138,8 +138,8 @@ class Strays(NamedTuple):
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether they are too many, or too far off, to be let pass."""
-        return self.agreeing >= AGREE_COUNT or (self.agreeing > 1 and abs(self.off_s) > STRAY_S)
+        """Whether they are too far off to be let pass."""
+        return self.agreeing > 1 and abs(self.off_s) > STRAY_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

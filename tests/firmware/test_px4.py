@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -105,8 +106,10 @@ def fly_pass(
             vehicle.station.log.clear_flight()
             start_px4(vehicle, items)
             until_landed(vehicle, 150.0)
-        found = verdicts(vehicle.station.log, config)
-        tell(estimate_errors(vehicle.station.log))
+        log = vehicle.station.log
+        (folder / "log.pkl").write_bytes(pickle.dumps((log.places, log.pulses, log.told)))
+        found = verdicts(log, config)
+        tell(estimate_errors(log))
     for name, verdict in found.items():
         tell(f"{name}: {verdict}")
     return found

@@ -108,7 +108,7 @@ def test_an_autopilot_that_was_held_up_as_it_answered_closes_nothing(held_up_s: 
 
 
 # Beside a real ArduCopter in simulation, on a busy computer: asked five times a second, over a way
-# of a millisecond, it is held up for 6 to 57 ms as it answers, in one of seven exchanges.
+# of a millisecond, it is held up for 6 to 57 ms as it answers, in up to three exchanges in turn.
 BUSY = Vehicle(asks_s=0.2, way_s=0.001, jitter_s=0.002)
 
 
@@ -126,7 +126,7 @@ def test_answers_of_a_busy_autopilot_close_nothing(seed: int) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class BusyVehicle(Vehicle):
-    """Held up as it answers, now once and now twice in turn, by another time each."""
+    """Held up as it answers, once or up to three times in turn, by the same or by another time."""
 
     asks_s: float = 0.2
     way_s: float = 0.001
@@ -138,7 +138,7 @@ class BusyVehicle(Vehicle):
         return replace(report, offset_s=report.offset_s + late_ms / 1000.0)
 
 
-HELD_UP_MS = (0, 0, 25, 0, 0, 0, 0, 9, 36, 0, 0, 0, 0, 0, 57, 23, 0, 0, 0, 0, 0, 0, 27, 0, 0, 0, 0)
+HELD_UP_MS = (0, 0, 25, 0, 0, 9, 36, 0, 0, 57, 23, 0, 0, 24, 24, 26, 0, 7, 7, 7, 0, 27, 0, 0, 0)
 
 
 @pytest.mark.parametrize("by_s", [-0.045, -0.025, 0.025])
@@ -174,8 +174,9 @@ def test_answers_that_go_on_to_be_impossible_close() -> None:
         state = estimate(track, item.received_s)
         assert state is not None
         agrees.append(state.clock_agrees)
-    assert all(agrees[:102])
-    assert not any(agrees[112:])
+    # Beside a simulation that is so for three answers in turn, 0.6 s, every minute.
+    assert all(agrees[:118])
+    assert not any(agrees[132:])
 
 
 def test_a_rate_that_wanders_is_followed_by_frequent_exchanges() -> None:
