@@ -174,7 +174,9 @@ def fresh_project(folder: Path, *, is_old: bool) -> tuple[list[str], Path]:
     log, python = folder / "calls.log", folder / "fake-python"
     python.write_text(FAKE_PYTHON.format(log=log, old=int(is_old)))
     python.chmod(0o755)
-    return ["make", "--directory", str(folder), f"PYTHON={python}", "setup"], log
+    # What was said to the make that runs these tests is not for this one.
+    command = ["env", "--unset=MAKEFLAGS", "--unset=MAKEOVERRIDES", "--unset=VENV", "make"]
+    return [*command, "--directory", str(folder), f"PYTHON={python}", "setup"], log
 
 
 @needs_make

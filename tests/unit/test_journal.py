@@ -458,7 +458,9 @@ def test_a_journal_that_is_still_written_is_locked_for_other_processes(tmp_path:
         with pytest.raises(JournalError):
             read_journal(journal.path)  # must not give the locks up
         code = (
-            f"import sqlite3; sqlite3.connect({str(journal.path)!r}, timeout=0).execute('VACUUM')"
+            "import contextlib, sqlite3\n"
+            f"with contextlib.closing(sqlite3.connect({str(journal.path)!r}, timeout=0)) as db:\n"
+            "    db.execute('VACUUM')\n"
         )
         other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "database is locked" in other.stderr
