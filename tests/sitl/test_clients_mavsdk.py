@@ -159,7 +159,7 @@ async def set_parameters(bench: Bench, station: Ground) -> None:
 async def give_commands(station: Ground) -> None:
     assert await station.command(dialect.MAV_CMD_DO_SPRAYER, 1.0) == ACCEPTED
     await station.until(lambda: station.value("SPR_STATE") == 1.0)
-    await station.until(lambda: station.has_said("not-armed"))
+    await station.until(lambda: station.has_said("not armed"))
     assert await station.command(dialect.MAV_CMD_DO_SPRAYER, 0.5) == DENIED
     assert await station.command(dialect.MAV_CMD_DO_SPRAYER, 0.0) == ACCEPTED
     await station.until(lambda: station.value("SPR_STATE") == 2.0)

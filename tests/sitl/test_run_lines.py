@@ -35,7 +35,7 @@ def write_ferry(path: Path) -> None:
         "QGC WPL 110\n"
         "0 1 0 16 0 0 0 0 36.0 114.5 60 1\n"
         "1 0 3 22 0 0 0 0 36.0 114.5 3.5 1\n"
-        "2 0 3 178 1 5 0 0 0 0 0 1\n"
+        "2 0 2 178 1 5 0 0 0 0 0 1\n"
         + "".join(f"{3 + n} 0 3 16 0 0 0 0 {place} 3.5 1\n" for n, place in enumerate(degrees))
     )
 

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.sitl
 MISSION = (
     "QGC WPL 110\n"
     "0 1 0 16 0 0 0 0 36.0 114.5 60 1\n"
-    "1 0 3 22 0 0 0 0 0 0 2.0 1\n"
+    "1 0 3 22 0 0 0 0 36.0 114.5 2.0 1\n"
     "2 0 3 16 0 0 0 0 36.0002 114.5 2.0 1\n"
 )
 SERVE = (sys.executable, "-c", "from sitl.cli import app; app()", "serve", "--json")
