@@ -26,8 +26,7 @@ def flow(
         typer.Argument(
             metavar="CSV",
             help="Columns duty (0 to 1), seconds, millilitres or litres; set (valves, as 1-4 or "
-            "1 2 3 4) may be added. us (a motor's pulse) instead of duty: a pump's curve. Repeated "
-            "rows are welcome.",
+            "1 2 3 4) may be added. us (a motor's pulse) instead of duty: a pump's curve.",
         ),
     ],
     config: Annotated[
@@ -46,8 +45,10 @@ def flow(
 ) -> None:
     """Make the flow curve of valves or pump from a bucket test.
 
-    Catch what all nozzles of a set give in a measured time, at five duties or more, twice each. Of
-    a pump whose speed makes the flow: what all nozzles give, at five pulse widths or more.
+    Catch what all nozzles of a set give in a measured time, at five duties or more, twice each.
+    The curve is fitted through the scatter of the repeats, where there are four repeats or more.
+
+    Of a pump whose speed makes the flow: what all nozzles give, at five pulse widths or more.
 
     Example: vrspray calibrate flow bucket.csv --config config.toml --plot curve.png
     """

@@ -78,9 +78,10 @@ def demo_flights(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Fly the field of the first paper with all methods and compare them.
+    """Fly the field of Wang et al. 2024 with all methods and compare them.
 
-    Simulated: no hardware, no network. Exit 0: flown; 2: an option or the folder is wrong.
+    Simulated: no hardware, no network. Exit 0: flown; 2: an option or the folder is wrong; 130:
+    interrupted.
     """
     began_s = time.perf_counter()
     from sitl.demo import DemoOptions, check

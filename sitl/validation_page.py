@@ -133,6 +133,13 @@ READING = """\
 """
 
 
+# What the two pictures show, for those who cannot see them.
+PICTURES_SHOW = (
+    "Settled lag distance of each method at 4, 5 and 6 m/s, with the ranges that P1 published",
+    "Spraying accuracy by speed and prescribed rate: P1's Table 5, and the twin with each method",
+)
+
+
 def summary_lines(result: Validation) -> list[str]:
     """Return the tables for a terminal."""
     lines = [*_plain(_lag_table(result)), "", *_plain(_ours_table(result)), ""]
@@ -154,7 +161,9 @@ def write_page(result: Validation, folder: Path, *, pictures: Sequence[str], com
     bounds = ", ".join(
         f"`{method}` {'met' if held else '**missed**'}" for method, held in result.bounds().items()
     )
-    images = [f"![Lag distance and accuracy beside P1's]({picture})\n" for picture in pictures]
+    images = [
+        f"![{alt}]({picture})\n" for alt, picture in zip(PICTURES_SHOW, pictures, strict=False)
+    ]
     parts = [
         INTRODUCTION,
         f"Made by `{command}` on {today}: {basis(result)} Means at {BOUND_SPEED_M_S:g} m/s within "

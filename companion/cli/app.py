@@ -35,7 +35,7 @@ class Place(NamedTuple):
 
 COMMANDS = {
     "demo": Place(
-        "sitl.demo_cli:demo", "Fly the field of the first paper by all methods; compare them."
+        "sitl.demo_cli:demo", "Fly the field of Wang et al. 2024 by all methods; compare them."
     ),
     "run": Place("companion.cli.run:run", "Spray: the companion beside the flight controller."),
     "ground": Place(
@@ -96,7 +96,7 @@ def load_command(name: str, place: Place) -> Command:
         and not isinstance(found, typer.Typer)
         and not hasattr(found, "make_context")
     ):
-        function, found = found, typer.Typer(add_completion=False)
+        function, found = found, typer.Typer(add_completion=False, rich_markup_mode=None)
         found.command()(function)
     return typer.main.get_command(found) if isinstance(found, typer.Typer) else found
 

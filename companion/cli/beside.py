@@ -24,6 +24,15 @@ NICENESS = 10
 PATIENT = frozenset(
     {"demo", "config", "map", "plan", "calibrate", "report", "flights", "replay", "export", "wsp"}
 )
+# Of these, what is done before a line about it could be read.
+QUICK = frozenset(
+    {
+        *(("config", name) for name in ("check", "show", "schema")),
+        *(("map", name) for name in ("rate", "new", "offset")),
+        *(("flights", name) for name in ("list", "show", "pin", "unpin", "prune")),
+        ("calibrate", "mission"),
+    }
+)
 
 
 @contextlib.contextmanager
@@ -47,11 +56,16 @@ def running(sockets: Path = _SOCKETS) -> tuple[int, ...]:
 
 
 def give_way(arguments: Sequence[str]) -> None:
-    """Lower this process's priority, if its command can wait; say so where a companion runs."""
+    """Lower this process's priority, if its command can wait.
+
+    Where a companion runs, what computes for long says so.
+    """
     is_flight = list(arguments[:2]) == ["sitl", "fly"]
     if not arguments or (arguments[0] not in PATIENT and not is_flight):
         return
     os.nice(max(NICENESS - os.nice(0), 0))
+    if "--help" in arguments or tuple(arguments[:2]) in QUICK:
+        return
     flying = running()
     if flying:
         numbers = ", ".join(str(number) for number in flying)

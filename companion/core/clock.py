@@ -12,9 +12,11 @@ the ones before it foretell shows a clock that was set, and so do positions that
 can have been sent. Until the clock is known again `is_doubtful` says so, and nothing is sprayed.
 
 An autopilot that was held up, as a simulation is on a busy computer, answers now and then by a
-clock that is catching up, or goes on some tens of milliseconds behind. Such an exchange is a stray:
-it is not used and closes nothing, until three in turn agree with each other. Then the clock is
-another, and is theirs, if the positions can have come by it.
+clock that is catching up, or goes on some tens of milliseconds behind. Such an exchange, off by up
+to 0.1 s, is a stray: it is not used, and closes nothing at once. Three in a row that agree with
+each other become the new clock, if the positions can have come by it. `is_doubtful` at the second
+that agrees and is off by more than 0.05 s, and after 1.5 s in which no exchange agreed with the
+line; above 0.1 s at once.
 """
 
 from __future__ import annotations

@@ -37,10 +37,14 @@ def test_a_run_is_seen_while_it_lives_and_never_after_it() -> None:
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         assert process.pid in running()
-        at, said = niceness("map", "--help")
+        at, said = niceness("map", "check", "nowhere.shp")
         assert at == max(os.nice(0), NICENESS)
         assert f"{process.pid}" in said
         assert "gives way" in said
+        for quick in (("report", "--help"), ("map", "rate", "nowhere.shp", "1", "2")):
+            at, said = niceness(*quick)
+            assert at == max(os.nice(0), NICENESS)
+            assert "gives way" not in said
         process.kill()
         process.wait()
         assert process.pid not in running()
