@@ -55,6 +55,11 @@ def running(sockets: Path = _SOCKETS) -> tuple[int, ...]:
     return tuple(sorted(found - {os.getpid()}))
 
 
+def is_quick(arguments: Sequence[str]) -> bool:
+    """Whether a patient command is done before a line about its priority could be read."""
+    return "--help" in arguments or tuple(arguments[:2]) in QUICK
+
+
 def give_way(arguments: Sequence[str]) -> None:
     """Lower this process's priority, if its command can wait.
 
@@ -64,9 +69,7 @@ def give_way(arguments: Sequence[str]) -> None:
     if not arguments or (arguments[0] not in PATIENT and not is_flight):
         return
     os.nice(max(NICENESS - os.nice(0), 0))
-    if "--help" in arguments or tuple(arguments[:2]) in QUICK:
-        return
-    flying = running()
+    flying = () if is_quick(arguments) else running()
     if flying:
         numbers = ", ".join(str(number) for number in flying)
         note(f"note: vrspray run flies on this computer (process {numbers}); this gives way to it")

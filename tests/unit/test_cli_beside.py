@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from companion.cli.app import COMMANDS, main
-from companion.cli.beside import NICENESS, PATIENT, running, shown
+from companion.cli.beside import NICENESS, PATIENT, is_quick, running, shown
 
 # Waits for a line, so that the test says when it ends.
 RUN = "from companion.cli.beside import shown\nwith shown():\n print('up', flush=True)\n input()"
@@ -41,13 +41,16 @@ def test_a_run_is_seen_while_it_lives_and_never_after_it() -> None:
         assert at == max(os.nice(0), NICENESS)
         assert f"{process.pid}" in said
         assert "gives way" in said
-        for quick in (("report", "--help"), ("map", "rate", "nowhere.shp", "1", "2")):
-            at, said = niceness(*quick)
-            assert at == max(os.nice(0), NICENESS)
-            assert "gives way" not in said
         process.kill()
         process.wait()
         assert process.pid not in running()
+
+
+def test_what_is_done_at_once_says_nothing() -> None:
+    assert is_quick(("report", "--help"))
+    assert is_quick(("map", "rate", "map.shp", "36.0", "114.5"))
+    assert not is_quick(("map", "check", "map.shp"))
+    assert not is_quick(("demo",))
 
 
 def test_this_process_is_not_another() -> None:
