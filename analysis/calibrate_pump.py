@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.bucket_scale import PULSE_FULL_US
 from analysis.bucket_table import pump_curve_of
-from analysis.calibrate_flow import heading, point_cells, residuals
+from analysis.bucket_words import heading, point_cells, residuals
 from companion.cli.answer import answer, note
 
 if TYPE_CHECKING:
