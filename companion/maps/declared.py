@@ -14,6 +14,9 @@ from companion.maps.units import (
     RateUnit,
     is_mass_per_area,
     l_ha_per_unit,
+    other_quantity,
+    quantity_in_name,
+    quantity_of_word,
     rate_unit,
     unit_in_name,
 )
@@ -68,6 +71,7 @@ def unit_of(layer: Layer | Grid, rate: Column | Band, *, given: Given, path: Pat
     wanted = None if given.unit is None else _wanted(given.unit, path)
     declared = _declared(layer, rate)
     known = {found.name: found for found in map(rate_unit, declared) if found is not None}
+    _refuse_other_quantity(layer, rate, declared, wanted=wanted, known=bool(known), path=path)
     unknown = [text for text in declared if rate_unit(text) is None]
     if unknown and (wanted is None or any(map(is_mass_per_area, unknown))):
         raise map_error(
@@ -95,10 +99,50 @@ def unit_of(layer: Layer | Grid, rate: Column | Band, *, given: Given, path: Pat
         raise map_error(
             path, f"no unit is given for the rates in {rate.name}", fix=_FIX, code="no-unit"
         )
-    return _in_litres(found, given, path, tuple(_overridden(unknown, found.name, rate)))
+    problems = tuple(_overridden(unknown, found.name, rate))
+    return _in_litres(found, given, path, problems, layer.instead)
 
 
-def _in_litres(found: RateUnit, given: Given, path: Path, problems: tuple[Problem, ...]) -> Unit:
+def _refuse_other_quantity(
+    layer: Layer | Grid,
+    rate: Column | Band,
+    declared: Sequence[str],
+    *,
+    wanted: RateUnit | None,
+    known: bool,
+    path: Path,
+) -> None:
+    """Refuse rates of which the file says that they are seeds, centimetres, percent, nutrients.
+
+    Whatever the operator states: those numbers are no litres. Only a weight without its area may
+    be of an area that the operator knows.
+    """
+    found = [(text, other_quantity(text)) for text in declared]
+    named = None if rate.unit is not None else quantity_in_name(rate.name)
+    if named is not None:
+        found.append(named)
+    elif not known:
+        found.append((rate.name, quantity_of_word(words(rate.name))))
+    for text, quantity in found:
+        if quantity is None or (
+            quantity == "a weight" and wanted is not None and wanted.kind == "mass"
+        ):
+            continue
+        raise map_error(
+            path,
+            f"{rate.name} is in {text[:40]!r}: {quantity}, and no volume per area"
+            if text != rate.name
+            else f"{rate.name} is {quantity} by its name, and no volume per area",
+            fix=layer.instead
+            or "name a column with a volume per area with --rate-field (prescription.rate_field), "
+            "or make the map in L/ha",
+            code="not-a-volume",
+        )
+
+
+def _in_litres(
+    found: RateUnit, given: Given, path: Path, problems: tuple[Problem, ...], instead: str
+) -> Unit:
     """Return the unit with its L/ha; a weight needs a density, a flow a width and a speed."""
     l_ha = l_ha_per_unit(
         found.name,
@@ -111,7 +155,7 @@ def _in_litres(found: RateUnit, given: Given, path: Path, problems: tuple[Proble
             path,
             f"its unit {found.name!r} is a weight, and no volume per area",
             fix="give the density of what is sprayed with --density-kg-l "
-            "(prescription.density_kg_l), or make the map in L/ha",
+            f"(prescription.density_kg_l), or {instead or 'make the map in L/ha'}",
             code="not-a-volume",
         )
     if l_ha is None:

@@ -53,7 +53,8 @@ class Layer:
     """The content of one file; None among `geometries` is explained in `skipped`.
 
     `crs` None: the file does not say. `unit`: what the file as a whole declares. `boundary`: the
-    outline of the field, in longitude and latitude, where the file has one.
+    outline of the field, in longitude and latitude, where the file has one. `instead`: what else
+    of the file could be sprayed, as an advice where this cannot.
     """
 
     format: str
@@ -63,6 +64,7 @@ class Layer:
     sha256: str
     unit: str | None = None
     boundary: MultiPolygon | None = None
+    instead: str = ""
     skipped: dict[int, str] = field(default_factory=dict)
     problems: tuple[Problem, ...] = ()
 
@@ -89,6 +91,7 @@ class Grid:
     sha256: str
     unit: str | None = None
     boundary: MultiPolygon | None = None
+    instead: str = ""
     problems: tuple[Problem, ...] = ()
 
 

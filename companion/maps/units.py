@@ -8,6 +8,7 @@ to state them.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -57,6 +58,19 @@ _MINUTES: dict[str, tuple[float, str]] = {
 }
 _MASS = r"(?:k|m|µ|u)?g|kgs?|kilo(?:gram)?s?|grams?|t|to|tons?|tonnes?|lbs?|pounds?|oz|cwt|dt"
 _SEPARATOR = r"(?:1?(?:/|per|[·.*_-]|)1?)"
+# What is counted, measured along a line, harvested, or a part of what is weighed: units of other
+# machines' maps, which no density, width or speed turns into litres.
+_COUNTED = (
+    r"(?:k|m|mio\.?|mil|thousand|million|[0-9.,])*(?:seeds?|sds|grains?|kernels?|krn|graines?|"
+    r"körner|koerner|samen|semillas?|sementes?|semi|plants?|pl|pflanzen|plantes?|plantas?|piante|"
+    r"pop(?:ulation)?|pieces?|pcs|stk|stück|bags?|粒|株)"
+)
+_LENGTHS = r"mm|cm|dm|m|km|in|inch(?:es)?|ft|feet|foot|yd|yards?|\"|毫米|厘米|米"
+# Nutrients and active ingredients: so much of the product holds so much of them.
+_PART = (
+    r"n|p|k|s|mg|ca|b|zn|mn|p2o5|k2o|cao|mgo|so3|no3|nh4|nitrogen|azote?|stickstoff|phosph[a-z]*|"
+    r"potas[a-z]*|kali|sul(?:f|ph)ur|a\.?i\.?|a\.?e\.?|a\.?s\.?|wirkstoff|active[a-z]*"
+)
 # "l ha^-1", "l.ha⁻¹", and "gal1ac-1", as ADAPT codes it; with the power no separator is needed.
 _POWER = r"\^?\(?-1\)?"
 _WHOLE = {"gpa": ("gal", "ac"), "lha": ("L", "ha"), "lpha": ("L", "ha")}
@@ -172,6 +186,92 @@ def is_mass_per_area(unit: str) -> bool:
     """
     areas = "|".join(areas for _, areas in _HECTARES.values())
     return re.fullmatch(_ratio(_MASS, areas), _plain(unit)[:40]) is not None
+
+
+def other_quantity(unit: str) -> str | None:
+    """Return what a known unit measures that is no volume per area and cannot become one.
+
+    None for units that can, and for what is no unit that is known here.
+
+    >>> other_quantity("seeds/ha"), other_quantity("%"), other_quantity("kg N/ha")
+    ('a count', 'a share', 'a weight of a nutrient or an active ingredient')
+    >>> other_quantity("L/ha"), other_quantity("kg/ha"), other_quantity("Einh.")
+    (None, None, None)
+    """
+    plain = _plain(unit)
+    if not plain or len(plain) > 40 or rate_unit(unit) is not None:
+        return None
+    return next((name for name, form in _OTHERS if form.fullmatch(plain)), None)
+
+
+def _others() -> tuple[tuple[str, re.Pattern[str]], ...]:
+    volumes, areas, masses, times = (
+        "|".join(called for _, called in units.values())
+        for units in (_LITRES, _HECTARES, _KILOGRAMS, _MINUTES)
+    )
+    masses = f"{_MASS}|{masses}"
+    liquid_or_solid = f"{volumes}|{masses}"
+    join = r"[._-]?"
+    per_area = f"(?:{_SEPARATOR}(?:{areas})(?:{_POWER})?)"
+    forms = {
+        "a count": f"(?:{_COUNTED})(?:{per_area}|{_SEPARATOR}(?:{times}))?|"
+        f"1?(?:/|per)(?:{areas}|{times})|1?(?:{areas}|{times}){_POWER}|"
+        rf"m-2|m\^-2|units?{per_area}",
+        "a share": r"%.*|percent.*|pct|prozent|pour-?cent.*|por(?:cento|ciento)|‰|pp[mb]|"
+        f"(?:{liquid_or_solid})(?:/|per)(?:100|1000)?(?:{liquid_or_solid})",
+        "a length": rf"(?:{_LENGTHS})(?:between.*|spacing|depth)?",
+        "an amount per length": f"(?:{liquid_or_solid}|{_COUNTED}|1)?(?:/|per)(?:100|1000)?"
+        f"(?:{_LENGTHS})",
+        "a weight of a nutrient or an active ingredient": f"(?:{masses}){join}(?:{_PART})"
+        f"{per_area}?|(?:{_PART}){join}(?:{masses}){per_area}",
+        "a weight per time": f"(?:{masses})(?:/|per)(?:{times})",
+        "a weight": f"(?:{masses}){per_area}?",
+        "a yield": f"(?:bu|bushels?|bales?){per_area}?",
+        "a speed": r"km/?h|kmh|kph|m/s|mph|kn(?:ots)?",
+        "a pressure": r"bar|psi|[kmh]?pa",
+        "an index": r"ndvi|ndre|index|score",
+    }
+    return tuple((name, re.compile(form)) for name, form in forms.items())
+
+
+_OTHERS = _others()
+# Alone at the end of a name these letters may be anything: `rate_s`, `dose_m`, `value_k`.
+_SHORT = 2
+# Words that say what a column counts or compares, with or without a unit behind them.
+_OTHER_WORDS = {
+    "a count": {"seed", "seeds", "seeding", "plants", "kernels", "population", "graines", "körner"},
+    "a share": {"percent", "percentage", "pct", "prozent"},
+    "a length": {"spacing", "depth"},
+}
+
+
+def quantity_in_name(column: str) -> tuple[str, str] | None:
+    """Return a unit in which a column's name ends and what it measures, as `other_quantity` does.
+
+    >>> quantity_in_name("rate_seeds_ha"), quantity_in_name("rate (%)")
+    (('seeds_ha', 'a count'), ('%', 'a share'))
+    >>> quantity_in_name("N_kg_ha")
+    ('N_kg_ha', 'a weight of a nutrient or an active ingredient')
+    >>> quantity_in_name("rate_l_ha"), quantity_in_name("rate_m"), quantity_in_name("value")
+    (None, None, None)
+    """
+    for start in (0, *(match.end() for match in re.finditer(r"[\s_(\[]+", column))):
+        tail = column[start:].rstrip(")] ")
+        if rate_unit(tail) is not None:
+            return None
+        found = other_quantity(tail)
+        if found is not None and (len(tail) > _SHORT or tail in ("%", "‰", "cm", "mm", "kg", "lb")):
+            return tail, found
+    return None
+
+
+def quantity_of_word(words: Sequence[str]) -> str | None:
+    """Return what one of the words of a column's name says that it measures, if no volume.
+
+    >>> quantity_of_word(["seed", "rate"]), quantity_of_word(["rate"])
+    ('a count', None)
+    """
+    return next((name for name, known in _OTHER_WORDS.items() if known & set(words)), None)
 
 
 def unit_in_name(column: str) -> str | None:

@@ -11,7 +11,7 @@ from companion.errors import MapError
 from companion.maps.declared import Given, unit_of
 from companion.maps.fields import Choice, choose
 from companion.maps.layer import Column, Layer, Value
-from companion.maps.units import is_mass_per_area, l_ha_per_unit, unit_name
+from companion.maps.units import is_mass_per_area, l_ha_per_unit, other_quantity, unit_name
 
 PATH = Path("rx.shp")
 
@@ -169,3 +169,67 @@ def test_what_is_no_volume_per_area_has_no_factor(text: str) -> None:
 def test_weighed_rates_are_known_as_such() -> None:
     assert all(is_mass_per_area(text) for text in ("kg/ha", "kg ha-1", "lbs/acre", "t/ha", "g/m2"))
     assert not any(is_mass_per_area(text) for text in ("L/ha", "kg", "L", ""))
+
+
+NO_VOLUME = (
+    "seeds/ha", "Seeds/acre", "kseeds/ac", "plants m-2", "1/m2", "/m2", "ha-1", "seeds1ac-1",
+    "Körner/m²", "graines/m2", "pl/m2", "seeds", "%", "percent", "Prozent", "ppm", "mL/L", "g/kg",
+    "L/100L", "mm3/m3", "mg/kg", "cm", "mm", "inch", "mm between seeds", "kg N/ha", "kgN/ha",
+    "lb N/ac", "kg P2O5/ha", "N kg/ha", "g a.i./ha", "kg ai/ha", "kg", "lbs", "ton/ac", "mL/m",
+    "seeds/m", "L/100m", "kg/min", "mg/s", "1/s", "bu/ac", "km/h", "bar",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", NO_VOLUME)
+def test_a_known_unit_of_something_else_is_refused_whatever_is_asked_for(text: str) -> None:
+    for asked in (None, "L/ha", "gal/ac"):
+        with pytest.raises(MapError) as caught:
+            unit(column("unit", text, text), asked=asked)
+        assert caught.value.code == "not-a-volume"
+        assert "give the unit with --unit" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["L/ha", "gal/ac", "mL/m2", "L/mu", "kg/ha", "g/m2", "L/min"])
+def test_units_that_can_be_converted_are_not_of_something_else(text: str) -> None:
+    assert other_quantity(text) is None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rate_seeds_ha", "Seeds/ha", "rate (seeds/ha)", "SeedRate", "seed_rate", "plants_m2",
+        "rate_pct", "rate (%)", "rate %", "dose_percent", "kgN_ha", "rate_kg_N_ha", "N_kg_ha",
+        "rate_N_kg_ha", "dose_cm", "rate_kg", "Population", "rate_ksds_ac",
+    ],
+)  # fmt: skip
+def test_a_column_whose_name_says_another_unit_is_refused(name: str) -> None:
+    for asked in (None, "L/ha"):
+        with pytest.raises(MapError) as caught:
+            unit(asked=asked, rate=name)
+        assert caught.value.code == "not-a-volume", name
+        assert "give the unit with --unit" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rate", "rate_m", "dose_s", "Tgt_Rate", "value", "rate_k", "P_rate_l_ha", "K_l_ha", "rate1",
+        "Rate_L", "amount", "rate_t", "rate in",
+    ],
+)  # fmt: skip
+def test_a_column_whose_name_says_no_unit_waits_for_the_operator(name: str) -> None:
+    assert unit(asked="L/ha", rate=name) == "L/ha"
+
+
+def test_a_weight_without_its_area_is_a_weight_for_whoever_says_the_area() -> None:
+    given = Given(unit="kg/ha", density_kg_l=1.25)
+    rate = column("rate", 7.0, 8.0)
+    layer = Layer(
+        format="shapefile", crs=None, columns=(rate, column("unit", "kg", "kg")), geometries=(),
+        sha256="",
+    )  # fmt: skip
+    assert unit_of(layer, rate, given=given, path=PATH).l_ha == 0.8
+
+
+def test_the_unit_that_the_file_states_prevails_over_a_word_in_a_name() -> None:
+    assert unit(column("unit", "L/ha", "L/ha"), rate="seed_treatment") == "L/ha"

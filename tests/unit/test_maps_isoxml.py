@@ -17,6 +17,7 @@ from shapely import Polygon, box
 from companion.errors import MapError
 from companion.maps.isoxml.reader import read_isoxml
 from companion.maps.layer import Grid, Layer
+from companion.maps.registry import read_map
 
 WEST, SOUTH = 15.0, 48.0
 HEAD = '<?xml version="1.0" encoding="UTF-8"?>'
@@ -115,6 +116,14 @@ TWO = (
     zone(4, polygon(RIGHT), value(0)),
 )
 TYPE_2 = zone(0, value(0))
+# Two things of one id.
+OTHER_PRODUCTS = ('<PDT A="PDT1" B="a"/>', '<PDT A="PDT1" B="b"/>')
+OTHER_PRESENTATIONS = (VPN, VPN.replace("0.0001", "0.01"))
+OTHER_FIELDS = (field(LEFT), field(RIGHT))
+OTHER_GRIDS = (
+    task(grid(1, 1, 1), zone(0, value(1)), own="TSK1"),
+    task(grid(1, 2, 1), zone(0, value(1)), own="TSK2"),
+)
 
 
 # --- polygons
@@ -235,7 +244,7 @@ def test_several_tasks_are_refused_without_a_choice(tmp_path: Path) -> None:
     )
     error = refusal(tmp_path, VPN, *tasks)
     assert error.code == "several-layers"
-    assert "TSK1 (North), TSK2 (South)" in str(error)
+    assert "TSK1 (North): rate in L/ha, TSK2 (South): rate in L/ha" in str(error)
     for chosen in ("TSK2", "South", "south"):
         assert read_layer(tmp_path, VPN, *tasks, layer=chosen).columns[1].values == (7.0,)
     missing = refusal(tmp_path, VPN, *tasks, layer="TSK3")
@@ -292,20 +301,114 @@ def test_product_that_the_file_lacks_is_told(tmp_path: Path) -> None:
     "inside",
     [
         (task(*TWO, own="TSK1"), task(own="TSK1")),
-        (task(*TWO), '<PDT A="PDT1" B="a"/><PDT A="PDT1" B="b"/>'),
-        (task(*TWO), VPN, VPN),
-        (task(*TWO), field(LEFT), field(RIGHT)),
+        (task(zone(3, polygon(LEFT), value(1, more='C="PDT1"'))), *OTHER_PRODUCTS),
+        (task(*TWO), *OTHER_PRESENTATIONS),
+        (task(*TWO, more='E="PFD1"'), *OTHER_FIELDS),
         (task(*TWO, TWO[0]),),
         (task(zone(3, polygon(LEFT), value(1), value(2))),),
-        (
-            task(grid(1, 1, 1), zone(0, value(1)), own="TSK1"),
-            task(grid(1, 2, 1), zone(0, value(1)), own="TSK2"),
-        ),
+        OTHER_GRIDS,
     ],
     ids=["task", "product", "presentation", "field", "zone", "value", "grid"],
 )
 def test_what_is_there_twice_is_refused(tmp_path: Path, inside: tuple[str, ...]) -> None:
-    assert refusal(tmp_path, *inside).code == "duplicate-code"
+    assert refusal(tmp_path, *inside, layer="TSK1").code == "duplicate-code"
+
+
+def test_lines_that_are_repeated_byte_for_byte_are_one(tmp_path: Path) -> None:
+    product, ground = '<PDT A="PDT1" B="Roundup"/>', field(LEFT)
+    repeated = (product, ground, VPN, f"{VPN}\n  ", product, ground)
+    own = task(zone(3, polygon(LEFT), value(20_000, more='C="PDT1" E="VPN1"')), more='E="PFD1"')
+    found = read_layer(tmp_path, *repeated, own, own)
+    assert (found.columns[1].name, found.columns[1].values) == ("Roundup", (2.0,))
+    assert found.boundary is not None
+    assert found.problems == ()
+
+
+def test_an_id_that_the_task_does_not_use_may_stand_for_anything(tmp_path: Path) -> None:
+    value_of_vpn9 = value(20_000, more='E="VPN9"')
+    used = VPN.replace("VPN1", "VPN9")
+    broken = '<VPN A="VPN8" B="not a number"/><VPN B="0"/><PDT B="no id"/>'
+    others = (*OTHER_PRODUCTS, *OTHER_PRESENTATIONS, *OTHER_FIELDS, broken)
+    own = task(zone(3, polygon(LEFT), value_of_vpn9), own="TSK7")
+    assert read_layer(tmp_path, used, *others, own).columns[1].values == (2.0,)
+    tasks = (own, *OTHER_GRIDS)
+    assert read_layer(tmp_path, used, *tasks, layer="TSK7").columns[1].values == (2.0,)
+
+
+MIXED = (
+    '<PDT A="PDT1" B="Maize"/><PDT A="PDT2" B="Roundup"/><PDT A="PDT3" B="Urea"/>',
+    task(zone(3, polygon(LEFT), value(80_000, "000B", 'C="PDT1"')), own="TSK1", more='B="Plant"'),
+    task(zone(3, polygon(LEFT), value(490_000, "0001", 'C="PDT2"')), own="TSK2", more='B="Spray"'),
+    task(zone(3, polygon(LEFT), value(16_000, "0006", 'C="PDT3"')), own="TSK3"),
+)
+
+
+def test_lists_of_tasks_name_product_and_unit(tmp_path: Path) -> None:
+    error = refusal(tmp_path, *MIXED)
+    assert "TSK1 (Plant): Maize in 1/m2, TSK2 (Spray): Roundup in L/ha, TSK3: Urea" in str(error)
+    assert error.fix.endswith("--layer TSK2")
+
+
+# Each family of rates in ISO 11783-11 that is no volume per area and cannot become one, by its
+# setpoint: count and spacing, shares, weight and count per time, volume per length.
+@pytest.mark.parametrize("ddi", ["000B", "0010", "0015", "001A", "001F", "0029", "002E", "0279"])
+def test_no_unit_makes_litres_of_seeds_and_shares(tmp_path: Path, ddi: str) -> None:
+    seeds = task(zone(3, polygon(LEFT), value(80_000, ddi, 'C="PDT1"')), own="TSK1")
+    write(tmp_path, {"TASKDATA.XML": document(*(seeds, MIXED[0], *MIXED[2:]))})
+    for unit in (None, "L/ha", "gal/ac", "kg/ha", "L/min"):
+        with pytest.raises(MapError) as caught:
+            read_map(
+                tmp_path, layer="TSK1", unit=unit, density_kg_l=1.0, flow_width_m=6.0,
+                flow_speed_m_s=5.0,
+            )  # fmt: skip
+        assert caught.value.code == "not-a-volume"
+        assert caught.value.fix == (
+            "choose with --layer a task that can be sprayed: TSK2 (Spray): Roundup in L/ha"
+        )
+
+
+def test_another_product_of_the_task_is_named_where_one_can_be_sprayed(tmp_path: Path) -> None:
+    both = (value(80_000, "000B", 'C="PDT1"'), value(490_000, "0001", 'C="PDT2"'))
+    write(tmp_path, {"TASKDATA.XML": document(MIXED[0], task(zone(3, polygon(LEFT), *both)))})
+    with pytest.raises(MapError) as caught:
+        read_map(tmp_path, rate_field="Maize", unit="L/ha")
+    assert caught.value.fix.startswith("take with --rate-field (prescription.rate_field): Roundup")
+    assert read_map(tmp_path, rate_field="Roundup").rates_l_ha == (49.0,)
+
+
+@pytest.mark.parametrize(
+    ("ddi", "said"),
+    [("008C", "percentage of a rate"), ("0038", "seeding depth"), ("0053", "yield"), ("DFFF", "")],
+)
+def test_values_that_are_no_rates_are_named(tmp_path: Path, ddi: str, said: str) -> None:
+    error = refusal(tmp_path, task(zone(3, polygon(LEFT), value(5, ddi))))
+    assert error.code == "not-a-volume"
+    assert f"DDI {ddi}" in str(error)
+    assert said in str(error)
+    assert error.fix == "no task of the file has a volume per area: make the map in L/ha"
+
+
+@pytest.mark.parametrize("shown", ["seeds/ha", "%", "kg N/ha", "cm"])
+def test_a_presentation_in_another_quantity_is_a_conflict(tmp_path: Path, shown: str) -> None:
+    for ddi in ("0001", "0006"):
+        inside = (VPN.replace("l/ha", shown), task(zone(3, polygon(LEFT), value(10_000, ddi))))
+        assert refusal(tmp_path, *inside).code == "unit-conflict"
+
+
+@pytest.mark.parametrize(
+    ("inside", "said"),
+    [
+        (zone(0, value(490_000)), "task TSK1 has treatment zones with values but no ground"),
+        (zone(0, polygon(LEFT)), "task TSK1 has treatment zones with polygons but no values"),
+        ("", "none of its 2 tasks has treatment zones"),
+    ],
+)
+def test_a_task_with_half_a_prescription_is_not_called_empty(
+    tmp_path: Path, inside: str, said: str
+) -> None:
+    error = refusal(tmp_path, task(own="TSK0"), task(inside))
+    assert error.code == "no-rate-column"
+    assert said in str(error)
 
 
 @pytest.mark.parametrize("key", ["H", "I", "J"])
@@ -820,3 +923,22 @@ def test_real_grid_whose_presentation_says_ten_times_as_much(samples: Path) -> N
     assert caught.value.code == "unit-conflict"
     assert "19.05 kg/ha" in str(caught.value)
     assert "190.5 kg/ha" in str(caught.value)
+
+
+def test_real_herbicide_task_beside_a_repeated_presentation(samples: Path) -> None:
+    folder = samples / "07_isoxml_v3_onesoil"
+    with pytest.raises(MapError) as caught:
+        read_map(folder)
+    assert "TSK1 (OneSoil-2024-10-10): seed in kg/ha" in str(caught.value)
+    assert "herbicides in L/ha" in str(caught.value)
+    assert caught.value.fix.endswith("--layer TSK2")
+    assert read_map(folder, layer="TSK2").rates_l_ha == (0.0, 19.0, 20.0, 21.0)
+
+
+def test_real_seeds_are_refused_whatever_is_asked_for(samples: Path) -> None:
+    path = samples / "20_isoxml_agco" / "agco_jd_sprayer_900.zip"
+    for unit in (None, "L/ha"):
+        with pytest.raises(MapError) as caught:
+            read_map(path, layer="TSK2", rate_field="Y99", unit=unit)
+        assert caught.value.code == "not-a-volume"
+        assert "TSK3 (PostSpray): RoundUp in L/ha" in caught.value.fix

@@ -8,6 +8,7 @@ and which of the two the maker of the map meant is not for a program to decide.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,10 +16,11 @@ from xml.etree.ElementTree import Element
 
 from companion.maps.isoxml.values import number, text
 from companion.maps.model import map_error
-from companion.maps.units import rate_unit
+from companion.maps.units import other_quantity, rate_unit
 
 Role = Literal["setpoint", "actual", "default", "minimum", "maximum"]
 _ROLES: tuple[Role, ...] = ("setpoint", "actual", "default", "minimum", "maximum")
+_DDI = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
 # What a scale rounded to few digits may change (gallons), far below any confusion of units.
 _ROUNDING = 0.01
 
@@ -50,6 +52,15 @@ FAMILIES = (
     Family(ddis=(46, 47, 48, 49, 50), unit="1/s", raw_per_unit=1000.0),  # [/s x 0.001]
     Family(ddis=(633, 634, 635, 636, 637), unit="mL/m", raw_per_unit=1000.0),  # [mL/m x 0.001]
 )
+# What other values in treatment zones are: no rates at all, or a share of a rate that stands
+# nowhere in the file (first and last DDI of ISO 11783-11).
+_NO_RATES = (
+    (51, 55, "tillage depth"), (56, 60, "seeding depth"), (61, 65, "working height"),
+    (66, 70, "working width"), (71, 79, "tank content"), (80, 82, "total applied"),
+    (83, 98, "yield or crop loss"), (121, 123, "product density"),
+    (140, 140, "percentage of a rate"), (153, 153, "vegetation index"), (193, 204, "pressure"),
+    (308, 310, "percentage of a rate"), (311, 313, "yield potential"),
+)  # fmt: skip
 _MEANING: dict[int, tuple[Family, Role]] = {
     ddi: (family, role)
     for family in FAMILIES
@@ -67,6 +78,29 @@ def meaning(ddi: int) -> tuple[Family, Role] | None:
     ('L/min', 1.0, None)
     """
     return _MEANING.get(ddi)
+
+
+def ddi_of(written: str) -> int | None:
+    """Return the DDI that four hexadecimal digits are, or None.
+
+    >>> ddi_of("000B"), ddi_of("0x24"), ddi_of("12345"), ddi_of("")
+    (11, 36, None, None)
+    """
+    found = _DDI.fullmatch(written)
+    return None if found is None else int(found[1], 16)
+
+
+def ddi_meaning(ddi: int) -> str:
+    """Return a DDI with what it stands for, where that is known.
+
+    >>> ddi_meaning(140), ddi_meaning(2), ddi_meaning(0xDFFF)
+    ('DDI 008C (percentage of a rate)', 'DDI 0002 (actual value in L/ha)', 'DDI DFFF')
+    """
+    known = meaning(ddi)
+    said = next((name for first, last, name in _NO_RATES if first <= ddi <= last), None)
+    if known is not None:
+        said = f"{known[1]} value in {known[0].unit}"
+    return ddi_name(ddi) if said is None else f"{ddi_name(ddi)} ({said})"
 
 
 def ddi_name(ddi: int) -> str:
@@ -110,6 +144,15 @@ def check_presentation(
     Return whether the two could be compared; a unit that is none of ours says nothing.
     """
     own, other = rate_unit(family.unit), rate_unit(presentation.unit)
+    quantity = None if own is None else other_quantity(presentation.unit)
+    if own is not None and quantity is not None:
+        raise map_error(
+            path,
+            f"its values are in {own.name} by {ddi_name(family.ddis[0])}, but {presentation.id} "
+            f"shows them in {presentation.unit[:20]!r}, {quantity}",
+            fix="correct the DDI or the unit where the task is made",
+            code="unit-conflict",
+        )
     if own is None or other is None:
         return own is None or not presentation.unit
     if own.kind != other.kind:

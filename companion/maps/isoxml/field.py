@@ -12,7 +12,7 @@ from shapely import MultiPolygon, box
 
 from companion.maps.crs import WGS84
 from companion.maps.isoxml.polygons import FIELD, ground_of_polygons, point_count
-from companion.maps.isoxml.task import Task, by_id
+from companion.maps.isoxml.task import ById, Task
 from companion.maps.isoxml.values import EXPORT_AGAIN, children
 from companion.maps.layer import check_counts
 from companion.maps.model import Affine, Problem, map_error
@@ -28,10 +28,10 @@ _TRIED_MAX = 50_000
 
 def field_of(root: Element, task: Task, path: Path) -> tuple[MultiPolygon | None, list[Problem]]:
     """Return the outline of the field that the task names, in longitude and latitude."""
-    fields = by_id(root, "PFD", path)
     if task.field is None:
         return None, []
-    if task.field not in fields:
+    field = ById(root, "PFD", path).get(task.field)
+    if field is None:
         problem = Problem(
             severity="warning",
             code="undefined-code",
@@ -41,7 +41,7 @@ def field_of(root: Element, task: Task, path: Path) -> tuple[MultiPolygon | None
             fix=EXPORT_AGAIN,
         )
         return None, [problem]
-    polygons = children(fields[task.field], "PLN")
+    polygons = children(field, "PLN")
     check_counts(path, records=len(polygons), vertices=point_count(polygons))
     ground, others = ground_of_polygons(polygons, (FIELD,), where=f"field {task.field}", path=path)
     problems = []

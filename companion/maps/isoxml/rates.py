@@ -8,7 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.maps.isoxml.ddi import Family, check_presentation, ddi_name, meaning
+from companion.maps.isoxml.ddi import (
+    Family,
+    check_presentation,
+    ddi_meaning,
+    ddi_name,
+    meaning,
+)
 from companion.maps.isoxml.references import References
 from companion.maps.isoxml.task import Task, TreatmentZone, Variable
 from companion.maps.isoxml.values import EXPORT_AGAIN
@@ -44,11 +50,11 @@ def rates_of(task: Task, references: References) -> tuple[list[Rates], list[Prob
     variables = [one for zone in task.zones.values() for one in zone.variables]
     usable, problems = _usable(variables)
     if not usable:
-        found = ", ".join(sorted({ddi_name(one.ddi) for one in variables})) or "none"
+        found = ", ".join(map(ddi_meaning, sorted({one.ddi for one in variables}))) or "none"
         raise map_error(
             path,
             f"task {task.id[:40]} has no setpoint that a sprayer could use (values: {found})",
-            fix="export the task with an application rate by volume, DDI 0001",
+            fix=references.instead,
             code="not-a-volume" if variables else "no-rate-column",
         )
     missing = references.missing(usable)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from companion.maps.isoxml.contents import instead_of
 from companion.maps.isoxml.field import field_of
 from companion.maps.isoxml.files import TaskFiles
 from companion.maps.isoxml.grid import grid_of_task
-from companion.maps.isoxml.references import References
+from companion.maps.isoxml.references import References, product_names
 from companion.maps.isoxml.task import chosen_task
 from companion.maps.isoxml.zones import zones_layer
 from companion.maps.layer import Grid, Layer
-from companion.maps.model import Problem
 
 
 def read_isoxml(path: Path, layer: str | None = None) -> Layer | Grid:
@@ -21,17 +21,13 @@ def read_isoxml(path: Path, layer: str | None = None) -> Layer | Grid:
     `layer` is the id or the designator of one of several tasks.
     """
     files = TaskFiles(path)
-    task = chosen_task(files.root, path, layer)
-    references = References(files.root, path)
+    task, tasks = chosen_task(files.root, path, layer, product_names(files.root))
+    instead = instead_of(task.id, tasks)
+    references = References(files.root, path, instead)
     boundary, problems = field_of(files.root, task, path)
     found: Layer | Grid
     if task.grid is not None:
         found = grid_of_task(files, task.grid, task, references, boundary)
     else:
         found = zones_layer(files, task, references, boundary)
-    return _with(found, [*files.problems, *problems])
-
-
-def _with(found: Layer | Grid, problems: list[Problem]) -> Layer | Grid:
-    """Return a layer or grid with problems of the whole file put before its own."""
-    return replace(found, problems=(*problems, *found.problems))
+    return replace(found, instead=instead, problems=(*files.problems, *problems, *found.problems))

@@ -7,34 +7,44 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from companion.maps.isoxml.ddi import Presentation, presentation_of
-from companion.maps.isoxml.task import Variable, by_id
-from companion.maps.isoxml.values import text
+from companion.maps.isoxml.task import ById, Variable
+from companion.maps.isoxml.values import children, text
 
 
 class References:
-    """The products and presentations to which variables refer."""
+    """The products and presentations to which variables refer; only what is in use is checked."""
 
-    def __init__(self, root: Element, path: Path) -> None:
-        """Index both; ids given twice are refused."""
-        self.path = path
-        self._products = {
-            own: text(element, "B") or own for own, element in by_id(root, "PDT", path).items()
-        }
-        self._presentations = {
-            own: presentation_of(element, own, path)
-            for own, element in by_id(root, "VPN", path).items()
-        }
+    def __init__(self, root: Element, path: Path, instead: str) -> None:
+        """Index both; `instead` says what to choose where a task cannot be sprayed."""
+        self.path, self.instead = path, instead
+        self._products = ById(root, "PDT", path)
+        self._presentations = ById(root, "VPN", path)
 
     def product(self, own: str) -> str:
         """Return a product's name, or its id where it has none."""
-        return " ".join(self._products.get(own, own).split())[:60]
+        element = self._products.get(own)
+        name = None if element is None else text(element, "B")
+        return " ".join((name or own).split())[:60]
 
     def presentation(self, own: str | None) -> Presentation | None:
         """Return a presentation, or None where there is none of that id."""
-        return None if own is None else self._presentations.get(own)
+        element = None if own is None else self._presentations.get(own)
+        return None if own is None or element is None else presentation_of(element, own, self.path)
 
     def missing(self, variables: Iterable[Variable]) -> list[str]:
         """Return the ids to which variables refer and which are nowhere."""
-        products = {one.product for one in variables if one.product} - set(self._products)
+        products = {one.product for one in variables if one.product}
         shown = {one.presentation for one in variables if one.presentation}
-        return sorted(products | (shown - set(self._presentations)))
+        return sorted(
+            {own for own in products if self._products.get(own) is None}
+            | {own for own in shown if self._presentations.get(own) is None}
+        )
+
+
+def product_names(root: Element) -> dict[str, str]:
+    """Return the products' names as they stand in the file, for a list of what there is."""
+    return {
+        own: text(element, "B") or own
+        for element in reversed(children(root, "PDT"))
+        if (own := text(element, "A")) is not None
+    }

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
-from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, tostring
 
+from companion.maps.isoxml.contents import TaskContents, contents_of, task_list
+from companion.maps.isoxml.ddi import ddi_of
 from companion.maps.isoxml.values import (
     EXPORT_AGAIN,
     children,
@@ -23,7 +23,6 @@ from companion.maps.model import map_error
 # The standard ends at 254; some programs number their polygons beyond.
 _CODE_MAX = 65_535
 _RAW_MAX = 2**31 - 1
-_DDI = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,54 +74,106 @@ class Task:
         return {code for code in codes if code is not None}
 
 
-def by_id(root: Element, name: str, path: Path) -> dict[str, Element]:
-    """Return all elements of one kind by their ids, each of which may be given once."""
-    found: dict[str, Element] = {}
-    for element in children(root, name):
-        own = required(element, "A", path)
-        if own in found:
-            raise _duplicate(path, f"{own[:40]} is the id of several {name}")
-        found[own] = element
-    return found
+class ById:
+    """All elements of one kind by their ids, looked up only when something refers to them.
+
+    Programs write a line again wherever it is used, byte for byte: that is one and the same. What
+    differs under one id is refused where the id is in use, and nowhere else.
+    """
+
+    def __init__(self, root: Element, name: str, path: Path) -> None:
+        self._name, self._path = name, path
+        self._found: dict[str, list[Element]] = {}
+        for element in children(root, name):
+            own = text(element, "A")
+            if own is not None:
+                self._found.setdefault(own, []).append(element)
+
+    def get(self, own: str) -> Element | None:
+        """Return the element of this id, or None where the file has none."""
+        alike = self._found.get(own, [])
+        if len(alike) > 1 and len({_content(element) for element in alike}) > 1:
+            raise _duplicate(
+                self._path, f"{own[:40]} is the id of several {self._name} that differ"
+            )
+        return alike[0] if alike else None
 
 
-def chosen_task(root: Element, path: Path, layer: str | None) -> Task:
-    """Return the one task that prescribes, or the one that `layer` names by id or designator."""
-    tasks = by_id(root, "TSK", path)
-    _check_grids(tasks.values(), path)
-    prescribing = {own: task for own, task in tasks.items() if _prescribes(task)}
+def _content(element: Element) -> bytes:
+    """Return what an element says; the blanks behind it are the file's."""
+    written: bytes = tostring(element, encoding="utf-8")
+    return written.rstrip()
+
+
+def chosen_task(
+    root: Element, path: Path, layer: str | None, products: Mapping[str, str]
+) -> tuple[Task, list[TaskContents]]:
+    """Return the one task that prescribes, or the one that `layer` names by id or designator.
+
+    With it, what each of the tasks prescribes that could be chosen instead.
+    """
+    tasks = children(root, "TSK")
+    prescribing: dict[str, list[Element]] = {}
+    for task in tasks:
+        if _prescribes(task):
+            prescribing.setdefault(required(task, "A", path), []).append(task)
     if not prescribing:
-        raise map_error(
-            path,
-            f"none of its {len(tasks)} tasks has treatment zones with values or a grid",
-            fix="export the task with its application map",
-            code="no-rate-column",
-        )
-    names = ", ".join(_called(own, task) for own, task in list(prescribing.items())[:20])
+        raise _nothing_prescribed(tasks, path)
+    every = [contents_of(alike[0], products) for alike in prescribing.values()]
     if layer is None:
         found = list(prescribing)
     else:
         wanted = layer.strip()
         found = [own for own in prescribing if own == wanted] or [
-            own
-            for own, task in prescribing.items()
-            if (text(task, "B") or "").casefold() == wanted.casefold()
+            one.id for one in every if (one.name or "").casefold() == wanted.casefold()
         ]
         if not found:
             raise map_error(
                 path,
                 f"there is no task {layer[:40]!r} with a prescription",
-                fix=f"choose with --layer one of {names}",
+                fix=f"choose with --layer one of {task_list(every)}",
                 code="no-layer",
             )
     if len(found) > 1:
+        listed = [one for one in every if one.id in found]
+        example = next((one.id for one in listed if one.sprayable), found[0])
         raise map_error(
             path,
-            f"several tasks have a prescription: {names}",
-            fix=f"choose one with --layer, for example --layer {found[0]}",
+            f"several tasks have a prescription: {task_list(listed)}",
+            fix=f"choose one with --layer, for example --layer {example}",
             code="several-layers",
         )
-    return _task(prescribing[found[0]], path)
+    chosen = ById(root, "TSK", path).get(found[0])
+    if chosen is None:
+        raise ValueError("a task that prescribes has its id")
+    _check_grid(chosen, tasks, path)
+    return _task(chosen, path), every
+
+
+def _nothing_prescribed(tasks: Sequence[Element], path: Path) -> Exception:
+    """Return the refusal, with what the tasks have and what they lack."""
+    for task in tasks:
+        zones = children(task, "TZN")
+        valued = [zone for zone in zones if children(zone, "PDV")]
+        if valued or any(children(zone, "PLN") for zone in zones):
+            lack = (
+                "treatment zones with values but no ground: neither polygons nor a grid"
+                if valued
+                else "treatment zones with polygons but no values"
+            )
+            return map_error(
+                path,
+                f"task {(text(task, 'A') or '')[:40]} has {lack}",
+                fix="export the task with its application map"
+                + (", or fly one rate for the whole field without a map" if valued else ""),
+                code="no-rate-column",
+            )
+    return map_error(
+        path,
+        f"none of its {len(tasks)} tasks has treatment zones with values or a grid",
+        fix="export the task with its application map",
+        code="no-rate-column",
+    )
 
 
 def _prescribes(task: Element) -> bool:
@@ -132,11 +183,6 @@ def _prescribes(task: Element) -> bool:
         or (tag(child) == "TZN" and children(child, "PDV") and children(child, "PLN"))
         for child in task
     )
-
-
-def _called(own: str, task: Element) -> str:
-    name = text(task, "B")
-    return f"{own} ({name[:60]})" if name else own
 
 
 def _task(element: Element, path: Path) -> Task:
@@ -187,7 +233,7 @@ def _zone(element: Element, path: Path) -> TreatmentZone:
 
 
 def _variable(element: Element, path: Path) -> Variable:
-    ddi = _DDI.fullmatch(required(element, "A", path))
+    ddi = ddi_of(required(element, "A", path))
     if ddi is None:
         raise map_error(
             path,
@@ -197,7 +243,7 @@ def _variable(element: Element, path: Path) -> Variable:
             code="bad-attribute",
         )
     return Variable(
-        ddi=int(ddi[1], 16),
+        ddi=ddi,
         raw=integer(element, "B", path, low=-_RAW_MAX - 1, high=_RAW_MAX, code="bad-rate"),
         product=text(element, "C"),
         device=text(element, "D"),
@@ -221,17 +267,17 @@ def _special(element: Element, key: str, zones: dict[int, TreatmentZone], path: 
     return code
 
 
-def _check_grids(tasks: Iterable[Element], path: Path) -> None:
-    """Refuse one file for two different grids: it cannot be both."""
-    shapes = {
-        (text(grid, "G") or "", tuple(text(grid, key) for key in "ABCDEFI"))
-        for task in tasks
-        for grid in children(task, "GRD")
-    }
-    names = Counter(name for name, _ in shapes)
-    twice = next((name for name, count in names.items() if count > 1), None)
-    if twice is not None:
-        raise _duplicate(path, f"{twice[:40]} is the file of several different grids")
+def _check_grid(chosen: Element, tasks: Sequence[Element], path: Path) -> None:
+    """Refuse a file of cells that another task reads as another grid: it cannot be both."""
+    own = {_grid_shape(grid) for grid in children(chosen, "GRD")}
+    every = {_grid_shape(grid) for task in tasks for grid in children(task, "GRD")}
+    for name, shape in own:
+        if any(other == name and other_shape != shape for other, other_shape in every):
+            raise _duplicate(path, f"{name[:40]} is the file of several different grids")
+
+
+def _grid_shape(grid: Element) -> tuple[str, tuple[str | None, ...]]:
+    return text(grid, "G") or "", tuple(text(grid, key) for key in "ABCDEFI")
 
 
 def _duplicate(path: Path, said: str) -> Exception:
