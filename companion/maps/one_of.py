@@ -28,7 +28,7 @@ def one_of(bundle: Bundle, names: Sequence[str], layer: str | None, *, kind: str
     raise map_error(
         bundle.path,
         f"it holds the {kind} files {listed}" + ("" if meant else f", and no {layer!r}"),
-        fix="name one of them with --layer",
+        fix="name one of them with --layer (prescription.layer)",
         code="several-layers" if meant else "no-layer",
     )
 

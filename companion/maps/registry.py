@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -13,18 +15,19 @@ from shapely.errors import ShapelyError
 from companion.maps.adapt.geoparquet import read_geoparquet
 from companion.maps.adapt.reader import read_adapt
 from companion.maps.assemble import crs_of, ground_of, map_of, zone_names
-from companion.maps.bundle import open_bundle
+from companion.maps.bundle import Bundle, open_bundle
 from companion.maps.csvfile.reader import read_csv
 from companion.maps.declared import Given
-from companion.maps.geojson.reader import read_geojson
+from companion.maps.geojson.reader import is_geojson, read_geojson
 from companion.maps.geopackage.reader import read_geopackage
-from companion.maps.geotiff.dji import read_dji
+from companion.maps.geotiff.dji import RX_FOLDER, SHAPE_FOLDER, read_dji
 from companion.maps.geotiff.reader import read_geotiff
 from companion.maps.isoxml.reader import read_isoxml
 from companion.maps.kml.reader import read_kml
 from companion.maps.layer import Grid, Layer
 from companion.maps.local import polygons_of
 from companion.maps.model import MapFile, map_error
+from companion.maps.outline import BOUNDARY_NAME
 from companion.maps.shapefile.reader import read_shapefile
 from companion.maps.text.reader import read_text_map
 
@@ -46,18 +49,23 @@ READERS: dict[str, Reader] = {
     ".csv": read_csv,
     ".txt": read_text_map,
 }
-# Folders and archives, by a file in them: the first pattern that any name matches. A shapefile
-# comes last, as other formats carry boundaries in shapefiles.
-PACKAGES: tuple[tuple[str, Reader], ...] = (
-    ("taskdata.xml", read_isoxml),
-    ("adapt.json", read_adapt),
-    ("*.gpkg", read_geopackage),
-    ("*.kml", read_kml),
-    ("*.tif", read_dji),
-    ("*.tiff", read_dji),
-    ("*.parquet", read_geoparquet),
-    ("*.shp", read_shapefile),
+# Folders and archives, by the files in them: what each format is called, and the patterns of its
+# files' names. A package has to hold maps of one format alone, else the operator names the file.
+PACKAGES: tuple[tuple[str, tuple[str, ...], Reader], ...] = (
+    ("ISOXML", ("taskdata.xml",), read_isoxml),
+    ("ADAPT", ("adapt.json",), read_adapt),
+    ("GeoPackage", ("*.gpkg",), read_geopackage),
+    ("KML", ("*.kml",), read_kml),
+    ("GeoTIFF", ("*.tif", "*.tiff"), read_dji),
+    ("GeoParquet", ("*.parquet", "*.geoparquet"), read_geoparquet),
+    ("GeoJSON", ("*.geojson", "*.json"), read_geojson),
+    ("shapefile", ("*.shp",), read_shapefile),
 )
+# Readers whose layers are tasks or operations: a name of theirs is never one of a file.
+_OF_TASKS = (read_isoxml, read_adapt)
+# Files of ISOXML's own, `GRD00001`: terminals keep pictures of their grids beside them.
+_TASK_FILE = re.compile(r"[a-z]{3}\d{5}")
+_SHOWN_MAX = 8
 # A repair of a boundary or an exclusion may move the limit of spraying by this much unasked.
 REPAIR_MAX_M2 = 1.0
 
@@ -165,7 +173,7 @@ def _read(
     suffix = path.suffix.casefold()
     reader = READERS.get(suffix)
     if folder or suffix == ".zip":
-        reader = _of_package(path)
+        reader, layer = _of_package(path, layer)
     elif path.name.casefold() == "adapt.json":
         reader = read_adapt
     if reader is None:
@@ -190,16 +198,96 @@ def _read(
     return reader(path, layer)
 
 
-def _of_package(path: Path) -> Reader:
-    """Return who reads a folder or an archive, by what lies in it."""
-    bundle = open_bundle(path)
-    for sign, reader in PACKAGES:
-        if any(PurePosixPath(name.casefold()).match(sign) for name in bundle.names):
-            return reader
-    signs = ", ".join(sign for sign, _ in PACKAGES)
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """One file of a package that could be the map, or of several files the one that names it."""
+
+    name: str
+    format: str
+    reader: Reader
+
+
+def _of_package(path: Path, layer: str | None) -> tuple[Reader, str | None]:
+    """Return who reads a folder or an archive, and the layer to ask for.
+
+    A file that the operator names becomes the layer, by its place in the package; a task's own
+    name stays what it is.
+    """
+    found = _candidates(open_bundle(path))
+    if not found:
+        signs = ", ".join(sign for _, signs, _ in PACKAGES for sign in signs)
+        raise map_error(
+            path,
+            f"it holds none of {signs}",
+            fix="name the file of the map itself",
+            code="unknown-format",
+        )
+    maps = [one for one in found if PurePosixPath(one.name).stem.casefold() != BOUNDARY_NAME]
+    readers = list(dict.fromkeys(one.reader for one in maps or found))
+    if len(readers) == 1:
+        return readers[0], layer
+    meant = [] if layer is None else _named(found, layer)
+    if len(meant) == 1:
+        reader = meant[0].reader
+        return reader, None if reader in _OF_TASKS else meant[0].name
+    of_tasks = [reader for reader in readers if reader in _OF_TASKS]
+    if layer is not None and not meant and len(of_tasks) == 1:
+        return of_tasks[0], layer
+    shown = [f"{one.name} ({one.format})" for one in found[:_SHOWN_MAX]]
+    shown += [f"{len(found) - _SHOWN_MAX} more"] if len(found) > _SHOWN_MAX else []
+    none = f", and no {layer[:40]!r}" if layer is not None and not meant else ""
     raise map_error(
         path,
-        f"it holds none of {signs}",
-        fix="name the file of the map itself",
-        code="unknown-format",
+        f"it holds maps of several formats: {', '.join(shown)}{none}",
+        fix=f"name one with --layer (prescription.layer), for example --layer {maps[0].name}, or "
+        "give the file itself",
+        code="several-layers",
     )
+
+
+def _candidates(bundle: Bundle) -> list[_Candidate]:
+    """Return the files that could be the map; what belongs to one of them is none."""
+    tasks, described = (
+        {PurePosixPath(name).parent for name in bundle.called(sign)}
+        for sign in ("taskdata.xml", "adapt.json")
+    )
+    found = []
+    for format_name, signs, reader in PACKAGES:
+        for name in bundle.names:
+            place = PurePosixPath(name)
+            if not any(PurePosixPath(name.casefold()).match(sign) for sign in signs):
+                continue
+            if place.parent in tasks and _TASK_FILE.match(place.stem.casefold()):
+                continue
+            if place.parent in described and reader in (read_dji, read_geoparquet):
+                continue
+            if reader is read_geojson and not is_geojson(bundle, name):
+                continue
+            found.append(_Candidate(name, format_name, reader))
+    return [one for one in found if not _is_field_of_dji(one, found)]
+
+
+def _is_field_of_dji(one: _Candidate, found: Sequence[_Candidate]) -> bool:
+    """Tell whether a shapefile is the outline beside the raster of DJI's package."""
+    return (
+        one.reader is read_shapefile
+        and PurePosixPath(one.name).parent.name.casefold() == SHAPE_FOLDER.casefold()
+        and any(
+            other.reader is read_dji
+            and PurePosixPath(other.name).parent.name.casefold() == RX_FOLDER.casefold()
+            for other in found
+        )
+    )
+
+
+def _named(found: Sequence[_Candidate], layer: str) -> list[_Candidate]:
+    """Return the files that a name means: by place, by file name, else by what stands before it."""
+    for called in (
+        lambda place: str(place),
+        lambda place: place.name,
+        lambda place: place.stem,
+    ):
+        meant = [one for one in found if called(PurePosixPath(one.name)) == layer]
+        if meant:
+            return meant
+    return []

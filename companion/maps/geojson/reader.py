@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from pyproj import CRS
 from shapely import MultiPolygon
 
+from companion.maps.bundle import Bundle, open_bundle
 from companion.maps.crs import WGS84, crs_name, parse_crs
 from companion.maps.geojson.ground import BROKEN, GEOMETRIES, polygons_in
 from companion.maps.layer import (
@@ -22,19 +24,42 @@ from companion.maps.layer import (
 )
 from companion.maps.local import Area, as_area
 from companion.maps.model import Problem, map_error
+from companion.maps.one_of import one_of
 from companion.maps.outline import BOUNDARY_NAME, outline_of
 
 _OUTLINES = ("Polygon", "MultiPolygon")
 _COLUMNS_MAX = 255  # as many as a shapefile can have
 _CELLS_MAX = 10_000_000  # as in an attribute table
+_SUFFIXES = (".geojson", ".json")
+# Other programs keep settings and metadata as JSON beside a map.
+_FEATURES = re.compile(rb'"type"\s*:\s*"Feature(?:Collection)?"')
+_HEAD_BYTES = 65_536
 _EXPORT_AGAIN = "export the map again"
 
 
 def read_geojson(path: Path, layer: str | None = None) -> Layer:
-    """Return what a GeoJSON file holds; it has no layers, so `layer` is refused."""
+    """Return what a GeoJSON file holds, or one in a folder or a zip, which `layer` names.
+
+    A file by itself has no layers, so `layer` is refused.
+    """
+    if path.is_dir() or path.suffix.casefold() == ".zip":
+        bundle = open_bundle(path)
+        names = [name for name in bundle.with_suffix(*_SUFFIXES) if is_geojson(bundle, name)]
+        name = one_of(bundle, names, layer, kind="GeoJSON")
+        return _layer(bundle.read(name), bundle.path / name)
     if layer is not None:
         raise map_error(path, "GeoJSON has no layers", fix="leave out --layer", code="no-layer")
-    content = read_bytes(path)
+    return _layer(read_bytes(path), path)
+
+
+def is_geojson(bundle: Bundle, name: str) -> bool:
+    """Tell whether a file is GeoJSON: by its suffix, or a `.json` by what it begins with."""
+    if PurePosixPath(name).suffix.casefold() != ".json":
+        return True
+    return _FEATURES.search(bundle.read(name)[:_HEAD_BYTES]) is not None
+
+
+def _layer(content: bytes, path: Path) -> Layer:
     document = _parse(content, path)
     features = _features(document, path)
     check_counts(path, records=len(features), vertices=0)

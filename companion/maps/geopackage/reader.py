@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from companion.maps.attributes import column_of, stated_unit
 from companion.maps.bundle import open_bundle
@@ -27,6 +27,7 @@ from companion.maps.geopackage.wkb import CurvedError, Found, Rings, areas_of, p
 from companion.maps.layer import Column, Layer, Value, check_counts, digest, read_bytes
 from companion.maps.local import Area
 from companion.maps.model import map_error
+from companion.maps.one_of import one_of
 from companion.maps.outline import outline_of
 
 # Bytes of the envelope by its code in the header's flags (section 2.1.3.1.1).
@@ -50,7 +51,7 @@ def read_geopackage(path: Path, layer: str | None = None) -> Layer:
 
     A layer called "boundary" that holds no numbers is the outline of the field.
     """
-    content = _bytes_of(path)
+    content, layer = _content_of(path, layer)
     with open_database(content, path) as database:
         tables = layers_of(database)
         chosen = chosen_layer(database, tables, layer)
@@ -73,30 +74,28 @@ def read_geopackage(path: Path, layer: str | None = None) -> Layer:
     )
 
 
-def _bytes_of(path: Path) -> bytes:
-    """Return the database: the file itself, or the only one in a folder or an archive."""
+def _content_of(path: Path, layer: str | None) -> tuple[bytes, str | None]:
+    """Return the database, the file itself or one in a folder or an archive, and the layer in it.
+
+    What names a file of several is no layer any more.
+    """
     if not path.is_dir() and path.suffix.casefold() != ".zip":
         check_closed(path)
-        return read_bytes(path)
+        return read_bytes(path), layer
     bundle = open_bundle(path)
     names = bundle.with_suffix(".gpkg")
-    if len(names) != 1:
-        raise map_error(
-            path,
-            f"it holds {len(names)} GeoPackages{': ' if names else ''}{', '.join(names[:5])}",
-            fix="name the .gpkg file itself",
-            code="several-layers" if names else "no-file",
-        )
+    is_file = any(layer in (name, PurePosixPath(name).name) for name in names)
+    name = one_of(bundle, names, layer if is_file or len(names) > 1 else None, kind="GeoPackage")
     if path.is_dir():
-        check_closed(path / names[0])
-    elif f"{names[0]}-wal" in bundle.names:
+        check_closed(path / name)
+    elif f"{name}-wal" in bundle.names:
         raise map_error(
             path,
-            f"{names[0]} was copied while a program had it open",
+            f"{name} was copied while a program had it open",
             fix="close the program, and make the archive again",
             code="file-in-use",
         )
-    return bundle.read(names[0])
+    return bundle.read(name), None if is_file or len(names) > 1 else layer
 
 
 def _content(database: Database, table: LayerTable) -> _Content:

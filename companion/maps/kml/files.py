@@ -62,9 +62,13 @@ def _main_file(bundle: Bundle, path: Path, layer: str | None) -> tuple[str, bool
     names = bundle.with_suffix(".kml")
     main = [name for name in names if name.casefold() == _MAIN]
     meant = main or names
+    # By its suffix a name can only be that of a file; without it, it may be a folder's.
+    named = [name for name in names if layer in (name, PurePosixPath(name).name)]
+    if len(named) == 1:
+        return named[0], True
     if len(meant) == 1:
         return meant[0], False
-    asked = [name for name in names if layer in (name, Path(name).name, Path(name).stem)]
+    asked = [name for name in names if layer == PurePosixPath(name).stem]
     if len(asked) == 1:
         return asked[0], True
     raise map_error(
