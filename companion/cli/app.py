@@ -156,6 +156,9 @@ def execute(arguments: Sequence[str]) -> int:
         code = FAILED if isinstance(error, ActuatorError | UnreadableError) else REFUSED
         more = {"ok": False, "problems": [refusal(error)]} if isinstance(error, MapError) else {}
         return _fail(str(error), code, as_json=as_json, more=more)
+    except MemoryError:
+        text = "there is not enough memory for this; use a smaller file, or another computer"
+        return _fail(text, REFUSED, as_json=as_json)
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted", INTERRUPTED, as_json=as_json)
     if result == INTERRUPTED:  # Typer makes an exit of an interrupt

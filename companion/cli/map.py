@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
+from os import SEEK_END
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +23,7 @@ from companion.cli.map_options import File, Reading, reading_options
 from companion.cli.map_plan import plan_of, sprayer_problems
 from companion.cli.map_report import report_lines
 from companion.errors import MapError
+from companion.maps.layer import cut_off
 from companion.maps.lint import point_rates, summary
 
 POINTS_MAX = 1_000_000
@@ -118,6 +120,8 @@ def _read_points(path: Path) -> list[tuple[float, float]]:
                     raise _bad_points(f"{path}: more than {POINTS_MAX} points", "split the file")
                 where = f"{path}: line {reader.line_num}"
                 places.append(_place(row["lat"], row["lon"], where))
+        if places and list(row)[-1] in ("lat", "lon") and not _last_line_ends(path):
+            raise cut_off(path, reader.line_num, row[list(row)[-1]])
     except OSError as error:
         reason = (error.strerror or "cannot be read").lower()
         raise _bad_points(
@@ -126,6 +130,12 @@ def _read_points(path: Path) -> list[tuple[float, float]]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise _bad_points(f"{path}: no CSV text in UTF-8 ({error})", "save it as that") from error
     return places
+
+
+def _last_line_ends(path: Path) -> bool:
+    with path.open("rb") as file:
+        file.seek(-1, SEEK_END)
+        return file.read(1) in b'\r\n"'
 
 
 def _place(

@@ -16,7 +16,14 @@ from pyproj import CRS
 from shapely.errors import ShapelyError
 
 from companion.maps.cells import check_place, corner
-from companion.maps.crs import Objects, crs_name, datum_problem, parse_crs, to_longitude_latitude
+from companion.maps.crs import (
+    Objects,
+    check_edges,
+    crs_name,
+    datum_problem,
+    parse_crs,
+    to_longitude_latitude,
+)
 from companion.maps.declared import Given, Unit, unit_of
 from companion.maps.fields import choose
 from companion.maps.layer import Band, Column, Grid, Layer, as_number
@@ -30,6 +37,7 @@ from companion.maps.model import (
     map_error,
     unusable_polygons,
 )
+from companion.maps.overlaps import check_crossings
 
 # Names of zones, the best first: the first of these columns that tells all records apart.
 _NAME_COLUMNS = ("name", "zonename", "zone", "zoneid", "zone_id", "label", "id", "fid", "level")
@@ -274,7 +282,8 @@ def ground_of(
     try:
         native: Objects = np.array([layer.geometries[index] for index in here], dtype=object)
         areas = to_longitude_latitude(native, crs, path=path)
-        repaired, repairs = _repaired(areas, [names[index] for index in here])
+        repaired, repairs = _repaired(areas, [names[index] for index in here], path)
+        check_edges(np.array([area for area in repaired if area is not None], dtype=object), path)
     except ShapelyError as error:
         raise unusable_polygons(path, error) from None
     ground: list[Area | None] = [None] * len(layer.geometries)
@@ -290,12 +299,15 @@ def ground_of(
     return ground, repairs
 
 
-def _repaired(areas: Objects, names: Sequence[str]) -> tuple[list[Area | None], list[Repair]]:
+def _repaired(
+    areas: Objects, names: Sequence[str], path: Path
+) -> tuple[list[Area | None], list[Repair]]:
     """Return valid polygons, and for each that was not, how much ground the repair changed."""
     result: list[Area | None] = list(areas)
     repairs = []
     broken = np.flatnonzero(~shapely.is_valid(areas))
     frame = frame_around(areas)
+    check_crossings(areas[broken], path)
     for index in broken.tolist():
         area = result[index] = make_valid(areas[index])
         repairs.append(

@@ -23,15 +23,17 @@ from companion.maps.crs_place import (
     crs_name,
     looks_like_metres,
 )
+from companion.maps.layer import MAX_VERTICES
 from companion.maps.model import Problem, map_error
 
 __all__ = [
-    "EXTENT_MAX_M", "METRES_PER_DEGREE", "SEGMENT_M", "WGS84", "Floats", "Objects", "crs_name",
-    "datum_problem", "densified", "is_wgs84", "parse_crs", "to_longitude_latitude",
+    "EXTENT_MAX_M", "METRES_PER_DEGREE", "SEGMENT_M", "WGS84", "Floats", "Objects", "check_edges",
+    "crs_name", "datum_problem", "densified", "is_wgs84", "parse_crs", "to_longitude_latitude",
 ]  # fmt: skip
 
 Objects = NDArray[np.object_]
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 # A straight line of a projection is an arc in another. Over 100 m the two part by 0.4 mm at
 # 60 degrees of latitude (sagitta L^2 tan(lat) / (8 R)), over 1 km by 3 cm.
@@ -117,17 +119,44 @@ def to_longitude_latitude(geometries: Objects, crs: CRS, *, path: Path) -> Objec
     check_place(transform(coordinates), coordinates, crs, path)
     if not crs.is_geographic:
         unit_m = crs.axis_info[0].unit_conversion_factor or 1.0
-        geometries = densified(geometries, SEGMENT_M / unit_m)
+        geometries = densified(geometries, SEGMENT_M / unit_m, path=path)
     result: Objects = shapely.transform(geometries, transform)
     return result
 
 
-def densified(geometries: Objects, step: float) -> Objects:
+def densified(geometries: Objects, step: float, *, path: Path | None = None) -> Objects:
     """Return the geometries with no edge longer than `step`.
 
     Only valid ones: GEOS would repair the others on the way, in silence, and drop ground.
     """
-    valid = shapely.is_valid(geometries)
     result: Objects = geometries.copy()
-    result[valid] = shapely.segmentize(geometries[valid], step)
+    long = _with_long_edges(geometries, step, path)
+    if len(long):
+        result[long] = shapely.segmentize(geometries[long], step)
     return result
+
+
+def check_edges(degrees: Objects, path: Path) -> None:
+    """Refuse ground whose edges, cut as a flight needs them, are more than a map may have."""
+    _with_long_edges(degrees, SEGMENT_M / METRES_PER_DEGREE, path)
+
+
+def _with_long_edges(geometries: Objects, step: float, path: Path | None) -> Indices:
+    """Return which valid geometries have an edge to be cut, if all of them have not too many."""
+    points, owner = shapely.get_coordinates(geometries, return_index=True)
+    # From the end of a ring to the next one too: a way that makes nothing long is no edge either.
+    long: Indices = np.unique(owner[1:][np.hypot(*np.diff(points, axis=0).T) > step])
+    long = long[shapely.is_valid(geometries[long])]
+    rings = shapely.get_rings(shapely.get_parts(geometries[long]))
+    corners, ring = shapely.get_coordinates(rings, return_index=True)
+    edges = np.hypot(*np.diff(corners, axis=0).T)[ring[1:] == ring[:-1]]
+    count = len(points) + float(np.floor(edges / step).sum())
+    if not count <= MAX_VERTICES:
+        raise map_error(
+            Path("map") if path is None else path,
+            f"its edges are so long that they take {count:.0f} vertices, one every "
+            f"{SEGMENT_M:.0f} m, more than {MAX_VERTICES}",
+            fix="remove the stray zone, or cut the map to one field",
+            code="too-large",
+        )
+    return long

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon
 
+from companion.errors import MapError
 from companion.maps.model import Affine, Problem, map_error
 
 # Bounds on what is read from a file that nobody vouches for. Real maps have at most some
@@ -143,6 +144,21 @@ def read_bytes(path: Path) -> bytes:
         raise map_error(
             path, f"cannot be read ({error})", fix="check path and rights", code="no-file"
         ) from None
+
+
+def cut_off(path: Path, line: int, last: str) -> MapError:
+    """Return the refusal of a text whose last line has no end.
+
+    Cut short inside its last number, `12.5` reads as 12 or as 1; nothing but the end of the line
+    says that a number is whole.
+    """
+    return map_error(
+        path,
+        f"line {line} is the last and has no line end: a file cut short inside its last number "
+        f"({last[:40]!r}) looks the same",
+        fix="copy the file again; if it is whole, add a line end behind that line",
+        code="truncated",
+    )
 
 
 def digest(parts: Iterable[bytes]) -> str:

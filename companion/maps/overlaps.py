@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import shapely
@@ -13,6 +14,7 @@ from shapely import STRtree
 
 from companion.errors import MapError
 from companion.maps.local import Area
+from companion.maps.model import map_error
 
 Objects = NDArray[np.object_]
 Ints = NDArray[np.int64]
@@ -36,6 +38,9 @@ CANDIDATES_MAX = 5_000_000
 VERTICES_MAX = 300_000_000
 CROSSINGS_MAX = 400_000
 _CROSSINGS_PER_VERTEX = 4
+# Pairs of boxes of the edges of rings that cross themselves; each is met from both sides. A repair
+# with so many takes some 2 s.
+SELF_CROSSINGS_MAX = 200_000
 # Pairs that cannot have many crossings are not asked: one side is short, or both are.
 _SHORT, _PRODUCT_MIN = 100, 300_000
 
@@ -85,6 +90,38 @@ def overlaps(zones: Sequence[Area], *, above_m2: float = OVERLAP_MAX_M2) -> list
     return sorted(found, key=lambda overlap: overlap.area_m2, reverse=True)
 
 
+def check_crossings(areas: Objects, path: Path) -> None:
+    """Refuse rings that cross themselves so often that their repair has no end.
+
+    Every crossing becomes a corner, and rings of 18 000 edges can have a hundred million.
+    """
+    left = SELF_CROSSINGS_MAX
+    for area in areas:
+        boxes = _edge_boxes(area)
+        # Every edge meets itself and its two neighbours.
+        expected = _CROSSINGS_PER_VERTEX * len(boxes)
+        left -= max(0, _hits(boxes, boxes, left + expected) - expected)
+        if not left >= 0:
+            raise map_error(
+                path,
+                f"its rings cross themselves in more than {SELF_CROSSINGS_MAX // 2} places",
+                fix="repair the map where it is made, and export it again",
+                code="too-complicated",
+            )
+
+
+def _hits(first: Objects, second: Objects, most: int) -> int:
+    """Return how many pairs of boxes meet; something more than `most` where they are more."""
+    tree = STRtree(first)
+    hits, start, chunk = 0, 0, 1
+    while start < len(second) and hits <= most:
+        more = len(tree.query(second[start : start + chunk])[0])
+        start += chunk
+        chunk = max(1, min(2 * chunk, int(chunk * _HITS_WANTED / max(more, 1))))
+        hits += more
+    return hits
+
+
 def _candidates(parts: Objects, owner: Ints) -> Iterator[tuple[Ints, Ints]]:
     """Yield, in bites, each pair of parts of different zones whose boxes share ground, once."""
     tree = STRtree(parts)
@@ -127,17 +164,11 @@ def _crossings(parts: Objects, vertices: Ints, one: Ints, two: Ints, left: int) 
     found = 0
     for pair in np.flatnonzero((few > _SHORT) | (few * many > _PRODUCT_MIN)).tolist():
         first, second = _edge_boxes(parts[one[pair]]), _edge_boxes(parts[two[pair]])
-        tree = STRtree(first)
         expected = _CROSSINGS_PER_VERTEX * int(few[pair] + many[pair])
-        hits, start, chunk = 0, 0, 1
-        while start < len(second):
-            more = len(tree.query(second[start : start + chunk])[0])
-            start += chunk
-            chunk = max(1, min(2 * chunk, int(chunk * _HITS_WANTED / max(more, 1))))
-            hits += more
-            if not found + hits - expected <= left:
-                raise _too_complicated()
-        found += max(0, hits - expected)
+        more = max(0, _hits(first, second, left - found + expected) - expected)
+        if not found + more <= left:
+            raise _too_complicated()
+        found += more
     return found
 
 

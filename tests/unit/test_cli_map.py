@@ -256,7 +256,7 @@ def test_cells_are_answered_for_a_file_of_points(
     monkeypatch.setattr("companion.cli.map_options.read_map", lambda *_, **__: given)
     rows = [(SOUTH + up * CELL, WEST + right * CELL) for up in (1.5, 0.5) for right in (0.5, 1.5)]
     points = tmp_path / "points.csv"
-    points.write_text("lat,lon\n" + "\n".join(f"{lat},{lon}" for lat, lon in rows))
+    points.write_text("lat,lon\n" + "".join(f"{lat},{lon}\n" for lat, lon in rows))
     code, found = run_json(capsys, "rate", "rx", "--points", str(points))
     assert code == 0
     assert [row["rate_l_ha"] for row in found["points"]] == [10.0, 20.0, None, 0.0]

@@ -163,7 +163,7 @@ def test_mean_of_points_leaves_out_blanks(folder: Path) -> None:
             random.random(6), random.random(6), ["1", "", "3", "NA", "8", ""], strict=True
         )
     ]
-    grid = grid_of(write(folder, "\n".join(["lat,lon,rate", *lines])))
+    grid = grid_of(write(folder, "\n".join(["lat,lon,rate", *lines, ""])))
     assert grid.problems[0].code == "irregular-points"
     values = grid.bands[0].values
     assert np.nansum(values) == pytest.approx(12.0)
@@ -174,7 +174,7 @@ def test_irregular_projected_points_need_metres(folder: Path) -> None:
 
     def text(offset: float) -> str:
         rows = [f"{offset + x:.2f},{offset + y:.2f},5" for x, y in random.random((40, 2)) * 90.0]
-        return "\n".join(["x,y,rate", *rows])
+        return "\n".join(["x,y,rate", *rows, ""])
 
     grid = grid_of(write(folder, text(500_000.0)))
     assert grid.crs is None

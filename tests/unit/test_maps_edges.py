@@ -101,7 +101,7 @@ def test_metres_without_a_crs_are_not_told_to_be_degrees(tmp_path: Path) -> None
     path = tmp_path / "points.csv"
     path.write_text(
         "easting,northing,rate_l_ha\n"
-        + "\n".join(f"{686000 + 5 * i},{5330000 + 5 * j},10" for i in range(4) for j in range(4))
+        + "".join(f"{686000 + 5 * i},{5330000 + 5 * j},10\n" for i in range(4) for j in range(4))
     )
     found = refused(path)
     assert found.code == "no-crs"

@@ -208,10 +208,10 @@ def test_figure_1_is_read(folder: Path) -> None:
         FIGURE_1 + "\n\n \t\n",
         "\ufeff" + FIGURE_1,
         FIGURE_1.replace("7\n", "7\t\t\t\n", 1),
-        FIGURE_1.rstrip("\n"),
+        FIGURE_1.rstrip("\n") + "\t",
         FIGURE_1.replace("\n", "\r"),
     ],
-    ids=["crlf", "spaces", "blank-end", "bom", "tabs-after-count", "no-end", "cr"],
+    ids=["crlf", "spaces", "blank-end", "bom", "tabs-after-count", "tab-at-the-end", "cr"],
 )
 def test_writing_of_lines_does_not_matter(text: str) -> None:
     found = parse_text_map(text.encode(), Path("x.txt"))
@@ -245,6 +245,7 @@ def row(latitude: str = "39.5000000", longitude: str = "-0.4", rest: str = "5.0\
         ("2\n1 2 3\n1 2 3 4\n", "bad-line", "line 2 has 3 numbers"),
         ("2\n1 2 3 4\n1 2 3\n", "truncated", "line 3 has 3 numbers"),
         ("7\n1 2 3 4\n1 2\n", "truncated", "the file is cut short"),
+        (FIGURE_1.rstrip("\n"), "truncated", "line 8 is the last and has no line end"),
         ("", "truncated", "empty"),
         (" \n\n", "truncated", "empty"),
         (row("-104.5", "39.9"), "swapped-axes", "look exchanged"),

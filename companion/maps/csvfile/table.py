@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from companion.maps.fields import NONE, score
-from companion.maps.layer import MAX_FILE_BYTES, MAX_RECORDS, Column
+from companion.maps.layer import MAX_FILE_BYTES, MAX_RECORDS, Column, cut_off
 from companion.maps.model import Floats, map_error
 
 if TYPE_CHECKING:
@@ -86,7 +86,8 @@ class Table:
         values = self.columns[name]
         if _PLAIN.fullmatch("".join(values)) is not None:
             try:
-                return np.array(values, dtype=np.str_).astype(np.float64)
+                # Not an array of text: one long cell would make all of them as wide as itself.
+                return np.fromiter(map(float, values), dtype=np.float64, count=len(values))
             except ValueError:
                 pass  # a blank, or no number after all
         tidy = [value.strip() for value in values]
@@ -117,7 +118,7 @@ def read_table(content: bytes, path: Path, *, wanted: Callable[[Sequence[str]], 
     text = _text(content, path)
     with _large_fields():
         try:
-            return _table(text, path, _delimiter(text, path, wanted))
+            table = _table(text, path, _delimiter(text, path, wanted))
         except csv.Error as error:
             raise map_error(
                 path,
@@ -125,6 +126,21 @@ def read_table(content: bytes, path: Path, *, wanted: Callable[[Sequence[str]], 
                 fix=_AS_CSV,
                 code="truncated",
             ) from None
+    _check_end(text, table)
+    return table
+
+
+def _check_end(text: str, table: Table) -> None:
+    """Refuse a last line without an end, unless its last field shows that it is whole.
+
+    A quotation mark closes a field, and a text is no rate. A number and a blank may be what is
+    left of a longer number.
+    """
+    last = [values[-1] for values in table.columns.values()][-1].strip()
+    if text.endswith('"') or not (last.casefold() in _BLANK or _NUMBER.fullmatch(last)):
+        return
+    if not text.endswith(("\n", "\r")):
+        raise cut_off(table.path, table.lines[-1], last)
 
 
 @contextmanager

@@ -55,7 +55,9 @@ def grid_of_tiff(
     world = None
     if world_name is not None:
         files[world_name] = bundle.read(world_name)
-        world = parse_world_file(files[world_name], bundle.path / world_name)
+        world = parse_world_file(
+            files[world_name], bundle.path / world_name, alone=raster.transform is None
+        )
     transform, moved = _placed(raster, world, (shape[0], shape[1]), path)
     bands, said = _bands(raster, operation, path)
     return Grid(

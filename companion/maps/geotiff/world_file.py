@@ -15,6 +15,7 @@ from pyproj import CRS
 from companion.maps.bundle import Bundle
 from companion.maps.cells import corner
 from companion.maps.crs import METRES_PER_DEGREE
+from companion.maps.layer import cut_off
 from companion.maps.model import Affine, Problem, map_error
 
 SUFFIXES = (".tfw", ".tifw", ".tiffw", ".wld")
@@ -44,8 +45,12 @@ def world_file_of(bundle: Bundle, name: str) -> str | None:
     return found[0] if found else None
 
 
-def parse_world_file(content: bytes, path: Path) -> Affine:
-    """Return from (column, row) of corners of cells to x and y."""
+def parse_world_file(content: bytes, path: Path, *, alone: bool = False) -> Affine:
+    """Return from (column, row) of corners of cells to x and y.
+
+    `alone`: nothing else says where the map lies, so that a last number that is cut short would
+    move it unseen.
+    """
     try:
         if len(content) > _MAX_BYTES:
             raise ValueError("it is too long")
@@ -59,6 +64,9 @@ def parse_world_file(content: bytes, path: Path) -> Affine:
             fix="export the map again; numbers take a decimal point, not a comma",
             code="bad-world-file",
         ) from None
+    if alone and not content[-1:].isspace():
+        lines = content.decode("ascii").splitlines()
+        raise cut_off(path, len(lines), lines[-1].strip())
     return (a, b, x - (a + b) / 2.0, d, e, y - (d + e) / 2.0)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.maps.layer import cut_off
 from companion.maps.model import map_error
 from companion.maps.whole_file import write_whole
 
@@ -75,6 +76,8 @@ def parse_text_map(content: bytes, path: Path) -> TextMap:
             code="wrong-count",
         )
     table = _table(rows, path)
+    if rows[-1][1][-1] in "0123456789." and not content.endswith((b"\n", b"\r")):
+        raise cut_off(path, rows[-1][0], rows[-1][1].split()[-1])
     _check_values(table, [number for number, _ in rows], path)
     latitude, longitude, altitude, rate = table.T
     return TextMap(
