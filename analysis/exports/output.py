@@ -6,6 +6,7 @@ is moved from there when it is complete. Where a move fails, those before it are
 
 from __future__ import annotations
 
+import os
 import tempfile
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -127,6 +128,8 @@ def _write(folder: Path, content: Content) -> int:
             for chunk in chunks:
                 file.write(chunk)
                 size += len(chunk)
+            file.flush()
+            os.fsync(file.fileno())  # before the name that makes it count
     return size
 
 

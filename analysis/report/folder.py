@@ -6,6 +6,7 @@ when all are complete. Where that fails, or is interrupted, what was there befor
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
@@ -66,6 +67,8 @@ def _drafts(folder: Path, files: Mapping[str, bytes]) -> dict[Path, str]:
     drafts = {folder / f"new-{number}": name for number, name in enumerate(files)}
     for draft, name in drafts.items():
         draft.write_bytes(files[name])
+        with draft.open("rb") as file:
+            os.fsync(file.fileno())  # before the name that makes it count
     return drafts
 
 

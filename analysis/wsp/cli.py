@@ -31,6 +31,7 @@ from analysis.wsp.results import (
 from analysis.wsp.sheet import CARD_WIDTH_MM, Reading, SheetResult, read_sheet
 from analysis.wsp.spread import SPREADS, spread_of
 from analysis.wsp.stains import THRESHOLD, Threshold
+from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError
 
@@ -241,7 +242,7 @@ def _within(name: str, value: float | None, low: float, high: float) -> float | 
 
 
 def _write(text: str, path: Path) -> None:
-    path.write_text(text, encoding="utf-8")
+    write_atomically(path, text.encode())
 
 
 # What the program's own command line takes in: one command of the kind that Typer makes.

@@ -13,6 +13,7 @@ import shapely
 import typer
 from shapely import MultiPolygon
 
+from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note
 from companion.core.coverage import Coverage
 from companion.core.frame import LocalFrame
@@ -174,6 +175,7 @@ def _write(out: Path, rest: MultiPolygon, frame: LocalFrame, result: Mapping[str
             }
         )
     try:
-        out.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+        text = json.dumps({"type": "FeatureCollection", "features": features})
+        write_atomically(out, text.encode())
     except OSError as error:
         raise VrsprayError(f"{out}: cannot be written: {error}") from error

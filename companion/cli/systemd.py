@@ -8,6 +8,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
+from companion.atomic_write import write_atomically
 from companion.cli.service_unit import is_ours
 from companion.errors import VrsprayError
 
@@ -72,12 +73,9 @@ def read_unit(path: Path) -> str | None:
 def write_unit(path: Path, text: str) -> None:
     """Write the unit in one piece; one that somebody else wrote is not replaced."""
     refuse_foreign(path)
-    part = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text)
-        part.chmod(0o644)
-        part.replace(path)
+        write_atomically(path, text.encode(), mode=0o644)
     except OSError as error:
         raise ServiceError(f"{path}: cannot be written; {_advice(error)}") from error
 

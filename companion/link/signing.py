@@ -10,14 +10,18 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import logging
 import os
 import stat
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from companion.errors import LinkError
-from companion.link.state_file import read_state, write_state
+from companion.link.state_file import DamagedStateError, read_state, write_state
+
+_logger = logging.getLogger(__name__)
 
 _SIGNED = 0x01
 _TAIL = 13
@@ -31,6 +35,9 @@ RADIO_STATUS = 109
 # and a jump of some seconds refuses nobody.
 _KEEP_S = 5.0
 _AHEAD = 10 * _PER_S
+# A stamp has 48 bits.
+_STAMP_MAX = 1 << 48
+_DISK_MAX_S = 2.0
 STATE_NAME = "signing.json"
 
 
@@ -76,6 +83,33 @@ def _key_of(content: bytes) -> bytes | None:
     return hashlib.sha256(text.encode()).digest() if len(text) >= 8 else None
 
 
+def _kept_stamp(path: Path) -> int:
+    """Return the stamp that was kept, 0 where none ever was.
+
+    Of a damaged file the time at which it was written is left: no stamp that was given before is
+    later than that and what was written ahead, unless others were ahead of this computer's clock,
+    and from them the stamp is learnt again.
+    """
+    try:
+        values = read_state(path)
+        stamp = values.get("stamp", -1.0) if values or path.exists() else 0.0
+        if 0.0 <= stamp < _STAMP_MAX:
+            return round(stamp)
+    except DamagedStateError:
+        pass
+    written_s = path.stat().st_mtime
+    _logger.warning(
+        "%s: damaged; the stamp of signing goes on from the computer's clock, or from when the "
+        "file was written where that is later",
+        path,
+    )
+    return min(_stamp_at(written_s) + _AHEAD, _STAMP_MAX // 2)
+
+
+def _stamp_at(utc_s: float) -> int:
+    return max(0, round((utc_s - _EPOCH_2015_S) * _PER_S))
+
+
 class Signing:
     """Judges what comes in and stamps what goes out."""
 
@@ -94,14 +128,15 @@ class Signing:
         self.bad_count = 0
         self.unsigned_count = 0
         self.old_count = 0
-        before = 0
-        if self._state is not None:
-            before = round(read_state(self._state).get("stamp", 0))
+        before = 0 if self._state is None else _kept_stamp(self._state)
         self._stamp = max(before, self._now())
-        self.keep()
+        self._writing: threading.Thread | None = None
+        if self._state is not None:
+            write_state(self._state, {"stamp": float(self._stamp + _AHEAD)})
+            self._kept = self._stamp
 
     def _now(self) -> int:
-        return max(0, round((self._clock() - _EPOCH_2015_S) * _PER_S))
+        return _stamp_at(self._clock())
 
     def next_stamp(self) -> int:
         """Return a stamp that was never given before."""
@@ -138,13 +173,27 @@ class Signing:
     def keep(self, *, is_last: bool = False) -> None:
         """Write the stamp down now and then; called from the control loop, so it waits for no disk.
 
-        A rename replaces the file as a whole; what a power cut takes is learnt again.
+        The disk is waited for in a thread of its own, and at the end. While a slow one still
+        takes the stamp before, there is none to write.
         """
         if self._state is None or not (is_last or self._stamp >= self._kept + _KEEP_S * _PER_S):
             return
-        ahead = 0 if is_last else _AHEAD
-        write_state(self._state, {"stamp": float(self._stamp + ahead)}, is_synced=is_last)
-        self._kept = self._stamp
+        if is_last:
+            self.wait_until_kept()
+            write_state(self._state, {"stamp": float(self._stamp)})
+        elif self._writing is None or not self._writing.is_alive():
+            values = {"stamp": float(self._stamp + _AHEAD)}
+            # A daemon: a disk that hangs does not hold up the end of the program.
+            self._writing = threading.Thread(
+                target=write_state, args=(self._state, values), name="signing", daemon=True
+            )
+            self._writing.start()
+            self._kept = self._stamp
+
+    def wait_until_kept(self) -> None:
+        """Wait until the disk has what was written, but not for one that hangs."""
+        if self._writing is not None:
+            self._writing.join(_DISK_MAX_S)
 
     @property
     def refused_count(self) -> int:

@@ -1,22 +1,18 @@
-"""A file appears whole or not at all."""
+"""A map appears whole or not at all; what the system refuses is told as a map's error."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from companion.atomic_write import write_atomically
 from companion.errors import MapError
 from companion.maps.model import map_error
 
 
 def write_whole(path: Path, content: bytes) -> None:
     """Write a file beside `path` and move it there, so that nobody ever sees half of it."""
-    part = path.with_name(f".{path.name}.part")
     try:
-        try:
-            part.write_bytes(content)
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        write_atomically(path, content)
     except OSError as error:
         raise not_written(path, error) from None
 

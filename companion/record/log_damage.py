@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from companion.atomic_write import sync_folder
 from companion.record.content_hash import log_of
 from companion.record.geopackage import time_text
 from companion.record.kept_pages import page_bytes_of
@@ -98,6 +99,7 @@ def keep_log(path: Path) -> None:
         with draft.open("rb") as file:
             os.fsync(file.fileno())
         draft.replace(kept_log_of(path))
+    sync_folder(path.parent)
 
 
 def kept_log_of(path: Path) -> Path:

@@ -10,6 +10,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from companion.atomic_write import sync_folder
 from companion.record.geopackage import APPLICATION_ID, USER_VERSION
 from companion.record.kept_pages import KeptPages, kept_pages
 from companion.record.read_only import read_only, tolerate_damage
@@ -62,6 +63,7 @@ def salvage(path: Path) -> Salvaged:
         with draft.open("rb") as file:
             os.fsync(file.fileno())
         draft.rename(target)
+        sync_folder(path.parent)
         return found
     finally:
         draft.unlink(missing_ok=True)

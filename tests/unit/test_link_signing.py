@@ -112,6 +112,7 @@ def test_a_restart_with_a_clock_that_forgot_goes_on_ahead(tmp_path: Path, is_cle
     for _ in range(1000):
         given_ = before.next_stamp()
         before.keep()
+        before.wait_until_kept()
     if is_clean:
         before.keep(is_last=True)
     after = signing(tmp_path, at_s=0.0)
@@ -126,6 +127,7 @@ def test_the_stamp_is_written_every_few_seconds_only(tmp_path: Path) -> None:
         now_s[0] += 0.05
         guard.next_stamp()
         guard.keep()
+        guard.wait_until_kept()
         written.add(read_state(tmp_path / STATE_NAME)["stamp"])
     assert 9 <= len(written) <= 12
     assert max(written) > guard.next_stamp()
