@@ -84,6 +84,10 @@ def serve(
     ] = None,
     profile: Annotated[str, typer.Option(help="Sprayer profile.")] = "wang-2024",
     board: Annotated[Board, typer.Option(help="restarting or free-running.")] = Board.RESTARTING,
+    flow_law: Annotated[
+        FlowLaw | None,
+        typer.Option(help="The true flow between measured points; default: the profile's own."),
+    ] = None,
     gust: Annotated[float, typer.Option(help="Gusts in m/s.")] = 1.0,
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for the truth.")] = None,
@@ -123,6 +127,7 @@ def serve(
         field_config=field_config,
         profile=profile,
         board=board.value,
+        flow_law=None if flow_law is None else flow_law.value,
         speed_m_s=speed,
         gust_m_s=gust,
         seed=seed,

@@ -51,6 +51,16 @@ class Earth:
         north_m = along_m * (lat - lat_0) + 0.5 * across_m * sin * cos * lon**2 * lift
         return east_m, north_m
 
+    def to_local(self, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
+        """Return east and north of one place."""
+        east_m, north_m = self.to_local_all(latitude_deg, longitude_deg)
+        return float(east_m), float(north_m)
+
+    def to_geographic(self, east_m: float, north_m: float) -> tuple[float, float]:
+        """Return latitude and longitude of one place."""
+        latitude, longitude = self.to_geographic_all(east_m, north_m)
+        return float(latitude), float(longitude)
+
     def to_geographic_all(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[Floats, Floats]:
         """Return latitudes and longitudes of many places: the other way round, by rounds."""
         east, north = np.asarray(east_m, dtype=np.float64), np.asarray(north_m, dtype=np.float64)

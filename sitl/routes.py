@@ -15,6 +15,7 @@ from shapely import LineString
 
 from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
+from sitl.earth import Earth
 from sitl.stub.flight_plan import SAME_PLACE_M, plan_flight
 from sitl.stub.mission_file import read_mission
 from sitl.vehicle import Leg, Route
@@ -42,7 +43,7 @@ def read_route(
     places = [item for item in items if item.has_place]
     if not places:
         raise ConfigError(f"{path}: no item has a place; plan at least one waypoint")
-    home = LocalFrame(places[0].latitude_deg, places[0].longitude_deg)
+    home = Earth(places[0].latitude_deg, places[0].longitude_deg)
     plan = plan_flight(
         items,
         home,
@@ -78,7 +79,7 @@ def _home_altitude_m(items: tuple[MissionItem, ...]) -> float:
     return items[0].z_m if items[0].has_place else 0.0
 
 
-def _moved(leg: Leg, home: LocalFrame, frame: LocalFrame, speed_m_s: float | None) -> Leg:
+def _moved(leg: Leg, home: Earth, frame: LocalFrame, speed_m_s: float | None) -> Leg:
     east_m, north_m = frame.to_local(*home.to_geographic(leg.east_m, leg.north_m))
     speed = leg.speed_m_s if speed_m_s is None else speed_m_s
     return replace(leg, east_m=east_m, north_m=north_m, speed_m_s=speed)

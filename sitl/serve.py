@@ -17,9 +17,10 @@ from typing import Any
 from companion.assembly import build_setup
 from companion.config import Config, load
 from companion.core.controller import Setup
-from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
 from sitl.anyang import EXAMPLE
+from sitl.earth import Earth
+from sitl.flow_law import FlowLaw
 from sitl.serve_mission import (
     MissionWatch,
     first_course_deg,
@@ -70,6 +71,7 @@ class ServeOptions:
     field_config: Path | None = None
     profile: str = "wang-2024"
     board: BoardKind = "restarting"
+    flow_law: FlowLaw | None = None
     speed_m_s: float = 5.0
     gust_m_s: float = 1.0
     seed: int = 0
@@ -138,6 +140,7 @@ class _Run:
         self.operator = Operator(
             self.autopilot,
             enable=options.enable,
+            key=self.autopilot.key,
             mission_is_there=(lambda: self.mission.is_there) if options.wait_mission else None,
             start_s=start_s,
         )
@@ -288,7 +291,7 @@ def _config(options: ServeOptions) -> Config:
 
 def _start(
     options: ServeOptions, scenario: Scenario, config: Config, setup: Setup | None
-) -> tuple[LocalFrame, tuple[MissionItem, ...]]:
+) -> tuple[Earth, tuple[MissionItem, ...]]:
     """Return where the vehicle stands, and its mission if it has one."""
     firmware = _firmware(options.autopilot, scenario)
     if setup is not None and options.wait_mission:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from companion.config import Config
 from companion.core.controller import Setup
-from companion.core.frame import LocalFrame, course_deg
+from companion.core.frame import course_deg
 from companion.errors import ConfigError
 from sitl.anyang import anyang_items
+from sitl.earth import Earth
 from sitl.stub.autopilot import Autopilot
 from sitl.stub.firmware import Firmware
 from sitl.stub.flight_plan import starts_with_take_off
@@ -58,9 +59,9 @@ def _items_of_file(path: Path) -> tuple[MissionItem, ...]:
     return (places[0], *items[1:])
 
 
-def home_of(items: tuple[MissionItem, ...]) -> LocalFrame:
+def home_of(items: tuple[MissionItem, ...]) -> Earth:
     """Return the frame that begins at the home of a mission."""
-    return LocalFrame(items[0].latitude_deg, items[0].longitude_deg)
+    return Earth(items[0].latitude_deg, items[0].longitude_deg)
 
 
 def home_of_file(name: str) -> tuple[float, float] | None:
@@ -76,27 +77,29 @@ def home_of_file(name: str) -> tuple[float, float] | None:
 
 def waiting_place(
     given: tuple[float, float] | None, config: Config, setup: Setup, *, is_example: bool
-) -> LocalFrame:
+) -> Earth:
     """Return where a vehicle without a mission stands.
 
     That is the place given, else where the example's flight begins, else the first depot of the
     configuration, else the origin of the map's frame.
     """
     if given is not None:
-        return LocalFrame(*given)
+        return Earth(*given)
     if is_example:
         return home_of(anyang_items(1.0))
     depots = () if config.mission is None else config.mission.depots
-    return LocalFrame(*depots[0]) if depots else setup.frame
+    return (
+        Earth(*depots[0]) if depots else Earth(setup.frame.latitude_deg, setup.frame.longitude_deg)
+    )
 
 
-def first_course_deg(items: tuple[MissionItem, ...], home: LocalFrame) -> float:
+def first_course_deg(items: tuple[MissionItem, ...], home: Earth) -> float:
     """Return the direction of the first leg, so that the vehicle stands ready for it."""
     place = _first_place_m(items, home)
     return 0.0 if place is None else course_deg(*place)
 
 
-def _first_place_m(items: tuple[MissionItem, ...], home: LocalFrame) -> tuple[float, float] | None:
+def _first_place_m(items: tuple[MissionItem, ...], home: Earth) -> tuple[float, float] | None:
     """Return the first place that is not home, in metres east and north."""
     for item in items[1:]:
         if item.has_place:

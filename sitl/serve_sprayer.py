@@ -73,4 +73,5 @@ def sprayer_options(options: ServeOptions, config: Config, scenario: Scenario) -
         liquid=_liquid(options, scenario),
         seed=options.seed,
         drive_channels=_pins(options, scenario, _drive_channels(config)),
+        flow_law=options.flow_law,
     )

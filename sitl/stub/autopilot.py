@@ -61,10 +61,10 @@ class Autopilot:
         self._impairment = Impairment(parts.faults, seed=parts.seed)
         self._incidents = Incidents()
         self._acknowledgements = Acknowledgements()
-        self._key = parts.key
+        self.key = parts.key
         self._clock_rate = 1.0 + parts.drift_ppm * 1e-6
         self._boot_s = start_s - parts.uptime_s
-        self._now_s = start_s
+        self._start_s = self._now_s = start_s
         # The same day in every flight; a stub in real time is given today's.
         self.utc_offset_s = UTC_START_S - start_s
         self._script_due_s = start_s
@@ -79,7 +79,7 @@ class Autopilot:
 
     def attach(self, name: str, send: Callable[[bytes], None]) -> Channel:
         """Take a new peer on; PX4 begins to stream at once."""
-        channel = Channel(name, send, key=self._key)
+        channel = Channel(name, send, key=self.key)
         self.channels.append(channel)
         self._stream_defaults(channel, self._now_s)
         return channel
@@ -224,6 +224,7 @@ class Autopilot:
     def tick(self, now_s: float) -> None:
         """Do everything that is due at `now_s`."""
         self._now_s = now_s
+        self._speaker.keep_time(now_s - self._start_s)
         self.flight.tick(now_s)
         if self.flight.in_air and self.faults.take_off_s is None:
             self.faults.take_off_s = now_s

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
+from sitl.earth import Earth
 from sitl.stub.ardupilot import ardupilot
 from sitl.stub.autopilot import Autopilot
 from sitl.stub.estimator import ARDUPILOT_NOISE, PX4_NOISE, Estimator, EstimatorNoise
@@ -34,7 +34,7 @@ class StubOptions:
     of the scenario's. `signing_time` is the time stamp that a signed link begins with.
     """
 
-    home: LocalFrame
+    home: Earth
     autopilot: str = "ardupilot"
     home_altitude_m: float = 60.0
     heading_deg: float = 0.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from companion.core.frame import LocalFrame
+from sitl.earth import Earth
 from sitl.stub.flight_plan import Ending, FlightPlan, home_leg, plan_flight, starts_with_take_off
 from sitl.stub.mission_items import ACTION_NAMES, ACTIONS, MissionItem
 from sitl.stub.modes import (
@@ -40,7 +40,7 @@ class Flight:
     def __init__(
         self,
         world: World,
-        frame: LocalFrame,
+        frame: Earth,
         parameters: Parameters,
         *,
         home_altitude_m: float,

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from companion.core.frame import LocalFrame
+from sitl.earth import Earth
 from sitl.stub.mission_items import ABSOLUTE_FRAMES, ACTIONS, MissionItem
 from sitl.stub.parameters import SPEED_MAX_M_S, SPEED_MIN_M_S
 from sitl.stub.protocol import dialect
@@ -51,7 +51,7 @@ def home_leg(speed_m_s: float) -> Leg:
 
 def plan_flight(
     items: tuple[MissionItem, ...],
-    frame: LocalFrame,
+    frame: Earth,
     *,
     first_sequence: int,
     speed_m_s: float,
@@ -105,9 +105,7 @@ def _ends_there(item: MissionItem, leg: Leg, before: list[Leg]) -> bool:
     return math.hypot(leg.east_m - last.east_m, leg.north_m - last.north_m) < SAME_PLACE_M
 
 
-def _leg(
-    item: MissionItem, frame: LocalFrame, speed_m_s: float, *, zero_is_a_place: bool
-) -> Leg | None:
+def _leg(item: MissionItem, frame: Earth, speed_m_s: float, *, zero_is_a_place: bool) -> Leg | None:
     """Return the way to an item's place; none for an item without one."""
     if item.command == dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH:
         return home_leg(speed_m_s)
@@ -119,7 +117,7 @@ def _leg(
     return Leg(east_m=east_m, north_m=north_m, speed_m_s=speed_m_s, kind="spray")
 
 
-def _leg_to_zero(frame: LocalFrame, speed_m_s: float) -> Leg:
+def _leg_to_zero(frame: Earth, speed_m_s: float) -> Leg:
     """Return the way towards latitude 0, longitude 0, as far as the local frame goes."""
     latitude, longitude = math.radians(frame.latitude_deg), math.radians(frame.longitude_deg)
     course = math.atan2(-math.sin(longitude), -math.sin(latitude) * math.cos(longitude))

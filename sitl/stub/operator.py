@@ -17,6 +17,7 @@ from sitl.stub.protocol import (
     GROUND_COMPONENT,
     GROUND_SYSTEM,
     Message,
+    SigningKey,
     Speaker,
     dialect,
     sender,
@@ -43,7 +44,8 @@ class Operator:
     """Acts at each `tick`; `enabled` says whether the companion has taken the enable.
 
     With `mission_is_there` it waits for that first, and then for a companion that beats afterwards:
-    what was on the link before may have gone. `since_s` is when it began to wait.
+    what was on the link before may have gone. `since_s` is when it began to wait. Where the link is
+    signed, so is what its ground station sends.
     """
 
     def __init__(
@@ -52,8 +54,10 @@ class Operator:
         *,
         enable: bool = True,
         mission_is_there: Callable[[], bool] | None = None,
+        key: SigningKey | None = None,
         start_s: float = 0.0,
     ) -> None:
+        self._start_s = start_s
         self.step = Step.WAITING if mission_is_there is None else Step.NO_MISSION
         self.since_s = start_s
         self.enabled = False
@@ -61,7 +65,7 @@ class Operator:
         self._autopilot = autopilot
         self._enable = enable
         self._mission_is_there = mission_is_there
-        self._ground = Speaker(GROUND_SYSTEM, GROUND_COMPONENT)
+        self._ground = Speaker(GROUND_SYSTEM, GROUND_COMPONENT, key=key)
         self._heard_s: float | None = None
         self._due_s = 0.0
         autopilot.hears = self.hear
@@ -121,6 +125,7 @@ class Operator:
         if now_s < self._due_s:
             return
         self._due_s = now_s + _RETRY_S
+        self._ground.keep_time(now_s - self._start_s)
         command = dialect.MAVLink_command_long_message(
             AUTOPILOT_SYSTEM,
             COMPANION_COMPONENT,

@@ -62,6 +62,12 @@ class Speaker:
         signing = self._mavlink.signing
         signing.secret_key = _STRANGE_KEY if key is None else key.secret
         signing.timestamp = 1 if key is None else key.timestamp
+        self._first_stamp: int = signing.timestamp
+
+    def keep_time(self, passed_s: float) -> None:
+        """Stamp what is signed from now on so long after the first: late ones are not heard."""
+        signing = self._mavlink.signing
+        signing.timestamp = max(signing.timestamp, self._first_stamp + round(passed_s * 1e5))
 
     def frame(
         self, message: Message, *, mavlink1: bool = False, signed: bool | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from companion.errors import ConfigError
 from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.drives import Motors
+from sitl.flow_law import FlowLaw
 from sitl.plants import edge_plant
 from sitl.profile import load_profile
 from sitl.stub.box import ArmingBox
@@ -30,6 +31,7 @@ class SprayerOptions:
     """Which sprayer, and how it is wired: one servo channel a valve, left to right.
 
     `drive_channels` are the pump's, where it has an order of its own, and the atomisers'.
+    `flow_law` says how the flow runs between measured points; None: as the profile.
     """
 
     profile: str = "wang-2024"
@@ -41,6 +43,7 @@ class SprayerOptions:
     liquid: LiquidOptions | None = None
     seed: int = 0
     drive_channels: tuple[int, ...] = ()
+    flow_law: FlowLaw | None = None
 
 
 class _Both:
@@ -60,6 +63,8 @@ class Sprayer:
 
     def __init__(self, options: SprayerOptions, *, start_s: float) -> None:
         profile = load_profile(options.profile)
+        if options.flow_law is not None:
+            profile = replace(profile, flow_law=options.flow_law)
         if len(options.channels) != profile.valve_count:
             raise ConfigError(
                 f"the configuration wires {len(options.channels)} valves, the sprayer "

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
+from sitl.earth import Earth
 from sitl.stub.sprayer import Sprayer
 from sitl.stub.world import Pose, World
 
@@ -30,7 +30,7 @@ _PATH_S = 0.01  # the vehicle's own step; between two of them the path is as goo
 class TruthLog:
     """Notes from when to when was flown; everything else is worked out at the end."""
 
-    def __init__(self, world: World, sprayer: Sprayer, home: LocalFrame) -> None:
+    def __init__(self, world: World, sprayer: Sprayer, home: Earth) -> None:
         self.from_s: float | None = None
         self.until_s = 0.0
         self.distance_m = 0.0

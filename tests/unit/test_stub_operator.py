@@ -6,7 +6,8 @@ from typing import Any
 
 from sitl.stub.modes import AUTO, LAND, Phase
 from sitl.stub.operator import Operator, Step
-from sitl.stub.protocol import dialect
+from sitl.stub.protocol import Listener, SigningKey, Speaker, dialect
+from sitl.stub.scenario import Scenario
 from tests.unit.stub_bench import Bench, mission
 
 ACK = dialect.MAVLink_command_ack_message(dialect.MAV_CMD_DO_SPRAYER, 0, 0, 0, 255, 190)
@@ -107,3 +108,24 @@ def test_a_vehicle_that_refuses_is_not_asked_at_every_moment() -> None:
     flown.run(14.0)
     assert flown.operator.step is Step.SETTLING
     assert len(flown.bench.companion.of("STATUSTEXT")) <= 8
+
+
+def test_its_enable_is_signed_where_the_link_is() -> None:
+    """A companion with the key set hears nobody who does not sign."""
+    secret = bytes(range(1, 33))
+    bench = Bench(scenario=Scenario(signing_key=secret), items=mission((0.0, 60.0)))
+    frames: list[bytes] = []
+    bench.companion.channel.send = frames.append
+    operator = Operator(bench.autopilot, key=bench.autopilot.key)
+    operator.hear(_beat(), bench.now_s)
+    for _ in range(400):
+        bench.run(0.02)
+        operator.tick(bench.now_s)
+    heard = Listener(SigningKey(secret=secret, timestamp=0)).messages(b"".join(frames))
+    orders = [each for each in heard if each.get_type() == "COMMAND_LONG"]
+    assert [order.command for order in orders[:1]] == [dialect.MAV_CMD_DO_SPRAYER]
+
+
+def _beat() -> Any:
+    beat = dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    return Listener().messages(Speaker(1, 191).frame(beat))[0]

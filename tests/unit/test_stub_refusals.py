@@ -9,9 +9,9 @@ from typing import Literal
 
 import pytest
 
-from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
 from missions.files.plan_rules import plan_problems
+from sitl.earth import Earth
 from sitl.serve_mission import mission_items
 from sitl.stub.flight_plan import plan_flight
 from sitl.stub.mission_file import read_mission
@@ -108,7 +108,7 @@ def test_a_landing_at_zero_is_here_to_ardupilot_and_far_away_to_px4() -> None:
 def test_every_example_is_taken_and_stays_near_its_home(autopilot: Personality, path: Path) -> None:
     items = read_mission(path)
     assert answer(Bench(autopilot=autopilot), of_firmware(autopilot, items)) == 0
-    home = LocalFrame(items[0].latitude_deg, items[0].longitude_deg)
+    home = Earth(items[0].latitude_deg, items[0].longitude_deg)
     placed = [item for item in items[1:] if item.frame != dialect.MAV_FRAME_MISSION]
     assert placed
     for item in placed:

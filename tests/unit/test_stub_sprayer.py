@@ -70,3 +70,16 @@ def test_a_pump_behind_its_output_feeds_the_sections_that_are_open() -> None:
 def test_a_configuration_with_other_motors_is_refused() -> None:
     with pytest.raises(ConfigError, match="wires 0 motors"):
         Sprayer(SprayerOptions(profile="pump-sections"), start_s=0.0)
+
+
+def test_the_law_between_the_measured_points_can_be_chosen() -> None:
+    """At a duty of 0.22, between two points of Table 2; a profile's own law is the smooth one."""
+    litres = {}
+    for law in (None, "smooth", "straight", "offset"):
+        sprayer = Sprayer(SprayerOptions(flow_law=law), start_s=0.0)
+        for channel in sprayer.options.channels:
+            sprayer.take(ServoOrder(at_s=1.0, channel=channel, pulse_us=1220))
+        sprayer.advance(11.0)
+        litres[law] = sprayer.volume_l(11.0)
+    assert litres[None] == litres["smooth"]
+    assert len({round(value, 4) for value in litres.values()}) == 3

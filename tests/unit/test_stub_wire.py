@@ -155,6 +155,19 @@ def test_a_signed_link_hears_only_who_knows_the_key() -> None:
     assert heard == ["COMMAND_ACK"]
 
 
+def test_the_stamps_of_a_signed_link_keep_the_time() -> None:
+    """Who comes later hears no stream that is a minute behind."""
+    bench = Bench(scenario=Scenario(signing_key=SECRET), signing_time=1000)
+    bench.run(0.1)
+    began_s = bench.now_s
+    for _ in range(70):
+        bench.run(1.0)
+    frames = raw_frames(bench)
+    bench.run(1.0)
+    stamp = int.from_bytes(frames[0][-12:-6], "little")
+    assert stamp / 1e5 == pytest.approx(bench.now_s - began_s, abs=2.0)
+
+
 # --------------------------------------------------------------------------------- other senders
 
 

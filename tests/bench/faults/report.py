@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from tests.bench.faults.place import ROOT
 
 PAGE = ROOT / "docs" / "safety.md"
 BEGIN, END = "<!-- fault campaign: begin -->", "<!-- fault campaign: end -->"
+PROSE_WIDTH = 120
 _OUTPUTS = {"gpio": "GPIO", "script": "servo, script", "dither": "servo, dither"}
 
 
@@ -72,7 +74,7 @@ def page(found: dict[str, Any]) -> str:
     """Return the text between the markers."""
     table = "\n".join(_lines(found["rows"]))
     wrong, not_flown = len(found["wrong"]), len(found["not_flown"])
-    return (
+    words = (
         f"`{found['command']}`: {found['flights']} flights, seed {found['seed']}, "
         f"{found['lanes']} at a time, {found['wall_s'] / 60.0:.0f} min; "
         f"{wrong or 'no'} limit{'' if wrong == 1 else 's'} broken, "
@@ -82,9 +84,11 @@ def page(found: dict[str, Any]) -> str:
         f"The computer: the vehicle was late by {_ms(found['vehicle_late_median_s'])} at worst in "
         f"the median flight, {_ms(found['vehicle_late_worst_s'])} in the worst; while it was "
         f"watched the companion waited for a core for {_ms(found['companion_waited_median_s'])} in "
-        f"all (median), {_ms(found['companion_waited_worst_s'])} (worst).\n\n"
-        f"{table}"
+        f"all (median), {_ms(found['companion_waited_worst_s'])} (worst)."
     )
+    # Hyphens and the command stay whole.
+    prose = textwrap.fill(words, PROSE_WIDTH, break_on_hyphens=False, break_long_words=False)
+    return f"{prose}\n\n{table}"
 
 
 def _ms(time_s: float) -> str:
