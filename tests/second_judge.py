@@ -48,7 +48,7 @@ class Truth:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What the second judge found."""
+    """What the second judge found; no accuracy where the whole boom was never in the field."""
 
     lag_m: tuple[float, ...]
     missed: int
@@ -216,12 +216,11 @@ def judge(truth: Truth, ground: Ground) -> Verdict:
         wanted += strip.rates * ML_PER_M * strip.across * run_m / period_s
         counts &= moves
     counts &= wanted > 0.0
+    right = 1.0 - np.abs(given - wanted)[counts] / wanted[counts]
     return Verdict(
         lag_m=tuple(lag for its, _ in found for lag in its),
         missed=sum(missed for _, missed in found),
         misapplied_percent=100.0 * wrong_ml / asked_ml,
-        accuracy_percent=float(
-            100.0 * (1.0 - np.abs(given - wanted)[counts] / wanted[counts]).mean()
-        ),
+        accuracy_percent=100.0 * float(right.mean()) if len(right) else float("nan"),
         off_target_ml=sum(strip.off_target_ml(ground) for strip in strips),
     )

@@ -29,11 +29,17 @@ class Judged(NamedTuple):
     other: Verdict
 
 
-def judged(fidelity: Fidelity, law: FlowLaw, *, until_s: float = PASS_S) -> Judged:
-    """Fly the first pass of the demo, and have both judge it."""
+def judged(fidelity: Fidelity, law: FlowLaw, *, aside_m: float = 0.0) -> Judged:
+    """Fly the first pass of the demo, or to its left, and have both judge it."""
     setup = replace(demo_setup(5.0), lag=demo_lags("gpio"))
     path = demo_trajectory(5.0, 1)
-    cut = path.at(path.time_s[path.time_s < path.time_s[0] + until_s])
+    cut = path.at(path.time_s[path.time_s < path.time_s[0] + PASS_S])
+    left = np.radians(cut.heading_deg - 90.0)
+    cut = replace(
+        cut,
+        east_m=cut.east_m + aside_m * np.sin(left),
+        north_m=cut.north_m + aside_m * np.cos(left),
+    )
     options = FlightOptions(fidelity=fidelity, flow_law=law)
     record = fly(setup, cut, WANG, options, speed_m_s=5.0).record
     origin = (setup.frame.latitude_deg, setup.frame.longitude_deg)
@@ -76,6 +82,15 @@ def test_a_flight_is_judged_as_it_is(pulsed: Judged) -> None:
     assert abs(other.lag_mean_m) < 0.025
     assert other.misapplied_percent < 2.6
     assert other.accuracy_percent > 97.5
+    assert other.off_target_ml < 0.01
+
+
+def test_a_flight_beside_its_pass_is_judged_as_it_is() -> None:
+    """Two of its valves hang over the border: who takes left for right sprays there."""
+    _, other = judged("averaged", "straight", aside_m=2.1)
+    assert other.missed == 0
+    assert other.lag_mean_abs_m < 0.05
+    assert other.misapplied_percent < 4.0
     assert other.off_target_ml < 0.01
 
 
