@@ -17,7 +17,7 @@ from companion.maps.convert.formats import Wish, keeps_cells
 from companion.maps.convert.writers import write_map, writer_for
 from companion.maps.model import MapFile, Problem, map_error
 from companion.maps.registry import read_map
-from companion.maps.totals import as_sprayed, totals
+from companion.maps.totals import totals
 
 # What a conversion may change of a rate; files hold three decimals or more.
 CHANGE_MAX_L_HA = 0.01
@@ -192,7 +192,7 @@ def _result(
     file: Path, out: Path, files: list[Path], format_name: str, source: MapFile, checked: _Checked
 ) -> dict[str, Any]:
     written = checked.written
-    after, before = totals(as_sprayed(written)), totals(as_sprayed(source))
+    after, before = totals(written), totals(source)
     problems = list(source.problems)
     if format_name in _OF_CELLS:
         problems += _area_problems(out, after.area_ha, before.area_ha)

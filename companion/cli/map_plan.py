@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from shapely import MultiPolygon
+
 from companion.assembly import above_label, undelivered
 from companion.cli.answer import note
 from companion.config import Config
@@ -26,18 +28,17 @@ def plan_of(config: Config | None, home: tuple[float, float] | None) -> tuple[Pl
     table, mission = config.prescription, config.mission
     if home is None and mission is not None:
         homes = mission.depots
-    boundary, problems = None, []
-    if table is not None and table.boundary is not None:
-        path = config.resolve(table.boundary)
-        try:
-            boundary = read_area(path)
-        except MapError as error:
-            if error.code == "no-file":
-                note(f"prescription.boundary: {path} is not there; the map is checked without it")
-            else:
-                problems.append(_refused_boundary(error))
+    problems: list[Problem] = []
+    boundary, exclusions = None, []
+    if table is not None:
+        if table.boundary is not None:
+            boundary = _area(config, table.boundary, "prescription.boundary", problems)
+        for number, name in enumerate(table.exclusions):
+            area = _area(config, name, f"prescription.exclusions[{number}]", problems)
+            exclusions += [] if area is None else [area]
     plan = Plan(
         boundary=boundary,
+        exclusions=tuple(exclusions),
         default_rate_l_ha=None if table is None else table.default_rate_l_ha,
         homes=homes,
         sprayer=_sprayer(config),
@@ -45,12 +46,26 @@ def plan_of(config: Config | None, home: tuple[float, float] | None) -> tuple[Pl
     return plan, problems
 
 
-def _refused_boundary(error: MapError) -> Problem:
+def _area(config: Config, name: str, key: str, problems: list[Problem]) -> MultiPolygon | None:
+    """Return a boundary or an exclusion, or None with what is wrong with it."""
+    path = config.resolve(name)
+    try:
+        return read_area(path)
+    except MapError as error:
+        if error.code == "no-file":
+            note(f"{key}: {path} is not there; the map is checked without it")
+        else:
+            problems.append(_refused_area(error, key))
+    return None
+
+
+def _refused_area(error: MapError, key: str) -> Problem:
+    what = "the boundary" if key == "prescription.boundary" else "an exclusion"
     return Problem(
         severity="error",
         code=error.code,
-        text=f"the boundary cannot be used: {str(error).removesuffix('; ' + error.fix)}",
-        where="prescription.boundary",
+        text=f"{what} cannot be used: {str(error).removesuffix('; ' + error.fix)}",
+        where=key,
         fix=error.fix,
     )
 

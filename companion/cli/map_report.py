@@ -35,12 +35,20 @@ def _extent(result: Mapping[str, Any]) -> str:
         along, across = result["cell_m"]
         return (
             f"{result['rows']} rows x {result['columns']} columns of cells, {along:.2f} m x "
-            f"{across:.2f} m; {result['zones']} have a rate, {result['area_ha']:.4f} ha"
+            f"{across:.2f} m; {result['zones']} have a rate, {_area(result)}"
         )
     zones, parts, holes = (counted(result[f"{name}s"], name) for name in ("zone", "part", "hole"))
     in_parts = f" in {parts}" if result["parts"] != result["zones"] else ""
     with_holes = f" with {holes}" if result["holes"] else ""
-    return f"{zones}{in_parts}{with_holes}, {result['area_ha']:.4f} ha"
+    return f"{zones}{in_parts}{with_holes}, {_area(result)}"
+
+
+def _area(result: Mapping[str, Any]) -> str:
+    """Return the ground that is sprayed, and that of the file where it reaches further."""
+    own, inside = result["map_area_ha"], result["area_ha"]
+    if abs(own - inside) <= 5e-5:
+        return f"{inside:.4f} ha"
+    return f"{own:.4f} ha, {inside:.4f} ha to spray"
 
 
 def _rates(result: Mapping[str, Any]) -> str:

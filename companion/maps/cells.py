@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
+from shapely import MultiPolygon
 
 from companion.core.cells import DEGREE_MAX, NO_RATE, CellGrid, Warp, monomials
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
-from companion.maps.crs import WGS84, is_wgs84
+from companion.maps.crs import (
+    METRES_PER_DEGREE,
+    SEGMENT_M,
+    WGS84,
+    Objects,
+    densified,
+    is_wgs84,
+)
 from companion.maps.crs_place import check_extent
 from companion.maps.model import Affine, MapCells, map_error
 
@@ -26,6 +36,8 @@ USABLE_MAX_M = 1e-3
 # Cells smaller than this are below what any receiver can tell apart.
 CELL_MIN_M = 0.05
 BLOCK_CELLS = 200_000
+# A share of a cell below what rounding leaves where thousands of edges add up.
+SHARE_ZERO = 1e-9
 
 
 def corner(transform: Affine, column: Floats, row: Floats) -> tuple[Floats, Floats]:
@@ -126,6 +138,89 @@ def cell_areas_m2(cells: MapCells, frame: LocalFrame) -> Floats:
         falling = (east[1:, :-1] - east[:-1, 1:]) * (north[1:, 1:] - north[:-1, :-1])
         areas[first:last] = np.abs(rising - falling) / 2.0
     return areas
+
+
+def numbered(areas: Sequence[MultiPolygon], cells: MapCells) -> Objects:
+    """Return areas of longitude and latitude in columns and rows of the cells."""
+    native: Objects = np.array(areas, dtype=object)
+    to_crs = None
+    if not is_wgs84(cells.crs):
+        to_crs = _transformer(WGS84, cells.crs)
+        native = densified(native, SEGMENT_M / METRES_PER_DEGREE)
+    a, b, c, d, e, f = cells.transform
+    size = a * e - b * d
+
+    def number(points: Floats) -> Floats:
+        x, y = points.T if to_crs is None else to_crs.transform(points[:, 0], points[:, 1])
+        return np.column_stack(
+            [(e * (x - c) - b * (y - f)) / size, (a * (y - f) - d * (x - c)) / size]
+        )
+
+    result: Objects = shapely.transform(native, number)
+    return result
+
+
+def shares_inside(cells: MapCells, area: MultiPolygon) -> Floats:
+    """Return which share of every cell (rows, columns) lies in ground of longitude and latitude.
+
+    Exact for polygons: every edge, cut where it leaves a cell, adds the part of that cell to its
+    right, and all cells further right; what adds up along a row is the share (the area to the
+    right of a closed ring's edges, as Green's theorem has it).
+    """
+    rows, columns = cells.rates_l_ha.shape
+    parts = shapely.orient_polygons(shapely.get_parts(numbered([area], cells)))
+    points, ring = shapely.get_coordinates(shapely.get_rings(parts), return_index=True)
+    same = np.flatnonzero(ring[1:] == ring[:-1])
+    start, end = points[same], points[same + 1]
+    crossed = np.abs(np.clip(end, 0, (columns, rows)) - np.clip(start, 0, (columns, rows)))
+    pieces = np.cumsum(crossed.sum(axis=1) + 4.0)
+    shares = np.zeros((rows, columns + 2))
+    first = 0
+    while first < len(start):
+        done = pieces[first - 1] if first else 0.0
+        last = max(int(np.searchsorted(pieces, done + BLOCK_CELLS, side="right")), first + 1)
+        _add_edges(shares, start[first:last], end[first:last])
+        first = last
+    inside = np.cumsum(shares[:, :columns], axis=1, out=shares[:, :columns])
+    # Rounding along a row is no ground, and a cell that is inside is wholly so.
+    inside[np.abs(inside) < SHARE_ZERO] = 0.0
+    inside[np.abs(inside - 1.0) < SHARE_ZERO] = 1.0
+    return np.clip(inside, 0.0, 1.0)
+
+
+def _add_edges(shares: Floats, start: Floats, end: Floats) -> None:
+    """Add what lies to the right of each edge; an edge upwards has its ground on the left."""
+    rows, columns = shares.shape[0], shares.shape[1] - 2
+    edges = np.arange(len(start))
+    owner, at = [edges, edges], [np.zeros(len(start)), np.ones(len(start))]
+    for axis, limit in ((0, columns), (1, rows)):
+        low = np.clip(np.minimum(start[:, axis], end[:, axis]), 0, limit)
+        high = np.clip(np.maximum(start[:, axis], end[:, axis]), 0, limit)
+        line = np.ceil(low).astype(np.int64)
+        count = np.maximum(np.floor(high).astype(np.int64) - line + 1, 0)
+        owns = np.repeat(edges, count)
+        step = np.arange(len(owns)) - np.repeat(np.cumsum(count) - count, count)
+        way = (end - start)[owns, axis]
+        slanted = way != 0.0
+        owns, step, way = owns[slanted], step[slanted], way[slanted]
+        owner.append(owns)
+        at.append(np.clip((line[owns] + step - start[owns, axis]) / way, 0.0, 1.0))
+    edge, share = np.concatenate(owner), np.concatenate(at)
+    order = np.lexsort((share, edge))
+    edge, share = edge[order], share[order]
+    place = start[edge] + share[:, None] * (end - start)[edge]
+    piece = np.flatnonzero(edge[1:] == edge[:-1])
+    one, two = place[piece], place[piece + 1]
+    middle = (one + two) / 2.0
+    met = (middle[:, 1] > 0.0) & (middle[:, 1] < rows)
+    rise = (one[:, 1] - two[:, 1])[met]
+    x = np.clip(middle[met, 0], 0.0, columns)
+    row = np.minimum(middle[met, 1].astype(np.int64), rows - 1)
+    column = x.astype(np.int64)
+    flat = row * (columns + 2) + column
+    right = column + 1.0 - x
+    for index, weight in ((flat, rise * right), (flat + 1, rise * (1.0 - right))):
+        np.add.at(shares.reshape(-1), index, weight)
 
 
 def cell_size_m(cells: MapCells, frame: LocalFrame) -> tuple[float, float]:

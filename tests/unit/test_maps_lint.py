@@ -444,18 +444,20 @@ def test_a_stripe_aslant_is_as_short_as_the_passes_find_it() -> None:
 
 
 def test_the_summary_of_zones_adds_up() -> None:
-    found = summary(a_map((HOLED, 10.0), (cell(5), 0.0), (cell(7), None), boundary=cell(0)))
+    field = cell(0, width=8, height=3)
+    found = summary(a_map((HOLED, 10.0), (cell(5), 0.0), (cell(7), None), boundary=field))
     one_ha = WIDTH_M * HEIGHT_M / 10_000
     assert (found["zones"], found["parts"], found["holes"]) == (3, 3, 1)
     assert found["area_ha"] == pytest.approx(9 * one_ha, rel=1e-3)
-    assert found["zero_ha"] == pytest.approx(found["no_rate_ha"])
+    assert found["zero_ha"] == pytest.approx(found["no_rate_ha"], rel=1e-5)
     assert found["zero_ha"] == pytest.approx(one_ha, rel=1e-3)
     assert found["litres"] == pytest.approx(80 * one_ha, rel=1e-3)
     assert found["mean_rate_l_ha"] == pytest.approx(80 / 9, rel=1e-3)
     assert (found["rows"], found["columns"], found["cell_m"]) == (None, None, None)
     assert found["bounds"] == pytest.approx([WEST, SOUTH, WEST + 8 * CELL, SOUTH + 3 * CELL])
     assert found["boundary_from"] == "map"
-    assert found["boundary_ha"] == pytest.approx(one_ha, rel=1e-3)
+    assert found["boundary_ha"] == pytest.approx(24 * one_ha, rel=1e-3)
+    assert found["map_area_ha"] == pytest.approx(found["area_ha"], rel=1e-5)
 
 
 def test_the_summary_of_cells_counts_those_with_a_rate() -> None:

@@ -13,7 +13,7 @@ from pyproj import Transformer
 from shapely import MultiPolygon
 
 from companion.maps.build import frame_for
-from companion.maps.cells import bounds_deg, cell_size_m
+from companion.maps.cells import bounds_deg, cell_size_m, numbered
 from companion.maps.convert.scan import painted, spans_of
 from companion.maps.crs import WGS84
 from companion.maps.local import make_valid, project_all
@@ -98,7 +98,7 @@ def in_field(cells: MapCells, map_file: MapFile, *, clip: bool) -> MapCells:
     if default is not None:
         cells = _reaching(cells, map_file.boundary, map_file.path)
     rows, columns = cells.rates_l_ha.shape
-    spans = spans_of(_numbered([map_file.boundary], cells), (rows, columns), path=map_file.path)
+    spans = spans_of(numbered([map_file.boundary], cells), (rows, columns), path=map_file.path)
     flat = np.zeros(rows * columns, dtype=np.bool_)
     for _, cell in painted(spans, columns, path=map_file.path):
         flat[cell] = True
@@ -112,7 +112,7 @@ def in_field(cells: MapCells, map_file: MapFile, *, clip: bool) -> MapCells:
 def _reaching(cells: MapCells, boundary: MultiPolygon, path: Path) -> MapCells:
     """Return the cells with more of them around, without a rate, as far as the boundary reaches."""
     rows, columns = cells.rates_l_ha.shape
-    west, south, east, north = shapely.total_bounds(_numbered([boundary], cells))
+    west, south, east, north = shapely.total_bounds(numbered([boundary], cells))
     before = max(math.ceil(-south - 0.5), 0), max(math.ceil(-west - 0.5), 0)
     after = max(math.ceil(north - rows - 0.5), 0), max(math.ceil(east - columns - 0.5), 0)
     if not (rows + before[0] + after[0]) * (columns + before[1] + after[1]) <= MAX_CELLS:
@@ -171,24 +171,6 @@ def _lattice(box: Box, cell_m: float, path: Path) -> tuple[tuple[int, int], Affi
             code="too-large",
         )
     return (rows, columns), (width_deg, 0.0, west, 0.0, -height_deg, north)
-
-
-def _numbered(areas: list[MultiPolygon], cells: MapCells) -> NDArray[np.object_]:
-    """Return areas of longitude and latitude in columns and rows of the cells."""
-    to_crs = None
-    if cells.crs.to_epsg() != 4326:
-        to_crs = Transformer.from_crs(WGS84, cells.crs, always_xy=True)
-    a, b, c, d, e, f = cells.transform
-    size = a * e - b * d
-
-    def number(points: Floats) -> Floats:
-        x, y = points.T if to_crs is None else to_crs.transform(points[:, 0], points[:, 1])
-        return np.column_stack(
-            [(e * (x - c) - b * (y - f)) / size, (a * (y - f) - d * (x - c)) / size]
-        )
-
-    result: NDArray[np.object_] = shapely.transform(np.array(areas, dtype=object), number)
-    return result
 
 
 def _of_zones(map_file: MapFile, shape: tuple[int, int], transform: Affine, overlap: str) -> Floats:

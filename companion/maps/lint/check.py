@@ -16,6 +16,7 @@ from companion.maps.lint.shapes import overlap_problems, shape_problems
 from companion.maps.lint.short import short_problems
 from companion.maps.lint.survey import Survey
 from companion.maps.model import MapFile, Problem, map_error
+from companion.maps.totals import Totals, totals
 
 
 def check_map(
@@ -26,7 +27,7 @@ def check_map(
     Overlaps are an error only where the overlap policy refuses them.
     """
     plan = plan or Plan()
-    return _checked(Survey(map_file, boundary=plan.boundary), overlap, plan)
+    return _checked(_survey(map_file, plan), overlap, plan)
 
 
 def summary(
@@ -38,16 +39,15 @@ def summary(
 ) -> dict[str, object]:
     """Return what `map check --json` prints; `more` are problems that others found.
 
-    `area_ha` is of the zones or cells that have a rate, each counted once, in the map's local
-    frame; `litres` is area times rate, likewise.
+    `area_ha` is the ground that has a rate and may be sprayed, and `litres` what it takes, both as
+    `totals` has them; `map_area_ha` is the ground of the file's own zones or cells with a rate,
+    inside the boundary and outside.
     """
     plan = plan or Plan()
-    survey = Survey(map_file, boundary=plan.boundary)
+    survey = _survey(map_file, plan)
     problems = _worst_first([*_checked(survey, overlap, plan), *_placed(survey, more)])
-    rates, area_m2 = survey.rates[survey.rated], survey.area_m2[survey.rated]
     parts = shapely.get_parts(np.array([zone.geometry for zone in map_file.zones], dtype=object))
-    litres = float((rates * area_m2).sum()) / 10_000.0
-    total_m2 = float(area_m2.sum())
+    found = _totals(survey, overlap, plan)
     return {
         "ok": not any(problem.severity == "error" for problem in problems),
         "path": str(map_file.path),
@@ -59,14 +59,15 @@ def summary(
         "parts": len(parts),
         "holes": int(shapely.get_num_interior_rings(parts).sum()),
         **_shape(survey),
-        "area_ha": total_m2 / 10_000.0,
-        "zero_ha": survey.hectares(survey.rates == 0.0),
+        "area_ha": found.area_ha,
+        "map_area_ha": float(survey.area_m2[survey.rated].sum()) / 10_000.0,
+        "zero_ha": float(found.areas_ha[found.rates_l_ha == 0.0].sum()),
         "no_rate_ha": survey.hectares(~survey.rated) if map_file.cells is None else None,
         "boundary_ha": None if survey.boundary is None else survey.boundary.area / 10_000.0,
         "boundary_from": _boundary_from(map_file, plan),
         "default_rate_l_ha": _default(survey, plan),
-        "litres": litres,
-        "mean_rate_l_ha": 10_000.0 * litres / total_m2 if total_m2 > 0.0 else None,
+        "litres": found.all_litres,
+        "mean_rate_l_ha": found.all_litres / found.area_ha if found.area_ha > 0.0 else None,
         "rates_l_ha": list(map_file.rates_l_ha),
         "bounds": list(survey.bounds_deg),
         "sha256": map_file.sha256,
@@ -81,6 +82,24 @@ def summary(
             for problem in problems
         ],
     }
+
+
+def _survey(map_file: MapFile, plan: Plan) -> Survey:
+    return Survey(map_file, boundary=plan.boundary, exclusions=plan.exclusions)
+
+
+def _totals(survey: Survey, overlap: str, plan: Plan) -> Totals:
+    try:
+        return totals(
+            survey.map_file,
+            boundary=plan.boundary,
+            default_rate_l_ha=plan.default_rate_l_ha,
+            exclusions=plan.exclusions,
+            overlap=overlap,
+            frame=survey.frame,
+        )
+    except ShapelyError as error:
+        raise _unusable(survey.map_file, error) from None
 
 
 def _checked(survey: Survey, overlap: str, plan: Plan) -> tuple[Problem, ...]:

@@ -45,9 +45,11 @@ class Plan:
     """Where the field and the home are, in longitude and latitude, and what flies there.
 
     `boundary` and `default_rate_l_ha` stand above the map's own; homes are (latitude, longitude).
+    Nothing falls on `exclusions`.
     """
 
     boundary: MultiPolygon | None = None
+    exclusions: tuple[MultiPolygon, ...] = ()
     default_rate_l_ha: float | None = None
     homes: tuple[tuple[float, float], ...] = ()
     sprayer: Sprayer | None = None

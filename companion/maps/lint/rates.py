@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from shapely import Geometry, Polygon
 
-from companion.maps.cells import to_degrees
+from companion.maps.cells import shares_inside, to_degrees
 from companion.maps.lint.survey import Survey, area_text
 from companion.maps.local import project
 from companion.maps.model import MapCells, Problem
@@ -152,7 +152,7 @@ def _of_zones(survey: Survey, boundary: Geometry) -> Ground:
 
 
 def _of_cells(survey: Survey, cells: MapCells, boundary: Geometry) -> Ground:
-    """Return the same for cells, each by its centre, and for ground beyond the rows and columns."""
+    """Return the same for cells, and for ground beyond the rows and columns."""
     rows, columns = survey.rates.shape
     longitude, latitude = to_degrees(
         cells, np.array([0.0, columns, columns, 0.0]), np.array([0.0, 0.0, rows, rows])
@@ -162,8 +162,13 @@ def _of_cells(survey: Survey, cells: MapCells, boundary: Geometry) -> Ground:
     bare = survey.cells_inside & ~survey.rated
     outside = ~survey.cells_inside & survey.rated & (survey.rates > 0.0)
     where = survey.cell_spots(bare) or _largest(survey, beyond)
-    empty_m2 = beyond.area + float(survey.area_m2[bare].sum())
-    return (empty_m2, where), (float(survey.area_m2[outside].sum()), survey.cell_spots(outside))
+    share_m2 = survey.area_m2
+    if survey.boundary_deg is not None:
+        share_m2 = shares_inside(cells, survey.boundary_deg) * survey.area_m2
+    empty_m2 = beyond.area + float(share_m2[~survey.rated].sum())
+    sprayed = survey.rated & (survey.rates > 0.0)
+    outside_m2 = float((survey.area_m2 - share_m2)[sprayed].sum())
+    return (empty_m2, where), (outside_m2, survey.cell_spots(outside))
 
 
 def _largest(survey: Survey, ground: Geometry) -> str:

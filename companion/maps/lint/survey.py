@@ -14,6 +14,7 @@ from companion.maps.build import frame_for
 from companion.maps.cells import cell_areas_m2, cell_size_m, to_degrees
 from companion.maps.local import make_valid, project, project_all
 from companion.maps.model import MapCells, MapFile, MapZone
+from companion.maps.totals import Ground, inside_m2
 
 Objects = NDArray[np.object_]
 Floats = NDArray[np.float64]
@@ -34,10 +35,18 @@ class Survey:
     Args:
         map_file: the map.
         boundary: where spraying is allowed, in longitude and latitude; the map's own without it.
+        exclusions: where it is not, in longitude and latitude.
     """
 
-    def __init__(self, map_file: MapFile, *, boundary: MultiPolygon | None = None) -> None:
+    def __init__(
+        self,
+        map_file: MapFile,
+        *,
+        boundary: MultiPolygon | None = None,
+        exclusions: Sequence[MultiPolygon] = (),
+    ) -> None:
         self.map_file = map_file
+        self.exclusions = tuple(exclusions)
         self.frame = frame_for(map_file)
         self.boundary_deg = map_file.boundary if boundary is None else boundary
         if map_file.cells is None:
@@ -70,6 +79,11 @@ class Survey:
             return cell_areas_m2(self.cells, self.frame)
         found: Floats = shapely.area(self.local)
         return found
+
+    @cached_property
+    def inside_m2(self) -> Floats:
+        """Return how much of every zone or cell may be sprayed."""
+        return inside_m2(self.map_file, Ground.of(self.boundary_deg, self.exclusions), self.frame)
 
     @cached_property
     def rated(self) -> Bools:
@@ -143,8 +157,8 @@ class Survey:
         return inside.reshape(self.rates.shape)
 
     def hectares(self, which: Bools) -> float:
-        """Return the ground of some zones or cells [ha]."""
-        return float(self.area_m2[which].sum()) / 10_000.0
+        """Return the ground of some zones or cells that may be sprayed [ha]."""
+        return float(self.inside_m2[which].sum()) / 10_000.0
 
     def zone_name(self, index: int) -> str:
         """Return what a zone is called in a sentence; a mere number says that it is a zone."""

@@ -90,7 +90,7 @@ def _drawn(map_file: MapFile, title: str, suffix: str) -> tuple[bytes, Totals]:
 
     sprayed = as_sprayed(map_file)
     frame = frame_for(sprayed)
-    found = totals(sprayed, frame)
+    found = totals(map_file, frame=frame)
     with rc_context({"font.family": _FONT, "svg.hashsalt": "vrspray", "hatch.linewidth": 0.6}):
         figure = _figure(sprayed, frame, found, title)
         content = BytesIO()
@@ -118,7 +118,10 @@ def _figure(map_file: MapFile, frame: LocalFrame, found: Totals, title: str) -> 
     for spine in axes.spines.values():
         spine.set_color("0.75")
     colours = Colours.of(found.rates_l_ha)
-    bare = draw_ground(axes, map_file, frame, colours, metres_per_inch=sheet.metres_per_inch)
+    bare = draw_ground(
+        axes, map_file, frame, colours,
+        metres_per_inch=sheet.metres_per_inch, rated_ha=found.area_ha,
+    )  # fmt: skip
     axes.set_xlim(west, east)
     axes.set_ylim(south, north)
     _scale(axes, sheet)

@@ -22,7 +22,7 @@ from companion.maps.cells import to_degrees
 from companion.maps.convert.cell_zones import zones_of
 from companion.maps.local import project, project_all
 from companion.maps.model import Floats, MapCells, MapFile, MapZone
-from companion.maps.totals import M2_PER_HA, totals
+from companion.maps.totals import M2_PER_HA
 
 Objects = NDArray[np.object_]
 Colour = tuple[float, float, float, float]
@@ -81,14 +81,20 @@ class Colours:
 
 
 def draw_ground(
-    axes: Axes, map_file: MapFile, frame: LocalFrame, colours: Colours, *, metres_per_inch: float
+    axes: Axes,
+    map_file: MapFile,
+    frame: LocalFrame,
+    colours: Colours,
+    *,
+    metres_per_inch: float,
+    rated_ha: float,
 ) -> bool:
     """Draw zones or cells and the boundary; return whether there is ground without a rate."""
     bare = any(zone.rate_l_ha is None for zone in map_file.zones)
     outline = None if map_file.boundary is None else project(map_file.boundary, frame)
     if outline is not None:
         _hatched(axes, [outline], edge="none")
-        bare = bare or _is_partly_bare(map_file, frame, outline.area)
+        bare = bare or not M2_PER_HA * rated_ha >= (1.0 - _BARE_SHARE) * outline.area
     if map_file.cells is not None:
         _draw_cells(axes, map_file.cells, frame, colours)
         _draw_zero(axes, map_file.cells, frame)
@@ -136,11 +142,6 @@ def _hatched(axes: Axes, areas: Sequence[shapely.Geometry], *, edge: str) -> Non
             ),
             autolim=False,
         )
-
-
-def _is_partly_bare(map_file: MapFile, frame: LocalFrame, field_m2: float) -> bool:
-    rated_m2 = M2_PER_HA * totals(map_file, frame).area_ha
-    return not rated_m2 >= (1.0 - _BARE_SHARE) * field_m2
 
 
 def _draw_zones(axes: Axes, zones: Sequence[MapZone], frame: LocalFrame, colours: Colours) -> None:
