@@ -248,7 +248,11 @@ async def _do(
         missing = work.missing()
         if missing:
             ready_s = clock()
-            if GroundReason.OUTPUTS_NEED_ARMING in missing or not ready_s < until_s:
+            if GroundReason.OUTPUTS_NEED_ARMING in missing:
+                # Waiting does not help; what else is missing may only not have been heard yet.
+                missing = frozenset({GroundReason.OUTPUTS_NEED_ARMING})
+                until_s = ready_s
+            if not ready_s < until_s:
                 return GroundOutcome(reasons=missing, open_s=0.0, has_begun=False, text=work.fault)
     link.announce(f"ground work: {task.kind}")
     on_ready()

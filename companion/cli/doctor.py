@@ -157,7 +157,6 @@ def _vehicle(
             link,
             config.link.url,
             options=options,
-            position_rate_hz=config.link.position_rate_hz,
             wait_s=wait_s,
         )
     )

@@ -20,7 +20,6 @@ from companion.core.types import (
 )
 from companion.doctor.vehicle_facts import Heard, Position, Rate
 from companion.errors import LinkError
-from companion.link.streams import wanted_streams
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_check import ardupilot_places
 from companion.output.autopilot_findings import more_parameters, wanted_parameters
@@ -132,7 +131,6 @@ async def listen(
     url: str,
     *,
     options: ServoOptions | None,
-    position_rate_hz: float,
     wait_s: float,
     clock: Callable[[], float] = time.monotonic,
 ) -> Heard:
@@ -152,9 +150,7 @@ async def listen(
     except LinkError as error:
         return Heard(url=url, refused=str(error))
     try:
-        rates, is_ordered = await _attend(
-            link, ear, wake, options, position_rate_hz, began_s + wait_s, clock
-        )
+        rates, is_ordered = await _attend(link, ear, wake, options, began_s + wait_s, clock)
     finally:
         await link.close()
     return _heard(link, ear, url, clock() - began_s, troubles, rates, is_ordered)
@@ -165,7 +161,6 @@ async def _attend(
     ear: Ear,
     wake: asyncio.Event,
     options: ServoOptions | None,
-    position_rate_hz: float,
     until_s: float,
     clock: Callable[[], float],
 ) -> tuple[tuple[Rate, ...], bool]:
@@ -196,13 +191,13 @@ async def _attend(
     after = link.component.codec.vehicle_counts
     rates = tuple(
         Rate(
-            name=_NAMES.get(stream.message_id, str(stream.message_id)),
+            name=_NAMES[stream.message_id],
             wanted_hz=stream.rate_hz,
             rate_hz=(after.get(stream.message_id, 0) - counts.get(stream.message_id, 0))
             / (now_s - counted_s),
         )
-        for stream in wanted_streams(position_rate_hz=position_rate_hz, is_px4=ear.is_px4)
-        if not stream.optional
+        for stream in link.component.streams
+        if stream.message_id in _NAMES and not stream.optional
     )
     return rates, is_ordered
 

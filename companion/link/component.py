@@ -36,7 +36,7 @@ from companion.link.parameters import Parameters
 from companion.link.service import OnEvent, Service
 from companion.link.signing import Signing
 from companion.link.statistics import Meter
-from companion.link.streams import StreamRequest, StreamSupervisor, wanted_streams
+from companion.link.streams import Stream, StreamRequest, StreamSupervisor, wanted_streams
 from companion.link.tank import Tank
 from companion.link.wind import WindWatch
 
@@ -63,6 +63,7 @@ class ComponentOptions:
     use_mission: bool = False
     need_mission: bool = False
     use_battery: bool = False
+    use_switch: bool = True
     watch_mission: bool = False
     may_enable: bool = True
     training: str = ""
@@ -109,6 +110,7 @@ class Component:
         self._wind = WindWatch()
         self._flies_mission = False
         self._supervisor: StreamSupervisor | None = None
+        self.streams: tuple[Stream, ...] = ()
         self._order = Order()
         self._news = News()
         self.clock = ClockExchanges()
@@ -251,13 +253,14 @@ class Component:
             self.note(f"training: {self._options.training}")
         if self._supervisor is None:
             self._supervisor = StreamSupervisor(may_group=vehicle.is_ardupilot)
-        streams = wanted_streams(
+        self.streams = wanted_streams(
             position_rate_hz=self._options.position_rate_hz,
             is_px4=vehicle.is_px4,
             with_mission=self._options.use_mission or self._options.watch_mission,
             with_battery=self._options.use_battery,
+            with_switch=self._options.use_switch,
         )
-        for request in self._supervisor.start(streams, now_s):
+        for request in self._supervisor.start(self.streams, now_s):
             self._ask(request)
 
     def _ask(self, request: StreamRequest) -> None:

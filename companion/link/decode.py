@@ -55,7 +55,10 @@ _EKF_REFUSED = 128 | 1024 | 32768  # CONST_POS_MODE, UNINITIALIZED, GPS_GLITCHIN
 _EKF_VARIANCE_MAX = 0.8
 # ESTIMATOR_STATUS_FLAGS (PX4) share the low bits; the ratios are innovations over their limits.
 _ESTIMATOR_NEEDED = 2 | 16
-_ESTIMATOR_REFUSED = 128 | 1024  # CONST_POS_MODE, GPS_GLITCH
+_ESTIMATOR_REFUSED = 1024  # GPS_GLITCH
+# From 1.16 on CONST_POS_MODE is set at rest too (ekf2, ekf_helper.cpp; measured on the ground): it
+# counts where satellites are not in use, for which PRED_POS_HORIZ_ABS stands there.
+_CONST_POS_MODE, _PRED_POS_HORIZ_ABS = 128, 512
 _ESTIMATOR_RATIO_MAX = 1.0
 
 
@@ -104,6 +107,7 @@ def _estimator(m: Any, received_s: float) -> EstimatorReport:
     healthy = (
         m.flags & _ESTIMATOR_NEEDED == _ESTIMATOR_NEEDED
         and not m.flags & _ESTIMATOR_REFUSED
+        and m.flags & (_CONST_POS_MODE | _PRED_POS_HORIZ_ABS) != _CONST_POS_MODE
         and 0.0 <= m.vel_ratio < _ESTIMATOR_RATIO_MAX
         and 0.0 <= m.pos_horiz_ratio < _ESTIMATOR_RATIO_MAX
     )

@@ -62,10 +62,12 @@ def wanted_streams(
     is_px4: bool,
     with_mission: bool = False,
     with_battery: bool = False,
+    with_switch: bool = True,
 ) -> tuple[Stream, ...]:
     """Return what the core and the statistics live on; few distinct rates, as ArduPilot likes.
 
     `with_battery`: also the battery monitors, of which a flow meter may be one.
+    `with_switch`: the pilot's channels have to come; PX4 sends none without a receiver.
     `with_mission`: also which item is flown to; PX4 has no such stream and says it by itself.
     """
     estimator, wind = (230, 231) if is_px4 else (193, 168)
@@ -76,7 +78,7 @@ def wanted_streams(
         Stream(message_id=24, rate_hz=5.0, group=_EXTENDED_STATUS),
         Stream(message_id=estimator, rate_hz=2.0, group=_EXTRA3),
         Stream(message_id=245, rate_hz=2.0, group=_EXTENDED_STATUS),
-        Stream(message_id=65, rate_hz=5.0, group=_RC_CHANNELS),
+        Stream(message_id=65, rate_hz=5.0, group=_RC_CHANNELS, optional=not with_switch),
         Stream(message_id=36, rate_hz=10.0, group=_RC_CHANNELS),
         Stream(message_id=wind, rate_hz=2.0, group=_EXTRA3, optional=True),
         Stream(message_id=132, rate_hz=10.0, group=_EXTRA3, optional=True),  # height above the crop

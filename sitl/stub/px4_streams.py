@@ -17,6 +17,8 @@ from sitl.stub.streams import COMMON, HEALTHY, LOST, estimated, version_word
 if TYPE_CHECKING:
     from sitl.stub.autopilot import Autopilot
 
+# ekf2 says CONST_POS_MODE of a vehicle at rest.
+CONST_POS_AT_REST_SINCE = (1, 16, 0)
 DEFAULT_RATES_HZ: Mapping[int, float] = {
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
     dialect.MAVLINK_MSG_ID_ATTITUDE: 100.0,
@@ -61,9 +63,11 @@ def estimator_status(autopilot: Autopilot, now_s: float) -> Message:
     lost = autopilot.estimator_lost(now_s)
     ratio = 1.5 if lost else 0.05
     accuracy_m = 25.0 if lost else 0.15
+    at_rest = autopilot.firmware.version >= CONST_POS_AT_REST_SINCE and not autopilot.flight.in_air
+    good = HEALTHY | (dialect.ESTIMATOR_CONST_POS_MODE if at_rest else 0)
     return dialect.MAVLink_estimator_status_message(
         autopilot.boot_ms(now_s) * 1000,
-        LOST if lost else HEALTHY,
+        LOST if lost else good,
         *(ratio, ratio, 0.05, 0.05, 0.0, 0.0),
         accuracy_m,
         0.3,

@@ -114,7 +114,9 @@ def companion(
         yield started
 
 
-def vrspray(*command: str, within_s: float = 120.0) -> subprocess.CompletedProcess[str]:
+def vrspray(
+    *command: str, within_s: float = 120.0, within: Path | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run a command of the program to its end."""
     return subprocess.run(
         [sys.executable, "-m", "companion", *command],
@@ -122,6 +124,7 @@ def vrspray(*command: str, within_s: float = 120.0) -> subprocess.CompletedProce
         capture_output=True,
         text=True,
         timeout=within_s,
+        cwd=within,
         check=False,
     )
 
@@ -159,7 +162,7 @@ def px4(
     folder.mkdir(parents=True, exist_ok=True)
     station = Station("udp", 14550)
     try:
-        started = _with_links(firmware, folder / "firmware")
+        started = with_links(firmware, folder / "firmware")
         command = (started / "px4.sh", folder, latitude, longitude, height)
         with process(command, folder / "px4.txt"):
             yield station
@@ -167,7 +170,7 @@ def px4(
         station.close()
 
 
-def _with_links(firmware: Path, copy: Path) -> Path:
+def with_links(firmware: Path, copy: Path) -> Path:
     """Return where PX4 starts: its start script calls `px4-...`, links to `px4`.
 
     A copy of the folder that has lost them is given them again, in a copy of its own.

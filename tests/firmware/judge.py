@@ -30,6 +30,7 @@ SMOOTHED_S = 0.1  # to each side: the vehicle's acceleration is steady for so lo
 METRES_A_DEGREE = 111_319.49
 CLOSED_US, FULL_US, DEAD_BAND = 1000.0, 2000.0, 0.01
 SMALL_STEP, CLOSE_M, REACH_M = 0.08, 2.5, 4.0
+GRAZED_M = 1.5  # before and after a change: whether it is the same one beside
 OFF_TARGET_ELEMENT_M = 0.1
 CELL_M = 0.5
 # On a line: within a metre of it, and within 20 degrees of its course.
@@ -274,6 +275,47 @@ def flows_ml_s(pulses: Sequence[Pulses], grid_s: Floats, sprayer: Sprayer, seed:
     return np.array(flows)
 
 
+# docs/driver-board.md, rule 11: a width that has moved by less than half the dither for so long
+# closes its valve.
+ALIVE_S, MOVE_US = 0.3, 4
+
+
+@dataclass(frozen=True, slots=True)
+class Closing:
+    """A valve that was open and that the board closed, its width having stood still."""
+
+    output: int
+    came_s: float
+
+
+def obeyed(
+    pulses: Sequence[Pulses], outputs: Sequence[int] = Sprayer().outputs
+) -> tuple[list[Pulses], list[Closing]]:
+    """Return the pulses as a board obeys them that wants its widths to move, and what it closed.
+
+    PX4 repeats the last order of a dead companion for ever: such a board is what closes there.
+    """
+    found: list[Pulses] = []
+    closings: list[Closing] = []
+    moved = dict.fromkeys(outputs, (-np.inf, -np.inf))  # to which width, when
+    is_open = dict.fromkeys(outputs, False)
+    for one in pulses:
+        us = list(one.us)
+        for output in outputs:
+            width_us = us[output - 1]
+            if abs(width_us - moved[output][0]) >= MOVE_US:
+                moved[output] = (width_us, one.at_s)
+            is_wanted = width_us > CLOSED_US + DEAD_BAND * (FULL_US - CLOSED_US)
+            is_alive = one.at_s - moved[output][1] < ALIVE_S
+            if is_wanted and not is_alive:
+                us[output - 1] = round(CLOSED_US)
+                if is_open[output]:
+                    closings.append(Closing(output, one.came_s))
+            is_open[output] = is_wanted and is_alive
+        found.append(Pulses(one.came_s, one.at_s, tuple(us)))
+    return found, closings
+
+
 # -------------------------------------------------------------------------------------- verdict
 
 
@@ -286,8 +328,12 @@ def judge(
     lines: Sequence[shapely.LineString] | None = None,
     sprayer: Sprayer | None = None,
     seed: int = 1,
+    grazing_m: float = 0.0,
 ) -> Verdict:
     """Return what a flight did.
+
+    A change counts apart where it would be another one that far aside: a valve that runs along a
+    boundary crosses it here by one place and there by the next.
 
     `inside` is where liquid may fall, else all zones. With `lines` only what is flown along one of
     them counts; what is sprayed off them is `off_lines_ml`.
@@ -306,11 +352,8 @@ def judge(
     if lines is not None:
         on_line = along_lines(path, [plane.of(line) for line in lines])
         verdict.off_lines_ml = float(flows[:, ~on_line].sum()) * STEP_S
-    for valve, right_m in enumerate(sprayer.right_m):
-        east_m = path.east_m + right_m * np.cos(path.yaw_rad)
-        north_m = path.north_m - right_m * np.sin(path.yaw_rad)
-        rates = np.where(on_line, rates_at(flat, east_m, north_m), np.nan)
-        _judge_valve(verdict, valve, path, rates, flows[valve], sprayer)
+    for valve in range(len(sprayer.right_m)):
+        _judge_valve(verdict, valve, path, on_line, flat, flows[valve], sprayer, grazing_m)
     verdict.off_target_ml = _off_target_ml(path, flows, allowed, sprayer)
     return verdict
 
@@ -337,23 +380,51 @@ def along_lines(path: Path2d, lines: Sequence[shapely.LineString]) -> NDArray[np
 
 
 def _judge_valve(
-    verdict: Verdict, valve: int, path: Path2d, rates: Floats, flow: Floats, sprayer: Sprayer
+    verdict: Verdict,
+    valve: int,
+    path: Path2d,
+    on_line: NDArray[np.bool_],
+    zones: Sequence[Zone],
+    flow: Floats,
+    sprayer: Sprayer,
+    grazing_m: float,
 ) -> None:
+    def place(aside_m: float) -> tuple[Floats, Floats]:
+        right_m = sprayer.right_m[valve] + aside_m
+        east_m = path.east_m + right_m * np.cos(path.yaw_rad)
+        return east_m, path.north_m - right_m * np.sin(path.yaw_rad)
+
+    def rates_of(aside_m: float) -> Floats:
+        return np.where(on_line, rates_at(zones, *place(aside_m)), np.nan)
+
+    # The valve's own way: in a turn the ends of the boom go faster and slower than the middle.
+    east_m, north_m = place(0.0)
+    steps_m = np.hypot(np.diff(east_m), np.diff(north_m))
+    along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    rates = rates_of(0.0)
     known = np.where(np.isnan(rates), -1.0, rates)
+    beside = [rates_of(aside_m) for aside_m in (-grazing_m, grazing_m) if grazing_m]
     edges = np.flatnonzero(np.diff(known) != 0.0) + 1
     edges = edges[path.speed_m_s[edges] >= 1.0]
     volume = np.concatenate([[0.0], np.cumsum(flow[1:] * np.diff(path.at_s))])
-    ml = np.where(np.isnan(rates), 0.0, rates) * sprayer.width_m * path.speed_m_s * STEP_S * 0.1
+    ml = np.where(np.isnan(rates), 0.0, rates)[1:] * sprayer.width_m * steps_m * 0.1
     verdict.prescribed_l += float(ml.sum()) / 1000.0
     bounds = np.concatenate([[0], edges, [len(known) - 1]])
     for number, edge in enumerate(edges, start=1):
         before, after = known[edge - 1], known[edge]
         if before < 0.0 or after < 0.0:
             continue  # the border's
-        here_m = path.along_m[edge]
-        back_m = here_m - path.along_m[bounds[number - 1]]
-        on_m = path.along_m[bounds[number + 1]] - here_m
-        lag_m = _lag_m(path.along_m, volume, here_m, back_m, on_m, (before, after))
+        here_m = along_m[edge]
+        back_m = here_m - along_m[bounds[number - 1]]
+        on_m = along_m[bounds[number + 1]] - here_m
+        lag_m = _lag_m(along_m, volume, here_m, back_m, on_m, (before, after))
+        off_s = GRAZED_M / path.speed_m_s[edge]
+        sides = edge + np.array([-1, 1]) * round(off_s / STEP_S)
+        sides = np.clip(sides, 0, len(known) - 1)
+        is_grazed = any(
+            (side[sides[0]], side[sides[1]]) != (known[sides[0]], known[sides[1]])
+            for side in beside
+        )
         change = Change(
             valve + 1,
             float(path.at_s[edge]),
@@ -364,7 +435,7 @@ def _judge_valve(
             lag_m,
         )
         is_small = abs(after - before) < SMALL_STEP * max(before, after)
-        if is_small or min(back_m, on_m) < CLOSE_M:
+        if is_small or is_grazed or min(back_m, on_m) < CLOSE_M:
             verdict.apart.append(change)
         else:
             verdict.changes.append(change)
@@ -413,18 +484,33 @@ def _off_target_ml(
     return found_ml
 
 
-def missed_and_doubled_m2(
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """What a pass over zones did to a band of ground as wide as the boom, in square metres."""
+
+    left_m2: float  # with less than half of the rate
+    twice_m2: float  # with more than one and a half of it
+    whole_m2: float
+
+    def __str__(self) -> str:
+        return f"left {self.left_m2:.1f} m2, twice {self.twice_m2:.1f} m2 of {self.whole_m2:.0f} m2"
+
+
+def treated_ground(
     places: Sequence[Place],
     pulses: Sequence[Pulses],
     zones: Sequence[Zone],
     *,
     ends: tuple[tuple[float, float], tuple[float, float]],
+    by_valve: bool = False,
     sprayer: Sprayer | None = None,
-) -> tuple[float, float]:
-    """Return how much of a pass got less than half, and more than one and a half of its rate.
+) -> Ground:
+    """Return how much of a pass was left, and how much treated twice.
 
     `ends` are latitude and longitude of where the pass is judged from and to: a band as wide as
-    the boom, in cells of one strip by CELL_M. All that was flown counts, there and back.
+    the boom, in cells of one strip by CELL_M. All that was flown counts, there and back. With
+    `by_valve` each valve has a strip of its own, wherever beside the line it was flown: two ways
+    that are less than half a strip apart leave a sliver by rule, and no valve can help it.
     """
     sprayer = sprayer or Sprayer()
     plane = Plane(*ends[0])
@@ -441,6 +527,8 @@ def missed_and_doubled_m2(
         row = np.floor((east_m * east + north_m * north) / CELL_M).astype(int)
         aside_m = east_m * north - north_m * east
         column = np.floor(aside_m / sprayer.width_m + strips / 2).astype(int)
+        if by_valve:
+            column[:] = valve
         hits = (row >= 0) & (row < ml.shape[0]) & (column >= 0) & (column < strips)
         np.add.at(ml, (row[hits], column[hits]), flows[valve][hits] * STEP_S)
     along_m = (np.arange(ml.shape[0]) + 0.5) * CELL_M
@@ -448,4 +536,8 @@ def missed_and_doubled_m2(
     wanted = rates_at(flat, along_m * east, along_m * north) * 0.1 * sprayer.width_m * CELL_M
     share = ml / wanted[:, None]
     cell_m2 = CELL_M * sprayer.width_m
-    return float((share < 0.5).sum()) * cell_m2, float((share > 1.5).sum()) * cell_m2
+    return Ground(
+        left_m2=float((share < 0.5).sum()) * cell_m2,
+        twice_m2=float((share > 1.5).sum()) * cell_m2,
+        whole_m2=share.size * cell_m2,
+    )

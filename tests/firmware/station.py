@@ -63,6 +63,13 @@ class Log:
         self.pulses.clear()
 
 
+@dataclass(slots=True)
+class _Repeated:
+    every_s: float
+    do: Callable[[], None]
+    done_s: float = -math.inf
+
+
 class NoAnswerError(AssertionError):
     """What was waited for did not come; the last texts are named."""
 
@@ -78,10 +85,11 @@ class Station:
         self._parser = dialect.MAVLink(None)
         self._parser.robust_parsing = True
         self._coder = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
-        self._beat_s = -math.inf
         self._socket = self._open(port)
         self._socket.setblocking(False)
         self._takers: list[Callable[[Any], None]] = []
+        self._repeated: list[_Repeated] = []
+        self.every(HEARTBEAT_EVERY_S, self._beat)
 
     def _open(self, port: int) -> socket.socket:
         if self._kind == "udp":
@@ -107,14 +115,24 @@ class Station:
         elif self._address is not None:
             self._socket.sendto(data, self._address)
 
-    def _beat(self, now_s: float) -> None:
-        if now_s - self._beat_s >= HEARTBEAT_EVERY_S:
-            self._beat_s = now_s
-            self.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+    def _beat(self) -> None:
+        self.send(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+
+    def every(self, every_s: float, do: Callable[[], None]) -> None:
+        """Do something again and again, as often as that while somebody pumps."""
+        self._repeated.append(_Repeated(every_s, do))
+
+    def no_more(self, do: Callable[[], None]) -> None:
+        """Do it no more."""
+        self._repeated = [one for one in self._repeated if one.do != do]
 
     def pump(self, within_s: float) -> None:
         """Take what has come, or wait for it that long."""
-        self._beat(time.monotonic())
+        now_s = time.monotonic()
+        for one in self._repeated:
+            if now_s - one.done_s >= one.every_s:
+                one.done_s = now_s
+                one.do()
         readable, _, _ = select.select([self._socket], [], [], within_s)
         if not readable:
             return
@@ -290,6 +308,15 @@ class Station:
         finally:
             self._takers.remove(take)
         return over[0], last
+
+    def begin_mission(self) -> None:
+        """Make the first item the current one."""
+
+        def fits(came: Any) -> bool:
+            return came.get_type() == "MISSION_CURRENT" and came.seq == 0
+
+        message = dialect.MAVLink_mission_set_current_message(1, AUTOPILOT, 0)
+        self._answered(message, fits, "item 0 as the current one", within_s=10.0)
 
     def mission(self) -> list[MissionItem]:
         """Return the mission that is on the vehicle."""

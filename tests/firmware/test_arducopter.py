@@ -2,49 +2,27 @@
 
 from __future__ import annotations
 
-import json
-import pickle
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.firmware.fields import (
-    HOME,
-    LOW_RATES_L_HA,
-    RATES_L_HA,
-    copy_example,
-    pass_items,
-    write_pass,
+from tests.firmware.fields import LOW_RATES_L_HA, RATES_L_HA, pass_items, write_pass
+from tests.firmware.firmware import companion
+from tests.firmware.flights import (
+    COPTER,
+    OFF_LINES_MAX_ML,
+    fly_field,
+    ready,
+    start,
+    until_heard,
+    until_landed,
 )
-from tests.firmware.firmware import companion, vrspray
-from tests.firmware.flights import ready_copter, start, until_heard, until_landed
-from tests.firmware.judge import (
-    Verdict,
-    geojson_area,
-    geojson_lines,
-    geojson_zones,
-    judge,
-    shapefile_zones,
-)
+from tests.firmware.judge import Verdict, geojson_area, geojson_zones, judge
 
 pytestmark = [pytest.mark.firmware, pytest.mark.timeout(300)]
 
 MEAN_MAX_M, WORST_MAX_M, OFF_TARGET_MAX_ML = 0.05, 0.25, 0.1
-# At the ends of four lines, on sprayable ground, all six valves at 50 mL/s: the order is early by
-# the lag, so that what is left is the half of the fall (0.070 s) behind its middle, the wait for a
-# servo frame, and 0.05 m of place at 5 m/s.
-OFF_LINES_MAX_ML = 4 * 50.0 * (0.070 / 8.0 + 0.020 + 0.010)
-COMPANION_LINK = "udpin:127.0.0.1:14550"
-
-
-def done(*command: str) -> dict[str, Any]:
-    """Run a command of the program to its end and return its one object."""
-    found = vrspray(*command, "--json")
-    assert found.returncode == 0, found.stderr
-    values: dict[str, Any] = json.loads(found.stdout)
-    return values
 
 
 def fly_pass(
@@ -52,7 +30,7 @@ def fly_pass(
 ) -> Verdict:
     """Fly one pass over eight zones and judge it."""
     config = write_pass(folder / "field", rates_l_ha)
-    with ready_copter(folder / "copter", firmwares, HOME) as vehicle:
+    with ready(COPTER, folder / "copter", firmwares) as vehicle:
         with companion(folder, "--config", str(config)) as started:
             until_heard(vehicle.station, started, folder / "companion.txt")
             vehicle.station.log.clear_flight()
@@ -98,35 +76,11 @@ def test_small_steps_of_low_flows_at_3_m_s_fall_on_their_boundaries(
 def test_the_planned_and_uploaded_field_is_sprayed_on_its_lines(
     firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
 ) -> None:
-    # README's commands, the vehicle being ArduCopter.
-    field = copy_example(tmp_path / "field")
-    config, plan, lines = field / "config.toml", field / "field.plan", field / "field.lines.geojson"
-    depot = (35.9972, 114.5439)
-    planned = done(
-        *("plan", f"{field}/prescription.shp", "--prescription", f"{field}/prescription.shp"),
-        *("--config", f"{config}", "--depot", "{},{}".format(*depot), "--out", f"{plan}"),
-    )
-    home = "{},{},60,192".format(*depot)
-    with ready_copter(tmp_path / "copter", firmwares, home) as vehicle:
-        uploaded = done("upload", f"{plan}", "--link", COMPANION_LINK)
-        assert (uploaded["ok"], uploaded["firmware"]) == (True, "ardupilot")
-        options = ("--config", f"{config}", "--set", f"mission.lines={lines}")
-        with companion(tmp_path, *options) as started:
-            until_heard(vehicle.station, started, tmp_path / "companion.txt")
-            vehicle.station.log.clear_flight()
-            start(vehicle, None)
-            until_landed(vehicle, 200.0)
-        log = vehicle.station.log
-    (tmp_path / "log.pkl").write_bytes(pickle.dumps((log.places, log.pulses, log.told)))
-    verdict = judge(
-        log.places,
-        log.pulses,
-        shapefile_zones(field / "prescription.shp"),
-        inside=geojson_area(field / "boundary.geojson"),
-        lines=geojson_lines(lines),
-    )
+    flown = fly_field(COPTER, firmwares, tmp_path)
+    log = flown.log
+    verdict = judge(log.places, log.pulses, flown.zones, inside=flown.inside, lines=flown.lines)
     tell(verdict)
     assert len(verdict.changes) + len(verdict.apart) == 4 * 9 * 6
     holds(verdict)
     assert verdict.off_lines_ml <= OFF_LINES_MAX_ML
-    assert verdict.sprayed_l == pytest.approx(planned["volume_l"], rel=0.05)
+    assert verdict.sprayed_l == pytest.approx(flown.planned_l, rel=0.05)

@@ -89,6 +89,19 @@ async def test_px4_has_no_script(tmp_path: Path) -> None:
     assert checks["board-dither"]["text"] == "not answered"
 
 
+async def test_px4_lets_no_valve_click_and_says_why(tmp_path: Path) -> None:
+    port = free_port()
+    config = example(tmp_path).with_name("px4.toml")
+    async with standing(port, "px4") as (_, orders), guided(config, port, "--click") as doctor:
+        await doctor.answer("valve 1 (1 of 6): Enter clicks", "\n")
+        code, result = await doctor.ended()
+    assert code == 1
+    assert {order.pulse_us for order in orders} <= {0, 900}
+    first = result["checks"][0]
+    assert first["text"].startswith("nothing was opened: servo outputs of this autopilot follow")
+    assert first["fix"] == 'use valves on GPIO (output.kind = "gpio")'
+
+
 async def test_what_only_a_person_sees_is_asked(tmp_path: Path) -> None:
     config, port = example(tmp_path), free_port()
     fitted = ("--no-link", "--set", "safety.pump_cutoff=true", "--set", "output.dither_us=8")

@@ -179,7 +179,15 @@ def test_an_estimator_in_doubt_is_unhealthy(
 
 @pytest.mark.parametrize(
     ("flags", "ratio", "healthy"),
-    [(HEALTHY, 0.2, True), (HEALTHY | 1024, 0.2, False), (1, 0.2, False), (HEALTHY, 1.1, False)],
+    [
+        (HEALTHY, 0.2, True),
+        (HEALTHY | 1024, 0.2, False),
+        (1, 0.2, False),
+        (HEALTHY, 1.1, False),
+        # PX4 1.16 at rest, its satellites in use (measured); and without them.
+        (1023, 0.03, True),
+        (1023 & ~512, 0.03, False),
+    ],
 )
 def test_the_estimator_of_px4_counts_too(flags: int, ratio: float, healthy: bool) -> None:
     status = frame("estimator_status", 0, flags, ratio, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1)

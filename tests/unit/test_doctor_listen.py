@@ -45,7 +45,6 @@ async def heard(peer: WirePeer | None, *, wait_s: float) -> Heard:
         link,
         config.link.url,
         options=servo_options(config),
-        position_rate_hz=20.0,
         wait_s=wait_s,
     )
     if peer is None:
@@ -63,6 +62,7 @@ async def test_a_disarmed_vehicle_is_heard_and_ordered_closed_only() -> None:
     assert found.position is not None
     assert found.position.latitude_deg == pytest.approx(36.0, abs=1e-3)
     assert {rate.name for rate in found.rates if rate.rate_hz > 0} >= {"position", "GNSS"}
+    assert "RC channels" not in {rate.name for rate in found.rates}  # no switch is configured
     assert found.outputs_us == dict.fromkeys(range(9, 15), 1000)
     assert {order.pulse_us for order in peer.orders} == {1000}
     assert set(found.order_results) == {0}
@@ -88,7 +88,7 @@ async def test_a_link_that_cannot_be_opened_is_told() -> None:
     _, first = parts(port)
     await first.open(lambda: None)
     config, second = parts(port)
-    found = await listen(second, config.link.url, options=None, position_rate_hz=20.0, wait_s=1.0)
+    found = await listen(second, config.link.url, options=None, wait_s=1.0)
     await first.close()
     assert found.refused is not None
     assert "in use" in found.refused
@@ -112,7 +112,7 @@ async def test_the_link_is_closed_however_it_ends(
     monkeypatch.setattr(link, "close", noted)
     if fails:
         monkeypatch.setattr(link, "receive", broken)
-    given = listen(link, config.link.url, options=None, position_rate_hz=20.0, wait_s=0.1)
+    given = listen(link, config.link.url, options=None, wait_s=0.1)
     if fails:
         with pytest.raises(RuntimeError, match="broken"):
             await given

@@ -121,7 +121,7 @@ CLOSING: list[tuple[Inhibit, tuple[Any, ...]]] = [
     *((Inhibit.ESTIMATOR_UNHEALTHY, ekf(velocity=v)) for v in (0.8, 1.5, NAN, INF, -0.1)),
     *((Inhibit.ESTIMATOR_UNHEALTHY, ekf(position=v)) for v in (0.8, 1.5, NAN, INF, -0.1)),
     *((Inhibit.ESTIMATOR_UNHEALTHY, estimator(831 & ~need)) for need in (2, 16)),
-    *((Inhibit.ESTIMATOR_UNHEALTHY, estimator(831 | refuse)) for refuse in (128, 1024)),
+    *((Inhibit.ESTIMATOR_UNHEALTHY, estimator(flags)) for flags in (831 ^ 640, 831 | 1024)),
     *((Inhibit.ESTIMATOR_UNHEALTHY, estimator(velocity=v)) for v in (1.0, NAN, -0.1)),
     *((Inhibit.ESTIMATOR_UNHEALTHY, estimator(position=v)) for v in (1.0, NAN, -0.1)),
     (Inhibit.SPEED_DISAGREES, ("vfr_hud", 0.0, 6.2, 90, 40, 60.0, 0.0)),

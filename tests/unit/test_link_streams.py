@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytest
 
 from companion.link.announcer import lines
-from companion.link.streams import StreamRequest, StreamSupervisor, wanted_streams
+from companion.link.streams import Stream, StreamRequest, StreamSupervisor, wanted_streams
 
 STREAMS = wanted_streams(position_rate_hz=20.0, is_px4=False)
 WATCHED = [stream for stream in STREAMS if not stream.optional]
@@ -18,18 +18,19 @@ Share = Callable[[int, float], float]
 class Bench:
     """An autopilot whose streams come at a share of what was asked for, and the supervisor."""
 
-    def __init__(self, *, may_group: bool = True) -> None:
+    def __init__(self, streams: Sequence[Stream] = STREAMS, *, may_group: bool = True) -> None:
+        self.streams = streams
         self.supervisor = StreamSupervisor(may_group=may_group)
         self.counts: dict[int, float] = {}
         self.requests: list[tuple[float, StreamRequest]] = []
         self.texts: list[str] = []
         self.now_s = 0.0
-        self.supervisor.start(STREAMS, 0.0)
+        self.supervisor.start(streams, 0.0)
 
     def run(self, duration_s: float, share: Share) -> None:
         for _ in range(round(duration_s / 0.05)):
             self.now_s += 0.05
-            for stream in STREAMS:
+            for stream in self.streams:
                 number = stream.message_id
                 step = 0.05 * stream.rate_hz * share(number, self.now_s)
                 self.counts[number] = self.counts.get(number, 0.0) + step
@@ -49,6 +50,18 @@ def test_streams_at_their_rate_are_left_alone() -> None:
     bench.run(60.0, lambda number, now_s: 1.0)
     assert not bench.requests
     assert not bench.texts
+
+
+@pytest.mark.parametrize(
+    ("use_switch", "texts"), [(False, []), (True, ["not sent as asked: RC_CHANNELS"])]
+)
+def test_a_missing_receiver_is_told_where_a_switch_needs_it(
+    use_switch: bool, texts: list[str]
+) -> None:
+    # PX4 sends no RC_CHANNELS without a receiver.
+    bench = Bench(wanted_streams(position_rate_hz=20.0, is_px4=True, with_switch=use_switch))
+    bench.run(60.0, lambda number, now_s: float(number != 65))
+    assert bench.texts == texts
 
 
 def test_a_quarter_of_everything_is_a_transfer_and_waited_out() -> None:

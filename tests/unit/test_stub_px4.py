@@ -164,6 +164,17 @@ def test_a_reboot_brings_the_streams_back_by_itself() -> None:
     assert positions[-1].time_boot_ms < 1500
 
 
+@pytest.mark.parametrize(("version", "is_said"), [((1, 16, 0), True), ((1, 15, 4), False)])
+def test_at_rest_the_estimator_says_constant_position_beside_a_good_one(
+    version: Version, is_said: bool
+) -> None:
+    bench = px4(version=version)
+    bench.run(1.1)
+    flags = bench.companion.last("ESTIMATOR_STATUS").flags
+    assert flags & dialect.ESTIMATOR_POS_HORIZ_ABS
+    assert bool(flags & dialect.ESTIMATOR_CONST_POS_MODE) is is_said
+
+
 def test_a_lost_position_ends_the_stream_and_the_estimator_says_so() -> None:
     bench = px4(faults=(Fault(kind=FaultKind.STALE_POSITION, at_s=1.0, duration_s=2.0),))
     bench.run(1.1)
