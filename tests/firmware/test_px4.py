@@ -41,7 +41,7 @@ MEAN_MAX_M, WORST_MAX_M, OFF_TARGET_MAX_ML = 0.05, 0.25, 0.1
 # place after GNSS. The filters of the companion believe the velocity and follow such a place 0.8 s
 # behind, so that all valves are early or late alike: in two flights by 0.08 and 0.10 m (sd), 0.19
 # and 0.27 m at most, 0.2 s ahead. To that the bar itself. (docs/px4.md, what PX4 is off by)
-# Sideways its place is off by so much (sd), and which column of zones an outer valve runs in with it.
+# So much (sd) is its place off sideways, and with it the column of zones that an outer valve is in.
 GRAZING_M = 0.2
 MEAN_BOUND_M, WORST_BOUND_M, OFF_TARGET_BOUND_ML = 0.10 + MEAN_MAX_M, 0.20 + WORST_MAX_M, 0.5
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import pytest
 import shapely
 
-from tests.firmware.judge import Verdict, Zone, judge
+from tests.firmware.judge import Verdict, Zone, judge, obeyed, treated_ground
 from tests.firmware.station import Place, Pulses
 
 # The valve's mean lag: dead time, half the rise, half a servo frame.
@@ -37,8 +38,13 @@ def flown(
     has_changes: bool = True,
     is_closed_outside: bool = True,
     is_told: bool = False,
+    east_m: float = 0.0,
+    grazing_m: float = 0.0,
 ) -> Verdict:
-    """Fly north over three zones, every change ordered so that it falls `lag_m` too late."""
+    """Fly north over three zones, every change ordered so that it falls `lag_m` too late.
+
+    The third ends 2.9 m to the right of the line, which is what the fourth begins with.
+    """
     places, pulses = [], []
     ordered_m = [end - LAG_S * speed_m_s + lag_m for end in ENDS_M]
     for number in range(int(85.0 / speed_m_s / 0.01)):
@@ -48,19 +54,27 @@ def flown(
         late_s = 0.003 * (number % 2) + (0.1 if 500 <= number < 510 else 0.0)
         came_s = at_s + CLOCK_S + late_s
         told_s = at_s if is_told else None
-        places.append(Place(came_s, told_s, number, north_m / NORTH_M, 0.0, 0.0))
-        zone = sum(north_m >= ordered for ordered in ordered_m)
-        if zone in (0, len(ENDS_M)):
+        places.append(Place(came_s, told_s, number, north_m / NORTH_M, east_m / EQUATOR_M, 0.0))
+        number_of_zone = sum(north_m >= ordered for ordered in ordered_m)
+        if number_of_zone in (0, len(ENDS_M)):
             us = 1000 if is_closed_outside else pulse_us(15.0, speed_m_s)
         else:
-            us = pulse_us(RATES_L_HA[zone - 1 if has_changes else 0], speed_m_s)
+            us = pulse_us(RATES_L_HA[number_of_zone - 1 if has_changes else 0], speed_m_s)
         pulses.append(Pulses(came_s, at_s, (1500,) * 8 + (us,) * 6 + (0, 0)))
-    half = 4.0 / EQUATOR_M
     zones = [
-        Zone(shapely.box(-half, start / NORTH_M, half, end / NORTH_M), rate)
+        zone(start, end, rate, to_m=2.9 if start == ENDS_M[2] else 4.0)
         for start, end, rate in zip(ENDS_M, ENDS_M[1:], RATES_L_HA, strict=False)
     ]
-    return judge(places, pulses, zones)
+    zones.append(zone(*ENDS_M[2:], RATES_L_HA[1], from_m=2.9))
+    return judge(places, pulses, zones, grazing_m=grazing_m)
+
+
+def zone(
+    start_m: float, end_m: float, rate: float, *, from_m: float = -4.0, to_m: float = 4.0
+) -> Zone:
+    """Return a rectangle, `from_m` to `to_m` being metres to the east."""
+    box = (from_m / EQUATOR_M, start_m / NORTH_M, to_m / EQUATOR_M, end_m / NORTH_M)
+    return Zone(shapely.box(*box), rate)
 
 
 @pytest.mark.parametrize(("speed_m_s", "lag_m"), [(4.0, 0.0), (5.0, -0.3), (5.0, 0.5)])
@@ -92,3 +106,59 @@ def test_what_falls_outside_is_counted() -> None:
     # The valves are open and closed on the border by their mean: half of the rise is outside.
     assert 0.0 < inside.off_target_ml < 20.0
     assert inside.sprayed_l == pytest.approx(inside.prescribed_l, rel=0.01)
+
+
+def test_a_valve_along_a_boundary_counts_apart() -> None:
+    # Half a metre to the right the sixth valve is 0.1 m beyond the end of the third zone.
+    beside = flown(5.0, east_m=0.5)
+    assert len(beside.changes) + len(beside.apart) == 2 * 6 - 1
+    near = flown(5.0, east_m=0.3, grazing_m=0.2)
+    assert (len(near.changes), len(near.apart)) == (2 * 6 - 1, 1)
+    assert len(flown(5.0, grazing_m=0.2).changes) == 2 * 6
+
+
+def pulsed(us: Sequence[int]) -> list[Pulses]:
+    """Return output 9 every 20 ms, the others closed."""
+    return [
+        Pulses(CLOCK_S + 0.02 * number, 0.02 * number, (1000,) * 8 + (one,) + (1000,) * 7)
+        for number, one in enumerate(us)
+    ]
+
+
+def test_a_board_closes_what_stands_still_and_opens_with_the_next_move() -> None:
+    moving = [1500 + 8 * (number // 5 % 2) for number in range(50)]
+    obeys, closings = obeyed(pulsed([*moving, *[moving[-1]] * 30, 1500, 1500]))
+    open_at = [one.us[8] > 1000 for one in obeys]
+    # The last move was at number 45; after 0.3 s, from number 61 on, it is closed.
+    assert open_at == [number <= 60 or number >= 80 for number in range(82)]
+    assert [(one.output, round(one.came_s - CLOCK_S, 2)) for one in closings] == [(9, 1.22)]
+    # Less than half the dither is no move, and a closed output need not move.
+    _, still = obeyed(pulsed([1500 + number % 4 for number in range(40)]))
+    assert len(still) == 1
+    assert obeyed(pulsed([1000] * 40))[1] == []
+
+
+def test_ground_that_one_flight_left_is_found_and_what_two_treated_too() -> None:
+    def flight(
+        start_s: float, open_m: tuple[float, float], east_m: float
+    ) -> tuple[list[Place], list[Pulses]]:
+        places, pulses = [], []
+        for number in range(1000):
+            at_s = number * 0.01
+            place = (5.0 * at_s / NORTH_M, east_m / EQUATOR_M)
+            places.append(Place(start_s + at_s, start_s + at_s, number, *place, 0.0))
+            is_open = open_m[0] <= 5.0 * at_s < open_m[1]
+            us = pulse_us(20.0, 5.0) if is_open else 1000
+            pulses.append(Pulses(start_s + at_s, start_s + at_s, (1500,) * 8 + (us,) * 6 + (0, 0)))
+        return places, pulses
+
+    one = flight(0.0, (0.0, 20.0), 0.0)
+    other = flight(20.0, (15.0, 30.0), 0.7)
+    # Judged from 0.6 m to 40.6 m: treated once to 15, twice to 20, once to 30, left from there.
+    ends = (0.6 / NORTH_M, 0.0), (40.6 / NORTH_M, 0.0)
+    ground = treated_ground(
+        one[0] + other[0], one[1] + other[1], [zone(-1.0, 60.0, 20.0)], ends=ends, by_valve=True
+    )
+    assert ground.whole_m2 == pytest.approx(40.0 * 6.0, abs=3.0)
+    assert ground.left_m2 == pytest.approx(10.6 * 6.0, abs=3.0)
+    assert ground.twice_m2 == pytest.approx(5.0 * 6.0, abs=3.0)
