@@ -139,17 +139,9 @@ async def test_the_commands_of_px4s_page_fly_and_spray(firmwares: Path, tmp_path
     here = tmp_path / "here"
     copy_example(here / "examples" / "anyang")
     section = blocks("px4.md", "PX4's own simulation")
-    assert [kind for kind, _ in section] == [
-        "sh",
-        "pxh",
-        "sh",
-        "sh",
-        "pxh",
-        "sh",
-        "mavproxy",
-        "pxh",
-    ]
-    simulation, setting, upload, run, arming, station, enabling, landing = (
+    shells = ["sh", "pxh", "sh", "sh", "pxh", "sh", "mavproxy", "pxh", "mavproxy"]
+    assert [kind for kind, _ in section] == shells
+    simulation, setting, upload, run, arming, station, enabling, landing, again = (
         lines for _, lines in section
     )
     *given, make, target, model = shlex.split(simulation[0])
@@ -185,5 +177,6 @@ async def test_the_commands_of_px4s_page_fly_and_spray(firmwares: Path, tmp_path
         async with asyncio.timeout(10.0):
             while pulses_us(shown.said) != [900] * 6:
                 await typist.types(enabling[-1:])
+        await typist.types(again)
     said = (here / "companion.txt").read_text()
     assert "vehicle: system 1, px4" in said
