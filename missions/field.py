@@ -16,21 +16,29 @@ from companion.core.prescription import SLIVER_M
 from companion.maps.local import Area, as_area, make_valid, polygons_of, project
 from companion.maps.local import places as places_of
 from missions.errors import PlanError
+from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
 from missions.strips import Floats
 from missions.wind import WindBuffer
 
 # Coordinates are rounded when they are written, and a long edge is straight in degrees for one
 # program and in metres for another: strips keep this far from the border.
 MARGIN_M = 0.0025
-SIMPLER_M = 0.001
+# Borders are drawn anew with fewer corners so far inside, at most, and those of obstacles so far
+# outside of their buffers: a circle of 5 m becomes one of ten corners.
+OUTLINE_TOLERANCE_M, OBSTACLE_TOLERANCE_M = 0.1, 0.5
 EXTENT_MAX_M = 20_000.0
+# 383 ha with a swath of 1 m have so many.
+PASSES_MAX = 1_000
+# Corners sharper than 23 degrees are cut off beyond 5 times the buffer.
+MITRE_LIMIT = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Field:
     """`outline` is as given; `fly` lies in it without holes and obstacles; `spray` in `fly`.
 
-    `limit` is all that may be sprayed; `spray` keeps a margin from its edge.
+    `limit` is all that may be sprayed; `spray` keeps a margin from its edge, and has fewer
+    corners. `given_up_m2` is the ground between the two.
     `blocked` is what may not be flown over, not even on the way to the field. `closes` is the
     ground outside of which the companion closes its valves, where that is another than `limit`.
     """
@@ -42,6 +50,12 @@ class Field:
     limit: BaseGeometry
     blocked: BaseGeometry
     closes: BaseGeometry | None = None
+    tolerance_m: float = OUTLINE_TOLERANCE_M
+
+    @property
+    def given_up_m2(self) -> float:
+        """Return the ground that may be sprayed and is left to draw its border simpler."""
+        return float(self.limit.area) - float(self.spray.area)
 
     @property
     def kept_in(self) -> BaseGeometry:
@@ -72,12 +86,14 @@ def build_field(
     frame: LocalFrame | None = None,
     offset_m: tuple[float, float] = (0.0, 0.0),
     kept_m: float = 0.0,
+    tolerance_m: float = OUTLINE_TOLERANCE_M,
 ) -> Field:
     """Return the field of a boundary and what lies in it, all in longitude and latitude.
 
     `offset_m` moves all of it: the offset between map and receiver (prescription.offset_east_m).
     A `wind` widens the buffers of no-spray areas where it blows towards them. Strips keep `kept_m`
-    from every border, where that leaves room for a swath.
+    from every border, where that leaves room for a swath. Borders are drawn simpler by
+    `tolerance_m` at most, inside of the outline and outside of what is kept clear.
 
     Raises:
         PlanError: where nothing is left that a strip of the swath's width fits on.
@@ -87,23 +103,28 @@ def build_field(
     west, south, east, north = outline.bounds
     if not max(east - west, north - south) <= EXTENT_MAX_M:
         raise PlanError(
-            f"the field spans {max(east - west, north - south) / 1000.0:.0f} km; give one field"
+            f"the field spans {max(east - west, north - south) / 1000.0:.0f} km; give one field, "
+            "in the CRS of its coordinates"
         )
     outline = translate(outline, *offset_m)
     holes = [Polygon(ring) for part in polygons_of(outline) for ring in part.interiors]
-    kept = [
-        translate(local_area(area, frame), *offset_m).buffer(obstacle_buffer_m)
-        for area in obstacles
-    ]
-    blocked = shapely.union_all([*holes, *kept])
-    flown = outline.difference(shapely.union_all(kept)) if kept else outline
-    fly = _ground(flown)
+    kept = shapely.union_all(
+        [_grown(translate(local_area(area, frame), *offset_m), obstacle_buffer_m)
+         for area in obstacles]
+    )  # fmt: skip
+    blocked = shapely.union_all([*holes, kept])
+    flown = outline.difference(kept)
+    fly = _ground(outline, kept, tolerance_m)
     off = [translate(local_area(area, frame), *offset_m) for area in no_spray]
-    closed = [
-        area.buffer(no_spray_buffer_m) if wind is None else wind.around(area, no_spray_buffer_m)
-        for area in off
-    ]
-    spray = fly if not closed else _without(fly, closed)
+    closed = shapely.union_all(
+        [
+            _grown(area, no_spray_buffer_m)
+            if wind is None
+            else wind.around(area, no_spray_buffer_m)
+            for area in off
+        ]
+    )
+    spray = fly if closed.is_empty else _ground(outline, kept.union(closed), tolerance_m)
     if spray is None or fly is None:
         raise PlanError("obstacles and no-spray areas leave nothing of the field to spray")
     _check_width(spray, swath_width_m)
@@ -113,8 +134,9 @@ def build_field(
         outline=outline,
         fly=fly,
         spray=spray,
-        limit=flown.difference(shapely.union_all(closed)) if closed else flown,
+        limit=flown.difference(closed),
         blocked=blocked,
+        tolerance_m=tolerance_m,
     )
 
 
@@ -142,16 +164,20 @@ def _pieces(area: Area) -> int:
     return sum(1 + len(part.interiors) for part in polygons_of(area))
 
 
-def _ground(area: BaseGeometry) -> Area | None:
-    """Return the ground a margin inside the area, with few vertices."""
-    inside = area.buffer(-MARGIN_M, join_style="mitre").simplify(SIMPLER_M)
-    return as_area(polygons_of(inside))
+def _grown(area: BaseGeometry, by_m: float) -> BaseGeometry:
+    """Return an area and all within a distance of it, with straight edges around its corners."""
+    return area.buffer(by_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
 
 
-def _without(fly: Area | None, closed: Sequence[BaseGeometry]) -> Area | None:
-    if fly is None:
+def _ground(outline: Area, kept: BaseGeometry, tolerance_m: float) -> Area | None:
+    """Return the ground a margin inside the outline and off what is kept clear, few-cornered."""
+    apart = around_with_fewer_corners(
+        _grown(kept, MARGIN_M), max(tolerance_m, OBSTACLE_TOLERANCE_M)
+    )
+    inside = as_area(polygons_of(outline.buffer(-MARGIN_M, join_style="mitre")))
+    if inside is None:
         return None
-    left = fly.difference(shapely.union_all(closed).buffer(MARGIN_M, join_style="mitre"))
+    left = inside_with_fewer_corners(inside, tolerance_m).difference(apart)
     return as_area(polygons_of(left))
 
 
@@ -166,6 +192,14 @@ def _inset(spray: Area, kept_m: float, swath_width_m: float) -> Area:
 
 
 def _check_width(spray: Area, swath_width_m: float) -> None:
+    # The longer side of the hull is not longer than this: passes are at least that many.
+    hull = spray.convex_hull
+    passes = 2.0 * hull.area / hull.length / swath_width_m
+    if not passes <= PASSES_MAX:
+        raise PlanError(
+            f"a swath of {swath_width_m:g} m needs {passes:.0f} passes or more, and a plan has "
+            f"{PASSES_MAX} at most; see --swath-m (mission.swath_width_m)"
+        )
     if spray.buffer(-swath_width_m / 2.0).is_empty:
         raise PlanError(
             f"the field is nowhere as wide as the swath of {swath_width_m:g} m "

@@ -13,25 +13,30 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from companion.maps.local import as_area, polygons_of
+from missions.fewer_corners import inside_with_fewer_corners
 from missions.strips import Floats
 
 # Ways bend this far from a corner, so that rounding does not put them behind it.
-CLEAR_M = 0.3
+CLEAR_M, MITRE_LIMIT = 0.3, 2.0
 # Places on the border count as inside.
 TOUCH_M = 1e-6
-# With more corners than these the outline is simplified first.
-CORNERS_MAX = 300
+# With more corners than these it is drawn simpler, inside of itself, up to the last tolerance.
+CORNERS_MAX, SIMPLER_M = 300, (0.1, 0.2, 0.4, 0.8, 1.6)
 
 
 def _corners(space: BaseGeometry) -> Floats:
     """Return the corners at which a way may have to bend."""
-    inside: BaseGeometry = space.buffer(-CLEAR_M, join_style="mitre", mitre_limit=2.0)
-    tolerance_m = CLEAR_M / 4.0
+    inside = as_area(
+        polygons_of(space.buffer(-CLEAR_M, join_style="mitre", mitre_limit=MITRE_LIMIT))
+    )
+    if inside is None:
+        return np.empty((0, 2))
     found = _sticking_out(inside)
-    while len(found) > CORNERS_MAX:
-        inside = inside.simplify(tolerance_m).intersection(space.buffer(-0.01))
-        tolerance_m *= 2.0
-        found = _sticking_out(inside)
+    for tolerance_m in SIMPLER_M:
+        if len(found) <= CORNERS_MAX:
+            break
+        found = _sticking_out(inside_with_fewer_corners(inside, tolerance_m))
     return found
 
 

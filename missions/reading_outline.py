@@ -19,6 +19,9 @@ from missions.errors import PlanError
 from missions.nearness import check_near
 from missions.strips import Floats
 
+# The nearest land is 1.4 degrees south and 5.6 east of 0, 0.
+AT_SEA_DEG = 1.0
+
 
 def outline_of(
     path: Path, map_file: MapFile | None, said: list[str], *, crs: str | None = None
@@ -28,7 +31,9 @@ def outline_of(
     Rings that cross themselves are repaired, and what that changes is added to `said`.
     """
     try:
-        return read_area(path, crs=crs, repairs=said)
+        outline = read_area(path, crs=crs, repairs=said)
+        check_degrees(outline, path)
+        return outline
     except MapError as error:
         if error.code != "no-polygon":
             raise
@@ -40,6 +45,22 @@ def outline_of(
         if cells is None or cells.cells is None:
             raise
         return _of_cells(cells)
+
+
+def check_degrees(area: Area, path: Path) -> None:
+    """Refuse metres of a local origin that were read as degrees: they begin at 0, 0.
+
+    Raises:
+        PlanError: for what lies beside 0, 0 in the Gulf of Guinea, where no field is.
+    """
+    west, south, east, north = area.bounds
+    beside = west <= AT_SEA_DEG and east >= -AT_SEA_DEG
+    if beside and south <= AT_SEA_DEG and north >= -AT_SEA_DEG:
+        raise PlanError(
+            f"{path}: the outline lies at latitude 0, longitude 0, in the sea (x {west:g} to "
+            f"{east:g}, y {south:g} to {north:g}); these look like metres from a local origin: "
+            "give longitude and latitude in degrees, or metres with their CRS"
+        )
 
 
 def _of_cells(map_file: MapFile) -> MultiPolygon | Area:

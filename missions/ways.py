@@ -94,10 +94,13 @@ def _is_in(blocked: BaseGeometry, east_m: float, north_m: float) -> bool:
 
 
 def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
-    """Return places along the edge of the field, evenly apart."""
+    """Return places along the edge of the field, evenly apart, where one gets to from outside.
+
+    Obstacles that reach over the edge, or cut the field in two, have edges in it: none of those.
+    """
     rings = [shapely.get_exterior_ring(part) for part in shapely.get_parts(field.fly)]
     step_m = max(step_m, sum(ring.length for ring in rings) / count_max)
-    return np.concatenate(
+    places = np.concatenate(
         [
             shapely.get_coordinates(
                 shapely.line_interpolate_point(ring, np.arange(0.0, ring.length, step_m))
@@ -105,6 +108,13 @@ def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
             for ring in rings
         ]
     )
+    edges = shapely.union_all(
+        [shapely.get_exterior_ring(part) for part in shapely.get_parts(field.outline)]
+    )
+    far_m = shapely.distance(edges, shapely.points(places))
+    # So far inside the border may be drawn.
+    outer: Floats = places[far_m <= max(field.tolerance_m, ON_EDGE_M)]
+    return outer if len(outer) else places
 
 
 def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:

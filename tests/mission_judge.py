@@ -1,0 +1,170 @@
+"""Judges a planned mission from its files, with shapely and the shape of the Earth alone.
+
+Nothing of the planner is imported: outline and obstacles are those that were drawn, the plan is
+the `.geojson` that was written, the fence that of the `.plan`. Places are turned into metres by
+the tangent plane of WGS84 in the field's middle, in which ways that are straight on the ground
+stay straight (3 mm over 2 km).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
+Floats = NDArray[np.float64]
+
+AXIS_M, FLATTENING = 6_378_137.0, 1.0 / 298.257_223_563
+# An edge is straight on the ground for one program and in degrees for another.
+STRAIGHT_M = 0.03
+# A strip and the border that it is flown along differ by the digits of coordinates in files.
+DIGITS_M = 1e-3
+
+
+def _centred(lon_lat: Floats) -> Floats:
+    """Return places from the Earth's centre."""
+    lon, lat = np.radians(lon_lat[:, 0]), np.radians(lon_lat[:, 1])
+    square = FLATTENING * (2.0 - FLATTENING)
+    normal = AXIS_M / np.sqrt(1.0 - square * np.sin(lat) ** 2)
+    flat = normal * np.cos(lat)
+    return np.column_stack(
+        [flat * np.cos(lon), flat * np.sin(lon), normal * (1.0 - square) * np.sin(lat)]
+    )
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The tangent plane at a place of longitude and latitude."""
+
+    lon: float
+    lat: float
+
+    def metres(self, lon_lat: Floats) -> Floats:
+        """Return east and north of the place."""
+        away = _centred(lon_lat) - _centred(np.array([[self.lon, self.lat]]))
+        lon, lat = np.radians(self.lon), np.radians(self.lat)
+        east = np.array([-np.sin(lon), np.cos(lon), 0.0])
+        north = np.array([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)])
+        return np.column_stack([away @ east, away @ north])
+
+    def area(self, degrees: BaseGeometry) -> BaseGeometry:
+        """Return an area in metres."""
+        found: BaseGeometry = shapely.transform(degrees, self.metres)
+        return found if found.is_valid else found.buffer(0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drawn:
+    """What was drawn, in longitude and latitude; `tolerance_m` is what the plan may leave off."""
+
+    outline: BaseGeometry
+    obstacles: Sequence[BaseGeometry] = ()
+    obstacle_buffer_m: float = 2.0
+    no_spray: Sequence[BaseGeometry] = ()
+    width_m: float = 6.0
+    plane: Plane = field(init=False)
+
+    def __post_init__(self) -> None:
+        west, south, east, north = self.outline.bounds
+        object.__setattr__(self, "plane", Plane((west + east) / 2.0, (south + north) / 2.0))
+
+    def flown(self) -> BaseGeometry:
+        """Return what may be flown over."""
+        taken = [self.plane.area(each).buffer(self.obstacle_buffer_m) for each in self.obstacles]
+        return self.plane.area(self.outline).difference(shapely.union_all(taken))
+
+    def sprayed(self) -> BaseGeometry:
+        """Return what may be sprayed."""
+        return self.flown().difference(
+            shapely.union_all([self.plane.area(each) for each in self.no_spray])
+        )
+
+
+def judge(drawn: Drawn, plan: dict[str, Any], *, speed_m_s: float, a_m_s2: float) -> dict[str, Any]:
+    """Return the figures of a plan as GeoJSON."""
+    legs = [
+        (each["properties"]["kind"], drawn.plane.metres(np.array(each["geometry"]["coordinates"])))
+        for each in plan["features"]
+        if each["geometry"]["type"] == "LineString"
+    ]
+    strips, lengths_m = [], []
+    for kind, points in legs:
+        if kind == "spray":
+            for a, b in pairwise(points):
+                strips.append(_strip(a, b, drawn.width_m))
+                lengths_m.append(float(np.hypot(*(b - a))))
+    covered = shapely.union_all(strips)
+    ground, half_m = drawn.sprayed(), drawn.width_m / 2.0
+    reachable = ground.buffer(-half_m, quad_segs=32).buffer(half_m, quad_segs=32)
+    reached = covered.intersection(reachable).area
+    off = covered.difference(ground.buffer(STRAIGHT_M))
+    ways = [shapely.LineString(points[:, :2]) for kind, points in legs if kind == "transit"]
+    free = drawn.flown().buffer(STRAIGHT_M)
+    total_m = np.array(lengths_m)
+    return {
+        "area_ha": ground.area / 1e4,
+        "lines": len(strips),
+        "short_lines": int((total_m < speed_m_s**2 / a_m_s2).sum()),
+        "under_1_m": int((total_m < 1.0).sum()),
+        "spray_km": float(total_m.sum()) / 1e3,
+        "covered_percent": 100.0 * covered.intersection(ground).area / ground.area,
+        "reachable_percent": 100.0 * reached / reachable.area,
+        "twice_percent": 100.0 * (float(total_m.sum()) * drawn.width_m - covered.area)
+        / ground.area,
+        "off_m2": off.area if off.area > DIGITS_M else 0.0,
+        "transit_outside_m": sum(way.difference(free).length for way in ways),
+        "transit_km": sum(way.length for way in ways) / 1e3,
+    }  # fmt: skip
+
+
+def _strip(start: Floats, end: Floats, width_m: float) -> BaseGeometry:
+    along = (end - start) / np.hypot(*(end - start))
+    side = np.array([along[1], -along[0]]) * width_m / 2.0
+    return shapely.Polygon([start + side, end + side, end - side, start - side])
+
+
+def judge_fence(
+    drawn: Drawn, plan: dict[str, Any], *, corners_max: int, outside_max_m: float
+) -> list[str]:
+    """Return what is wrong with the fence of a `.plan`."""
+    polygons = plan["geoFence"]["polygons"]
+    corners = sum(len(each["polygon"]) for each in polygons)
+    found = [f"{corners} corners"] if corners > corners_max else []
+    inside, outside = [], []
+    for each in polygons:
+        ring = np.array(each["polygon"])[:, ::-1]
+        area = shapely.Polygon(drawn.plane.metres(ring))
+        if not area.is_valid:
+            found.append("a ring crosses itself")
+        (inside if each["inclusion"] else outside).append(area)
+    free = shapely.intersection_all(inside).difference(shapely.union_all(outside))
+    items = [
+        (item["params"][5], item["params"][4])
+        for item in plan["mission"]["items"]
+        if item["command"] in (16, 22) and item["params"][4]
+    ]
+    places = shapely.points(drawn.plane.metres(np.array(items)))
+    beyond = int((~shapely.covers(free, places)).sum())
+    if beyond:
+        found.append(f"{beyond} items outside of it")
+    ways = shapely.LineString(drawn.plane.metres(np.array(items)))
+    if not free.buffer(DIGITS_M).covers(ways):
+        found.append(f"{ways.difference(free).length:.1f} m of the way outside of it")
+    outline = drawn.plane.area(drawn.outline)
+    wanted = shapely.union_all([outline, *(way.buffer(2.0) for way in (ways,))])
+    far_m = max(
+        (
+            float(shapely.distance(wanted, shapely.points(shapely.get_coordinates(each))).max())
+            for each in inside
+        ),
+        default=0.0,
+    )
+    if far_m > outside_max_m:
+        found.append(f"{far_m:.1f} m outside the field")
+    return found

@@ -1,0 +1,218 @@
+"""Outlines as they are recorded and digitised: many corners, rings that cross, no degrees."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from shapely import Polygon, box
+from shapely.affinity import rotate, translate
+
+from companion.errors import MapError
+from companion.maps.local import make_valid
+from missions.demand import Uniform
+from missions.errors import PlanError
+from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
+from missions.field import Field, build_field
+from missions.free_space import CORNERS_MAX, free_space
+from missions.plan import Plan, Settings
+from missions.planner import plan_mission
+from missions.reading_outline import outline_of
+from missions.strips import Floats
+from missions.ways import edge_places
+from tests.bench.missions import FRAME, to_degrees
+from tests.mission_fields import blob, recorded, trees
+from tests.mission_judge import Drawn, judge
+
+SETTINGS = Settings(swath_width_m=6.0, speed_m_s=6.0, moves=500)
+
+
+def corners(area: shapely.Geometry) -> int:
+    return len(shapely.get_coordinates(area))
+
+
+def field_of(drawn: Drawn) -> Field:
+    return build_field(
+        drawn.outline, obstacles=list(drawn.obstacles), swath_width_m=drawn.width_m  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+def zigzag(teeth: int) -> Polygon:
+    """Return a field with a saw's edge, no tooth of which can be left out."""
+    across = np.repeat(np.arange(teeth) * 4.0, 2)
+    along = np.tile([0.0, 3.0], teeth)
+    edge: Floats = np.column_stack([across + np.tile([0.0, 2.0], teeth), along])
+    long_m = float(edge[-1, 0])
+    return Polygon([*edge, (long_m, 120.0), (0.0, 120.0)])
+
+
+SHAPES = {
+    "recorded-1": recorded(rotate(box(0.0, 0.0, 134.0, 84.0), 17.0), step_m=1.0),
+    "recorded-3": recorded(blob(5.0, seed=3), step_m=3.0),
+    "smooth": Drawn(outline=recorded(blob(1.1, seed=2), step_m=1.0, noise_m=0.0).outline),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_fewer_corners_stay_inside_and_near(name: str) -> None:
+    drawn = SHAPES[name]
+    area = drawn.plane.area(drawn.outline)
+    assert isinstance(area, Polygon)
+    found = inside_with_fewer_corners(area, 0.1)
+    assert area.buffer(1e-6).covers(found)
+    assert corners(found) < corners(area) * 0.4
+    far_m = shapely.distance(found.boundary, shapely.points(shapely.get_coordinates(area)))
+    assert far_m.max() <= 0.1 + 1e-3
+    assert area.area - found.area <= 0.1 * area.length
+
+
+def test_a_hole_with_fewer_corners_is_larger_and_a_drawn_corner_stays_where_it_is() -> None:
+    hole = shapely.Point(60.0, 40.0).buffer(8.0, quad_segs=24)
+    ground = Polygon(
+        [(0.0, 0.0), (150.0, 0.0), (150.0, 90.0), (70.0, 130.0), (0.0, 90.0)],
+        [hole.exterior.coords],
+    )
+    found = inside_with_fewer_corners(ground, 0.1)
+    assert isinstance(found, Polygon)
+    assert corners(found.exterior) == 6
+    assert found.exterior.equals(ground.exterior)
+    assert Polygon(found.interiors[0]).covers(hole)
+    assert corners(found.interiors[0]) < 40
+
+
+@pytest.mark.parametrize("radius_m", [1.0, 3.0, 7.0])
+def test_a_tree_is_drawn_around_with_few_corners(radius_m: float) -> None:
+    tree = shapely.Point(3.0, 4.0).buffer(radius_m, quad_segs=32)
+    found = around_with_fewer_corners(tree, 0.5)
+    assert found.covers(tree)
+    assert corners(found) <= 13
+    assert found.hausdorff_distance(tree) <= 0.75
+
+
+def test_ways_over_ground_with_very_many_corners_are_found() -> None:
+    # No tolerance takes a tooth away; a simpler border used to get them back, without end.
+    ground = zigzag(CORNERS_MAX + 20)
+    space = free_space(ground)
+    assert len(space.corners) > CORNERS_MAX
+    way = space.way((8.0, 1.0), (1248.0, 1.0))
+    assert way
+    assert ground.buffer(1e-3).covers(shapely.LineString(way))
+
+
+def test_an_outline_of_a_point_every_metre_is_planned_like_the_field_that_it_is() -> None:
+    drawn = recorded(rotate(box(0.0, 0.0, 134.0, 84.0), 17.0), step_m=1.0)
+    found = judged(drawn)
+    assert found["lines"] <= 60  # its rectangle needs 15, today's planner 425
+    assert found["reachable_percent"] >= 99.7  # 0.17 % are given up for a simpler border
+    assert found["off_m2"] == 0.0
+    assert found["transit_outside_m"] == 0.0
+
+
+@pytest.mark.parametrize("corner_count", [8, 64])
+def test_trees_need_a_few_lines_each(corner_count: int) -> None:
+    drawn = trees(5, corners=corner_count, area_ha=4.0)
+    found = judged(drawn)
+    assert found["lines"] <= 95
+    assert found["reachable_percent"] >= 99.8
+    assert found["off_m2"] == 0.0
+    assert found["transit_outside_m"] == 0.0
+
+
+def judged(drawn: Drawn) -> dict[str, float]:
+    return judge(drawn, geojson_of(planned(drawn)), speed_m_s=6.0, a_m_s2=2.5)
+
+
+def planned(drawn: Drawn) -> Plan:
+    return plan_mission(field_of(drawn), SETTINGS, Uniform(rate_l_ha=20.0))
+
+
+def geojson_of(plan: Plan) -> dict[str, object]:
+    from missions.files.geojson import geojson_text
+
+    found: dict[str, object] = json.loads(geojson_text(plan))
+    return found
+
+
+# --- rings that cross, and what is no degrees --------------------------------------------------
+
+
+def written(path: Path, *rings: list[tuple[float, float]]) -> Path:
+    geometry = {"type": "Polygon", "coordinates": [[list(at) for at in ring] for ring in rings]}
+    feature = {"type": "Feature", "properties": {}, "geometry": geometry}
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    return path
+
+
+def ring(*points: tuple[float, float]) -> list[tuple[float, float]]:
+    found = shapely.get_coordinates(to_degrees(Polygon(points)))
+    return [(float(x), float(y)) for x, y in found]
+
+
+SQUARE = ring((0, 0), (200, 0), (200, 100), (0, 100))
+
+
+def test_a_hole_outside_of_its_outline_is_no_ground() -> None:
+    shell, hole = box(0, 0, 100, 100), box(150, 0, 160, 10)
+    drawn = Polygon(shell.exterior.coords, [hole.exterior.coords])
+    found = make_valid(drawn)
+    assert found is not None
+    assert found.equals(shell)
+    # One that reaches over its edge takes away what it has of the field.
+    crossing = Polygon(shell.exterior.coords, [translate(hole, -55.0, 20.0).exterior.coords])
+    found = make_valid(crossing)
+    assert found is not None
+    assert found.area == pytest.approx(100.0 * 100.0 - 5.0 * 10.0)
+
+
+@pytest.mark.parametrize(
+    "rings",
+    [
+        (ring((0, 0), (200, 100), (200, 0), (0, 100)),),
+        (SQUARE, ring((250, 20), (300, 20), (300, 60), (250, 60))),
+        (SQUARE, ring((180, 20), (230, 20), (230, 60), (180, 60))),
+    ],
+    ids=["bow-tie", "hole outside", "hole over the edge"],
+)
+def test_an_outline_whose_repair_changes_its_ground_is_refused(
+    tmp_path: Path, rings: tuple[list[tuple[float, float]], ...]
+) -> None:
+    path = written(tmp_path / "f.geojson", *rings)
+    with pytest.raises(MapError, match=r"f\.geojson: record 1: rings cross .* repair it"):
+        outline_of(path, None, [])
+
+
+def test_a_walk_that_crosses_its_own_start_is_repaired_and_that_is_said(tmp_path: Path) -> None:
+    walk = ring((0, 1.5), (-2, -2), (200, 0), (200, 100), (0, 100), (0, -2), (-3, -1))
+    said: list[str] = []
+    outline_of(written(tmp_path / "f.geojson", walk), None, said)
+    assert len(said) == 1
+
+
+def test_metres_that_were_read_as_degrees_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path / "f.geojson", [(0, 0), (0.2, 0), (0.2, 0.1), (0, 0.1), (0, 0)])
+    with pytest.raises(PlanError, match="metres from a local origin"):
+        outline_of(path, None, [])
+    metres = [(0.0, 0.0), (80.0, 0.0), (80.0, 40.0), (0.0, 40.0), (0.0, 0.0)]
+    with pytest.raises(MapError, match="metres from a local origin"):
+        outline_of(written(path, metres), None, [])
+
+
+@pytest.mark.parametrize("width_m", [0.05, 1e-6])
+def test_a_swath_that_needs_thousands_of_passes_is_refused(width_m: float) -> None:
+    with pytest.raises(PlanError, match=r"passes or more.*--swath-m"):
+        build_field(to_degrees(box(0, 0, 200, 100)), swath_width_m=width_m, frame=FRAME)
+
+
+def test_no_depot_is_suggested_at_an_obstacle_inside_the_field() -> None:
+    field = build_field(
+        to_degrees(box(0, 0, 300, 100)), obstacles=[to_degrees(box(140, -10, 150, 110))],
+        swath_width_m=6.0, frame=FRAME,
+    )  # fmt: skip
+    places = edge_places(field, step_m=5.0, count_max=500)
+    edge = field.outline.boundary
+    assert max(edge.distance(shapely.Point(place)) for place in places) <= 0.11
+    assert math.isfinite(places.sum())
