@@ -124,7 +124,10 @@ def build_field(
             for area in off
         ]
     )
-    spray = fly if closed.is_empty else _ground(outline, kept.union(closed), tolerance_m)
+    spray = fly
+    if fly is not None and not closed.is_empty:
+        apart = around_with_fewer_corners(_grown(closed, MARGIN_M), tolerance_m)
+        spray = as_area(polygons_of(fly.difference(apart)))
     if spray is None or fly is None:
         raise PlanError("obstacles and no-spray areas leave nothing of the field to spray")
     _check_width(spray, swath_width_m)
