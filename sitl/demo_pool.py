@@ -16,6 +16,7 @@ Work = TypeVar("Work")
 Done = TypeVar("Done")
 
 PROCESSES_MAX = 2
+_SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def do_all(
@@ -33,7 +34,7 @@ def do_all(
         processes = min(PROCESSES_MAX, len(os.sched_getaffinity(0)))
     if processes == 1:
         return [_told(function(work), on_done) for work in works]
-    with _pool(processes) as pool:
+    with _no_module_of_this_folder(), _pool(processes) as pool:
         futures: list[Future[Done]] = [pool.submit(function, work) for work in works]
         for future in as_completed(futures):
             _told(future.result(), on_done)
@@ -69,6 +70,19 @@ def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown(cancel_futures=True)
         ours.close()
         theirs.close()
+
+
+@contextmanager
+def _no_module_of_this_folder() -> Iterator[None]:
+    """Start every Python as with -P: `multiprocessing` starts its own by `-c`, which looks here."""
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[_SAFE_PATH]
+        if before is not None:
+            os.environ[_SAFE_PATH] = before
 
 
 @contextmanager

@@ -17,6 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from companion.cli.beside import give_way
+from companion.cli.drawing_rules import ignore_the_folders_own
 from companion.errors import ActuatorError, MapError, UnreadableError, VrsprayError
 
 if TYPE_CHECKING:
@@ -140,6 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments is None:
         arguments = sys.argv[1:]
         give_way(arguments)
+        ignore_the_folders_own()
     sys.exit(execute(arguments))
 
 

@@ -55,7 +55,7 @@ class Unit:
         """Return the unit's file."""
         template = resources.files("companion.cli").joinpath("vrspray.service").read_text()
         filled = template.format(
-            start=command(self.python, "-m", "companion", "run", "--config", self.config),
+            start=command(self.python, "-P", "-m", "companion", "run", "--config", self.config),
             closer=self._closer(),
             account="" if self.is_user else self._account(),
             realtime=self._realtime(),
@@ -67,7 +67,7 @@ class Unit:
     def _closer(self) -> str:
         if not self.closer:
             return "# No valve hangs on this computer's lines: there is nothing to close after it."
-        close = command(self.python, "-m", "companion.output.engine.closer", *self.closer)
+        close = command(self.python, "-P", "-m", "companion.output.engine.closer", *self.closer)
         return (
             "# After every end, crash and watchdog included: lines to their safe levels.\n"
             f"ExecStopPost={close}"

@@ -76,7 +76,7 @@ def test_the_watchdog_and_the_restart_are_those_of_a_sprayer() -> None:
 def test_only_valves_on_own_lines_have_a_closer() -> None:
     closed = replace(UNIT, closer=("--chip", "gpiochip0", "--low", "17", "18"))
     assert [line for line in lines_of(closed) if line.startswith("ExecStopPost=")] == [
-        "ExecStopPost=/opt/vrspray/bin/python -m companion.output.engine.closer "
+        "ExecStopPost=/opt/vrspray/bin/python -P -m companion.output.engine.closer "
         "--chip gpiochip0 --low 17 18"
     ]
     assert not any(line.startswith("ExecStopPost=") for line in lines_of(UNIT))

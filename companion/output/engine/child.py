@@ -11,7 +11,9 @@ from contextlib import ExitStack, suppress
 
 from companion.output.engine.wire import PACKET_MAX
 
-COMMAND = (sys.executable, "-m", "companion.output.engine")
+# -P: a module of the working directory is none of ours, whatever its name. Not -I, which would
+# also leave out a user's own site-packages, where this program may be installed.
+COMMAND = (sys.executable, "-P", "-m", "companion.output.engine")
 KILL_MAX_S = 0.1
 
 

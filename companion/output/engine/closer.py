@@ -1,7 +1,7 @@
 """The independent closer: drives lines to given levels and ends.
 
 For `ExecStopPost` of the service, which runs after every end of it, crash and watchdog included:
-`python -m companion.output.engine.closer --chip gpiochip0 --low 17 18 --high 22`, or for a shift
+`python -P -m companion.output.engine.closer --chip gpiochip0 --low 17 18 --high 22`, or for a shift
 register `--spi /dev/spidev0.0 --bytes 000008`. Motors on hardware PWM, which pulses on by itself,
 are stopped by `--pwm 0:1:1000` (chip, output, microseconds of stop). It needs no configuration, no
 file and nothing of the companion, so that it works where those are the trouble.
@@ -58,7 +58,7 @@ def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
         prog="closer",
         description="Drive lines to their safe levels.",
-        epilog="Example: python -m companion.output.engine.closer --chip gpiochip0 --low 17 18",
+        epilog="Example: python -P -m companion.output.engine.closer --chip gpiochip0 --low 17 18",
     )
     parser.add_argument("--chip", default="gpiochip0", help="name, path or label of the chip")
     parser.add_argument("--low", type=int, nargs="*", default=[], metavar="LINE")

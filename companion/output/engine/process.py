@@ -130,7 +130,7 @@ def _end_wakes() -> int:
 
 
 def main(arguments: list[str]) -> int:
-    """Run as `python -m companion.output.engine FD PARENT`."""
+    """Run as `python -P -m companion.output.engine FD PARENT`."""
     file, parent = (int(text) for text in arguments)
     with socket.socket(fileno=file) as connection:
         os.set_inheritable(file, False)
