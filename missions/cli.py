@@ -13,6 +13,7 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 from companion.cli.map_grid import parse_mark
 from companion.config import load
+from missions.files.fence import fence_warnings
 from missions.files.fleet import write_fleet
 from missions.files.write import check_suffix
 from missions.picture import check_picture, draw_plan
@@ -172,6 +173,8 @@ def plan(
     files, marks = write_fleet(planned, out, with_sprayer=sprayer)
     if png is not None:
         draw_plan(planned, png, title=field.stem)
+    if out.suffix.casefold() == ".plan":
+        planned = replace(planned, warnings=(*planned.warnings, *fence_warnings(planned)))
     warnings = planned.warnings
     result = sheet(planned, with_sprayer=sprayer) | {
         "planning_s": took_s,

@@ -134,8 +134,11 @@ def judge_fence(
 ) -> list[str]:
     """Return what is wrong with the fence of a `.plan`."""
     polygons = plan["geoFence"]["polygons"]
+    circles = plan["geoFence"]["circles"]
     corners = sum(len(each["polygon"]) for each in polygons)
-    found = [f"{corners} corners"] if corners > corners_max else []
+    # As ArduPilot keeps it: 8 bytes a corner, 2 a polygon, 13 a circle, 5 in all.
+    kept = 5 + 8 * corners + 2 * len(polygons) + 13 * len(circles)
+    found = [f"{corners} corners, {kept} bytes"] if kept > 8 * corners_max else []
     inside, outside = [], []
     for each in polygons:
         ring = np.array(each["polygon"])[:, ::-1]
@@ -143,6 +146,10 @@ def judge_fence(
         if not area.is_valid:
             found.append("a ring crosses itself")
         (inside if each["inclusion"] else outside).append(area)
+    for each in circles:
+        lat, lon = each["circle"]["center"]
+        middle = shapely.Point(*drawn.plane.metres(np.array([[lon, lat]]))[0])
+        outside.append(middle.buffer(each["circle"]["radius"]))
     free = shapely.intersection_all(inside).difference(shapely.union_all(outside))
     items = [
         (item["params"][5], item["params"][4])

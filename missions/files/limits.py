@@ -6,7 +6,6 @@ from typing import Any
 
 from missions.errors import PlanError
 from missions.files.plan_rules import (
-    FENCE_CORNERS_MAX,
     ITEMS_MAX,
     RALLY_MAX,
     plan_problems,
@@ -46,8 +45,3 @@ def check_content(plan: Plan, sortie: Sortie, content: dict[str, Any]) -> None:
     problems = plan_problems(content)
     if problems:
         raise PlanError(f"sortie {sortie.number} makes no plan that loads: {problems[0]}")
-
-
-def corners_max(plan: Plan) -> int:
-    """Return how many corners a fence may have in all."""
-    return FENCE_CORNERS_MAX[plan.settings.autopilot]

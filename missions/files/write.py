@@ -6,6 +6,7 @@ from pathlib import Path
 
 from companion.maps.whole_file import write_whole
 from missions.errors import PlanError
+from missions.files.fence import Fences
 from missions.files.geojson import geojson_text
 from missions.files.kml import kml_text
 from missions.files.plan_file import plan_text
@@ -63,7 +64,10 @@ def write_plan(plan: Plan, out: Path, *, with_sprayer: bool = False) -> list[Pat
     elif suffix == ".kml":
         texts = [kml_text(plan)]
     elif suffix == ".plan":
-        texts = [plan_text(plan, each, with_sprayer=with_sprayer) for each in plan.sorties]
+        fences = Fences(plan)
+        texts = [
+            plan_text(plan, each, with_sprayer=with_sprayer, fences=fences) for each in plan.sorties
+        ]
     else:
         texts = [waypoints_text(plan, each, with_sprayer=with_sprayer) for each in plan.sorties]
     paths = paths_of(out, len(texts))

@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 import pytest
 from pymavlink import mavwp
-from shapely import Polygon, box
+from shapely import Point, Polygon, box
 
 from companion.core.frame import LocalFrame
 from missions.demand import Uniform
@@ -67,6 +67,10 @@ def test_the_fence_holds_the_whole_flight(plan: Plan, tmp_path: Path) -> None:
     polygons = content["geoFence"]["polygons"]
     keep_in = [Polygon(each["polygon"]) for each in polygons if each["inclusion"]]
     keep_out = [Polygon(each["polygon"]) for each in polygons if not each["inclusion"]]
+    keep_out += [
+        Point(each["circle"]["center"]).buffer(each["circle"]["radius"] / 111_200.0)
+        for each in content["geoFence"]["circles"]
+    ]
     assert len(keep_in) == len(keep_out) == 1
     for item in content["mission"]["items"]:
         if item["command"] == 16:

@@ -18,6 +18,10 @@ from missions.demand import Uniform
 from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
 from missions.field import Field, build_field
+from missions.files.fence import Fences, fence_warnings
+from missions.files.geojson import geojson_text
+from missions.files.plan_file import plan_text
+from missions.files.plan_rules import FENCE_CORNERS_MAX
 from missions.free_space import CORNERS_MAX, free_space
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
@@ -25,8 +29,8 @@ from missions.reading_outline import outline_of
 from missions.strips import Floats
 from missions.ways import edge_places
 from tests.bench.missions import FRAME, to_degrees
-from tests.mission_fields import blob, recorded, trees
-from tests.mission_judge import Drawn, judge
+from tests.mission_fields import blob, degrees, recorded, trees
+from tests.mission_judge import Drawn, judge, judge_fence
 
 SETTINGS = Settings(swath_width_m=6.0, speed_m_s=6.0, moves=500)
 
@@ -131,8 +135,6 @@ def planned(drawn: Drawn) -> Plan:
 
 
 def geojson_of(plan: Plan) -> dict[str, object]:
-    from missions.files.geojson import geojson_text
-
     found: dict[str, object] = json.loads(geojson_text(plan))
     return found
 
@@ -216,3 +218,48 @@ def test_no_depot_is_suggested_at_an_obstacle_inside_the_field() -> None:
     edge = field.outline.boundary
     assert max(edge.distance(shapely.Point(place)) for place in places) <= 0.11
     assert math.isfinite(places.sum())
+
+
+# --- fences ------------------------------------------------------------------------------------
+
+
+def fence_faults(plan: Plan, drawn: Drawn) -> list[str]:
+    fences = Fences(plan)
+    return [
+        fault
+        for sortie in plan.sorties
+        for fault in judge_fence(
+            drawn, json.loads(plan_text(plan, sortie, fences=fences)),
+            corners_max=FENCE_CORNERS_MAX["ardupilot"], outside_max_m=6.0,
+        )
+    ]  # fmt: skip
+
+
+def test_a_fence_among_many_trees_fits_and_says_which_found_no_room() -> None:
+    drawn = trees(50, corners=8, area_ha=8.0)
+    plan = planned(drawn)
+    assert not fence_faults(plan, drawn)
+    assert "the fence has no room for" in fence_warnings(plan)[0]
+
+
+def test_a_fence_around_an_outline_of_a_point_every_metre_is_near_it() -> None:
+    drawn = recorded(blob(2.0, seed=3), step_m=1.0)
+    plan = planned(drawn)
+    assert not fence_faults(plan, drawn)
+    assert fence_warnings(plan) == ()
+
+
+def test_two_parts_of_a_field_have_no_fence_around_all_between_them() -> None:
+    two = shapely.union_all([box(0, 0, 80, 60), box(400, 0, 480, 60)])
+    drawn = Drawn(outline=degrees(two))
+    plan = planned(drawn)
+    assert not fence_faults(plan, drawn)
+
+
+def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:
+    comb_like = shapely.union_all(
+        [box(0, 0, 400, 20), *(box(16 * k, 0, 16 * k + 8, 60) for k in range(25))]
+    )
+    plan = planned(Drawn(outline=degrees(comb_like)))
+    with pytest.raises(PlanError, match=r"sortie 1: a fence within 9 m .* ArduPilot stores 70"):
+        plan_text(plan, plan.sorties[0])

@@ -1,0 +1,230 @@
+"""The fence of a sortie: where it must stay, off which obstacles, in the room an autopilot has.
+
+Autopilots store few corners. The border is drawn with the fewest that keep it near the field, and
+obstacles as circles where they are round. What cannot hold the whole way is no fence: the plan is
+refused. Obstacles for which there is no room are left out, the smallest first, and counted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import shapely
+from shapely import LineString, Polygon
+from shapely.geometry.base import BaseGeometry
+from shapely.geometry.polygon import orient
+
+from companion.maps.local import polygons_of
+from missions.errors import PlanError
+from missions.fewer_corners import around_with_fewer_corners
+from missions.files.limits import NAMES
+from missions.files.plan_rules import FENCE_CORNERS_MAX
+from missions.plan import Plan, Sortie
+
+# The fence lies so far outside the field, at least; drawn with fewer corners, so much farther.
+OUT_M, QUICK_M, SIMPLER_M = 1.0, 0.2, (0.5, 1.0, 2.0, 4.0, 8.0)
+# A fence that lies farther outside than this is worth a word.
+NEAR_M = 6.0
+# On each side of a way outside the field.
+FERRY_M = 2.0
+# Obstacles are fenced so much smaller than their buffers: no rounding puts a pass into them.
+OBSTACLE_LESS_M, OBSTACLE_SIMPLER_M = 0.5, 0.4
+# A circle stands for an obstacle of which it is so much.
+ROUND_SHARE = 0.6
+# ArduPilot keeps a fence in 560 bytes, 8 for a corner: beside the corners it notes where the fence
+# begins and ends (5 bytes), kind and number of corners of each polygon (2), and circles (13).
+CORNER_BYTES, ENDS_BYTES, POLYGON_BYTES, CIRCLE_BYTES = 8, 5, 2, 13
+DIGITS = 9
+MITRE_LIMIT = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fence:
+    """Shapes in metres; `left_out` are the obstacles that found no room."""
+
+    border: Polygon
+    polygons: tuple[Polygon, ...] = ()
+    circles: tuple[tuple[float, float, float], ...] = ()
+    left_out: int = 0
+    simpler_m: float = 0.0
+
+    @property
+    def outside_m(self) -> float:
+        """Return how far outside of field and ways it lies, at most."""
+        return OUT_M + QUICK_M + self.simpler_m
+
+
+@dataclass(frozen=True)
+class Fences:
+    """The fences of all sorties of a plan."""
+
+    plan: Plan
+
+    @property
+    def room_bytes(self) -> int:
+        """Return what the autopilot keeps a fence in, as if all counted corners as ArduPilot."""
+        return FENCE_CORNERS_MAX[self.plan.settings.autopilot] * CORNER_BYTES - ENDS_BYTES
+
+    @cached_property
+    def obstacles(self) -> list[tuple[Polygon, tuple[float, float, float] | None]]:
+        """Return the obstacles, the largest first, each with the circle that may stand for it."""
+        inner = self.plan.field.blocked.buffer(-OBSTACLE_LESS_M, join_style="mitre")
+        parts = sorted(polygons_of(inner), key=lambda part: -part.area)
+        return [(_smaller(part), _circle(part)) for part in parts]
+
+    @cached_property
+    def borders(self) -> list[tuple[float, BaseGeometry]]:
+        """Return the borders of the field with its ways outside, which most sorties share."""
+        return self._borders(self.plan.field.outline)
+
+    def of(self, sortie: Sortie) -> Fence:
+        """Return the fence of one sortie.
+
+        Raises:
+            PlanError: where none has room that keeps near the field and holds the way.
+        """
+        way = shapely.union_all([LineString(leg.points) for leg in sortie.legs])
+        outline = self.plan.field.outline
+        beyond = way.difference(outline.buffer(OUT_M / 2.0))
+        borders = self.borders
+        if not beyond.is_empty:
+            whole = outline.union(beyond.buffer(FERRY_M, quad_segs=2))
+            borders = self._borders(whole)
+        fitting = [
+            found
+            for simpler_m, drawn in borders
+            for border in polygons_of(drawn)
+            if border.covers(way)
+            if (found := self._with_obstacles(border, simpler_m)) is not None
+        ]
+        if not fitting:
+            self._refuse(sortie, borders, way)
+        fence = min(fitting, key=lambda found: found.left_out)
+        self._check(fence, way, sortie)
+        return fence
+
+    def _borders(self, ground: BaseGeometry) -> list[tuple[float, BaseGeometry]]:
+        """Return (tolerance, borders) around some ground, nearer ones with more corners first."""
+        # A first, quick simplification that a wider buffer makes up for.
+        wider = ground.buffer(OUT_M + QUICK_M, join_style="mitre", mitre_limit=MITRE_LIMIT)
+        quick = wider.simplify(QUICK_M)
+        return [(each, around_with_fewer_corners(quick, each)) for each in SIMPLER_M]
+
+    def _with_obstacles(self, border: Polygon, simpler_m: float) -> Fence | None:
+        """Return a fence of this border with as many obstacles as there is room for."""
+        left = self.room_bytes - _polygon_bytes(border)
+        if left < 0:
+            return None
+        polygons, circles = [], []
+        for polygon, circle in self.obstacles:
+            taken = _polygon_bytes(polygon) if circle is None else CIRCLE_BYTES
+            if not border.intersects(polygon):
+                continue
+            if taken > left:
+                break
+            left -= taken
+            if circle is None:
+                polygons.append(polygon)
+            else:
+                circles.append(circle)
+        inside = sum(border.intersects(polygon) for polygon, _ in self.obstacles)
+        return Fence(
+            border=border, polygons=tuple(polygons), circles=tuple(circles),
+            left_out=inside - len(polygons) - len(circles), simpler_m=simpler_m,
+        )  # fmt: skip
+
+    def _refuse(
+        self, sortie: Sortie, borders: list[tuple[float, BaseGeometry]], way: BaseGeometry
+    ) -> None:
+        drawn = [part for _, border in borders for part in polygons_of(border) if part.covers(way)]
+        corners = min((_corners(part) for part in drawn), default=0)
+        room = FENCE_CORNERS_MAX[self.plan.settings.autopilot]
+        far_m = OUT_M + QUICK_M + SIMPLER_M[-1]
+        raise PlanError(
+            f"sortie {sortie.number}: a fence within {far_m:.0f} m of the field has {corners} "
+            f"corners, and {NAMES[self.plan.settings.autopilot]} stores {room}; write "
+            ".waypoints, which has no fence, or draw the outline with fewer corners"
+        )
+
+    def _check(self, fence: Fence, way: BaseGeometry, sortie: Sortie) -> None:
+        """Refuse a fence that the sortie itself would break."""
+        kept = [*fence.polygons, *(shapely.Point(x, y).buffer(r) for x, y, r in fence.circles)]
+        if fence.border.covers(way) and not shapely.union_all(kept).intersects(way):
+            return
+        raise PlanError(
+            f"sortie {sortie.number} leads out of its fence; write .waypoints, which has none, and "
+            "report this field"
+        )
+
+
+def fence_content(plan: Plan, fence: Fence) -> dict[str, Any]:
+    """Return a fence as `.plan` files have it."""
+    polygons = [_polygon(plan, fence.border, inclusion=True)]
+    polygons += [_polygon(plan, part, inclusion=False) for part in fence.polygons]
+    circles = [
+        {
+            "circle": {"center": _rounded(plan.frame.to_geographic(x, y)), "radius": round(r, 2)},
+            "inclusion": False,
+            "version": 1,
+        }
+        for x, y, r in fence.circles
+    ]
+    return {"circles": circles, "polygons": polygons, "version": 2}
+
+
+def fence_warnings(plan: Plan) -> tuple[str, ...]:
+    """Return what the fences of a plan lack: room for obstacles, and nearness to the field."""
+    fences = Fences(plan)
+    found = [fences.of(sortie) for sortie in plan.sorties]
+    most = max((fence.left_out for fence in found), default=0)
+    outside_m = max((fence.outside_m for fence in found), default=0.0)
+    name = NAMES[plan.settings.autopilot]
+    said = []
+    if outside_m > NEAR_M:
+        said.append(
+            f"the fence lies up to {outside_m:.0f} m outside the field: {name} has no room for "
+            "the corners of a nearer one"
+        )
+    if not most:
+        return tuple(said)
+    return (
+        *said,
+        f"the fence has no room for {most} of {len(fences.obstacles)} obstacles, the smallest: the "
+        f"passes keep clear of them, but {name} would not stop the aircraft there",
+    )
+
+
+def _corners(part: Polygon) -> int:
+    return len(part.exterior.coords) - 1
+
+
+def _polygon_bytes(part: Polygon) -> int:
+    return POLYGON_BYTES + CORNER_BYTES * _corners(part)
+
+
+def _smaller(part: Polygon) -> Polygon:
+    """Return an obstacle with few corners, within itself."""
+    found = Polygon(part.exterior).simplify(OBSTACLE_SIMPLER_M)
+    return found if isinstance(found, Polygon) and not found.is_empty else part
+
+
+def _circle(part: Polygon) -> tuple[float, float, float] | None:
+    """Return the circle (east, north, radius) in a round obstacle."""
+    middle = part.centroid
+    radius_m = float(part.exterior.distance(middle))
+    if not part.contains(middle) or math.pi * radius_m**2 < ROUND_SHARE * part.area:
+        return None
+    return float(middle.x), float(middle.y), radius_m
+
+
+def _rounded(place: tuple[float, float]) -> list[float]:
+    return [round(place[0], DIGITS), round(place[1], DIGITS)]
+
+
+def _polygon(plan: Plan, part: Polygon, *, inclusion: bool) -> dict[str, Any]:
+    ring = shapely.get_coordinates(orient(part, sign=-1.0).exterior)[:-1]
+    places = [_rounded(plan.frame.to_geographic(*point)) for point in ring.tolist()]
+    return {"inclusion": inclusion, "polygon": places, "version": 1}
