@@ -6,6 +6,9 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+# Letters of the file's name in that of its draft: names have 255 bytes, a letter up to four.
+_NAME_MAX = 40
+
 
 def write_atomically(path: Path, content: bytes, *, mode: int | None = None) -> None:
     """Replace a file as a whole; an OSError where that is not possible, and `path` is as before.
@@ -21,7 +24,7 @@ def write_atomically(path: Path, content: bytes, *, mode: int | None = None) -> 
         return
     # Two programs do not meet in one draft. What a cut left of this name, or somebody put there
     # as a link to elsewhere, is not written through.
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    draft = path.with_name(f".{path.name[:_NAME_MAX]}.{os.getpid()}.part")
     draft.unlink(missing_ok=True)
     try:
         file = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)

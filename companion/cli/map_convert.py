@@ -8,22 +8,27 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from shapely import MultiPolygon
 
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
 from companion.cli.map_options import File, Reading, reading_options
 from companion.errors import MapError
-from companion.maps.convert.compare import Comparison, compare
-from companion.maps.convert.formats import Wish, keeps_cells
+from companion.maps.convert.compare import CHANGE_MAX_L_HA, Comparison, compare
+from companion.maps.convert.formats import Wish, keeps_cells, keeps_raster
+from companion.maps.convert.plain_zones import outline_of_rates
 from companion.maps.convert.writers import write_map, writer_for
+from companion.maps.local import polygons_of
 from companion.maps.model import MapFile, Problem, map_error
 from companion.maps.registry import read_map
 from companion.maps.totals import totals
 
-# What a conversion may change of a rate; files hold three decimals or more.
-CHANGE_MAX_L_HA = 0.01
 NOT_PRESERVED = "not-preserved"
 # What cells may change of the ground in all before somebody should know.
 AREA_CHANGE_MAX = 0.001
+# And of the ground at the edges, where what is left out and what is added make up for each other.
+EDGE_MAX = 0.01
+# Of the ground that has another rate, since edges of cells run elsewhere.
+MOVED_MAX_PERCENT = 5.0
 _OF_CELLS = ("geotiff", "dji", "text-map")
 _OVERLAPS = ("max", "min", "mean", "last")
 
@@ -149,16 +154,19 @@ def _check(source: MapFile, made: Path, format_name: str, wish: Wish) -> _Checke
         raise map_error(
             made,
             f"what was written does not read back ({str(error)[:200]})",
-            fix="nothing is kept; take another format",
+            fix="nothing is kept; take smaller cells (--cell-m) or another format"
+            if format_name in _OF_CELLS
+            else "nothing is kept; take another format",
             code=NOT_PRESERVED,
         ) from None
     cells = written.cells is not None
+    keeps = keeps_raster if format_name == "geotiff" else keeps_cells
     clipped = format_name == "geotiff" and source.boundary is not None
     found = compare(
         source,
         written,
         overlaps=(wish.overlap,) if cells else ("min", "max", "last"),
-        same_cells=format_name != "text-map" and keeps_cells(source, wish) and not clipped,
+        same_cells=format_name != "text-map" and keeps(source, wish) and not clipped,
         zero_is_none=format_name == "isoxml" and cells,
     )
     what = _objection(found)
@@ -166,7 +174,7 @@ def _check(source: MapFile, made: Path, format_name: str, wish: Wish) -> _Checke
         raise map_error(
             made,
             what,
-            fix="nothing is kept; take smaller cells or another format",
+            fix="nothing is kept; take smaller cells (--cell-m) or another format",
             code=NOT_PRESERVED,
         )
     return _Checked(written=written, comparison=found)
@@ -194,8 +202,10 @@ def _result(
     written = checked.written
     after, before = totals(written), totals(source)
     problems = list(source.problems)
+    lost_ha, beyond_ha = _at_edges(source, written, after.area_ha, before.area_ha)
     if format_name in _OF_CELLS:
-        problems += _area_problems(out, after.area_ha, before.area_ha)
+        problems += _area_problems(out, after.area_ha, before.area_ha, (lost_ha, beyond_ha))
+    problems += _moved(out, checked.comparison)
     shape = None if written.cells is None else written.cells.rates_l_ha.shape
     return {
         "ok": True,
@@ -210,24 +220,84 @@ def _result(
         "litres": after.all_litres,
         "source_area_ha": before.area_ha,
         "source_litres": before.all_litres,
+        "lost_ha": lost_ha,
+        "beyond_ha": beyond_ha,
         "boundary": written.boundary is not None,
         "points_compared": checked.comparison.points,
         "max_rate_change_l_ha": checked.comparison.change_l_ha,
+        "points_anywhere": checked.comparison.anywhere,
+        "changed_percent": checked.comparison.changed_percent,
+        "max_rate_change_anywhere_l_ha": checked.comparison.changed_max_l_ha,
         "problems": [problem_object(problem) for problem in problems],
     }
 
 
-def _area_problems(out: Path, after_ha: float, before_ha: float) -> list[Problem]:
-    """Return what to say where cells, which follow no border, hold another area than the map."""
-    if abs(after_ha - before_ha) <= AREA_CHANGE_MAX * before_ha:
+def _at_edges(
+    source: MapFile, written: MapFile, after_ha: float, before_ha: float
+) -> tuple[float, float]:
+    """Return the ground with a rate that the written map lacks, and that it has beyond [ha]."""
+    if written.cells is None:
+        return 0.0, 0.0
+    try:
+        ground = outline_of_rates(source)
+    except MapError:  # cells too speckled for an outline
+        return 0.0, 0.0
+    if source.boundary is not None:
+        default = source.default_rate_l_ha is not None
+        ground = source.boundary if default else _common(ground, source.boundary)
+    kept_ha = 0.0
+    if not ground.is_empty:
+        inside = ground if written.boundary is None else _common(ground, written.boundary)
+        kept_ha = totals(written, boundary=inside).area_ha if not inside.is_empty else 0.0
+    lost_ha, beyond_ha = before_ha - kept_ha, after_ha - kept_ha
+    rounding_ha = 1e-4 * before_ha
+    return (
+        lost_ha if lost_ha > rounding_ha else 0.0,
+        beyond_ha if beyond_ha > rounding_ha else 0.0,
+    )
+
+
+def _common(one: MultiPolygon, two: MultiPolygon) -> MultiPolygon:
+    return MultiPolygon(polygons_of(one.intersection(two)))
+
+
+def _area_problems(
+    out: Path, after_ha: float, before_ha: float, at_edges_ha: tuple[float, float]
+) -> list[Problem]:
+    """Return what to say where cells, which follow no border, hold other ground than the map."""
+    lost_ha, beyond_ha = at_edges_ha
+    if (
+        abs(after_ha - before_ha) <= AREA_CHANGE_MAX * before_ha
+        and max(lost_ha, beyond_ha) <= EDGE_MAX * before_ha
+    ):
         return []
     return [
         Problem(
             severity="warning",
             code="area-changed",
-            text=f"its cells cover {after_ha:.4f} ha, the source {before_ha:.4f} ha",
+            text=f"cells follow no border: {after_ha:.4f} ha have a rate, {before_ha:.4f} ha in "
+            f"the source; {lost_ha:.4f} ha with a rate have none in it, and {beyond_ha:.4f} ha "
+            "beyond have one",
             where=str(out),
-            fix="take smaller cells with --cell-m",
+            fix="take smaller cells with --cell-m, or a format that keeps borders (.gpkg, .shp)",
+        )
+    ]
+
+
+def _moved(out: Path, found: Comparison) -> list[Problem]:
+    """Return what to say where much of the ground has another rate than in the source."""
+    if found.changed_percent is None or not found.changed_percent > MOVED_MAX_PERCENT:
+        return []
+    return [
+        Problem(
+            severity="warning",
+            code="edges-moved",
+            text=f"{found.changed_percent:.1f} % of the ground has another rate than in the "
+            f"source, by up to {found.changed_max_l_ha:.3g} L/ha, or none: edges run along other "
+            "cells",
+            where=str(out),
+            fix="take smaller cells with --cell-m, or a format that keeps edges (.gpkg, .tif of "
+            "the same raster)",
         )
     ]
 
@@ -242,9 +312,21 @@ def _lines(result: dict[str, Any]) -> list[str]:
         f"{result['out']}: {result['format']}, {ground}, {result['area_ha']:.4f} ha, "
         f"{result['litres']:.1f} L",
         f"source: {result['source_area_ha']:.4f} ha, {result['source_litres']:.1f} L",
-        f"largest difference at {result['points_compared']} places: "
+        f"largest difference at {result['points_compared']} places"
+        f"{'' if result['changed_percent'] is None else ' away from edges'}: "
         f"{result['max_rate_change_l_ha']:.3g} L/ha",
+        *_anywhere(result),
         *(f"also written: {name}" for name in result["files"] if name != result["out"]),
+    ]
+
+
+def _anywhere(result: dict[str, Any]) -> list[str]:
+    if result["changed_percent"] is None:
+        return []
+    return [
+        f"{result['changed_percent']:.1f} % of {result['points_anywhere']} places anywhere have "
+        "another rate, or one in one of the files alone; rates differ by up to "
+        f"{result['max_rate_change_anywhere_l_ha']:.3g} L/ha"
     ]
 
 

@@ -10,11 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
+import rasterio.warp
+import shapely
 import typer
+from pyproj import CRS, Geod
+from shapely import MultiPolygon, Polygon, box
 
 from companion.cli import map_convert
 from companion.errors import MapError
 from companion.maps.convert.formats import WRITERS, Writer
+from companion.maps.convert.writers import write_map
+from companion.maps.model import MapCells, MapFile
 from companion.maps.registry import read_map
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -207,6 +213,153 @@ def test_cells_keep_their_lattice(tmp_path: Path, capsys: Captured, raster: Path
     code, found = run_json(capsys, "convert", raster, tmp_path / "TASKDATA.XML")
     assert (code, found["rows"]) == (0, 30)
     assert found["max_rate_change_l_ha"] <= 5.1e-5
+
+
+# Speckled, so that every edge of a cell is an edge of the rates.
+SPECKLED = np.random.default_rng(3).choice([20.0, 35.0, 50.0, 65.0], (30, 40)).astype(np.float32)
+TURN = np.radians(20.0)
+
+
+def projected(path: Path, transform: rasterio.Affine, crs: str = "EPSG:32650") -> Path:
+    with rasterio.open(
+        path, "w", driver="GTiff", width=40, height=30, count=1, dtype="float32", crs=crs,
+        transform=transform, nodata=-9999.0,
+    ) as target:  # fmt: skip
+        target.write(SPECKLED, 1)
+        target.units = ("L/ha",)
+    return path
+
+
+def at(transform: rasterio.Affine, column: Any, row: Any) -> tuple[Any, Any]:
+    a, b, c, d, e, f = transform[:6]
+    return a * column + b * row + c, d * column + e * row + f
+
+
+LATTICES = {
+    "utm": rasterio.Affine(3.0, 0.0, 443_000.0, 0.0, -3.0, 3_984_000.0),
+    "turned": rasterio.Affine(
+        3.0 * np.cos(TURN), 3.0 * np.sin(TURN), 443_000.0,
+        3.0 * np.sin(TURN), -3.0 * np.cos(TURN), 3_984_000.0,
+    ),
+    "south-first": rasterio.Affine(3.0, 0.0, 443_000.0, 0.0, 3.0, 3_984_000.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LATTICES)
+def test_a_geotiff_of_any_projection_stays_as_it_is(
+    tmp_path: Path, capsys: Captured, name: str
+) -> None:
+    source = projected(tmp_path / "in.tif", LATTICES[name])
+    code, found = run_json(capsys, "convert", source, tmp_path / "a.tif")
+    assert (code, found["rows"], found["columns"]) == (0, 30, 40)
+    assert found["changed_percent"] is None
+    assert found["litres"] == pytest.approx(found["source_litres"], rel=1e-9)
+    assert found["problems"] == []
+    with rasterio.open(source) as one, rasterio.open(tmp_path / "a.tif") as two:
+        assert two.crs == one.crs
+        # By place, since the first row may be another one.
+        places = [at(one.transform, c + 0.5, r + 0.5) for r in range(30) for c in range(40)]
+        assert [v[0] for v in one.sample(places)] == [v[0] for v in two.sample(places)]
+
+
+def sampled(path: Path, x: np.ndarray, y: np.ndarray, crs: str) -> np.ndarray:
+    """Return what GDAL finds in a raster at places of EPSG:32650; NaN where there is nothing."""
+    xs, ys = rasterio.warp.transform("EPSG:32650", crs, x.tolist(), y.tolist())
+    with rasterio.open(path) as found:
+        values = np.array([v[0] for v in found.sample(zip(xs, ys, strict=True))], dtype=float)
+    values[values == -9999.0] = np.nan
+    return values
+
+
+@pytest.mark.parametrize("more", [(), ("--cell-m", "3"), ("--cell-m", "0.5")])
+def test_what_a_new_lattice_changes_is_said_as_gdal_finds_it(
+    tmp_path: Path, capsys: Captured, more: tuple[str, ...]
+) -> None:
+    source = projected(tmp_path / "in.tif", LATTICES["turned"])
+    code, found = run_json(capsys, "convert", source, tmp_path / "a", "--format", "dji", *more)
+    assert code == 0
+    random = np.random.default_rng(11)
+    column, row = random.uniform(0.0, 40.0, 8000), random.uniform(0.0, 30.0, 8000)
+    x, y = at(LATTICES["turned"], column, row)
+    one = sampled(source, x, y, "EPSG:32650")
+    two = sampled(tmp_path / "a/DJI/Rx/a.tif", x, y, "EPSG:4326")
+    theirs = 100.0 * float(np.mean(one != two))
+    assert found["changed_percent"] == pytest.approx(theirs, rel=0.25, abs=1.0)
+    assert found["max_rate_change_anywhere_l_ha"] == 45.0
+    told = [one for one in found["problems"] if one["code"] == "edges-moved"]
+    assert len(told) == (theirs > 5.0)
+    if more == ("--cell-m", "3"):
+        assert theirs > 20.0
+        assert f"{found['changed_percent']:.1f} %" in told[0]["text"]
+        assert "--cell-m" in told[0]["fix"]
+    if not more:  # a quarter as wide as those of the source
+        assert found["rows"] * found["columns"] > 16 * 1200
+        assert theirs < 12.0
+
+
+def test_a_person_reads_what_changed_at_the_edges(tmp_path: Path, capsys: Captured) -> None:
+    source = projected(tmp_path / "in.tif", LATTICES["turned"])
+    assert run("convert", source, tmp_path / "a", "--format", "dji", "--cell-m", "3") == 0
+    text = capsys.readouterr().out
+    assert " places away from edges: 0 L/ha" in text
+    assert "one of the files alone; rates differ by up to 45 L/ha" in text
+
+
+def test_ground_that_a_geotiff_leaves_out_at_the_edge_is_said(
+    tmp_path: Path, capsys: Captured
+) -> None:
+    """A boundary across large cells, which a GeoTIFF cannot hold."""
+    cells = MapCells(
+        rates_l_ha=SPECKLED.astype(np.float64),
+        transform=(2.4e-4, 0.0, 10.0, 0.0, 1.8e-4, 50.0), crs=CRS.from_epsg(4326),
+    )  # fmt: skip
+    a, e = 2.4e-4, 1.8e-4
+    corners = [(3.4, 2.6), (37.7, 4.2), (35.1, 27.3), (5.2, 26.4)]
+    field = Polygon([(10.0 + a * x, 50.0 + e * y) for x, y in corners])
+    whole = MapFile(
+        path=tmp_path, format="test", crs="EPSG:4326", unit="L/ha", rate_field="rate", zones=(),
+        sha256="", cells=cells, boundary=MultiPolygon([field]),
+    )  # fmt: skip
+    write_map(whole, tmp_path / "TASKDATA.XML")
+    code, found = run_json(capsys, "convert", tmp_path / "TASKDATA.XML", tmp_path / "a.tif")
+    assert code == 0
+    with rasterio.open(tmp_path / "a.tif") as made:
+        values = made.read(1)
+        boxes = [
+            box(*at(made.transform, c, r), *at(made.transform, c + 1, r + 1))
+            for r, c in zip(*np.nonzero(values != -9999.0), strict=True)
+        ]
+    kept = shapely.union_all(boxes)
+    degrees_to_ha = Geod(ellps="WGS84").geometry_area_perimeter(field)[0] / field.area / 1e4
+    lost_ha = field.difference(kept).area * abs(degrees_to_ha)
+    beyond_ha = kept.difference(field).area * abs(degrees_to_ha)
+    assert lost_ha / found["source_area_ha"] > 0.015
+    assert found["lost_ha"] == pytest.approx(lost_ha, rel=1e-3)
+    assert found["beyond_ha"] == pytest.approx(beyond_ha, rel=1e-3)
+    (problem,) = (one for one in found["problems"] if one["code"] == "area-changed")
+    assert f"{found['lost_ha']:.4f} ha with a rate have none in it" in problem["text"]
+    assert f"{found['beyond_ha']:.4f} ha beyond" in problem["text"]
+    assert "--cell-m" in problem["fix"]
+    fine, finer = run_json(
+        capsys, "convert", tmp_path / "TASKDATA.XML", tmp_path / "b.tif", "--cell-m", "1"
+    )
+    assert (fine, finer["lost_ha"] < 0.1 * found["lost_ha"]) == (0, True)
+
+
+def test_messages_name_the_options_that_help(tmp_path: Path, capsys: Captured) -> None:
+    many = projected(tmp_path / "in.tif", LATTICES["utm"])
+    with rasterio.open(many, "r+") as target:
+        target.write((20.0 + np.arange(1200.0).reshape(30, 40) / 100.0).astype("float32"), 1)
+    with pytest.raises(MapError, match="different rates") as caught:
+        run("convert", many, tmp_path / "TASKDATA.XML")
+    assert "--round" in caught.value.fix
+    thin = json.loads(json.dumps(OVERLAPPING).replace("50.0002", "50.000003"))
+    (tmp_path / "thin.geojson").write_text(json.dumps(thin), "utf-8")
+    code, found = run_json(
+        capsys, "convert", tmp_path / "thin.geojson", tmp_path / "b.tif", "--overlap", "max"
+    )
+    assert (code, found["code"]) == (1, "not-preserved")
+    assert "--cell-m" in found["error"]
 
 
 def test_rates_can_be_rounded_on_the_way_to_zones(

@@ -83,14 +83,14 @@ def test_cells_with_the_south_first_are_turned_over(tmp_path: Path) -> None:
     check(read_geotiff(tmp_path / "rx.tif"))
 
 
-def test_other_cells_are_a_mistake_of_the_caller(tmp_path: Path) -> None:
+def test_other_cells_for_dji_are_a_mistake_of_the_caller(tmp_path: Path) -> None:
     turned = (WIDTH, 1e-6, WEST, 0.0, -HEIGHT, NORTH)
     for cells in (
         MapCells(rates_l_ha=RATES, transform=turned, crs=WGS84),
         MapCells(rates_l_ha=RATES, transform=NORTH_UP, crs=CRS.from_epsg(32650)),
     ):
         with pytest.raises(ValueError, match="longitude and latitude"):
-            write_geotiff(cells, tmp_path / "rx.tif")
+            write_dji(cells, tmp_path / "rx")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -12,13 +13,15 @@ from shapely import STRtree
 from companion.maps.build import frame_for
 from companion.maps.cells import cell_size_m
 from companion.maps.convert.rasterise import cell_rates
-from companion.maps.convert.sample_places import centres, sample_places
+from companion.maps.convert.sample_places import Bools, centres, sample_places
 from companion.maps.model import Floats, MapFile
 
 POINTS = 1000
 # Nine decimals of a degree are a tenth of a millimetre, and what is straight in one projection is
 # bent by less than that in another: this is ample.
 EDGE_M = 0.02
+# What a conversion may change of a rate; files hold three decimals or more.
+CHANGE_MAX_L_HA = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +31,11 @@ class Comparison:
     At `rated` of the `points` the source has a rate. `change_l_ha` is the largest difference where
     both have one; `lost` counts the places where only one has; `worst` (latitude, longitude) is a
     place of the largest difference or loss.
+
+    Those places keep away from edges where the written map has cells of its own. So that nobody
+    takes that for the whole map, `anywhere` counts places with a rate up to the very edges,
+    `changed` those of them that have another rate or none in one of the two, and
+    `changed_max_l_ha` is the most by which both rates differ there; all 0 where edges stay.
     """
 
     points: int
@@ -35,6 +43,14 @@ class Comparison:
     change_l_ha: float
     lost: int
     worst: tuple[float, float] | None
+    anywhere: int = 0
+    changed: int = 0
+    changed_max_l_ha: float = 0.0
+
+    @property
+    def changed_percent(self) -> float | None:
+        """Return the share of ground with another rate, None where all edges stay."""
+        return 100.0 * self.changed / self.anywhere if self.anywhere else None
 
 
 def compare(
@@ -46,7 +62,7 @@ def compare(
     zero_is_none: bool = False,
     count: int = POINTS,
 ) -> Comparison:
-    """Return the largest difference between two maps, away from the edges of the source.
+    """Return the largest difference between two maps, and how much of the ground differs.
 
     Each of the policies `overlaps` has to give the same on both. Where the written map has cells
     that its source has not, both are asked in the middle of its cells, and beyond that only where
@@ -62,25 +78,56 @@ def compare(
         margin_m = 1.1 * float(np.hypot(*size_m))
     places.append(sample_places(source, count=count, margin_m=margin_m, around=written))
     longitude, latitude = (np.concatenate(values) for values in zip(*places, strict=True))
-    gap = np.zeros(len(longitude))
-    rated = np.zeros(len(longitude), dtype=np.bool_)
-    for overlap in overlaps:
-        one = rates_at(source, longitude, latitude, overlap)
-        two = rates_at(written, longitude, latitude, overlap)
-        rated |= ~np.isnan(one)
-        if zero_is_none:
-            one, two = np.nan_to_num(one), np.nan_to_num(two)
-        lost = np.isnan(one) != np.isnan(two)
-        gap = np.maximum(gap, np.where(lost, np.inf, np.nan_to_num(np.abs(one - two))))
+    asked = _Asked(source, written, overlaps, zero_is_none)
+    one, _, gap = asked.at(longitude, latitude)
     both = gap[np.isfinite(gap)]
     worst = int(np.argmax(gap)) if len(gap) else 0
-    return Comparison(
+    found = Comparison(
         points=len(gap),
-        rated=int(rated.sum()),
+        rated=int(one.sum()),
         change_l_ha=float(both.max(initial=0.0)),
         lost=int(np.isinf(gap).sum()),
         worst=(float(latitude[worst]), float(longitude[worst])) if gap.any() else None,
     )
+    if margin_m == EDGE_M:
+        return found
+    one, two, gap = asked.at(
+        *sample_places(source, count=count, margin_m=EDGE_M, around=written, seed=2)
+    )
+    there = one | two
+    return replace(
+        found,
+        anywhere=int(there.sum()),
+        changed=int((gap[there] > CHANGE_MAX_L_HA).sum()),
+        changed_max_l_ha=float(gap[np.isfinite(gap)].max(initial=0.0)),
+    )
+
+
+class _Asked(NamedTuple):
+    """Two maps that are asked for their rates at the same places."""
+
+    source: MapFile
+    written: MapFile
+    overlaps: Sequence[str]
+    zero_is_none: bool
+
+    def at(self, longitude: Floats, latitude: Floats) -> tuple[Bools, Bools, Floats]:
+        """Return where each of the two has a rate, and by how much they differ at most.
+
+        The difference is infinite where only one of the two has a rate.
+        """
+        gap = np.zeros(len(longitude))
+        rated = [np.zeros(len(longitude), dtype=np.bool_) for _ in range(2)]
+        for overlap in self.overlaps:
+            one = rates_at(self.source, longitude, latitude, overlap)
+            two = rates_at(self.written, longitude, latitude, overlap)
+            rated[0] |= ~np.isnan(one)
+            rated[1] |= ~np.isnan(two)
+            if self.zero_is_none:
+                one, two = np.nan_to_num(one), np.nan_to_num(two)
+            lost = np.isnan(one) != np.isnan(two)
+            gap = np.maximum(gap, np.where(lost, np.inf, np.nan_to_num(np.abs(one - two))))
+        return rated[0], rated[1], gap
 
 
 def rates_at(

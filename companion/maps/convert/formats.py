@@ -15,7 +15,7 @@ from shapely import MultiPolygon
 
 from companion.errors import MapError
 from companion.maps.convert.plain_zones import outline_of_rates, plain_zones
-from companion.maps.convert.rasterise import cells_of, north_up
+from companion.maps.convert.rasterise import cells_of, in_field, north_up
 from companion.maps.crs import is_wgs84
 from companion.maps.local import polygons_of
 from companion.maps.model import MapCells, MapFile, map_error
@@ -111,10 +111,20 @@ def _sound(boundary: MultiPolygon) -> MultiPolygon:
     return MultiPolygon(polygons_of(snapped)) if polygons_of(snapped) else boundary
 
 
+def keeps_raster(map_file: MapFile, wish: Wish) -> bool:
+    """Tell whether a GeoTIFF takes the cells of the map as they are, in whatever CRS they lie."""
+    return map_file.cells is not None and wish.cell_m is None
+
+
 def _geotiff(map_file: MapFile, path: Path, wish: Wish) -> None:
     from companion.maps.geotiff.writer import write_geotiff
 
-    write_geotiff(_cells(map_file, wish, clip=True), path)
+    cells = map_file.cells
+    if cells is None or not keeps_raster(map_file, wish):
+        made = _cells(map_file, wish, clip=True)
+    else:
+        made = in_field(cells, map_file, clip=True)
+    write_geotiff(made, path)
 
 
 def _dji(map_file: MapFile, path: Path, wish: Wish) -> None:

@@ -25,6 +25,8 @@ Bools = NDArray[np.bool_]
 Box = tuple[float, float, float, float]
 
 MAX_CELLS = 16_000_000
+# Cells that are cut up on the way to another lattice become at most so many.
+REMADE_CELLS = 2_000_000
 CELL_MIN_M, CELL_MAX_M = 0.05, 1000.0
 _BITE = 500_000
 # Of WGS84: half axis [m] and square of the eccentricity.
@@ -71,15 +73,17 @@ def cells_of(
 def north_up(map_file: MapFile, cell_m: float | None = None, *, clip: bool = True) -> MapCells:
     """Return the cells of a map as they are, or turned over where their first row is the south.
 
-    Cells of another CRS, or along other axes, are made anew, as wide as the old ones.
+    Cells of another CRS, or along other axes, are made anew, a quarter as wide as the old ones
+    where there is room: an edge moves by half of a new cell at most.
     """
     cells = map_file.cells
     if cells is None:
         raise ValueError("the map has no cells")
     a, b, c, d, e, f = cells.transform
     if cell_m is not None or cells.crs.to_epsg() != 4326 or not (a > 0.0 and b == d == 0.0):
-        size_m = min(cell_size_m(cells, frame_for(map_file))) if cell_m is None else cell_m
-        return cells_of(map_file, size_m, clip=clip)
+        if cell_m is None:
+            cell_m = min(cell_size_m(cells, frame_for(map_file))) / _parts(cells)
+        return cells_of(map_file, cell_m, clip=clip)
     if e > 0.0:
         rows = cells.rates_l_ha.shape[0]
         cells = MapCells(
@@ -88,6 +92,11 @@ def north_up(map_file: MapFile, cell_m: float | None = None, *, clip: bool = Tru
             crs=cells.crs,
         )
     return in_field(cells, map_file, clip=clip)
+
+
+def _parts(cells: MapCells) -> int:
+    """Return into how many parts the side of a cell is cut where it is made anew."""
+    return next((parts for parts in (4, 2) if cells.rates_l_ha.size * parts**2 <= REMADE_CELLS), 1)
 
 
 def in_field(cells: MapCells, map_file: MapFile, *, clip: bool) -> MapCells:

@@ -1,4 +1,4 @@
-"""GeoTIFF as DJI takes it: one band of 32-bit numbers in longitude and latitude, and its `.tfw`.
+"""GeoTIFF of one band of 32-bit numbers with its `.tfw`; DJI's package of one in degrees.
 
 No data is -9999 and never 0, so that 0 L/ha stays a rate. The place is written twice: the GeoTIFF
 has the corner of the first cell, the world file its centre.
@@ -29,7 +29,7 @@ _DBF_DATE, _ZIP_DATE = b"\x64\x01\x01", (1980, 1, 1, 0, 0, 0)
 
 
 def write_geotiff(cells: MapCells, path: Path, *, boundary: MultiPolygon | None = None) -> None:
-    """Write cells in longitude and latitude as GeoTIFF, with a world file beside it.
+    """Write cells of any CRS as GeoTIFF, with a world file beside it.
 
     A GeoTIFF has no place for the outline of the field; `write_dji` keeps it.
     """
@@ -43,6 +43,9 @@ def write_dji(cells: MapCells, path: Path, boundary: MultiPolygon | None = None)
     """Write DJI's package: a zip where the name ends in `.zip`, else a folder."""
     zipped = path.suffix.casefold() == ".zip"
     name = path.stem if zipped else path.name
+    a, b, _, d, _, _ = cells.transform
+    if cells.crs.to_epsg() != 4326 or not (a > 0.0 and b == d == 0.0):
+        raise ValueError("cells for DJI need longitude and latitude along their edges")
     picture, world = _content(cells, path)
     files = {f"{_ROOT}/{RX_FOLDER}/{name}{end}": part for end, part in
              ((".tif", picture), (".tfw", world))}  # fmt: skip
@@ -68,25 +71,26 @@ def write_dji(cells: MapCells, path: Path, boundary: MultiPolygon | None = None)
 
 
 def _content(cells: MapCells, path: Path) -> tuple[bytes, bytes]:
-    """Return the GeoTIFF and its world file, the north first whatever the cells have."""
+    """Return the GeoTIFF and its world file, the north first where rows run east."""
     a, b, c, d, e, f = cells.transform
-    if cells.crs.to_epsg() != 4326 or not (a > 0.0 and b == d == 0.0):
-        raise ValueError("cells for a GeoTIFF need longitude and latitude along their edges")
     rates = cells.rates_l_ha
-    if e > 0.0:
+    if b == d == 0.0 and e > 0.0:
         rates, e, f = rates[::-1], -e, f + e * rates.shape[0]
     values = np.where(np.isnan(rates), NODATA, rates).astype(np.float32)
     # x from column and row, then y: the order of the lines, and the centre of the first cell.
-    world = "".join(f"{value!r}\n" for value in (a, 0.0, 0.0, e, c + a / 2.0, f + e / 2.0))
-    return _tiff(values, (a, 0.0, c, 0.0, e, f), path), world.encode("ascii")
+    centre = (c + (a + b) / 2.0, f + (d + e) / 2.0)
+    world = "".join(f"{value!r}\n" for value in (a, d, b, e, *centre))
+    return _tiff(values, (a, b, c, d, e, f), cells.crs, path), world.encode("ascii")
 
 
 def _tiff(
     values: np.ndarray[tuple[int, ...], np.dtype[np.float32]],
     transform: tuple[float, ...],
+    crs: CRS,
     path: Path,
 ) -> bytes:
     rasterio = gdal(path)
+    code = crs.to_epsg()
     rows, columns = values.shape
     with rasterio.Env(GDAL_PAM_ENABLED=False), rasterio.io.MemoryFile() as memory:
         with memory.open(
@@ -95,7 +99,7 @@ def _tiff(
             height=rows,
             count=1,
             dtype="float32",
-            crs="EPSG:4326",
+            crs=crs.to_wkt() if code is None else f"EPSG:{code}",
             transform=rasterio.Affine(*transform),
             nodata=NODATA,
         ) as target:

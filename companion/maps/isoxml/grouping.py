@@ -47,7 +47,7 @@ def grouped(zones: Sequence[MapZone], path: Path) -> list[ZoneGroup]:
             path,
             f"the map has {len(by_raw)} different rates, and ISOXML has room for {ZONES_MAX} "
             "treatment zones",
-            fix="round the rates, or convert the map to another format",
+            fix="round the rates (--round), or convert the map to another format",
             code="too-many-rates",
         )
     return [
