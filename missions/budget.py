@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from missions.energy import J_WH, KG_L, Battery, vertical_s
+from missions.energy import J_WH, KG_L, Battery
 from missions.network import Network
 from missions.strips import Floats
 from missions.turns import Motion
+from missions.verticals import Vertical
 
 # From one pass to the next, and from a ferry into a pass, the nose turns by this much or less.
 NOSE_DEG = 180.0
@@ -62,15 +63,19 @@ def build_budget(
     battery: Battery,
     motion: Motion,
     *,
-    cruise_s: Floats,
+    length_m: Floats,
+    pace_s_m: Floats | float,
+    vertical: Vertical,
     height_m: float,
     reserve_l: float,
     nose_rate_deg_s: float | None,
     refill_s: float,
     limit_wh: float,
 ) -> Budget:
-    """Return the budget of a network; `cruise_s` is the time of each piece without its stop."""
-    stop_s = motion.speed_m_s / motion.acceleration_m_s2
+    """Return the budget of a network; `pace_s_m` is the time of a metre of each piece."""
+    cruise_s = length_m * pace_s_m
+    stops_s = motion.legs_s(length_m) - length_m / motion.speed_m_s
+    stop_s = motion.at(motion.speed_m_s).reaching_s
     between_s = network.between_s.copy()
     between_s[network.depot] -= refill_s / 2.0
     between_s[:, network.depot] -= refill_s / 2.0
@@ -81,17 +86,17 @@ def build_budget(
         nose_s[between_s > 0.0] = NOSE_DEG / nose_rate_deg_s
     other_s = between_s - moving_s + nose_s
     between_wh = (moving_s * battery.cruise_w + other_s * battery.hover_w) / J_WH
-    piece_wh = (cruise_s * battery.cruise_w + stop_s * battery.hover_w) / J_WH
-    climb_s, descent_s = vertical_s(height_m)
+    upright_s = vertical.climb_s(height_m) + vertical.return_s(height_m)
+    piece_wh = (cruise_s * battery.cruise_w + stops_s * battery.hover_w) / J_WH
     return Budget(
         between_s=(between_s + nose_s).tolist(),
         between_wh=between_wh.tolist(),
-        piece_s=(cruise_s + stop_s).tolist(),
+        piece_s=(cruise_s + stops_s).tolist(),
         piece_wh=piece_wh.tolist(),
         litres=network.litres.tolist(),
         depot=network.depot,
-        start_wh=(climb_s + descent_s) * battery.hover_w / J_WH,
-        start_s=climb_s + descent_s,
+        start_wh=upright_s * battery.hover_w / J_WH,
+        start_s=upright_s,
         reserve_l=reserve_l,
         per_l_wh_s=battery.per_kg_w * KG_L / J_WH,
         limit_wh=limit_wh,

@@ -12,9 +12,8 @@ from missions.turns import Turn
 
 if TYPE_CHECKING:
     from missions.plan import Leg, Sortie
+    from missions.verticals import Vertical
 
-# ArduPilot's defaults for climbing and descending in a mission (WPNAV_SPEED_UP, _DN).
-CLIMB_M_S, DESCENT_M_S = 2.5, 1.5
 # Spray liquid is water, but for a few per cent.
 KG_L = 1.0
 J_WH = 3600.0
@@ -63,11 +62,6 @@ class Battery:
         return (drawn + (cruise_s + other_s) * litres * KG_L * self.per_kg_w) / J_WH
 
 
-def vertical_s(height_m: float) -> tuple[float, float]:
-    """Return how long the climb and the descent take."""
-    return height_m / CLIMB_M_S, height_m / DESCENT_M_S
-
-
 def nose_s(legs: Sequence[Leg], *, turn: Turn, rate_deg_s: float | None) -> float:
     """Return how long the aircraft stands and turns its nose, at every corner of its way.
 
@@ -86,20 +80,25 @@ def nose_s(legs: Sequence[Leg], *, turn: Turn, rate_deg_s: float | None) -> floa
 
 
 def sortie_wh(
-    sortie: Sortie, battery: Battery, *, height_m: float, reserve_l: float, nose_turn_s: float
+    sortie: Sortie,
+    battery: Battery,
+    *,
+    vertical: Vertical,
+    height_m: float,
+    reserve_l: float,
+    nose_turn_s: float,
 ) -> float:
     """Return the use of a sortie: the tank empties line by line, down to its reserve.
 
     Turning the nose is counted with half of the sortie's litres on board.
     """
     left_l = sortie.volume_l + reserve_l
-    climb_s, descent_s = vertical_s(height_m)
-    used = battery.wh(cruise_s=0.0, other_s=climb_s, litres=left_l)
-    used += battery.wh(cruise_s=0.0, other_s=descent_s, litres=reserve_l)
+    used = battery.wh(cruise_s=0.0, other_s=vertical.climb_s(height_m), litres=left_l)
+    used += battery.wh(cruise_s=0.0, other_s=vertical.return_s(height_m), litres=reserve_l)
     middle_l = reserve_l + sortie.volume_l / 2.0
     used += battery.wh(cruise_s=0.0, other_s=nose_turn_s, litres=middle_l)
     for leg in sortie.legs:
-        cruise_s = min(leg.length_m / leg.speed_m_s, max(leg.seconds, 0.0))
+        cruise_s = min(leg.length_m / leg.speed_m_s, leg.seconds)
         used += battery.wh(
             cruise_s=cruise_s, other_s=leg.seconds - cruise_s, litres=left_l - leg.volume_l / 2.0
         )

@@ -69,7 +69,8 @@ def most_wh(sorties: Sequence[Sortie], settings: Settings) -> float:
         return 0.0
     return max(
         sortie_wh(
-            sortie, battery, height_m=settings.height_m, reserve_l=settings.reserve_l,
+            sortie, battery, vertical=settings.vertical, height_m=settings.height_m,
+            reserve_l=settings.reserve_l,
             nose_turn_s=nose_s(
                 sortie.legs, turn=settings.turn, rate_deg_s=settings.nose_rate_deg_s
             ),
@@ -86,7 +87,7 @@ def line_pace(lines: Floats, rates: Rates, settings: Settings) -> Floats:
     for row in lines.tolist():
         leg = Leg(
             kind="spray", points=((row[0], row[1]), (row[2], row[3])),
-            speed_m_s=settings.speed_m_s, seconds=0.0,
+            speed_m_s=settings.speed_m_s,
         )  # fmt: skip
         parts = stretches_of(leg, rates, settings)
         taken = chosen(parts, choices(parts, settings), settings.acceleration_m_s2)

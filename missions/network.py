@@ -9,7 +9,7 @@ import numpy as np
 
 from missions.demand import Pieces
 from missions.free_space import FreeSpace
-from missions.strips import Floats, directions
+from missions.strips import Floats, directions, lengths_m
 from missions.turns import Motion
 
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
@@ -65,13 +65,15 @@ def build_network(
     if not space.is_convex:
         _bend(far_m, ends, near, space)
     between = np.zeros((count + 1, count + 1))
-    between[:count, :count] = motion.legs_s(far_m)
-    stops_s = motion.speed_m_s / motion.acceleration_m_s2
+    between[:count, :count] = motion.ways_s(far_m)
+    length_m = lengths_m(pieces.ends)
     rows, columns = _flown_through(pieces.ends, far_m, near)
-    between[rows, columns] = between[columns, rows] = -stops_s
+    spared_s = motion.spared_straight_s(length_m[rows >> 1], length_m[columns >> 1])
+    between[rows, columns] = between[columns, rows] = -spared_s
     rows, columns = _flown_on(pieces)
     along_m = np.hypot(*(ends[rows] - ends[columns]).T)
-    between[rows, columns] = between[columns, rows] = along_m / motion.speed_m_s - stops_s
+    onward_s = _onward_s(motion, length_m[rows >> 1], along_m, length_m[columns >> 1])
+    between[rows, columns] = between[columns, rows] = onward_s
     _know(near, rows, columns)
     home_m = np.hypot(
         depots[:, 0][:, None] - ends[:, 0][None, :], depots[:, 1][:, None] - ends[:, 1][None, :]
@@ -92,6 +94,14 @@ def _flown_through(lines: Floats, far_m: Floats, near: Ints) -> tuple[Ints, Ints
     through = (far_m[rows, columns] < JOIN_M) & (straight > math.cos(math.radians(JOIN_DEG)))
     through &= (rows >> 1) != (columns >> 1)
     return rows[through], columns[through]
+
+
+def _onward_s(motion: Motion, before_m: Floats, gap_m: Floats, after_m: Floats) -> Floats:
+    """Return what a gap adds between two parts of a line, both counted from rest to rest."""
+    one = -motion.spared_straight_s(before_m, after_m)
+    legs = motion.legs_s(gap_m) - motion.spared_straight_s(before_m, gap_m)
+    two: Floats = legs - motion.spared_straight_s(gap_m, after_m)
+    return np.where(gap_m < JOIN_M, one, two)
 
 
 def _flown_on(pieces: Pieces) -> tuple[Ints, Ints]:

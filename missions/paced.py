@@ -72,22 +72,17 @@ def _split(leg: Leg, parts: Stretches, taken: Floats, settings: Settings) -> lis
     at_m[-1] = length_m
     litres = np.interp(cuts, at_m, np.concatenate([[0.0], np.cumsum(parts.litres)]))
     litres[-1] = leg.volume_l
-    legs, before = [], 0.0
+    legs = []
     for number, speed in enumerate(speeds.tolist()):
         if cuts[number + 1] - cuts[number] < 1e-6:
             continue
         points = (between(leg, cuts[number] / length_m), between(leg, cuts[number + 1] / length_m))
-        seconds = (cuts[number + 1] - cuts[number]) / speed
-        seconds += max(speed - before, 0.0) ** 2 / (2.0 * settings.acceleration_m_s2 * speed)
         legs.append(
             Leg(
-                kind="spray", points=points, speed_m_s=speed, seconds=float(seconds),
+                kind="spray", points=points, speed_m_s=speed,
                 volume_l=float(litres[number + 1] - litres[number]),
             )
         )  # fmt: skip
-        before = speed
-    stop_s = legs[-1].speed_m_s / (2.0 * settings.acceleration_m_s2)
-    legs[-1] = replace(legs[-1], seconds=legs[-1].seconds + stop_s)
     ends = (leg.points[0], leg.points[-1])
     legs[0] = replace(legs[0], points=(ends[0], legs[0].points[1]))
     legs[-1] = replace(legs[-1], points=(legs[-1].points[0], ends[1]))
@@ -107,10 +102,8 @@ def _joined(legs: list[Leg], settings: Settings) -> tuple[Leg, ...]:
             continue
         after = legs[number + 1].speed_m_s
         slower = min(legs[number - 1].speed_m_s, after)
-        if leg.seconds < leg.length_m / leg.speed_m_s:
-            if slower < settings.speed_m_s:
-                seconds = leg.length_m / slower - slower / acceleration
-                found[number] = replace(leg, speed_m_s=slower, seconds=seconds)
+        if leg.through:
+            found[number] = replace(leg, speed_m_s=slower)
         elif len(leg.points) == 2 and leg.length_m <= after**2 / acceleration:
             slope_m_s = leg.speed_m_s if leg.speed_m_s < settings.speed_m_s else after
             found[number] = replace(leg, speed_m_s=min(after, slope_m_s))

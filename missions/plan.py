@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 
 from companion.core.frame import LocalFrame
+from missions.corners import CornerRule
 from missions.coverage import Coverage
-from missions.energy import Battery, nose_s, sortie_wh, vertical_s
+from missions.energy import Battery, nose_s, sortie_wh
 from missions.field import Field
 from missions.strips import Floats
 from missions.terrain.ground import Terrain
-from missions.turns import Turn
+from missions.turns import Motion, Turn
+from missions.verticals import VERTICALS, Vertical
 
 Place = tuple[float, float]
 Kind = Literal["spray", "transit", "ferry"]
+
+# WPNAV_JERK of ArduCopter, MPC_JERK_AUTO of PX4, as they come.
+JERKS_M_S3 = {"ardupilot": 1.0, "px4": 4.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,12 +35,15 @@ class Settings:
     `border_buffer_m` is what the companion keeps its valves' strips off the border, if it does.
     `refill_s` and `swap_s` (of a battery) are on the ground; several aircraft keep
     `aircraft_gap_m` between them. `nose_rate_deg_s` is how fast the nose turns at a stop.
+    Without them, `jerk_m_s3` and `return_height_m` are those that the autopilot comes with.
     """
 
     swath_width_m: float
     speed_m_s: float
     height_m: float = 3.5
     acceleration_m_s2: float = 2.5
+    jerk_m_s3: float | None = None
+    return_height_m: float | None = None
     turn: Turn = "stop"
     angle_deg: float | None = None
     tank_l: float = 40.0
@@ -63,6 +71,24 @@ class Settings:
             raise ValueError(f"a reserve of {self.reserve_l} L leaves nothing of {self.tank_l} L")
 
     @property
+    def motion(self) -> Motion:
+        """Return how the aircraft flies, with its autopilot's rule for corners."""
+        rule: CornerRule = self.autopilot
+        jerk = JERKS_M_S3[self.autopilot] if self.jerk_m_s3 is None else self.jerk_m_s3
+        return Motion(
+            speed_m_s=self.speed_m_s, acceleration_m_s2=self.acceleration_m_s2, jerk_m_s3=jerk,
+            turn=self.turn, corners=rule,
+        )  # fmt: skip
+
+    @property
+    def vertical(self) -> Vertical:
+        """Return how the aircraft takes off, returns and lands."""
+        found = VERTICALS[self.autopilot]
+        if self.return_height_m is None:
+            return found
+        return replace(found, return_height_m=self.return_height_m)
+
+    @property
     def usable_l(self) -> float:
         """Return what of a full tank is sprayed before the refill."""
         return self.tank_l - self.reserve_l
@@ -70,13 +96,18 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:
-    """A way at one speed: a straight spray line, or a transit or ferry that may bend."""
+    """A way at one speed: a straight spray line, or a transit or ferry that may bend.
+
+    One flown `through` leads from a line into the next, which goes on straight. `seconds` are
+    those of `missions.timing`, once the whole sortie is known.
+    """
 
     kind: Kind
     points: tuple[Place, ...]
     speed_m_s: float
-    seconds: float
+    seconds: float = 0.0
     volume_l: float = 0.0
+    through: bool = False
 
     @property
     def length_m(self) -> float:
@@ -168,7 +199,10 @@ class Plan:
 
     def airborne_s(self, sortie: Sortie) -> float:
         """Return the time from take-off to landing."""
-        return sortie.flight_s + self.nose_s(sortie) + sum(vertical_s(self.settings.height_m))
+        vertical = self.settings.vertical
+        height_m = self.settings.height_m
+        upright_s = vertical.climb_s(height_m) + vertical.return_s(height_m)
+        return sortie.flight_s + self.nose_s(sortie) + upright_s
 
     def energy_wh(self, sortie: Sortie) -> float | None:
         """Return what a sortie draws from the battery; None where no power is given."""
@@ -176,8 +210,8 @@ class Plan:
         if settings.battery is None:
             return None
         return sortie_wh(
-            sortie, settings.battery, height_m=settings.height_m, reserve_l=settings.reserve_l,
-            nose_turn_s=self.nose_s(sortie),
+            sortie, settings.battery, vertical=settings.vertical, height_m=settings.height_m,
+            reserve_l=settings.reserve_l, nose_turn_s=self.nose_s(sortie),
         )  # fmt: skip
 
     @property

@@ -25,7 +25,6 @@ from missions.short import short_warnings
 from missions.strips import Floats, joined
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from missions.treated_rates import UntreatedRates, demands_once
-from missions.turns import Motion
 from missions.ways import Ways, build_ways, edge_places, suggested_depot
 
 # One sortie may begin and end anywhere: its depot is chosen among so many places of the edge.
@@ -66,11 +65,7 @@ def _planned(
     around: Surroundings,
 ) -> Plan:
     width_m = settings.swath_width_m
-    motion = Motion(
-        speed_m_s=settings.speed_m_s,
-        acceleration_m_s2=settings.acceleration_m_s2,
-        turn=settings.turn,
-    )
+    motion = settings.motion
     if left is None:
         lines, angle_deg = spray_lines(field, settings, motion)
         sprayed = lines

@@ -19,7 +19,6 @@ from shapely.geometry.base import BaseGeometry
 from companion.core.frame import LocalFrame
 from missions.field import Field
 from missions.plan import Leg, Place, Settings, Sortie
-from missions.turns import Motion
 
 # Less room is not worth a waypoint: at 2.5 m/s2 it is 1.6 m/s.
 ROOM_MIN_M = 0.5
@@ -78,7 +77,7 @@ def slow_starts(
         (_start_m_s(before, line, settings.acceleration_m_s2), line.speed_m_s, line.points[0])
         for sortie in sorties
         for before, line in pairwise(sortie.legs)
-        if line.kind == "spray" and before.kind != "spray" and not _is_through(before)
+        if line.kind == "spray" and before.kind != "spray" and not before.through
     ]
     slow = [each for each in starts if each[0] < NEARLY * each[1]]
     if not slow:
@@ -90,11 +89,6 @@ def slow_starts(
         f"slowest at {speed:.1f} instead of {wanted:g} m/s near {latitude_deg:.6f}, "
         f"{longitude_deg:.6f}; allow ways outside the field (mission.overrun)",
     )
-
-
-def _is_through(leg: Leg) -> bool:
-    """Return whether a way is flown through without a stop: its time says so."""
-    return leg.seconds < leg.length_m / leg.speed_m_s - 1e-9
 
 
 def _start_m_s(before: Leg, line: Leg, acceleration_m_s2: float) -> float:
@@ -119,19 +113,13 @@ class _Drawn:
         """Return the legs of a sortie; a way that is flown through without a stop stays."""
         found = list(legs)
         for number, leg in enumerate(legs):
-            if leg.kind == "spray" or _is_through(leg):
+            if leg.kind == "spray" or leg.through:
                 continue
             before = legs[number - 1] if number else None
             after = legs[number + 1] if number + 1 < len(legs) else None
             out = None if before is None else self._end(before.points[-1], before, onward=True)
             into = None if after is None else self._end(after.points[0], after, onward=False)
-            way, out, into = self._way(leg, out, into)
-            found[number] = self._timed(leg, way, out, into)
-            if before is not None and out is not None:
-                found[number - 1] = self._quicker(found[number - 1], out.speed_m_s)
-            if after is not None:
-                speed = into.speed_m_s if into is not None else 0.0
-                found[number + 1] = self._quicker(after, speed)
+            found[number] = replace(leg, points=tuple(self._way(leg, out, into)))
         return tuple(found)
 
     def _end(self, at: Place, line: Leg, *, onward: bool) -> _End | None:
@@ -159,9 +147,7 @@ class _Drawn:
                 return float(part.length) - 2.0 * TOUCH_M
         return 0.0
 
-    def _way(
-        self, leg: Leg, out: _End | None, into: _End | None
-    ) -> tuple[list[Place], _End | None, _End | None]:
+    def _way(self, leg: Leg, out: _End | None, into: _End | None) -> list[Place]:
         """Return the way with as much of both runs as leaves it on free ground."""
         for one, other in ((out, into), (None, into), (out, None)):
             way = list(leg.points)
@@ -171,33 +157,5 @@ class _Drawn:
                 way.insert(len(way) - 1, other.beyond)
             new = [pair for pair in pairwise(way) if pair not in set(pairwise(leg.points))]
             if new and bool(shapely.covers(self._space, shapely.linestrings(new)).all()):
-                return way, one, other
-        return list(leg.points), None, None
-
-    def _timed(self, leg: Leg, way: list[Place], out: _End | None, into: _End | None) -> Leg:
-        """Return the leg: braking, from rest to rest between the runs, and speeding up."""
-        if out is None and into is None:
-            return leg
-        acceleration = self._settings.acceleration_m_s2
-        motion = Motion(
-            speed_m_s=leg.speed_m_s, acceleration_m_s2=acceleration, turn=self._settings.turn
-        )
-        middle = way[1 if out is not None else 0 : len(way) - 1 if into is not None else len(way)]
-        parts_m = np.array([math.dist(a, b) for a, b in pairwise(middle)])
-        if leg.kind == "transit" and len(parts_m) == 1:
-            seconds = motion.between_passes_s(float(parts_m[0]))
-        else:
-            seconds = float(motion.legs_s(parts_m).sum())
-        runs_s = sum(end.speed_m_s for end in (out, into) if end is not None) / acceleration
-        return replace(leg, points=tuple(way), seconds=seconds + runs_s)
-
-    def _quicker(self, line: Leg, speed_m_s: float) -> Leg:
-        """Return a pass, one of whose ends is flown at a speed instead of from rest.
-
-        From rest an end costs v / 2a more than flying on, from a speed u (v - u)^2 / 2av.
-        """
-        speed = line.speed_m_s
-        spared_s = (2.0 * speed * speed_m_s - speed_m_s**2) / (
-            2.0 * self._settings.acceleration_m_s2 * speed
-        )
-        return replace(line, seconds=max(line.seconds - spared_s, line.length_m / speed))
+                return way
+        return list(leg.points)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -82,7 +81,7 @@ def plan_sorties(
         )  # fmt: skip
     homes = [_home(network, order) for order in orders]
     ranked = sorted(range(len(orders)), key=lambda at: (homes[at], min(orders[at])))
-    drawn = _Drawn(pieces=pieces, ways=ways, motion=motion)
+    drawn = _Drawn(pieces=pieces, ways=ways, speed_m_s=motion.speed_m_s)
     return tuple(
         Sortie(number=number, depot=homes[at], legs=drawn.legs(orders[at], homes[at]))
         for number, at in enumerate(ranked, start=1)
@@ -134,8 +133,8 @@ def _budget(network: Network, pieces: Pieces, settings: Settings, flying: Flying
     if flying.pace_s_m is not None:
         pace_s_m = flying.pace_s_m[pieces.line]
     return build_budget(
-        network, battery, flying.motion, cruise_s=lengths_m(pieces.ends) * pace_s_m,
-        height_m=settings.height_m, reserve_l=settings.reserve_l,
+        network, battery, flying.motion, length_m=lengths_m(pieces.ends), pace_s_m=pace_s_m,
+        vertical=settings.vertical, height_m=settings.height_m, reserve_l=settings.reserve_l,
         nose_rate_deg_s=settings.nose_rate_deg_s, refill_s=settings.refill_s,
         limit_wh=battery.usable_wh * flying.battery_share,
     )  # fmt: skip
@@ -163,11 +162,11 @@ def _home(network: Network, order: Order) -> int:
 class _Drawn:
     """Legs of an order of pieces."""
 
-    def __init__(self, *, pieces: Pieces, ways: Ways, motion: Motion) -> None:
+    def __init__(self, *, pieces: Pieces, ways: Ways, speed_m_s: float) -> None:
         self._ends = pieces.ends.reshape(-1, 2).tolist()
         self._pieces = pieces
         self._ways = ways
-        self._motion = motion
+        self._speed_m_s = speed_m_s
 
     def legs(self, order: Order, depot: int) -> tuple[Leg, ...]:
         """Return the legs from the depot along all pieces and back."""
@@ -208,16 +207,9 @@ class _Drawn:
     def _leg(
         self, kind: Kind, points: list[Place], *, litres: float = 0.0, through: bool = False
     ) -> Leg:
-        motion = self._motion
-        parts_m = [_far_m(a, b) for a, b in pairwise(points)]
-        seconds = float(motion.legs_s(np.array(parts_m)).sum()) if parts_m else 0.0
-        if through:
-            seconds = sum(parts_m) / motion.speed_m_s - motion.speed_m_s / motion.acceleration_m_s2
-        elif kind == "transit" and len(points) == 2:
-            seconds = motion.between_passes_s(parts_m[0])
         return Leg(
-            kind=kind, points=tuple(points), speed_m_s=motion.speed_m_s, seconds=seconds,
-            volume_l=litres,
+            kind=kind, points=tuple(points), speed_m_s=self._speed_m_s, volume_l=litres,
+            through=through,
         )  # fmt: skip
 
 

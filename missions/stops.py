@@ -9,6 +9,10 @@ from missions.plan import Place, Sortie
 
 # Waypoints closer than this to the one before say nothing new: a border goes on in its next line.
 SAME_M = 0.6
+# A place on the straight between its neighbours is no waypoint where it is this near to one of
+# them: an autopilot that plans each leg from rest to rest slows down for every short one. The
+# companion lets a leg end 30 m beyond its line, and no farther.
+RUN_M, ASIDE_M = 25.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,7 +33,8 @@ def waypoints_of(sortie: Sortie, *, apart: bool = False) -> list[Stop]:
 
     Where one line goes on in the next, their ends are one place in the middle, unless `apart`;
     where the speed changes inside a line, there is a place and nothing closes.
-    The way back to the depot is left to the return, but for its bends.
+    The way back to the depot is left to the return, but for its bends. What is straight on, a run
+    into a line or a short gap, is one way with its line, unless `apart`.
     """
     legs = sortie.legs
     stops = [Stop(place=legs[0].points[0], speed_m_s=legs[0].speed_m_s)]
@@ -44,7 +49,31 @@ def waypoints_of(sortie: Sortie, *, apart: bool = False) -> list[Stop]:
             )
             continue
         stops += [Stop(place=place, speed_m_s=leg.speed_m_s) for place in leg.points[1:-1]]
-    return stops
+    return stops if apart else _without_runs(stops)
+
+
+def _without_runs(stops: list[Stop]) -> list[Stop]:
+    kept = stops[:1]
+    for here, after in zip(stops[1:], [*stops[2:], None], strict=True):
+        goes_on = after is not None and after.speed_m_s == here.speed_m_s
+        if after is None or not goes_on or not is_run(kept[-1].place, here.place, after.place):
+            kept.append(here)
+    return kept
+
+
+def is_run(before: Place, here: Place, after: Place) -> bool:
+    """Return whether a place between two others needs no waypoint of its own.
+
+    >>> is_run((0.0, 0.0), (0.0, 7.2), (0.0, 90.0)), is_run((0.0, 0.0), (0.0, 80.0), (6.0, 80.0))
+    (True, False)
+    """
+    far_m, near_m = math.dist(before, after), min(math.dist(before, here), math.dist(here, after))
+    if not near_m <= RUN_M or far_m == 0.0:
+        return False
+    east, north = (after[0] - before[0]) / far_m, (after[1] - before[1]) / far_m
+    off_east, off_north = here[0] - before[0], here[1] - before[1]
+    along_m = off_east * east + off_north * north
+    return 0.0 < along_m < far_m and abs(off_east * north - off_north * east) < ASIDE_M
 
 
 def _add(stops: list[Stop], place: Place, speed_m_s: float, *, apart: bool) -> None:

@@ -15,6 +15,7 @@ from missions.strips import Floats
 from missions.terrain.ground import Terrain
 from missions.terrain.heights import return_warnings
 from missions.terrain.slopes import slowed
+from missions.timing import timed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,14 +33,14 @@ class Surroundings:
     def paced(
         self, sorties: Sequence[Sortie], rates: Rates, field: Field, settings: Settings
     ) -> Paced:
-        """Return the sorties at the speeds that rates and slopes need, with their run-ins."""
+        """Return the sorties with the speeds of rates and slopes, their run-ins and times."""
         found = paced(sorties, rates, settings, self.terrain)
         if self.run_in is None:
-            return found
+            return replace(found, sorties=timed(found.sorties, settings))
         longer = with_run_ins(found.sorties, field, settings, self.run_in)
         if self.terrain is not None:
             longer = tuple(self._slowed(sortie, settings) for sortie in longer)
-        return replace(found, sorties=longer)
+        return replace(found, sorties=timed(longer, settings))
 
     def _slowed(self, sortie: Sortie, settings: Settings) -> Sortie:
         """Return a sortie whose new ways keep to the slopes as well."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +12,6 @@ from missions.plan import Leg, Place, Settings
 from missions.speeds import ROUND_M_S, Stretches
 from missions.strips import Floats
 from missions.terrain.ground import Profile, Terrain
-from missions.turns import Motion
 
 # No way is flown slower than this, whatever safety.speed_min_m_s says.
 SLOWEST_M_S = 0.5
@@ -87,7 +85,4 @@ def slowed(leg: Leg, terrain: Terrain, settings: Settings) -> Leg:
     speed = float(min(leg.speed_m_s, limits.min()))
     if speed == leg.speed_m_s:
         return leg
-    motion = Motion(speed_m_s=speed, acceleration_m_s2=settings.acceleration_m_s2)
-    lengths = np.array([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(leg.points)])
-    seconds = max(float(motion.legs_s(lengths).sum()), leg.seconds)
-    return replace(leg, speed_m_s=speed, seconds=seconds)
+    return replace(leg, speed_m_s=speed)
