@@ -173,6 +173,8 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             speed_m_s=mission.speed_m_s,
             height_m=mission.height_m,
             acceleration_m_s2=mission.acceleration_m_s2,
+            jerk_m_s3=mission.jerk_m_s3,
+            return_height_m=mission.return_height_m,
             turn=mission.turn,
             angle_deg=None if mission.angle_deg == "auto" else float(mission.angle_deg),
             tank_l=mission.tank_l,

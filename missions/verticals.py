@@ -51,8 +51,8 @@ class Vertical:
 # MPC_ACC_DOWN_MAX, RTL_RETURN_ALT, MPC_LAND_ALT1, MPC_LAND_SPEED.
 VERTICALS = {
     "ardupilot": Vertical(
-        ready_s=4.0, climb_m_s=2.5, descent_m_s=1.5, acceleration_m_s2=1.0, settled_s=1.0,
-        return_height_m=15.0, loiter_s=5.0, slow_m=10.0, land_m_s=0.5, down_s=2.5,
+        ready_s=4.0, climb_m_s=2.5, descent_m_s=1.5, acceleration_m_s2=1.0, settled_s=0.0,
+        return_height_m=15.0, loiter_s=5.0, slow_m=10.0, land_m_s=0.5, down_s=2.3,
     ),
     "px4": Vertical(
         ready_s=4.0, climb_m_s=1.5, descent_m_s=1.5, acceleration_m_s2=3.0, settled_s=1.0,

@@ -214,6 +214,12 @@ class MissionTable(Table):
     speed_m_s: float = Field(ge=0.5, le=50, description="in the passes")
     height_m: float = Field(default=3.5, ge=0.5, le=120, description="in the passes")
     acceleration_m_s2: float = Field(default=2.5, gt=0, le=20, description="of the vehicle")
+    jerk_m_s3: float | None = Field(
+        default=None, gt=0, le=100, description="of the vehicle; absent: 1 of ArduPilot, 4 of PX4"
+    )
+    return_height_m: float | None = Field(
+        default=None, ge=0, le=500, description="of its return; absent: 15 of ArduPilot, 60 of PX4"
+    )
     turn: Literal["stop", "strafe", "rounded"] = Field(default="stop", description="between passes")
     angle_deg: Annotated[float, Field(ge=-360, le=360)] | Literal["auto"] = Field(
         default="auto", description="of the passes, clockwise from north"

@@ -196,12 +196,6 @@ def test_a_leg_from_rest_to_rest() -> None:
     assert motion.leg_s(600.0) == pytest.approx(102.4)
 
 
-def test_a_rounded_turn_is_no_longer_than_a_stop() -> None:
-    stop = Motion(speed_m_s=6.0, acceleration_m_s2=2.5)
-    rounded = Motion(speed_m_s=6.0, acceleration_m_s2=2.5, turn="rounded")
-    assert rounded.between_passes_s(6.0) < stop.between_passes_s(6.0)
-
-
 def test_overlap_and_outside_are_measured() -> None:
     lines = np.array([[0.0, 3.0, 100.0, 3.0], [0.0, 6.0, 110.0, 6.0]])
     found = measure(lines, box(0.0, 0.0, 100.0, 12.0), 6.0)

@@ -56,8 +56,10 @@ def test_a_narrow_bare_strip_is_flown_over_without_a_stop() -> None:
     through = [leg for each in plan.sorties for leg in each.legs
                if leg.kind == "transit" and leg.length_m > 40.0]  # fmt: skip
     assert through
+    # A leg of its own between two lines: hardly slower than at full speed.
     for leg in through:
-        assert leg.seconds == pytest.approx(leg.length_m / 6.0 - 6.0 / 2.5)
+        assert leg.through
+        assert leg.length_m / 6.0 < leg.seconds < leg.length_m / 6.0 + 1.0
     assert plan.flight_s <= planned(Bare(0.0, 0.0)).flight_s + 1.0
 
 
