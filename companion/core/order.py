@@ -10,6 +10,10 @@ run of the clock only if they follow each other in step with our clock, and
 - SYSTEM_TIME gives the new times another time of day than the old ones had; or
 - the vehicle is disarmed, and they have gone on for some seconds.
 
+Where copies come as late as the clock was set back, they and the new positions have the same times,
+and no evidence for the one speaks against the other. So what is late waits first: as long after the
+last position of the stream as copies were late in the minutes before, until all of them are here.
+
 Until then they are dropped, and the last good position ages. The link uses the same rules to see
 that an autopilot has forgotten what was asked of it.
 """
@@ -40,6 +44,11 @@ ROUND_TRIP_MAX_S = 0.25
 # `time_boot_ms` has 32 bits, which begin anew after 50 days; TIMESYNC has 64.
 BOOT_WRAP_S = 2**32 / 1000.0
 _RUNS_MAX = 4
+# How late copies come is remembered for so long, up to twice; later than that is no copy's way.
+LATE_KEPT_S = 60.0
+LATE_MAX_S = 30.0
+# Copies of one way differ by this: a router's queue, a radio's repeats.
+LATE_SLACK_S = 0.5
 # The mean arrival follows a clock that is 5 % off at 10 positions a second.
 _FOLLOW = 0.2
 _FOLLOW_MAX_S = 0.05
@@ -56,6 +65,39 @@ class Run(NamedTuple):
     positions: int
 
 
+class Lateness(NamedTuple):
+    """How late copies came at most, while the stream went on: of late, before that, and just now.
+
+    Only when the stream goes on is it known that what came in between were copies.
+    """
+
+    since_s: float = -math.inf
+    most_s: float = 0.0
+    before_s: float = 0.0
+    pending_s: float = 0.0
+
+    @property
+    def wait_s(self) -> float:
+        """Return how long after the last position copies may still come."""
+        most_s = max(self.most_s, self.before_s)
+        return most_s + LATE_SLACK_S if most_s > 0.0 else 0.0
+
+    def seen(self, late_s: float) -> Lateness:
+        """Return it with something that is late, by so much, and may be a copy."""
+        return self._replace(pending_s=max(self.pending_s, min(late_s, LATE_MAX_S)))
+
+    def went_on(self, now_s: float) -> Lateness:
+        """Return it at a position of the stream: what was late in between is counted."""
+        if now_s - self.since_s > LATE_KEPT_S:
+            return Lateness(now_s, self.pending_s, self.most_s)
+        if not self.pending_s > 0.0:
+            return self
+        return self._replace(most_s=max(self.most_s, self.pending_s), pending_s=0.0)
+
+
+NO_COPIES = Lateness()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Order:
     """The stream of positions so far, and what may be another run of the autopilot's clock."""
@@ -68,6 +110,7 @@ class Order:
     epoch_s: float | None = None  # the time of day at which the clock was zero
     utc: UtcReport | None = None  # the last one that gives another
     disarmed_s: float = -math.inf
+    lateness: Lateness = NO_COPIES
 
 
 class Place(Enum):
@@ -114,21 +157,31 @@ def sorted_in(order: Order, item: Telemetry) -> tuple[Order, Place]:
         if off_s >= -_FOLLOW_MAX_S:
             seen_s = order.offset_s + _FOLLOW * min(off_s, _FOLLOW_MAX_S)
         return _followed(order, item, seen_s), Place.NEXT
-    if item.boot_s == order.boot_s:
+    late_s = seen_s - order.offset_s
+    if late_s > 0.0:
+        order = replace(order, lateness=order.lateness.seen(late_s))
+    waits = item.received_s <= order.received_s + order.lateness.wait_s
+    if waits or item.boot_s == order.boot_s:
         return order, Place.AGAIN
     run, others = _run(order.runs, item, seen_s)
     if _is_believed(order, run):
         exchange = order.exchange
         if exchange is not None and exchange.received_s <= run.first_s:
             exchange = None  # with the clock as it was
-        anew = replace(order, exchange=exchange, epoch_s=None, utc=None)
+        lateness = order.lateness._replace(pending_s=0.0)  # that was no copies
+        anew = replace(order, exchange=exchange, epoch_s=None, utc=None, lateness=lateness)
         return _followed(anew, item, run.offset_s), Place.ANEW
     return replace(order, runs=(*others, run)[-_RUNS_MAX:]), Place.AGAIN
 
 
 def _followed(order: Order, item: Telemetry, offset_s: float) -> Order:
     return replace(
-        order, boot_s=item.boot_s, received_s=item.received_s, offset_s=offset_s, runs=()
+        order,
+        boot_s=item.boot_s,
+        received_s=item.received_s,
+        offset_s=offset_s,
+        runs=(),
+        lateness=order.lateness.went_on(item.received_s),
     )
 
 

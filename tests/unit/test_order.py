@@ -228,3 +228,79 @@ def test_whatever_comes_late_the_place_is_right_or_nothing_opens(
         if may_open:
             # What is not known here is the delay of the way: nobody answers TIMESYNC.
             assert state.east_m == pytest.approx(5.0 * now_s, abs=0.35)
+
+
+def set_back(back_s: float, lates_s: Sequence[float], *, gap_s: float, by_utc: bool) -> list[Input]:
+    """Return a flight whose clock is set back at 12 s, copied all the time, and told of as well."""
+
+    def clock_s(now_s: float) -> float:
+        return UP_S + now_s - (back_s if now_s > 12.0 else 0.0)
+
+    told: list[Input] = [exchange(0.05 + i, clock_s(0.05 + i)) for i in range(30)]
+    if by_utc:
+        told = [
+            UtcReport(received_s=it.received_s, utc_s=UTC_S + it.received_s, boot_s=UP_S)
+            for it in told
+        ]
+        told = [
+            replace(it, boot_s=clock_s(it.received_s)) for it in told if isinstance(it, UtcReport)
+        ]
+    begin_s = 12.0 + gap_s
+    clean = [*stream(0.0, 12.0), *restarted(begin_s, 30.0, boot_s=clock_s(begin_s + 1e-9))]
+    late = [
+        replace(it, received_s=it.received_s + late_s + 0.01 * (i % 3))
+        for i, it in enumerate(clean)
+        for late_s in lates_s
+    ]
+    return [item for item in arrived([*clean, *late, *told]) if item.received_s < 30.0]
+
+
+def far_off_m(items: Iterable[Input]) -> tuple[float, float]:
+    """Return how far the place is off at worst where a valve may open, and when one last may."""
+    track, worst_m, may_s = Track(enabled=True), 0.0, 0.0
+    for item in items:
+        now_s = item.received_s
+        track = observe(track, item, SETUP)
+        state = estimate(track, now_s)
+        assert state is not None
+        is_young = now_s - state.position_received_s <= 0.8
+        if state.position_valid and state.clock_agrees and is_young:
+            worst_m, may_s = max(worst_m, abs(state.east_m - 5.0 * now_s)), now_s
+    return worst_m, may_s
+
+
+@pytest.mark.parametrize("by_utc", [False, True])
+@pytest.mark.parametrize("gap_s", [0.3, 3.0])
+@pytest.mark.parametrize("lates_s", [(5.0,), (4.95, 5.0), (3.97, 5.07)])
+def test_a_clock_set_back_among_copies_as_late_as_that(
+    lates_s: tuple[float, ...], gap_s: float, by_utc: bool
+) -> None:
+    """A copy of before and a position by the new clock have the same time: only waiting helps."""
+    worst_m, may_s = far_off_m(set_back(5.0, lates_s, gap_s=gap_s, by_utc=by_utc))
+    assert worst_m < 0.5
+    assert by_utc or may_s > 29.0
+
+
+@given(
+    back_s=st.floats(1.2, 9.0),
+    aparts_s=st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=3),
+    gap_s=st.floats(0.1, 4.0),
+    by_utc=st.booleans(),
+)
+@settings(max_examples=25, deadline=None)
+def test_a_clock_set_back_among_copies(
+    back_s: float, aparts_s: list[float], gap_s: float, by_utc: bool
+) -> None:
+    lates_s = [max(back_s + each, 0.05) for each in aparts_s]
+    assert far_off_m(set_back(back_s, lates_s, gap_s=gap_s, by_utc=by_utc))[0] < 0.5
+
+
+def test_only_copies_of_late_make_a_clock_that_was_set_wait() -> None:
+    order, _ = sort([*stream(0.0, 10.0), *stream(0.0, 10.0, late_s=11.0)])
+    assert order.lateness.wait_s == 0.0  # nobody knows: the stream had ended before
+    order, _ = sort(arrived([*stream(0.0, 30.0), *stream(0.0, 10.0, late_s=9.0)]))
+    assert order.lateness.wait_s == pytest.approx(9.5, abs=0.05)
+    order, _ = sort(stream(30.0, 120.0), order)
+    assert order.lateness.wait_s == pytest.approx(9.5, abs=0.05)
+    order, _ = sort(stream(120.0, 200.0), order)
+    assert order.lateness.wait_s == 0.0
