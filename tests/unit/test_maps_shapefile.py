@@ -291,6 +291,82 @@ def test_shapes_out_of_order_are_found_through_the_index(tmp_path: Path) -> None
     assert first.equals(cell(1))
 
 
+def newer_shapes(tmp_path: Path) -> Path:
+    """Return a shapefile of two records whose `.shp` is of a later export with three."""
+    path = simple(tmp_path)
+    later = write(
+        tmp_path / "later.shp", [cell(0), cell(1), cell(2)], geometry_type="Polygon",
+        rate=[1.0, 2.0, 3.0],
+    )  # fmt: skip
+    path.write_bytes(later.read_bytes())
+    for end in (".shp", ".shx", ".dbf", ".prj", ".cpg"):
+        later.with_suffix(end).unlink(missing_ok=True)
+    return path
+
+
+def test_shapes_that_no_record_points_to_are_said(tmp_path: Path) -> None:
+    found = read_map(newer_shapes(tmp_path))
+    assert [zone.rate_l_ha for zone in found.zones] == [12.5, 0.0]
+    (problem,) = found.problems
+    assert (problem.severity, problem.code) == ("warning", "stray-records")
+    assert "1 of 3 shapes" in problem.text
+    assert problem.where.endswith("rx.shp")
+
+
+def test_a_shape_that_was_replaced_at_the_end_is_a_stray_too(tmp_path: Path) -> None:
+    """As programs edit in place: the old shape stays, the index points to the new one."""
+    path = simple(tmp_path)
+    content, shx = bytearray(path.read_bytes()), path.with_suffix(".shx")
+    end, size = len(content), 8 + 2 * struct.unpack_from(">i", content, 104)[0]
+    content += content[100 : 100 + size]
+    struct.pack_into(">i", content, 24, len(content) // 2)
+    path.write_bytes(content)
+    index = bytearray(shx.read_bytes())
+    struct.pack_into(">i", index, 100, end // 2)
+    shx.write_bytes(index)
+    found = read_map(path)
+    assert [zone.geometry.equals(cell(number)) for number, zone in enumerate(found.zones)] == [
+        True, True,
+    ]  # fmt: skip
+    assert codes(found) == {"stray-records"}
+
+
+def test_rows_behind_the_last_of_the_table_are_said(tmp_path: Path) -> None:
+    path = simple(tmp_path)
+    dbf = path.with_suffix(".dbf")
+    content = dbf.read_bytes()
+    header, width = struct.unpack("<HH", content[8:12])
+    end = header + 2 * width
+    dbf.write_bytes(content[:end] + content[header : header + width] + b"\x1a")
+    found = read_map(path)
+    assert [zone.rate_l_ha for zone in found.zones] == [12.5, 0.0]
+    (problem,) = found.problems
+    assert (problem.code, problem.where) == ("stray-records", str(dbf))
+    assert "1 row" in problem.text
+
+
+def test_an_index_with_entries_behind_its_own_end_is_read_to_its_end(tmp_path: Path) -> None:
+    path = simple(tmp_path)
+    shx = path.with_suffix(".shx")
+    shx.write_bytes(shx.read_bytes() + shx.read_bytes()[100:108])
+    found = read_map(path)
+    assert len(found.zones) == 2
+    assert found.problems == ()
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_a_table_of_another_export_is_refused_with_both_counts(tmp_path: Path, rows: int) -> None:
+    path = simple(tmp_path)
+    other = write(
+        tmp_path / "other.shp", [cell(n) for n in range(rows)], geometry_type="Polygon",
+        rate=[5.0] * rows,
+    )  # fmt: skip
+    path.with_suffix(".dbf").write_bytes(other.with_suffix(".dbf").read_bytes())
+    with pytest.raises(MapError, match=f"{rows} records for 2 shapes") as caught:
+        read_map(path)
+    assert caught.value.code == "table-mismatch"
+
+
 def test_a_missing_index_is_a_warning(tmp_path: Path) -> None:
     path = simple(tmp_path)
     path.with_suffix(".shx").unlink()

@@ -73,7 +73,29 @@ def read_columns(
     cells = [_cells(rows, field) for field in fields]
     texts = Texts(dbf[29], cpg)
     columns = tuple(_column(field, raw, texts) for field, raw in zip(fields, cells, strict=True))
-    return columns, texts.problems(table)
+    strays = _strays(dbf, header_bytes + records * record_bytes, record_bytes, table)
+    return columns, (*strays, *texts.problems(table))
+
+
+def _strays(dbf: bytes, end: int, record_bytes: int, table: Path) -> tuple[Problem, ...]:
+    """Return a warning for whole rows behind the last that the header counts."""
+    rest = dbf[end:]
+    count = len(rest) // record_bytes
+    flags = rest[: count * record_bytes : record_bytes]
+    # What follows the last row is a mark, and zeros of the file system; a row begins with a flag.
+    rows = next((number for number, flag in enumerate(flags) if flag not in _FLAGS[:2]), count)
+    if not rows:
+        return ()
+    problem = Problem(
+        severity="warning",
+        code="stray-records",
+        text=f"{rows} {'row' if rows == 1 else 'rows'} behind the last one that the header of the "
+        "attribute table counts are left out",
+        where=str(table),
+        fix="compare the number of zones with that of the program that made the map, or export it "
+        "again",
+    )
+    return (problem,)
 
 
 def _header(dbf: bytes, table: Path) -> tuple[int, int, int]:

@@ -161,10 +161,13 @@ def _index(files: ShapeFiles) -> tuple[list[int], tuple[Problem, ...]]:
     _check_header(shp, files.main)
     if shx is not None:
         _check_header(shx, files.main.with_suffix(".shx"))
-        count = (len(shx) - _HEADER_BYTES) // 8
+        # Behind its own end the file may hold anything.
+        count = (2 * struct.unpack_from(">i", shx, 24)[0] - _HEADER_BYTES) // 8
         check_counts(files.main, records=count, vertices=0)
-        words = np.frombuffer(shx, ">i4", 2 * count, _HEADER_BYTES)[::2]
-        return (2 * words.astype(np.int64)).tolist(), ()
+        words = np.frombuffer(shx, ">i4", 2 * count, _HEADER_BYTES).astype(np.int64)
+        found = (2 * words[::2]).tolist()
+        covered = int((2 * words[1::2] + 8).sum())
+        return found, _strays(shp, found, covered, files.main)
     offsets: list[int] = []
     position = _HEADER_BYTES
     try:
@@ -183,6 +186,37 @@ def _index(files: ShapeFiles) -> tuple[list[int], tuple[Problem, ...]]:
         fix="copy the whole set of files",
     )
     return offsets, (problem,)
+
+
+def _strays(shp: bytes, indexed: list[int], covered_bytes: int, main: Path) -> tuple[Problem, ...]:
+    """Return a warning for whole shapes in the file that the index does not name.
+
+    They are old versions that an editing program left lying, or the `.shx` and the table are of
+    another export than the `.shp`; which of the two, no file says.
+    """
+    end = 2 * struct.unpack_from(">i", shp, 24)[0]
+    if covered_bytes >= end - _HEADER_BYTES:
+        return ()
+    named, count, strays, position = set(indexed), 0, 0, _HEADER_BYTES
+    try:
+        while position < end and count < MAX_RECORDS:
+            after = position + 8 + _length(shp, position)
+            count += 1
+            strays += position not in named
+            position = after
+    except _CutOffError:
+        pass  # bytes that are no shape
+    if not strays:
+        return ()
+    problem = Problem(
+        severity="warning",
+        code="stray-records",
+        text=f"{strays} of {count} shapes in the .shp stand in no record of the .shx and are left "
+        "out: old versions that a program left there, or files of two exports",
+        where=str(main),
+        fix="compare the area with that of the program that made the map, or export it again",
+    )
+    return (problem,)
 
 
 def _check_header(content: bytes, path: Path) -> None:
