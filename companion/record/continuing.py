@@ -19,6 +19,7 @@ from companion.core.overlap_guard import OverlapGuard
 from companion.errors import JournalError, UnreadableError
 from companion.record.coverage_area import as_polygons, moved, polygons
 from companion.record.coverage_table import read_coverage
+from companion.record.distrust import distrust
 from companion.record.geopackage import wkb_of
 from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
@@ -117,9 +118,10 @@ def is_journal(path: Path) -> bool:
     uri = f"{path.resolve().as_uri()}?immutable=1"
     try:
         with closing(sqlite3.connect(uri, uri=True)) as connection:
+            distrust(connection, path.stat().st_size)
             sql = "SELECT 1 FROM meta WHERE key = 'journal_version'"
             return connection.execute(sql).fetchone() is not None
-    except sqlite3.Error:
+    except (sqlite3.Error, OSError):
         return False
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from companion.errors import VrsprayError
 from companion.record.content_hash import log_of
+from companion.record.distrust import allow_damaged_list, check_beside, distrust
 
 # What a damaged journal may do to its reader: SQLite's findings, and values that are none.
 DAMAGE = (
@@ -29,6 +30,7 @@ DAMAGE = (
 @contextmanager
 def read_only(path: Path, *, timeout_s: float = 1.0) -> Iterator[sqlite3.Connection]:
     """Open for reading only: what a crash left (the -wal file beside it) is read, not changed."""
+    check_beside(path)
     log, index = log_of(path), path.with_name(path.name + "-shm")
     with ExitStack() as at_end:
         folder = at_end.enter_context(tempfile.TemporaryDirectory(prefix="vrspray-"))
@@ -42,7 +44,12 @@ def read_only(path: Path, *, timeout_s: float = 1.0) -> Iterator[sqlite3.Connect
                 shutil.copy(file, folder)
             source = Path(folder) / path.name
         uri = f"{source.resolve().as_uri()}?mode=ro"
-        yield at_end.enter_context(closing(sqlite3.connect(uri, uri=True, timeout=timeout_s)))
+        connection = at_end.enter_context(
+            closing(sqlite3.connect(uri, uri=True, timeout=timeout_s))
+        )
+        size_bytes = sum(file.stat().st_size for file in (path, log) if file.exists())
+        distrust(connection, size_bytes)
+        yield connection
 
 
 def tolerate_damage(connection: sqlite3.Connection) -> None:
@@ -51,6 +58,7 @@ def tolerate_damage(connection: sqlite3.Connection) -> None:
     SQLite refuses such a file as a whole, unless its list of tables may be written; of a
     connection that is read only nothing is written all the same.
     """
+    allow_damaged_list(connection)
     connection.execute("PRAGMA writable_schema = ON")
 
 

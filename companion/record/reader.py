@@ -15,6 +15,7 @@ from companion.errors import NoMapError, UnreadableError
 from companion.record.blocks import Entry
 from companion.record.codec import FieldNames, decode
 from companion.record.coverage_table import read_treated
+from companion.record.distrust import check_programs
 from companion.record.events import Event
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import read_ground
@@ -144,6 +145,7 @@ def _checked(path: Path, connection: sqlite3.Connection, *, is_lenient: bool) ->
     unread: list[str] = []
     application_id, tables = _registered(connection, unread if is_lenient else None)
     check_kind(path, tables, is_geopackage=application_id == APPLICATION_ID)
+    check_programs(connection)
     meta = _meta(connection, tables, unread if is_lenient else None)
     version = check_version(path, meta, tables, is_lenient=is_lenient)
     if is_lenient:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from companion.errors import JournalError
 from companion.record.content_hash import log_of
+from companion.record.distrust import check_beside, check_programs, distrust
 from companion.record.folder import journals
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import box_of_points, set_box
@@ -144,6 +145,7 @@ def _looked_at(path: Path) -> tuple[bool, _Ending | None]:
     with read_only(path, timeout_s=0.0) as connection:
         if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
             raise ValueError("is no journal")
+        check_programs(connection, writes=True)
         (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
         if path.stat().st_size % page_bytes:
             # SQLite takes zeros for the rest of a page.
@@ -192,7 +194,11 @@ def _fold_in(path: Path, ending: _Ending | None, damage: LogDamage | None) -> st
 @contextmanager
 def _alone(path: Path) -> Iterator[sqlite3.Connection]:
     """Open for writing, and alone: a journal whose flight lives is locked."""
-    with closing(sqlite3.connect(path, isolation_level=None, timeout=0.0)) as connection:
+    check_beside(path, writes=True)
+    # Absolute: a name that begins with "file:" is an address for some builds of SQLite.
+    where = path.absolute()
+    with closing(sqlite3.connect(where, isolation_level=None, timeout=0.0)) as connection:
+        distrust(connection, where.stat().st_size, writes=True)
         # Before the first read, or a shared-memory file would be made.
         connection.execute("PRAGMA locking_mode = EXCLUSIVE").fetchall()
         yield connection

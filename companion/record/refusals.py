@@ -33,6 +33,8 @@ def refused(path: Path, error: Exception) -> JournalError:
             return JournalError(f"{path}: its flight still writes it; end the flight first")
         if any(word in text for word in _KEPT_BACK):
             return JournalError(f"{path}: cannot be read: {text}")
+        if "interrupted" in text:
+            return UnreadableError(f"{path}: is damaged: reading it comes to no end")
     if isinstance(error, PermissionError):
         return JournalError(f"{path}: cannot be read: {text}")
     if isinstance(error, sqlite3.DatabaseError) and "not a database" in text:

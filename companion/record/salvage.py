@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 from companion.atomic_write import sync_folder
+from companion.record.distrust import check_beside, known_tables
 from companion.record.geopackage import APPLICATION_ID, USER_VERSION
 from companion.record.kept_pages import KeptPages, kept_pages
 from companion.record.read_only import read_only, tolerate_damage
@@ -25,6 +27,11 @@ _OF_A_FLIGHT = ("meta", "applied", "blocks", "valve_changes")
 _TELL_VERSION = "INSERT OR IGNORE INTO meta (key, value) VALUES ('journal_version', ?)"
 # Behind a damaged page the search goes on after so many rows, each time twice as many.
 _SKIPS = 24
+_UNKNOWN_BYTES = 1 << 30
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+_KINDS = frozenset(
+    {"BLOB", "DATETIME", "DOUBLE", "GEOMETRY", "INTEGER", "POINT", "TEXT", "TINYINT"}
+)
 
 
 def salvaged_name(path: Path) -> Path:
@@ -50,6 +57,7 @@ def salvage(path: Path) -> Salvaged:
     What went wrong otherwise is a `sqlite3.Error`, a ValueError or an OSError: then there is no
     copy.
     """
+    check_beside(path)
     target = salvaged_name(path)
     draft = target.with_name(f".new-{os.getpid()}-salvaged.gpkg")
     draft.unlink(missing_ok=True)
@@ -78,9 +86,9 @@ def _copy_all(source: sqlite3.Connection, pages: KeptPages, copy: sqlite3.Connec
     copy.execute("BEGIN")
     rows: Counter[str] = Counter()
     lost, torn = [], torn_rows(pages)
-    for name, sql in tables.items():
+    for name in tables:
         try:
-            _make(copy, name, sql)
+            _make(copy, name, _columns(source, name))
             copied, is_whole = _copy(source, copy, name, torn)
         except (sqlite3.Error, ValueError):  # a name, or a list of columns, that is none
             copied, is_whole = 0, False
@@ -103,32 +111,63 @@ def _copy_all(source: sqlite3.Connection, pages: KeptPages, copy: sqlite3.Connec
     return Salvaged(rows=(rows + stray).total(), lost_tables=tuple(lost), stray=stray)
 
 
-def _tables(source: sqlite3.Connection) -> dict[str, str]:
-    """Return the tables by their names: what the file's list says, then what it must have said."""
-    found: dict[str, str] = {}
+def _tables(source: sqlite3.Connection) -> list[str]:
+    """Return the tables of a journal: by the file's list, and by what it must have said.
+
+    What is in it besides, such as a map viewer's styles, is not for a journal's copy.
+    """
+    found: list[str] = []
     is_whole = False
     try:
-        for name, sql in source.execute(TABLES):
-            found[name] = sql
+        for name, _ in source.execute(TABLES):
+            if name in known_tables():
+                found.append(name)
         is_whole = not missing_tables("1" if "records" in found else "2", found)
     except (sqlite3.DatabaseError, ValueError):
         pass
-    return found if is_whole else {name: sql for name, (sql, _) in own_tables().items()} | found
+    return found if is_whole else [*own_tables(), *(set(found) - own_tables().keys())]
 
 
-def _make(copy: sqlite3.Connection, name: str, sql: str) -> None:
-    """Make a table as the file says it; where damage speaks from that, as it must have been."""
-    own_sql, own_columns = own_tables().get(name, (sql, None))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Column:
+    name: str
+    kind: str
+    is_key: bool
+
+
+def _columns(source: sqlite3.Connection, table: str) -> tuple[_Column, ...]:
+    """Return the columns of a table as the file has them; none where that is damaged."""
     try:
-        copy.execute(sql)
-        columns = columns_of(copy, name)
-        is_other = len(columns) != len(own_columns or ())
-        if columns and (own_columns is None or columns == own_columns or is_other):
-            return
-        copy.execute(f'DROP TABLE IF EXISTS "{name}"')
-    except sqlite3.Error:
-        pass
-    copy.execute(own_sql)
+        rows = source.execute(f'PRAGMA table_xinfo("{table}")').fetchall()
+    except sqlite3.DatabaseError:
+        return ()
+    if any(row[6] for row in rows):
+        raise ValueError(f"{table} has computed columns")
+    return tuple(_Column(name=row[1], kind=row[2].upper(), is_key=bool(row[5])) for row in rows)
+
+
+def _make(copy: sqlite3.Connection, table: str, columns: Sequence[_Column]) -> None:
+    """Make a table as it is today, or with the columns that an older journal has.
+
+    By a statement of our own in any case: the file's text is nobody's.
+    """
+    own_sql, own_names = own_tables().get(table, (None, ()))
+    names = tuple(column.name for column in columns)
+    is_older = bool(names) and len(names) != len(own_names) and all(map(_is_sound, columns))
+    if own_sql is not None and not is_older:
+        copy.execute(own_sql)
+        return
+    if not is_older:
+        raise ValueError(f"{table} has no columns that a journal has")
+    parts = [f'"{column.name}" {column.kind}' for column in columns]
+    keys = ", ".join(f'"{column.name}"' for column in columns if column.is_key)
+    parts += [f"PRIMARY KEY ({keys})"] if keys else []
+    parts += ["UNIQUE (key)"] if table == "meta" and "key" in names else []
+    copy.execute(f'CREATE TABLE "{table}" ({", ".join(parts)})')
+
+
+def _is_sound(column: _Column) -> bool:
+    return bool(_NAME.fullmatch(column.name)) and column.kind in _KINDS
 
 
 def _copy_strays(pages: KeptPages, copy: sqlite3.Connection, tables: Iterable[str]) -> Counter[str]:
@@ -174,11 +213,27 @@ def _copy(
     return count, whole[0]
 
 
+def _bytes_of(source: sqlite3.Connection) -> int:
+    try:
+        ((pages,), (page_bytes,)) = (
+            source.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "page_size")
+        )
+    except sqlite3.DatabaseError:
+        return _UNKNOWN_BYTES
+    return int(pages) * int(page_bytes)
+
+
 def readable_rows(source: sqlite3.Connection, name: str, whole: list[bool]) -> Iterator[Row]:
     """Yield rowid and row of all that can be read; `whole[0]` becomes False where that is less."""
     last = -(2**62)
+    # Pages that lead to each other would go on for ever: a row takes five bytes and more.
+    rows_max = _bytes_of(source) // 5
     try:
-        for row in source.execute(f'SELECT rowid, * FROM "{name}" ORDER BY rowid'):
+        for count, row in enumerate(
+            source.execute(f'SELECT rowid, * FROM "{name}" ORDER BY rowid')
+        ):
+            if count > rows_max:
+                raise sqlite3.DatabaseError("its pages lead to each other")
             last = row[0]
             yield row
     except sqlite3.DatabaseError:
@@ -191,7 +246,9 @@ def readable_rows(source: sqlite3.Connection, name: str, whole: list[bool]) -> I
         beyond = last + 2**power
         try:
             sql = f'SELECT rowid, * FROM "{name}" WHERE rowid >= ? ORDER BY rowid'
-            for row in source.execute(sql, (beyond,)):
+            for count, row in enumerate(source.execute(sql, (beyond,))):
+                if count > rows_max:
+                    return
                 last = row[0]
                 yield row
         except sqlite3.DatabaseError:
