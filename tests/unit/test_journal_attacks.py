@@ -319,7 +319,9 @@ def test_what_is_none_of_our_statements_is_refused(sql: str) -> None:
         connection.executescript("CREATE TABLE evil (a); CREATE TABLE meta (key)")
         distrust(connection, 0)
         assert connection.execute("SELECT count(*) FROM meta").fetchone() == (0,)
-        with pytest.raises(sqlite3.DatabaseError, match=r"not authorized|prohibited|too many|denied"):
+        with pytest.raises(
+            sqlite3.DatabaseError, match=r"not authorized|prohibited|too many|denied"
+        ):
             connection.execute(sql).fetchall()
 
 
