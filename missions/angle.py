@@ -9,14 +9,17 @@ from collections.abc import Iterator
 
 import numpy as np
 import shapely
+from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
+from companion.maps.local import polygons_of
 from missions.strips import Floats, lengths_m
 from missions.swaths import inner_lines
 from missions.turns import Motion
 
 COARSE_DEG = 15.0
 EDGES_MAX = 8
+SMALL_SWATHS = 5.0
 # Angles closer than this are the same edge, drawn twice.
 SAME_DEG = 0.05
 # Around the best, in two rounds: a tenth of a degree is a strip more or less on a long field.
@@ -42,6 +45,21 @@ def edge_angles(ground: BaseGeometry) -> list[float]:
     return longest[:EDGES_MAX]
 
 
+def _without_small_holes(ground: BaseGeometry, width_m: float) -> BaseGeometry:
+    """Return the ground with holes of a few swaths filled: no course is better for a tree."""
+    least_m2 = (SMALL_SWATHS * width_m) ** 2
+    filled: BaseGeometry = shapely.union_all(
+        [
+            Polygon(
+                part.exterior,
+                [ring for ring in part.interiors if Polygon(ring).area > least_m2],
+            )
+            for part in polygons_of(ground)
+        ]
+    )
+    return filled
+
+
 def cost_s(
     lines: Floats,
     motion: Motion,
@@ -61,6 +79,7 @@ def ranked(
     inner: BaseGeometry, ground: BaseGeometry, *, width_m: float, motion: Motion
 ) -> list[tuple[float, float]]:
     """Return (cost in seconds, angle) of all angles that were tried, the best first."""
+    inner = _without_small_holes(inner, width_m)
     if inner.is_empty:
         return [(0.0, angle) for angle in edge_angles(ground)[:1]]
     tried: dict[float, float] = {}

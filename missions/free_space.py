@@ -5,7 +5,6 @@ A visibility graph: a shortest way bends only at corners that stick out into the
 
 from __future__ import annotations
 
-import heapq
 import math
 from dataclasses import dataclass
 
@@ -22,27 +21,36 @@ CLEAR_M, MITRE_LIMIT = 0.3, 2.0
 # Places on the border count as inside.
 TOUCH_M = 1e-6
 # With more corners than these it is drawn simpler, inside of itself, up to the last tolerance.
-CORNERS_MAX, SIMPLER_M = 300, (0.1, 0.2, 0.4, 0.8, 1.6)
+CORNERS_MAX, SIMPLER_M = 300, (0.4, 1.6)
+# Free sight is looked for to so many of the nearest corners, and to all where that is no way.
+NEAREST = 40
+# Around one straight line so many corners are looked at, those that lie least aside.
+ASIDE = 60
 
 
-def _corners(space: BaseGeometry) -> Floats:
-    """Return the corners at which a way may have to bend."""
+Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+Bools = np.ndarray[tuple[int, ...], np.dtype[np.bool_]]
+Place = tuple[float, float]
+
+
+def _corners(space: BaseGeometry) -> tuple[Floats, Ints]:
+    """Return the corners at which a way may have to bend, and the ring of each."""
     inside = as_area(
         polygons_of(space.buffer(-CLEAR_M, join_style="mitre", mitre_limit=MITRE_LIMIT))
     )
     if inside is None:
-        return np.empty((0, 2))
+        return np.empty((0, 2)), np.empty(0, dtype=np.int64)
     found = _sticking_out(inside)
     for tolerance_m in SIMPLER_M:
-        if len(found) <= CORNERS_MAX:
+        if len(found[0]) <= CORNERS_MAX:
             break
         found = _sticking_out(inside_with_fewer_corners(inside, tolerance_m))
     return found
 
 
-def _sticking_out(space: BaseGeometry) -> Floats:
+def _sticking_out(space: BaseGeometry) -> tuple[Floats, Ints]:
     parts = shapely.orient_polygons(shapely.get_parts(space))
-    found = [np.empty((0, 2))]
+    found, ring_of = [np.empty((0, 2))], [np.empty(0, dtype=np.int64)]
     for part in parts:
         for ring in (part.exterior, *part.interiors):
             points = shapely.get_coordinates(ring)[:-1]
@@ -51,44 +59,65 @@ def _sticking_out(space: BaseGeometry) -> Floats:
                 np.roll(points, -1, axis=0) - points,
             )
             turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-            found.append(points[turn < 0.0])  # inside is on the left: a right turn sticks out
-    return np.concatenate(found)
+            some = points[turn < 0.0]  # inside is on the left: a right turn sticks out
+            found.append(some)
+            ring_of.append(np.full(len(some), len(found), dtype=np.int64))
+    return np.concatenate(found), np.concatenate(ring_of)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeSpace:
-    """Where one may fly; `between_m` are the ways between its corners."""
+    """Where one may fly; `between_m` are ways between its corners, nearly the shortest."""
 
     space: BaseGeometry
     corners: Floats
     between_m: Floats
-    next_corner: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    next_corner: Ints
     is_convex: bool
 
-    def sees(self, starts: Floats, ends: Floats) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    def sees(self, starts: Floats, ends: Floats) -> Bools:
         """Return, for each pair, whether the straight way between them is free."""
-        if self.is_convex:
+        if self.is_convex or not len(starts):
             return np.ones(len(starts), dtype=np.bool_)
         straight = shapely.linestrings(np.stack([starts, ends], axis=1))
         return np.asarray(shapely.covers(self.space, straight), dtype=np.bool_)
 
-    def to_corners_m(self, points: Floats) -> Floats:
-        """Return the straight distance from every point to every corner that it sees."""
-        count, corners = len(points), len(self.corners)
-        if not corners or not count:
-            return np.full((count, corners), math.inf)
-        starts, ends = np.repeat(points, corners, axis=0), np.tile(self.corners, (count, 1))
-        far_m = np.hypot(*(ends - starts).T)
-        return np.where(self.sees(starts, ends), far_m, math.inf).reshape(count, corners)
+    def to_corners_m(self, points: Floats, *, nearest: int | None = NEAREST) -> Floats:
+        """Return the straight distance from every point to its nearest corners that it sees.
 
-    def way(
-        self, start: tuple[float, float], end: tuple[float, float]
-    ) -> list[tuple[float, float]]:
+        With `nearest` None all corners are looked at; infinite stands for those that are not seen.
+        """
+        count, corners = len(points), len(self.corners)
+        found = np.full((count, corners), math.inf)
+        if not corners or not count:
+            return found
+        far_m = np.hypot(
+            points[:, 0][:, None] - self.corners[:, 0][None, :],
+            points[:, 1][:, None] - self.corners[:, 1][None, :],
+        )
+        if nearest is None or nearest >= corners:
+            rows, columns = np.divmod(np.arange(count * corners), corners)
+        else:
+            near = np.argpartition(far_m, nearest, axis=1)[:, :nearest]
+            rows, columns = np.repeat(np.arange(count), nearest), near.ravel()
+        seen = self.sees(points[rows], self.corners[columns])
+        rows, columns = rows[seen], columns[seen]
+        found[rows, columns] = far_m[rows, columns]
+        return found
+
+    def way(self, start: Place, end: Place) -> list[Place]:
         """Return the places of the shortest way, both ends among them; nothing where none is."""
         ends = np.array([start, end])
         if bool(self.sees(ends[:1], ends[1:])[0]):
             return [start, end]
-        reach = self.to_corners_m(ends)
+        for nearest in (NEAREST, None):
+            found = self._along_corners(ends, nearest)
+            if found:
+                return self._straightened(ends, found)
+        return []
+
+    def _along_corners(self, ends: Floats, nearest: int | None) -> list[int]:
+        reach = self.to_corners_m(ends, nearest=nearest)
         if not reach.size:
             return []
         total = reach[0][:, None] + self.between_m + reach[1][None, :]
@@ -98,46 +127,85 @@ class FreeSpace:
         chain = [int(first)]
         while chain[-1] != last:
             chain.append(int(self.next_corner[chain[-1], last]))
-        bends = [(float(x), float(y)) for x, y in self.corners[chain]]
-        return [start, *bends, end]
+        return chain
+
+    def _straightened(self, ends: Floats, chain: list[int]) -> list[Place]:
+        """Return the shortest way over the corners that lie no farther aside than this one."""
+        known = np.concatenate([ends[:1], self.corners[chain], ends[1:]])
+        known_m = float(np.hypot(*np.diff(known, axis=0).T).sum())
+        aside_m = np.hypot(*(self.corners - ends[0]).T) + np.hypot(*(self.corners - ends[1]).T)
+        some = np.argsort(aside_m, kind="stable")[:ASIDE]
+        some = np.union1d(some[aside_m[some] < known_m], chain)
+        places = np.concatenate([ends[:1], self.corners[some], ends[1:]])
+        rows, columns = np.triu_indices(len(places), 1)
+        far_m = np.full((len(places), len(places)), math.inf)
+        seen = self.sees(places[rows], places[columns])
+        rows, columns = rows[seen], columns[seen]
+        far_m[rows, columns] = far_m[columns, rows] = np.hypot(*(places[rows] - places[columns]).T)
+        _, following = _shortest(far_m)
+        last, way = len(places) - 1, [0]
+        while way[-1] != last:
+            way.append(int(following[way[-1], last]))
+        return [(float(x), float(y)) for x, y in places[way]]
 
 
 def free_space(ground: BaseGeometry) -> FreeSpace:
     """Return the free space of a ground, whose border may be touched."""
     space = ground.buffer(TOUCH_M, join_style="mitre")
     is_convex = space.convex_hull.area - space.area < 1e-6 * space.area
-    corners = np.empty((0, 2)) if is_convex else _corners(ground)
+    corners, rings = (
+        (np.empty((0, 2)), np.empty(0, dtype=np.int64)) if is_convex else _corners(ground)
+    )
     shapely.prepare(space)
     count = len(corners)
-    direct = FreeSpace(
+    found = FreeSpace(
         space=space, corners=corners, between_m=np.zeros((count, count)),
         next_corner=np.zeros((count, count), dtype=np.int64), is_convex=is_convex,
-    ).to_corners_m(corners)  # fmt: skip
-    between = np.full((count, count), math.inf)
-    following = np.zeros((count, count), dtype=np.int64)
-    for target in range(count):
-        between[target], following[:, target] = _to_target(direct, target)
+    )  # fmt: skip
+    if not count:
+        return found
+    direct = found.to_corners_m(corners)
+    _see(found, direct, *_neighbours(rings))
+    between, following = _shortest(direct)
+    # Islands of corners that are near to each other alone.
+    rows, columns = np.nonzero(np.triu(np.isinf(between)))
+    if len(rows) and _see(found, direct, rows, columns):
+        between, following = _shortest(direct)
     return FreeSpace(
         space=space, corners=corners, between_m=between, next_corner=following,
         is_convex=is_convex,
     )  # fmt: skip
 
 
-def _to_target(
-    direct_m: Floats, target: int
-) -> tuple[Floats, np.ndarray[tuple[int, ...], np.dtype[np.int64]]]:
-    """Return the ways from all corners to one, and the next corner on each (Dijkstra)."""
-    distance = np.full(len(direct_m), math.inf)
-    following = np.full(len(direct_m), target, dtype=np.int64)
-    distance[target] = 0.0
-    heap = [(0.0, target)]
-    while heap:
-        far_m, corner = heapq.heappop(heap)
-        if far_m > distance[corner]:
-            continue
-        through = far_m + direct_m[:, corner]
-        for better in np.flatnonzero(through < distance - 1e-9).tolist():
-            distance[better] = through[better]
-            following[better] = corner
-            heapq.heappush(heap, (float(through[better]), better))
-    return distance, following
+def _neighbours(rings: Ints) -> tuple[Ints, Ints]:
+    """Return each corner with the next one of its ring: there is mostly a way between them."""
+    at = np.arange(len(rings))
+    following = at + 1
+    is_last = np.append(rings[1:] != rings[:-1], True)
+    first = np.searchsorted(rings, rings)
+    following[is_last] = first[is_last]
+    return at, following
+
+
+def _see(space: FreeSpace, direct: Floats, rows: Ints, columns: Ints) -> bool:
+    """Add the straight ways of pairs of corners that see each other; return whether any does."""
+    corners = space.corners
+    seen = space.sees(corners[rows], corners[columns])
+    rows, columns = rows[seen], columns[seen]
+    direct[rows, columns] = np.hypot(*(corners[rows] - corners[columns]).T)
+    return bool(len(rows))
+
+
+def _shortest(direct: Floats) -> tuple[Floats, Ints]:
+    """Return the shortest ways over any stations, and the next station on each (Floyd, 1962)."""
+    between = np.minimum(direct, direct.T)
+    count = len(between)
+    np.fill_diagonal(between, 0.0)
+    following = np.tile(np.arange(count), (count, 1))
+    through, better = np.empty_like(between), np.empty(between.shape, dtype=np.bool_)
+    for station in range(count):
+        np.add.outer(between[:, station], between[station] + 1e-9, out=through)
+        np.less(through, between, out=better)
+        np.copyto(between, through, where=better)
+        np.copyto(following, following[:, station, None], where=better)
+    return between, following

@@ -12,17 +12,21 @@ from missions.field import Field
 from missions.fitted_lines import fitted_lines, has_edges_along
 from missions.free_space import free_space
 from missions.one_tour import LINES_MAX, Tour, tour_of
-from missions.open_lines import needed_passes, open_lines
+from missions.open_lines import LEFT_SHARE, needed_passes, open_lines
 from missions.patches import patches
 from missions.plan import Settings
 from missions.strips import Floats, joined, lengths_m
 from missions.swaths import border_passes, inner_ground, inner_lines
 from missions.turns import Motion
+from missions.worth import LEFT_SHARE as WORTH_LEFT
 from missions.worth import worthwhile
 
 # Of the best courses so many are drawn in full; of the layouts so many are gone through line by
 # line, and only the best one where it has more lines than this.
 ANGLES_TRIED, LAYOUTS_TRIED, MANY_LINES = 2, 2, 100
+# Simpler borders and what lines leave out come to 0.2 % of the ground at most, with a little for
+# how both are measured; lines alone may always leave out 0.02 %.
+LOST_MAX, LEFT_MIN = 0.0018, 0.0002
 
 
 def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Floats, float]:
@@ -41,23 +45,35 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
         doubled_m2 = max(float(lengths_m(tour.lines).sum()) * width_m - area_m2, 0.0)
         return tour.seconds + LAYOUT_WEIGHT * doubled_m2 / (width_m * settings.speed_m_s)
 
-    # As the plan is measured: what the margin of the border costs is left out already.
-    target = reachable(field.limit, width_m)
+    target = reachable(field.spray, width_m)
     tours = [(angle_deg, tour_of(lines, space, motion)) for angle_deg, lines in drawn]
     best = sorted(tours, key=lambda each: cost(each[1]))[:LAYOUTS_TRIED]
     if len(best[0][1].lines) > MANY_LINES:
         best = best[:1]
     better = [
-        (angle_deg, tour_of(worthwhile(tour, target, width_m), space, motion))
+        (
+            angle_deg,
+            tour_of(
+                worthwhile(tour, target, width_m, left_share=min(WORTH_LEFT, _spare(field))),
+                space,
+                motion,
+            ),
+        )
         for angle_deg, tour in best
     ]
     angle_deg, tour = min(better, key=lambda each: cost(each[1]))
     return tour.lines, angle_deg
 
 
+def _spare(field: Field) -> float:
+    """Return what share of the ground lines may leave out, beside what simpler borders gave up."""
+    return max(LOST_MAX - field.given_up_m2 / field.area_m2, LEFT_MIN)
+
+
 def _layouts(field: Field, settings: Settings, motion: Motion) -> list[tuple[float, Floats]]:
     """Return (course, lines) of each layout."""
     width_m, ground = settings.swath_width_m, field.spray
+    left_share = min(LEFT_SHARE, _spare(field) / 2.0)
     inner, passes = inner_ground(ground, width_m), border_passes(ground, width_m)
     if settings.angle_deg is None:
         angles = [angle for _, angle in ranked(inner, ground, width_m=width_m, motion=motion)]
@@ -74,8 +90,9 @@ def _layouts(field: Field, settings: Settings, motion: Motion) -> list[tuple[flo
             straights.append(fitted_lines(ground, width_m, angle_deg, motion))
         for straight in straights:
             if len(straight):
-                more = needed_passes(straight, passes, ground, width_m)
+                more = needed_passes(straight, passes, ground, width_m, left_share=left_share)
                 choices.append(joined([more, straight]))
         for lines in choices:
-            drawn.append((angle_deg, joined([lines, patches(lines, ground, width_m)])))
+            more = patches(lines, ground, width_m, left_share=left_share)
+            drawn.append((angle_deg, joined([lines, more])))
     return drawn

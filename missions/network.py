@@ -129,8 +129,18 @@ def _bend(far_m: Floats, ends: Floats, near: Ints, space: FreeSpace) -> None:
     if not len(rows) or not len(space.corners):
         return
     to_corners = space.to_corners_m(ends)
-    first = _min_plus(to_corners, space.between_m)
-    bent = np.array([np.min(first[a] + to_corners[b]) for a, b in zip(rows, columns, strict=True)])
+    seen = [np.flatnonzero(np.isfinite(row)) for row in to_corners]
+    bent = np.array(
+        [
+            np.min(
+                to_corners[a, seen[a], None]
+                + space.between_m[np.ix_(seen[a], seen[b])]
+                + to_corners[b, seen[b]],
+                initial=np.inf,
+            )
+            for a, b in zip(rows.tolist(), columns.tolist(), strict=True)
+        ]
+    )
     # No way through: far apart for the search, whatever the ferry around will cost.
     bent = np.where(np.isfinite(bent), bent, 3.0 * far_m[rows, columns] + 1000.0)
     far_m[rows, columns] = far_m[columns, rows] = bent
@@ -140,17 +150,9 @@ def _bend_home(home_m: Floats, depots: Floats, ends: Floats, space: FreeSpace) -
     to_corners = space.to_corners_m(ends)
     for number, depot in enumerate(depots):
         hidden = np.flatnonzero(~space.sees(np.tile(depot, (len(ends), 1)), ends))
-        reach = space.to_corners_m(depot[None, :])
+        reach = space.to_corners_m(depot[None, :], nearest=None)
         if not len(hidden) or not reach.size:
             continue
-        first = _min_plus(reach, space.between_m)[0]
+        first = np.min(reach[0][:, None] + space.between_m, axis=0)
         bent = np.min(first[None, :] + to_corners[hidden], axis=1)
         home_m[number, hidden] = np.where(np.isfinite(bent), bent, home_m[number, hidden])
-
-
-def _min_plus(left: Floats, right: Floats) -> Floats:
-    """Return the shortest sums over all stations between: a product with min and plus."""
-    result = np.full((len(left), right.shape[1]), np.inf)
-    for station in range(right.shape[0]):
-        np.minimum(result, left[:, station][:, None] + right[station][None, :], out=result)
-    return result

@@ -7,6 +7,7 @@ the ends of the lines: there the pass along the border is flown.
 
 from __future__ import annotations
 
+import heapq
 import math
 
 import numpy as np
@@ -19,7 +20,9 @@ from missions.strips import Floats, directions, joined, no_lines, rectangles, un
 from missions.swaths import LINE_MIN_M, axes, count_across
 
 # So much of the reachable ground may be left for patches.
-LEFT_SHARE = 0.0002
+LEFT_SHARE = 0.0005
+# A pass that covers less is none.
+LEAST_M2 = 1e-3
 # An edge that is a hair off the lines' course must not cut them short. The ground keeps a larger
 # margin from what may be sprayed (`field.MARGIN_M`).
 SLACK_M = 0.001
@@ -82,34 +85,45 @@ def _gaps(spans: list[list[float]]) -> list[tuple[float, float]]:
     return gaps
 
 
-def needed_passes(lines: Floats, passes: Floats, ground: BaseGeometry, width_m: float) -> Floats:
+def needed_passes(
+    lines: Floats,
+    passes: Floats,
+    ground: BaseGeometry,
+    width_m: float,
+    *,
+    left_share: float = LEFT_SHARE,
+) -> Floats:
     """Return the parts of passes along the border that cover what the lines leave out."""
     target = reachable(ground, width_m)
-    missing = target.difference(united(lines, width_m))
-    allowed_m2 = LEFT_SHARE * target.area
-    chosen = no_lines()
-    left = passes
-    while len(left) and missing.area > allowed_m2:
-        gain = _gain_m2(left, missing, width_m)
-        order = np.argsort(-gain, kind="stable")
-        # Several at a time: those that gain next to the most, as long as they are apart.
-        some = [int(at) for at in order[:8] if gain[at] > max(0.5 * gain[order[0]], 1e-3)]
-        if not some:
+    missing = shapely.get_parts(target.difference(united(lines, width_m)))
+    allowed_m2 = left_share * target.area
+    left_m2 = float(shapely.area(missing).sum())
+    strips = rectangles(passes, width_m)
+    one, patch = shapely.STRtree(missing).query(strips, predicate="intersects")
+    over = np.split(patch, np.searchsorted(one, np.arange(1, len(passes))))
+    common = shapely.area(shapely.intersection(strips[one], missing[patch]))
+    gain_m2 = np.bincount(one, weights=common, minlength=len(passes))
+    # A pass never gains more than it did before others were chosen: the best of those that are
+    # looked at anew is the best of all.
+    waiting = [(-float(gain), at) for at, gain in enumerate(gain_m2) if gain > LEAST_M2]
+    heapq.heapify(waiting)
+    chosen = []
+    while waiting and left_m2 > allowed_m2:
+        _, at = heapq.heappop(waiting)
+        own = missing[over[at]]
+        gain = float(shapely.area(shapely.intersection(own, strips[at])).sum())
+        if waiting and gain < -waiting[0][0] - LEAST_M2:
+            if gain > LEAST_M2:
+                heapq.heappush(waiting, (-gain, at))
+            continue
+        if gain <= LEAST_M2:
             break
-        new = joined([_trimmed(left[at], missing, width_m) for at in some])
-        chosen = joined([chosen, new])
-        missing = missing.difference(united(new, width_m))
-        left = np.delete(left, some, axis=0)
-    return chosen
-
-
-def _gain_m2(passes: Floats, missing: BaseGeometry, width_m: float) -> Floats:
-    """Return how much of what is missing each pass would cover, patch by patch."""
-    strips, patches = rectangles(passes, width_m), shapely.get_parts(missing)
-    one, patch = shapely.STRtree(patches).query(strips)
-    common = shapely.area(shapely.intersection(strips[one], patches[patch]))
-    gain = np.bincount(one, weights=common, minlength=len(passes))
-    return np.asarray(gain, dtype=np.float64)
+        new = _trimmed(passes[at], shapely.union_all(own), width_m)
+        chosen.append(new)
+        left = shapely.difference(own, united(new, width_m))
+        left_m2 += float(shapely.area(left).sum() - shapely.area(own).sum())
+        missing[over[at]] = left
+    return joined(chosen)
 
 
 def _trimmed(line: Floats, missing: BaseGeometry, width_m: float) -> Floats:

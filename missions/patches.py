@@ -11,7 +11,7 @@ from missions.strips import NARROWER_M, Floats, joined, no_lines, rectangles, st
 from missions.swaths import LINE_MIN_M
 
 # So much may stay uncovered of what can be reached: half of what the plan as a whole may miss.
-LEFT_SHARE = 0.0002
+LEFT_SHARE = 0.0005
 PATCH_MIN_M2 = 0.02
 ROUNDS = 4
 PATCHES_MAX = 200
@@ -20,20 +20,25 @@ ANGLES = 12
 SEED_M = 0.05
 
 
-def patches(lines: Floats, ground: BaseGeometry, width_m: float) -> Floats:
+def patches(
+    lines: Floats, ground: BaseGeometry, width_m: float, *, left_share: float = LEFT_SHARE
+) -> Floats:
     """Return more lines, for ground that the others miss though a strip could reach it."""
     target = reachable(ground, width_m)
     covered = united(lines, width_m)
-    allowed_m2 = LEFT_SHARE * target.area
+    allowed_m2 = left_share * target.area
     tight = ground.buffer(NARROWER_M)
     shapely.prepare(tight)
     added = no_lines()
     for _ in range(ROUNDS):
         missing = shapely.get_parts(target.difference(covered))
-        missing = missing[shapely.area(missing) > 0.0]
-        if not shapely.area(missing).sum() > allowed_m2:
+        area_m2 = shapely.area(missing)
+        order = np.argsort(-area_m2, kind="stable")
+        # No more of them than have to be covered.
+        still_m2 = area_m2.sum() - np.concatenate([[0.0], np.cumsum(area_m2[order])[:-1]])
+        largest = missing[order[still_m2 > allowed_m2]][:PATCHES_MAX]
+        if not len(largest):
             break
-        largest = missing[np.argsort(-shapely.area(missing), kind="stable")][:PATCHES_MAX]
         new = joined([_over(patch, tight, width_m) for patch in largest])
         if not len(new):
             break

@@ -26,13 +26,15 @@ TRIED_MAX = 16
 CRUMB_M2, LEAST_M = 0.02, 0.5
 
 
-def worthwhile(tour: Tour, target: BaseGeometry, width_m: float) -> Floats:
+def worthwhile(
+    tour: Tour, target: BaseGeometry, width_m: float, *, left_share: float = LEFT_SHARE
+) -> Floats:
     """Return the lines of a tour that are worth their time, without the ends that others cover."""
     lines, motion = tour.lines, tour.motion
     if len(lines) < 2:
         return lines
     ground = _Ground(lines, target, width_m)
-    spare_m2 = LEFT_SHARE * target.area - target.difference(united(lines, width_m)).area
+    spare_m2 = left_share * target.area - target.difference(united(lines, width_m)).area
     alone_m2 = np.array([ground.alone_m2(at) for at in range(len(lines))])
     pays_m2_s = WORTH * motion.speed_m_s * width_m
     taken_s = motion.legs_s(lengths_m(lines))

@@ -263,3 +263,19 @@ def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:
     plan = planned(Drawn(outline=degrees(comb_like)))
     with pytest.raises(PlanError, match=r"sortie 1: a fence within 9 m .* ArduPilot stores 70"):
         plan_text(plan, plan.sorties[0])
+
+
+def test_ways_among_many_obstacles_are_the_shortest() -> None:
+    stones = shapely.union_all(
+        [box(20 * x + 7 * (y % 2), 20 * y, 20 * x + 7 * (y % 2) + 8, 20 * y + 8)
+         for x in range(12) for y in range(12)]
+    )  # fmt: skip
+    space = free_space(box(-10, -10, 260, 260).difference(stones))
+    assert len(space.corners) == 4 * 144
+    way = space.way((-5.0, 4.0), (255.0, 4.0))
+    # Beside the first row, the corners of its first and its last stone.
+    assert len(way) == 4
+    assert shapely.LineString(way).length == pytest.approx(262.0, abs=0.2)
+    far = space.way((-5.0, -5.0), (250.0, 243.0))
+    assert space.space.covers(shapely.LineString(far))
+    assert shapely.LineString(far).length < 1.05 * math.dist((-5.0, -5.0), (250.0, 243.0))
