@@ -9,10 +9,14 @@ from typing import Annotated
 
 import typer
 
+from companion.assembly import build_setup
 from companion.cli.answer import AsJson, answer, note
+from companion.config import load
+from missions.errors import UploadError
 from missions.upload.checks import FIRMWARES
 from missions.upload.items import MissionFile
 from missions.upload.mavsdk_vehicle import connected
+from missions.upload.places import elsewhere
 from missions.upload.reading import read_mission_file
 from missions.upload.transfer import TransferError, Uploaded, What, put
 
@@ -37,6 +41,13 @@ def upload(
     while_armed: Annotated[
         bool, typer.Option("--while-armed", help="Change the mission under an armed vehicle.")
     ] = False,
+    config: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Refuse a mission that is not for its field."),
+    ] = None,
+    anywhere: Annotated[
+        bool, typer.Option("--elsewhere", help="With --config: upload it nevertheless.")
+    ] = False,
     wait_s: Annotated[
         float, typer.Option(metavar="S", help="For the vehicle.", min=1.0, max=600.0)
     ] = WAIT_S,
@@ -47,6 +58,10 @@ def upload(
     Nothing is sent to an armed vehicle, and nothing that its firmware is known to refuse.
     """
     mission = read_mission_file(file)
+    if anywhere and config is None:
+        raise UploadError("--elsewhere is for --config, which says where the field is")
+    if config is not None and not anywhere:
+        _refuse_elsewhere(mission, config)
     try:
         done = asyncio.run(_put(mission, link, wait_s, with_fence=fence, while_armed=while_armed))
     except TransferError as error:
@@ -57,6 +72,20 @@ def upload(
     answer({"ok": True, "file": str(file), **asdict(done)}, [_line(file, done)], as_json=as_json)
     for text in done.left_out:
         note(f"warning: {FIRMWARES[done.firmware]} does not keep {text}")
+
+
+def _refuse_elsewhere(mission: MissionFile, path: Path) -> None:
+    """Refuse a mission for another field than the configuration's."""
+    setup = build_setup(load(path))
+    reason = elsewhere(
+        mission,
+        setup.prescription.field,
+        setup.frame,
+        reach_m=setup.boom.reach_m,
+        whose=str(path),
+    )
+    if reason is not None:
+        raise UploadError(reason)
 
 
 async def _put(

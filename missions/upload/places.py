@@ -1,9 +1,13 @@
-"""Whether a mission stays where its field is: items at 0, 0, far away, or outside its own fence."""
+"""Whether a mission stays where its field is: items at 0, 0, far away, or outside its own fence.
+
+With a configuration at hand, whether it is that one's field at all.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from statistics import median
 
 import shapely
@@ -22,6 +26,8 @@ from missions.upload.items import (
 
 # A sortie of a spraying aircraft is smaller than this; another field is mostly farther away.
 FAR_M = 5000.0
+# Items are said to be somewhere by whole metres up to this, then by kilometres.
+METRES_TO = 1000.0
 # Corners are kept to 2 cm, and a line along the fence may be drawn on it.
 ON_FENCE_M = 0.1
 POLYGON_IN, POLYGON_OUT, CIRCLE_IN, CIRCLE_OUT = 5001, 5002, 5003, 5004
@@ -50,6 +56,50 @@ def misplaced(file: MissionFile, firmware: Firmware, *, with_fence: bool) -> str
             )
     somewhere = [(number, item) for number, item in placed if item.x or item.y]
     return next(_away(file, somewhere, with_fence=with_fence), None)
+
+
+def elsewhere(
+    file: MissionFile,
+    field: shapely.Polygon | shapely.MultiPolygon,
+    frame: LocalFrame,
+    *,
+    reach_m: float,
+    whose: str,
+) -> str | None:
+    """Return why this is no mission for a field, and what to do; None where it is one.
+
+    A depot may lie far from its field. Some way from item to item leads over the field all the
+    same, or so near that a boom which reaches `reach_m` to the side comes over it.
+    """
+    fix = "correct the mission or take the configuration of its field, or say --elsewhere"
+    placed = [
+        (number, item, shapely.Point(*frame.to_local(item.x * DEGREES, item.y * DEGREES)))
+        for number, item in enumerate(file.items, start=1)
+        if item.command in PLACES and (item.x or item.y)
+    ]
+    for number, item, point in placed:
+        far_m = point.distance(field)
+        if not far_m <= FAR_M:
+            return (
+                f"{file.path}: item {number} ({item.name}): {item.x * DEGREES:.7f}, "
+                f"{item.y * DEGREES:.7f} is {_said(far_m)} from the field of {whose}; {fix}"
+            )
+    ways = [shapely.LineString((a, b)) for (*_, a), (*_, b) in pairwise(placed)]
+    if any(way.distance(field) <= reach_m for way in ways):
+        return None
+    nearest = min(placed, key=lambda each: each[2].distance(field), default=None)
+    how_near = ""
+    if nearest is not None:
+        number, item, point = nearest
+        how_near = (
+            f"; the nearest item, item {number} ({item.name}), is "
+            f"{_said(point.distance(field))} from it"
+        )
+    return f"{file.path}: no way of the mission leads over the field of {whose}{how_near}; {fix}"
+
+
+def _said(length_m: float) -> str:
+    return f"{length_m:.0f} m" if length_m < METRES_TO else f"{length_m / 1000.0:.1f} km"
 
 
 def _away(file: MissionFile, placed: Sequence[Numbered], *, with_fence: bool) -> Iterator[str]:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import shapely
 
 from companion.cli.app import execute
+from companion.core.frame import LocalFrame
 from missions.errors import UploadError
 from missions.upload.checks import compare, refusal
 from missions.upload.items import Firmware, MissionFile, WireItem
+from missions.upload.places import elsewhere
 from missions.upload.reading import read_mission_file
 from missions.upload.transfer import (
     NotNowError,
@@ -25,6 +29,7 @@ from missions.upload.transfer import (
     put,
 )
 
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 HOME = WireItem(command=16, frame=0, x=480_000_000, y=110_000_000)
 OPEN = math.nan
 ITEMS = (
@@ -178,6 +183,55 @@ async def test_an_item_that_leads_away_is_refused_before_anything_is_sent(
     with pytest.raises(UploadError, match=says):
         await put(vehicle, file, progress=nothing)
     assert vehicle.kept == {}
+
+
+FRAME = LocalFrame(48.0, 11.0)
+
+
+def over(*places_m: tuple[float, float]) -> MissionFile:
+    """Return a mission with waypoints at places in metres east and north of home."""
+    found = []
+    for east_m, north_m in places_m:
+        latitude, longitude = FRAME.to_geographic(east_m, north_m)
+        x, y = round(latitude * 1e7), round(longitude * 1e7)
+        found.append(WireItem(command=16, frame=3, x=x, y=y, z_m=3.5))
+    return replace(FILE, items=(*ITEMS[:2], *found, ITEMS[3]), fence=())
+
+
+@pytest.mark.parametrize(
+    ("places_m", "says"),
+    [
+        (((20.0, 100.0), (20.0, 300.0)), None),
+        (((-1.5, 100.0), (-1.5, 300.0)), None),  # beside it, and the boom reaches it
+        (((-3000.0, 200.0), (500.0, 200.0)), None),  # from a depot far away, across it
+        (((-9.0, 100.0), (-9.0, 300.0)), "no way of the mission leads over .*is 9 m from it"),
+        (((20.0, -900.0), (60.0, -900.0)), r"no way .*item 1 \(TAKEOFF\), is 50 m from it"),
+        (((20.0, 100.0), (20.0, 5690.0)), r"item 4 \(WAYPOINT\): .* is 5.1 km from"),
+        (((30_000.0, 0.0), (30_000.0, 300.0)), r"item 3 \(WAYPOINT\): .* is 29.9 km from"),
+        ((), "no way of the mission leads over the field of c.toml;"),
+    ],
+)
+def test_a_mission_that_lies_elsewhere_is_known(
+    places_m: tuple[tuple[float, float], ...], says: str | None
+) -> None:
+    field = shapely.box(0.0, 50.0, 100.0, 550.0)
+    found = elsewhere(over(*places_m), field, FRAME, reach_m=3.0, whose="c.toml")
+    assert found is None if says is None else re.search(says, found or "")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--elsewhere",), "--elsewhere is for --config"),
+        (("--config", str(EXAMPLE / "config.toml")), "km from the field of"),
+    ],
+)
+def test_a_mission_over_another_field_reaches_no_link(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, options: tuple[str, ...], says: str
+) -> None:
+    file = str(plan_file(tmp_path))
+    assert execute(["upload", file, "--link", "udpin:127.0.0.1:14550", *options]) == 2
+    assert says in capsys.readouterr().err
 
 
 def corners(command: int, *places: tuple[int, int]) -> tuple[WireItem, ...]:
