@@ -8,7 +8,7 @@ from pathlib import Path
 
 from companion.maps.layer import Column, Value
 from companion.maps.model import map_error
-from companion.maps.units import is_mass_per_area, unit_in_name, unit_name
+from companion.maps.units import is_mass_per_area, quantity_in_name, unit_in_name, unit_name
 
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?", re.ASCII)
 
@@ -45,7 +45,11 @@ def stated_unit(texts: Iterable[str], *, column: str, path: Path) -> str | None:
     >>> stated_unit(["dose by the soil map"], column="dose", path=Path("rx.gpkg")) is None
     True
     """
+    texts = [text.strip()[:200] for text in texts]
     units = {unit for text in texts if (unit := _unit(text)) is not None}
+    if not units:
+        # A quantity that is none of ours, so that nobody takes its numbers for litres.
+        units = {found[0] for text in texts if (found := quantity_in_name(text)) is not None}
     if len(units) > 1:
         raise map_error(
             path,
@@ -57,7 +61,6 @@ def stated_unit(texts: Iterable[str], *, column: str, path: Path) -> str | None:
 
 
 def _unit(text: str) -> str | None:
-    plain = text.strip()[:200]
-    if is_mass_per_area(plain):
-        return plain
-    return unit_name(plain) or unit_in_name(plain)
+    if is_mass_per_area(text):
+        return text
+    return unit_name(text) or unit_in_name(text)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+import pyogrio
 import pytest
+import shapely
 from pyproj import CRS
 
 from companion.errors import MapError
+from companion.maps.attributes import stated_unit
 from companion.maps.declared import Given, unit_of
 from companion.maps.fields import Choice, choose
 from companion.maps.layer import Column, Layer, Value
+from companion.maps.registry import read_map
 from companion.maps.units import is_mass_per_area, l_ha_per_unit, other_quantity, unit_name
 
 PATH = Path("rx.shp")
@@ -233,3 +240,52 @@ def test_a_weight_without_its_area_is_a_weight_for_whoever_says_the_area() -> No
 
 def test_the_unit_that_the_file_states_prevails_over_a_word_in_a_name() -> None:
     assert unit(column("unit", "L/ha", "L/ha"), rate="seed_treatment") == "L/ha"
+
+
+@pytest.mark.parametrize(
+    ("titles", "stated"),
+    [
+        (["Rate (seeds/ha)"], "seeds/ha"),
+        (["target", "percent"], "percent"),
+        (["Spacing [cm]"], "cm"),
+        (["Dose (L/ha)", "80 seeds/m2 were sown"], "L/ha"),
+        (["soil map of 2024", "rate in"], None),
+    ],
+)
+def test_titles_that_say_another_quantity_are_heard(titles: list[str], stated: str | None) -> None:
+    assert stated_unit(titles, column="rate", path=PATH) == stated
+
+
+def seeds_geojson(path: Path) -> None:
+    zone = [[[114.5, 36.0], [114.501, 36.0], [114.501, 36.001], [114.5, 36.0]]]
+    shape = {"type": "Polygon", "coordinates": zone}
+    one = {"type": "Feature", "properties": {"seed_rate": 80}, "geometry": shape}
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [one]}))
+
+
+def seeds_csv(path: Path) -> None:
+    path.write_text(
+        'wkt,rate,unit\n"POLYGON((114.5 36,114.501 36,114.501 36.001,114.5 36))",80,plants/m2\n'
+    )
+
+
+def seeds_shapefile(path: Path) -> None:
+    wkb = shapely.to_wkb(shapely.box(114.5, 36.0, 114.501, 36.001))
+    pyogrio.raw.write(
+        str(path), np.array([wkb], dtype=object), [np.array([12.0])], ["rate_cm"],
+        geometry_type="Polygon", crs="EPSG:4326", driver="ESRI Shapefile",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "make"),
+    [("rx.geojson", seeds_geojson), ("rx.csv", seeds_csv), ("rx.shp", seeds_shapefile)],
+)
+def test_files_of_every_kind_with_another_quantity_are_refused(
+    tmp_path: Path, name: str, make: Callable[[Path], None]
+) -> None:
+    make(tmp_path / name)
+    for asked in (None, "L/ha"):
+        with pytest.raises(MapError) as caught:
+            read_map(tmp_path / name, unit=asked)
+        assert caught.value.code == "not-a-volume"

@@ -617,10 +617,10 @@ def test_nothing_is_written_where_nothing_can_be(
     path = tmp_path / "out.gpkg"
     path.write_bytes(b"old")
 
-    def full(self: Path, target: Path) -> None:
+    def full(source: Path, target: Path) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "replace", full)
+    monkeypatch.setattr("companion.atomic_write.os.replace", full)
     with pytest.raises(MapError) as caught:
         write_geopackage(ZONES, path)
     assert caught.value.code == "not-written"
