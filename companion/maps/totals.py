@@ -66,23 +66,25 @@ def totals(
     exclusions: Sequence[MultiPolygon] = (),
     overlap: str = "error",
     frame: LocalFrame | None = None,
+    areas_m2: Floats | None = None,
 ) -> Totals:
     """Return the ground of each rate inside the boundary, and so the litres: the only such sum.
 
     Zones and cells are cut at the boundary, not counted by their middles. As in flight, the
     map's own boundary and default hold where none are given, a default only inside a boundary,
     and ground under several zones has one rate, by the policy `overlap`; under `error`, which
-    refuses more than slivers, it counts for each.
+    refuses more than slivers, it counts for each. `areas_m2` are those of `inside_m2`, for whoever
+    has them already.
     """
     frame = frame_for(map_file) if frame is None else frame
     if default_rate_l_ha is None and map_file.boundary is not None:
         default_rate_l_ha = map_file.default_rate_l_ha
     ground = Ground.of(map_file.boundary if boundary is None else boundary, exclusions)
     if map_file.cells is None:
-        rates, area_m2 = _of_zones(map_file, ground, overlap, frame)
+        rates, area_m2 = _of_zones(map_file, ground, overlap, frame, areas_m2)
         covered_m2 = None
     else:
-        inside = inside_m2(map_file, ground, frame)
+        inside = inside_m2(map_file, ground, frame) if areas_m2 is None else areas_m2
         there = ~np.isnan(map_file.cells.rates_l_ha)
         rates, area_m2 = map_file.cells.rates_l_ha[there], inside[there]
         covered_m2 = float(area_m2.sum())
@@ -155,11 +157,13 @@ def _cut(zones: Sequence[MapZone], ground: Ground, frame: LocalFrame) -> Objects
 
 
 def _of_zones(
-    map_file: MapFile, ground: Ground, overlap: str, frame: LocalFrame
+    map_file: MapFile, ground: Ground, overlap: str, frame: LocalFrame, areas_m2: Floats | None
 ) -> tuple[Floats, Floats]:
     """Return rates and areas [m2] of the zones that have a rate."""
     rated = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
     rates = np.array([zone.rate_l_ha for zone in rated], dtype=np.float64)
+    if areas_m2 is not None and overlap == "error":
+        return rates, areas_m2[[zone.rate_l_ha is not None for zone in map_file.zones]]
     local = _cut(rated, ground, frame)
     area_m2: Floats = shapely.area(local) if rated else np.zeros(0)
     shared = _overlapping(local) if overlap != "error" and rated else np.zeros(0, dtype=np.int64)

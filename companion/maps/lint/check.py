@@ -97,6 +97,7 @@ def _totals(survey: Survey, overlap: str, plan: Plan) -> Totals:
             exclusions=plan.exclusions,
             overlap=overlap,
             frame=survey.frame,
+            areas_m2=survey.inside_m2,
         )
     except ShapelyError as error:
         raise _unusable(survey.map_file, error) from None

@@ -83,6 +83,8 @@ class Survey:
     @cached_property
     def inside_m2(self) -> Floats:
         """Return how much of every zone or cell may be sprayed."""
+        if self.boundary_deg is None and not self.exclusions:
+            return self.area_m2
         return inside_m2(self.map_file, Ground.of(self.boundary_deg, self.exclusions), self.frame)
 
     @cached_property
