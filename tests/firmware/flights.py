@@ -102,12 +102,6 @@ class Vehicle:
     folder: Path
     kind: Kind
 
-    @property
-    def journal(self) -> Path:
-        """The only journal of the flight."""
-        (found,) = self.folder.rglob("flight-*.gpkg")
-        return found
-
 
 def ready(
     kind: Kind, folder: Path, where: Path, home_deg: tuple[float, float] = HOME_DEG
