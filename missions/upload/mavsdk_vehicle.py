@@ -168,6 +168,15 @@ class MavsdkVehicle:
             raise NotNowError(f"it could not be read back ({error.result.name})") from error
         return tuple(_item(each) for each in found)
 
+    async def begin(self) -> None:
+        """Make the mission's first item the one to fly to; MAVSDK waits until it is."""
+        from mavsdk.plugins.mission_raw import MissionRawError
+
+        try:
+            await self._raw.set_current_mission_item(0)
+        except MissionRawError as error:
+            raise NotNowError(f"the first item does not count ({error.result.name})") from error
+
 
 def _reason(name: str, what: What, count: int, *, asked: int | None = None) -> Exception:
     """Return the error for a result of MAVSDK."""

@@ -50,6 +50,9 @@ class Vehicle(Protocol):
     async def read(self, what: What) -> tuple[WireItem, ...]:
         """Read back what is there."""
 
+    async def begin(self) -> None:
+        """Make the mission's first item the one to fly to."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Uploaded:
@@ -72,7 +75,8 @@ async def put(
 ) -> Uploaded:
     """Upload fence and mission, and prove by reading back that they are there.
 
-    The fence goes first: where it is refused, the vehicle keeps the mission that it had.
+    The fence goes first: where it is refused, the vehicle keeps the mission that it had. PX4 would
+    go on with the item at which it left the same mission; disarmed, it is told to begin.
 
     Raises:
         UploadError: the vehicle will not have it, or must not be given it now.
@@ -88,10 +92,10 @@ async def put(
         ("fence", fence),
         ("mission", file.items_for(vehicle.firmware)),
     )
-    attempts, left_out = 0, list[str]()
+    attempts, left_out, is_armed = 0, list[str](), True
     for what, items in parts:
         if items:
-            await _refuse_armed(vehicle, while_armed=while_armed)
+            is_armed = await _refuse_armed(vehicle, while_armed=while_armed)
             try:
                 tried, compared = await _put_one(vehicle, what, items, progress)
             except RefusedError as error:
@@ -101,13 +105,16 @@ async def put(
                 ) from error
             attempts = max(attempts, tried)
             left_out += compared.left_out
+    if vehicle.firmware == "px4" and not is_armed:
+        await _begin(vehicle)
     return Uploaded(
         firmware=vehicle.firmware, items=len(file.items), fence_items=len(fence),
         attempts=attempts, left_out=tuple(left_out),
     )  # fmt: skip
 
 
-async def _refuse_armed(vehicle: Vehicle, *, while_armed: bool) -> None:
+async def _refuse_armed(vehicle: Vehicle, *, while_armed: bool) -> bool:
+    """Return whether it is armed, which it may be `while_armed` only."""
     armed = await vehicle.is_armed()
     if armed is None:
         raise TransferError("the vehicle fell silent; nothing more was sent to it")
@@ -115,6 +122,19 @@ async def _refuse_armed(vehicle: Vehicle, *, while_armed: bool) -> None:
         raise UploadError(
             "the vehicle is armed; disarm it, or say --while-armed to change the mission under it"
         )
+    return armed
+
+
+async def _begin(vehicle: Vehicle) -> None:
+    for _ in range(ATTEMPTS):
+        try:
+            return await vehicle.begin()
+        except NotNowError as error:
+            reason = str(error)
+    raise TransferError(
+        f"the mission is on the vehicle ({FIRMWARES[vehicle.firmware]}), which would go on in the "
+        f"middle of it: {reason}; do not fly it, and upload it again"
+    )
 
 
 async def _put_one(

@@ -31,6 +31,7 @@ class Firmware:
     `commands_at_once` are answered by the receiver itself; the others of a firmware with a
     `queue_depth` go through a queue that is emptied `commands_per_s` times a second.
     `first_item` is how many items of the flight's list the wire does not count: home, on PX4.
+    `keeps_item`: the same mission, uploaded again, goes on with the item that was left.
     `zero_is_a_place` tells PX4, which flies to 0, 0, from ArduPilot, to which that means "here".
     """
 
@@ -52,6 +53,7 @@ class Firmware:
     commands_per_s: float = 30.0
     first_item: int = 0
     zero_is_a_place: bool = False
+    keeps_item: bool = False
     busy_factor: float = 1.0
     interval_kinds_max: int | None = None
     timesync_s: float = 10.0

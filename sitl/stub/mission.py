@@ -90,8 +90,11 @@ def handle_count(autopilot: Autopilot, channel: Channel, message: Message, now_s
 def _keep(autopilot: Autopilot, kind: int, items: tuple[MissionItem, ...], now_s: float) -> None:
     if kind == _FENCE:
         autopilot.fence = items
-    else:
-        autopilot.flight.set_items(items, now_s)
+        return
+    flight = autopilot.flight
+    is_same = repr(items) == repr(flight.items)  # a yaw that is left open is not equal to itself
+    if not (autopilot.firmware.keeps_item and is_same and not flight.mission_complete):
+        flight.set_items(items, now_s)
 
 
 def _refusal(autopilot: Autopilot, upload: Upload, message: Message) -> int | None:

@@ -35,6 +35,7 @@ def px4(version: Version = VERSION, *, commands_per_s: float = COMMANDS_PER_S) -
         commands_per_s=commands_per_s,
         first_item=1,
         zero_is_a_place=True,
+        keeps_item=True,
         timesync_s=0.1,
         forwards=False,
         tells_of_actions=False,

@@ -114,7 +114,6 @@ COMMANDS: Mapping[int, CommandHandler] = {
     dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: commands.to_mode(RTL, refused=REJECTED),
     dialect.MAV_CMD_NAV_LOITER_UNLIM: commands.to_mode(LOITER, refused=REJECTED),
     dialect.MAV_CMD_MISSION_START: _start_mission,
-    dialect.MAV_CMD_DO_SET_MISSION_CURRENT: commands.set_current,
     dialect.MAV_CMD_DO_SET_ACTUATOR: _set_actuator,
     dialect.MAV_CMD_DO_CHANGE_SPEED: commands.change_speed,
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,

@@ -229,7 +229,7 @@ def start(
         station.upload(px4_items(items) if vehicle.kind is PX4 else items)
     if vehicle.kind is PX4:
         # It goes on where it left the same mission, though that was uploaded anew.
-        station.begin_mission()
+        station.go_on_with(0)
     set_mode(vehicle, "mission")
     assert station.command(ARM, 1.0) == ACCEPTED
     if vehicle.kind is COPTER:

@@ -309,14 +309,14 @@ class Station:
             self._takers.remove(take)
         return over[0], last
 
-    def begin_mission(self) -> None:
-        """Make the first item the current one."""
+    def go_on_with(self, seq: int) -> None:
+        """Make an item of the mission the current one."""
 
         def fits(came: Any) -> bool:
-            return came.get_type() == "MISSION_CURRENT" and came.seq == 0
+            return came.get_type() == "MISSION_CURRENT" and came.seq == seq
 
-        message = dialect.MAVLink_mission_set_current_message(1, AUTOPILOT, 0)
-        self._answered(message, fits, "item 0 as the current one", within_s=10.0)
+        message = dialect.MAVLink_mission_set_current_message(1, AUTOPILOT, seq)
+        self._answered(message, fits, f"item {seq} as the current one", within_s=10.0)
 
     def mission(self) -> list[MissionItem]:
         """Return the mission that is on the vehicle."""

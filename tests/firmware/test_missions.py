@@ -20,6 +20,7 @@ pytestmark = [pytest.mark.firmware, pytest.mark.timeout(300)]
 LINKS = {"ardupilot": "udpin:127.0.0.1:14550", "px4": "udpin:127.0.0.1:14540"}
 PLACE = (HOME_DEG[0] + 0.0005, HOME_DEG[1])
 MISSION_FRAME = 2
+ACCEPTED = 0
 LISTENS_WITHIN_S = 40.0
 both = pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
 
@@ -35,6 +36,9 @@ def on_the_ground(firmware: str, where: Path, folder: Path) -> Iterator[Station]
     )
     with started as station:
         station.until(lambda: station.heard("HEARTBEAT") is not None, "heartbeat", LISTENS_WITHIN_S)
+        # ArduCopter has no room for a mission in its first moments.
+        way = around(firmware, MissionItem(16, *PLACE, 3.5))
+        station.until(lambda: station.try_upload(way)[0] == ACCEPTED, "room", LISTENS_WITHIN_S)
         yield station
 
 
@@ -97,6 +101,15 @@ def test_every_mission_of_the_examples_is_uploaded_and_there(
                 assert one.latitude_deg == pytest.approx(other.latitude_deg, abs=3e-7)
                 assert one.longitude_deg == pytest.approx(other.longitude_deg, abs=3e-7)
                 assert one.height_m == pytest.approx(other.height_m, abs=0.02)
+
+
+def test_px4_begins_a_mission_anew_that_it_left(firmwares: Path, tmp_path: Path) -> None:
+    file = str(ROOT / "examples" / "anyang" / "mission.plan")
+    with on_the_ground("px4", firmwares, tmp_path / "px4") as station:
+        assert vrspray("upload", file, "--link", LINKS["px4"]).returncode == 0
+        station.go_on_with(3)
+        assert vrspray("upload", file, "--link", LINKS["px4"]).returncode == 0
+        station.until(lambda: station.heard("MISSION_CURRENT").seq == 0, "first item", 5.0)
 
 
 def test_an_item_that_px4_refuses_is_named(firmwares: Path, tmp_path: Path) -> None:

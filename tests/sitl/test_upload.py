@@ -6,6 +6,7 @@ import asyncio
 import json
 import math
 import sys
+import time
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -60,6 +61,17 @@ async def test_mission_and_fence_are_on_the_vehicle_as_the_file_has_them(
         pytest.approx(corner, abs=1e-7) for corner in corners
     ]
     assert done.fence_items == len(corners)
+
+
+@both
+async def test_a_mission_that_was_left_begins_anew(autopilot: str, tmp_path: Path) -> None:
+    file = sorties(tmp_path, 1)[0]
+    async with stub_on_a_port(autopilot) as (server, url):
+        await upload(file, url)
+        assert server.autopilot.flight.set_sequence(3, time.monotonic())
+        await upload(file, url)
+        # Home is no item of PX4's; ArduPilot begins with the first when it is armed anew.
+        assert server.autopilot.flight.sequence == (1 if autopilot == "px4" else 0)
 
 
 async def test_sorties_in_a_row_each_replace_the_one_before(tmp_path: Path) -> None:

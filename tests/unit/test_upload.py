@@ -343,6 +343,13 @@ class Fake:
         self.forgets = 0
         self.refuses_at: int | None = None
         self.kept: dict[str, tuple[WireItem, ...]] = {}
+        self.current, self.stays = 3, 0
+
+    async def begin(self) -> None:
+        if self.stays:
+            self.stays -= 1
+            raise NotNowError("the first item is not the current one (TIMEOUT)")
+        self.current = 0
 
     async def is_armed(self) -> bool | None:
         return self.armed
@@ -382,6 +389,21 @@ async def test_after_three_attempts_it_is_said_not_to_be_there(fault: str, says:
     with pytest.raises(TransferError, match=f"after 3 attempts: .*{says}.*do not fly it"):
         await put(vehicle, FILE, progress=nothing)
     assert "mission" not in vehicle.kept
+
+
+async def test_px4_begins_the_mission_anew_and_an_armed_one_flies_on() -> None:
+    vehicle = Fake("px4")
+    vehicle.stays = 2
+    await put(vehicle, FILE, progress=nothing)
+    assert vehicle.current == 0
+    armed = Fake("px4")
+    armed.armed = True
+    await put(armed, FILE, while_armed=True, progress=nothing)
+    assert armed.current == 3
+    stays = Fake("px4")
+    stays.stays = 99
+    with pytest.raises(TransferError, match="would go on in the middle of it"):
+        await put(stays, FILE, progress=nothing)
 
 
 @pytest.mark.parametrize(("armed", "says"), [(True, "is armed"), (None, "fell silent")])
