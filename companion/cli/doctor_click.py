@@ -12,7 +12,7 @@ from companion import ground, runtime
 from companion.cli.answer import note
 from companion.cli.ground_tasks import ground_setup
 from companion.cli.ground_words import in_words
-from companion.cli.hand import INTERRUPTED, Hand
+from companion.cli.hand import INTERRUPTED, Hand, read_line
 from companion.cli.link_parts import build_link
 from companion.cli.run import build_executor, component_options
 from companion.cli.sensor_parts import build_sensors
@@ -214,14 +214,5 @@ class _Bench:
         """Return what the operator types; the end of the terminal is the end of the questions."""
         sys.stderr.write(text)
         sys.stderr.flush()
-        line = b""
-        while not line.endswith(b"\n"):
-            try:
-                byte = os.read(self._descriptor, 1)
-            except OSError:
-                byte = b""  # the terminal is gone
-            if not byte:
-                return END
-            line += byte
-        said = line.decode(errors="replace").strip()
-        return END if said.lower() in ("q", "quit") else said
+        said = read_line(self._descriptor)
+        return END if said is None or said.lower() in ("q", "quit") else said

@@ -12,6 +12,7 @@ from companion.cli.answer import note
 from companion.cli.gpio_parts import engine_setup
 from companion.cli.ground_tasks import ground_setup
 from companion.cli.ground_words import in_words
+from companion.cli.hand import read_line
 from companion.cli.link_parts import build_link
 from companion.cli.run import component_options
 from companion.cli.servo_parts import servo_options
@@ -101,9 +102,9 @@ def _ask(question: Question) -> Check:
     note(f"{question.text}?")
     while True:
         note("[y/n, s skips]")
-        said = sys.stdin.readline()
-        word = said.strip().lower()
-        if not said or word in ("s", "skip"):
+        said = read_line(sys.stdin.fileno())
+        word = "skip" if said is None else said.lower()
+        if word in ("s", "skip"):
             return asked_check(question, None)
         if word in ("y", "yes", "n", "no"):
             return asked_check(question, word.startswith("y"))

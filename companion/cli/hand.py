@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import select
 import signal
 import termios
 import time
@@ -27,6 +28,8 @@ _SIGNALS = {
     signal.SIGQUIT: INTERRUPTED,
     signal.SIGTSTP: KEY,
 }
+# So often a wait for a line looks for signals: Ctrl-C is answered at once to a person.
+_SIGNALS_EVERY_S = 0.1
 # A line that is longer is no line.
 _LINE_MAX = 4096
 _INPUT_FLAGS, _LOCAL_FLAGS, _CHARACTERS = 0, 3, 6
@@ -121,12 +124,22 @@ class Hand:
             asyncio.get_running_loop().remove_reader(self._file)
 
 
-def read_line(descriptor: int) -> str:
-    """Return the next line without what stands around it; what follows stays to be read."""
+def read_line(descriptor: int) -> str | None:
+    """Return the next line without what stands around it; what follows stays to be read.
+
+    None: the terminal, or the script, has ended without one.
+    """
     line = b""
     while not line.endswith(b"\n"):
-        byte = os.read(descriptor, 1)
+        # A signal that comes just before the call that waits does not end it: Python would look
+        # for it after the next key only.
+        while not select.select([descriptor], [], [], _SIGNALS_EVERY_S)[0]:
+            pass
+        try:
+            byte = os.read(descriptor, 1)
+        except OSError:
+            byte = b""  # the terminal is gone
         if not byte:
             break
         line += byte
-    return line.decode(errors="replace").strip()
+    return line.decode(errors="replace").strip() if line else None

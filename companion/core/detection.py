@@ -128,7 +128,7 @@ def _ordered(
     orders = with_orders(
         before,
         (watching.order(at_s, duties, index) for at_s, duties in duties_of(plan, now_s)),
-        keep_from_s=now_s - watching.delay_s - watching.bin_s - 2.0 * STALE_S,
+        keep_from_s=now_s - watching.delay_s - watching.bin_s - 3.0 * STALE_S,
     )
     changed_s, open_s = memory.changed_s, memory.open_s
     if orders and any(orders[-1].flows_ml_s):

@@ -32,8 +32,8 @@ class Order(NamedTuple):
 class Bin(NamedTuple):
     """Some whole periods: expected volume of each valve, metered volume, pressure over expected.
 
-    `is_whole` says that the same valves were open all the time: what the lags leave at the ends
-    of a pass is no evidence.
+    `is_whole` says that the same valves were open all the time, from the count before its begin to
+    the one after its end: what the lags leave at the ends of a pass is no evidence.
     """
 
     begin_s: float
@@ -50,12 +50,16 @@ class Bin(NamedTuple):
 
 
 class Collecting(NamedTuple):
-    """The bin that is being filled; `from_s` is None where none is."""
+    """The bin that is being filled; `from_s` is None where none is.
+
+    `from_ml` lies between two counts, of which `counted_s` is the time of the first.
+    """
 
     orders: tuple[Order, ...] = ()
     last: FlowReport | None = None
     from_s: float | None = None
     from_ml: float = 0.0
+    counted_s: float = -math.inf
     pressure_s: float = -math.inf
     pressure_sum: float = 0.0
     pressure_count: int = 0
@@ -161,10 +165,10 @@ def collected(
     edge_s = state.from_s + bin_s
     if report.received_s < edge_s:
         return state._replace(last=report), None
-    if not state.orders or state.orders[0].at_s > state.from_s - delay_s:
+    if not state.orders or state.orders[0].at_s > state.counted_s - delay_s:
         return _begun(state, report), None  # what was ordered then is not known
-    share = (edge_s - last.received_s) / (report.received_s - last.received_s)
-    edge_ml = last.volume_ml + min(max(share, 0.0), 1.0) * (report.volume_ml - last.volume_ml)
+    share = _share_by(state.orders, last.received_s, edge_s, report.received_s, delay_s=delay_s)
+    edge_ml = last.volume_ml + share * (report.volume_ml - last.volume_ml)
     count = state.pressure_count
     filled = Bin(
         begin_s=state.from_s,
@@ -172,9 +176,26 @@ def collected(
         expected_ml=expected_ml(state.orders, state.from_s - delay_s, edge_s - delay_s),
         metered_ml=edge_ml - state.from_ml,
         pressure=state.pressure_sum / count if count else None,
-        is_whole=_is_whole(state.orders, state.from_s - delay_s, edge_s - delay_s),
+        is_whole=_is_whole(state.orders, state.counted_s - delay_s, report.received_s - delay_s),
     )
-    return _begun(state, report)._replace(from_s=edge_s, from_ml=edge_ml), filled
+    begun = _begun(state, report)
+    return begun._replace(from_s=edge_s, from_ml=edge_ml, counted_s=last.received_s), filled
+
+
+def _share_by(
+    orders: tuple[Order, ...], last_s: float, edge_s: float, next_s: float, *, delay_s: float
+) -> float:
+    """Return the share of what came between two counts that had come by `edge_s`.
+
+    As the orders have it, not by the time alone: a rate that changes between two counts of an
+    autopilot's meter, 0.2 s apart and more, would else leave a tenth of a bin in its neighbour.
+    """
+    edge_s = min(max(edge_s, last_s), next_s)
+    before_ml = math.fsum(expected_ml(orders, last_s - delay_s, edge_s - delay_s))
+    after_ml = math.fsum(expected_ml(orders, edge_s - delay_s, next_s - delay_s))
+    if before_ml + after_ml > 0.0:
+        return before_ml / (before_ml + after_ml)
+    return (edge_s - last_s) / (next_s - last_s)
 
 
 def _begun(state: Collecting, report: FlowReport | None) -> Collecting:
@@ -182,6 +203,7 @@ def _begun(state: Collecting, report: FlowReport | None) -> Collecting:
         last=report,
         from_s=None if report is None else report.received_s,
         from_ml=0.0 if report is None else report.volume_ml,
+        counted_s=-math.inf if report is None else report.received_s,
         pressure_sum=0.0,
         pressure_count=0,
     )

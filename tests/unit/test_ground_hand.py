@@ -6,6 +6,8 @@ import asyncio
 import os
 import signal
 import termios
+import threading
+import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, suppress
 
@@ -224,4 +226,28 @@ def test_a_word_without_an_end_is_the_word(pipe: tuple[int, int]) -> None:
     os.write(pipe[1], b" click ")
     os.close(pipe[1])
     assert read_line(pipe[0]) == "click"
-    assert read_line(pipe[0]) == ""
+    assert read_line(pipe[0]) is None
+
+
+def test_ctrl_c_just_before_the_waiting_ends_it(pipe: tuple[int, int]) -> None:
+    """The signal is taken in by another thread, so that it interrupts no system call of ours.
+
+    That is what becomes of a signal between the question and the call that waits for the answer.
+    """
+    is_over, keys = threading.Event(), []
+
+    def interrupt() -> None:
+        time.sleep(0.1)
+        signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+        if not is_over.wait(10.0):
+            keys.append(os.write(pipe[1], b"\n"))
+
+    other = threading.Thread(target=interrupt)
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            read_line(pipe[0])
+    finally:
+        is_over.set()
+        other.join()
+    assert not keys, "it waited for a key"
