@@ -17,6 +17,7 @@ from companion.core.liquid_bins import (
     Collecting,
     collected,
     duties_of,
+    heard,
     pressed,
     with_orders,
 )
@@ -84,7 +85,13 @@ def follow(
     memory = _enabled(memory, state)
     if plan is not None:
         memory = _ordered(watching, memory, plan, index, now_s)
-    collecting = pressed(memory.collecting, state.pressure, delay_s=watching.delay_s, now_s=now_s)
+    collecting = heard(
+        memory.collecting,
+        state.position_received_s,
+        keep_from_s=now_s - _kept_s(watching),
+        now_s=now_s,
+    )
+    collecting = pressed(collecting, state.pressure, delay_s=watching.delay_s, now_s=now_s)
     collecting, filled = collected(
         collecting, state.flow, bin_s=watching.bin_s, delay_s=watching.delay_s, now_s=now_s
     )
@@ -92,6 +99,11 @@ def follow(
     if filled is not None:
         memory = _judged(watching, memory, filled, state)
     return of_sensors(watching, memory, state, now_s)
+
+
+def _kept_s(watching: Watching) -> float:
+    """Return how long orders are needed: until the bin that they are in is filled."""
+    return watching.delay_s + watching.bin_s + 3.0 * STALE_S
 
 
 def _heard(memory: WatchMemory, report: FlowReport | None, now_s: float) -> float:
@@ -128,7 +140,7 @@ def _ordered(
     orders = with_orders(
         before,
         (watching.order(at_s, duties, index) for at_s, duties in duties_of(plan, now_s)),
-        keep_from_s=now_s - watching.delay_s - watching.bin_s - 3.0 * STALE_S,
+        keep_from_s=now_s - _kept_s(watching),
     )
     changed_s, open_s = memory.changed_s, memory.open_s
     if orders and any(orders[-1].flows_ml_s):

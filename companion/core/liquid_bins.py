@@ -19,6 +19,12 @@ from companion.core.types import FlowReport, PressureReport, SprayPlan
 BIN_S = 0.25
 # The ramp of a valve is over within this: a bin that begins later is not bent by it.
 EDGE_S = 0.05
+# Positions further apart than so many times the usual, and than this: the link, the vehicle or this
+# computer stood still. At 20 Hz one may be lost, not two. An order of that time came late, by up
+# to 0.3 s where the lease ended it, and a count of it is as old as it may be.
+SILENT_TIMES = 2.4
+SILENT_MIN_S = 0.12
+_USUAL_SHARE = 0.1
 
 
 class Order(NamedTuple):
@@ -33,7 +39,8 @@ class Bin(NamedTuple):
     """Some whole periods: expected volume of each valve, metered volume, pressure over expected.
 
     `is_whole` says that the same valves were open all the time, from the count before its begin to
-    the one after its end: what the lags leave at the ends of a pass is no evidence.
+    the one after its end, and that the vehicle was heard all the while: what the lags leave at the
+    ends of a pass is no evidence, nor what became of an order that somebody held back.
     """
 
     begin_s: float
@@ -52,7 +59,9 @@ class Bin(NamedTuple):
 class Collecting(NamedTuple):
     """The bin that is being filled; `from_s` is None where none is.
 
-    `from_ml` lies between two counts, of which `counted_s` is the time of the first.
+    `from_ml` lies between two counts, of which `counted_s` is the time of the first. Of the
+    positions it is known of what time the newest is and when it came, how far apart they usually
+    come, and when none came for longer than that.
     """
 
     orders: tuple[Order, ...] = ()
@@ -60,6 +69,10 @@ class Collecting(NamedTuple):
     from_s: float | None = None
     from_ml: float = 0.0
     counted_s: float = -math.inf
+    position_s: float = -math.inf
+    heard_s: float = -math.inf
+    usual_s: float | None = None
+    silences: tuple[tuple[float, float], ...] = ()
     pressure_s: float = -math.inf
     pressure_sum: float = 0.0
     pressure_count: int = 0
@@ -125,6 +138,29 @@ def _is_whole(orders: tuple[Order, ...], begin_s: float, end_s: float) -> bool:
     return len(open_now) <= 1
 
 
+def heard(state: Collecting, position_s: float, *, keep_from_s: float, now_s: float) -> Collecting:
+    """Return the bin in progress after a look at `now_s` for a position that is newer."""
+    if not position_s > state.position_s:
+        return state
+    gap_s = now_s - state.heard_s
+    if not math.isfinite(gap_s):
+        return state._replace(position_s=position_s, heard_s=now_s)
+    usual_s = gap_s if state.usual_s is None else state.usual_s
+    silences = tuple(each for each in state.silences if each[1] >= keep_from_s)
+    if gap_s > max(SILENT_TIMES * usual_s, SILENT_MIN_S):
+        silences = (*silences, (state.heard_s, now_s))
+    usual_s += _USUAL_SHARE * (min(gap_s, 2.0 * usual_s) - usual_s)
+    return state._replace(position_s=position_s, heard_s=now_s, usual_s=usual_s, silences=silences)
+
+
+def _is_heard(state: Collecting, begin_s: float, end_s: float, *, delay_s: float) -> bool:
+    """Whether what the meter saw in this time was ordered while the vehicle was heard."""
+    return not any(
+        from_s < end_s and begin_s < until_s + delay_s + EDGE_S
+        for from_s, until_s in state.silences
+    )
+
+
 def pressed(
     state: Collecting, report: PressureReport | None, *, delay_s: float, now_s: float
 ) -> Collecting:
@@ -176,7 +212,8 @@ def collected(
         expected_ml=expected_ml(state.orders, state.from_s - delay_s, edge_s - delay_s),
         metered_ml=edge_ml - state.from_ml,
         pressure=state.pressure_sum / count if count else None,
-        is_whole=_is_whole(state.orders, state.counted_s - delay_s, report.received_s - delay_s),
+        is_whole=_is_whole(state.orders, state.counted_s - delay_s, report.received_s - delay_s)
+        and _is_heard(state, state.counted_s, report.received_s, delay_s=delay_s),
     )
     begun = _begun(state, report)
     return begun._replace(from_s=edge_s, from_ml=edge_ml, counted_s=last.received_s), filled

@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 from companion.core.controller import Memory, step
 from companion.core.detection import Detection, Watching, WatchMemory, follow
 from companion.core.flow_trim import FlowTrim
-from companion.core.liquid_bins import Bin, bin_length_s, duties_of, expected_ml
+from companion.core.liquid_bins import (
+    Bin,
+    Collecting,
+    Order,
+    bin_length_s,
+    collected,
+    duties_of,
+    expected_ml,
+)
 from companion.core.liquid_naming import valve_of
 from companion.core.types import (
     Decision,
@@ -63,6 +71,7 @@ class Rig:
     fault: str = ""
     order_late_s: float = 0.0
     count_late_s: float = 0.0
+    is_held_up: bool = False
     now_s: float = 100.0
     seed: int = 1
 
@@ -74,6 +83,8 @@ class Rig:
         self.chance = random.Random(self.seed)
         self.plan: SprayPlan | None = None
         self.past: list[tuple[float, tuple[float, ...]]] = []
+        self.in_force: tuple[float, ...] = (0.0,) * 6
+        self.arrived: tuple[float, FlowReport] | None = None
 
     @property
     def kinds(self) -> list[FaultKind]:
@@ -91,16 +102,22 @@ class Rig:
         self.now_s += STEP_S
         lag_s = 0.115 + self.order_late_s
         delayed = [duty for at_s, duty in self.past if at_s <= self.now_s - lag_s]
-        duty = delayed[-1] if delayed else (0.0,) * 6
+        if not self.is_held_up:
+            self.in_force = delayed[-1] if delayed else (0.0,) * 6
+        duty = self.in_force
         factor = self.gain * (1.0 + self.noise * self.chance.gauss(0.0, 1.0))
         self.ml += max(self.flow_ml_s(duty) * STEP_S * factor, 0.0)
         counted_s = self.now_s - self.count_late_s
         flow = FlowReport(received_s=counted_s, volume_ml=NAN if self.fault else self.ml)
+        if not self.is_held_up or self.arrived is None:
+            self.arrived = self.now_s, flow
+        heard_s, flow = self.arrived
         mean = sum(duty) / 6.0
         kpa = (164.0 + 126.0 * mean) * self.pressure
         state = replace(
             SPRAYING,
             time_s=self.now_s,
+            position_received_s=heard_s,
             enabled=self.enabled,
             flow=replace(flow, fault=self.fault) if self.meter else None,
             pressure=PressureReport(received_s=self.now_s, pressure_kpa=kpa),
@@ -287,6 +304,64 @@ def test_valves_that_were_told_late_to_close_are_no_leak(late_s: float) -> None:
     rig = healthy()
     rig.order_late_s, rig.duty = late_s, (0.0,) * 6
     assert not rig.run(6.0).memory.findings
+
+
+def on_a_link_that_stops(rig: Rig, seconds: float, *, rest_s: float) -> Rig:
+    """Have each order for less fall into 0.4 s in which nothing comes, and nothing is carried out.
+
+    The orders, the counts and the positions of that time come after it.
+    """
+    until_s = rig.now_s + seconds
+    while rig.now_s < until_s and not rig.memory.findings:
+        rig.duty, rig.is_held_up = (0.3,) * 6, True
+        rig.run(0.4)
+        rig.is_held_up = False
+        rig.run(rest_s)
+        rig.duty = (0.5,) * 6
+        rig.run(rest_s)
+    return rig
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_healthy_sprayer_on_a_link_that_stops_again_and_again_has_no_fault(seed: int) -> None:
+    rig = healthy(seed=seed, duty=(0.5,) * 6)
+    assert not on_a_link_that_stops(rig, 20.0, rest_s=0.5).memory.findings
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_on_a_link_that_stops_again_and_again_a_stuck_valve_is_named(seed: int) -> None:
+    rig = healthy(seed=seed, duty=(0.5,) * 6)
+    rig.stuck_open = {2}
+    on_a_link_that_stops(rig, 12.0, rest_s=0.9)
+    assert rig.kinds == [FaultKind.STUCK_OPEN]
+
+
+def test_positions_that_come_seldom_are_no_silence() -> None:
+    rig = healthy(duty=(0.5,) * 6)
+    for turn in range(200):
+        if turn == 120:
+            rig.stuck_open = {2}
+        rig.is_held_up = turn % 4 > 0  # five positions and counts a second
+        rig.step()
+    assert rig.kinds == [FaultKind.STUCK_OPEN]
+
+
+@pytest.mark.parametrize("changed_s", [0.31, 0.37, 0.45])
+def test_a_rate_that_changes_between_two_counts_is_no_difference(changed_s: float) -> None:
+    """Counts 0.2 s apart, as of an autopilot's meter; a bin ends between two of them."""
+    orders = (Order(-1.0, (40.0,), None), Order(changed_s, (80.0,), None))
+
+    def counted(at_s: float) -> FlowReport:
+        volume_ml = 40.0 * min(at_s, changed_s) + 80.0 * max(at_s - changed_s, 0.0)
+        return FlowReport(received_s=at_s, volume_ml=volume_ml)
+
+    state, bins = Collecting(orders=orders), []
+    for at_s in (0.0, 0.1, 0.3, 0.5, 0.7, 0.9):
+        state, filled = collected(state, counted(at_s), bin_s=0.4, delay_s=0.0, now_s=at_s)
+        bins += [] if filled is None else [filled]
+    assert [round(each.end_s, 6) for each in bins] == [0.4, 0.8]
+    for each in bins:
+        assert each.metered_ml == pytest.approx(each.all_ml, rel=1e-9)
 
 
 @pytest.mark.parametrize("begin_s", [1.0, 1.1, 1.2, 1.3])
