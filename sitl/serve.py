@@ -134,8 +134,7 @@ class _Run:
             written=self.sprayer.take,
         )
         self.autopilot.utc_offset_s = time.time() - time.monotonic()
-        if self.sprayer.liquid is not None:
-            self.autopilot.batteries = self.sprayer.liquid.batteries
+        self.autopilot.batteries = self.sprayer.batteries
         self.mission = MissionWatch(self.autopilot, say)
         self.operator = Operator(
             self.autopilot,
@@ -147,7 +146,7 @@ class _Run:
         self.truth = TruthLog(self.autopilot.flight.world, self.sprayer, home)
         self._options = options
         self._say = say
-        self._start_s = start_s
+        self._start_s = self._ticked_s = start_s
         self._say_due_s = 0.0
         self._step = self.operator.step
         self._done = asyncio.Event()
@@ -170,6 +169,7 @@ class _Run:
 
     def tick(self, now_s: float) -> None:
         """Let operator, sprayer and log go on; called after each tick of the stub."""
+        self._ticked_s = now_s
         self.mission.tick()
         if not self._options.ground:
             self.operator.tick(now_s)
@@ -199,7 +199,7 @@ class _Run:
             **self.truth.summary(),
         }
         if self.sprayer.liquid is not None:
-            begun = self.sprayer.liquid.begun(time.monotonic())
+            begun = self.sprayer.liquid.begun(self._ticked_s)
             summary["liquid"] = [
                 {"fault": words_of(fault), "from_s": round(fault.from_s, 3)} for fault in begun
             ]

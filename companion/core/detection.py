@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 from companion.core.flow_window import ML_S_PER_L_MIN, STALE_S
 from companion.core.liquid_bins import (
+    LONGEST_BINS,
     Bin,
     Collecting,
     collected,
@@ -103,7 +104,7 @@ def follow(
 
 def _kept_s(watching: Watching) -> float:
     """Return how long orders are needed: until the bin that they are in is filled."""
-    return watching.delay_s + watching.bin_s + 3.0 * STALE_S
+    return watching.delay_s + LONGEST_BINS * watching.bin_s + 3.0 * STALE_S
 
 
 def _heard(memory: WatchMemory, report: FlowReport | None, now_s: float) -> float:

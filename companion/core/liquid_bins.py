@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from itertools import pairwise
 from typing import NamedTuple
 
 from companion.core.flow_window import STALE_S, is_usable
@@ -20,10 +21,13 @@ BIN_S = 0.25
 # The ramp of a valve is over within this: a bin that begins later is not bent by it.
 EDGE_S = 0.05
 # Positions further apart than so many times the usual, and than this: the link, the vehicle or this
-# computer stood still. At 20 Hz one may be lost, not two. An order of that time came late, by up
-# to 0.3 s where the lease ended it, and a count of it is as old as it may be.
+# computer stood still. At 20 Hz one may be lost, not two. A count of that time is as old as it may
+# be, so no bin ends there: it goes on, for so many times its length. An order of that time was
+# carried out as late as the end of the silence: a bin to which that is more than this is none.
 SILENT_TIMES = 2.4
 SILENT_MIN_S = 0.12
+LONGEST_BINS = 4
+LATE_SHARE = 0.03
 _USUAL_SHARE = 0.1
 
 
@@ -39,8 +43,8 @@ class Bin(NamedTuple):
     """Some whole periods: expected volume of each valve, metered volume, pressure over expected.
 
     `is_whole` says that the same valves were open all the time, from the count before its begin to
-    the one after its end, and that the vehicle was heard all the while: what the lags leave at the
-    ends of a pass is no evidence, nor what became of an order that somebody held back.
+    the one after its end, and that no order of weight was held back: what the lags leave at the
+    ends of a pass is no evidence, nor what somebody did too late.
     """
 
     begin_s: float
@@ -153,12 +157,20 @@ def heard(state: Collecting, position_s: float, *, keep_from_s: float, now_s: fl
     return state._replace(position_s=position_s, heard_s=now_s, usual_s=usual_s, silences=silences)
 
 
-def _is_heard(state: Collecting, begin_s: float, end_s: float, *, delay_s: float) -> bool:
-    """Whether what the meter saw in this time was ordered while the vehicle was heard."""
-    return not any(
-        from_s < end_s and begin_s < until_s + delay_s + EDGE_S
-        for from_s, until_s in state.silences
-    )
+def _is_silent(state: Collecting, begin_s: float, end_s: float) -> bool:
+    """Whether nothing was heard for some of this time."""
+    return any(from_s < end_s and begin_s < until_s for from_s, until_s in state.silences)
+
+
+def _late_ml(state: Collecting, begin_s: float, end_s: float) -> float:
+    """Return the volume that orders of this time may have missed the table by, by coming late."""
+    missed_ml = 0.0
+    for from_s, until_s in state.silences:
+        for before, order in pairwise(state.orders):
+            if max(from_s, begin_s) <= order.at_s < min(until_s, end_s):
+                moved_ml_s = math.fsum(order.flows_ml_s) - math.fsum(before.flows_ml_s)
+                missed_ml += abs(moved_ml_s) * (until_s - order.at_s)
+    return missed_ml
 
 
 def pressed(
@@ -195,25 +207,31 @@ def collected(
         return _begun(state, None)._replace(last=report if sound else None), None
     assert report is not None  # is_usable
     if last is None or state.from_s is None:
-        return _begun(state, report), None
+        is_dated = not _is_silent(state, report.received_s, report.received_s)
+        return _begun(state, report if is_dated else None)._replace(last=report), None
     if report.received_s == last.received_s:
         return state, None
-    edge_s = state.from_s + bin_s
-    if report.received_s < edge_s:
+    bins = int((report.received_s - state.from_s) / bin_s)
+    edge_s = state.from_s + bins * bin_s
+    is_dated = bins >= LONGEST_BINS or not _is_silent(state, last.received_s, report.received_s)
+    if not (edge_s > last.received_s and bins > 0 and is_dated):
         return state._replace(last=report), None
     if not state.orders or state.orders[0].at_s > state.counted_s - delay_s:
         return _begun(state, report), None  # what was ordered then is not known
     share = _share_by(state.orders, last.received_s, edge_s, report.received_s, delay_s=delay_s)
     edge_ml = last.volume_ml + share * (report.volume_ml - last.volume_ml)
+    expected = expected_ml(state.orders, state.from_s - delay_s, edge_s - delay_s)
     count = state.pressure_count
+    late_ml = _late_ml(state, state.from_s - delay_s, edge_s - delay_s)
     filled = Bin(
         begin_s=state.from_s,
         end_s=edge_s,
-        expected_ml=expected_ml(state.orders, state.from_s - delay_s, edge_s - delay_s),
+        expected_ml=expected,
         metered_ml=edge_ml - state.from_ml,
         pressure=state.pressure_sum / count if count else None,
         is_whole=_is_whole(state.orders, state.counted_s - delay_s, report.received_s - delay_s)
-        and _is_heard(state, state.counted_s, report.received_s, delay_s=delay_s),
+        and not _is_silent(state, last.received_s, report.received_s)
+        and late_ml <= LATE_SHARE * math.fsum(expected),
     )
     begun = _begun(state, report)
     return begun._replace(from_s=edge_s, from_ml=edge_ml, counted_s=last.received_s), filled

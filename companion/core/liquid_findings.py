@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 Findings = tuple[Finding, ...]
 
-# Fewer bins than this have no name yet; so many of nothing are no flow (5 of 0.27 s: 1.4 s).
+# What is shorter than so many bins of the usual length has no name yet; nothing for so long is no
+# flow (5 of 0.27 s: 1.4 s).
 BINS_NAMED = 4
 NOTHING_S = 1.3
 # While closed: so many bins after the first with liquid in it, the last two with liquid as well.
@@ -90,7 +91,8 @@ def of_spraying(
         )
         return _found(watching, memory, name, evidence)
     count = memory.low[1] if memory.low[0] >= alarm else memory.high[1]
-    if count < BINS_NAMED:
+    length_s = math.fsum(each.end_s - each.begin_s for each in memory.bins[-count:])
+    if count < 2 or length_s < (BINS_NAMED - 0.5) * watching.bin_s:
         return memory
     evidence = _evidence(watching, memory, count)
     return _found(watching, memory, name_of(evidence), evidence)

@@ -71,9 +71,9 @@ def heartbeat(autopilot: Autopilot, _now_s: float) -> Message:
     )
 
 
-def battery_status(autopilot: Autopilot, _now_s: float) -> Message:
+def battery_status(autopilot: Autopilot, now_s: float) -> Message:
     """Return BATTERY_STATUS of one monitor; they take turns (GCS_Common.cpp)."""
-    monitors = autopilot.batteries()
+    monitors = autopilot.batteries(now_s)
     autopilot.battery_turn = (autopilot.battery_turn + 1) % len(monitors)
     found = monitors[autopilot.battery_turn]
     percent = -1 if found.remaining_percent is None else found.remaining_percent
@@ -94,9 +94,9 @@ BUILDERS: Mapping[int, Builder] = {
 }
 
 
-def withholds(autopilot: Autopilot, message_id: int, _now_s: float) -> bool:
+def withholds(autopilot: Autopilot, message_id: int, now_s: float) -> bool:
     """Return whether a message is not sent now: BATTERY_STATUS, without a monitor."""
-    return message_id == dialect.MAVLINK_MSG_ID_BATTERY_STATUS and not autopilot.batteries()
+    return message_id == dialect.MAVLINK_MSG_ID_BATTERY_STATUS and not autopilot.batteries(now_s)
 
 
 def second_servo_output(autopilot: Autopilot, now_s: float) -> Message | None:

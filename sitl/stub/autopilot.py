@@ -51,7 +51,7 @@ class Autopilot:
         self.fence: tuple[MissionItem, ...] = ()
         self.script: Script | None = None
         # The battery monitors: those of flow meter and tank too, where the sprayer has them.
-        self.batteries: Callable[[], Sequence[Battery]] = tuple
+        self.batteries: Callable[[float], Sequence[Battery]] = lambda _now_s: ()
         self.battery_turn = -1
         self.hears: Callable[[Message, float], None] = lambda _message, _now_s: None
         self.says: Callable[[str], None] = lambda _text: None

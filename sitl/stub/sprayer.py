@@ -15,7 +15,7 @@ from sitl.flow_law import FlowLaw
 from sitl.plants import edge_plant
 from sitl.profile import load_profile
 from sitl.stub.box import ArmingBox
-from sitl.stub.liquid import Liquid, LiquidOptions
+from sitl.stub.liquid import Battery, Liquid, LiquidOptions
 from sitl.stub.liquid_entries import SPRAYING
 from sitl.stub.outputs import ServoOrder
 
@@ -137,6 +137,13 @@ class Sprayer:
         self._recent.record(edges)
         if self.liquid is not None:
             self.liquid.advance(until_s, self.volume_l)
+
+    def batteries(self, now_s: float) -> list[Battery]:
+        """Return the battery monitors as they are now, however long ago the last tick was."""
+        if self.liquid is None:
+            return []
+        self.advance(now_s)
+        return self.liquid.batteries()
 
     def begins(self, moment: str, at_s: float) -> None:
         """Take that a moment has come from which faults of the liquid count."""

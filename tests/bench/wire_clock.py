@@ -25,6 +25,7 @@ from companion.assembly import build_setup
 from companion.cli.run import build_executor, component_options
 from companion.config import load
 from companion.link.vehicle_link import VehicleLink
+from companion.ports import Recorder
 from companion.runtime import run
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.channel import Channel
@@ -32,6 +33,8 @@ from tests.bench.wire import MEAN_ABS_MAX_M, RTK, WORST_MAX_M, example
 
 WIRE_S = 0.0005
 _TICK_S = 0.02
+# The clock moves at each wait by this at least.
+_LEAST_S = 1e-4
 
 
 class _Jump(selectors.SelectSelector):
@@ -95,17 +98,35 @@ class WireLink(VehicleLink):
         self._on_bytes(data)
 
 
-async def _vehicle(stub: _Run, link: WireLink) -> None:
+# How long, at a time, the vehicle and the wire stand still.
+Holds = Callable[[float], float]
+
+
+def _never(_at_s: float) -> float:
+    return 0.0
+
+
+async def _vehicle(stub: _Run, link: WireLink, held_s: Holds) -> None:
     """Be the vehicle until its mission is flown."""
     loop = asyncio.get_running_loop()
+    last_s = 0.0
 
     def send(data: bytes) -> None:
-        loop.call_later(WIRE_S, link.arrive, data)
+        nonlocal last_s
+        at_s = loop.time() + WIRE_S
+        if (wait_s := held_s(at_s)) > 0.0:
+            # What was held back comes in its order.
+            at_s = last_s = max(at_s + wait_s, last_s + 1e-6)
+        loop.call_at(at_s, link.arrive, data)
 
     channel: Channel = stub.autopilot.attach("wire", send)
 
     def deliver(data: bytes) -> None:
-        stub.autopilot.receive(channel, data, loop.time())
+        wait_s = held_s(loop.time())
+        if wait_s > _LEAST_S:
+            loop.call_later(wait_s, deliver, data)
+        else:
+            stub.autopilot.receive(channel, data, loop.time())
 
     link.deliver = deliver  # type: ignore[method-assign]
     while not stub._done.is_set():
@@ -113,19 +134,24 @@ async def _vehicle(stub: _Run, link: WireLink) -> None:
         stub.autopilot.tick(now_s)
         stub.tick(now_s)
         due_s = min(max(stub.autopilot.next_due_s(), now_s), now_s + _TICK_S)
-        await asyncio.sleep(max(due_s - now_s, 1e-4))
+        await asyncio.sleep(max(due_s + held_s(due_s) - now_s, _LEAST_S))
 
 
-async def _fly(config_file: Path, stub: _Run) -> str | None:
+async def _fly(
+    config_file: Path,
+    stub: _Run,
+    recorder: Recorder | None,
+    held_s: Holds,
+) -> str | None:
     """Fly the stub's mission with the companion; return what was the matter with the outputs."""
     loop = asyncio.get_running_loop()
     config = load(config_file)
     link = WireLink(config.link.url, component_options(config), clock=loop.time)
     executor = build_executor(config, link)
-    vehicle = asyncio.create_task(_vehicle(stub, link))
+    vehicle = asyncio.create_task(_vehicle(stub, link, held_s))
     await asyncio.sleep(0.1)
     companion = asyncio.create_task(
-        run(build_setup(config), link=link, executor=executor, clock=loop.time)
+        run(build_setup(config), link=link, executor=executor, recorder=recorder, clock=loop.time)
     )
     await asyncio.wait({vehicle, companion}, return_when=asyncio.FIRST_COMPLETED)
     fault = executor.fault
@@ -138,12 +164,22 @@ async def _fly(config_file: Path, stub: _Run) -> str | None:
     return fault
 
 
-def fly(config: Path, options: ServeOptions) -> tuple[dict[str, Any], str | None]:
-    """Fly a mission; return what the stub says, and the fault of the outputs at the end."""
+def fly(
+    config: Path,
+    options: ServeOptions,
+    *,
+    recorder: Recorder | None = None,
+    held_s: Holds = _never,
+) -> tuple[dict[str, Any], str | None]:
+    """Fly a mission; return what the stub says, and the fault of the outputs at the end.
+
+    `held_s` gives for how long the vehicle and the wire stand still at a time since the start.
+    """
     stub = _Run(options, lambda _: None)
-    loop = JumpingLoop(stub._start_s)
+    start_s = stub._start_s
+    loop = JumpingLoop(start_s)
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
-        fault = runner.run(_fly(config, stub))
+        fault = runner.run(_fly(config, stub, recorder, lambda at_s: held_s(at_s - start_s)))
     return stub.result(cancelled=False), fault
 
 

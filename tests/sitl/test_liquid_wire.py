@@ -1,4 +1,8 @@
-"""A valve sticks in real time: `run` sees it in the autopilot's meter, names it and closes."""
+"""A valve sticks open: `run` sees it in the autopilot's meter, names it and closes.
+
+How soon and by which name is asked of a flight on a clock of its own, without a link or a computer
+that stands still, and with one. In real time the same has to happen, however busy the computer is.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +13,19 @@ import signal
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from companion.core.coverage import Coverage
+from companion.core.types import Decision, Input
 from companion.record.reader import read_journal
+from sitl.serve import ServeOptions
+from tests.bench.wire import example
+from tests.bench.wire_clock import Holds, fly
+from tests.sitl.test_wire_flight import write_field, write_mission
 from tests.sitl.wire_peer import free_port
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(120)]
@@ -22,9 +33,79 @@ pytestmark = [pytest.mark.sitl, pytest.mark.timeout(120)]
 EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang"
 # 3 s are for a pulse meter on this computer; the autopilot's counts are compared over 0.55 s.
 FOUND_MAX_S = 5.0
+# Where everything stands still for a fifth of a second every 1.1 s: bins are longer there.
+FOUND_HELD_UP_MAX_S = 8.0
 # The order to close leaves with the plan of the step that found it.
 CLOSED_MAX_S = 0.15
+# In real time on a computer that has something else to do.
+FOUND_BUSY_MAX_S, CLOSED_BUSY_MAX_S = 20.0, 1.0
 CLOSED_US = 1000
+STUCK = (
+    "[sensors]\nmeter_battery = 1\n"
+    '[[liquid]]\nkind = "stuck-open"\nsince = "spraying"\nat_s = 3.0\nvalve = 3\n'
+)
+
+
+@dataclass
+class Events:
+    """A recorder that keeps what happened."""
+
+    found: list[tuple[float, str]] = field(default_factory=list)
+
+    def record_input(self, item: Input) -> None: ...
+
+    def record_decision(self, decision: Decision) -> None: ...
+
+    def record_coverage(self, coverage: Coverage) -> None: ...
+
+    def record_event(self, at_s: float, kind: str, text: str) -> None:
+        if kind.startswith("fault-"):
+            self.found.append((at_s, kind))
+
+
+def never(_at_s: float) -> float:
+    return 0.0
+
+
+def a_fifth_of_a_second(at_s: float) -> float:
+    return max(0.2 - at_s % 1.1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("held_s", "within_s"), [(never, FOUND_MAX_S), (a_fifth_of_a_second, FOUND_HELD_UP_MAX_S)]
+)
+@pytest.mark.parametrize("seed", [1, 2, 4])
+def test_a_stuck_valve_is_named_at_once_though_everything_stands_still_now_and_then(
+    tmp_path: Path, held_s: Holds, within_s: float, seed: int
+) -> None:
+    config = example(tmp_path / "field", autopilot="ardupilot", port=14550)
+    write_field(config.parent)
+    write_mission(config.parent / "short.waypoints")
+    text = config.read_text().replace('rate_field = "rate"', 'rate_field = "rate"\nunit = "L/ha"')
+    text += '\n[flow_meter]\nsource = "autopilot"\n\n[detection]\nenabled = true\n'
+    config.write_text(text)
+    scenario = tmp_path / "stuck.toml"
+    scenario.write_text(STUCK)
+    events, out = Events(), tmp_path / "truth"
+    result, fault = fly(
+        config,
+        ServeOptions(
+            field_config=config,
+            mission=config.parent / "short.waypoints",
+            scenario=scenario,
+            seed=seed,
+            out=out,
+        ),
+        recorder=events,
+        held_s=held_s,
+    )
+    assert fault is None
+    ((what, fault_s),) = [(one["fault"], one["from_s"]) for one in result["liquid"]]
+    assert what == "stuck-open, valve 3"
+    assert {kind for _, kind in events.found} == {"fault-stuck-open"}
+    found_s = events.found[0][0]
+    assert 0.0 < found_s - fault_s <= within_s
+    check_closed(out, found_s, within_s=CLOSED_MAX_S + held_s(0.0))
 
 
 @asynccontextmanager
@@ -59,10 +140,7 @@ async def test_a_stuck_valve_is_found_within_seconds_by_the_autopilots_meter_and
     folder = tmp_path / "field"
     shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("flights"))
     scenario = tmp_path / "stuck.toml"
-    scenario.write_text(
-        "[sensors]\nmeter_battery = 1\n"
-        '[[liquid]]\nkind = "stuck-open"\nsince = "spraying"\nat_s = 3.0\nvalve = 3\n'
-    )
+    scenario.write_text(STUCK)
     sensors = tmp_path / "iio"
     serve = (
         *("sitl", "serve", "--json", "--link", f"udpout:127.0.0.1:{port}"),
@@ -95,19 +173,19 @@ async def test_a_stuck_valve_is_found_within_seconds_by_the_autopilots_meter_and
     fault_s = summary["liquid"][0]["from_s"]
     (path,) = (folder / "flights").glob("*.gpkg")
     found = [event for event in read_journal(path).events if event.kind.startswith("fault-")]
-    assert found
-    assert found[0].kind == "fault-stuck-open"
+    # A computer that stands still may have it called a leak until all is closed.
+    assert found[-1].kind == "fault-stuck-open"
     found_s = found[0].at_s
-    assert 0.0 < found_s - fault_s <= FOUND_MAX_S
-    check_closed(out, found_s)
+    assert 0.0 < found_s - fault_s <= FOUND_BUSY_MAX_S
+    check_closed(out, found_s, within_s=CLOSED_BUSY_MAX_S)
 
 
-def check_closed(out: Path, found_s: float) -> None:
+def check_closed(out: Path, found_s: float, *, within_s: float) -> None:
     """Each valve was opened before the finding, is ordered closed at once, and stays closed."""
     truth = np.load(out / "truth.npz")
     at_s, valve = truth["order_time_s"], truth["order_valve"]
     pulse_us = truth["order_pulse_us"]
-    by_then = at_s <= found_s + CLOSED_MAX_S
+    by_then = at_s <= found_s + within_s
     for each in range(6):
         ordered_us = pulse_us[by_then & (valve == each)]
         assert max(ordered_us) > CLOSED_US

@@ -1,4 +1,7 @@
-"""A field planned, uploaded, flown, sprayed and judged by four commands, each a process."""
+"""A field planned, uploaded, flown, sprayed and judged by four commands, each a process.
+
+How well the changes fall on their boundaries is asked of the same plan on a clock of its own.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,9 @@ from typing import Any, Literal
 
 import pytest
 
+from sitl.serve import ServeOptions
 from tests.bench.wire import RTK, start
+from tests.bench.wire_clock import fly
 from tests.sitl import client_bench
 from tests.sitl.wire_peer import free_port
 from tests.unit.stub_bench import HOME
@@ -25,10 +30,12 @@ RATES_L_HA, PLOT_M, FIRST_M = (15.0, 25.0), 8.0, 9.0
 WIDTH_M = 6.006
 
 
-def write_field(folder: Path, autopilot: Literal["ardupilot", "px4"]) -> Path:
+def write_field(
+    folder: Path, autopilot: Literal["ardupilot", "px4"], *, plot_m: float = PLOT_M
+) -> Path:
     """Write two plots, a pass wide, with a configuration for them; return that."""
     config = client_bench.write_field(folder, autopilot)
-    ends_m = [FIRST_M + number * PLOT_M for number in range(len(RATES_L_HA) + 1)]
+    ends_m = [FIRST_M + number * plot_m for number in range(len(RATES_L_HA) + 1)]
     plots = [
         (client_bench._ring(south, north, 0.5 * WIDTH_M), {"rate": rate})
         for (south, north), rate in zip(pairwise(ends_m), RATES_L_HA, strict=True)
@@ -53,13 +60,19 @@ async def done(*command: str) -> dict[str, Any]:
     return found
 
 
-async def flown(config: Path, serve: tuple[str, ...], port: int) -> tuple[dict[str, Any], ...]:
-    """Return what plan, upload and serve say."""
+def plan_of(config: Path) -> tuple[str, ...]:
+    """Return the command that plans the field."""
     folder = config.parent
-    plan = await done(
+    return (
         *("plan", str(folder / "field.geojson"), "--config", str(config)),
         *("--angle-deg", "0", "--depot", DEPOT, "--out", str(folder / "field.plan")),
     )
+
+
+async def flown(config: Path, serve: tuple[str, ...], port: int) -> tuple[dict[str, Any], ...]:
+    """Return what plan, upload and serve say."""
+    folder = config.parent
+    plan = await done(*plan_of(config))
     link, lines = f"udpin:127.0.0.1:{port}", folder / "field.lines.geojson"
     vehicle = await start(
         *("sitl", "serve", "--wait-mission", "--lines", str(lines), "--json"),
@@ -112,6 +125,43 @@ async def test_what_was_planned_is_uploaded_flown_and_sprayed_on_its_lines(
     # changes: that one counts apart.
     assert metrics["apart"] <= 1
     assert metrics["lag_distance_m"]["count"] == 6 * (len(RATES_L_HA) - 1) - metrics["apart"]
-    assert metrics["lag_distance_m"]["mean_abs"] <= 0.2
-    assert metrics["off_target_ml"] < 1.0
+    # All changes of this one boundary are late by what the computer does besides: a tenth of a
+    # second of it is allowed.
+    assert metrics["lag_distance_m"]["mean_abs"] <= 0.5
+    assert metrics["off_target_ml"] <= 0.01 * 1000.0 * asked_l
     assert flight["volume_l"] == pytest.approx(plan["volume_l"], rel=0.1)
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_what_was_planned_falls_on_its_boundary(
+    tmp_path: Path, autopilot: Literal["ardupilot", "px4"]
+) -> None:
+    # On plots of 8 m, which are flown into and out of at 3 m/s, the flow is never level: the step
+    # between two such flows lies 0.06 to 0.17 m early, with nothing late. On 20 m it is level.
+    config = write_field(tmp_path, autopilot, plot_m=20.0)
+    scenario = tmp_path / "rtk.toml"
+    scenario.write_text(RTK)
+    asyncio.run(done(*plan_of(config)))
+    lines = tmp_path / "field.lines.geojson"
+    text = config.read_text().replace("[mission]", f'[mission]\nlines = "{lines.name}"')
+    config.write_text(text)
+    flight, fault = fly(
+        config,
+        ServeOptions(
+            autopilot=autopilot,
+            field_config=config,
+            mission=tmp_path / "field.plan",
+            lines=lines,
+            scenario=scenario,
+            out=tmp_path / "truth",
+        ),
+    )
+    metrics = flight["metrics"]
+    lag = metrics["lag_distance_m"]
+    assert fault is None
+    assert (metrics["missed"], metrics["apart"], lag["count"]) == (0, 0, 6)
+    assert metrics["off_target_ml"] < 1.0
+    # The changes of one boundary share one error of the position, 2 cm (1 sd).
+    assert abs(lag["mean"]) <= 0.06
+    assert lag["mean_abs"] <= 0.08
+    assert lag["max_abs"] <= 0.20

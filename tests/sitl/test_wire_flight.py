@@ -1,4 +1,4 @@
-"""Two processes and a socket: the companion sprays a short field on the boundary."""
+"""The companion sprays a short field on the boundary: on a clock of its own, and as processes."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ import shapely
 from pyogrio.raw import write
 
 from companion.core.frame import LocalFrame
+from sitl.serve import ServeOptions
+from tests.bench.wire_clock import fly
 from tests.sitl.wire_peer import free_port
 
 pytestmark = pytest.mark.sitl
@@ -70,15 +72,46 @@ async def start(*command: str) -> asyncio.subprocess.Process:
     )
 
 
-async def test_each_change_falls_on_its_boundary_over_a_real_socket(tmp_path: Path) -> None:
-    folder = tmp_path / "field"
+def short_field(folder: Path, port: int) -> Path:
+    """Return the configuration of one row of plots, with a mission beside it."""
     shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("flights", "*.shp", "*.dbf"))
     write_field(folder)
     write_mission(folder / "short.waypoints")
-    config, port = folder / "config.toml", free_port()
+    config = folder / "config.toml"
     text = config.read_text().replace("14550", str(port))
     text = text.replace('rate_field = "rate"', 'rate_field = "rate"\nunit = "L/ha"')
     config.write_text(text)
+    return config
+
+
+def test_each_change_falls_on_its_boundary(tmp_path: Path) -> None:
+    # Real bytes on a clock of their own: what is asked for here must not hang on a busy computer.
+    config = short_field(tmp_path / "field", 14550)
+    result, fault = fly(
+        config,
+        ServeOptions(
+            field_config=config,
+            mission=config.parent / "short.waypoints",
+            seed=5,
+            out=config.parent / "truth",
+        ),
+    )
+    metrics = result["metrics"]
+    lag = metrics["lag_distance_m"]
+    assert fault is None
+    assert lag["count"] == (len(RATES) - 1) * 6
+    assert (metrics["missed"], metrics["off_target_ml"]) == (0, 0.0)
+    # The whole example field is measured against 0.05 m and 0.20 m (docs/performance.md). The
+    # thirty changes of this one pass share one error of the position, 2 cm (1 sd).
+    assert abs(lag["mean"]) <= 0.06
+    assert lag["mean_abs"] <= 0.08
+    assert lag["max_abs"] <= 0.30
+
+
+async def test_two_processes_spray_the_field_over_a_real_socket(tmp_path: Path) -> None:
+    port = free_port()
+    config = short_field(tmp_path / "field", port)
+    folder = config.parent
     companion = await start("run", "--config", str(config))
     vehicle = await start(
         *("sitl", "serve", "--json", "--link", f"udpout:127.0.0.1:{port}"),
@@ -100,11 +133,10 @@ async def test_each_change_falls_on_its_boundary_over_a_real_socket(tmp_path: Pa
                 await process.communicate()
     result = json.loads(out)
     metrics = result["metrics"]
-    lag = metrics["lag_distance_m"]
-    assert lag["count"] == (len(RATES) - 1) * 6
-    assert (metrics["missed"], metrics["off_target_ml"]) == (0, 0.0)
-    # The whole example field is measured against 0.05 m and 0.20 m (docs/performance.md). The
-    # thirty changes of this one pass share one error of the position, 2 cm (1 sd).
-    assert abs(lag["mean"]) <= 0.06
-    assert lag["mean_abs"] <= 0.08
-    assert lag["max_abs"] <= 0.30
+    assert result["state"] == "landed"
+    # On a busy computer orders come late; how exactly they fall is the other test's matter.
+    assert metrics["missed"] == 0
+    assert metrics["lag_distance_m"]["mean_abs"] <= 0.5
+    asked_l = sum(RATES) * PLOT_M * 6.0 / 10_000.0
+    assert result["volume_l"] == pytest.approx(asked_l, rel=0.1)
+    assert metrics["off_target_ml"] <= 0.01 * 1000.0 * result["volume_l"]

@@ -172,10 +172,23 @@ def test_monitors_take_turns_and_without_any_nothing_comes() -> None:
     assert not autopilot.has(BATTERY, 0.0)
     sprayer = sprayer_with(LiquidOptions(meter_battery=1, tank_battery=4))
     assert sprayer.liquid is not None
-    autopilot.batteries = sprayer.liquid.batteries
+    autopilot.batteries = sprayer.batteries
     assert autopilot.has(BATTERY, 0.0)
     messages = [autopilot.build(BATTERY, 0.0) for _ in range(4)]
     assert [message.id for message in messages] == [0, 1, 4, 0]
     assert [message.current_consumed for message in messages] == [1200, 0, -1, 1200]
     assert [message.battery_remaining for message in messages] == [80, -1, 100, 80]
     assert all(math.isfinite(message.current_battery) for message in messages)
+
+
+def test_a_count_is_of_the_time_at_which_it_is_sent_however_long_a_tick_took() -> None:
+    sprayer = sprayer_with(LiquidOptions(meter_battery=1))
+    order(sprayer, 1.0, 2000)
+    run(sprayer, 1.0, 5.0)
+    before, after = (
+        next(each.consumed for each in sprayer.batteries(at_s) if each.number == 1)
+        for at_s in (5.0, 5.5)
+    )
+    assert before is not None
+    assert after is not None
+    assert after - before == pytest.approx(0.5 * 6.096 * 1000.0 / 60.0, rel=0.1)
