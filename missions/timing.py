@@ -68,6 +68,8 @@ def _ways(sortie: Sortie) -> list[_Way]:
     here = sortie.legs[0].points[0]
     for number, leg in enumerate(sortie.legs):
         if leg.through and leg.length_m < SAME_M:
+            # The ends of both lines are one waypoint.
+            here = leg.points[-1]
             continue
         for place in leg.points:
             length_m = math.dist(here, place)

@@ -120,6 +120,24 @@ def test_an_outline_of_a_point_a_metre_is_not_flown_in_no_time() -> None:
     assert spraying_s > around_m / 1.6
 
 
+def test_ends_of_lines_that_are_one_waypoint_take_no_time() -> None:
+    def border(gap_m: float) -> float:
+        half = (100.0 + gap_m, 0.0)
+        legs = (
+            Leg(kind="ferry", points=((0.0, -50.0), (0.0, 0.0)), speed_m_s=5.0),
+            Leg(kind="spray", points=((0.0, 0.0), (100.0, 0.0)), speed_m_s=5.0),
+            Leg(kind="transit", points=((100.0, 0.0), half), speed_m_s=5.0, through=True),
+            Leg(kind="spray", points=(half, (half[0] + 96.0, 28.0)), speed_m_s=5.0),
+            Leg(kind="ferry", points=((half[0] + 96.0, 28.0), (0.0, -50.0)), speed_m_s=5.0),
+        )
+        (found,) = timed(
+            [Sortie(number=1, depot=0, legs=legs)], Settings(swath_width_m=6.0, speed_m_s=5.0)
+        )
+        return sum(leg.seconds for leg in found.legs[:-1])
+
+    assert border(0.5) == pytest.approx(border(0.0), abs=0.01)
+
+
 def test_a_flight_of_arducopter_from_take_off_to_disarmed() -> None:
     # Flown: 7.2 s until the way begins, 3.5 m high; 48.4 s from the last waypoint, 26 m away, of
     # which the way home takes about ten.
