@@ -20,7 +20,7 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs lock clean
+.PHONY: help setup demo test test-computing test-flights lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs lock clean bench-missions
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -64,6 +64,9 @@ imports: $(INSTALLED)
 
 bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 	$(BIN)/python -m tests.bench $(SEED)
+
+bench-missions: $(INSTALLED) ## plans for real and recorded fields, judged apart (VRSPRAY_SAMPLES; ARGS="--only trees")
+	$(BIN)/python -m tests.bench.real_fields $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 mutants: $(INSTALLED) ## each known way to break the code makes a test fail (ARGS="lease" for some)
 	$(BIN)/python -m tests.mutations $(ARGS)

@@ -26,11 +26,13 @@ Bools = NDArray[np.bool_]
 
 # New corners lie so deep inside, in parts of the tolerance: 0 keeps a corner where it was drawn.
 DEPTHS = np.array([0.0, 0.1, 0.25, 0.5, 0.75, 1.0])
+# The border begins at its sharpest corner, as deep as the best of these.
+STARTS = (0, 2)
 # Of two borders with as many edges the one that gives less ground away; a corner more is worth
 # as much as the ground along four edges in the middle of the tolerance.
 DEPTH_COST = 0.125
-# So many points ahead are looked at together.
-AHEAD = 48
+# So many points ahead are looked at together at first, and then twice as many.
+AHEAD = 8
 # Rounding of angles [rad]: 1e-9 is a micrometre over a kilometre. The caller keeps a margin.
 ROUNDING = 1e-9
 # Where the whole tolerance leads to no border, it is made less, so many times.
@@ -102,7 +104,7 @@ def _ring(points: Floats, tolerance_m: float) -> Floats:
     inwards = _inwards(edges, turn)
     closed = np.vstack([points, points[:1]])
     inwards = np.vstack([inwards, inwards[:1]])
-    tried = [_path(closed, inwards, tolerance_m, depth) for depth in (0, 1, 3)]
+    tried = [_path(closed, inwards, tolerance_m, depth) for depth in STARTS]
     return min(tried, key=lambda found: found[0])[1]
 
 
@@ -162,8 +164,10 @@ def _seen(
     starts = places[at, known]
     onward = math.atan2(*(closed[at + 1] - closed[at])[::-1])
     low, high = np.full(len(known), -math.inf), np.full(len(known), math.inf)
-    for first in range(at + 1, count + 1, AHEAD):
-        ends = np.arange(first, min(first + AHEAD, count + 1))
+    first, ahead = at + 1, AHEAD
+    while first <= count:
+        ends = np.arange(first, min(first + ahead, count + 1))
+        first, ahead = first + ahead, 2 * ahead
         least, most = _sectors(closed[ends], starts, onward, tolerance_m)
         least = np.maximum(np.maximum.accumulate(least, axis=1), low[:, None])
         most = np.minimum(np.minimum.accumulate(most, axis=1), high[:, None])

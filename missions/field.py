@@ -15,6 +15,7 @@ from companion.core.frame import LocalFrame
 from companion.core.prescription import SLIVER_M
 from companion.maps.local import Area, as_area, make_valid, polygons_of, project
 from companion.maps.local import places as places_of
+from missions.coverage import reachable
 from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
 from missions.strips import Floats
@@ -26,6 +27,9 @@ MARGIN_M = 0.0025
 # Borders are drawn anew with fewer corners so far inside, at most, and those of obstacles so far
 # outside of their buffers: a circle of 5 m becomes one of ten corners.
 OUTLINE_TOLERANCE_M, OBSTACLE_TOLERANCE_M = 0.1, 0.5
+# A simpler outline leaves so much of what a strip can reach; if not, the tolerance is made less,
+# and after so many times the outline stays as it was drawn.
+REACHED_MIN, TOLERANCE_LESS, TOLERANCES = 0.9975, 0.3, 3
 EXTENT_MAX_M = 20_000.0
 # 383 ha with a swath of 1 m have so many.
 PASSES_MAX = 1_000
@@ -38,7 +42,7 @@ class Field:
     """`outline` is as given; `fly` lies in it without holes and obstacles; `spray` in `fly`.
 
     `limit` is all that may be sprayed; `spray` keeps a margin from its edge, and has fewer
-    corners. `given_up_m2` is the ground between the two.
+    corners: `given_up_m2` is left for that, within `tolerance_m` of the outline.
     `blocked` is what may not be flown over, not even on the way to the field. `closes` is the
     ground outside of which the companion closes its valves, where that is another than `limit`.
     """
@@ -51,11 +55,7 @@ class Field:
     blocked: BaseGeometry
     closes: BaseGeometry | None = None
     tolerance_m: float = OUTLINE_TOLERANCE_M
-
-    @property
-    def given_up_m2(self) -> float:
-        """Return the ground that may be sprayed and is left to draw its border simpler."""
-        return float(self.limit.area) - float(self.spray.area)
+    given_up_m2: float = 0.0
 
     @property
     def kept_in(self) -> BaseGeometry:
@@ -114,7 +114,13 @@ def build_field(
     )  # fmt: skip
     blocked = shapely.union_all([*holes, kept])
     flown = outline.difference(kept)
-    fly = _ground(outline, kept, tolerance_m)
+    inside, tolerance_m = _simpler(outline, tolerance_m, swath_width_m)
+    fly = None
+    if inside is not None:
+        apart = around_with_fewer_corners(
+            _grown(kept, MARGIN_M), max(tolerance_m, OBSTACLE_TOLERANCE_M)
+        )
+        fly = as_area(polygons_of(inside.difference(apart)))
     off = [translate(local_area(area, frame), *offset_m) for area in no_spray]
     closed = shapely.union_all(
         [
@@ -130,16 +136,19 @@ def build_field(
         spray = as_area(polygons_of(fly.difference(apart)))
     if spray is None or fly is None:
         raise PlanError("obstacles and no-spray areas leave nothing of the field to spray")
+    limit = flown.difference(closed)
     _check_width(spray, swath_width_m)
+    given_up_m2 = float(limit.area) - float(spray.area)
     spray = _inset(spray, kept_m, swath_width_m)
     return Field(
         frame=frame,
         outline=outline,
         fly=fly,
         spray=spray,
-        limit=flown.difference(closed),
+        limit=limit,
         blocked=blocked,
         tolerance_m=tolerance_m,
+        given_up_m2=given_up_m2,
     )
 
 
@@ -172,16 +181,21 @@ def _grown(area: BaseGeometry, by_m: float) -> BaseGeometry:
     return area.buffer(by_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
 
 
-def _ground(outline: Area, kept: BaseGeometry, tolerance_m: float) -> Area | None:
-    """Return the ground a margin inside the outline and off what is kept clear, few-cornered."""
-    apart = around_with_fewer_corners(
-        _grown(kept, MARGIN_M), max(tolerance_m, OBSTACLE_TOLERANCE_M)
-    )
+def _simpler(outline: Area, tolerance_m: float, swath_width_m: float) -> tuple[Area | None, float]:
+    """Return the ground a margin inside the outline, few-cornered, and within which tolerance.
+
+    It is less where a ditch would become narrower than a swath by it.
+    """
     inside = as_area(polygons_of(outline.buffer(-MARGIN_M, join_style="mitre")))
     if inside is None:
-        return None
-    left = inside_with_fewer_corners(inside, tolerance_m).difference(apart)
-    return as_area(polygons_of(left))
+        return None, 0.0
+    wanted_m2 = REACHED_MIN * reachable(inside, swath_width_m).area
+    for _ in range(TOLERANCES if tolerance_m > 0.0 else 0):
+        simple = inside_with_fewer_corners(inside, tolerance_m)
+        if reachable(simple, swath_width_m).area >= wanted_m2:
+            return simple, tolerance_m
+        tolerance_m *= TOLERANCE_LESS
+    return inside, 0.0
 
 
 def _inset(spray: Area, kept_m: float, swath_width_m: float) -> Area:

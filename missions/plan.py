@@ -233,6 +233,7 @@ class Plan:
             "overlap_percent": self.coverage.overlap_percent,
             "outside_m2": self.coverage.outside_m2,
             "largest_skip_m2": self.coverage.largest_skip_m2,
+            "simpler_border_m2": self.field.given_up_m2,
             "area_ha": self.field.area_m2 / 10_000.0,
             "angle_deg": self.angle_deg,
             "swaths": len(self.lines),

@@ -20,7 +20,7 @@ from companion.maps.model import MapFile
 from companion.maps.registry import read_map
 from missions.demand import Rates, Uniform
 from missions.errors import PlanError
-from missions.field import Field, build_field, frame_of
+from missions.field import OUTLINE_TOLERANCE_M, Field, build_field, frame_of
 from missions.map_rates import MapRates
 from missions.nearness import check_near
 from missions.plan import Settings
@@ -103,6 +103,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         frame=frame,
         offset_m=offset_m,
         kept_m=asked.border_m,
+        tolerance_m=OUTLINE_TOLERANCE_M if mission is None else mission.outline_tolerance_m,
     )
     rates = _rates(asked, config, map_file, boundary, frame)
     if isinstance(rates, MapRates) and _is_flown(asked, config):

@@ -234,6 +234,9 @@ class MissionTable(Table):
         Field(strict=False, max_length=100),
     ] = Field(default=(), description="[[latitude, longitude], ...]; empty: best place on the edge")
     obstacle_buffer_m: float = Field(default=2.0, ge=0, le=100, description="kept from obstacles")
+    outline_tolerance_m: float = Field(
+        default=0.1, ge=0, le=2, description="borders are drawn simpler by it, only ever inwards"
+    )
     refill_s: float = Field(default=60.0, ge=0, le=3600, description="on the ground for one refill")
     battery_wh: float | None = Field(
         default=None,

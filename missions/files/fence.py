@@ -25,7 +25,9 @@ from missions.files.plan_rules import FENCE_CORNERS_MAX
 from missions.plan import Plan, Sortie
 
 # The fence lies so far outside the field, at least; drawn with fewer corners, so much farther.
-OUT_M, QUICK_M, SIMPLER_M = 1.0, 0.2, (0.5, 1.0, 2.0, 4.0, 8.0)
+OUT_M, QUICK_M, SIMPLER_M = 1.0, 0.2, (0.5, 1.0, 2.0, 4.0, 6.0, 8.0)
+# No fence lies farther outside of field and ways.
+OUTSIDE_MAX_M, STEP_M = 10.0, 2.0
 # A fence that lies farther outside than this is worth a word.
 NEAR_M = 6.0
 # On each side of a way outside the field.
@@ -49,12 +51,7 @@ class Fence:
     polygons: tuple[Polygon, ...] = ()
     circles: tuple[tuple[float, float, float], ...] = ()
     left_out: int = 0
-    simpler_m: float = 0.0
-
-    @property
-    def outside_m(self) -> float:
-        """Return how far outside of field and ways it lies, at most."""
-        return OUT_M + QUICK_M + self.simpler_m
+    outside_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -95,25 +92,35 @@ class Fences:
             borders = self._borders(whole)
         fitting = [
             found
-            for simpler_m, drawn in borders
+            for outside_m, drawn in borders
             for border in polygons_of(drawn)
             if border.covers(way)
-            if (found := self._with_obstacles(border, simpler_m)) is not None
+            if (found := self._with_obstacles(border, outside_m)) is not None
         ]
         if not fitting:
-            self._refuse(sortie, borders, way)
+            raise self._refusal(sortie, borders, way)
         fence = min(fitting, key=lambda found: found.left_out)
         self._check(fence, way, sortie)
         return fence
 
     def _borders(self, ground: BaseGeometry) -> list[tuple[float, BaseGeometry]]:
-        """Return (tolerance, borders) around some ground, nearer ones with more corners first."""
-        # A first, quick simplification that a wider buffer makes up for.
-        wider = ground.buffer(OUT_M + QUICK_M, join_style="mitre", mitre_limit=MITRE_LIMIT)
-        quick = wider.simplify(QUICK_M)
-        return [(each, around_with_fewer_corners(quick, each)) for each in SIMPLER_M]
+        """Return borders around some ground and how far outside they lie, the nearest first."""
+        shapely.prepare(ground)
+        found = []
+        for simpler_m in SIMPLER_M:
+            # Bays in which it would be no farther from the field are closed, and a first, quick
+            # simplification is made up for by a wider buffer.
+            wide_m = OUT_M + QUICK_M + simpler_m
+            wider = ground.buffer(wide_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
+            closed = wider.buffer(-simpler_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
+            border = around_with_fewer_corners(closed.simplify(QUICK_M), simpler_m)
+            points = shapely.points(shapely.get_coordinates(shapely.segmentize(border, STEP_M)))
+            outside_m = float(shapely.distance(ground, points).max())
+            if outside_m <= OUTSIDE_MAX_M and border.covers(ground):
+                found.append((outside_m, border))
+        return found
 
-    def _with_obstacles(self, border: Polygon, simpler_m: float) -> Fence | None:
+    def _with_obstacles(self, border: Polygon, outside_m: float) -> Fence | None:
         """Return a fence of this border with as many obstacles as there is room for."""
         left = self.room_bytes - _polygon_bytes(border)
         if left < 0:
@@ -133,19 +140,18 @@ class Fences:
         inside = sum(border.intersects(polygon) for polygon, _ in self.obstacles)
         return Fence(
             border=border, polygons=tuple(polygons), circles=tuple(circles),
-            left_out=inside - len(polygons) - len(circles), simpler_m=simpler_m,
+            left_out=inside - len(polygons) - len(circles), outside_m=outside_m,
         )  # fmt: skip
 
-    def _refuse(
+    def _refusal(
         self, sortie: Sortie, borders: list[tuple[float, BaseGeometry]], way: BaseGeometry
-    ) -> None:
+    ) -> PlanError:
         drawn = [part for _, border in borders for part in polygons_of(border) if part.covers(way)]
         corners = min((_corners(part) for part in drawn), default=0)
         room = FENCE_CORNERS_MAX[self.plan.settings.autopilot]
-        far_m = OUT_M + QUICK_M + SIMPLER_M[-1]
-        raise PlanError(
-            f"sortie {sortie.number}: a fence within {far_m:.0f} m of the field has {corners} "
-            f"corners, and {NAMES[self.plan.settings.autopilot]} stores {room}; write "
+        return PlanError(
+            f"sortie {sortie.number}: a fence within {OUTSIDE_MAX_M:.0f} m of the field has "
+            f"{corners} corners, and {NAMES[self.plan.settings.autopilot]} stores {room}; write "
             ".waypoints, which has no fence, or draw the outline with fewer corners"
         )
 

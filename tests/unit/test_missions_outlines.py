@@ -258,10 +258,10 @@ def test_two_parts_of_a_field_have_no_fence_around_all_between_them() -> None:
 
 def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:
     comb_like = shapely.union_all(
-        [box(0, 0, 400, 20), *(box(16 * k, 0, 16 * k + 8, 60) for k in range(25))]
+        [box(0, 0, 1000, 20), *(box(40 * k, 0, 40 * k + 8, 60) for k in range(25))]
     )
     plan = planned(Drawn(outline=degrees(comb_like)))
-    with pytest.raises(PlanError, match=r"sortie 1: a fence within 9 m .* ArduPilot stores 70"):
+    with pytest.raises(PlanError, match=r"sortie 1: a fence within 10 m .* ArduPilot stores 70"):
         plan_text(plan, plan.sorties[0])
 
 

@@ -205,7 +205,7 @@ def test_a_wiggly_border_gets_a_fence_that_fits_and_still_holds_the_field(
     field = build_field(to_degrees(ground), swath_width_m=6.0, frame=FRAME)
     wiggly = replace(plan, field=field)
     if depth_m > 9.0:
-        with pytest.raises(PlanError, match="within 9 m of the field has"):
+        with pytest.raises(PlanError, match="within 10 m of the field has"):
             plan_text(wiggly, plan.sorties[0])
         return
     fence = json.loads(plan_text(wiggly, plan.sorties[0]))["geoFence"]["polygons"]
