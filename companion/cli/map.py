@@ -19,7 +19,7 @@ from companion.cli.map_convert import convert, show
 from companion.cli.map_grid import GRID_EXAMPLE, grid, parse_mark
 from companion.cli.map_new import NEW_EXAMPLE, new
 from companion.cli.map_offset import OFFSET_EXAMPLE, offset
-from companion.cli.map_options import File, Reading, reading_options
+from companion.cli.map_options import File, OverlapPolicy, Reading, reading_options
 from companion.cli.map_plan import plan_of, sprayer_problems
 from companion.cli.map_report import report_lines
 from companion.errors import MapError
@@ -47,6 +47,7 @@ def check(
             metavar="LAT,LON", help="Where the sprayer stands; else mission.depots of --config."
         ),
     ] = None,
+    overlap: OverlapPolicy = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what is in a map and what is wrong with it.
@@ -54,6 +55,7 @@ def check(
     With --config also whether its sprayer can deliver the rates and settle in every zone, and
     whether the map lies in its field. Exit 0: usable; 1: readable, with errors; 2: unreadable.
     """
+    reading = reading.with_overlap(overlap)
     plan, found = plan_of(reading.config, None if home is None else parse_mark(home, "--home"))
     map_file = reading.read(file)
     found += sprayer_problems(reading.config, map_file, plan)
@@ -76,6 +78,7 @@ def rate(
         Path | None,
         typer.Option("--points", metavar="CSV", help="File with columns lat and lon instead."),
     ] = None,
+    overlap: OverlapPolicy = None,
     as_json: AsJson = False,
 ) -> None:
     """Say the rate at a place, or at all places of a file.
@@ -83,6 +86,7 @@ def rate(
     As the map has it; with --config as it will be flown: boundary, exclusions, default rate and
     offset applied.
     """
+    reading = reading.with_overlap(overlap)
     if (points is None) == (latitude is None or longitude is None):
         raise typer.BadParameter("give LAT and LON, or --points CSV")
     if points is not None:

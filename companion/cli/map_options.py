@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -12,6 +12,7 @@ from companion.cli.map_grid import parse_place
 from companion.cli.options import Option, with_options
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
+from companion.core.prescription import Overlap
 from companion.maps.model import MapFile
 from companion.maps.registry import read_map
 
@@ -46,6 +47,14 @@ _Origin = Annotated[
     str | None,
     typer.Option(metavar="LAT,LON,ALT", help="P2's text map: origin of its plane; else point 1."),
 ]
+OverlapPolicy = Annotated[
+    str | None,
+    typer.Option(
+        "--overlap",
+        metavar="P",
+        help="Where zones overlap: max, min, mean or last holds; error refuses.",
+    ),
+]
 _ConfigFile = Annotated[
     Path | None,
     typer.Option(
@@ -74,12 +83,27 @@ class Reading:
     merge: str | None = None
     origin: tuple[float, float, float] | None = None
     config: Config | None = None
+    policy: str | None = None
 
     @property
     def overlap(self) -> str:
         """Return the policy where zones overlap."""
         table = None if self.config is None else self.config.prescription
-        return "error" if table is None else table.overlap
+        return (self.policy or "error") if table is None else table.overlap
+
+    def with_overlap(self, policy: str | None) -> Reading:
+        """Return the same with another policy where zones overlap, if one is given."""
+        if policy is None:
+            return self
+        if policy not in get_args(Overlap):
+            raise typer.BadParameter(
+                f"--overlap is one of {', '.join(get_args(Overlap))}, not {policy!r}"
+            )
+        table = None if self.config is None else self.config.prescription
+        if self.config is None or table is None:
+            return replace(self, policy=policy)
+        changed = table.model_copy(update={"overlap": policy})
+        return replace(self, config=self.config.model_copy(update={"prescription": changed}))
 
     def read(self, file: Path) -> MapFile:
         """Return the map, read as the options say and otherwise as the configuration does.
@@ -89,7 +113,9 @@ class Reading:
         table = None if self.config is None else self.config.prescription
         own = table is not None and self._is_own(file, table)
         answers = {}
-        for name in (field.name for field in fields(self) if field.name != "config"):
+        for name in (
+            field.name for field in fields(self) if field.name not in ("config", "policy")
+        ):
             given = getattr(self, name)
             if given is None and table is not None and (own or name not in _OF_ONE_FILE):
                 given = getattr(table, name)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from shapely import Geometry, MultiPolygon, Polygon, STRtree
 
 from companion.core.cells import NO_RATE, CellGrid
+from companion.core.dissolve import dissolved
 
 Overlap = Literal["error", "max", "min", "mean", "last"]
 Floats = NDArray[np.float64]
@@ -104,7 +105,7 @@ class Prescription:
         zone_parts, owner = _parts([zone.polygon for zone in zones])
         ground: Geometry | None = boundary
         if ground is None:
-            ground = _outline(zone_parts) if cells is None else cells.outline
+            ground = closed(dissolved(zone_parts)) if cells is None else cells.outline
         self.field = _field(ground, exclusions)
         # Without a boundary or an exclusion, inside is where a cell has a rate: no need to ask.
         self._is_all_cells = cells is not None and boundary is None and not exclusions
@@ -259,10 +260,10 @@ def _edges(parts: NDArray[np.object_], owner: Ints) -> Edges:
     return Edges(ends=ends, owner=owners.astype(np.int64), tree=STRtree(lines))
 
 
-def _outline(parts: NDArray[np.object_]) -> Geometry:
-    """Return the ground of all zones, with the slivers between them closed."""
-    grown = shapely.buffer(parts, SLIVER_M / 2, join_style="mitre")
-    return shapely.buffer(shapely.union_all(grown), -SLIVER_M / 2, join_style="mitre")
+def closed(ground: Geometry) -> Geometry:
+    """Return the ground of all zones with the slivers between them closed."""
+    grown = shapely.buffer(ground, SLIVER_M / 2, join_style="mitre")
+    return shapely.buffer(grown, -SLIVER_M / 2, join_style="mitre")
 
 
 def _field(

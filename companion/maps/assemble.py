@@ -27,7 +27,7 @@ from companion.maps.crs import (
 from companion.maps.declared import Given, Unit, unit_of
 from companion.maps.fields import choose
 from companion.maps.layer import Band, Column, Grid, Layer, as_number
-from companion.maps.local import Area, frame_around, make_valid, project
+from companion.maps.local import Area, frame_around, make_valid, project_all
 from companion.maps.model import (
     RATE_MAX_L_HA,
     MapCells,
@@ -68,16 +68,31 @@ class Repair:
             f"from {self.before_m2:.2f} to {self.after_m2:.2f} m2"
         )
 
-    @property
-    def problem(self) -> Problem:
-        """Return the repair as something to tell the operator."""
-        return Problem(
+
+def repair_problems(repairs: Sequence[Repair]) -> list[Problem]:
+    """Return what to tell the operator of repairs, the one that changes most ground first."""
+    if not repairs:
+        return []
+    worst = repairs[0]
+    text = worst.text
+    if len(repairs) > 1:
+        total_m2 = sum(repair.change_m2 for repair in repairs)
+        text = (
+            f"rings of {len(repairs)} zones cross themselves; the repairs change "
+            f"{total_m2:.2f} m2 in all, and {worst.change_m2:.2f} m2 in the worst "
+            f"({worst.reason})"
+        )
+    return [
+        Problem(
             severity="warning",
             code="invalid-ring",
-            text=self.text,
-            where=self.zone,
-            fix="repair the zone where the map is made",
+            text=text,
+            where=worst.zone,
+            fix="repair the zone where the map is made"
+            if len(repairs) == 1
+            else "repair them where the map is made (in QGIS: Fix geometries)",
         )
+    ]
 
 
 def map_of(
@@ -126,7 +141,7 @@ def map_of(
             *choice.problems,
             *unit.problems,
             *skip_problems(found, names),
-            *(repair.problem for repair in repairs),
+            *repair_problems(repairs),
         ),
     )
 
@@ -304,20 +319,27 @@ def _repaired(
 ) -> tuple[list[Area | None], list[Repair]]:
     """Return valid polygons, and for each that was not, how much ground the repair changed."""
     result: list[Area | None] = list(areas)
-    repairs = []
     broken = np.flatnonzero(~shapely.is_valid(areas))
-    frame = frame_around(areas)
+    if not len(broken):
+        return result, []
     check_crossings(areas[broken], path)
-    for index in broken.tolist():
-        area = result[index] = make_valid(areas[index])
-        repairs.append(
-            Repair(
-                zone=names[index],
-                reason=shapely.is_valid_reason(areas[index])[:60],
-                before_m2=project(areas[index], frame).area,
-                after_m2=0.0 if area is None else project(area, frame).area,
-            )
+    mended = [make_valid(area) for area in areas[broken]]
+    frame = frame_around(areas)
+    before_m2 = shapely.area(project_all(areas[broken], frame))
+    after_m2 = shapely.area(project_all(np.array(mended, dtype=object), frame))
+    for index, area in zip(broken.tolist(), mended, strict=True):
+        result[index] = area
+    repairs = [
+        Repair(
+            zone=names[index],
+            reason=shapely.is_valid_reason(areas[index])[:60],
+            before_m2=before,
+            after_m2=after,
         )
+        for index, before, after in zip(
+            broken.tolist(), before_m2.tolist(), after_m2.tolist(), strict=True
+        )
+    ]
     repairs.sort(key=lambda repair: repair.change_m2, reverse=True)
     return result, repairs
 

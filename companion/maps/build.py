@@ -10,12 +10,21 @@ import shapely
 from shapely import MultiPolygon
 from shapely.errors import ShapelyError
 
+from companion.core.dissolve import dissolved
 from companion.core.frame import LocalFrame
-from companion.core.prescription import Overlap, Prescription, Zone
+from companion.core.prescription import Overlap, Prescription, Zone, closed
 from companion.maps.cells import bounds_deg, grid_of
-from companion.maps.local import Area, frame_around, make_valid, project, project_all
+from companion.maps.local import (
+    Area,
+    as_area,
+    frame_around,
+    make_valid,
+    polygons_of,
+    project,
+    project_all,
+)
 from companion.maps.model import MapFile, map_error, unusable_polygons
-from companion.maps.overlaps import overlaps
+from companion.maps.overlaps import PAIRS_MAX, check_outline, overlaps
 
 __all__ = ["build_prescription", "frame_for", "project"]
 
@@ -67,9 +76,14 @@ def build_prescription(
         if policy == "error":
             _check_overlaps(map_file, zones)
         cells = map_file.cells
+        border: Area | None
+        if boundary is not None:
+            border = _projected(boundary, frame, offset_m)
+        else:
+            border = _outline(map_file, zones) if cells is None else None
         return Prescription(
             zones,
-            boundary=None if boundary is None else _projected(boundary, frame, offset_m),
+            boundary=border,
             exclusions=[_projected(area, frame, offset_m) for area in exclusions],
             overlap=policy,
             default_rate_l_ha=default_rate_l_ha,
@@ -109,6 +123,14 @@ def _zones(map_file: MapFile, frame: LocalFrame, offset_m: tuple[float, float]) 
     return zones
 
 
+def _outline(map_file: MapFile, zones: Sequence[Zone]) -> Area:
+    """Return the outline of all zones, which is the border where there is no boundary."""
+    parts = shapely.get_parts(np.array([zone.polygon for zone in zones], dtype=object))
+    ground = dissolved(parts)
+    check_outline(ground, map_file.path)
+    return as_area(polygons_of(closed(ground))) or MultiPolygon()
+
+
 def _projected(area: Area, frame: LocalFrame, offset_m: tuple[float, float]) -> Area:
     """Return a boundary or exclusion in metres; rounding can make touching rings cross."""
     local = project(area, frame, offset_m=offset_m)
@@ -120,7 +142,8 @@ def _check_overlaps(map_file: MapFile, zones: Sequence[Zone]) -> None:
     if not found:
         return
     worst = found[0]
-    more = f" (and {len(found) - 1} more pairs)" if len(found) > 1 else ""
+    least = "at least " if len(found) > PAIRS_MAX else ""
+    more = f" (and {least}{len(found) - 1} more pairs)" if len(found) > 1 else ""
     raise map_error(
         map_file.path,
         f"zones {zones[worst.first].name} and {zones[worst.second].name} overlap by "

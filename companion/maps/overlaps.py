@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely import STRtree
+from shapely import Geometry, STRtree
 
+from companion.core.dissolve import lines_of, without_overlay
+from companion.core.prescription import SLIVER_M
 from companion.errors import MapError
 from companion.maps.local import Area
 from companion.maps.model import map_error
@@ -38,9 +40,14 @@ CANDIDATES_MAX = 5_000_000
 VERTICES_MAX = 300_000_000
 CROSSINGS_MAX = 400_000
 _CROSSINGS_PER_VERTEX = 4
+# An edge of an outline has its neighbours near, and theirs where it is short. Closing slivers
+# takes some 12 us for every further pair, and some 0.2 us for a pair of boxes.
+_NEAR_EACH, NEAR_MAX, BOXES_MAX = 12, 200_000, 20_000_000
 # Pairs of boxes of the edges of rings that cross themselves; each is met from both sides. A repair
 # with so many takes some 2 s.
 SELF_CROSSINGS_MAX = 200_000
+# Rings of so few edges have no crossings to speak of.
+_FEW_EDGES = 50
 # Pairs that cannot have many crossings are not asked: one side is short, or both are.
 _SHORT, _PRODUCT_MIN = 100, 300_000
 
@@ -64,6 +71,10 @@ def overlaps(zones: Sequence[Area], *, above_m2: float = OVERLAP_MAX_M2) -> list
     if not zones:
         return []
     parts, owner = shapely.get_parts(np.array(zones, dtype=object), return_index=True)
+    # A sound map is one without a single overlay.
+    joined = without_overlay(parts)
+    if joined is not None and joined[1] <= above_m2:
+        return []
     vertices = shapely.get_num_coordinates(parts).astype(np.int64)
     shapely.prepare(parts[vertices >= _PREPARED_MIN])
     shared: dict[tuple[int, int], float] = defaultdict(float)
@@ -96,7 +107,7 @@ def check_crossings(areas: Objects, path: Path) -> None:
     Every crossing becomes a corner, and rings of 18 000 edges can have a hundred million.
     """
     left = SELF_CROSSINGS_MAX
-    for area in areas:
+    for area in areas[shapely.get_num_coordinates(areas) > _FEW_EDGES]:
         boxes = _edge_boxes(area)
         # Every edge meets itself and its two neighbours.
         expected = _CROSSINGS_PER_VERTEX * len(boxes)
@@ -180,6 +191,35 @@ def _edge_boxes(part: Area) -> Objects:
     low, high = np.minimum(ends[:, :2], ends[:, 2:]), np.maximum(ends[:, :2], ends[:, 2:])
     boxes: Objects = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
     return boxes
+
+
+def check_outline(ground: Geometry, path: Path) -> None:
+    """Refuse an outline so dense that closing the slivers in it takes longer than anyone waits.
+
+    Edges that are nearer to each other than a sliver is wide all cross when they are moved.
+    """
+    rings = shapely.get_rings(shapely.get_parts(ground))
+    points, ring = shapely.get_coordinates(rings, return_index=True)
+    ends = np.stack([points[:-1], points[1:]], axis=1)[ring[1:] == ring[:-1]]
+    lines = lines_of(ends)
+    tree = STRtree(lines)
+    boxes = near = start = 0
+    chunk = 4
+    while start < len(lines):
+        some = lines[start : start + chunk]
+        more = len(tree.query(some)[0])
+        boxes += more
+        near += len(tree.query(some, "dwithin", distance=SLIVER_M)[0])
+        if not (near <= _NEAR_EACH * len(lines) + NEAR_MAX and boxes <= BOXES_MAX):
+            raise map_error(
+                path,
+                f"its outline has {len(lines)} edges, more than {NEAR_MAX} times one of them is "
+                f"within {SLIVER_M * 100:.0f} cm of another",
+                fix="simplify the map (in QGIS: Simplify, 0.1 m), or draw it again",
+                code="too-complicated",
+            )
+        start += chunk
+        chunk = max(1, min(2 * chunk, int(chunk * _HITS_WANTED / max(more, 1)), _CHUNK_MAX))
 
 
 def _too_complicated() -> MapError:

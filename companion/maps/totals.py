@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import MultiPolygon, STRtree
 
+from companion.core.dissolve import without_overlay
 from companion.core.frame import LocalFrame
 from companion.maps.build import frame_for
 from companion.maps.cells import cell_areas_m2, shares_inside
@@ -18,6 +19,7 @@ from companion.maps.convert.rasterise import in_field
 from companion.maps.crs import Objects
 from companion.maps.local import Area, make_valid, polygons_of, project, project_all
 from companion.maps.model import Floats, MapFile, MapZone
+from companion.maps.overlaps import OVERLAP_MAX_M2
 
 M2_PER_HA = 10_000.0
 # Of ground that is covered all over, rounding leaves less than this without a rate.
@@ -177,6 +179,9 @@ def _of_zones(
 
 def _overlapping(local: Objects) -> NDArray[np.int64]:
     """Return the zones that share ground with another one."""
+    joined = without_overlay(shapely.get_parts(local))
+    if joined is not None and joined[1] <= OVERLAP_MAX_M2:
+        return np.zeros(0, dtype=np.int64)
     one, two = STRtree(local).query(local, predicate="intersects")
     one, two = one[one < two], two[one < two]
     common = shapely.area(shapely.intersection(local[one], local[two])) > 0.0

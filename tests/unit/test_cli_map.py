@@ -277,3 +277,23 @@ def test_the_offset_between_map_and_receiver_is_ready_to_paste(capsys: Captured)
 def test_another_mark_and_no_place_are_refused(capsys: Captured, surveyed: str) -> None:
     assert execute(["map", "offset", "--map", "-36.0,114.5", "--surveyed", surveyed]) == 2
     assert "--surveyed" in capsys.readouterr().err
+
+
+def test_overlap_policy_is_asked_for_check_and_rate(capsys: Captured, tmp_path: Path) -> None:
+    path = tmp_path / "two.csv"
+    path.write_text(
+        "wkt;rate\n"
+        "POLYGON((114.5 36,114.502 36,114.502 36.001,114.5 36.001,114.5 36));10\n"
+        "POLYGON((114.501 36,114.503 36,114.503 36.001,114.501 36.001,114.501 36));30\n"
+    )
+    given = (str(path), "--unit", "L/ha")
+    code, found = run_json(capsys, "check", *given)
+    assert (code, found["ok"]) == (1, False)
+    code, found = run_json(capsys, "check", *given, "--overlap", "max")
+    assert (code, found["ok"]) == (0, True)
+    assert "the larger rate holds there" in found["problems"][0]["text"]
+    for policy, rate_l_ha in (("max", 30.0), ("min", 10.0), ("mean", 20.0), ("last", 30.0)):
+        place = ("36.0005", "114.5015", "--overlap", policy)
+        assert run_json(capsys, "rate", *given, *place)[1]["rate_l_ha"] == rate_l_ha
+    assert execute(["map", "check", *given, "--overlap", "first"]) == 2
+    assert "--overlap is one of error, max, min, mean, last" in capsys.readouterr().err

@@ -17,9 +17,12 @@ import pytest
 
 from companion.cli.app import execute
 from companion.errors import MapError
+from companion.maps.build import build_prescription, frame_for
 from companion.maps.csvfile.reader import read_csv
 from companion.maps.geotiff.world_file import parse_world_file
 from companion.maps.layer import Grid, Layer
+from companion.maps.lint import summary
+from companion.maps.registry import read_map
 from companion.maps.text.reader import read_text_map
 
 MORE_BYTES = 512 * 1024**2
@@ -61,7 +64,7 @@ def points(*, rate: str) -> str:
 
 
 def polygon(ring: list[tuple[float, float]]) -> str:
-    corners = ",".join(f"{x:.7f} {y:.7f}" for x, y in [*ring, ring[0]])
+    corners = ",".join(f"{x:.10f} {y:.10f}" for x, y in [*ring, ring[0]])
     return f'wkt,rate\n"POLYGON(({corners}))",10\n'
 
 
@@ -98,6 +101,24 @@ def test_a_small_file_never_takes_much_memory(folder: Path) -> None:
         assert said == says if isinstance(says, float) else says in said, name
         if was != "read":
             assert name in said and "\n" not in said
+
+
+def test_an_outline_that_would_take_long_is_refused_by_check_and_flight_alike(
+    folder: Path,
+) -> None:
+    """20 000 corners on 20 m: closing the slivers between its teeth would take most of a minute."""
+    x = np.repeat(np.linspace(0.0, 20.0, 10_001), 2)
+    y = np.tile([20.0, 20.0, 1.0, 1.0], 5_001)[: len(x)]
+    teeth = np.column_stack([x[1:-1], y[2:]]) / 111_320.0 + (114.5, 36.0)
+    ring = [(114.5, 36.0), *map(tuple, teeth.tolist()), (float(teeth[-1, 0]), 36.0)]
+    path = folder / "comb.csv"
+    path.write_text(polygon(ring), "ascii")
+    found = read_map(path, unit="L/ha")
+    for use in (summary, lambda one: build_prescription(one, frame_for(one))):
+        with pytest.raises(MapError, match=r"comb\.csv: its outline has \d+ edges") as caught:
+            use(found)
+        assert caught.value.code == "too-complicated"
+        assert "simplify" in caught.value.fix
 
 
 def rates_of(found: Grid | Layer) -> list[float]:

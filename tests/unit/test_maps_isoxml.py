@@ -708,6 +708,42 @@ def test_obstacles_of_the_field_are_told(tmp_path: Path) -> None:
     assert found.boundary.area == pytest.approx(LEFT.area)
 
 
+@pytest.mark.parametrize("kind", [3, 4, 5, 6, 12], ids=["water", "house", "road", "other", "trees"])
+def test_obstacles_of_the_field_are_taken_out_of_it(tmp_path: Path, kind: int) -> None:
+    west, south, east, north = LEFT.bounds
+    pond = box(west, south, (west + east) / 2, (south + north) / 2)
+    found = read_layer(
+        tmp_path, VPN, field(LEFT, more=polygon(pond, kind)), task(*TWO, more='E="PFD1"')
+    )
+    assert codes(found) == ["field-objects"]
+    assert "taken out of the ground to spray, 25 % of it" in found.problems[0].text
+    assert found.boundary is not None
+    assert found.boundary.area == pytest.approx(0.75 * LEFT.area)
+    assert not found.boundary.intersects(pond.buffer(-1e-6))
+
+
+def test_headland_of_the_field_is_no_obstacle(tmp_path: Path) -> None:
+    found = read_layer(
+        tmp_path, VPN, field(LEFT, more=polygon(LEFT, 10)), task(*TWO, more='E="PFD1"')
+    )
+    assert "not taken out" in found.problems[0].text
+    assert found.boundary is not None
+    assert found.boundary.area == pytest.approx(LEFT.area)
+
+
+def test_a_field_that_is_all_obstacle_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match="cover the whole field"):
+        read_layer(tmp_path, VPN, field(LEFT, more=polygon(LEFT, 3)), task(*TWO, more='E="PFD1"'))
+
+
+def test_an_obstacle_on_a_zone_is_no_ground_of_it(tmp_path: Path) -> None:
+    west, south, east, north = LEFT.bounds
+    pond = box(west, south, (west + east) / 2, north)
+    found = read_layer(tmp_path, VPN, task(zone(3, polygon(LEFT), polygon(pond, 3), value(10))))
+    assert found.geometries[0] is not None
+    assert found.geometries[0].area == pytest.approx(LEFT.area / 2)
+
+
 def test_outline_that_crosses_itself_is_refused(tmp_path: Path) -> None:
     bow = Polygon([(15, 48), (15.01, 48.01), (15.01, 48), (15, 48.01)])
     error = refusal(tmp_path, VPN, field(bow), task(*TWO, more='E="PFD1"'))

@@ -99,6 +99,12 @@ CASES = [
         place="rate: zone0 at 35.996050",
     ),
     Case(
+        code="low-rate",
+        given=a_map((cell(0), 0.31), (cell(1), 0.87)),
+        says=r"the largest rate is 0\.87 L/ha: values from 0 to 1 look like a vegetation index",
+        place="rate: zone1 at 35.996050",
+    ),
+    Case(
         code="high-rate",
         given=cells_map([[10.0, 5_000.0]]),
         says="5000 L/ha",
@@ -547,6 +553,9 @@ def test_more_pairs_of_boxes_than_anyone_waits_for_are_refused(
 ) -> None:
     stripes = [Polygon([(i, 0), (i + 0.5, 0), (i + 90.5, 90), (i + 90, 90)]) for i in range(60)]
     assert overlaps(stripes) == []
+    # As where their edges alone do not show that none overlaps.
+    monkeypatch.setattr(overlaps_module, "without_overlay", lambda _: None)
+    assert overlaps(stripes) == []
     monkeypatch.setattr(overlaps_module, "CANDIDATES_MAX", 1_000)
     with pytest.raises(MapError, match="too many places"):
         overlaps(stripes)
@@ -559,3 +568,14 @@ def test_a_map_too_large_to_join_says_what_was_not_looked_for(
     given_map = a_map(*((cell(2 * i), 1.0) for i in range(3)), boundary=cell(0, width=9))
     found = check_map(given_map, plan=plan_with(sprayer(speed_m_s=100.0)))
     assert [problem.code for problem in found] == ["not-checked"]
+
+
+def test_pairs_that_are_not_all_counted_are_said_to_be_at_least_so_many(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(overlaps_module, "PAIRS_MAX", 3)
+    monkeypatch.setattr("companion.maps.lint.shapes.PAIRS_MAX", 3)
+    stack = a_map(*((cell(0), float(rate)) for rate in range(2, 7)))
+    (problem,) = (one for one in check_map(stack) if one.code == "overlap")
+    assert problem.text.startswith("at least 10 pairs of zones overlap, by at least ")
+    assert "(the search ends after 3 pairs)" in problem.text

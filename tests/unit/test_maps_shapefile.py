@@ -19,6 +19,7 @@ from shapely import Geometry, MultiPolygon, Polygon, box
 
 from companion.errors import MapError
 from companion.maps import layer
+from companion.maps.assemble import Repair, repair_problems
 from companion.maps.model import MapFile
 from companion.maps.registry import read_area, read_map
 from companion.maps.shapefile import dbf
@@ -1216,3 +1217,16 @@ def test_the_real_maps_are_read_from_a_zip_as_from_their_folder(
         part for area in found.geometries if area is not None for part in shapely.get_parts(area)
     ]
     assert len(parts) == 527
+
+
+def test_many_repaired_rings_are_one_problem_with_the_worst_named() -> None:
+    repairs = [
+        Repair(zone=f"zone{i}", reason="Self-intersection", before_m2=10.0, after_m2=10.0 + i)
+        for i in (3, 2, 1)
+    ]
+    (problem,) = repair_problems(repairs)
+    assert problem.where == "zone3"
+    assert problem.text.startswith(
+        "rings of 3 zones cross themselves; the repairs change 6.00 m2 in all, and 3.00 m2"
+    )
+    assert repair_problems([]) == []

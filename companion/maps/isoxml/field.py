@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, box
 
 from companion.maps.crs import WGS84
-from companion.maps.isoxml.polygons import FIELD, ground_of_polygons, point_count
+from companion.maps.isoxml.polygons import (
+    FIELD,
+    OBSTACLES,
+    ground_of_polygons,
+    point_count,
+)
 from companion.maps.isoxml.task import ById, Task
 from companion.maps.isoxml.values import EXPORT_AGAIN, children
 from companion.maps.layer import check_counts
+from companion.maps.local import Area, polygons_of
 from companion.maps.model import Affine, Problem, map_error
 from companion.maps.outline import outline_of
 
@@ -44,19 +50,50 @@ def field_of(root: Element, task: Task, path: Path) -> tuple[MultiPolygon | None
     polygons = children(field, "PLN")
     check_counts(path, records=len(polygons), vertices=point_count(polygons))
     ground, others = ground_of_polygons(polygons, (FIELD,), where=f"field {task.field}", path=path)
+    blocked, rest = ground_of_polygons(polygons, OBSTACLES, where=f"field {task.field}", path=path)
+    objects = others - (len(polygons) - rest)
+    outline = outline_of([ground], WGS84, path)
     problems = []
-    if others:
+    if outline is not None and blocked is not None:
+        outline, taken = _without(outline, blocked, path)
+        problems.append(_field_objects(task.field, taken))
+    if objects:
         problems.append(
             Problem(
                 severity="warning",
                 code="field-objects",
-                text=f"the field has {others} other polygons (obstacles, water, headland), which "
-                "are not taken out of the map",
+                text=f"the field has {objects} other polygons (headland, buffer zones), which are "
+                "not taken out of the map",
                 where=task.field,
                 fix="give what must not be sprayed as an exclusion (prescription.exclusions)",
             )
         )
-    return outline_of([ground], WGS84, path), problems
+    return outline, problems
+
+
+def _without(outline: MultiPolygon, blocked: Area, path: Path) -> tuple[MultiPolygon, float]:
+    """Return the outline without its obstacles, and which part of it they take, 0 to 1."""
+    ground = outline_of([blocked], WGS84, path) or MultiPolygon()
+    left = MultiPolygon(polygons_of(shapely.difference(outline, ground)))
+    if left.is_empty:
+        raise map_error(
+            path,
+            "water, buildings, roads and obstacles cover the whole field",
+            fix=EXPORT_AGAIN,
+            code="field-objects",
+        )
+    return left, 1.0 - left.area / outline.area
+
+
+def _field_objects(field: str, taken: float) -> Problem:
+    return Problem(
+        severity="warning",
+        code="field-objects",
+        text="water, buildings, roads, obstacles and windbreaks of the field are taken out of the "
+        f"ground to spray, {100 * taken:.2g} % of it",
+        where=field,
+        fix="nothing, if they are where the field has them",
+    )
 
 
 def check_grid_in_field(

@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 # Types of a PLN (ISO 11783-10): 1 boundary of the field, 2 treatment zone; 3 to 7 and 12 are
 # water, building, road, obstacle, flag and windbreak; 8 to 11 other, mainfield, headland, buffer.
 FIELD, ZONE = "1", "2"
+# What nobody sprays, wherever it lies in the field: water, building, road, obstacle, windbreak.
+OBSTACLES = ("3", "4", "5", "6", "12")
 # Types of a ring (LSG).
 _EXTERIOR, _INTERIOR = "1", "2"
 # What numbers are written with; keeps out "nan", "inf" and "1_000", which float() would take.

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import shapely
 from shapely import MultiPolygon, Polygon
 
 from companion.maps.crs import WGS84
 from companion.maps.isoxml.files import TaskFiles
-from companion.maps.isoxml.polygons import FIELD, ZONE, ground_of_polygons, point_count
+from companion.maps.isoxml.polygons import (
+    FIELD,
+    OBSTACLES,
+    ZONE,
+    ground_of_polygons,
+    point_count,
+)
 from companion.maps.isoxml.rates import (
     Rates,
     check_shown,
@@ -17,6 +24,7 @@ from companion.maps.isoxml.rates import (
 from companion.maps.isoxml.references import References
 from companion.maps.isoxml.task import Task, TreatmentZone
 from companion.maps.layer import Column, Layer, check_counts
+from companion.maps.local import as_area, polygons_of
 from companion.maps.model import Problem, map_error
 
 
@@ -80,6 +88,11 @@ def _ground(
         ground, others = ground_of_polygons(
             zone.polygons, (ZONE, FIELD), where=f"treatment zone {zone.code}", path=files.path
         )
+        blocked, _ = ground_of_polygons(
+            zone.polygons, OBSTACLES, where=f"treatment zone {zone.code}", path=files.path
+        )
+        if ground is not None and blocked is not None and ground.is_valid and blocked.is_valid:
+            ground = as_area(polygons_of(shapely.difference(ground, blocked)))
         geometries.append(ground)
         if ground is None:
             skipped[index] = "not-a-polygon:no treatment zone (PLN type 2)"

@@ -16,6 +16,7 @@ from companion.maps.lint.shapes import overlap_problems, shape_problems
 from companion.maps.lint.short import short_problems
 from companion.maps.lint.survey import Survey
 from companion.maps.model import MapFile, Problem, map_error
+from companion.maps.overlaps import check_outline
 from companion.maps.totals import Totals, totals
 
 
@@ -107,6 +108,8 @@ def _checked(survey: Survey, overlap: str, plan: Plan) -> tuple[Problem, ...]:
     """Return all problems; overlaps are looked for first, they refuse what none could join."""
     try:
         overlapping = overlap_problems(survey, overlap)
+        if survey.boundary is None and survey.cells is None and survey.is_simple:
+            check_outline(survey.rated_ground, survey.map_file.path)
         default = _default(survey, plan)
         found = [
             *place_problems(survey, plan.homes),

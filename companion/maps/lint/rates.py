@@ -13,6 +13,8 @@ from companion.maps.model import MapCells, Problem
 
 # Herbicides in water need some 400 L/ha at most, liquid fertiliser some 1 000.
 RATE_HIGH_L_HA = 2_000.0
+# Even ultra-low-volume spraying puts down more, as a rule 1 to 5 L/ha; NDVI lies below 1.
+RATE_LOW_L_HA = 1.0
 # A map drawn by hand never meets its boundary exactly: this share of the field is let pass.
 SHARE_MIN = 0.002
 AREA_MIN_M2 = 1.0
@@ -48,6 +50,18 @@ def rate_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Probl
                 "dry, but a default rate would fall on the second",
                 where=f"rate 0: {survey.rate_spots(0.0)}",
                 fix="write 0 where nothing may fall, and leave out the zones that mean nothing",
+            )
+        )
+    if 0.0 < most < RATE_LOW_L_HA:
+        problems.append(
+            Problem(
+                severity="warning",
+                code="low-rate",
+                text=f"the largest rate is {most:g} L/ha: values from 0 to 1 look like a "
+                "vegetation index or a share, and not like litres",
+                where=f"{survey.map_file.rate_field}: {survey.rate_spots(most)}",
+                fix="check the rate column (--rate-field) and its unit (--unit); an index has to "
+                "be turned into rates first",
             )
         )
     if not most <= RATE_HIGH_L_HA:

@@ -10,7 +10,7 @@ from shapely import Geometry
 
 from companion.maps.lint.survey import PLACES_MAX, Objects, Survey, area_text, counted, some
 from companion.maps.model import Problem
-from companion.maps.overlaps import PAIRS_MAX, Overlap, overlaps
+from companion.maps.overlaps import OVERLAP_MAX_M2, PAIRS_MAX, Overlap, overlaps
 
 SMALL_M2 = 1.0
 # Mean width of a strip, 2 area / perimeter, that no boom can follow.
@@ -28,7 +28,12 @@ _POLICIES = {
 
 def overlap_problems(survey: Survey, policy: str) -> list[Problem]:
     """Return how much ground zones with a rate share, whose, and what holds there."""
-    rated = np.flatnonzero(survey.rated).tolist() if survey.cells is None else []
+    if survey.cells is not None:
+        return []
+    joined = survey.rated_joined
+    if joined is not None and joined[1] <= OVERLAP_MAX_M2:
+        return []
+    rated = np.flatnonzero(survey.rated).tolist()
     found = overlaps([survey.local[index] for index in rated])
     if not found:
         return []
@@ -40,17 +45,19 @@ def overlap_problems(survey: Survey, policy: str) -> list[Problem]:
         return f"{names}: {overlap.area_m2:.1f} m2 at {survey.spot(shared)}"
 
     total_m2 = sum(overlap.area_m2 for overlap in found)
-    more = "more than " if len(found) > PAIRS_MAX else ""
     pairs = (
         "1 pair of zones overlaps" if len(found) == 1 else f"{len(found)} pairs of zones overlap"
     )
+    extent = f"by {area_text(total_m2)} in all"
+    if len(found) > PAIRS_MAX:
+        pairs = f"at least {pairs}"
+        extent = f"by at least {area_text(total_m2)} (the search ends after {PAIRS_MAX} pairs)"
     then = _POLICIES.get(policy, "no rule is set, and the map is refused")
     return [
         Problem(
             severity="error" if policy == "error" else "warning",
             code="overlap",
-            text=f"{more}{pairs}, by {area_text(total_m2)} in all; "
-            f"prescription.overlap is {policy!r}: {then}",
+            text=f"{pairs}, {extent}; prescription.overlap is {policy!r}: {then}",
             where=some([pair(overlap) for overlap in found[:PLACES_MAX]], len(found)),
             fix="correct the map, or set prescription.overlap to max, min, mean or last",
         )

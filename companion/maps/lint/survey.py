@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Geometry, MultiPolygon, Polygon
 
+from companion.core.dissolve import dissolved, without_overlay
 from companion.maps.build import frame_for
 from companion.maps.cells import cell_areas_m2, cell_size_m, to_degrees
 from companion.maps.local import make_valid, project, project_all
@@ -121,8 +122,25 @@ class Survey:
     @cached_property
     def covered(self) -> Geometry:
         """Return the ground of all zones, those without a rate included."""
-        joined: Geometry = shapely.union_all(self.local)
-        return joined
+        if self.rated.all() and self.rated_joined is not None:
+            return self.rated_joined[0]
+        return dissolved(shapely.get_parts(self.local))
+
+    @cached_property
+    def rated_joined(self) -> tuple[Geometry, float] | None:
+        """Return the ground of all zones with a rate where their edges show that none overlap."""
+        return without_overlay(shapely.get_parts(self.local[self.rated]))
+
+    @cached_property
+    def rated_ground(self) -> Geometry:
+        """Return the ground of all zones with a rate."""
+        if self.rated_joined is not None:
+            return self.rated_joined[0]
+        return (
+            self.covered
+            if self.rated.all()
+            else dissolved(shapely.get_parts(self.local[self.rated]))
+        )
 
     @cached_property
     def bounds_deg(self) -> tuple[float, float, float, float]:
