@@ -21,6 +21,8 @@ NEAR = 24
 # at 15 degrees an arc of 23 m leaves the corner by 0.2 m, and a copter of 2.5 m/s2 flies it at
 # 7.6 m/s.
 JOIN_M, JOIN_DEG = 0.6, 15.0
+# Parts of one line on both sides of ground that is not sprayed, flown on without a turn.
+ACROSS_M, STRAIGHT_M, ONWARD = 60.0, 0.05, 1.0 - 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +73,8 @@ def build_network(
     spared_s = motion.spared_straight_s(length_m[rows >> 1], length_m[columns >> 1])
     between[rows, columns] = between[columns, rows] = -spared_s
     rows, columns = _flown_on(pieces)
+    across = _flown_across(ends, pieces.ends, far_m, near)
+    rows, columns = np.append(rows, across[0]), np.append(columns, across[1])
     along_m = np.hypot(*(ends[rows] - ends[columns]).T)
     onward_s = _onward_s(motion, length_m[rows >> 1], along_m, length_m[columns >> 1])
     between[rows, columns] = between[columns, rows] = onward_s
@@ -108,6 +112,24 @@ def _flown_on(pieces: Pieces) -> tuple[Ints, Ints]:
     """Return pairs of ends at which one piece of a line follows another, a gap between or not."""
     follows = np.flatnonzero(np.diff(pieces.line) == 0)
     return 2 * follows + 1, 2 * follows + 2
+
+
+def _flown_across(ends: Floats, lines: Floats, far_m: Floats, near: Ints) -> tuple[Ints, Ints]:
+    """Return pairs of ends at which a line goes on behind ground that is not sprayed.
+
+    A low tree is a gap in its lines: straight on over it with closed valves, or other lines first.
+    """
+    away = np.repeat(directions(lines), 2, axis=0)
+    away[::2] *= -1.0
+    rows, columns = np.repeat(np.arange(len(far_m)), near.shape[1]), near.ravel()
+    way = ends[columns] - ends[rows]
+    gap_m = np.hypot(*way.T)
+    aside_m = np.abs(way[:, 0] * away[rows, 1] - way[:, 1] * away[rows, 0])
+    across = (gap_m >= JOIN_M) & (gap_m <= ACROSS_M) & (aside_m <= STRAIGHT_M)
+    across &= (way * away[rows]).sum(axis=1) > 0.0
+    across &= -(away[rows] * away[columns]).sum(axis=1) > ONWARD
+    across &= ((rows >> 1) != (columns >> 1)) & (far_m[rows, columns] < gap_m + 1e-6)
+    return rows[across], columns[across]
 
 
 def _know(near: Ints, rows: Ints, columns: Ints) -> None:

@@ -7,12 +7,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import shapely
 
 from missions.budget import Budget, build_budget
 from missions.demand import Demand, Pieces, cut
 from missions.energy import J_WH, KG_L
 from missions.errors import PlanError
-from missions.network import JOIN_DEG, JOIN_M, Network, build_network
+from missions.network import (
+    ACROSS_M,
+    JOIN_DEG,
+    JOIN_M,
+    STRAIGHT_M,
+    Network,
+    build_network,
+)
 from missions.plan import Kind, Leg, Place, Settings, Sortie
 from missions.savings import Sortie as Order
 from missions.savings import by_savings, one_chain
@@ -202,6 +210,8 @@ class _Drawn:
         if is_on and _is_straight(before, after):
             return self._leg("transit", [before.end, after.start], through=True)
         way, leaves = self._ways.between(before.end, after.start)
+        if len(way) == 2 and not leaves and _is_across(before, after):
+            return self._leg("transit", way, through=True)
         return self._leg("ferry" if leaves else "transit", way)
 
     def _leg(
@@ -229,6 +239,18 @@ def _place(point: list[float]) -> Place:
 
 def _far_m(a: Place, b: Place) -> float:
     return float(np.hypot(b[0] - a[0], b[1] - a[1]))
+
+
+def _is_across(first: _Run, second: _Run) -> bool:
+    """Return whether one line goes on in the other, behind ground that is not sprayed."""
+    gap = shapely.LineString([first.start, second.end])
+    ends = shapely.points([first.end, second.start])
+    apart_m = _far_m(first.end, second.start)
+    return (
+        _is_straight(first, second)
+        and apart_m <= ACROSS_M
+        and float(shapely.distance(gap, ends).max()) <= STRAIGHT_M
+    )
 
 
 def _is_straight(first: _Run, second: _Run) -> bool:

@@ -279,3 +279,24 @@ def test_ways_among_many_obstacles_are_the_shortest() -> None:
     far = space.way((-5.0, -5.0), (250.0, 243.0))
     assert space.space.covers(shapely.LineString(far))
     assert shapely.LineString(far).length < 1.05 * math.dist((-5.0, -5.0), (250.0, 243.0))
+
+
+def test_a_low_tree_is_flown_across_without_a_stop_and_a_high_one_around() -> None:
+    tree = to_degrees(box(95.0, 20.0, 105.0, 30.0))
+    ground = to_degrees(box(0.0, 0.0, 200.0, 48.0))
+    low = build_field(ground, no_spray=[tree], swath_width_m=6.0, frame=FRAME)
+    high = build_field(
+        ground, obstacles=[tree], obstacle_buffer_m=0.0, swath_width_m=6.0, frame=FRAME
+    )
+    across, around = (
+        plan_mission(field, SETTINGS, Uniform(rate_l_ha=20.0)) for field in (low, high)
+    )
+    middle = box(96.0, 20.5, 104.0, 29.5)
+    over = [
+        leg for sortie in across.sorties for leg in sortie.legs
+        if middle.intersects(shapely.LineString(leg.points))
+    ]  # fmt: skip
+    assert over
+    assert any(leg.kind == "transit" and leg.through for leg in over)
+    assert all(leg.kind != "spray" for leg in over)
+    assert across.flight_s < around.flight_s
