@@ -1,4 +1,4 @@
-"""The vehicle's motion from its positions: two filters side by side, each as far as it is believed.
+"""The vehicle's motion from its positions: filters side by side, each as far as it is believed.
 
 A multirotor in cruise only shivers in gusts, which is best told from the noise of its velocity by
 a filter that believes in small, short accelerations. One that brakes or follows a swinging speed
@@ -6,38 +6,66 @@ needs the opposite. Neither serves both: the calm filter lags by centimetres whi
 nimble one doses the noise in cruise. So both run, and their share follows how well each foretold
 what came (interacting multiple models, Blom and Bar-Shalom, IEEE Trans. Automatic Control 1988,
 without the mixing of states, which changed nothing).
+
+Both believe the velocity that is told, and follow a place that disagrees with it 0.8 s late. An
+autopilot tells such a place while its estimator draws it after GNSS: PX4 by 0.05 to 0.5 m/s, for
+seconds. So both run a second time, doubting: how far the told velocity is from that of the place
+is a state of theirs (a bias that fades slowly, as of an inertial sensor; Friedland, IEEE Trans.
+Automatic Control 1969), and the place they hear is smooth, as a fused one is. A receiver that is
+noisy, or that wanders from message to message, speaks against them, and nobody doubts.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
+from companion.core.arithmetic import (
+    Matrix,
+    Row,
+    added,
+    exp,
+    identity,
+    inverse,
+    log,
+    product,
+    transposed,
+)
 
 # Noise of what is heard, as assumed: RTK position, fused velocity (accuracy.md section 4).
 POSITION_SD_M = 0.02
 VELOCITY_SD_M_S = 0.03
+# A place as an autopilot's estimator tells it goes on from message to message to within this:
+# rounded to 1e-7 degrees and 1 ms, 1 cm and 5 mm.
+SMOOTH_SD_M = 0.01
+# How far the told velocity is from that of the place where it is doubted, and for how long: PX4's,
+# in simulation, by 0.2 m/s (standard deviation). 0.1 to 0.3 m/s and 10 to 30 s serve alike.
+ASTRAY_SD_M_S = 0.2
+ASTRAY_TIME_S = 30.0
 # A position that disagrees with its prediction by more than this is a jump, not motion.
 JUMP_M = 2.0
 # A vehicle changes between cruise and manoeuvre about this often (2.5 to 50 s serve alike).
 CHANGE_TIME_S = 10.0
+# An estimator that told one motion begins to tell two about this seldom.
+DOUBT_TIME_S = 1000.0
+# One message speaks no louder than this for doubt (a logarithm): of places that scatter, some fall
+# where a doubting filter has them by chance. Against it, it may.
+DOUBT_MAX = 0.5
 # No filter is ever given up: it must come back within a few messages.
 SHARE_MIN = 1e-4
+EVIDENCE_MAX = 50.0
 # The longest time between messages that the filters bridge, and the finest step of their gains.
 BRIDGED_MAX_S = 2.0
 GAIN_STEP_S = 0.005
-# So many rounds stand for thousands of messages.
+# So many rounds stand for thousands of messages; most are there sooner.
 DOUBLINGS = 14
-Matrix = NDArray[np.float64]
+SETTLED = 1e-12
 
 
 def gained_s(dt_s: float, fade_s: float) -> float:
     """Return the velocity gained over `dt_s` by an acceleration of 1 m/s2 that fades."""
-    return fade_s * (1.0 - math.exp(-dt_s / fade_s))
+    return fade_s * (1.0 - exp(-dt_s / fade_s))
 
 
 def carried_s2(dt_s: float, fade_s: float) -> float:
@@ -46,24 +74,40 @@ def carried_s2(dt_s: float, fade_s: float) -> float:
 
 
 class Model(NamedTuple):
-    """An acceleration driven by white noise that fades (Singer, IEEE Trans. AES 1970)."""
+    """An acceleration driven by white noise that fades (Singer, IEEE Trans. AES 1970).
+
+    `astray_m_s` is how far the told velocity may be from that of the place; 0 believes it.
+    """
 
     wander_m_s2_sqrt_s: float
     fade_s: float
+    position_sd_m: float = POSITION_SD_M
+    astray_m_s: float = 0.0
+
+
+class Models(NamedTuple):
+    """A calm and a nimble filter."""
+
+    cruise: Model
+    manoeuvre: Model
 
 
 # Tried on simulated flights: cruise in gusts of 1 m/s at 2 and 5 m/s, a speed that swings by
 # 1 m/s, braking from 6 to 2 m/s; each alone is up to half worse in the other's flights.
 CRUISE = Model(0.4, 0.5)
 MANOEUVRE = Model(1.0, 3.0)
+BELIEVING = Models(CRUISE, MANOEUVRE)
+DOUBTING = Models(*(Model(*one[:2], SMOOTH_SD_M, ASTRAY_SD_M_S) for one in BELIEVING))
 
 
 class Axis(NamedTuple):
-    """One direction of the motion, in one filter."""
+    """One direction of the motion, in one filter; the velocity is that of the place."""
 
     position_m: float
     velocity_m_s: float
     acceleration_m_s2: float
+    # How much more the told velocity is.
+    astray_m_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +118,20 @@ class Belief:
     north: Axis
 
 
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """A calm and a nimble filter, and how far the vehicle is believed to manoeuvre."""
+
+    cruise: Belief
+    manoeuvre: Belief
+    share: float
+
+
 class Gains(NamedTuple):
     """A filter in its steady state: corrections, and how far off a message is expected to be."""
 
-    by_position: tuple[float, float, float]
-    by_velocity: tuple[float, float, float]
+    by_position: Row
+    by_velocity: Row
     # The inverse of the covariance of what is unexpected, and half its logarithm.
     weight: tuple[float, float, float]
     half_log: float
@@ -91,51 +144,101 @@ class Seen(NamedTuple):
     velocity_m_s: float | None
 
 
-@lru_cache(maxsize=512)
+@lru_cache(maxsize=1024)
 def gains(model: Model, steps: int, velocity_known: bool) -> Gains:
     """Return the steady-state Kalman filter of messages every `steps` times `GAIN_STEP_S`."""
     dt_s = steps * GAIN_STEP_S
-    carry = np.array(
-        [
-            [1.0, dt_s, carried_s2(dt_s, model.fade_s)],
-            [0.0, 1.0, gained_s(dt_s, model.fade_s)],
-            [0.0, 0.0, math.exp(-dt_s / model.fade_s)],
-        ]
+    kept = exp(-dt_s / ASTRAY_TIME_S)
+    size = 4 if model.astray_m_s > 0.0 else 3
+    carry = _cut(
+        (
+            (1.0, dt_s, carried_s2(dt_s, model.fade_s), 0.0),
+            (0.0, 1.0, gained_s(dt_s, model.fade_s), 0.0),
+            (0.0, 0.0, exp(-dt_s / model.fade_s), 0.0),
+            (0.0, 0.0, 0.0, kept),
+        ),
+        size,
     )
-    push = np.array([[dt_s**2 / 2], [dt_s], [1.0]])
-    wander = push @ push.T * model.wander_m_s2_sqrt_s**2 * dt_s
-    count = 2 if velocity_known else 1
-    seen = np.eye(3)[:count]
-    noise = np.diag([POSITION_SD_M**2, VELOCITY_SD_M_S**2])[:count, :count]
+    push = (0.5 * dt_s * dt_s, dt_s, 1.0, 0.0)
+    power = model.wander_m_s2_sqrt_s * model.wander_m_s2_sqrt_s * dt_s
+    strays = model.astray_m_s * model.astray_m_s * (1.0 - kept * kept)
+    wander = _cut(
+        tuple(
+            tuple(a * b * power + (strays if i == j == 3 else 0.0) for j, b in enumerate(push))
+            for i, a in enumerate(push)
+        ),
+        size,
+    )
+    seen = _cut(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 1.0)), size)[: 2 if velocity_known else 1]
+    place2, pace2 = model.position_sd_m * model.position_sd_m, VELOCITY_SD_M_S * VELOCITY_SD_M_S
+    noise = ((place2, 0.0), (0.0, pace2)) if velocity_known else ((place2,),)
     spread = _steady(carry, wander, seen, noise)
-    unexpected = seen @ spread @ seen.T + noise
-    gain = spread @ seen.T @ np.linalg.inv(unexpected)
-    inverse, padded = np.zeros((2, 2)), np.zeros((3, 2))
-    inverse[:count, :count] = np.linalg.inv(unexpected)
-    padded[:, :count] = gain
+    across = product(spread, transposed(seen))
+    unexpected = added(product(seen, across), noise)
+    weight = inverse(unexpected)
+    gain = transposed(product(across, weight))
+    none = (0.0,) * (4 - size)
+    if not velocity_known:
+        return Gains(
+            by_position=gain[0] + none,
+            by_velocity=(0.0,) * 4,
+            weight=(weight[0][0], 0.0, 0.0),
+            half_log=0.5 * log(unexpected[0][0]),
+        )
+    (first, both), (_, second) = unexpected
     return Gains(
-        by_position=_three(padded[:, 0]),
-        by_velocity=_three(padded[:, 1]),
-        weight=(float(inverse[0, 0]), float(inverse[0, 1]), float(inverse[1, 1])),
-        half_log=0.5 * math.log(float(np.linalg.det(unexpected))),
+        by_position=gain[0] + none,
+        by_velocity=gain[1] + none,
+        weight=(weight[0][0], weight[0][1], weight[1][1]),
+        half_log=0.5 * log(first * second - both * both),
     )
+
+
+def _cut(matrix: Matrix, size: int) -> Matrix:
+    """Return as many columns, and at most as many rows."""
+    return tuple(row[:size] for row in matrix[:size])
 
 
 def _steady(carry: Matrix, wander: Matrix, seen: Matrix, noise: Matrix) -> Matrix:
     """Return the covariance before a message once many have come: the Riccati equation's solution.
 
     By doubling (Anderson, Int. J. Control 1978): each round stands for twice as many messages as
-    the one before it. A filter for a new interval must not cost the control loop a millisecond.
+    the one before it. A filter for a new interval must not cost the control loop many milliseconds.
     """
-    a, g, spread = carry.T, seen.T @ np.linalg.inv(noise) @ seen, wander
+    a, spread = transposed(carry), wander
+    g = product(product(transposed(seen), inverse(noise)), seen)
+    one = identity(len(a))
     for _ in range(DOUBLINGS):
-        w = np.linalg.inv(np.eye(3) + g @ spread)
-        a, g, spread = a @ w @ a, g + a @ w @ g @ a.T, spread + a.T @ spread @ w @ a
+        w = inverse(added(one, product(g, spread)))
+        wa = product(w, a)
+        back = transposed(a)
+        more = product(back, product(spread, wa))
+        g = added(g, product(product(product(a, w), g), back))
+        a = product(a, wa)
+        spread = added(spread, more)
+        if all(row[i] <= SETTLED * spread[i][i] for i, row in enumerate(more)):
+            break
     return spread
 
 
-def _three(column: Matrix) -> tuple[float, float, float]:
-    return float(column[0]), float(column[1]), float(column[2])
+class Stretch(NamedTuple):
+    """What a time does to a motion; into the past it goes at constant velocity."""
+
+    dt_s: float
+    carried_s2: float
+    gained_s: float
+    kept: float
+    astray_kept: float
+
+
+@lru_cache(maxsize=16)
+def stretch(fade_s: float, dt_s: float) -> Stretch:
+    """Return what `dt_s` does to the motion of a filter; several ask for the same."""
+    if dt_s <= 0.0:
+        return Stretch(dt_s, 0.0, 0.0, 1.0, 1.0)
+    kept = exp(-dt_s / fade_s)
+    gained = fade_s * (1.0 - kept)
+    return Stretch(dt_s, fade_s * (dt_s - gained), gained, kept, exp(-dt_s / ASTRAY_TIME_S))
 
 
 def follow(
@@ -144,66 +247,125 @@ def follow(
     """Return a filter after one message, and how likely it found it (a logarithm); None: a jump."""
     steps = round(min(max(dt_s, GAIN_STEP_S), 0.5) / GAIN_STEP_S)
     by = gains(model, steps, east.velocity_m_s is not None)
-    found_east = _correct(model, by, before.east, dt_s, east)
-    found_north = _correct(model, by, before.north, dt_s, north)
+    over = stretch(model.fade_s, dt_s)
+    found_east = _correct(by, before.east, over, east)
+    found_north = _correct(by, before.north, over, north)
     if found_east is None or found_north is None:
         return None
     likely = found_east[1] + found_north[1]
     return Belief(found_east[0], found_north[0]), likely
 
 
-def _correct(
-    model: Model, by: Gains, axis: Axis, dt_s: float, seen: Seen
-) -> tuple[Axis, float] | None:
-    ahead = carried(model, axis, dt_s)
-    off_m = seen.position_m - ahead.position_m
+def _correct(by: Gains, before: Axis, over: Stretch, seen: Seen) -> tuple[Axis, float] | None:
+    position_m, velocity_m_s, acceleration, astray_m_s = moved(before, over)
+    off_m = seen.position_m - position_m
     if not abs(off_m) <= JUMP_M:
         return None
-    off_m_s = 0.0 if seen.velocity_m_s is None else seen.velocity_m_s - ahead.velocity_m_s
+    off_m_s = 0.0
+    if seen.velocity_m_s is not None:
+        off_m_s = seen.velocity_m_s - velocity_m_s - astray_m_s
     first, both, second = by.weight
     unlikely = first * off_m * off_m + 2.0 * both * off_m * off_m_s + second * off_m_s * off_m_s
     p, v = by.by_position, by.by_velocity
     corrected = Axis(
-        ahead.position_m + p[0] * off_m + v[0] * off_m_s,
-        ahead.velocity_m_s + p[1] * off_m + v[1] * off_m_s,
-        ahead.acceleration_m_s2 + p[2] * off_m + v[2] * off_m_s,
+        position_m + p[0] * off_m + v[0] * off_m_s,
+        velocity_m_s + p[1] * off_m + v[1] * off_m_s,
+        acceleration + p[2] * off_m + v[2] * off_m_s,
+        astray_m_s + p[3] * off_m + v[3] * off_m_s,
     )
     return corrected, -0.5 * unlikely - by.half_log
 
 
-def carried(model: Model, axis: Axis, dt_s: float) -> Axis:
-    """Return one direction `dt_s` later; into the past, at constant velocity."""
-    if dt_s <= 0.0:
-        position_m = axis.position_m + axis.velocity_m_s * dt_s
-        return Axis(position_m, axis.velocity_m_s, axis.acceleration_m_s2)
-    position_m, velocity_m_s, acceleration = axis
-    fade_s = model.fade_s
-    gained = gained_s(dt_s, fade_s)
+def moved(axis: Axis, over: Stretch) -> Axis:
+    """Return one direction after a stretch of time."""
+    position_m, velocity_m_s, acceleration, astray_m_s = axis
     return Axis(
-        position_m + velocity_m_s * dt_s + acceleration * (fade_s * (dt_s - gained)),
-        velocity_m_s + acceleration * gained,
-        acceleration * (1.0 - gained / fade_s),
+        position_m + velocity_m_s * over.dt_s + acceleration * over.carried_s2,
+        velocity_m_s + acceleration * over.gained_s,
+        acceleration * over.kept,
+        astray_m_s * over.astray_kept,
     )
 
 
-def manoeuvre_share(
-    share: float, dt_s: float, cruise_likely: float, manoeuvre_likely: float
-) -> float:
-    """Return how far the vehicle is believed to manoeuvre, after what both filters foretold."""
-    changes = 1.0 - math.exp(-dt_s / CHANGE_TIME_S)
-    prior = share * (1.0 - changes) + (1.0 - share) * changes
-    odds = prior / (1.0 - prior) * math.exp(min(max(manoeuvre_likely - cruise_likely, -50.0), 50.0))
+def follow_pair(
+    models: Models, before: Pair, dt_s: float, east: Seen, north: Seen
+) -> tuple[Pair, float] | None:
+    """Return both filters after one message, and how likely they found it; None: a jump."""
+    cruise = follow(models.cruise, before.cruise, dt_s, east, north)
+    manoeuvre = follow(models.manoeuvre, before.manoeuvre, dt_s, east, north)
+    if cruise is None or manoeuvre is None:
+        return None
+    calm, nimble = cruise[1], manoeuvre[1]
+    prior = foreseen(before.share, dt_s, begins_s=CHANGE_TIME_S)
+    # (1 - prior) e^calm + prior e^nimble = (1 - prior) e^calm (1 + odds)
+    odds = _odds(prior, nimble - calm)
+    likely = calm + log((1.0 - prior) * (1.0 + odds))
+    return Pair(cruise[0], manoeuvre[0], _share(odds)), likely
+
+
+def doubted(share: float, dt_s: float, believing_likely: float, doubting_likely: float) -> float:
+    """Return how far the velocity is doubted, after what both pairs foretold."""
+    prior = foreseen(share, dt_s, begins_s=DOUBT_TIME_S)
+    return judged(prior, min(doubting_likely - believing_likely, DOUBT_MAX))
+
+
+def foreseen(share: float, dt_s: float, *, begins_s: float, ends_s: float = CHANGE_TIME_S) -> float:
+    """Return a share before a message; it comes and goes about once in these times."""
+    return share * ends_s / (ends_s + dt_s) + (1.0 - share) * dt_s / (begins_s + dt_s)
+
+
+def judged(share: float, evidence: float) -> float:
+    """Return a share after a message that says so much for it (a difference of logarithms)."""
+    return _share(_odds(share, evidence))
+
+
+def _odds(share: float, evidence: float) -> float:
+    return share / (1.0 - share) * exp(min(max(evidence, -EVIDENCE_MAX), EVIDENCE_MAX))
+
+
+def _share(odds: float) -> float:
     return min(max(odds / (1.0 + odds), SHARE_MIN), 1.0 - SHARE_MIN)
+
+
+def agreed(believing: Pair, doubting: Pair, doubt_share: float) -> Pair:
+    """Return one pair that is as both are, each as far as it is believed."""
+    nimble, nimble_doubting = (1.0 - doubt_share) * believing.share, doubt_share * doubting.share
+    share = nimble + nimble_doubting
+    calm = (doubt_share - nimble_doubting) / (1.0 - share)
+    return Pair(
+        _mixed_belief(believing.cruise, doubting.cruise, calm),
+        _mixed_belief(believing.manoeuvre, doubting.manoeuvre, nimble_doubting / share),
+        share,
+    )
+
+
+def _mixed_belief(first: Belief, second: Belief, share: float) -> Belief:
+    return Belief(mixed(first.east, second.east, share), mixed(first.north, second.north, share))
+
+
+def carried(model: Model, axis: Axis, dt_s: float) -> Axis:
+    """Return one direction `dt_s` later; into the past, at constant velocity."""
+    return moved(axis, stretch(model.fade_s, dt_s))
 
 
 def mixed(first: Axis, second: Axis, share: float) -> Axis:
     """Return `share` of the second and the rest of the first.
 
     >>> mixed(Axis(0.0, 1.0, 0.0), Axis(0.0, 3.0, 4.0), 0.25)
-    Axis(position_m=0.0, velocity_m_s=1.5, acceleration_m_s2=1.0)
+    Axis(position_m=0.0, velocity_m_s=1.5, acceleration_m_s2=1.0, astray_m_s=0.0)
     """
     return Axis(
         first.position_m + share * (second.position_m - first.position_m),
         first.velocity_m_s + share * (second.velocity_m_s - first.velocity_m_s),
         first.acceleration_m_s2 + share * (second.acceleration_m_s2 - first.acceleration_m_s2),
+        first.astray_m_s + share * (second.astray_m_s - first.astray_m_s),
     )
+
+
+def told(axis: Axis) -> Axis:
+    """Return one direction with the velocity that is told in place of the place's own.
+
+    >>> told(Axis(7.0, 5.0, 0.0, astray_m_s=-0.25))
+    Axis(position_m=7.0, velocity_m_s=4.75, acceleration_m_s2=0.0, astray_m_s=0.0)
+    """
+    return Axis(axis.position_m, axis.velocity_m_s + axis.astray_m_s, axis.acceleration_m_s2, 0.0)

@@ -1,21 +1,28 @@
-"""The vehicle's motion as its positions tell it: both filters of `motion.py`, course and height."""
+"""The vehicle's motion as its positions tell it: the filters of `motion.py`, course and height."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
+from companion.core.arithmetic import exp
 from companion.core.motion import (
+    BELIEVING,
     BRIDGED_MAX_S,
     CRUISE,
+    DOUBTING,
     MANOEUVRE,
+    SHARE_MIN,
     Axis,
     Belief,
+    Pair,
     Seen,
-    carried,
-    follow,
-    manoeuvre_share,
+    agreed,
+    doubted,
+    follow_pair,
     mixed,
+    moved,
+    stretch,
+    told,
 )
 from companion.core.types import Telemetry
 
@@ -26,14 +33,18 @@ CONFIRM_COUNT = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """What both filters make of the positions, true at `time_s` on our clock."""
+    """What the filters make of the positions, true at `time_s` on our clock.
+
+    `agreed` is what all of them say together.
+    """
 
     time_s: float
     boot_s: float
     received_s: float
-    cruise: Belief
-    manoeuvre: Belief
-    manoeuvre_share: float
+    believing: Pair
+    doubting: Pair
+    doubt_share: float
+    agreed: Pair
     heading_deg: float | None
     yaw_rate_deg_s: float
     height_m: float
@@ -41,25 +52,23 @@ class Motion:
     confirm_left: int
 
     def after(self, dt_s: float) -> tuple[Axis, Axis]:
-        """Return the motion to the east and to the north `dt_s` later."""
-        share = self.manoeuvre_share
+        """Return the motion to the east and to the north `dt_s` later: the place as it is told.
+
+        The velocity is the told one too, not that of the place: what draws the place comes and
+        goes within a second, and a dose that follows it half a second late is worse than one that
+        does not.
+        """
+        cruise, manoeuvre, share = self.agreed.cruise, self.agreed.manoeuvre, self.agreed.share
+        calm, nimble = stretch(CRUISE.fade_s, dt_s), stretch(MANOEUVRE.fade_s, dt_s)
         return (
-            mixed(
-                carried(CRUISE, self.cruise.east, dt_s),
-                carried(MANOEUVRE, self.manoeuvre.east, dt_s),
-                share,
-            ),
-            mixed(
-                carried(CRUISE, self.cruise.north, dt_s),
-                carried(MANOEUVRE, self.manoeuvre.north, dt_s),
-                share,
-            ),
+            told(mixed(moved(cruise.east, calm), moved(manoeuvre.east, nimble), share)),
+            told(mixed(moved(cruise.north, calm), moved(manoeuvre.north, nimble), share)),
         )
 
     @property
     def acceleration_fade_s(self) -> float:
         """Return the time constant with which the acceleration is expected to fade."""
-        return CRUISE.fade_s + self.manoeuvre_share * (MANOEUVRE.fade_s - CRUISE.fade_s)
+        return CRUISE.fade_s + self.agreed.share * (MANOEUVRE.fade_s - CRUISE.fade_s)
 
 
 def begun(item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
@@ -69,13 +78,15 @@ def begun(item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
         Axis(place[0], east.velocity_m_s or 0.0, 0.0),
         Axis(place[1], north.velocity_m_s or 0.0, 0.0),
     )
+    pair = Pair(belief, belief, 0.5)
     return Motion(
         time_s=time_s,
         boot_s=item.boot_s,
         received_s=item.received_s,
-        cruise=belief,
-        manoeuvre=belief,
-        manoeuvre_share=0.5,
+        believing=pair,
+        doubting=pair,
+        doubt_share=SHARE_MIN,
+        agreed=pair,
         heading_deg=item.heading_deg,
         yaw_rate_deg_s=0.0,
         height_m=item.relative_altitude_m,
@@ -90,21 +101,29 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
     if not 0.0 < dt_s < BRIDGED_MAX_S:
         return begun(item, place, time_s)
     east, north = _seen(item, place)
-    cruise = follow(CRUISE, before.cruise, dt_s, east, north)
-    manoeuvre = follow(MANOEUVRE, before.manoeuvre, dt_s, east, north)
-    if cruise is None or manoeuvre is None:
+    believing = follow_pair(BELIEVING, before.believing, dt_s, east, north)
+    if believing is None:
         return begun(item, place, time_s)
+    doubting = follow_pair(DOUBTING, before.doubting, dt_s, east, north)
+    known = east.velocity_m_s is not None
+    share = before.doubt_share
+    if doubting is None:
+        # No jump to those that believe: the doubters were led astray, and begin anew.
+        doubting, share = believing, SHARE_MIN
+    elif known:
+        share = doubted(share, dt_s, believing[1], doubting[1])
     return Motion(
         time_s=time_s,
         boot_s=item.boot_s,
         received_s=item.received_s,
-        cruise=cruise[0],
-        manoeuvre=manoeuvre[0],
-        manoeuvre_share=manoeuvre_share(before.manoeuvre_share, dt_s, cruise[1], manoeuvre[1]),
+        believing=believing[0],
+        doubting=doubting[0],
+        doubt_share=share,
+        agreed=agreed(believing[0], doubting[0], share),
         heading_deg=item.heading_deg,
         yaw_rate_deg_s=_yaw_rate(before, item.heading_deg, dt_s),
         height_m=item.relative_altitude_m,
-        velocity_known=east.velocity_m_s is not None,
+        velocity_known=known,
         confirm_left=max(before.confirm_left - 1, 0),
     )
 
@@ -123,5 +142,5 @@ def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:
     if not abs(heading_deg - before.heading_deg) <= 720.0:
         return 0.0  # one of them is no number; the rate would never be one again
     turned_deg = (heading_deg - before.heading_deg + 180.0) % 360.0 - 180.0
-    share = 1.0 - math.exp(-dt_s / YAW_RATE_TIME_S)
+    share = 1.0 - exp(-dt_s / YAW_RATE_TIME_S)
     return before.yaw_rate_deg_s + share * (turned_deg / dt_s - before.yaw_rate_deg_s)

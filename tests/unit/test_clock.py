@@ -57,7 +57,8 @@ def test_a_rate_that_wanders_is_followed() -> None:
     # A simulation that is 1 % slow for twenty seconds, and then in time again.
     slow = tuple((20.0 + i / 50, -0.0002) for i in range(1000))
     times, off = shifts_m(Vehicle(steps=slow))
-    assert np.abs(off).max() <= 0.15
+    # 0.031 s of clock at 5 m/s: a place without noise is followed as it is dated.
+    assert np.abs(off).max() <= 0.16
     assert len(times) > 0.75 * 60.0 * 20.0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from companion.core.estimator import Track, estimate, observe
-from companion.core.motion import CRUISE, MANOEUVRE, Belief, carried
+from companion.core.motion import CRUISE, MANOEUVRE, Belief, Pair, carried
 from companion.core.types import (
     ClockReport,
     EstimatorReport,
@@ -66,14 +66,13 @@ def test_two_predictions_in_a_row_are_one_and_none_is_identity() -> None:
     east, _ = track.motion.after(0.0)
     assert (now.east_m, now.velocity_east_m_s) == (east.position_m, east.velocity_m_s)
     motion = track.motion
-    carried_on = {
-        name: Belief(carried(model, belief.east, 0.2), carried(model, belief.north, 0.2))
-        for name, model, belief in (
-            ("cruise", CRUISE, motion.cruise),
-            ("manoeuvre", MANOEUVRE, motion.manoeuvre),
-        )
-    }
-    moved = replace(track, motion=replace(motion, time_s=at + 0.2, **carried_on))
+    agreed = motion.agreed
+    carried_on = [
+        Belief(carried(model, belief.east, 0.2), carried(model, belief.north, 0.2))
+        for model, belief in ((CRUISE, agreed.cruise), (MANOEUVRE, agreed.manoeuvre))
+    ]
+    later = replace(motion, time_s=at + 0.2, agreed=Pair(*carried_on, agreed.share))
+    moved = replace(track, motion=later)
     once, twice = estimate(track, at + 0.5), estimate(moved, at + 0.5)
     assert once is not None
     assert twice is not None

@@ -1,13 +1,16 @@
-"""The two filters behind the state: each follows its own kind of flight, the share follows both."""
+"""The filters behind the state: each follows its own kind of flight, the shares follow them all."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from companion.core.motion import (
+    CHANGE_TIME_S,
     CRUISE,
     JUMP_M,
     MANOEUVRE,
@@ -15,15 +18,22 @@ from companion.core.motion import (
     Axis,
     Belief,
     Model,
+    Pair,
     Seen,
+    agreed,
     carried,
+    doubted,
     follow,
+    foreseen,
     gains,
-    manoeuvre_share,
+    judged,
     mixed,
 )
+from companion.core.vehicle_motion import Motion, begun, followed
+from tests.builders import position
 
 DT_S = 0.05
+TOLD = position(0.0, 0.0, 0.0)
 STILL = Belief(Axis(0.0, 0.0, 0.0), Axis(0.0, 0.0, 0.0))
 
 
@@ -46,7 +56,7 @@ def flown(speed_m_s: list[float], seed: int = 1) -> tuple[list[float], list[floa
             beliefs[i] = found[0]
             likely.append(found[1])
             errors[i].append(abs(found[0].east.velocity_m_s - speed))
-        share = manoeuvre_share(share, DT_S, *likely)
+        share = judged(foreseen(share, DT_S, begins_s=CHANGE_TIME_S), likely[1] - likely[0])
         shares.append(share)
     return errors[0], errors[1], shares
 
@@ -126,7 +136,7 @@ def test_the_gains_are_those_of_the_variances_that_the_filter_has() -> None:
 
 def test_without_velocities_the_place_alone_corrects() -> None:
     by = gains(CRUISE, 10, False)
-    assert by.by_velocity == (0.0, 0.0, 0.0)
+    assert by.by_velocity == (0.0, 0.0, 0.0, 0.0)
     assert by.weight[1:] == (0.0, 0.0)
     assert by.by_position[0] > gains(CRUISE, 10, True).by_position[0]
 
@@ -159,7 +169,7 @@ def test_no_direction_is_preferred() -> None:
 def test_no_filter_is_ever_given_up(cruise: float, manoeuvre: float) -> None:
     share = 0.5
     for _ in range(100):
-        share = manoeuvre_share(share, DT_S, cruise, manoeuvre)
+        share = judged(foreseen(share, DT_S, begins_s=CHANGE_TIME_S), manoeuvre - cruise)
     assert SHARE_MIN <= share <= 1.0 - SHARE_MIN
     assert (share > 0.5) == (cruise < manoeuvre)
 
@@ -168,3 +178,91 @@ def test_a_mixture_lies_between() -> None:
     first, second = Axis(0.0, 1.0, -1.0), Axis(2.0, 5.0, 3.0)
     assert mixed(first, second, 0.0) == first
     assert mixed(first, second, 1.0) == second
+
+
+# ------------------------------------------------------------- a place that outruns its velocity
+
+
+def led(
+    outrun_m_s: Callable[[float], float], *, position_sd_m: float, walk_m_sqrt_s: float = 0.0
+) -> tuple[float, float, float]:
+    """Fly eastwards at 5 m/s; the place that is told runs ahead of the velocity that is told.
+
+    Returns how far off the told place is 0.2 s ahead, by the believing filters and by all (means
+    of absolute values), and how far the velocity was doubted; the first 10 s apart.
+    """
+    rng = np.random.default_rng(4)
+    lead, wandered_m, place_m = 4, np.zeros(2), 0.0
+    motion: Motion | None = None
+    told, expected, shares = [], [], []
+    for i in range(round(60.0 / DT_S)):
+        now_s = i * DT_S
+        place_m += (5.0 + outrun_m_s(now_s)) * DT_S
+        wandered_m += rng.normal(0.0, walk_m_sqrt_s * math.sqrt(DT_S), 2)
+        told.append(place_m + wandered_m[0])
+        noise_m = rng.normal(0.0, position_sd_m, 2)
+        place = (round(told[-1] + noise_m[0], 2), round(wandered_m[1] + noise_m[1], 2))
+        item = replace(
+            TOLD,
+            boot_s=now_s,
+            velocity_east_m_s=round(5.0 + float(rng.normal(0.0, 0.03)), 2),
+            velocity_north_m_s=round(float(rng.normal(0.0, 0.03)), 2),
+        )
+        if motion is None:
+            motion = begun(item, place, now_s)
+            continue
+        motion = followed(motion, item, place, now_s)
+        both = (motion.believing, motion.agreed)
+        expected.append([ahead_m(pair, lead * DT_S) for pair in both])
+        shares.append(motion.doubt_share)
+    off = np.abs(np.array(expected)[:-lead] - np.array(told)[1 + lead :, None])[200:]
+    return float(off[:, 0].mean()), float(off[:, 1].mean()), float(np.mean(shares[200:]))
+
+
+def ahead_m(pair: Pair, dt_s: float) -> float:
+    """Return the place to the east, so much later."""
+    calm = carried(CRUISE, pair.cruise.east, dt_s)
+    return mixed(calm, carried(MANOEUVRE, pair.manoeuvre.east, dt_s), pair.share).position_m
+
+
+def test_a_smooth_place_that_outruns_its_velocity_is_followed() -> None:
+    """As PX4's beside its own simulation: by 0.2 m/s (standard deviation), in 10 s."""
+    swings = led(lambda at_s: 0.3 * math.sin(2.0 * math.pi * at_s / 10.0), position_sd_m=0.003)
+    stays = led(lambda at_s: 0.2, position_sd_m=0.003)
+    for believing, both, share in (swings, stays):
+        assert believing > 0.08
+        assert both < 0.25 * believing
+        assert share > 0.9
+    assert stays[1] < 0.015
+
+
+@pytest.mark.parametrize(
+    ("position_sd_m", "walk_m_sqrt_s"),
+    [(0.014, 0.0), (0.3, 0.0), (1.0, 0.0), (0.014, 0.08), (0.014, 0.26)],
+)
+def test_places_that_scatter_or_wander_do_not_make_the_velocity_doubted(
+    position_sd_m: float, walk_m_sqrt_s: float
+) -> None:
+    """RTK, a receiver without corrections, and one that wanders by 0.3 and 1 m in 30 s."""
+    believing, both, share = led(
+        lambda at_s: 0.0, position_sd_m=position_sd_m, walk_m_sqrt_s=walk_m_sqrt_s
+    )
+    assert share < 0.05
+    assert both == pytest.approx(believing, rel=0.03)
+
+
+def test_one_message_does_not_make_the_velocity_doubted() -> None:
+    assert doubted(SHARE_MIN, DT_S, -1e9, 0.0) < 3.0 * SHARE_MIN
+    assert doubted(1.0 - SHARE_MIN, DT_S, 0.0, -1e9) == SHARE_MIN
+
+
+def test_what_both_pairs_say_is_as_far_as_each_is_believed() -> None:
+    axes = [Axis(float(n), 10.0 * n, 0.5 * n, 0.1 * n) for n in range(1, 5)]
+    calm, nimble, calm_doubt, nimble_doubt = (Belief(axis, axis) for axis in axes)
+    found = agreed(Pair(calm, nimble, 0.2), Pair(calm_doubt, nimble_doubt, 0.7), 0.4)
+    weights = (0.6 * 0.8, 0.6 * 0.2, 0.4 * 0.3, 0.4 * 0.7)
+    expected = sum(weight * axis.position_m for weight, axis in zip(weights, axes, strict=True))
+    assert mixed(found.cruise.east, found.manoeuvre.north, found.share).position_m == (
+        pytest.approx(expected, abs=1e-12)
+    )
+    assert found.share == pytest.approx(weights[1] + weights[3])
