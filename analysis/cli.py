@@ -107,6 +107,8 @@ def _notes(result: ReplayResult) -> list[str]:
         notes.append(f"training: {result.training}")
     if result.first_difference:
         notes.append(f"first difference: {result.first_difference}")
+    if result.differences and result.elsewhere and not result.is_what_if:
+        notes.append(f"flown with {', '.join(result.elsewhere)}: a last bit may differ for that")
     if result.coverage_differs:
         notes.append(f"treated ground: {result.coverage_differs} cells of 0.2 m differ")
     elif result.coverage_differs is None and not result.is_what_if:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,6 +25,7 @@ from companion.core.types import Decision, Input
 from companion.errors import UnreadableError
 from companion.record.codec import FIELD_NAMES, FieldNames, encode
 from companion.record.coverage_table import read_coverage
+from companion.record.new_file import computing
 from companion.record.reader import Entry, JournalContent, opened, read_journal
 
 SAY_EVERY = 5000
@@ -67,6 +68,7 @@ class ReplayResult:
 
     `coverage_differs` is how many cells of treated ground did; None where they are not compared: a
     what-if, or a journal that keeps none. `unread` says in a line each what of it is damaged.
+    `elsewhere` says what flew where that is another computer, Python or version than here.
     """
 
     inputs: int
@@ -82,6 +84,7 @@ class ReplayResult:
     moved_m: Moved | None = None
     coverage_differs: int | None = None
     unread: tuple[str, ...] = ()
+    elsewhere: tuple[str, ...] = ()
 
 
 def replay(
@@ -139,7 +142,16 @@ def replay(
         moved_m=None if what_if is None else what_if.moved_m,
         coverage_differs=apart,
         unread=tuple(unread),
+        elsewhere=tuple(_elsewhere(content.meta)),
     )
+
+
+def _elsewhere(meta: Mapping[str, str]) -> Iterator[str]:
+    """Yield what flew, and what replays in its place."""
+    for name, here in computing().items():
+        flew = meta.get(name)
+        if flew is not None and flew != here:
+            yield f"{name.removeprefix('version_')} {flew} (here {here})"
 
 
 def _content(path: Path) -> JournalContent:

@@ -40,16 +40,20 @@ def about(setup: Setup, started: datetime, started_s: float) -> dict[str, str]:
         "calibration_sha256": calibration_sha256(setup),
         "method": str(setup.method),
         "platform": platform.platform(),
-        "machine": platform.machine(),
-        "python": platform.python_version(),
         "setup": setup_to_json(setup),
     }
+    return about | computing()
+
+
+def computing() -> dict[str, str]:
+    """Return what the last bit of a decision may depend on: processor, Python and libraries."""
+    here = {"machine": platform.machine(), "python": platform.python_version()}
     for name in _LIBRARIES:
         try:
-            about[f"version_{name}"] = version(name)
+            here[f"version_{name}"] = version(name)
         except PackageNotFoundError:
-            about[f"version_{name}"] = "unknown"
-    return about
+            here[f"version_{name}"] = "unknown"
+    return here
 
 
 def new_file(folder: Path, setup: Setup, meta: Mapping[str, str]) -> Path:

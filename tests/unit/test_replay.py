@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import platform
 import random
+import sqlite3
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from numpy._core import _multiarray_umath
 
 from analysis.overrides import override
 from analysis.replay import FlownCore, first_difference, replay
@@ -33,6 +39,8 @@ from companion.record.journal import Journal
 from companion.record.reader import Entry
 from tests.builders import setup
 from tests.unit.journal_edit import edit_rows, with_body
+
+DISABLED = "NPY_DISABLE_CPU_FEATURES"
 
 
 def inputs_of(step_number: int, given: Setup, chance: random.Random) -> Iterator[Input]:
@@ -109,6 +117,40 @@ def test_every_decision_of_a_flight_comes_out_again(flown: tuple[Path, list[Deci
 def test_replay_needs_nothing_but_the_file(copy: Path) -> None:
     assert [file.name for file in copy.parent.iterdir()] == ["flight.gpkg"]
     assert replay(copy).differences == 0
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="kernels of x86")
+@pytest.mark.parametrize("without", ["blas", "numpy"])
+def test_no_decision_depends_on_the_kernels_of_blas_and_numpy(
+    flown: tuple[Path, list[Decision]], without: str
+) -> None:
+    """An older processor, as far as these two choose their code by it, decides the same."""
+    # OpenBLAS and NumPy would take the widest registers that this processor has.
+    features = " ".join(_multiarray_umath.__cpu_dispatch__)
+    older = {"blas": ("OPENBLAS_CORETYPE", "Prescott"), "numpy": (DISABLED, features)}[without]
+    done = subprocess.run(
+        [sys.executable, "-m", "companion", "replay", str(flown[0]), "--json"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, older[0]: older[1]},
+        check=False,
+    )
+    found = json.loads(done.stdout)
+    assert (done.returncode, found["decisions"], found["differences"]) == (0, 200, 0)
+
+
+def test_what_flew_elsewhere_is_said_beside_a_difference(
+    copy: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with sqlite3.connect(copy) as journal:
+        journal.execute("UPDATE meta SET value = 'aarch64' WHERE key = 'machine'")
+    journal.close()
+    assert execute(["replay", str(copy)]) == 0
+    assert "flown with" not in capsys.readouterr().err
+    edit_rows(copy, lambda entries: [one for one in entries if one.kind != "SpeedReport"])
+    assert execute(["replay", str(copy)]) == 1
+    said = capsys.readouterr().err
+    assert f"flown with machine aarch64 (here {platform.machine()}): a last bit may differ" in said
 
 
 # ---------------------------------------------------------------------------------- differences
