@@ -53,10 +53,12 @@ async def test_mission_and_fence_are_on_the_vehicle_as_the_file_has_them(
     assert without_yaw(kept.flight.items[1:]) == without_yaw(items[1:])
     assert math.isnan(kept.flight.items[1].param4)
     assert (done.items, done.firmware, done.attempts) == (len(items) - 1, autopilot, 1)
-    polygons = json.loads(file.read_text())["geoFence"]["polygons"]
+    fence = json.loads(file.read_text())["geoFence"]
     corners = [(5001 if each["inclusion"] else 5002, len(each["polygon"]), *place)
-               for each in polygons for place in each["polygon"]]  # fmt: skip
-    assert {each["inclusion"] for each in polygons} == {True, False}
+               for each in fence["polygons"] for place in each["polygon"]]  # fmt: skip
+    corners += [(5003 if each["inclusion"] else 5004, each["circle"]["radius"],
+                 *each["circle"]["center"]) for each in fence["circles"]]  # fmt: skip
+    assert {corner[0] for corner in corners} == {5001, 5004}
     assert [(i.command, i.param1, i.latitude_deg, i.longitude_deg) for i in kept.fence] == [
         pytest.approx(corner, abs=1e-7) for corner in corners
     ]
@@ -113,7 +115,9 @@ async def test_a_fence_beyond_the_vehicles_room_leaves_its_mission_alone(tmp_pat
         [home[0] + 0.01 * math.cos(corner), home[1] + 0.01 * math.sin(corner)]
         for corner in (math.tau * number / 65 for number in range(65))
     ]
-    content["geoFence"]["polygons"] = [{"inclusion": True, "polygon": ring, "version": 1}]
+    content["geoFence"] |= {
+        "polygons": [{"inclusion": True, "polygon": ring, "version": 1}], "circles": [],
+    }  # fmt: skip
     file.write_text(json.dumps(content))
     async with stub_on_a_port("ardupilot") as (server, url):
         before = server.autopilot.flight.items
