@@ -158,7 +158,7 @@ def sorted_in(order: Order, item: Telemetry) -> tuple[Order, Place]:
             seen_s = order.offset_s + _FOLLOW * min(off_s, _FOLLOW_MAX_S)
         return _followed(order, item, seen_s), Place.NEXT
     late_s = seen_s - order.offset_s
-    if late_s > 0.0:
+    if late_s > 0.0 and item.boot_s != order.boot_s:
         order = replace(order, lateness=order.lateness.seen(late_s))
     waits = item.received_s <= order.received_s + order.lateness.wait_s
     if waits or item.boot_s == order.boot_s:
