@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -78,5 +79,9 @@ async def test_another_reader_finds_the_same_items_fence_and_rally_points(
         assert other.param1 == pytest.approx(mine.param1)
         assert other.autocontinue == 1
         assert math.isnan(other.param4) or other.param4 == pytest.approx(mine.param4)
-    assert {item.command for item in found.geofence_items} == {5001, 5002}
+    fence = json.loads(path.read_text())["geoFence"]
+    kinds = {5001 if each["inclusion"] else 5002 for each in fence["polygons"]}
+    kinds |= {5003 if each["inclusion"] else 5004 for each in fence["circles"]}
+    assert len(kinds) == 2  # where to be, and the mast
+    assert {item.command for item in found.geofence_items} == kinds
     assert [(item.command, item.x) for item in found.rally_items] == [(5100, 480_000_000)]
