@@ -1,8 +1,9 @@
 """The fence of a sortie: where it must stay, off which obstacles, in the room an autopilot has.
 
 Autopilots store few corners. The border is drawn with the fewest that keep it near the field, and
-obstacles as circles where they are round. What cannot hold the whole way is no fence: the plan is
-refused. Obstacles for which there is no room are left out, the smallest first, and counted.
+round obstacles as circles where there is no room for all. What cannot hold the whole way is no
+fence: the plan is refused. Obstacles for which there is no room are left out, the smallest first,
+and counted.
 """
 
 from __future__ import annotations
@@ -126,7 +127,11 @@ class Fences:
         if left < 0:
             return None
         polygons, circles = [], []
-        for polygon, circle in self.obstacles:
+        near = [part for part, _ in self.obstacles if border.intersects(part)]
+        have_room = sum(_polygon_bytes(part) for part in near) <= left
+        # A circle lies within its obstacle: it stands for one only where not all have room.
+        for polygon, round_one in self.obstacles:
+            circle = None if have_room else round_one
             taken = _polygon_bytes(polygon) if circle is None else CIRCLE_BYTES
             if not border.intersects(polygon):
                 continue
@@ -137,10 +142,9 @@ class Fences:
                 polygons.append(polygon)
             else:
                 circles.append(circle)
-        inside = sum(border.intersects(polygon) for polygon, _ in self.obstacles)
         return Fence(
             border=border, polygons=tuple(polygons), circles=tuple(circles),
-            left_out=inside - len(polygons) - len(circles), outside_m=outside_m,
+            left_out=len(near) - len(polygons) - len(circles), outside_m=outside_m,
         )  # fmt: skip
 
     def _refusal(

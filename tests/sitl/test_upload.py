@@ -58,7 +58,7 @@ async def test_mission_and_fence_are_on_the_vehicle_as_the_file_has_them(
                for each in fence["polygons"] for place in each["polygon"]]  # fmt: skip
     corners += [(5003 if each["inclusion"] else 5004, each["circle"]["radius"],
                  *each["circle"]["center"]) for each in fence["circles"]]  # fmt: skip
-    assert {corner[0] for corner in corners} == {5001, 5004}
+    assert {corner[0] for corner in corners} == {5001, 5002}
     assert [(i.command, i.param1, i.latitude_deg, i.longitude_deg) for i in kept.fence] == [
         pytest.approx(corner, abs=1e-7) for corner in corners
     ]
