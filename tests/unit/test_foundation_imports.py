@@ -22,7 +22,7 @@ ALLOWED = {
 }
 CORE_ALLOWED = {
     "numpy": None,
-    "shapely": {"prescription.py", "cells.py"},
+    "shapely": {"prescription.py", "cells.py", "dissolve.py"},
     "pyproj": {"frame.py"},
 }
 PURE = {

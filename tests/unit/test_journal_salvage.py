@@ -174,7 +174,7 @@ def test_without_the_root_of_its_tree_a_table_is_whole_again(
 def test_pages_that_were_given_up_bring_nothing_back(path: Path, whole: Path) -> None:
     with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("PRAGMA secure_delete = OFF")
-        connection.execute("DELETE FROM valve_changes WHERE id > 40")
+        connection.execute("DELETE FROM valve_changes WHERE id > 20")
     assert int(str(query(path, "PRAGMA freelist_count")[0][0])) > 3
     left = rows_of(path)["valve_changes"]
     spoil(path, (root_of(path, "valve_changes") - 1) * PAGE_BYTES, PAGE_BYTES)
