@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
+import numpy as np
+
 from companion.core.controller import Setup
 from companion.core.detection import Detection, Watching, WatchMemory, follow
 from companion.core.flow_trim import FlowTrim
@@ -121,8 +123,9 @@ def found_over(
 
 def moved_by(fault: LiquidFault, duty: float) -> float:
     """Return by which share of the ordered flow a fault moves the total at a duty."""
-    curve = load_profile(PLANT).nozzle_sets[-1].curve
-    flow, full = curve.flow_for(duty), curve.flow_l_min[-1]
+    measured = load_profile(PLANT).nozzle_sets[-1]
+    flow = float(np.interp(duty, measured.duty, measured.flow_l_min))
+    full = measured.flow_max_l_min
     if fault.kind is LiquidFaultKind.LEAK:
         return fault.share * full / flow
     if fault.kind is LiquidFaultKind.STUCK_OPEN:
