@@ -91,7 +91,8 @@ def unit_of(layer: Layer | Grid, rate: Column | Band, *, given: Given, path: Pat
         raise map_error(
             path,
             f"its unit is {said.name}, but {wanted.name} is asked for",
-            fix="leave out --unit (prescription.unit), or correct the file",
+            fix="leave out --unit (prescription.unit), or correct the file"
+            + (f"; or {layer.instead}" if layer.instead and said.kind != "volume" else ""),
             code="unit-conflict",
         )
     found = wanted or said

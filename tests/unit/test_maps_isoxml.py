@@ -969,6 +969,10 @@ def test_real_herbicide_task_beside_a_repeated_presentation(samples: Path) -> No
     assert "herbicides in L/ha" in str(caught.value)
     assert caught.value.fix.endswith("--layer TSK2")
     assert read_map(folder, layer="TSK2").rates_l_ha == (0.0, 19.0, 20.0, 21.0)
+    with pytest.raises(MapError) as caught:
+        read_map(folder, layer="TSK1", unit="L/ha")
+    assert caught.value.code == "unit-conflict"
+    assert "TSK2 (OneSoil-2024-10-10): herbicides in L/ha" in caught.value.fix
 
 
 def test_real_seeds_are_refused_whatever_is_asked_for(samples: Path) -> None:
