@@ -15,6 +15,7 @@ from companion.cli.map_grid import parse_mark
 from companion.config import load
 from missions.files.fence import fence_warnings
 from missions.files.fleet import write_fleet
+from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
 from missions.files.write import check_suffix
 from missions.picture import check_picture, draw_plan
 from missions.plan import Plan
@@ -98,6 +99,12 @@ def plan(
     png: Annotated[
         Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
     ] = None,
+    pilot_sheet: Annotated[
+        Path | None, typer.Option("--sheet", metavar="FILE", help="To print: .html or .txt.")
+    ] = None,
+    first: Annotated[
+        str | None, typer.Option("--start", metavar="HH:MM", help="First take-off, for --sheet.")
+    ] = None,
     aircraft: Annotated[
         int | None, typer.Option(metavar="N", help="That share the field.", min=1, max=20)
     ] = None,
@@ -120,9 +127,7 @@ def plan(
     A .plan or .waypoints file holds one sortie; the second and later ones are numbered beside it.
     """
     start = perf_counter()
-    check_suffix(out)
-    if png is not None:
-        check_picture(png)
+    _check_outputs(out, png, pilot_sheet, first)
     for name, value in (("--angle-deg", angle_deg), ("--rate-l-ha", rate_l_ha)):
         if value is not None and not (math.isfinite(value) and abs(value) < 1e5):
             raise typer.BadParameter(f"{name} is {value}; write a number")
@@ -159,7 +164,8 @@ def plan(
         "moves": MOVES[effort],
         "aircraft": aircraft,
     }
-    task = read_task(asked, None if config is None else load(config), changes)
+    configured = None if config is None else load(config)
+    task = read_task(asked, configured, changes)
     planned = plan_mission(
         task.field,
         task.settings,
@@ -168,7 +174,7 @@ def plan(
         left=task.left,
         around=task.around,
     )
-    planned = replace(planned, warnings=(*task.said, *planned.warnings))
+    planned = replace(planned, warnings=(*task.said, *planned.warnings), wind=task.wind)
     took_s = perf_counter() - start
     files, marks = write_fleet(planned, out, with_sprayer=sprayer)
     if png is not None:
@@ -176,20 +182,40 @@ def plan(
     if out.suffix.casefold() == ".plan":
         planned = replace(planned, warnings=(*planned.warnings, *fence_warnings(planned)))
     warnings = planned.warnings
-    result = sheet(planned, with_sprayer=sprayer) | {
+    once = isinstance(task.rates, UntreatedRates)
+    result = sheet(planned, with_sprayer=sprayer, once=once) | {
         "planning_s": took_s,
         "files": [str(path) for path in files],
         "lines_file": str(marks[0]) if marks else None,
         "lines_files": [str(path) for path in marks],
     }
+    if pilot_sheet is not None:
+        write_sheet(
+            planned, result, pilot_sheet, title=field.stem, product=product_of(configured),
+            start_min=parse_start(first),
+        )  # fmt: skip
     answer(result, _lines(planned, result, files), as_json=as_json)
-    if isinstance(task.rates, UntreatedRates):
+    if once:
         note(
             "note: fly it with `vrspray run --continue`: its guard closes the valves on treated "
             "ground and on what is covered twice, and the litres count neither"
         )
     for warning in warnings:
         note(f"warning: {warning}")
+
+
+def _check_outputs(
+    out: Path, png: Path | None, pilot_sheet: Path | None, first: str | None
+) -> None:
+    """Refuse files that cannot be written, before any work."""
+    check_suffix(out)
+    if png is not None:
+        check_picture(png)
+    if pilot_sheet is not None:
+        check_sheet(pilot_sheet)
+    elif first is not None:
+        raise typer.BadParameter("--start is for --sheet, whose times it sets")
+    parse_start(first)
 
 
 def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str]:

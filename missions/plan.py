@@ -160,7 +160,10 @@ class Sortie:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """The whole mission; `lines` are all spray lines before they were cut into sorties."""
+    """The whole mission; `lines` are all spray lines before they were cut into sorties.
+
+    `wind` is what it is planned for, in m/s and degrees that it comes from.
+    """
 
     field: Field
     settings: Settings
@@ -172,6 +175,7 @@ class Plan:
     sorties: tuple[Sortie, ...]
     warnings: tuple[str, ...] = ()
     terrain: Terrain | None = None
+    wind: tuple[float, float] | None = None
 
     @property
     def frame(self) -> LocalFrame:

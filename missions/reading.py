@@ -56,6 +56,7 @@ class Task:
     around: Surroundings = NOTHING_AROUND
     left: Remaining | None = None
     said: tuple[str, ...] = ()
+    wind: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +99,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         no_spray=closed,
         obstacle_buffer_m=2.0 if mission is None else mission.obstacle_buffer_m,
         no_spray_buffer_m=no_spray_buffer_m(asked.ground, config),
-        wind=wind_of(asked.ground, config),
+        wind=wind_of(asked.ground, config, has_areas=bool(closed)),
         swath_width_m=settings.swath_width_m,
         frame=frame,
         offset_m=offset_m,
@@ -125,6 +126,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
             asked.pause, mission, frame, width_m=settings.swath_width_m, offset_m=offset_m
         ),
         said=tuple(said),
+        wind=asked.ground.wind or (None if mission is None else mission.wind),
     )
 
 

@@ -80,21 +80,24 @@ def terrain_of(asked: GroundAsked, config: Config | None, frame: LocalFrame) -> 
     )
 
 
-def wind_of(asked: GroundAsked, config: Config | None) -> WindBuffer | None:
-    """Return the wind that widens buffers, if one is given."""
+def wind_of(
+    asked: GroundAsked, config: Config | None, *, has_areas: bool = True
+) -> WindBuffer | None:
+    """Return the wind that widens buffers, if one is given; without areas it widens none."""
     mission = _table(config)
     wind = asked.wind or mission.wind
     if wind is None:
         return None
-    if mission.wind_buffer_m_per_m_s is None:
+    m_per_m_s = mission.wind_buffer_m_per_m_s
+    if m_per_m_s is None and not has_areas:
+        m_per_m_s = 0.0
+    if m_per_m_s is None:
         raise PlanError(
             "with a wind the buffers need mission.wind_buffer_m_per_m_s: the metres that are added "
             "for each m/s towards a no-spray area, from the label or a drift trial"
         )
     try:
-        return WindBuffer(
-            speed_m_s=wind[0], from_deg=wind[1], m_per_m_s=mission.wind_buffer_m_per_m_s
-        )
+        return WindBuffer(speed_m_s=wind[0], from_deg=wind[1], m_per_m_s=m_per_m_s)
     except ValueError as error:
         raise PlanError(f"--wind: {error}; write SPEED,FROM in m/s and degrees") from None
 

@@ -133,7 +133,7 @@ def test_a_wind_that_says_too_little_is_refused(
     config = config_with(tmp_path, keys)
     code, found, err = run(
         capsys, tmp_path / "boundary.geojson", "--config", config, *more,
-        "--out", tmp_path / "m.plan",
+        "--no-spray", tmp_path / "boundary.geojson", "--out", tmp_path / "m.plan",
     )  # fmt: skip
     assert (code, len(err.strip().splitlines())) == (2, 1)
     assert says in found["error"]
