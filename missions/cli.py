@@ -17,6 +17,7 @@ from missions.files.fence import fence_warnings
 from missions.files.fleet import write_fleet
 from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
 from missions.files.write import check_suffix
+from missions.obstacles import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.picture import check_picture, draw_plan
 from missions.plan import Plan
 from missions.planner import plan_mission
@@ -51,6 +52,19 @@ def plan(
     ] = None,
     obstacle: Annotated[
         list[Path] | None, typer.Option(metavar="FILE", help="Not to be flown over; repeat it.")
+    ] = None,
+    obstacle_radius_m: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="Of points without radius_m.", min=0.1, max=RADIUS_MAX_M),
+    ] = None,
+    corridor_m: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M",
+            help="Whole width, of lines without corridor_m.",
+            min=0.1,
+            max=CORRIDOR_MAX_M,
+        ),
     ] = None,
     no_spray: Annotated[
         list[Path] | None, typer.Option(metavar="FILE", help="Not to be sprayed; repeat it.")
@@ -138,6 +152,8 @@ def plan(
         prescription=prescription,
         obstacles=tuple(obstacle or ()),
         no_spray=tuple(no_spray or ()),
+        obstacle_radius_m=obstacle_radius_m,
+        corridor_m=corridor_m,
         ground=GroundAsked(
             terrain=terrain,
             autopilot=autopilot,

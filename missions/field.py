@@ -18,6 +18,7 @@ from companion.maps.local import places as places_of
 from missions.coverage import reachable
 from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
+from missions.obstacles import MITRE_LIMIT, Obstacle
 from missions.strips import Floats
 from missions.wind import WindBuffer
 
@@ -33,8 +34,6 @@ REACHED_MIN, TOLERANCE_LESS, TOLERANCES = 0.9975, 0.3, 3
 EXTENT_MAX_M = 20_000.0
 # 383 ha with a swath of 1 m have so many.
 PASSES_MAX = 1_000
-# Corners sharper than 23 degrees are cut off beyond 5 times the buffer.
-MITRE_LIMIT = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +76,7 @@ def frame_of(boundary: MultiPolygon | Polygon) -> LocalFrame:
 def build_field(
     boundary: Area,
     *,
-    obstacles: Sequence[Area] = (),
+    obstacles: Sequence[Area | Obstacle] = (),
     no_spray: Sequence[Area] = (),
     obstacle_buffer_m: float = 2.0,
     no_spray_buffer_m: float = 0.0,
@@ -108,10 +107,8 @@ def build_field(
         )
     outline = translate(outline, *offset_m)
     holes = [Polygon(ring) for part in polygons_of(outline) for ring in part.interiors]
-    kept = shapely.union_all(
-        [_grown(translate(local_area(area, frame), *offset_m), obstacle_buffer_m)
-         for area in obstacles]
-    )  # fmt: skip
+    given = [each if isinstance(each, Obstacle) else Obstacle(geometry=each) for each in obstacles]
+    kept = shapely.union_all([each.ground(frame, obstacle_buffer_m, offset_m) for each in given])
     blocked = shapely.union_all([*holes, kept])
     flown = outline.difference(kept)
     inside, tolerance_m = _simpler(outline, tolerance_m, swath_width_m)

@@ -23,6 +23,7 @@ from missions.errors import PlanError
 from missions.field import OUTLINE_TOLERANCE_M, Field, build_field, frame_of
 from missions.map_rates import MapRates
 from missions.nearness import check_near
+from missions.obstacles import Obstacle, read_obstacles
 from missions.plan import Settings
 from missions.reading_fleet import NO_BREAK, BreakAsked, fleet_settings, left_of, untreated
 from missions.reading_ground import (
@@ -67,6 +68,8 @@ class Asked:
     prescription: Path | None = None
     obstacles: tuple[Path, ...] = ()
     no_spray: tuple[Path, ...] = ()
+    obstacle_radius_m: float | None = None
+    corridor_m: float | None = None
     depots: tuple[tuple[float, float], ...] = ()
     rate_l_ha: float | None = None
     crs: str | None = None
@@ -95,7 +98,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         closed += [near_area(config.resolve(name), frame) for name in table.exclusions]
     ground = build_field(
         boundary,
-        obstacles=[near_area(path, frame) for path in asked.obstacles],
+        obstacles=_obstacles(asked, frame),
         no_spray=closed,
         obstacle_buffer_m=2.0 if mission is None else mission.obstacle_buffer_m,
         no_spray_buffer_m=no_spray_buffer_m(asked.ground, config),
@@ -128,6 +131,17 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         said=tuple(said),
         wind=asked.ground.wind or (None if mission is None else mission.wind),
     )
+
+
+def _obstacles(asked: Asked, frame: LocalFrame) -> list[Obstacle]:
+    """Return the obstacles of all files."""
+    return [
+        obstacle
+        for path in asked.obstacles
+        for obstacle in read_obstacles(
+            path, frame, radius_m=asked.obstacle_radius_m, corridor_m=asked.corridor_m
+        )
+    ]
 
 
 def _check_places(

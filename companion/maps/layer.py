@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
 
 from companion.errors import MapError
 from companion.maps.model import Affine, Problem, map_error
@@ -55,7 +56,8 @@ class Layer:
 
     `crs` None: the file does not say. `unit`: what the file as a whole declares. `boundary`: the
     outline of the field, in longitude and latitude, where the file has one. `instead`: what else
-    of the file could be sprayed, as an advice where this cannot.
+    of the file could be sprayed, as an advice where this cannot. `marks` are the points and lines
+    among the records that are left out, by number: trees and power lines of obstacle files.
     """
 
     format: str
@@ -68,6 +70,7 @@ class Layer:
     instead: str = ""
     skipped: dict[int, str] = field(default_factory=dict)
     problems: tuple[Problem, ...] = ()
+    marks: dict[int, BaseGeometry] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import shapely
+from pyproj import CRS
 from shapely import MultiPolygon
 from shapely.errors import ShapelyError
+from shapely.geometry.base import BaseGeometry
 
 from companion.maps.adapt.geoparquet import read_geoparquet
 from companion.maps.adapt.reader import read_adapt
 from companion.maps.assemble import crs_of, ground_of, map_of, zone_names
 from companion.maps.bundle import Bundle, open_bundle
+from companion.maps.crs import to_longitude_latitude
 from companion.maps.csvfile.reader import read_csv
 from companion.maps.declared import Given
 from companion.maps.geojson.reader import is_geojson, read_geojson
@@ -24,8 +27,8 @@ from companion.maps.geotiff.dji import RX_FOLDER, SHAPE_FOLDER, read_dji
 from companion.maps.geotiff.reader import read_geotiff
 from companion.maps.isoxml.reader import read_isoxml
 from companion.maps.kml.reader import read_kml
-from companion.maps.layer import Grid, Layer
-from companion.maps.local import polygons_of
+from companion.maps.layer import Grid, Layer, Value
+from companion.maps.local import Area, polygons_of
 from companion.maps.model import MapFile, map_error
 from companion.maps.outline import BOUNDARY_NAME
 from companion.maps.shapefile.reader import read_shapefile
@@ -118,16 +121,10 @@ def read_area(
     layer = _read(path, None)
     if layer.boundary is not None:
         return layer.boundary
-    if isinstance(layer, Grid):
-        raise map_error(
-            path,
-            "rows and columns of cells are no outline",
-            fix="give the boundary or the exclusion as polygons",
-            code="no-polygon",
-        )
+    layer = _no_grid(layer, path)
     used_crs, _ = crs_of(layer, path, crs)
     names = zone_names(layer)
-    ground, repaired = ground_of(layer, used_crs, names, path)
+    ground = _strict_ground(layer, used_crs, names, path, repairs)
     if layer.skipped:
         index, reason = next(iter(layer.skipped.items()))
         raise map_error(
@@ -136,6 +133,79 @@ def read_area(
             fix="draw it as a polygon",
             code="no-polygon",
         )
+    try:
+        united = shapely.union_all(np.array(ground, dtype=object))
+    except ShapelyError as error:
+        raise map_error(
+            path, f"its polygons do not unite ({error})", fix="repair them", code="broken-geometry"
+        ) from None
+    return MultiPolygon(polygons_of(united))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """One record of a file, an area, points or lines in longitude and latitude."""
+
+    name: str
+    geometry: BaseGeometry
+    values: Mapping[str, Value]
+
+
+def read_records(path: Path) -> list[Record]:
+    """Return areas, points and lines of a file with their attributes, as obstacles are given.
+
+    As strict as `read_area`: what is none of these could be what stands in the way.
+    """
+    path = Path(path)
+    layer = _read(path, None)
+    if layer.boundary is not None:
+        return [Record(name=BOUNDARY_NAME, geometry=layer.boundary, values={})]
+    layer = _no_grid(layer, path)
+    used_crs, _ = crs_of(layer, path, None)
+    names = zone_names(layer)
+    marks = dict(layer.marks)
+    for index, reason in layer.skipped.items():
+        if index not in marks:
+            raise map_error(
+                path,
+                f"record {names[index]} is no area, point or line: {reason}",
+                fix="draw it anew, or delete the record",
+                code="no-polygon",
+            )
+    found: dict[int, BaseGeometry] = {}
+    if len(marks) < len(layer.geometries):
+        ground = _strict_ground(layer, used_crs, names, path, None)
+        found = {index: area for index, area in enumerate(ground) if area is not None}
+    if marks:
+        native = np.array(list(marks.values()), dtype=object)
+        places = to_longitude_latitude(native, used_crs, path=path)
+        found |= dict(zip(marks, places.tolist(), strict=True))
+    return [
+        Record(
+            name=names[index],
+            geometry=found[index],
+            values={column.name.casefold(): column.values[index] for column in layer.columns},
+        )
+        for index in sorted(found)
+    ]
+
+
+def _no_grid(layer: Layer | Grid, path: Path) -> Layer:
+    if isinstance(layer, Grid):
+        raise map_error(
+            path,
+            "rows and columns of cells are no outline",
+            fix="give the boundary or the exclusion as polygons",
+            code="no-polygon",
+        )
+    return layer
+
+
+def _strict_ground(
+    layer: Layer, crs: CRS, names: Sequence[str], path: Path, repairs: list[str] | None
+) -> list[Area | None]:
+    """Return every record's ground; refuse repairs that move more than a little of it."""
+    ground, repaired = ground_of(layer, crs, names, path)
     large = [repair for repair in repaired if not repair.change_m2 <= REPAIR_MAX_M2]
     refused = large
     if repairs is not None:
@@ -148,13 +218,7 @@ def read_area(
             fix="repair it where it is made: corners in order, holes inside",
             code="invalid-ring",
         )
-    try:
-        united = shapely.union_all(np.array(ground, dtype=object))
-    except ShapelyError as error:
-        raise map_error(
-            path, f"its polygons do not unite ({error})", fix="repair them", code="broken-geometry"
-        ) from None
-    return MultiPolygon(polygons_of(united))
+    return ground
 
 
 def _read(

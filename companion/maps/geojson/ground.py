@@ -6,8 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from shapely import Polygon
+from shapely import MultiLineString, MultiPoint, Polygon
 from shapely.errors import ShapelyError
+from shapely.geometry.base import BaseGeometry
 
 from companion.maps.layer import check_coordinates
 
@@ -37,6 +38,35 @@ def polygons_in(geometry: object, *, depth: int = 0) -> Iterator[Polygon]:
     elif kind == "GeometryCollection":
         for part in geometry["geometries"]:
             yield from polygons_in(part, depth=depth + 1)
+
+
+def mark_in(geometry: object) -> BaseGeometry | None:
+    """Return the points or lines of a geometry; None where it is neither, or broken."""
+    if not isinstance(geometry, dict):
+        return None
+    try:
+        content = geometry["coordinates"]
+        match geometry.get("type"):
+            case "Point":
+                return MultiPoint(_positions([content]))
+            case "MultiPoint":
+                return MultiPoint(_positions(content))
+            case "LineString":
+                return MultiLineString([_positions(content)])
+            case "MultiLineString":
+                return MultiLineString([_positions(line) for line in content])
+    except BROKEN:
+        pass
+    return None
+
+
+def _positions(positions: list[list[float]]) -> NDArray[np.float64]:
+    found = np.array([(x, y) for x, y, *_ in positions])
+    if found.ndim != 2 or found.dtype.kind not in "if":
+        raise ValueError("positions are lists of numbers")
+    coordinates: NDArray[np.float64] = found.astype(np.float64)
+    check_coordinates(coordinates)
+    return coordinates
 
 
 def _polygon(rings: list[list[list[float]]]) -> Iterator[Polygon]:

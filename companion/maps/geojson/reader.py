@@ -13,7 +13,7 @@ from shapely import MultiPolygon
 
 from companion.maps.bundle import Bundle, open_bundle
 from companion.maps.crs import WGS84, crs_name, parse_crs
-from companion.maps.geojson.ground import BROKEN, GEOMETRIES, polygons_in
+from companion.maps.geojson.ground import BROKEN, GEOMETRIES, mark_in, polygons_in
 from companion.maps.layer import (
     Column,
     Layer,
@@ -76,6 +76,11 @@ def _layer(content: bytes, path: Path) -> Layer:
         boundary=_boundary(document, crs, path),
         skipped=skipped,
         problems=problems,
+        marks={
+            index: mark
+            for index in skipped
+            if (mark := mark_in(features[index].get("geometry"))) is not None
+        },
     )
 
 

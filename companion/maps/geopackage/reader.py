@@ -10,6 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from shapely.geometry.base import BaseGeometry
+
 from companion.maps.attributes import column_of, stated_unit
 from companion.maps.bundle import open_bundle
 from companion.maps.geopackage.geopackage_crs import UNDEFINED_SRS, layer_crs
@@ -40,6 +42,7 @@ class _Content:
     columns: tuple[Column, ...]
     polygons: list[list[Rings]] = field(default_factory=list)
     skipped: dict[int, str] = field(default_factory=dict)
+    marks: dict[int, BaseGeometry] = field(default_factory=dict)
 
     @property
     def areas(self) -> list[Area | None]:
@@ -71,6 +74,7 @@ def read_geopackage(path: Path, layer: str | None = None) -> Layer:
         sha256=digest([content]),
         boundary=boundary,
         skipped=records.skipped,
+        marks=records.marks,
     )
 
 
@@ -113,6 +117,8 @@ def _content(database: Database, table: LayerTable) -> _Content:
         if reason:
             content.skipped[index] = reason
         if found is not None:
+            if found.mark is not None:
+                content.marks[index] = found.mark
             vertices += found.vertex_count
             check_counts(database.path, records=index, vertices=vertices)
         for column, cell, (_, kind, _) in zip(values, cells, table.columns, strict=True):

@@ -16,6 +16,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from shapely import GeometryType
+from shapely.errors import ShapelyError
+from shapely.geometry.base import BaseGeometry
 
 from companion.maps.layer import check_coordinates
 from companion.maps.local import Area, as_area
@@ -32,6 +34,7 @@ _NAMES = {
     6: "MultiPolygon", 7: "GeometryCollection", 8: "CircularString", 9: "CompoundCurve",
     10: "CurvePolygon", 11: "MultiCurve", 12: "MultiSurface",
 }  # fmt: skip
+_MARKS = (_POINT, _LINE, 4, 5)
 # What the parts of these have to be.
 _PARTS = {
     _MULTI_POLYGON: (_POLYGON,),
@@ -50,6 +53,7 @@ class Found:
 
     kind: str
     polygons: list[Rings] = field(default_factory=list)
+    mark: BaseGeometry | None = None
 
     @property
     def vertex_count(self) -> int:
@@ -77,7 +81,18 @@ def polygons_in(blob: bytes, start: int = 0) -> Found:
         raise ValueError("it ends too early") from None
     if end != len(blob):
         raise ValueError(f"{len(blob) - end} bytes are left over at its end")
-    return Found(kind=_NAMES[kind], polygons=polygons)
+    mark = _mark(blob[start:]) if kind in _MARKS else None
+    return Found(kind=_NAMES[kind], polygons=polygons, mark=mark)
+
+
+def _mark(blob: bytes) -> BaseGeometry | None:
+    """Return points or lines, whose nesting and lengths were looked at; None for broken ones."""
+    try:
+        found = shapely.force_2d(shapely.from_wkb(blob))
+        check_coordinates(shapely.get_coordinates(found))
+    except (ShapelyError, ValueError):
+        return None
+    return None if found.is_empty else found
 
 
 def areas_of(records: Sequence[Sequence[Rings]]) -> list[Area | None]:

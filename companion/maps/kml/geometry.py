@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from shapely import MultiLineString, MultiPoint
+from shapely.errors import ShapelyError
+from shapely.geometry.base import BaseGeometry
 
 from companion.maps.geopackage.wkb import Floats, Rings
 from companion.maps.layer import MAX_VERTICES, check_coordinates
@@ -22,6 +25,7 @@ class Ground:
 
     polygons: list[Rings]
     reason: str
+    mark: BaseGeometry | None = None
 
 
 def ground_of(placemark: Element) -> Ground:
@@ -46,7 +50,27 @@ def ground_of(placemark: Element) -> Ground:
         reason = "no-area"
     else:
         reason = f"not-a-polygon:{next(iter(kinds))}"
-    return Ground(polygons=polygons, reason=reason)
+    mark = None if polygons else _mark(placemark)
+    return Ground(polygons=polygons, reason=reason, mark=mark)
+
+
+def _mark(placemark: Element) -> BaseGeometry | None:
+    """Return the points or the lines of a placemark; None for neither, both, or broken ones."""
+    found: dict[str, list[Floats]] = {}
+    for geometry in _geometries(placemark):
+        text = " ".join(part.text or "" for part in geometry if local_name(part) == "coordinates")
+        try:
+            found.setdefault(local_name(geometry), []).append(positions(text))
+        except ValueError:
+            return None
+    try:
+        if set(found) == {"Point"}:
+            return MultiPoint(np.vstack(found["Point"]))
+        if set(found) == {"LineString"}:
+            return MultiLineString(found["LineString"])
+    except (ValueError, ShapelyError):
+        pass
+    return None
 
 
 def local_name(element: Element) -> str:

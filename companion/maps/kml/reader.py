@@ -70,6 +70,11 @@ def read_kml(path: Path, layer: str | None = None) -> Layer:
             if grounds[index].reason
         },
         problems=files.problems,
+        marks={
+            position: mark
+            for position, index in enumerate(chosen)
+            if (mark := grounds[index].mark) is not None
+        },
     )
 
 

@@ -12,9 +12,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from pyproj import CRS
+from shapely import MultiLineString, MultiPoint
 from shapely.errors import ShapelyError
+from shapely.geometry.base import BaseGeometry
 
 from companion.maps.crs import parse_crs
 from companion.maps.layer import MAX_RECORDS, Layer, check_coordinates, check_counts
@@ -35,6 +38,7 @@ _KINDS = {0: "null-geometry"} | {
         (31, "MultiPatch"),
     )
 }  # fmt: skip
+_POINTS, _MULTI_POINTS, _LINES = (1, 11, 21), (8, 18, 28), (3, 13, 23)
 _HEADER_BYTES = 100
 _MAGIC = 9994
 # Of a polygon: type, bounds, the number of rings and of points; then the rings' first points.
@@ -50,10 +54,10 @@ def read_shapefile(path: Path, layer: str | None = None) -> Layer:
     files = find_shapefile(path, layer)
     offsets, problems = _index(files)
     shapes = list(_shapes(files, offsets))
-    geometries = _grounds([rings for rings, _ in shapes], files.main)
+    geometries = _grounds([rings for rings, _, _ in shapes], files.main)
     skipped = {
         index: reason or "no-area"
-        for index, ((_, reason), area) in enumerate(zip(shapes, geometries, strict=True))
+        for index, ((_, reason, _), area) in enumerate(zip(shapes, geometries, strict=True))
         if area is None
     }
     columns, encoding = read_columns(
@@ -70,6 +74,7 @@ def read_shapefile(path: Path, layer: str | None = None) -> Layer:
         sha256=files.sha256,
         skipped=skipped,
         problems=(*problems, *encoding),
+        marks={index: mark for index, (_, _, mark) in enumerate(shapes) if mark is not None},
     )
 
 
@@ -81,8 +86,10 @@ def _crs(files: ShapeFiles) -> CRS | None:
     return parse_crs(text, path=files.main.with_suffix(".prj"), source="its text")
 
 
-def _shapes(files: ShapeFiles, offsets: Iterable[int]) -> Iterator[tuple[list[Ring], str]]:
-    """Yield every record's rings, or none and why, in the order of the table."""
+def _shapes(
+    files: ShapeFiles, offsets: Iterable[int]
+) -> Iterator[tuple[list[Ring], str, BaseGeometry | None]]:
+    """Yield every record's rings, or none and why, in the order of the table; and its marks."""
     shp = files.content[".shp"]
     vertices = 0
     for number, offset in enumerate(offsets, start=1):
@@ -92,6 +99,7 @@ def _shapes(files: ShapeFiles, offsets: Iterable[int]) -> Iterator[tuple[list[Ri
             vertices += len(points)
             check_counts(files.main, records=number, vertices=vertices)
             check_coordinates(points)
+            mark = _mark(record) if reason.startswith("not-a-polygon") else None
         except ValueError as error:
             raise map_error(
                 files.main,
@@ -99,7 +107,33 @@ def _shapes(files: ShapeFiles, offsets: Iterable[int]) -> Iterator[tuple[list[Ri
                 fix=_EXPORT_AGAIN,
                 code="truncated" if isinstance(error, _CutOffError) else "broken-geometry",
             ) from None
-        yield ([points] if len(firsts) == 1 else np.split(points, firsts[1:])), reason
+        yield ([points] if len(firsts) == 1 else np.split(points, firsts[1:])), reason, mark
+
+
+def _mark(record: memoryview) -> BaseGeometry | None:
+    """Return the points or lines of a record, None where it is neither or broken."""
+    kind = int.from_bytes(record[:4], "little")
+    try:
+        if kind in _POINTS:
+            return shapely.Point(_checked(np.frombuffer(record, "<f8", 2, 4))[0])
+        if kind in _MULTI_POINTS:
+            count = struct.unpack_from("<i", record, 36)[0]
+            return MultiPoint(_checked(np.frombuffer(record, "<f8", 2 * count, 40)))
+        if kind in _LINES:
+            points, firsts, _ = _parts(record)
+            lines = np.split(_checked(points), firsts[1:])
+            return MultiLineString(lines)
+    except (ValueError, struct.error, ShapelyError):
+        pass
+    return None
+
+
+def _checked(numbers: NDArray[np.float64]) -> Ring:
+    points = numbers.reshape(-1, 2)
+    if not len(points):
+        raise ValueError("there are no points")
+    check_coordinates(points)
+    return points
 
 
 def _grounds(records: list[list[Ring]], main: Path) -> list[Area | None]:
@@ -125,6 +159,14 @@ def _rings(record: memoryview) -> tuple[Ring, NDArray[np.int32], str]:
         if kind not in _KINDS:
             raise ValueError(f"there is no shape of type {kind}")
         return _NO_POINTS, _NO_RINGS, _KINDS[kind]
+    return _parts(record)
+
+
+def _parts(record: memoryview) -> tuple[Ring, NDArray[np.int32], str]:
+    """Return the points of all parts and where each begins: polygons and lines are laid out alike.
+
+    Raises `ValueError` where they do not fit into the record.
+    """
     if len(record) < _POLYGON_BYTES:
         raise _CutOffError(f"it has {len(record)} bytes")
     parts, points = struct.unpack_from("<2i", record, 36)
