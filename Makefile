@@ -65,8 +65,8 @@ imports: $(INSTALLED)
 bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 	$(BIN)/python -m tests.bench $(SEED)
 
-bench-missions: $(INSTALLED) ## plans for real and recorded fields, judged apart (VRSPRAY_SAMPLES; ARGS="--only trees")
-	$(BIN)/python -m tests.bench.real_fields $(if $(SEED),--seed $(SEED)) $(ARGS)
+bench-missions: $(INSTALLED) ## plans for 221 outlines, judged apart, beside peers' (ARGS="--count 30 --fields DIR")
+	$(BIN)/python -m tests.bench.outlines $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 mutants: $(INSTALLED) ## each known way to break the code makes a test fail (ARGS="lease" for some)
 	$(BIN)/python -m tests.mutations $(ARGS)

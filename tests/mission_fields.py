@@ -1,13 +1,9 @@
-"""Fields as they are drawn and recorded: real ones, rectangles with trees, outlines with noise."""
+"""Fields as they are drawn and recorded: rectangles with trees, outlines with noise."""
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import random
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import shapely
@@ -27,23 +23,6 @@ def degrees(area: BaseGeometry) -> BaseGeometry:
     return shapely.transform(
         area, lambda points: points / scale + np.array([LONGITUDE_DEG, LATITUDE_DEG])
     )
-
-
-def real_fields(width_m: float = 6.0) -> Iterator[tuple[str, Drawn]]:
-    """Yield the real outlines of VRSPRAY_SAMPLES, the smallest first."""
-    folder = os.environ.get("VRSPRAY_SAMPLES")
-    if not folder:
-        return
-    paths = sorted(Path(folder).glob("fields/*.geojson"), key=lambda path: path.stat().st_size)
-    for path in paths:
-        yield path.stem, Drawn(outline=_read(path), width_m=width_m)
-
-
-def _read(path: Path) -> BaseGeometry:
-    content = json.loads(path.read_text(encoding="utf-8"))
-    features = content.get("features", [content])
-    shapes = [shapely.from_geojson(json.dumps(each["geometry"])) for each in features]
-    return shapely.union_all([shapely.make_valid(each) for each in shapes])
 
 
 def trees(count: int, *, corners: int, area_ha: float, seed: int = 1) -> Drawn:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -85,14 +86,37 @@ class Drawn:
             shapely.union_all([self.plane.area(each) for each in self.no_spray])
         )
 
+    @cached_property
+    def ground(self) -> BaseGeometry:
+        """Return what may be sprayed, once."""
+        return self.sprayed()
 
-def judge(drawn: Drawn, plan: dict[str, Any], *, speed_m_s: float, a_m_s2: float) -> dict[str, Any]:
-    """Return the figures of a plan as GeoJSON."""
-    legs = [
+    @cached_property
+    def reachable(self) -> BaseGeometry:
+        """Return what of it a disc as wide as a swath reaches."""
+        half_m = self.width_m / 2.0
+        return self.ground.buffer(-half_m, quad_segs=32).buffer(half_m, quad_segs=32)
+
+
+Legs = Sequence[tuple[str, Floats]]
+
+
+def legs_of(drawn: Drawn, plan: dict[str, Any]) -> Legs:
+    """Return kind and places of the legs of a plan as GeoJSON, in metres."""
+    return [
         (each["properties"]["kind"], drawn.plane.metres(np.array(each["geometry"]["coordinates"])))
         for each in plan["features"]
         if each["geometry"]["type"] == "LineString"
     ]
+
+
+def judge(drawn: Drawn, plan: dict[str, Any], *, speed_m_s: float, a_m_s2: float) -> dict[str, Any]:
+    """Return the figures of a plan as GeoJSON."""
+    return judge_legs(drawn, legs_of(drawn, plan), speed_m_s=speed_m_s, a_m_s2=a_m_s2)
+
+
+def judge_legs(drawn: Drawn, legs: Legs, *, speed_m_s: float, a_m_s2: float) -> dict[str, Any]:
+    """Return the figures of legs of kind `spray` and `transit`; others are not looked at."""
     strips, lengths_m = [], []
     for kind, points in legs:
         if kind == "spray":
@@ -100,8 +124,7 @@ def judge(drawn: Drawn, plan: dict[str, Any], *, speed_m_s: float, a_m_s2: float
                 strips.append(_strip(a, b, drawn.width_m))
                 lengths_m.append(float(np.hypot(*(b - a))))
     covered = shapely.union_all(strips)
-    ground, half_m = drawn.sprayed(), drawn.width_m / 2.0
-    reachable = ground.buffer(-half_m, quad_segs=32).buffer(half_m, quad_segs=32)
+    ground, reachable = drawn.ground, drawn.reachable
     reached = covered.intersection(reachable).area
     off = covered.difference(ground.buffer(STRAIGHT_M))
     ways = [shapely.LineString(points[:, :2]) for kind, points in legs if kind == "transit"]
@@ -115,6 +138,7 @@ def judge(drawn: Drawn, plan: dict[str, Any], *, speed_m_s: float, a_m_s2: float
         "spray_km": float(total_m.sum()) / 1e3,
         "covered_percent": 100.0 * covered.intersection(ground).area / ground.area,
         "reachable_percent": 100.0 * reached / reachable.area,
+        "missed_m2": reachable.area - reached,
         "twice_percent": 100.0 * (float(total_m.sum()) * drawn.width_m - covered.area)
         / ground.area,
         "off_m2": off.area if off.area > DIGITS_M else 0.0,

@@ -35,6 +35,7 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.strips import Floats, lengths_m, rectangles
 from missions.turns import Motion
+from tests.bench.peers import grid_lines, longest_edge_deg, nearest_order
 
 WIDTH_M, SPEED_M_S, RATE_L_HA, TANK_L = 7.0, 6.0, 20.0, 40.0
 MOTION = Motion(speed_m_s=SPEED_M_S, acceleration_m_s2=2.5)
@@ -90,62 +91,14 @@ def fields() -> dict[str, Field]:
 # --- what others fly --------------------------------------------------------------------------
 
 
-def grid_lines(
-    ground: Area, angle_deg: float, *, in_pairs: bool, width_m: float = WIDTH_M
-) -> Floats:
-    """Return the lines of a grid, serpentine; in pairs of crossings, or from first to last."""
-    turned = rotate(ground, angle_deg, origin=(0.0, 0.0))  # north is then along the lines
-    west, south, east, north = turned.bounds
-    count = math.ceil((east - west) / width_m)
-    first = (west + east) / 2.0 - (count - 1) * width_m / 2.0
-    rows = []
-    for number in range(count):
-        x = first + number * width_m
-        cut = shapely.LineString([(x, south - 1.0), (x, north + 1.0)]).intersection(turned)
-        spans = sorted(part.bounds[1::2] for part in shapely.get_parts(cut) if part.length > 0.0)
-        if not spans:
-            continue
-        if not in_pairs:
-            spans = [(spans[0][0], max(span[1] for span in spans))]
-        rows += [(x, low, x, high) for low, high in spans]
-    lines = np.array(rows)
-    back = math.radians(angle_deg)
-    turn = np.array([[math.cos(back), -math.sin(back)], [math.sin(back), math.cos(back)]])
-    return np.column_stack([lines[:, :2] @ turn, lines[:, 2:] @ turn])
-
-
-def nearest_order(lines: Floats) -> Floats:
-    """Return the lines in the order of the nearest next end, as Mission Planner flies them."""
-    left = list(range(1, len(lines)))
-    rows = [lines[0]]
-    while left:
-        here = rows[-1][2:]
-        ends = lines[left]
-        to_start = np.hypot(*(ends[:, :2] - here).T)
-        to_end = np.hypot(*(ends[:, 2:] - here).T)
-        best = int(np.argmin(np.minimum(to_start, to_end)))
-        row = ends[best]
-        rows.append(row if to_start[best] <= to_end[best] else row[[2, 3, 0, 1]])
-        left.pop(best)
-    return np.array(rows)
-
-
-def longest_edge_deg(ground: Area) -> float:
-    """Return the course of the longest edge of the outline as it is drawn."""
-    outline = max(polygons_of(ground), key=lambda part: part.area).exterior.simplify(0.5)
-    points = shapely.get_coordinates(outline)
-    step = np.diff(points, axis=0)
-    longest = step[int(np.argmax(np.hypot(*step.T)))]
-    return math.degrees(math.atan2(longest[0], longest[1]))
-
-
 def pattern(field: Field, *, in_pairs: bool) -> dict[str, Any]:
     """Return the figures of a grid along the longest edge; time from first to last line."""
     begun = process_time()
     # Neither knows holes: they are flown over, and sprayed.
     ground = as_area([Polygon(part.exterior) for part in polygons_of(field.outline)])
     assert ground is not None
-    lines = nearest_order(grid_lines(ground, longest_edge_deg(ground), in_pairs=in_pairs))
+    angle_deg = longest_edge_deg(ground)
+    lines = nearest_order(grid_lines(ground, angle_deg, in_pairs=in_pairs, width_m=WIDTH_M))
     took_s = process_time() - begun
     hops = np.hypot(*(lines[1:, :2] - lines[:-1, 2:]).T)
     covered = shapely.union_all(rectangles(lines, WIDTH_M))

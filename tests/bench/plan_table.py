@@ -42,7 +42,8 @@ from missions.turns import Motion
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.vehicle import Vehicle
-from tests.bench.missions import comb, grid_lines, longest_edge_deg, nearest_order, to_degrees
+from tests.bench.missions import comb, to_degrees
+from tests.bench.peers import grid_lines, longest_edge_deg, nearest_order
 from tests.bench.plan_twin import route_of, with_lines
 
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang"
