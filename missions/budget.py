@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from missions.energy import J_WH, KG_L, Battery
-from missions.network import Network
+from missions.network import Network, rows_of
 from missions.strips import Floats
 from missions.turns import Motion
 from missions.verticals import Vertical
@@ -24,8 +25,8 @@ class Budget:
     a refill. `limit_wh` is what a sortie may take.
     """
 
-    between_s: list[list[float]]
-    between_wh: list[list[float]]
+    between_s: list[Sequence[float]]
+    between_wh: list[Sequence[float]]
     piece_s: list[float]
     piece_wh: list[float]
     litres: list[float]
@@ -89,8 +90,8 @@ def build_budget(
     upright_s = vertical.climb_s(height_m) + vertical.return_s(height_m)
     piece_wh = (cruise_s * battery.cruise_w + stops_s * battery.hover_w) / J_WH
     return Budget(
-        between_s=(between_s + nose_s).tolist(),
-        between_wh=between_wh.tolist(),
+        between_s=rows_of(between_s + nose_s),
+        between_wh=rows_of(between_wh),
         piece_s=(cruise_s + stops_s).tolist(),
         piece_wh=piece_wh.tolist(),
         litres=network.litres.tolist(),

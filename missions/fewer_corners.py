@@ -31,8 +31,8 @@ STARTS = (0, 2)
 # Of two borders with as many edges the one that gives less ground away; a corner more is worth
 # as much as the ground along four edges in the middle of the tolerance.
 DEPTH_COST = 0.125
-# So many points ahead are looked at together at first, and then twice as many.
-AHEAD = 8
+# From so many corners at once as many points ahead are looked at, and then twice as many.
+TOGETHER, AHEAD = 64, 8
 # Rounding of angles [rad]: 1e-9 is a micrometre over a kilometre. The caller keeps a margin.
 ROUNDING = 1e-9
 # Where the whole tolerance leads to no border, it is made less, so many times.
@@ -104,8 +104,7 @@ def _ring(points: Floats, tolerance_m: float) -> Floats:
     inwards = _inwards(edges, turn)
     closed = np.vstack([points, points[:1]])
     inwards = np.vstack([inwards, inwards[:1]])
-    tried = [_path(closed, inwards, tolerance_m, depth) for depth in STARTS]
-    return min(tried, key=lambda found: found[0])[1]
+    return _cheapest(closed, inwards, tolerance_m)
 
 
 def _inwards(edges: Floats, turn: Floats) -> Floats:
@@ -121,75 +120,90 @@ def _inwards(edges: Floats, turn: Floats) -> Floats:
     return flat
 
 
-def _path(
-    closed: Floats, inwards: Floats, tolerance_m: float, first_depth: int
-) -> tuple[float, Floats]:
-    """Return the cost and the corners of the cheapest ring that begins at this depth."""
+def _cheapest(closed: Floats, inwards: Floats, tolerance_m: float) -> Floats:
+    """Return the corners of the cheapest ring; where there is none, the corners given."""
     count, depths = len(closed) - 1, len(DEPTHS)
     # The mitre of a sharp corner is cut off: no place is farther from its corner.
     steep = np.maximum(np.hypot(*inwards.T), 1.0)[:, None]
     deep = np.minimum(DEPTHS[None, :], 1.0 / steep) * tolerance_m
     places = closed[:, None, :] + inwards[:, None, :] * deep[:, :, None]
-    cost = np.full((count + 1, depths), np.inf)
-    cost[0, first_depth] = 0.0
-    before = np.full((count + 1, depths), -1, dtype=np.int64)
-    for at in range(count):
-        known = np.flatnonzero(np.isfinite(cost[at]))
-        if not len(known):
-            continue
-        for ends, possible in _seen(closed, places, at, known, tolerance_m):
-            spent = 1.0 + DEPTH_COST * DEPTHS[None, None, :] + cost[at, known][:, None, None]
-            spent = np.where(possible, spent, np.inf)
-            which = np.argmin(spent, axis=0)
-            least = np.take_along_axis(spent, which[None], axis=0)[0]
-            better = least < cost[ends] - 1e-12
-            cost[ends] = np.where(better, least, cost[ends])
-            before[ends] = np.where(better, at * depths + known[which], before[ends])
-    node = count * depths + first_depth
-    if not math.isfinite(cost[count, first_depth]):
-        return math.inf, closed[:-1]
-    chain: list[int] = []
+    # One row for each depth at which the ring may begin.
+    cost = np.full((len(STARTS), count + 1, depths), np.inf)
+    cost[np.arange(len(STARTS)), 0, STARTS] = 0.0
+    before = np.full(cost.shape, -1, dtype=np.int64)
+    edge = 1.0 + DEPTH_COST * DEPTHS
+    for at, possible in _seen(closed, places, tolerance_m):
+        spent = np.where(possible, edge + cost[:, at, :, None, None], np.inf)
+        which, least = spent.argmin(axis=1), spent.min(axis=1)
+        ends = slice(at + 1, at + 1 + possible.shape[1])
+        better = least < cost[:, ends] - 1e-12
+        np.copyto(cost[:, ends], least, where=better)
+        np.copyto(before[:, ends], at * depths + which, where=better)
+    cost_of = cost[np.arange(len(STARTS)), count, STARTS]
+    row = int(np.argmin(cost_of))
+    if not math.isfinite(cost_of[row]):
+        return closed[:-1]
+    node, chain = count * depths + STARTS[row], list[int]()
     while node >= depths or not chain:
-        node = int(before[divmod(node, depths)])
+        node = int(before[row].flat[node])
         chain.append(node)
     found: Floats = places.reshape(-1, 2)[chain[::-1]]
-    return float(cost[count, first_depth]), found
+    return found
 
 
-def _seen(
-    closed: Floats, places: Floats, at: int, known: Ints, tolerance_m: float
-) -> Iterator[tuple[Ints, Bools]]:
-    """Yield runs of corners ahead, and which of their places an edge from here may end at."""
+def _seen(closed: Floats, places: Floats, tolerance_m: float) -> Iterator[tuple[int, Bools]]:
+    """Yield each corner with the places ahead at which an edge from it may end.
+
+    What it may is by the depth of its start, how many corners ahead, and the depth there.
+    """
     count = len(closed) - 1
-    starts = places[at, known]
-    onward = math.atan2(*(closed[at + 1] - closed[at])[::-1])
-    low, high = np.full(len(known), -math.inf), np.full(len(known), math.inf)
-    first, ahead = at + 1, AHEAD
-    while first <= count:
-        ends = np.arange(first, min(first + ahead, count + 1))
-        first, ahead = first + ahead, 2 * ahead
+    for first in range(0, count, TOGETHER):
+        starts = np.arange(first, min(first + TOGETHER, count))
+        chunks: list[list[Bools]] = [[] for _ in starts]
+        for some, possible in _ahead(closed, places, starts, tolerance_m):
+            for at, each in zip((some - first).tolist(), possible, strict=True):
+                chunks[at].append(each)
+        for at, each in zip(starts.tolist(), chunks, strict=True):
+            yield at, np.concatenate(each, axis=1)[:, : count - at]
+
+
+def _ahead(
+    closed: Floats, places: Floats, at: Ints, tolerance_m: float
+) -> Iterator[tuple[Ints, Bools]]:
+    """Yield runs of corners ahead of some that still see any, the nearest first."""
+    count = len(closed) - 1
+    onward = np.arctan2(*(closed[at + 1] - closed[at]).T[::-1])
+    low = np.full((len(at), len(DEPTHS)), -math.inf)
+    high = -low
+    ahead, many = 1, AHEAD
+    while len(at):
+        # Beyond the last corner it is looked at again: nothing comes after it.
+        ends = np.minimum(at[:, None] + np.arange(ahead, ahead + many), count)
+        ahead, many = ahead + many, 2 * many
+        starts = places[at]
         least, most = _sectors(closed[ends], starts, onward, tolerance_m)
-        least = np.maximum(np.maximum.accumulate(least, axis=1), low[:, None])
-        most = np.minimum(np.minimum.accumulate(most, axis=1), high[:, None])
-        course, far_m = _courses(places[ends][None], starts[:, None, None, :], onward)
-        possible = (course >= least[:, :, None] - ROUNDING) & (
-            course <= most[:, :, None] + ROUNDING
+        least = np.maximum(np.maximum.accumulate(least, axis=2), low[:, :, None])
+        most = np.minimum(np.minimum.accumulate(most, axis=2), high[:, :, None])
+        course, far_m = _courses(
+            places[ends][:, None], starts[:, :, None, None], onward[:, None, None, None]
         )
+        possible = (course >= least[..., None] - ROUNDING) & (course <= most[..., None] + ROUNDING)
         possible &= far_m > SAME_M
-        yield ends, possible
-        low, high = least[:, -1], most[:, -1]
-        if not (low <= high).any():
-            return
+        yield at, possible
+        low, high = least[:, :, -1], most[:, :, -1]
+        on = (low <= high).any(axis=1) & (at + ahead <= count)
+        at, onward, low, high = at[on], onward[on], low[on], high[on]
 
 
 def _sectors(
-    points: Floats, starts: Floats, onward: float, tolerance_m: float
+    points: Floats, starts: Floats, onward: Floats, tolerance_m: float
 ) -> tuple[Floats, Floats]:
     """Return the courses that leave each point to the right, by the tolerance at most."""
-    course, far_m = _courses(points[None], starts[:, None, :], onward)
-    is_near = far_m <= tolerance_m
+    course, far_m = _courses(points[:, None], starts[:, :, None], onward[:, None, None])
     wide = np.where(
-        is_near, math.pi, np.arcsin(np.minimum(tolerance_m / np.maximum(far_m, 1e-12), 1.0))
+        far_m <= tolerance_m,
+        math.pi,
+        np.arcsin(np.minimum(tolerance_m / np.maximum(far_m, 1e-12), 1.0)),
     )
     is_same = far_m <= SAME_M
     return (
@@ -198,8 +212,9 @@ def _sectors(
     )
 
 
-def _courses(points: Floats, starts: Floats, onward: float) -> tuple[Floats, Floats]:
+def _courses(points: Floats, starts: Floats, onward: Floats) -> tuple[Floats, Floats]:
     """Return the course to points from starts, from the course onward, and how far they are."""
     way = points - starts
-    course = np.arctan2(way[..., 1], way[..., 0]) - onward
-    return (course + math.pi) % (2.0 * math.pi) - math.pi, np.hypot(way[..., 0], way[..., 1])
+    east_m, north_m = way[..., 0], way[..., 1]
+    course = np.arctan2(north_m, east_m) - onward
+    return (course + math.pi) % (2.0 * math.pi) - math.pi, np.hypot(east_m, north_m)

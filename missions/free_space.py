@@ -24,6 +24,8 @@ TOUCH_M = 1e-6
 CORNERS_MAX, SIMPLER_M = 300, (0.4, 1.6)
 # Free sight is looked for to so many of the nearest corners, and to all where that is no way.
 NEAREST = 40
+# Of two ways of one length the one over fewer stations.
+STATION_M = 1e-9
 # Around one straight line so many corners are looked at, those that lie least aside.
 ASIDE = 60
 
@@ -120,10 +122,14 @@ class FreeSpace:
         reach = self.to_corners_m(ends, nearest=nearest)
         if not reach.size:
             return []
-        total = reach[0][:, None] + self.between_m + reach[1][None, :]
-        first, last = np.unravel_index(int(np.argmin(total)), total.shape)
-        if not math.isfinite(total[first, last]):
+        near, far = (np.flatnonzero(np.isfinite(row)) for row in reach)
+        if not len(near) or not len(far):
             return []
+        total = reach[0][near, None] + self.between_m[np.ix_(near, far)] + reach[1][far]
+        row, column = np.unravel_index(int(np.argmin(total)), total.shape)
+        if not math.isfinite(total[row, column]):
+            return []
+        first, last = near[row], far[column]
         chain = [int(first)]
         while chain[-1] != last:
             chain.append(int(self.next_corner[chain[-1], last]))
@@ -138,15 +144,39 @@ class FreeSpace:
         some = np.union1d(some[aside_m[some] < known_m], chain)
         places = np.concatenate([ends[:1], self.corners[some], ends[1:]])
         rows, columns = np.triu_indices(len(places), 1)
-        far_m = np.full((len(places), len(places)), math.inf)
+        far_m = np.hypot(*(places[:, None] - places[None, :]).transpose(2, 0, 1))
+        # No other can be part of a shorter way.
+        bound_m = np.minimum(
+            far_m[0, rows] + far_m[columns, -1], far_m[0, columns] + far_m[rows, -1]
+        )
+        some = np.flatnonzero(bound_m + far_m[rows, columns] <= known_m + TOUCH_M)
+        rows, columns = rows[some], columns[some]
         seen = self.sees(places[rows], places[columns])
         rows, columns = rows[seen], columns[seen]
-        far_m[rows, columns] = far_m[columns, rows] = np.hypot(*(places[rows] - places[columns]).T)
-        _, following = _shortest(far_m)
-        last, way = len(places) - 1, [0]
-        while way[-1] != last:
-            way.append(int(following[way[-1], last]))
-        return [(float(x), float(y)) for x, y in places[way]]
+        direct = np.full(far_m.shape, math.inf)
+        direct[rows, columns] = direct[columns, rows] = far_m[rows, columns]
+        return [(float(x), float(y)) for x, y in places[_one_way(direct)]]
+
+
+def _one_way(direct: Floats) -> list[int]:
+    """Return the stations of the shortest way from the first to the last (Dijkstra, 1959)."""
+    last = len(direct) - 1
+    before = np.zeros(len(direct), dtype=np.int64)
+    reached, waiting = np.full(len(direct), math.inf), np.zeros(len(direct))
+    reached[0] = 0.0
+    while True:
+        station = int(np.argmin(reached + waiting))
+        if station == last:
+            break
+        waiting[station] = math.inf
+        through = reached[station] + direct[station] + STATION_M
+        better = through < reached
+        reached[better] = through[better]
+        before[better] = station
+    way = [last]
+    while way[-1]:
+        way.append(int(before[way[-1]]))
+    return way[::-1]
 
 
 def free_space(ground: BaseGeometry) -> FreeSpace:
@@ -204,7 +234,7 @@ def _shortest(direct: Floats) -> tuple[Floats, Ints]:
     following = np.tile(np.arange(count), (count, 1))
     through, better = np.empty_like(between), np.empty(between.shape, dtype=np.bool_)
     for station in range(count):
-        np.add.outer(between[:, station], between[station] + 1e-9, out=through)
+        np.add.outer(between[:, station], between[station] + STATION_M, out=through)
         np.less(through, between, out=better)
         np.copyto(between, through, where=better)
         np.copyto(following, following[:, station, None], where=better)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from missions.demand import Pieces
-from missions.free_space import FreeSpace
+from missions.free_space import Bools, FreeSpace
 from missions.strips import Floats, directions, lengths_m
 from missions.turns import Motion
 
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
+# Ends are looked at in groups of so many: what is computed on the way stays small.
+TOGETHER = 256
 # So many pairs are looked at for free sight; where there are more, each end's nearest ones.
 SIGHTS_MAX = 60_000
 NEAR = 24
@@ -43,6 +46,11 @@ class Network:
         """Return the index of the depot in `between_s`."""
         return len(self.between_s) - 1
 
+    @property
+    def rows(self) -> list[Sequence[float]]:
+        """Return the rows of `between_s` to look up one time after the other."""
+        return rows_of(self.between_s)
+
     def put_depot_anywhere(self) -> None:
         """Leave the ways from and to the depot out: it is put where the tour begins and ends."""
         self.between_s[self.depot, :] = self.between_s[:, self.depot] = 0.0
@@ -54,26 +62,21 @@ def build_network(
     """Return the network; of pairs far apart that do not see each other, a lower bound."""
     ends = pieces.ends.reshape(-1, 2)
     count = len(ends)
-    far_m = np.hypot(
-        ends[:, 0][:, None] - ends[:, 0][None, :], ends[:, 1][:, None] - ends[:, 1][None, :]
-    )
-    ranks = far_m.copy()
-    own = np.arange(count)
-    ranks[own, own] = ranks[own, own ^ 1] = np.inf
-    kept = min(NEAR, max(count - 2, 1))
-    near = np.argpartition(ranks, kept - 1, axis=1)[:, :kept] if count > 2 else own[:, None] ^ 1
-    order = np.argsort(np.take_along_axis(ranks, near, axis=1), axis=1, kind="stable")
-    near = np.take_along_axis(near, order, axis=1)
+    between = np.zeros((count + 1, count + 1))
+    # Distances become times in place: of a thousand lines they fill 32 MB.
+    far_m = between[:count, :count]
+    near = _measured(far_m, ends)
     if not space.is_convex:
         _bend(far_m, ends, near, space)
-    between = np.zeros((count + 1, count + 1))
-    between[:count, :count] = motion.ways_s(far_m)
+    near_m = np.take_along_axis(far_m, near, axis=1)
+    for first in range(0, count, TOGETHER):
+        far_m[first : first + TOGETHER] = motion.ways_s(far_m[first : first + TOGETHER])
     length_m = lengths_m(pieces.ends)
-    rows, columns = _flown_through(pieces.ends, far_m, near)
+    rows, columns = _flown_through(pieces.ends, near_m, near)
     spared_s = motion.spared_straight_s(length_m[rows >> 1], length_m[columns >> 1])
     between[rows, columns] = between[columns, rows] = -spared_s
     rows, columns = _flown_on(pieces)
-    across = _flown_across(ends, pieces.ends, far_m, near)
+    across = _flown_across(ends, pieces.ends, near_m, near)
     rows, columns = np.append(rows, across[0]), np.append(columns, across[1])
     along_m = np.hypot(*(ends[rows] - ends[columns]).T)
     onward_s = _onward_s(motion, length_m[rows >> 1], along_m, length_m[columns >> 1])
@@ -89,13 +92,43 @@ def build_network(
     return Network(between_s=between, home_s=home, near=near, litres=pieces.litres)
 
 
-def _flown_through(lines: Floats, far_m: Floats, near: Ints) -> tuple[Ints, Ints]:
+def rows_of(table: Floats) -> list[Sequence[float]]:
+    """Return the rows of a table whose numbers are looked up one by one.
+
+    Lists of lists would take four times the memory, and longer to look up.
+    """
+    return [memoryview(row) for row in table]
+
+
+def _measured(far_m: Floats, ends: Floats) -> Ints:
+    """Put in the distances between all ends; return the nearest ones of each, nearest first."""
+    count = len(ends)
+    own = np.arange(count)
+    kept = min(NEAR, max(count - 2, 1))
+    near = np.empty((count, kept), dtype=np.int64)
+    for first in range(0, count, TOGETHER):
+        some = own[first : first + TOGETHER]
+        here = far_m[some] = np.hypot(
+            ends[some, 0][:, None] - ends[:, 0][None, :],
+            ends[some, 1][:, None] - ends[:, 1][None, :],
+        )
+        here[some - first, some] = here[some - first, some ^ 1] = np.inf
+        if count <= 2:
+            near[some] = some[:, None] ^ 1
+            continue
+        nearest = np.argpartition(here, kept - 1, axis=1)[:, :kept]
+        order = np.argsort(np.take_along_axis(here, nearest, axis=1), axis=1, kind="stable")
+        near[some] = np.take_along_axis(nearest, order, axis=1)
+    return near
+
+
+def _flown_through(lines: Floats, near_m: Floats, near: Ints) -> tuple[Ints, Ints]:
     """Return pairs of ends at which a line goes on in the next so straight that none stops."""
     away = np.repeat(directions(lines), 2, axis=0)
     away[::2] *= -1.0  # how the line leaves at each of its ends
-    rows, columns = np.repeat(np.arange(len(far_m)), near.shape[1]), near.ravel()
+    rows, columns = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
     straight = -(away[rows] * away[columns]).sum(axis=1)
-    through = (far_m[rows, columns] < JOIN_M) & (straight > math.cos(math.radians(JOIN_DEG)))
+    through = (near_m.ravel() < JOIN_M) & (straight > math.cos(math.radians(JOIN_DEG)))
     through &= (rows >> 1) != (columns >> 1)
     return rows[through], columns[through]
 
@@ -114,21 +147,21 @@ def _flown_on(pieces: Pieces) -> tuple[Ints, Ints]:
     return 2 * follows + 1, 2 * follows + 2
 
 
-def _flown_across(ends: Floats, lines: Floats, far_m: Floats, near: Ints) -> tuple[Ints, Ints]:
+def _flown_across(ends: Floats, lines: Floats, near_m: Floats, near: Ints) -> tuple[Ints, Ints]:
     """Return pairs of ends at which a line goes on behind ground that is not sprayed.
 
     A low tree is a gap in its lines: straight on over it with closed valves, or other lines first.
     """
     away = np.repeat(directions(lines), 2, axis=0)
     away[::2] *= -1.0
-    rows, columns = np.repeat(np.arange(len(far_m)), near.shape[1]), near.ravel()
+    rows, columns = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
     way = ends[columns] - ends[rows]
     gap_m = np.hypot(*way.T)
     aside_m = np.abs(way[:, 0] * away[rows, 1] - way[:, 1] * away[rows, 0])
     across = (gap_m >= JOIN_M) & (gap_m <= ACROSS_M) & (aside_m <= STRAIGHT_M)
     across &= (way * away[rows]).sum(axis=1) > 0.0
     across &= -(away[rows] * away[columns]).sum(axis=1) > ONWARD
-    across &= ((rows >> 1) != (columns >> 1)) & (far_m[rows, columns] < gap_m + 1e-6)
+    across &= ((rows >> 1) != (columns >> 1)) & (near_m.ravel() < gap_m + 1e-6)
     return rows[across], columns[across]
 
 
@@ -146,26 +179,28 @@ def _bend(far_m: Floats, ends: Floats, near: Ints, space: FreeSpace) -> None:
         rows, columns = np.triu_indices(count, 1)
     else:
         rows, columns = np.repeat(np.arange(count), near.shape[1]), near.ravel()
-    hidden = ~space.sees(ends[rows], ends[columns])
+    hidden = ~_see_each_other(ends, rows, columns, space)
     rows, columns = rows[hidden], columns[hidden]
     if not len(rows) or not len(space.corners):
         return
     to_corners = space.to_corners_m(ends)
-    seen = [np.flatnonzero(np.isfinite(row)) for row in to_corners]
-    bent = np.array(
-        [
-            np.min(
-                to_corners[a, seen[a], None]
-                + space.between_m[np.ix_(seen[a], seen[b])]
-                + to_corners[b, seen[b]],
-                initial=np.inf,
-            )
-            for a, b in zip(rows.tolist(), columns.tolist(), strict=True)
-        ]
-    )
+    bent = np.empty(len(rows))
+    ordered = np.argsort(rows, kind="stable")
+    for group in np.split(ordered, np.flatnonzero(np.diff(rows[ordered])) + 1):
+        reach = to_corners[rows[group[0]]]
+        seen = np.flatnonzero(np.isfinite(reach))
+        over = np.min(reach[seen, None] + space.between_m[seen], axis=0, initial=np.inf)
+        bent[group] = np.min(over + to_corners[columns[group]], axis=1)
     # No way through: far apart for the search, whatever the ferry around will cost.
     bent = np.where(np.isfinite(bent), bent, 3.0 * far_m[rows, columns] + 1000.0)
     far_m[rows, columns] = far_m[columns, rows] = bent
+
+
+def _see_each_other(ends: Floats, rows: Ints, columns: Ints, space: FreeSpace) -> Bools:
+    """Return, for each pair, whether the way between is free; pairs may come both ways round."""
+    low, high = np.minimum(rows, columns), np.maximum(rows, columns)
+    pairs, which = np.unique(low * len(ends) + high, return_inverse=True)
+    return space.sees(ends[pairs // len(ends)], ends[pairs % len(ends)])[which]
 
 
 def _bend_home(home_m: Floats, depots: Floats, ends: Floats, space: FreeSpace) -> None:

@@ -111,27 +111,25 @@ def needed_passes(
     while waiting and left_m2 > allowed_m2:
         _, at = heapq.heappop(waiting)
         own = missing[over[at]]
-        gain = float(shapely.area(shapely.intersection(own, strips[at])).sum())
+        common = shapely.intersection(own, strips[at])
+        gain = float(shapely.area(common).sum())
         if waiting and gain < -waiting[0][0] - LEAST_M2:
             if gain > LEAST_M2:
                 heapq.heappush(waiting, (-gain, at))
             continue
         if gain <= LEAST_M2:
             break
-        new = _trimmed(passes[at], shapely.union_all(own), width_m)
+        new = _trimmed(passes[at], shapely.get_coordinates(common))
         chosen.append(new)
-        left = shapely.difference(own, united(new, width_m))
+        left = shapely.difference(own, rectangles(new, width_m)[0])
         left_m2 += float(shapely.area(left).sum() - shapely.area(own).sum())
         missing[over[at]] = left
     return joined(chosen)
 
 
-def _trimmed(line: Floats, missing: BaseGeometry, width_m: float) -> Floats:
-    """Return the part of a pass along which something is missing."""
+def _trimmed(line: Floats, points: Floats) -> Floats:
+    """Return the part of a pass along points of what is missing."""
     row = line[None, :]
-    points = shapely.get_coordinates(missing.intersection(rectangles(row, width_m)[0]))
-    if not len(points):
-        return no_lines()
     along = directions(row)[0]
     length_m = float(np.hypot(*(line[2:] - line[:2])))
     where = (points - line[:2]) @ along

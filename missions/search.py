@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from missions.network import Network
@@ -22,7 +23,7 @@ NEAREST = 12
 class _State:
     """The sorties while they are changed; `of` says in which one each piece is."""
 
-    between: list[list[float]]
+    between: list[Sequence[float]]
     near: list[list[int]]
     litres: list[float]
     capacity_l: float
@@ -71,7 +72,7 @@ def improve(
     if moves <= 0 or len(network.litres) < 2:
         return sorties
     state = _State(
-        between=network.between_s.tolist(),
+        between=network.rows,
         near=network.near[:, :NEAREST].tolist(),
         litres=network.litres.tolist(),
         capacity_l=capacity_l,

@@ -13,7 +13,7 @@ from itertools import chain
 
 import numpy as np
 
-from missions.network import Network
+from missions.network import Network, rows_of
 from missions.savings import Sortie
 
 NEAREST = 12
@@ -54,7 +54,7 @@ class Ring:
         both = [*range(depot + 1), depot]
         between = network.between_s[np.ix_(both, both)]
         between[depot:, depot:] = 0.0
-        self._between: list[list[float]] = between.tolist()
+        self._between = rows_of(between)
         near = network.near[:, :NEAREST].tolist()
         home = np.argsort(network.between_s[depot, :depot], kind="stable")[:NEAREST].tolist()
         self._near: list[list[int]] = [*near, home, home]

@@ -41,9 +41,10 @@ class Motion:
         [3.35, 12.4]
         """
         speed, short = self.speed_m_s, _short_legs(self)
-        reached_m = speed * short.reaching_s
-        tabled = np.interp(np.sqrt(np.maximum(length_m, 0.0)), short.root_m, short.seconds)
-        taken: Floats = np.where(length_m < reached_m, tabled, length_m / speed + short.reaching_s)
+        taken: Floats = length_m / speed + short.reaching_s
+        is_short = length_m < speed * short.reaching_s
+        root_m = np.sqrt(np.maximum(length_m[is_short], 0.0))
+        taken[is_short] = np.interp(root_m, short.root_m, short.seconds)
         return taken
 
     def leg_s(self, length_m: float) -> float:
