@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +28,19 @@ DRIVERS = {".geojson": "GeoJSON", ".shp": "ESRI Shapefile", ".kml": "LIBKML", ".
 FIELD = box(0, 0, 160, 200)
 
 
-def by_gdal(
-    path: Path, shapes: list[BaseGeometry], *, driver: str | None = None, **columns: list[Any]
-) -> Path:
+def degrees(shape: Any) -> BaseGeometry:
+    """Return a shape where the fields of these tests are."""
+    found: BaseGeometry = to_degrees(shape)
+    return found
+
+
+def by_gdal(path: Path, shapes: Sequence[BaseGeometry], **columns: list[Any]) -> Path:
     """Write shapes in made-up metres with GDAL's own writer, in longitude and latitude."""
-    driver = driver or DRIVERS[path.suffix]
+    driver = DRIVERS[path.suffix]
     if driver == "LIBKML" and driver not in pyogrio.list_drivers():
         driver = "KML"
     pyogrio.raw.write(
-        path, np.array([shapely.to_wkb(to_degrees(each)) for each in shapes], dtype=object),
+        path, shapely.to_wkb(np.array([degrees(each) for each in shapes])),
         [np.array(values) for values in columns.values()], list(columns), driver=driver,
         geometry_type=shapes[0].geom_type, crs="EPSG:4326",
     )  # fmt: skip
@@ -51,8 +56,8 @@ def planned(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, st
 def ways_m(path: Path) -> BaseGeometry:
     """Return all legs of a plan in the metres that fields are made up in."""
     features = json.loads(path.read_text())["features"]
-    corner = shapely.get_coordinates(to_degrees(Point(0, 0)))[0]
-    one = shapely.get_coordinates(to_degrees(Point(1, 1)))[0] - corner
+    corner = shapely.get_coordinates(degrees(Point(0, 0)))[0]
+    one = shapely.get_coordinates(degrees(Point(1, 1)))[0] - corner
     lines = [
         LineString((np.array(each["geometry"]["coordinates"]) - corner) / one)
         for each in features
