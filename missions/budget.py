@@ -68,6 +68,7 @@ def build_budget(
     pace_s_m: Floats | float,
     vertical: Vertical,
     height_m: float,
+    ferry_height_m: float | None,
     reserve_l: float,
     nose_rate_deg_s: float | None,
     refill_s: float,
@@ -87,7 +88,9 @@ def build_budget(
         nose_s[between_s > 0.0] = NOSE_DEG / nose_rate_deg_s
     other_s = between_s - moving_s + nose_s
     between_wh = (moving_s * battery.cruise_w + other_s * battery.hover_w) / J_WH
-    upright_s = vertical.climb_s(height_m) + vertical.return_s(height_m)
+    upper_m = height_m if ferry_height_m is None else ferry_height_m
+    upright_s = vertical.climb_s(upper_m) + vertical.return_s(upper_m)
+    upright_s += vertical.change_s(upper_m, height_m) + vertical.change_s(height_m, upper_m)
     piece_wh = (cruise_s * battery.cruise_w + stops_s * battery.hover_w) / J_WH
     return Budget(
         between_s=rows_of(between_s + nose_s),

@@ -119,6 +119,9 @@ def plan(
     first: Annotated[
         str | None, typer.Option("--start", metavar="HH:MM", help="First take-off, for --sheet.")
     ] = None,
+    ferry_height_m: Annotated[
+        float | None, typer.Option(metavar="M", help="Of ferries and long transits.")
+    ] = None,
     aircraft: Annotated[
         int | None, typer.Option(metavar="N", help="That share the field.", min=1, max=20)
     ] = None,
@@ -179,6 +182,7 @@ def plan(
         "tank_l": tank_l,
         "moves": MOVES[effort],
         "aircraft": aircraft,
+        "ferry_height_m": ferry_height_m,
     }
     configured = None if config is None else load(config)
     task = read_task(asked, configured, changes)

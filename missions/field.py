@@ -37,6 +37,14 @@ PASSES_MAX = 1_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class High:
+    """Where ferries at their own height may fly: `fly` in the field, and nowhere in `blocked`."""
+
+    fly: Area
+    blocked: BaseGeometry
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Field:
     """`outline` is as given; `fly` lies in it without holes and obstacles; `spray` in `fly`.
 
@@ -44,6 +52,7 @@ class Field:
     corners: `given_up_m2` is left for that, within `tolerance_m` of the outline.
     `blocked` is what may not be flown over, not even on the way to the field. `closes` is the
     ground outside of which the companion closes its valves, where that is another than `limit`.
+    `high` is the same for ferries, which cross low obstacles; None where they cross none.
     """
 
     frame: LocalFrame
@@ -55,6 +64,7 @@ class Field:
     closes: BaseGeometry | None = None
     tolerance_m: float = OUTLINE_TOLERANCE_M
     given_up_m2: float = 0.0
+    high: High | None = None
 
     @property
     def kept_in(self) -> BaseGeometry:
@@ -86,6 +96,7 @@ def build_field(
     offset_m: tuple[float, float] = (0.0, 0.0),
     kept_m: float = 0.0,
     tolerance_m: float = OUTLINE_TOLERANCE_M,
+    ferry_over_m: float | None = None,
 ) -> Field:
     """Return the field of a boundary and what lies in it, all in longitude and latitude.
 
@@ -108,16 +119,22 @@ def build_field(
     outline = translate(outline, *offset_m)
     holes = [Polygon(ring) for part in polygons_of(outline) for ring in part.interiors]
     given = [each if isinstance(each, Obstacle) else Obstacle(geometry=each) for each in obstacles]
-    kept = shapely.union_all([each.ground(frame, obstacle_buffer_m, offset_m) for each in given])
+    grounds = [each.ground(frame, obstacle_buffer_m, offset_m) for each in given]
+    kept = shapely.union_all(grounds)
     blocked = shapely.union_all([*holes, kept])
     flown = outline.difference(kept)
     inside, tolerance_m = _simpler(outline, tolerance_m, swath_width_m)
-    fly = None
+    fly, high = None, None
     if inside is not None:
-        apart = around_with_fewer_corners(
-            _grown(kept, MARGIN_M), max(tolerance_m, OBSTACLE_TOLERANCE_M)
-        )
-        fly = as_area(polygons_of(inside.difference(apart)))
+        fly = _apart(inside, kept, tolerance_m)
+        tall = [
+            ground
+            for ground, each in zip(grounds, given, strict=True)
+            if ferry_over_m is None or each.height_m is None or each.height_m > ferry_over_m
+        ]
+        over = _apart(inside, shapely.union_all(tall), tolerance_m)
+        if len(tall) < len(grounds) and over is not None:
+            high = High(fly=over, blocked=shapely.union_all([*holes, *tall]))
     off = [translate(local_area(area, frame), *offset_m) for area in no_spray]
     closed = shapely.union_all(
         [
@@ -146,7 +163,16 @@ def build_field(
         blocked=blocked,
         tolerance_m=tolerance_m,
         given_up_m2=given_up_m2,
+        high=high,
     )
+
+
+def _apart(inside: Area, kept: BaseGeometry, tolerance_m: float) -> Area | None:
+    """Return the ground inside that is off the obstacles, drawn around them with few corners."""
+    apart = around_with_fewer_corners(
+        _grown(kept, MARGIN_M), max(tolerance_m, OBSTACLE_TOLERANCE_M)
+    )
+    return as_area(polygons_of(inside.difference(apart)))
 
 
 def local_area(area: Area, frame: LocalFrame) -> Area:

@@ -35,12 +35,14 @@ class Settings:
     `border_buffer_m` is what the companion keeps its valves' strips off the border, if it does.
     `refill_s` and `swap_s` (of a battery) are on the ground; several aircraft keep
     `aircraft_gap_m` between them. `nose_rate_deg_s` is how fast the nose turns at a stop.
+    Ferries and long transits are flown at `ferry_height_m`, where it is given.
     Without them, `jerk_m_s3` and `return_height_m` are those that the autopilot comes with.
     """
 
     swath_width_m: float
     speed_m_s: float
     height_m: float = 3.5
+    ferry_height_m: float | None = None
     acceleration_m_s2: float = 2.5
     jerk_m_s3: float | None = None
     return_height_m: float | None = None
@@ -67,6 +69,11 @@ class Settings:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
             if not 0.0 < getattr(self, name) < 1e5:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if self.ferry_height_m is not None and not self.height_m < self.ferry_height_m <= 500.0:
+            raise ValueError(
+                f"a ferry height of {self.ferry_height_m:g} m is not above the {self.height_m:g} m "
+                "of the passes (mission.ferry_height_m, mission.height_m)"
+            )
         if not 0.0 <= self.reserve_l < self.tank_l:
             raise ValueError(f"a reserve of {self.reserve_l} L leaves nothing of {self.tank_l} L")
 
@@ -99,7 +106,8 @@ class Leg:
     """A way at one speed: a straight spray line, or a transit or ferry that may bend.
 
     One flown `through` leads from a line into the next, which goes on straight. `seconds` are
-    those of `missions.timing`, once the whole sortie is known.
+    those of `missions.timing`, once the whole sortie is known. `height_m` is None at that of the
+    lines.
     """
 
     kind: Kind
@@ -108,6 +116,7 @@ class Leg:
     seconds: float = 0.0
     volume_l: float = 0.0
     through: bool = False
+    height_m: float | None = None
 
     @property
     def length_m(self) -> float:
@@ -144,6 +153,11 @@ class Sortie:
     def flight_s(self) -> float:
         """Return the time of all legs."""
         return sum(leg.seconds for leg in self.legs)
+
+    def end_heights_m(self, height_m: float) -> tuple[float, float]:
+        """Return how high it begins and ends its way; `height_m` is that of the lines."""
+        first, last = self.legs[0].height_m, self.legs[-1].height_m
+        return height_m if first is None else first, height_m if last is None else last
 
     @property
     def lines(self) -> int:
@@ -204,8 +218,8 @@ class Plan:
     def airborne_s(self, sortie: Sortie) -> float:
         """Return the time from take-off to landing."""
         vertical = self.settings.vertical
-        height_m = self.settings.height_m
-        upright_s = vertical.climb_s(height_m) + vertical.return_s(height_m)
+        first_m, last_m = sortie.end_heights_m(self.settings.height_m)
+        upright_s = vertical.climb_s(first_m) + vertical.return_s(last_m)
         return sortie.flight_s + self.nose_s(sortie) + upright_s
 
     def energy_wh(self, sortie: Sortie) -> float | None:

@@ -44,6 +44,7 @@ from missions.treated_rates import untreated_rates
 # Where no configuration is given.
 DEFAULTS = Settings(swath_width_m=6.0, speed_m_s=6.0)
 RATE_L_HA = 20.0
+FERRY_CLEARANCE_M = 5.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,6 +109,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         offset_m=offset_m,
         kept_m=asked.border_m,
         tolerance_m=OUTLINE_TOLERANCE_M if mission is None else mission.outline_tolerance_m,
+        ferry_over_m=_ferry_over_m(settings, mission),
     )
     rates = _rates(asked, config, map_file, boundary, frame)
     if isinstance(rates, MapRates) and _is_flown(asked, config):
@@ -131,6 +133,13 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         said=tuple(said),
         wind=asked.ground.wind or (None if mission is None else mission.wind),
     )
+
+
+def _ferry_over_m(settings: Settings, mission: MissionTable | None) -> float | None:
+    """Return how high an obstacle may be that ferries cross; None where they cross none."""
+    clearance_m = FERRY_CLEARANCE_M if mission is None else mission.ferry_clearance_m
+    height_m = settings.ferry_height_m
+    return None if height_m is None else height_m - clearance_m
 
 
 def _obstacles(asked: Asked, frame: LocalFrame) -> list[Obstacle]:
@@ -204,6 +213,8 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             **fleet_settings(mission),
         )
     given: dict[str, Any] = {name: each for name, each in changes.items() if each is not None}
+    if config is not None and config.mission is not None:
+        given.setdefault("ferry_height_m", config.mission.ferry_height_m)
     highest = given.pop("speed_max_m_s", None)
     if highest is not None:
         limit = math.inf if config is None else config.safety.speed_max_m_s

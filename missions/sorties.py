@@ -142,7 +142,8 @@ def _budget(network: Network, pieces: Pieces, settings: Settings, flying: Flying
         pace_s_m = flying.pace_s_m[pieces.line]
     return build_budget(
         network, battery, flying.motion, length_m=lengths_m(pieces.ends), pace_s_m=pace_s_m,
-        vertical=settings.vertical, height_m=settings.height_m, reserve_l=settings.reserve_l,
+        vertical=settings.vertical, height_m=settings.height_m,
+        ferry_height_m=settings.ferry_height_m, reserve_l=settings.reserve_l,
         nose_rate_deg_s=settings.nose_rate_deg_s, refill_s=settings.refill_s,
         limit_wh=battery.usable_wh * flying.battery_share,
     )  # fmt: skip

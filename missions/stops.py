@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from missions.plan import Place, Sortie
+from missions.plan import Leg, Place, Sortie
 
 # Waypoints closer than this to the one before say nothing new: a border goes on in its next line.
 SAME_M = 0.6
@@ -19,7 +19,7 @@ RUN_M, ASIDE_M = 25.0, 0.05
 class Stop:
     """A place of the way, the speed of the way to it, and whether a line begins or ends there.
 
-    `height_m` is above home; None leaves it to the plan's one height.
+    `height_m` is above home, or the ground that is followed; None leaves it to that of the lines.
     """
 
     place: Place
@@ -33,12 +33,16 @@ def waypoints_of(sortie: Sortie, *, apart: bool = False) -> list[Stop]:
 
     Where one line goes on in the next, their ends are one place in the middle, unless `apart`;
     where the speed changes inside a line, there is a place and nothing closes.
+    Where the height changes, there are two places above each other.
     The way back to the depot is left to the return, but for its bends. What is straight on, a run
     into a line or a short gap, is one way with its line, unless `apart`.
     """
     legs = sortie.legs
-    stops = [Stop(place=legs[0].points[0], speed_m_s=legs[0].speed_m_s)]
+    stops = [Stop(place=legs[0].points[0], speed_m_s=legs[0].speed_m_s, height_m=legs[0].height_m)]
     for number, leg in enumerate(legs):
+        before = legs[number - 1] if number else leg
+        if leg.height_m != before.height_m:
+            stops += _changed(before, leg)
         if leg.kind == "spray":
             goes_on = legs[number - 1].kind == "spray"
             ends = number + 1 == len(legs) or legs[number + 1].kind != "spray"
@@ -48,14 +52,30 @@ def waypoints_of(sortie: Sortie, *, apart: bool = False) -> list[Stop]:
                 Stop(place=leg.points[-1], speed_m_s=leg.speed_m_s, opens=False if ends else None)
             )
             continue
-        stops += [Stop(place=place, speed_m_s=leg.speed_m_s) for place in leg.points[1:-1]]
+        stops += [
+            Stop(place=place, speed_m_s=leg.speed_m_s, height_m=leg.height_m)
+            for place in leg.points[1:-1]
+        ]
     return stops if apart else _without_runs(stops)
+
+
+def _changed(before: Leg, leg: Leg) -> list[Stop]:
+    """Return the end of one leg and above or below it the start of the next, but those of lines."""
+    return [
+        Stop(place=leg.points[0], speed_m_s=each.speed_m_s, height_m=each.height_m)
+        for each in (before, leg)
+        if each.kind != "spray"
+    ]
 
 
 def _without_runs(stops: list[Stop]) -> list[Stop]:
     kept = stops[:1]
     for here, after in zip(stops[1:], [*stops[2:], None], strict=True):
-        goes_on = after is not None and after.speed_m_s == here.speed_m_s
+        goes_on = (
+            after is not None
+            and after.speed_m_s == here.speed_m_s
+            and kept[-1].height_m == here.height_m == after.height_m
+        )
         if after is None or not goes_on or not is_run(kept[-1].place, here.place, after.place):
             kept.append(here)
     return kept

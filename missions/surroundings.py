@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from companion.core.frame import LocalFrame
 from missions.demand import Rates
+from missions.ferries import at_ferry_height
 from missions.field import Field
 from missions.paced import Paced, paced
 from missions.plan import Settings, Sortie
@@ -36,11 +37,14 @@ class Surroundings:
         """Return the sorties with the speeds of rates and slopes, their run-ins and times."""
         found = paced(sorties, rates, settings, self.terrain)
         if self.run_in is None:
-            return replace(found, sorties=timed(found.sorties, settings))
+            raised = at_ferry_height(found.sorties, settings)
+            return replace(found, sorties=timed(raised, settings))
         longer = with_run_ins(found.sorties, field, settings, self.run_in)
         if self.terrain is not None:
             longer = tuple(self._slowed(sortie, settings) for sortie in longer)
-        return replace(found, sorties=timed(longer, settings))
+        run_in_m = self.run_in.wanted_m(settings.speed_m_s, settings.acceleration_m_s2)
+        raised = at_ferry_height(longer, settings, run_in_m=run_in_m)
+        return replace(found, sorties=timed(raised, settings))
 
     def _slowed(self, sortie: Sortie, settings: Settings) -> Sortie:
         """Return a sortie whose new ways keep to the slopes as well."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 from missions.corners import parts_s
 from missions.plan import Place, Settings, Sortie
@@ -26,6 +26,7 @@ class _Way:
     end: Place
     speed_m_s: float
     legs: tuple[tuple[int, float], ...]
+    height_m: float | None = None
 
     @property
     def length_m(self) -> float:
@@ -44,8 +45,9 @@ def timed(sorties: Sequence[Sortie], settings: Settings) -> tuple[Sortie, ...]:
 
 def _timed(sortie: Sortie, settings: Settings) -> Sortie:
     ways, motion = _ways(sortie), settings.motion
-    seconds = [0.0] * len(sortie.legs)
-    for some in (_without_runs(ways[:-1]), ways[-1:]):
+    seconds = _upright_s(sortie, settings)
+    level = (list(some) for _, some in groupby(ways[:-1], key=lambda way: way.height_m))
+    for some in (*map(_without_runs, level), ways[-1:]):
         bends_deg = [
             abs((after.course_deg - before.course_deg + 180.0) % 360.0 - 180.0)
             for before, after in pairwise(some)
@@ -62,6 +64,18 @@ def _timed(sortie: Sortie, settings: Settings) -> Sortie:
     return replace(sortie, legs=tuple(legs))
 
 
+def _upright_s(sortie: Sortie, settings: Settings) -> list[float]:
+    """Return what each leg takes to climb or descend: a ferry both, at its two ends."""
+    lines_m = settings.height_m
+    heights_m = [lines_m if leg.height_m is None else leg.height_m for leg in sortie.legs]
+    seconds = [0.0] * len(heights_m)
+    for number, (before_m, after_m) in enumerate(pairwise(heights_m)):
+        if before_m != after_m:
+            higher = number if before_m > after_m else number + 1
+            seconds[higher] += settings.vertical.change_s(before_m, after_m)
+    return seconds
+
+
 def _ways(sortie: Sortie) -> list[_Way]:
     """Return the straight ways of a sortie, one after the other."""
     found = []
@@ -75,8 +89,11 @@ def _ways(sortie: Sortie) -> list[_Way]:
             length_m = math.dist(here, place)
             if length_m > TOUCH_M:
                 found.append(
-                    _Way(start=here, end=place, speed_m_s=leg.speed_m_s, legs=((number, length_m),))
-                )
+                    _Way(
+                        start=here, end=place, speed_m_s=leg.speed_m_s, legs=((number, length_m),),
+                        height_m=leg.height_m,
+                    )
+                )  # fmt: skip
                 here = place
     return found
 

@@ -39,6 +39,12 @@ class Vertical:
         up_s = self._way_s(above_m, self.climb_m_s)
         return self.settled_s + up_s + self.loiter_s + down_s + self.down_s
 
+    def change_s(self, from_m: float, to_m: float) -> float:
+        """Return the time from one height to another, standing over one place."""
+        return self._way_s(
+            abs(to_m - from_m), self.climb_m_s if to_m > from_m else self.descent_m_s
+        )
+
     def _way_s(self, length_m: float, speed_m_s: float) -> float:
         """Return the time of a climb or descent from rest to rest."""
         if length_m < speed_m_s**2 / self.acceleration_m_s2:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -42,11 +42,22 @@ class Ways:
         space = everything.convex_hull.buffer(AROUND_M).difference(self.field.blocked)
         return free_space(space)
 
+    @cached_property
+    def high(self) -> Ways | None:
+        """Return the ways of ferries, which cross low obstacles; None where they cross none."""
+        high = self.field.high
+        if high is None:
+            return None
+        field = replace(self.field, fly=high.fly, blocked=high.blocked, high=None)
+        return Ways(field=field, depots=self.depots, inside=free_space(high.fly))
+
     def between(self, start: Place, end: Place) -> tuple[list[Place], bool]:
         """Return the way between two places of the field, and whether it leaves the field."""
         way = self.inside.way(start, end)
         if way:
             return way, False
+        if self.high is not None:
+            return self.high.between(start, end)[0], True
         way = self.around.way(start, end)
         if not way:
             raise PlanError(
@@ -57,6 +68,8 @@ class Ways:
 
     def home(self, depot: int, end: Place) -> list[Place]:
         """Return the way from a depot to a place of the field: the shortest way in, then inside."""
+        if self.high is not None:
+            return self.high.home(depot, end)
         start = (float(self.depots[depot][0]), float(self.depots[depot][1]))
         entry = shapely.get_coordinates(shapely.shortest_line(self.field.fly, Point(start)))[0]
         gate = (float(entry[0]), float(entry[1]))

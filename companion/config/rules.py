@@ -344,6 +344,12 @@ def _mission(config: Config) -> Rule:
             key="mission.reserve_l",
             text=f"not below mission.tank_l = {mission.tank_l:g}; write less",
         )
+    ferry_height_m = None if mission is None else mission.ferry_height_m
+    if mission is not None and ferry_height_m is not None and ferry_height_m <= mission.height_m:
+        yield Contradiction(
+            key="mission.ferry_height_m",
+            text=f"not above mission.height_m = {mission.height_m:g}; write more, or leave it out",
+        )
     if mission is not None and mission.lines is not None:
         half_m = 0.5 * mission.swath_width_m
         if not mission.lines_aside_m <= half_m:

@@ -220,6 +220,12 @@ class MissionTable(Table):
     return_height_m: float | None = Field(
         default=None, ge=0, le=500, description="of its return; absent: 15 of ArduPilot, 60 of PX4"
     )
+    ferry_height_m: float | None = Field(
+        default=None, ge=0.5, le=120, description="of ferries and long transits; absent: height_m"
+    )
+    ferry_clearance_m: float = Field(
+        default=5.0, ge=1, le=100, description="over obstacles of known height, for ferries"
+    )
     turn: Literal["stop", "strafe", "rounded"] = Field(default="stop", description="between passes")
     angle_deg: Annotated[float, Field(ge=-360, le=360)] | Literal["auto"] = Field(
         default="auto", description="of the passes, clockwise from north"

@@ -44,6 +44,10 @@ DIGITS = 9
 MITRE_LIMIT = 2.0
 
 
+# A polygon, and the circle (east, north, radius) that may stand for it.
+Shape = tuple[Polygon, tuple[float, float, float] | None]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fence:
     """Shapes in metres; `left_out` are the obstacles that found no room."""
@@ -52,6 +56,7 @@ class Fence:
     polygons: tuple[Polygon, ...] = ()
     circles: tuple[tuple[float, float, float], ...] = ()
     left_out: int = 0
+    crossed: int = 0
     outside_m: float = 0.0
 
 
@@ -67,9 +72,29 @@ class Fences:
         return FENCE_CORNERS_MAX[self.plan.settings.autopilot] * CORNER_BYTES - ENDS_BYTES
 
     @cached_property
-    def obstacles(self) -> list[tuple[Polygon, tuple[float, float, float] | None]]:
+    def obstacles(self) -> list[Shape]:
         """Return the obstacles, the largest first, each with the circle that may stand for it."""
-        inner = self.plan.field.blocked.buffer(-OBSTACLE_LESS_M, join_style="mitre")
+        return self._fenced(self.plan.field.blocked)
+
+    @cached_property
+    def tall_and_low(self) -> tuple[list[Shape], list[Shape]]:
+        """Return the obstacles that no ferry crosses, and those that some may."""
+        blocked, high = self.plan.field.blocked, self.plan.field.high
+        if high is None:
+            return self.obstacles, []
+        return self._fenced(high.blocked), self._fenced(blocked.difference(high.blocked))
+
+    def obstacles_of(self, way: BaseGeometry) -> list[Shape]:
+        """Return the obstacles that a way does not cross: fences know no height."""
+        if not any(part.intersects(way) for part, _ in self.obstacles):
+            return self.obstacles
+        tall, low = self.tall_and_low
+        found = [*tall, *(each for each in low if not each[0].intersects(way))]
+        return sorted(found, key=lambda each: -each[0].area)
+
+    @staticmethod
+    def _fenced(blocked: BaseGeometry) -> list[Shape]:
+        inner = blocked.buffer(-OBSTACLE_LESS_M, join_style="mitre")
         parts = sorted(polygons_of(inner), key=lambda part: -part.area)
         return [(_smaller(part), _circle(part)) for part in parts]
 
@@ -87,7 +112,7 @@ class Fences:
         way = shapely.union_all([LineString(leg.points) for leg in sortie.legs])
         outline = self.plan.field.outline
         beyond = way.difference(outline.buffer(OUT_M / 2.0))
-        borders = self.borders
+        borders, obstacles = self.borders, self.obstacles_of(way)
         if not beyond.is_empty:
             whole = outline.union(beyond.buffer(FERRY_M, quad_segs=2))
             borders = self._borders(whole)
@@ -96,7 +121,7 @@ class Fences:
             for outside_m, drawn in borders
             for border in polygons_of(drawn)
             if border.covers(way)
-            if (found := self._with_obstacles(border, outside_m)) is not None
+            if (found := self._with_obstacles(border, outside_m, obstacles)) is not None
         ]
         if not fitting:
             raise self._refusal(sortie, borders, way)
@@ -121,16 +146,18 @@ class Fences:
                 found.append((outside_m, border))
         return found
 
-    def _with_obstacles(self, border: Polygon, outside_m: float) -> Fence | None:
+    def _with_obstacles(
+        self, border: Polygon, outside_m: float, obstacles: list[Shape]
+    ) -> Fence | None:
         """Return a fence of this border with as many obstacles as there is room for."""
         left = self.room_bytes - _polygon_bytes(border)
         if left < 0:
             return None
         polygons, circles = [], []
-        near = [part for part, _ in self.obstacles if border.intersects(part)]
+        near = [part for part, _ in obstacles if border.intersects(part)]
         have_room = sum(_polygon_bytes(part) for part in near) <= left
         # A circle lies within its obstacle: it stands for one only where not all have room.
-        for polygon, round_one in self.obstacles:
+        for polygon, round_one in obstacles:
             circle = None if have_room else round_one
             taken = _polygon_bytes(polygon) if circle is None else CIRCLE_BYTES
             if not border.intersects(polygon):
@@ -144,7 +171,8 @@ class Fences:
                 circles.append(circle)
         return Fence(
             border=border, polygons=tuple(polygons), circles=tuple(circles),
-            left_out=len(near) - len(polygons) - len(circles), outside_m=outside_m,
+            left_out=len(near) - len(polygons) - len(circles),
+            crossed=len(self.obstacles) - len(obstacles), outside_m=outside_m,
         )  # fmt: skip
 
     def _refusal(
@@ -197,6 +225,12 @@ def fence_warnings(plan: Plan) -> tuple[str, ...]:
         said.append(
             f"the fence lies up to {outside_m:.0f} m outside the field: {name} has no room for "
             "the corners of a nearer one"
+        )
+    crossed = max((fence.crossed for fence in found), default=0)
+    if crossed:
+        said.append(
+            f"the fence leaves out {crossed} obstacle{'' if crossed == 1 else 's'} that ferries "
+            f"cross at {plan.settings.ferry_height_m:g} m: it knows no heights"
         )
     if not most:
         return tuple(said)

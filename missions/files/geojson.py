@@ -37,6 +37,7 @@ def _leg(plan: Plan, sortie: Sortie, sequence: int, leg: Leg) -> dict[str, Any]:
             "sequence": sequence,
             "speed_m_s": leg.speed_m_s,
             "volume_l": round(leg.volume_l, 6),
+            "height_m": plan.settings.height_m if leg.height_m is None else leg.height_m,
         },
         "geometry": {
             "type": "LineString",

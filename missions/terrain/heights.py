@@ -18,10 +18,16 @@ RETURN_LOW_M = 7.5
 
 
 def raised(stops: Sequence[Stop], terrain: Terrain, *, home: Place, height_m: float) -> list[Stop]:
-    """Return the stops with heights above home, and more of them where the ground bends."""
+    """Return the stops with heights above home, and more of them where the ground bends.
+
+    `height_m` is that of the lines over the ground; a stop may have one of its own.
+    """
     home_m = float(terrain.heights_m(np.array([home]))[0])
-    found = [replace(stops[0], height_m=_above(terrain, stops[0].place, home_m) + height_m)]
+    first_m = height_m if stops[0].height_m is None else stops[0].height_m
+    found = [replace(stops[0], height_m=_above(terrain, stops[0].place, home_m) + first_m)]
+    lines_m = height_m
     for before, after in pairwise(stops):
+        height_m = lines_m if after.height_m is None else after.height_m
         way = terrain.straight_parts([before.place, after.place])
         inner = zip(way.places[1:-1].tolist(), way.ground_m[1:-1].tolist(), strict=True)
         found += [
