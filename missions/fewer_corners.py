@@ -37,8 +37,9 @@ TOGETHER, AHEAD = 64, 8
 ROUNDING = 1e-9
 # Where the whole tolerance leads to no border, it is made less, so many times.
 LESS, TRIED_MAX = 0.6, 6
-# With less it is the same place.
-SAME_M = 1e-4
+# With less it is the same place. An edge along a given corner is beyond it by the digits of its
+# coordinates: it touches, and the caller's margin is a thousand times as wide.
+SAME_M, TOUCH_M = 1e-4, 1e-6
 
 
 def inside_with_fewer_corners(area: Area, tolerance_m: float) -> Area:
@@ -70,7 +71,7 @@ def _shell(ring: shapely.LinearRing, tolerance_m: float, *, inwards: bool) -> Po
             drawn = Polygon(corners)
             if drawn.is_valid and _is_near(points, drawn, tolerance_m):
                 inner, outer = (drawn, given) if inwards else (given, drawn)
-                if outer.covers(inner):
+                if outer.buffer(TOUCH_M, join_style="mitre").covers(inner):
                     return drawn
         # Borders that nearly touch, and corners like needles.
         tolerance_m *= LESS

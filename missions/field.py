@@ -26,11 +26,13 @@ from missions.wind import WindBuffer
 # program and in metres for another: strips keep this far from the border.
 MARGIN_M = 0.0025
 # Borders are drawn anew with fewer corners so far inside, at most, and those of obstacles so far
-# outside of their buffers: a circle of 5 m becomes one of ten corners.
-OUTLINE_TOLERANCE_M, OBSTACLE_TOLERANCE_M = 0.1, 0.5
+# outside of their buffers: a circle of 5 m becomes one of ten corners. Where many obstacles would
+# take more of the ground than that share, it is the lesser distance.
+OUTLINE_TOLERANCE_M, OBSTACLE_TOLERANCE_M, OBSTACLE_LESS_M = 0.1, 0.5, 0.25
+OBSTACLE_SHARE = 0.001
 # A simpler outline leaves so much of what a strip can reach; if not, the tolerance is made less,
-# and after so many times the outline stays as it was drawn.
-REACHED_MIN, TOLERANCE_LESS, TOLERANCES = 0.9975, 0.3, 3
+# and after so many times the outline stays as it was drawn. A plan covers 99.8 %.
+REACHED_MIN, TOLERANCE_LESS, TOLERANCES = 0.9982, 0.6, 6
 EXTENT_MAX_M = 20_000.0
 # 383 ha with a swath of 1 m have so many.
 PASSES_MAX = 1_000
@@ -169,10 +171,15 @@ def build_field(
 
 def _apart(inside: Area, kept: BaseGeometry, tolerance_m: float) -> Area | None:
     """Return the ground inside that is off the obstacles, drawn around them with few corners."""
-    apart = around_with_fewer_corners(
-        _grown(kept, MARGIN_M), max(tolerance_m, OBSTACLE_TOLERANCE_M)
-    )
-    return as_area(polygons_of(inside.difference(apart)))
+    grown = _grown(kept, MARGIN_M)
+    free = inside.difference(grown)
+    left: BaseGeometry = free
+    for least_m in (OBSTACLE_TOLERANCE_M, OBSTACLE_LESS_M):
+        apart = around_with_fewer_corners(grown, max(tolerance_m, least_m))
+        left = inside.difference(apart)
+        if left.area >= (1.0 - OBSTACLE_SHARE) * free.area:
+            break
+    return as_area(polygons_of(left))
 
 
 def local_area(area: Area, frame: LocalFrame) -> Area:
