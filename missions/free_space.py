@@ -6,7 +6,7 @@ A visibility graph: a shortest way bends only at corners that stick out into the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -26,6 +26,8 @@ CORNERS_MAX, SIMPLER_M = 300, (0.4, 1.6)
 NEAREST = 40
 # Of two ways of one length the one over fewer stations.
 STATION_M = 1e-9
+# Rows of a table of ways are worked on together, so many: they stay in the processor's cache.
+TOGETHER = 64
 # Around one straight line so many corners are looked at, those that lie least aside.
 ASIDE = 60
 
@@ -69,12 +71,15 @@ def _sticking_out(space: BaseGeometry) -> tuple[Floats, Ints]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeSpace:
-    """Where one may fly; `between_m` are ways between its corners, nearly the shortest."""
+    """Where one may fly; `between_m` are ways between its corners, nearly the shortest.
+
+    `direct_m` are the straight ones of them, infinite where there is none.
+    """
 
     space: BaseGeometry
     corners: Floats
+    direct_m: Floats
     between_m: Floats
-    next_corner: Ints
     is_convex: bool
 
     def sees(self, starts: Floats, ends: Floats) -> Bools:
@@ -132,7 +137,8 @@ class FreeSpace:
         first, last = near[row], far[column]
         chain = [int(first)]
         while chain[-1] != last:
-            chain.append(int(self.next_corner[chain[-1], last]))
+            over = self.direct_m[chain[-1]] + self.between_m[:, last]
+            chain.append(int(np.argmin(over)))
         return chain
 
     def _straightened(self, ends: Floats, chain: list[int]) -> list[Place]:
@@ -187,24 +193,27 @@ def free_space(ground: BaseGeometry) -> FreeSpace:
         (np.empty((0, 2)), np.empty(0, dtype=np.int64)) if is_convex else _corners(ground)
     )
     shapely.prepare(space)
-    count = len(corners)
+    none = np.zeros((len(corners), len(corners)))
     found = FreeSpace(
-        space=space, corners=corners, between_m=np.zeros((count, count)),
-        next_corner=np.zeros((count, count), dtype=np.int64), is_convex=is_convex,
-    )  # fmt: skip
-    if not count:
+        space=space, corners=corners, direct_m=none, between_m=none, is_convex=is_convex
+    )
+    if not len(corners):
         return found
     direct = found.to_corners_m(corners)
     _see(found, direct, *_neighbours(rings))
-    between, following = _shortest(direct)
+    between = _shortest(_both_ways(direct))
     # Islands of corners that are near to each other alone.
     rows, columns = np.nonzero(np.triu(np.isinf(between)))
     if len(rows) and _see(found, direct, rows, columns):
-        between, following = _shortest(direct)
-    return FreeSpace(
-        space=space, corners=corners, between_m=between, next_corner=following,
-        is_convex=is_convex,
-    )  # fmt: skip
+        between = _shortest(_both_ways(direct))
+    return replace(found, direct_m=_both_ways(direct), between_m=between)
+
+
+def _both_ways(direct: Floats) -> Floats:
+    """Return the ways that are seen from either end."""
+    found: Floats = np.minimum(direct, direct.T)
+    np.fill_diagonal(found, math.inf)
+    return found
 
 
 def _neighbours(rings: Ints) -> tuple[Ints, Ints]:
@@ -226,16 +235,26 @@ def _see(space: FreeSpace, direct: Floats, rows: Ints, columns: Ints) -> bool:
     return bool(len(rows))
 
 
-def _shortest(direct: Floats) -> tuple[Floats, Ints]:
-    """Return the shortest ways over any stations, and the next station on each (Floyd, 1962)."""
-    between = np.minimum(direct, direct.T)
-    count = len(between)
+def _shortest(direct_m: Floats) -> Floats:
+    """Return the lengths of the shortest ways over any stations (Floyd, 1962).
+
+    They are the same both ways: only the part beyond the diagonal is worked on, rows together.
+    """
+    count = len(direct_m)
+    between = direct_m.copy()
     np.fill_diagonal(between, 0.0)
-    following = np.tile(np.arange(count), (count, 1))
-    through, better = np.empty_like(between), np.empty(between.shape, dtype=np.bool_)
+    parts = [
+        (slice(start, start + TOGETHER), between[start : start + TOGETHER, start:])
+        for start in range(0, count, TOGETHER)
+    ]
+    through = np.empty((TOGETHER, count))
     for station in range(count):
-        np.add.outer(between[:, station], between[station] + STATION_M, out=through)
-        np.less(through, between, out=better)
-        np.copyto(between, through, where=better)
-        np.copyto(following, following[:, station, None], where=better)
-    return between, following
+        begun = station - station % TOGETHER
+        to = np.concatenate([between[:begun, station], between[station, begun:]])
+        on = to + STATION_M
+        for rows, part in parts:
+            over = through[: part.shape[0], : part.shape[1]]
+            np.add.outer(to[rows], on[rows.start :], out=over)
+            np.minimum(part, over, out=part)
+    whole: Floats = np.where(np.tri(count, dtype=np.bool_), between.T, between)
+    return whole
