@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -14,6 +15,7 @@ from companion.cli.answer import AsJson, answer, note
 from companion.config import load
 from missions.errors import UploadError
 from missions.upload.checks import FIRMWARES
+from missions.upload.following import each_when_flown, sorties_from
 from missions.upload.items import MissionFile
 from missions.upload.mavsdk_vehicle import connected
 from missions.upload.places import elsewhere
@@ -48,6 +50,10 @@ def upload(
     anywhere: Annotated[
         bool, typer.Option("--elsewhere", help="With --config: upload it nevertheless.")
     ] = False,
+    all_sorties: Annotated[
+        bool,
+        typer.Option("--all", help="Then each later sortie, when the one before is flown."),
+    ] = False,
     wait_s: Annotated[
         float, typer.Option(metavar="S", help="For the vehicle.", min=1.0, max=600.0)
     ] = WAIT_S,
@@ -57,44 +63,77 @@ def upload(
 
     Nothing is sent to an armed vehicle, and nothing that its firmware is known to refuse.
     """
-    mission = read_mission_file(file)
+    files = sorties_from(file) if all_sorties else [file]
+    missions = {path: read_mission_file(path) for path in files}
+    if all_sorties and while_armed:
+        raise UploadError("--all waits until each sortie is disarmed; leave out --while-armed")
     if anywhere and config is None:
         raise UploadError("--elsewhere is for --config, which says where the field is")
     if config is not None and not anywhere:
-        _refuse_elsewhere(mission, config)
+        _refuse_elsewhere(list(missions.values()), config)
+    uploaded: list[dict[str, Any]] = []
+    put_all = _put_all(
+        missions, link, wait_s, with_fence=fence, while_armed=while_armed, uploaded=uploaded,
+        is_json=as_json,
+    )  # fmt: skip
     try:
-        done = asyncio.run(_put(mission, link, wait_s, with_fence=fence, while_armed=while_armed))
+        asyncio.run(put_all)
     except TransferError as error:
         if as_json:
             answer({"ok": False, "error": str(error)}, (), as_json=True)
         note(f"error: {error}")
         raise typer.Exit(FAILED) from error
-    answer({"ok": True, "file": str(file), **asdict(done)}, [_line(file, done)], as_json=as_json)
-    for text in done.left_out:
-        note(f"warning: {FIRMWARES[done.firmware]} does not keep {text}")
+    if as_json:
+        more = {"files": [str(path) for path in files]} if all_sorties else {}
+        answer(uploaded[-1] | more, (), as_json=True)
 
 
-def _refuse_elsewhere(mission: MissionFile, path: Path) -> None:
-    """Refuse a mission for another field than the configuration's."""
+def _refuse_elsewhere(missions: Sequence[MissionFile], path: Path) -> None:
+    """Refuse missions for another field than the configuration's."""
     setup = build_setup(load(path))
-    reason = elsewhere(
-        mission,
-        setup.prescription.field,
-        setup.frame,
-        reach_m=setup.boom.reach_m,
-        whose=str(path),
-    )
-    if reason is not None:
-        raise UploadError(reason)
-
-
-async def _put(
-    mission: MissionFile, link: str, wait_s: float, *, with_fence: bool, while_armed: bool
-) -> Uploaded:
-    async with connected(link, wait_s=wait_s) as vehicle:
-        return await put(
-            vehicle, mission, while_armed=while_armed, with_fence=with_fence, progress=_Progress()
+    for mission in missions:
+        reason = elsewhere(
+            mission,
+            setup.prescription.field,
+            setup.frame,
+            reach_m=setup.boom.reach_m,
+            whose=str(path),
         )
+        if reason is not None:
+            raise UploadError(reason)
+
+
+async def _put_all(
+    missions: Mapping[Path, MissionFile],
+    link: str,
+    wait_s: float,
+    *,
+    with_fence: bool,
+    while_armed: bool,
+    uploaded: list[dict[str, Any]],
+    is_json: bool,
+) -> None:
+    """Upload one mission, or each of several when the one before is flown."""
+    async with connected(link, wait_s=wait_s) as vehicle:
+
+        async def upload_one(path: Path) -> None:
+            done = await put(
+                vehicle, missions[path], while_armed=while_armed, with_fence=with_fence,
+                progress=_Progress(),
+            )  # fmt: skip
+            uploaded.append({"ok": True, "file": str(path), **asdict(done)})
+            if not is_json:
+                answer(uploaded[-1], [_line(path, done)], as_json=False)
+            elif len(missions) > 1:
+                note(_line(path, done))
+            for text in done.left_out:
+                note(f"warning: {FIRMWARES[done.firmware]} does not keep {text}")
+
+        lasts = [
+            (path, len(mission.items_for(vehicle.firmware)) - 1)
+            for path, mission in missions.items()
+        ]
+        await each_when_flown(vehicle, lasts, upload_one, say=note)
 
 
 class _Progress:

@@ -6,12 +6,13 @@ import asyncio
 import importlib.util
 import json
 import logging
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, AsyncIterator, Sequence
 from contextlib import aclosing, asynccontextmanager
 from typing import Any
 
 from companion.errors import LinkError
 from companion.link.transport import parse_url
+from missions.upload.following import Seen
 from missions.upload.items import Firmware, WireItem
 from missions.upload.transfer import NotNowError, Progress, RefusedError, What
 
@@ -22,6 +23,9 @@ ARMED_FLAG = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 # An autopilot's heartbeat comes once a second.
 HEARTBEAT_S = 5.0
 AUTOPILOT_COMPONENT = 1
+SET_MESSAGE_INTERVAL, MISSION_CURRENT, CURRENT_EVERY_US = 511, 42, 500_000.0
+# So many heartbeats without it, and it is asked for again: a battery was changed.
+ASK_EVERY = 5
 REQUESTS = ("MISSION_REQUEST_INT", "MISSION_REQUEST")
 # Not the vehicle's will but the way there: another attempt may go through.
 PASSING = ("TIMEOUT", "BUSY", "TRANSFER_CANCELLED", "PROTOCOL_ERROR", "INVALID_SEQUENCE", "ERROR")
@@ -114,6 +118,54 @@ class MavsdkVehicle:
         except TimeoutError:
             pass
         return None
+
+    async def watch(self) -> AsyncGenerator[Seen, None]:
+        """Yield what each heartbeat of the autopilot tells, with the newest item of its mission.
+
+        ArduPilot streams it where it is asked to; PX4, which refuses that, tells every change.
+        """
+        heard: list[int] = []
+
+        async def listen() -> None:
+            async with aclosing(self._direct.subscribe_message("MISSION_CURRENT")) as messages:
+                async for message in messages:
+                    heard.append(int(json.loads(message.fields_json)["seq"]))
+
+        listener = asyncio.create_task(listen())
+        newest, silent = None, ASK_EVERY
+        try:
+            async with aclosing(self._direct.subscribe_message("HEARTBEAT")) as beats:
+                async for beat in beats:
+                    if beat.component_id != AUTOPILOT_COMPONENT:
+                        continue
+                    silent = 0 if heard else silent + 1
+                    if silent >= ASK_EVERY and self.firmware == "ardupilot":
+                        await self._ask_for_current(beat.system_id)
+                        silent = 0
+                    newest = heard[-1] if heard else newest
+                    heard.clear()
+                    armed = bool(int(json.loads(beat.fields_json)["base_mode"]) & ARMED_FLAG)
+                    yield Seen(is_armed=armed, sequence=newest)
+        finally:
+            listener.cancel()
+            await asyncio.gather(listener, return_exceptions=True)
+
+    async def _ask_for_current(self, system_id: int) -> None:
+        """Ask for a stream of MISSION_CURRENT, twice a second."""
+        from mavsdk.plugins.mavlink_direct import MavlinkMessage
+
+        numbers = {f"param{number}": 0.0 for number in range(3, 8)}
+        fields = numbers | {
+            "target_system": system_id,
+            "target_component": AUTOPILOT_COMPONENT,
+            "command": SET_MESSAGE_INTERVAL,
+            "confirmation": 0,
+            "param1": float(MISSION_CURRENT),
+            "param2": CURRENT_EVERY_US,
+        }
+        await self._direct.send_message(
+            MavlinkMessage("COMMAND_LONG", 0, 0, system_id, AUTOPILOT_COMPONENT, json.dumps(fields))
+        )
 
     async def send(self, what: What, items: Sequence[WireItem], progress: Progress) -> None:
         """Upload all items."""

@@ -7,7 +7,8 @@ import json
 import math
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import AsyncGenerator, Iterable
+from contextlib import aclosing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -176,3 +177,46 @@ async def test_a_link_without_a_vehicle_is_one_line(tmp_path: Path) -> None:
     assert (code, out) == (2, "")
     assert err.startswith(f"error: --link {link}: no vehicle within 1 s")
     assert len(err.splitlines()) == 1
+
+
+@both
+async def test_the_next_sortie_follows_when_the_one_before_is_flown_and_landed(
+    autopilot: str, tmp_path: Path
+) -> None:
+    from missions.upload.following import Seen, each_when_flown
+    from missions.upload.mavsdk_vehicle import connected
+
+    files = [(path, len(read_mission(path))) for path in sorties(tmp_path, 3)[:2]]
+    counts = [count - (autopilot == "px4") - 1 for _, count in files]
+    loaded: list[int] = []
+    async with stub_on_a_port(autopilot) as (server, url), asyncio.timeout(60.0):
+        flight = server.autopilot.flight
+        async with connected(url, wait_s=20.0) as vehicle:
+
+            class Flown:
+                """Flies at every second heartbeat, the first time not to the end."""
+
+                beats = 0
+
+                async def watch(self) -> AsyncGenerator[Seen, None]:
+                    async with aclosing(vehicle.watch()) as seen:
+                        async for each in seen:
+                            self.beats += 1
+                            on_air = 2 <= self.beats % 6 < 5
+                            flight.armed = on_air
+                            last = len(flight.items) - 1
+                            if on_air:
+                                flight.set_sequence(3 if self.beats < 6 else last, time.monotonic())
+                            yield each
+
+            async def upload_one(path: Path) -> None:
+                await put(vehicle, read_mission_file(path), progress=lambda _what, _share: None)
+                loaded.append(len(flight.items))
+
+            said: list[str] = []
+            lasts = [(path, last) for (path, _), last in zip(files, counts, strict=True)]
+            await each_when_flown(Flown(), lasts, upload_one, say=said.append)
+        assert not flight.armed
+        assert without_yaw(flight.items[1:]) == without_yaw(read_mission(files[1][0])[1:])
+    assert loaded == [count for _, count in files]
+    assert any("is not flown to its end" in text for text in said)
