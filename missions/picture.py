@@ -30,6 +30,7 @@ from missions.picture_legend import (
     TWICE,
     colour_of,
     draw_scale,
+    draw_wind,
     write_legend,
     write_title,
 )
@@ -102,8 +103,11 @@ def _figure(plan: Plan, sheet: Sheet, title: str) -> Figure:
     seen = {"closed": _draw_field(axes, plan)} | _draw_strips(axes, plan, swath_pt=swath_pt)
     for sortie in plan.sorties:
         _draw_route(axes, sortie, swath_pt=swath_pt, points_per_m=72.0 / sheet.metres_per_inch)
+    _draw_ends(axes, plan)
     _draw_depots(axes, plan)
     draw_scale(axes, sheet)
+    if plan.wind is not None:
+        draw_wind(axes, sheet, plan.wind)
     write_title(figure, plan, title)
     write_legend(figure, plan, seen, left=(LEFT_IN + sheet.map_in[0] + 0.3) / wide)
     return figure
@@ -183,7 +187,7 @@ def _draw_route(axes: Axes, sortie: Sortie, *, swath_pt: float, points_per_m: fl
     thin = min(1.1, max(0.12 * swath_pt, 0.25))
     styles = (("spray", "-", thin), ("transit", "-", 0.8 * thin), ("ferry", "--", thin))
     for kind, style, width in styles:
-        ways = [leg.points for leg in sortie.legs if leg.kind == kind and leg.length_m > 0.0]
+        ways = [leg.points for leg in sortie.legs if _drawn_as(leg) == kind and leg.length_m > 0.0]
         if ways:
             shade = "0.15" if kind == "transit" else dark
             axes.add_collection(
@@ -193,6 +197,11 @@ def _draw_route(axes: Axes, sortie: Sortie, *, swath_pt: float, points_per_m: fl
     head_pt = min(9.0, max(0.9 * swath_pt, 3.0))
     for leg in _sprayed(sortie):
         _draw_arrows(axes, leg, dark, head_pt=head_pt, length_pt=leg.length_m * points_per_m)
+
+
+def _drawn_as(leg: Leg) -> str:
+    """Return the kind of a leg; what is flown at the height of ferries is drawn as one."""
+    return leg.kind if leg.height_m is None else "ferry"
 
 
 def _draw_arrows(
@@ -211,6 +220,33 @@ def _draw_arrows(
                         "mutation_scale": head_pt, "shrinkA": 0.0, "shrinkB": 0.0},
             annotation_clip=False,
             zorder=5,
+        )  # fmt: skip
+
+
+def _draw_ends(axes: Axes, plan: Plan) -> None:
+    """Draw where each sortie begins to spray, with its number, and where it ends."""
+    crowd = min(1.0, 20.0 / len(plan.sorties))
+    size_pt = 7.0 + 5.0 * crowd
+    for sortie in plan.sorties:
+        passes = _sprayed(sortie)
+        if not passes:
+            continue
+        colour = tuple(0.75 * part for part in colour_of(sortie.number))
+        (east_m, north_m), end = passes[0].points[0], passes[-1].points[-1]
+        axes.plot(
+            [end[0]], [end[1]], marker="X", markersize=0.7 * size_pt, color="white",
+            markeredgecolor=colour, markeredgewidth=1.2,
+            zorder=6.5,
+        )  # fmt: skip
+        axes.plot(
+            [east_m], [north_m], marker="o", markersize=size_pt, color=colour,
+            markeredgecolor="black", markeredgewidth=0.6,
+            zorder=6.6,
+        )  # fmt: skip
+        axes.text(
+            east_m, north_m, f"{sortie.number}", ha="center", va="center_baseline", color="white",
+            fontsize=0.58 * size_pt, fontweight="bold",
+            zorder=6.7,
         )  # fmt: skip
 
 

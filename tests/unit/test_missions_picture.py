@@ -47,6 +47,34 @@ def test_a_plan_is_drawn_with_all_of_its_sorties(
     assert "left unsprayed" not in text  # square corners, all covered
 
 
+def test_wind_speed_heights_and_both_ends_of_every_sortie_are_shown(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(shapely.box(0, 0, 120, 100), tmp_path / "f.geojson")
+    words = ["plan", field, "--rate-l-ha", "20", "--tank-l", "9", "--out", tmp_path / "m.geojson",
+             "--wind", "3.5,250", "--ferry-height-m", "18"]  # fmt: skip
+    assert execute([*map(str, words), "--png", str(tmp_path / "m.svg"), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    text = (tmp_path / "m.svg").read_text()
+    for shown in (
+        "wind 3.5 m/s", "from 250°", "passes at 6 m/s, 3.5 m high    ferries 18 m high",
+        "ferry or transit 18 m high", "last pass ends", "first pass begins",
+    ):  # fmt: skip
+        assert f"<!-- {shown}" in text
+    first = found["sorties"][0]
+    minutes = f"{first['airborne_s'] / 60:.1f} min"
+    assert f"<!-- sortie 1    fill {first['fill_l']:.1f} L    {minutes}" in text
+    for row in found["sorties"]:
+        assert f"<!-- {row['number']} -->" in text
+
+
+def test_without_a_wind_none_is_drawn(tmp_path: Path) -> None:
+    field = written(shapely.box(0, 0, 50, 50), tmp_path / "f.geojson")
+    words = [str(field), "--out", str(tmp_path / "m.kml"), "--png", str(tmp_path / "m.svg")]
+    assert execute(["plan", *words]) == 0
+    assert "<!-- wind" not in (tmp_path / "m.svg").read_text()
+
+
 def test_the_same_plan_makes_the_same_bytes(tmp_path: Path) -> None:
     from tests.unit.test_missions_files import plan as made
 
