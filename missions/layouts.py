@@ -54,7 +54,9 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
         (
             angle_deg,
             tour_of(
-                worthwhile(tour, target, width_m, left_share=min(WORTH_LEFT, _spare(field))),
+                worthwhile(
+                    tour, target, width_m, left_share=min(WORTH_LEFT, _spare(field, settings))
+                ),
                 space,
                 motion,
             ),
@@ -65,15 +67,16 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
     return tour.lines, angle_deg
 
 
-def _spare(field: Field) -> float:
+def _spare(field: Field, settings: Settings) -> float:
     """Return what share of the ground lines may leave out, beside what simpler borders gave up."""
-    return max(LOST_MAX - field.given_up_m2 / field.area_m2, LEFT_MIN)
+    reached_m2 = reachable(field.limit, settings.swath_width_m).area
+    return max(LOST_MAX - field.given_up_m2 / reached_m2, LEFT_MIN)
 
 
 def _layouts(field: Field, settings: Settings, motion: Motion) -> list[tuple[float, Floats]]:
     """Return (course, lines) of each layout."""
     width_m, ground = settings.swath_width_m, field.spray
-    left_share = min(LEFT_SHARE, _spare(field) / 2.0)
+    left_share = min(LEFT_SHARE, _spare(field, settings) / 2.0)
     inner, passes = inner_ground(ground, width_m), border_passes(ground, width_m)
     if settings.angle_deg is None:
         angles = [angle for _, angle in ranked(inner, ground, width_m=width_m, motion=motion)]

@@ -13,6 +13,8 @@ from missions.swaths import LINE_MIN_M
 # So much may stay uncovered of what can be reached: half of what the plan as a whole may miss.
 LEFT_SHARE = 0.0005
 PATCH_MIN_M2 = 0.02
+# What margins take of a place that is too narrow for them; at corners it is less than this.
+PLACE_M2 = 2.0
 ROUNDS = 4
 PATCHES_MAX = 200
 ANGLES = 12
@@ -21,10 +23,19 @@ SEED_M = 0.05
 
 
 def patches(
-    lines: Floats, ground: BaseGeometry, width_m: float, *, left_share: float = LEFT_SHARE
+    lines: Floats,
+    ground: BaseGeometry,
+    width_m: float,
+    *,
+    left_share: float = LEFT_SHARE,
+    target: BaseGeometry | None = None,
 ) -> Floats:
-    """Return more lines, for ground that the others miss though a strip could reach it."""
-    target = reachable(ground, width_m)
+    """Return more lines, for ground that the others miss though a strip could reach it.
+
+    That ground is the `target`, where it is given.
+    """
+    if target is None:
+        target = reachable(ground, width_m)
     covered = united(lines, width_m)
     allowed_m2 = left_share * target.area
     tight = ground.buffer(NARROWER_M)
@@ -45,6 +56,21 @@ def patches(
         added = joined([added, new])
         covered = shapely.union_all([covered, *rectangles(new, width_m)])
     return added
+
+
+def narrow_patches(
+    lines: Floats, ground: BaseGeometry, limit: BaseGeometry, width_m: float
+) -> Floats:
+    """Return more lines for places of the limit that margins make narrower than a swath.
+
+    A ditch that is a swath wide to the centimetre is flown across there, stroke by stroke.
+    """
+    whole = reachable(limit, width_m).intersection(ground)
+    lost = shapely.get_parts(whole.difference(reachable(ground, width_m)))
+    places = lost[shapely.area(lost) > PLACE_M2]
+    if not len(places):
+        return no_lines()
+    return patches(lines, ground, width_m, target=shapely.union_all(places))
 
 
 def _over(patch: BaseGeometry, ground: BaseGeometry, width_m: float) -> Floats:

@@ -18,6 +18,7 @@ from missions.fleet import fleet_sorties
 from missions.flown import flown
 from missions.layouts import spray_lines
 from missions.paced import Paced, range_warnings
+from missions.patches import narrow_patches
 from missions.plan import Plan, Settings, Sortie
 from missions.remaining import Remaining
 from missions.schedule import scheduled
@@ -68,6 +69,7 @@ def _planned(
     motion = settings.motion
     if left is None:
         lines, angle_deg = spray_lines(field, settings, motion)
+        lines = joined([lines, narrow_patches(lines, field.spray, field.limit, width_m)])
         sprayed = lines
     else:
         lines, angle_deg = left.lines, left.angle_deg

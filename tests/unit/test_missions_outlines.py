@@ -147,6 +147,14 @@ def test_an_outline_of_a_point_every_metre_is_planned_like_the_field_that_it_is(
     assert found["transit_outside_m"] == 0.0
 
 
+def test_a_ditch_as_wide_as_a_swath_is_covered_though_margins_make_it_narrower() -> None:
+    ditch = box(-20.0, 0.0, 0.1, 6.003)
+    drawn = Drawn(outline=degrees(rotate(box(0.0, -20.0, 60.0, 30.0).union(ditch), 12.0)))
+    found = judged(drawn)
+    assert found["reachable_percent"] >= 99.8
+    assert found["off_m2"] == 0.0
+
+
 @pytest.mark.parametrize("corner_count", [8, 64])
 def test_trees_need_a_few_lines_each(corner_count: int) -> None:
     drawn = trees(5, corners=corner_count, area_ha=4.0)
