@@ -8,29 +8,33 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby, pairwise
+from itertools import pairwise
 
-from missions.corners import parts_s
+from missions.corners import Course, parts_s
 from missions.plan import Place, Settings, Sortie
 from missions.stops import SAME_M, is_run
 
 # Places nearer than this are one.
 TOUCH_M = 1e-3
+SQUARE_DEG = 90.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Way:
-    """A way between two waypoints; `legs` are (leg, metres) that it is of."""
+    """A way between two waypoints; `legs` are (leg, metres) that it is of.
+
+    One that leads `upright_m` up, or down, has both above each other.
+    """
 
     start: Place
     end: Place
     speed_m_s: float
     legs: tuple[tuple[int, float], ...]
-    height_m: float | None = None
+    upright_m: float = 0.0
 
     @property
     def length_m(self) -> float:
-        return math.dist(self.start, self.end)
+        return abs(self.upright_m) or math.dist(self.start, self.end)
 
     @property
     def course_deg(self) -> float:
@@ -44,18 +48,15 @@ def timed(sorties: Sequence[Sortie], settings: Settings) -> tuple[Sortie, ...]:
 
 
 def _timed(sortie: Sortie, settings: Settings) -> Sortie:
-    ways, motion = _ways(sortie), settings.motion
-    seconds = _upright_s(sortie, settings)
-    level = (list(some) for _, some in groupby(ways[:-1], key=lambda way: way.height_m))
-    for some in (*map(_without_runs, level), ways[-1:]):
-        bends_deg = [
-            abs((after.course_deg - before.course_deg + 180.0) % 360.0 - 180.0)
-            for before, after in pairwise(some)
-        ]
+    ways, motion = _ways(sortie, settings.height_m), settings.motion
+    seconds = [0.0] * len(sortie.legs)
+    for some in (_without_runs(ways[:-1]), ways[-1:]):
         found = parts_s(
-            [way.length_m for way in some], bends_deg, [motion.at(way.speed_m_s) for way in some],
+            [way.length_m for way in some],
+            [_bend_deg(before, after) for before, after in pairwise(some)],
+            [_course(way, settings) for way in some],
             motion.corners,
-        )  # fmt: skip
+        )
         for way, taken_s in zip(some, found, strict=True):
             whole_m = sum(length_m for _, length_m in way.legs)
             for leg, length_m in way.legs:
@@ -64,23 +65,42 @@ def _timed(sortie: Sortie, settings: Settings) -> Sortie:
     return replace(sortie, legs=tuple(legs))
 
 
-def _upright_s(sortie: Sortie, settings: Settings) -> list[float]:
-    """Return what each leg takes to climb or descend: a ferry both, at its two ends."""
-    lines_m = settings.height_m
-    heights_m = [lines_m if leg.height_m is None else leg.height_m for leg in sortie.legs]
-    seconds = [0.0] * len(heights_m)
-    for number, (before_m, after_m) in enumerate(pairwise(heights_m)):
-        if before_m != after_m:
-            higher = number if before_m > after_m else number + 1
-            seconds[higher] += settings.vertical.change_s(before_m, after_m)
-    return seconds
+def _course(way: _Way, settings: Settings) -> Course:
+    """Return how fast a way is flown, and how that speed is reached."""
+    if not way.upright_m:
+        return settings.motion.at(way.speed_m_s)
+    vertical = settings.vertical
+    return Course(
+        speed_m_s=vertical.climb_m_s if way.upright_m > 0.0 else vertical.descent_m_s,
+        acceleration_m_s2=vertical.acceleration_m_s2,
+        jerk_m_s3=settings.motion.jerk_m_s3,
+    )
 
 
-def _ways(sortie: Sortie) -> list[_Way]:
-    """Return the straight ways of a sortie, one after the other."""
+def _bend_deg(before: _Way, after: _Way) -> float:
+    if before.upright_m or after.upright_m:
+        return SQUARE_DEG
+    return abs((after.course_deg - before.course_deg + 180.0) % 360.0 - 180.0)
+
+
+def _ways(sortie: Sortie, lines_m: float) -> list[_Way]:
+    """Return the straight ways of a sortie, one after the other, climbs and descents among them.
+
+    What a ferry takes to climb and descend, at its two ends, is its own.
+    """
     found = []
     here = sortie.legs[0].points[0]
+    heights_m = [lines_m if leg.height_m is None else leg.height_m for leg in sortie.legs]
     for number, leg in enumerate(sortie.legs):
+        rise_m = heights_m[number] - heights_m[max(number - 1, 0)]
+        if rise_m:
+            higher = number if rise_m > 0.0 else number - 1
+            found.append(
+                _Way(
+                    start=here, end=here, speed_m_s=leg.speed_m_s,
+                    legs=((higher, abs(rise_m)),), upright_m=rise_m,
+                )
+            )  # fmt: skip
         if leg.through and leg.length_m < SAME_M:
             # The ends of both lines are one waypoint.
             here = leg.points[-1]
@@ -91,7 +111,6 @@ def _ways(sortie: Sortie) -> list[_Way]:
                 found.append(
                     _Way(
                         start=here, end=place, speed_m_s=leg.speed_m_s, legs=((number, length_m),),
-                        height_m=leg.height_m,
                     )
                 )  # fmt: skip
                 here = place
@@ -103,7 +122,8 @@ def _without_runs(ways: list[_Way]) -> list[_Way]:
     kept = ways[:1]
     for way in ways[1:]:
         last = kept[-1]
-        if way.speed_m_s == last.speed_m_s and is_run(last.start, last.end, way.end):
+        level = not way.upright_m and not last.upright_m
+        if level and way.speed_m_s == last.speed_m_s and is_run(last.start, last.end, way.end):
             kept[-1] = replace(last, end=way.end, legs=(*last.legs, *way.legs))
         else:
             kept.append(way)
