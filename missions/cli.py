@@ -212,7 +212,7 @@ def plan(
     if pilot_sheet is not None:
         write_sheet(
             planned, result, pilot_sheet, title=field.stem, product=product_of(configured),
-            start_min=parse_start(first),
+            start_min=parse_start(first), picture=png,
         )  # fmt: skip
     answer(result, _lines(planned, result, files), as_json=as_json)
     if once:

@@ -5,6 +5,7 @@ One table, a row for each sortie, as HTML for the printer or as plain text.
 
 from __future__ import annotations
 
+import base64
 import math
 import re
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from missions.errors import PlanError
 from missions.plan import Plan
 
 SUFFIXES = (".html", ".txt")
+PICTURES = {".png": "image/png", ".svg": "image/svg+xml"}
 _DAY_MIN = 24 * 60
 _STYLE = """@page { size: A4 landscape; margin: 10mm; }
 body { font: 10pt sans-serif; margin: 8mm; color: #000; }
@@ -31,7 +33,8 @@ thead { display: table-header-group; }
 tr { break-inside: avoid; }
 tfoot td { font-weight: bold; }
 td.fill { font-size: 13pt; font-weight: bold; }
-p { margin: 3mm 0 0; }"""
+p { margin: 3mm 0 0; }
+img { max-width: 100%; max-height: 180mm; margin-top: 4mm; break-inside: avoid; }"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,14 +111,18 @@ def write_sheet(
     title: str,
     product: Product = NO_PRODUCT,
     start_min: int | None = None,
+    picture: Path | None = None,
 ) -> None:
-    """Write the sheet of a plan, with the figures of `missions.sheet`."""
+    """Write the sheet of a plan, with the figures of `missions.sheet`; HTML holds its picture."""
     check_sheet(out)
     facts = _facts(plan, found, product)
     table = _table(plan, found, product, start_min)
     notes = _notes(plan, start_min)
-    make = _html if out.suffix.casefold() == ".html" else _text
-    write_whole(out, make(title, facts, table, notes).encode("utf-8"))
+    if out.suffix.casefold() == ".html":
+        text = _html(title, facts, table, notes, _shown(picture))
+    else:
+        text = _text(title, facts, table, notes)
+    write_whole(out, text.encode("utf-8"))
 
 
 Facts = list[tuple[str, str]]
@@ -138,7 +145,7 @@ def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
         ("Time", f"{clock(found['total_s'])} (h:min) from first take-off to last landing"),
         ("Refill", f"{settings.refill_s:g} s, battery {settings.swap_s:g} s, in that time"),
         ("Speed, height", f"{_speeds(rows)} m/s, {settings.height_m:g} m above "
-         f"{'the ground' if plan.terrain is not None else 'the depot'}"),
+         f"{'the ground' if plan.terrain is not None else 'the depot'}{_ferries(plan)}"),
         ("Swath", f"{settings.swath_width_m:g} m, course {plan.angle_deg:.0f} deg"),
         ("Wind", _wind(plan)),
     ]  # fmt: skip
@@ -147,6 +154,11 @@ def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
         suggested = " (suggested)" if plan.suggested_depot else ""
         facts.append((name, f"{latitude_deg:.6f}, {longitude_deg:.6f}{suggested}"))
     return facts
+
+
+def _ferries(plan: Plan) -> str:
+    height_m = plan.settings.ferry_height_m
+    return "" if height_m is None else f", ferries {height_m:g} m"
 
 
 def _wind(plan: Plan) -> str:
@@ -243,7 +255,16 @@ def _row(cells: list[str], widths: list[int]) -> str:
     return "  ".join(cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
 
 
-def _html(title: str, facts: Facts, table: Table, notes: list[str]) -> str:
+def _shown(picture: Path | None) -> list[str]:
+    """Return a picture inside the page; none of a format that browsers do not show there."""
+    kind = None if picture is None else PICTURES.get(picture.suffix.casefold())
+    if picture is None or kind is None:
+        return []
+    content = base64.b64encode(picture.read_bytes()).decode("ascii")
+    return [f'<img alt="plan" src="data:{kind};base64,{content}">']
+
+
+def _html(title: str, facts: Facts, table: Table, notes: list[str], picture: list[str]) -> str:
     """Return the sheet as a page of its own, without a script and without a file beside it."""
     head = "".join(f"<th>{escape(name).replace(chr(10), '<br>')}</th>" for name in table[0])
     fill = table[0].index("fill to\nL")
@@ -260,6 +281,7 @@ def _html(title: str, facts: Facts, table: Table, notes: list[str]) -> str:
         f"<tbody>{body}</tbody>",
         f"<tfoot><tr>{_cells(table[-1])}</tr></tfoot></table>",
         *(f"<p>{escape(note)}</p>" for note in notes),
+        *picture,
         "</body></html>",
     ]
     return "\n".join(lines) + "\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 from html.parser import HTMLParser
@@ -150,14 +151,14 @@ def test_a_sheet_in_html_is_one_well_formed_page_with_a_row_for_each_sortie(
     )
     text = sheet.read_text()
     assert "Brew &amp; Sons &lt;A&gt;" in text
-    assert "<script" not in text and "http" not in text
+    assert "<script" not in text and "http" not in text and "<img" not in text
 
     class Rows(HTMLParser):
         open: list[str] = []  # noqa: RUF012
         count = 0
 
         def handle_starttag(self, tag: str, attrs: object) -> None:
-            if tag not in ("meta", "br"):
+            if tag not in ("meta", "br", "img"):
                 self.open.append(tag)
             self.count += tag == "tr"
 
@@ -168,6 +169,17 @@ def test_a_sheet_in_html_is_one_well_formed_page_with_a_row_for_each_sortie(
     parser.feed(text)
     assert not parser.open
     assert parser.count == len(found["sorties"]) + 2
+
+
+def test_a_sheet_in_html_holds_the_picture_that_was_made(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    pytest.importorskip("matplotlib")
+    field = written(box(0, 0, 50, 50), tmp_path / "f.geojson")
+    sheet, picture = tmp_path / "sheet.html", tmp_path / "m.png"
+    planned(capsys, field, "--out", tmp_path / "m.kml", "--sheet", sheet, "--png", picture)
+    _, _, rest = sheet.read_text().partition('src="data:image/png;base64,')
+    assert base64.b64decode(rest.partition('"')[0]) == picture.read_bytes()
 
 
 def test_several_aircraft_each_pour_their_own_reserve(
