@@ -3,8 +3,8 @@
 The Commander takes one command per loop of about 10 ms; the queue holds eight, and more than 20
 to 30 commands a second in total are not safe (vehicle_command lost; PX4 #16630, #16635, #20430).
 Modelled as eight commands at once and `per_s` of them a second in the long run; what is beyond is
-lost, with its acknowledgement. Those that get through are carried out 4 to 12 ms later, as measured
-on a PX4 1.16 SITL.
+lost, with its acknowledgement. Those that get through are answered 4 to 12 ms later, as measured
+on a PX4 1.16 SITL; DO_SET_ACTUATOR is at the outputs by then, which hear it themselves.
 """
 
 from __future__ import annotations

@@ -143,3 +143,5 @@ def _take(
         carry_out(now_s)
     elif not queue.put(carry_out, now_s):
         autopilot.says(f"vehicle_command lost: {command}")
+    elif command in autopilot.firmware.mixed_at_once:
+        autopilot.firmware.mixed_at_once[command](autopilot, params, now_s)

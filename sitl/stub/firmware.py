@@ -29,7 +29,8 @@ class Firmware:
     """A personality.
 
     `commands_at_once` are answered by the receiver itself; the others of a firmware with a
-    `queue_depth` go through a queue that is emptied `commands_per_s` times a second.
+    `queue_depth` go through a queue that is emptied `commands_per_s` times a second. The outputs
+    hear those `mixed_at_once` themselves; only the answer waits for the queue.
     `first_item` is how many items of the flight's list the wire does not count: home, on PX4.
     `keeps_item`: the same mission, uploaded again, goes on with the item that was left.
     `zero_is_a_place` tells PX4, which flies to 0, 0, from ArduPilot, to which that means "here".
@@ -49,6 +50,9 @@ class Firmware:
     groups: Mapping[int, tuple[int, ...]]
     default_rates_hz: Mapping[int, float]
     commands_at_once: frozenset[int] = frozenset()
+    mixed_at_once: Mapping[int, Callable[[Autopilot, Params, float], None]] = field(
+        default_factory=dict
+    )
     queue_depth: int | None = None
     commands_per_s: float = 30.0
     first_item: int = 0

@@ -6,7 +6,14 @@ from sitl.stub.ardupilot import MESSAGES
 from sitl.stub.firmware import Firmware, Version
 from sitl.stub.mission_items import refused_by_px4
 from sitl.stub.parameters import INT32, OUTPUT_COUNT, REAL32, Parameters
-from sitl.stub.px4_commands import ACKNOWLEDGED_SINCE, AT_ONCE, COMMANDS, handle_set_mode
+from sitl.stub.px4_commands import (
+    ACKNOWLEDGED_SINCE,
+    AT_ONCE,
+    COMMANDS,
+    DO_SET_ACTUATOR,
+    handle_set_mode,
+    set_actuators,
+)
 from sitl.stub.px4_streams import BUILDERS, DEFAULT_RATES_HZ, heartbeat, withholds
 
 NAME = "px4"
@@ -31,6 +38,7 @@ def px4(version: Version = VERSION, *, commands_per_s: float = COMMANDS_PER_S) -
         groups={},
         default_rates_hz=DEFAULT_RATES_HZ,
         commands_at_once=AT_ONCE,
+        mixed_at_once={DO_SET_ACTUATOR: set_actuators},
         queue_depth=_QUEUE_DEPTH,
         commands_per_s=commands_per_s,
         first_item=1,

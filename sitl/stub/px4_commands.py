@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 # Until this version nobody acknowledged DO_SET_ACTUATOR, and a NaN overwrote (PR #22711).
 ACKNOWLEDGED_SINCE = (1, 14, 2)
+DO_SET_ACTUATOR: int = dialect.MAV_CMD_DO_SET_ACTUATOR
 _INTERVAL_MIN_S = 0.002
 _UNASKABLE = frozenset({dialect.MAVLINK_MSG_ID_HEARTBEAT})
 
@@ -72,11 +73,10 @@ def _start_mission(autopilot: Autopilot, _channel: Channel, _params: Params, now
     return _change(autopilot, AUTO, now_s)
 
 
-def _set_actuator(
-    autopilot: Autopilot, _channel: Channel, params: Params, now_s: float
+def _answer_actuators(
+    autopilot: Autopilot, _channel: Channel, _params: Params, _now_s: float
 ) -> int | None:
-    """Set all six actuators; accepted whatever becomes of them, or never acknowledged."""
-    set_actuators(autopilot, params, now_s)
+    """Accept an order of all six actuators, whatever became of it, or never acknowledge it."""
     return ACCEPTED if autopilot.firmware.version >= ACKNOWLEDGED_SINCE else None
 
 
@@ -114,7 +114,7 @@ COMMANDS: Mapping[int, CommandHandler] = {
     dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: commands.to_mode(RTL, refused=REJECTED),
     dialect.MAV_CMD_NAV_LOITER_UNLIM: commands.to_mode(LOITER, refused=REJECTED),
     dialect.MAV_CMD_MISSION_START: _start_mission,
-    dialect.MAV_CMD_DO_SET_ACTUATOR: _set_actuator,
+    DO_SET_ACTUATOR: _answer_actuators,
     dialect.MAV_CMD_DO_CHANGE_SPEED: commands.change_speed,
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_interval,
     dialect.MAV_CMD_GET_MESSAGE_INTERVAL: commands.get_interval,

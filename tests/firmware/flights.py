@@ -173,7 +173,7 @@ class FlownField:
     planned_l: float
 
 
-def fly_field(kind: Kind, where: Path, folder: Path) -> FlownField:
+def fly_field(kind: Kind, where: Path, folder: Path, *settings: str) -> FlownField:
     """Plan the example's field, upload it and fly it on its lines; the log is kept too."""
     field = copy_example(folder / "field")
     config, plan, lines = field / kind.config, field / "field.plan", field / "field.lines.geojson"
@@ -185,7 +185,7 @@ def fly_field(kind: Kind, where: Path, folder: Path) -> FlownField:
         uploaded = _done("upload", f"{plan}", "--link", kind.link)
         assert (uploaded["ok"], uploaded["firmware"]) == (True, kind.name)
         more = ("--config", f"{config}", *kind.options, "--set", f"mission.lines={lines}")
-        with firmware.companion(folder, *more) as started:
+        with firmware.companion(folder, *more, *settings) as started:
             until_heard(vehicle.station, started, folder / "companion.txt")
             vehicle.station.log.clear_flight()
             start(vehicle, None)

@@ -339,10 +339,60 @@ def judge(
     them counts; what is sprayed off them is `off_lines_ml`.
     """
     sprayer = sprayer or Sprayer()
-    middle = shapely.union_all([zone.outline for zone in zones]).centroid
-    plane = Plane(middle.y, middle.x)
+    plane = _plane(zones)
     path = true_path(places, vehicle_times(places, pulses), plane)
     flows = flows_ml_s(pulses, path.at_s, sprayer, seed)
+    return _verdict(path, flows, plane, zones, inside, lines, sprayer, grazing_m)
+
+
+def judge_perfect(
+    places: Sequence[Place],
+    zones: Sequence[Zone],
+    *,
+    inside: shapely.Geometry | None = None,
+    lines: Sequence[shapely.LineString] | None = None,
+    sprayer: Sprayer | None = None,
+    grazing_m: float = 0.0,
+) -> Verdict:
+    """Return what a sprayer without delay would have done that believes the speeds that are told.
+
+    Its changes are on time to the millimetre. What is left is what places and speeds disagree by.
+    """
+    sprayer = sprayer or Sprayer()
+    plane = _plane(zones)
+    at_s = np.array([place.at_s for place in places], dtype=float)
+    path = true_path(places, at_s, plane)
+    flat = [Zone(plane.of(zone.outline), zone.rate_l_ha) for zone in zones]
+    speed_m_s = np.interp(path.at_s, at_s, [place.speed_m_s for place in places])
+    flows = [
+        np.nan_to_num(rates_at(flat, *_valve_place(path, right_m))) * sprayer.width_m * speed_m_s
+        for right_m in sprayer.right_m
+    ]
+    return _verdict(path, 0.1 * np.array(flows), plane, zones, inside, lines, sprayer, grazing_m)
+
+
+def apart_m(verdict: Verdict, other: Verdict) -> Floats:
+    """Return how far the changes of two verdicts of one flight are apart, those that both have."""
+    lags_m = {(one.valve, one.at_s): one.lag_m for one in other.changes}
+    pairs = [(one.lag_m, lags_m.get((one.valve, one.at_s))) for one in verdict.changes]
+    return np.array([a - b for a, b in pairs if a is not None and b is not None])
+
+
+def _plane(zones: Sequence[Zone]) -> Plane:
+    middle = shapely.union_all([zone.outline for zone in zones]).centroid
+    return Plane(middle.y, middle.x)
+
+
+def _verdict(
+    path: Path2d,
+    flows: Floats,
+    plane: Plane,
+    zones: Sequence[Zone],
+    inside: shapely.Geometry | None,
+    lines: Sequence[shapely.LineString] | None,
+    sprayer: Sprayer,
+    grazing_m: float,
+) -> Verdict:
     flat = [Zone(plane.of(zone.outline), zone.rate_l_ha) for zone in zones]
     allowed = plane.of(inside) if inside is not None else None
     if allowed is None:
@@ -364,6 +414,11 @@ def rates_at(zones: Sequence[Zone], east_m: Floats, north_m: Floats) -> Floats:
     for zone in zones:
         rates[shapely.contains_xy(zone.outline, east_m, north_m)] = zone.rate_l_ha
     return rates
+
+
+def _valve_place(path: Path2d, right_m: float) -> tuple[Floats, Floats]:
+    east_m = path.east_m + right_m * np.cos(path.yaw_rad)
+    return east_m, path.north_m - right_m * np.sin(path.yaw_rad)
 
 
 def along_lines(path: Path2d, lines: Sequence[shapely.LineString]) -> NDArray[np.bool_]:
@@ -390,9 +445,7 @@ def _judge_valve(
     grazing_m: float,
 ) -> None:
     def place(aside_m: float) -> tuple[Floats, Floats]:
-        right_m = sprayer.right_m[valve] + aside_m
-        east_m = path.east_m + right_m * np.cos(path.yaw_rad)
-        return east_m, path.north_m - right_m * np.sin(path.yaw_rad)
+        return _valve_place(path, sprayer.right_m[valve] + aside_m)
 
     def rates_of(aside_m: float) -> Floats:
         return np.where(on_line, rates_at(zones, *place(aside_m)), np.nan)

@@ -27,7 +27,7 @@ class Place:
     """Where the vehicle was.
 
     `at_s` is its own clock, None where the message has none; `pulses_before` counts the outputs'
-    messages that had come by then, which have a time.
+    messages that had come by then, which have a time. `speed_m_s` is the one told with it.
     """
 
     came_s: float
@@ -36,6 +36,7 @@ class Place:
     latitude_deg: float
     longitude_deg: float
     yaw_rad: float
+    speed_m_s: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +159,8 @@ class Station:
         elif kind == "GLOBAL_POSITION_INT":
             yaw_rad = math.radians(message.hdg * 1e-2)
             at_s = message.time_boot_ms * 1e-3
-            self._place(self.log.told, now_s, at_s, message.lat, message.lon, yaw_rad)
+            speed_m_s = math.hypot(message.vx, message.vy) * 1e-2
+            self._place(self.log.told, now_s, at_s, message.lat, message.lon, yaw_rad, speed_m_s)
         elif kind == "SERVO_OUTPUT_RAW" and message.port == 0:
             us = tuple(getattr(message, f"servo{number}_raw") for number in range(1, 17))
             self.log.pulses.append(Pulses(now_s, message.time_usec * 1e-6, us))
@@ -175,9 +177,10 @@ class Station:
         lat: int,
         lon: int,
         yaw_rad: float,
+        speed_m_s: float = math.nan,
     ) -> None:
         before = len(self.log.pulses)
-        places.append(Place(now_s, at_s, before, lat * _E7, lon * _E7, yaw_rad))
+        places.append(Place(now_s, at_s, before, lat * _E7, lon * _E7, yaw_rad, speed_m_s))
 
     # -------------------------------------------------------------------------------- waiting
 

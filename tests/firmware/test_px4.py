@@ -26,9 +26,11 @@ from tests.firmware.judge import (
     Plane,
     Verdict,
     Zone,
+    apart_m,
     geojson_area,
     geojson_zones,
     judge,
+    judge_perfect,
     obeyed,
 )
 from tests.firmware.station import Log, MissionItem, Place
@@ -36,14 +38,19 @@ from tests.firmware.station import Log, MissionItem, Place
 pytestmark = [pytest.mark.firmware, pytest.mark.timeout(300)]
 
 MEAN_MAX_M, WORST_MAX_M, OFF_TARGET_MAX_ML = 0.05, 0.25, 0.1
-# What is asked for is printed as met or missed; a flight fails by more than this. The place that
-# PX4 tells goes by 2 to 3 % faster and slower than the velocity it tells, within a second or two;
-# the dose is of the velocity, and near a step of 17 % that moves the place where two doses meet: in
-# eight recorded flights by 0.06 m in the mean and 0.2 m at most, were the changes on time to the
-# millimetre. (docs/px4.md, what PX4 is off by)
+# What is asked for is printed as met or missed; a flight fails by more than the bounds below. The
+# place that PX4 tells goes by 2 to 3 % faster and slower than the velocity it tells, within a
+# second or two; the dose is of the velocity, and near a step of 17 % that moves the place where two
+# doses meet: on 24 passes by 0.056 m in the mean and 0.44 m at most, were the changes on time to
+# the millimetre (`judge_perfect`). What is ours comes on top of that, change by change: on those
+# passes 0.031 to 0.059 m in the mean and 0.22 m at most. (docs/px4.md, what PX4 is off by)
+OURS_MEAN_BOUND_M, OURS_WORST_BOUND_M = 0.08, 0.35
+MEAN_BOUND_M, WORST_BOUND_M, OFF_TARGET_BOUND_ML = 0.13, 0.70, 0.3
 # So much (sd) is its place off sideways, and with it the column of zones that an outer valve is in.
 GRAZING_M = 0.2
-MEAN_BOUND_M, WORST_BOUND_M, OFF_TARGET_BOUND_ML = 0.10 + MEAN_MAX_M, 0.20 + WORST_MAX_M, 0.5
+# The told place is the aim here. The example's `position_s` makes good what that is late by.
+AS_TOLD = ("--set", "lag.position_s=0")
+TOLD, PERFECT = "told", "told, a perfect sprayer"
 
 
 def with_yaw_of(places: Sequence[Place], others: Sequence[Place]) -> list[Place]:
@@ -103,19 +110,23 @@ def verdicts(
 ) -> dict[str, Verdict]:
     """Return what the flight did: by what PX4 tells, by the truth, and by one half of each.
 
+    And what it would have done by what PX4 tells, had the sprayer no delay.
+
     Behind the outputs is the board that PX4 needs, one that closes what stands still.
     """
     pulses, _ = obeyed(log.pulses)
     ways = {
-        "told": log.told,
+        TOLD: log.told,
         "told, true heading": with_yaw_of(log.told, log.places),
         "true, told heading": with_yaw_of(log.places, log.told),
         "true": log.places,
     }
-    return {
+    found = {
         name: judge(places, pulses, zones, inside=inside, lines=lines, grazing_m=GRAZING_M)
         for name, places in ways.items()
     }
+    found[PERFECT] = judge_perfect(log.told, zones, inside=inside, lines=lines, grazing_m=GRAZING_M)
+    return found
 
 
 def fly_pass(
@@ -127,7 +138,7 @@ def fly_pass(
     """Fly passes over eight zones and judge them in four ways."""
     config = write_pass(folder / "field", config="px4.toml")
     with ready_px4(folder / "px4", firmwares) as vehicle:
-        with companion(folder, "--config", str(config), *PX4.options) as started:
+        with companion(folder, "--config", str(config), *PX4.options, *AS_TOLD) as started:
             until_heard(vehicle.station, started, folder / "companion.txt")
             vehicle.station.log.clear_flight()
             start(vehicle, items)
@@ -152,16 +163,24 @@ def told_of(
     return found
 
 
-def holds(told: Verdict, tell: Callable[[object], None]) -> None:
+def holds(found: dict[str, Verdict], tell: Callable[[object], None]) -> Verdict:
     """Hold a flight to what PX4 tells, and say whether it did what is asked for."""
+    told = found[TOLD]
     is_met = told.mean_abs_m <= MEAN_MAX_M and told.worst_m <= WORST_MAX_M
     is_met = is_met and told.off_target_ml <= OFF_TARGET_MAX_ML
     bars = f"mean {MEAN_MAX_M} m, worst {WORST_MAX_M} m, off target {OFF_TARGET_MAX_ML} mL"
     tell(f"{bars}: {'met' if is_met else 'MISSED'}")
+    ours_m = apart_m(told, found[PERFECT])
+    mean_m, worst_m = np.abs(ours_m).mean(), np.abs(ours_m).max()
+    tell(f"ours of it: mean {mean_m:.3f} m (signed {ours_m.mean():+.3f}), worst {worst_m:.3f} m")
     assert not told.missed
+    assert len(ours_m) == len(told.changes)
+    assert mean_m <= OURS_MEAN_BOUND_M
+    assert worst_m <= OURS_WORST_BOUND_M
     assert told.mean_abs_m <= MEAN_BOUND_M
     assert told.worst_m <= WORST_BOUND_M
     assert told.off_target_ml <= OFF_TARGET_BOUND_ML
+    return told
 
 
 @pytest.mark.short
@@ -169,26 +188,24 @@ def test_each_change_falls_where_px4_believes_its_boundary(
     firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
 ) -> None:
     found = fly_pass(firmwares, tmp_path, pass_items(5.0), tell)
-    told = found["told"]
+    told = holds(found, tell)
     assert len(told.changes) == 7 * 6
-    holds(told, tell)
 
 
 def test_two_passes_are_held_to_what_it_tells(
     firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
 ) -> None:
     found = fly_pass(firmwares, tmp_path, pass_items(5.0, passes=2), tell)
-    holds(found["told"], tell)
+    holds(found, tell)
 
 
 def test_the_planned_and_uploaded_field_is_sprayed_on_its_lines(
     firmwares: Path, tmp_path: Path, tell: Callable[[object], None]
 ) -> None:
-    flown = fly_field(PX4, firmwares, tmp_path)
+    flown = fly_field(PX4, firmwares, tmp_path, *AS_TOLD)
     log = flown.log
     found = told_of(log, verdicts(log, flown.zones, flown.inside, flown.lines), tell)
-    told = found["told"]
+    told = holds(found, tell)
     assert len(told.changes) >= 190  # of 216; those of valves along a boundary count apart
-    holds(told, tell)
     assert told.off_lines_ml <= OFF_LINES_MAX_ML
     assert told.sprayed_l == pytest.approx(flown.planned_l, rel=0.05)

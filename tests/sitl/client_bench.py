@@ -178,9 +178,8 @@ def write_field(folder: Path, autopilot: str) -> Path:
         numbers = iter(range(1, 7))
         text = re.sub(r"channel = \d+", lambda _: f"channel = {next(numbers)}", text)
         text = text.replace('modes = ["AUTO"]', 'modes = ["MISSION"]')
-        # It takes an order 8 ms later, and its positions are not 31 ms late (docs/px4.md).
-        text = text.replace("output_s = 0.0120", "output_s = 0.0200")
-        text = text.replace("position_s = 0.0349", "position_s = 0.0039")
+        # Its positions are 10 ms late and not 31 (docs/px4.md).
+        text = text.replace("position_s = 0.0349", "position_s = 0.0100")
     config.write_text(text)
     return config
 

@@ -8,7 +8,15 @@ from collections.abc import Sequence
 import pytest
 import shapely
 
-from tests.firmware.judge import Verdict, Zone, judge, obeyed, treated_ground
+from tests.firmware.judge import (
+    Verdict,
+    Zone,
+    apart_m,
+    judge,
+    judge_perfect,
+    obeyed,
+    treated_ground,
+)
 from tests.firmware.station import Place, Pulses
 
 # The valve's mean lag: dead time, half the rise, half a servo frame.
@@ -90,6 +98,34 @@ def test_a_lag_is_found_as_it_was_made(speed_m_s: float, lag_m: float) -> None:
 
 def test_a_place_with_a_time_of_its_own_is_judged_alike() -> None:
     assert flown(5.0, is_told=True).lags_m == pytest.approx(flown(5.0).lags_m, abs=0.01)
+
+
+def told_speed(speed_m_s: float, *, wiggle_m_s: float = 0.0) -> list[Place]:
+    """Return places at a steady speed, told with one that swings about it once a second."""
+    return [
+        Place(at_s, at_s, 0, at_s * speed_m_s / NORTH_M, 0.0, 0.0, told_m_s)
+        for at_s in (number * 0.01 for number in range(int(8500.0 / speed_m_s)))
+        for told_m_s in (speed_m_s + wiggle_m_s * math.sin(2.0 * math.pi * at_s),)
+    ]
+
+
+THREE_ZONES = [
+    (start, end, rate) for start, end, rate in zip(ENDS_M, ENDS_M[1:], RATES_L_HA, strict=False)
+]
+
+
+def test_a_perfect_sprayer_is_off_by_what_place_and_speed_disagree_by() -> None:
+    zones = [zone(*one) for one in THREE_ZONES]
+    steady = judge_perfect(told_speed(5.0), zones)
+    assert len(steady.changes) == 2 * 6
+    assert steady.worst_m < 0.015
+    assert steady.sprayed_l == pytest.approx(steady.prescribed_l, rel=0.005)
+    # 3 % for half a second each way, with changes of 17 and 60 %.
+    swinging = judge_perfect(told_speed(5.0, wiggle_m_s=0.15), zones)
+    assert 0.02 < swinging.mean_abs_m < 0.3
+    off_m = apart_m(swinging, steady)
+    assert off_m == pytest.approx(swinging.lags_m - steady.lags_m)
+    assert apart_m(steady, judge_perfect(told_speed(5.0), zones[:2])).shape == (6,)
 
 
 def test_a_change_that_never_came_is_missed() -> None:

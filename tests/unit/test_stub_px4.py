@@ -266,6 +266,14 @@ def test_nan_leaves_alone_or_overwrites_by_version(version: Version, left: int) 
     assert servos(bench) == [1500, *[left] * 5]
 
 
+def test_the_outputs_follow_before_the_commander_answers() -> None:
+    bench = px4()
+    arm(bench)
+    bench.run(0.1)
+    assert bench.companion.command(SET_ACTUATOR, *(1.0,) * 6, 0) is None
+    assert [order.pulse_us for order in bench.orders[-6:]] == [2000] * 6
+
+
 @pytest.mark.parametrize(("version", "answer"), [(OLD, None), ((1, 14, 2), 0), (None, 0)])
 def test_an_order_is_acknowledged_by_version(version: Version | None, answer: int | None) -> None:
     bench = px4(version=version)
