@@ -68,7 +68,7 @@ class Demand:
         [[0.0, 4.0, 8.0, 10.0], [1.0, 1.0, 0.5]]
         """
         count = max(1, math.ceil(self.total_l / piece_max_l - 1e-9))
-        litres = np.minimum(np.arange(count + 1) * piece_max_l, self.total_l)
+        litres = np.minimum(np.arange(count + 1) * min(piece_max_l, self.total_l), self.total_l)
         cuts = np.interp(litres, self.litres, self.at_m)
         cuts[0], cuts[-1] = self.at_m[0], self.at_m[-1]
         litres[-1] = self.total_l

@@ -117,29 +117,42 @@ class FreeSpace:
         ends = np.array([start, end])
         if bool(self.sees(ends[:1], ends[1:])[0]):
             return [start, end]
-        for nearest in (NEAREST, None):
-            found = self._along_corners(ends, nearest)
-            if found:
-                return self._straightened(ends, found)
-        return []
+        found, _ = self._over_corners(start, end)
+        return self._straightened(ends, found) if found else []
 
-    def _along_corners(self, ends: Floats, nearest: int | None) -> list[int]:
-        reach = self.to_corners_m(ends, nearest=nearest)
-        if not reach.size:
-            return []
-        near, far = (np.flatnonzero(np.isfinite(row)) for row in reach)
-        if not len(near) or not len(far):
-            return []
-        total = reach[0][near, None] + self.between_m[np.ix_(near, far)] + reach[1][far]
-        row, column = np.unravel_index(int(np.argmin(total)), total.shape)
-        if not math.isfinite(total[row, column]):
-            return []
-        first, last = near[row], far[column]
-        chain = [int(first)]
-        while chain[-1] != last:
-            over = self.direct_m[chain[-1]] + self.between_m[:, last]
+    def around_m(self, start: Place, end: Place) -> float:
+        """Return the way between two places that do not see each other; infinite without one."""
+        return self._over_corners(start, end)[1]
+
+    def _over_corners(self, start: Place, end: Place) -> tuple[list[int], float]:
+        """Return the corners of the shortest way, and its length.
+
+        The best first and last corner are looked at for sight first: most are never looked at.
+        """
+        if not len(self.corners):
+            return [], math.inf
+        total_m = self.between_m + np.add.outer(
+            np.hypot(*(self.corners - start).T), np.hypot(*(self.corners - end).T)
+        )
+        shape, seen = shapely.LineString, self.space
+        visible: dict[tuple[int, int], bool] = {}
+        while True:
+            pair = divmod(int(np.argmin(total_m)), len(self.corners))
+            if not math.isfinite(total_m[pair]):
+                return [], math.inf
+            for side, (place, corner) in enumerate(zip((start, end), pair, strict=True)):
+                if (side, corner) not in visible:
+                    straight = shape([place, self.corners[corner]])
+                    visible[side, corner] = bool(shapely.covers(seen, straight))
+                if not visible[side, corner]:
+                    total_m[(corner, slice(None)) if side == 0 else (slice(None), corner)] = np.inf
+            if all(visible.get((side, corner), False) for side, corner in enumerate(pair)):
+                break
+        chain = [pair[0]]
+        while chain[-1] != pair[1]:
+            over = self.direct_m[chain[-1]] + self.between_m[:, pair[1]]
             chain.append(int(np.argmin(over)))
-        return chain
+        return chain, float(total_m[pair])
 
     def _straightened(self, ends: Floats, chain: list[int]) -> list[Place]:
         """Return the shortest way over the corners that lie no farther aside than this one."""

@@ -82,12 +82,7 @@ def build_network(
     onward_s = _onward_s(motion, length_m[rows >> 1], along_m, length_m[columns >> 1])
     between[rows, columns] = between[columns, rows] = onward_s
     _know(near, rows, columns)
-    home_m = np.hypot(
-        depots[:, 0][:, None] - ends[:, 0][None, :], depots[:, 1][:, None] - ends[:, 1][None, :]
-    )
-    if not space.is_convex:
-        _bend_home(home_m, depots, ends, space)
-    home = motion.legs_s(home_m)
+    home = motion.legs_s(home_ways_m(depots, ends, space))
     between[count, :count] = between[:count, count] = home.min(axis=0) + refill_s / 2.0
     return Network(between_s=between, home_s=home, near=near, litres=pieces.litres)
 
@@ -203,13 +198,38 @@ def _see_each_other(ends: Floats, rows: Ints, columns: Ints, space: FreeSpace) -
     return space.sees(ends[pairs // len(ends)], ends[pairs % len(ends)])[which]
 
 
-def _bend_home(home_m: Floats, depots: Floats, ends: Floats, space: FreeSpace) -> None:
-    to_corners = space.to_corners_m(ends)
+def home_ways_m(depots: Floats, ends: Floats, space: FreeSpace) -> Floats:
+    """Return the way from every depot to every end, bent where it does not see it."""
+    far_m: Floats = np.hypot(
+        depots[:, 0][:, None] - ends[:, 0][None, :], depots[:, 1][:, None] - ends[:, 1][None, :]
+    )
+    if space.is_convex:
+        return far_m
     for number, depot in enumerate(depots):
         hidden = np.flatnonzero(~space.sees(np.tile(depot, (len(ends), 1)), ends))
         reach = space.to_corners_m(depot[None, :], nearest=None)
         if not len(hidden) or not reach.size:
             continue
-        first = np.min(reach[0][:, None] + space.between_m, axis=0)
-        bent = np.min(first[None, :] + to_corners[hidden], axis=1)
-        home_m[number, hidden] = np.where(np.isfinite(bent), bent, home_m[number, hidden])
+        to_corner_m = np.min(reach[0][:, None] + space.between_m, axis=0)
+        bent = _over_corners_m(to_corner_m, ends[hidden], space)
+        far_m[number, hidden] = np.where(np.isfinite(bent), bent, far_m[number, hidden])
+    return far_m
+
+
+def _over_corners_m(to_corner_m: Floats, ends: Floats, space: FreeSpace) -> Floats:
+    """Return the shortest way to each end over a corner that it sees; infinite without one."""
+    ways_m = to_corner_m + np.hypot(
+        ends[:, 0][:, None] - space.corners[:, 0][None, :],
+        ends[:, 1][:, None] - space.corners[:, 1][None, :],
+    )
+    order = np.argsort(ways_m, axis=1, kind="stable")
+    found = np.full(len(ends), np.inf)
+    waiting = np.arange(len(ends))
+    # The first corner in sight is the best one: few are looked at.
+    for corner in order.T:
+        seen = space.sees(ends[waiting], space.corners[corner[waiting]])
+        found[waiting[seen]] = ways_m[waiting[seen], corner[waiting[seen]]]
+        waiting = waiting[~seen]
+        if not len(waiting):
+            break
+    return found

@@ -96,6 +96,14 @@ class Settings:
         return replace(found, return_height_m=self.return_height_m)
 
     @property
+    def upright_s(self) -> float:
+        """Return what take-off, return and landing take, and the height of ferries once each."""
+        vertical, low_m = self.vertical, self.height_m
+        high_m = low_m if self.ferry_height_m is None else self.ferry_height_m
+        changes_s = vertical.change_s(high_m, low_m) + vertical.change_s(low_m, high_m)
+        return vertical.climb_s(high_m) + vertical.return_s(high_m) + changes_s
+
+    @property
     def usable_l(self) -> float:
         """Return what of a full tank is sprayed before the refill."""
         return self.tank_l - self.reserve_l

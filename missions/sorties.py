@@ -11,7 +11,7 @@ import shapely
 
 from missions.budget import Budget, build_budget
 from missions.demand import Demand, Pieces, cut
-from missions.energy import J_WH, KG_L
+from missions.energy import J_WH, KG_L, nose_s
 from missions.errors import PlanError
 from missions.network import (
     ACROSS_M,
@@ -20,12 +20,16 @@ from missions.network import (
     STRAIGHT_M,
     Network,
     build_network,
+    home_ways_m,
 )
 from missions.plan import Kind, Leg, Place, Settings, Sortie
+from missions.refill_search import build_limits, build_passes, several
+from missions.refills import Limits, Part, Passes, flown_by
 from missions.savings import Sortie as Order
 from missions.savings import by_savings, one_chain
 from missions.search import improve
 from missions.strips import Floats, lengths_m
+from missions.timing import timed
 from missions.tour import shortest_tour
 from missions.turns import Motion
 from missions.ways import Ways
@@ -34,6 +38,8 @@ from missions.ways import Ways
 PIECES_A_TANK = 6
 PIECES_MAX = 600
 TANKS_MAX = 1500
+# With more pieces the annealing finds little in its time that regrouping does not find sooner.
+ANNEALED_MAX = 400
 TOUCH_M = 1e-3
 # What one kick of a tour takes, counted in moves of the search over many sorties.
 MOVES_A_KICK = 100
@@ -58,36 +64,109 @@ def plan_sorties(
     lines: Floats, demand: list[Demand], ways: Ways, settings: Settings, flying: Flying
 ) -> tuple[Sortie, ...]:
     """Return all sorties, each within a tank and a battery."""
-    motion = flying.motion
+    piece_max_l = _piece_max_l(demand, settings)
     run_in_m = settings.speed_m_s**2 / (2.0 * settings.acceleration_m_s2)
+    whole = cut(lines, demand, piece_max_l=math.inf, margin_m=run_in_m)
+    planned = _in_one(whole, ways, settings, flying)
+    if not _has_battery(settings) and float(whole.litres.sum()) <= settings.usable_l:
+        return _drawn(whole, [planned], ways, flying.motion)
     pieces = cut(
-        lines, demand, piece_max_l=_piece_max_l(demand, settings),
+        lines, demand, piece_max_l=piece_max_l,
         piece_max_m=_piece_max_m(demand, settings, flying), margin_m=run_in_m,
     )  # fmt: skip
-    heaviest = float(pieces.litres.max(initial=0.0))
-    if not heaviest <= settings.usable_l * (1.0 + 1e-9):
-        raise PlanError(
-            f"one piece of a line needs {heaviest:.3g} L and the tank has {settings.usable_l:.3g} "
-            "L above its reserve; see mission.tank_l"
-        )
-    network = build_network(pieces, ways.depots, ways.inside, motion, refill_s=settings.refill_s)
+    passes = build_passes(lines, demand, ways, flying.motion, flying.pace_s_m)
+    limits = build_limits(settings, flying.battery_share)
+    run = [_part(passes, whole, enter) for enter in planned]
+    known: list[list[list[Part]]] = []
+    if len(pieces) <= ANNEALED_MAX:
+        orders = _annealed(pieces, ways, settings, flying)
+        known = [[[_part(passes, pieces, enter) for enter in order] for order in orders]]
+    found = several(passes, limits, run, known, moves=settings.moves, seed=settings.seed)
+    if not found:
+        parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
+        raise _too_far(passes, limits, parts, ways, settings)
+    return min(
+        (_drawn(*_as_pieces(passes, each), ways, flying.motion) for each in found),
+        key=lambda sorties: _total_s(sorties, settings),
+    )
+
+
+def _in_one(whole: Pieces, ways: Ways, settings: Settings, flying: Flying) -> Order:
+    """Return the order of all lines that an endless tank would take."""
+    network = build_network(
+        whole, ways.depots, ways.inside, flying.motion, refill_s=settings.refill_s
+    )
     if flying.any_depot:
         network.put_depot_anywhere()
+    order = one_chain(network, by_savings(network, math.inf))
+    kicks = settings.moves // MOVES_A_KICK
+    return shortest_tour(network, order, kicks=kicks, seed=settings.seed)
+
+
+def _annealed(pieces: Pieces, ways: Ways, settings: Settings, flying: Flying) -> list[Order]:
+    """Return sorties of pieces that were joined by savings and moved about."""
+    network = build_network(
+        pieces, ways.depots, ways.inside, flying.motion, refill_s=settings.refill_s
+    )
     budget = _budget(network, pieces, settings, flying)
     lasts = None if budget is None else budget.lasts
-    if budget is not None:
-        _check_reach(budget, pieces, ways, settings)
     orders = by_savings(network, settings.usable_l, lasts=lasts)
-    if lasts is None and float(pieces.litres.sum()) <= settings.usable_l:
-        order = one_chain(network, orders)
-        kicks = settings.moves // MOVES_A_KICK
-        orders = [shortest_tour(network, order, kicks=kicks, seed=settings.seed)]
-    else:
-        orders = improve(
-            network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed,
-            lasts=lasts,
-        )  # fmt: skip
-    homes = [_home(network, order) for order in orders]
+    return improve(
+        network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed, lasts=lasts
+    )
+
+
+def _has_battery(settings: Settings) -> bool:
+    return settings.battery is not None and settings.battery.capacity_wh is not None
+
+
+def _part(passes: Passes, pieces: Pieces, enter: int) -> Part:
+    """Return a piece as a part of its line, in the direction in which it is entered."""
+    at = enter >> 1
+    line = int(pieces.line[at])
+    (x, y), (east, north) = passes.starts[line], passes.along[line]
+    row = pieces.ends[at].tolist()
+    start_m = (row[0] - x) * east + (row[1] - y) * north
+    end_m = (row[2] - x) * east + (row[3] - y) * north
+    return (line, end_m, start_m) if enter & 1 else (line, start_m, end_m)
+
+
+def _as_pieces(passes: Passes, sorties: list[list[Part]]) -> tuple[Pieces, list[Order]]:
+    """Return the parts of sorties as pieces, each flown as it is drawn."""
+    parts = [part for sortie in sorties for part in sortie]
+    ends = np.array(
+        [
+            [*passes.place(line, start_m), *passes.place(line, end_m)]
+            for line, start_m, end_m in parts
+        ]
+    )
+    pieces = Pieces(
+        ends=ends,
+        litres=np.array([passes.need_l(part) for part in parts]),
+        line=np.array([line for line, _, _ in parts]),
+    )
+    numbers = iter(range(len(parts)))
+    return pieces, [[2 * next(numbers) for _ in sortie] for sortie in sorties]
+
+
+def _total_s(sorties: tuple[Sortie, ...], settings: Settings) -> float:
+    """Return the time of sorties as they are flown, landings and refills among it."""
+    landing_s = settings.upright_s + settings.refill_s
+    return sum(
+        sortie.flight_s
+        + landing_s
+        + nose_s(sortie.legs, turn=settings.turn, rate_deg_s=settings.nose_rate_deg_s)
+        for sortie in timed(sorties, settings)
+    )
+
+
+def _drawn(pieces: Pieces, orders: list[Order], ways: Ways, motion: Motion) -> tuple[Sortie, ...]:
+    """Return the sorties that fly these pieces, each from the depot that is best for it."""
+    ends = pieces.ends.reshape(-1, 2)
+    outer = np.array([[ends[order[0]], ends[order[-1] ^ 1]] for order in orders])
+    home_m = home_ways_m(ways.depots, outer.reshape(-1, 2), ways.inside)
+    both = motion.legs_s(home_m).reshape(len(ways.depots), -1, 2).sum(axis=2)
+    homes = np.argmin(both, axis=0).tolist()
     ranked = sorted(range(len(orders)), key=lambda at: (homes[at], min(orders[at])))
     drawn = _Drawn(pieces=pieces, ways=ways, speed_m_s=motion.speed_m_s)
     return tuple(
@@ -149,23 +228,20 @@ def _budget(network: Network, pieces: Pieces, settings: Settings, flying: Flying
     )  # fmt: skip
 
 
-def _check_reach(budget: Budget, pieces: Pieces, ways: Ways, settings: Settings) -> None:
-    """Refuse a field with a place to which the battery does not last, there and back."""
-    needed = [budget.wh([2 * piece]) for piece in range(len(pieces))]
+def _too_far(
+    passes: Passes, limits: Limits, parts: Sequence[Part], ways: Ways, settings: Settings
+) -> PlanError:
+    """Return that a battery does not last to some place, there and back, or for any sortie."""
+    needed = [flown_by(passes, limits, [part]).wh for part in parts]
     worst = int(np.argmax(needed))
-    if needed[worst] <= budget.limit_wh or settings.battery is None:
-        return
-    place = ways.field.frame.to_geographic(*pieces.ends[worst, :2].tolist())
-    raise PlanError(
+    line, start_m, _ = parts[worst]
+    place = ways.field.frame.to_geographic(*passes.place(line, start_m))
+    usable_wh = math.inf if settings.battery is None else settings.battery.usable_wh
+    return PlanError(
         f"one piece of a line near {place[0]:.6f}, {place[1]:.6f} and the ferry there and back "
-        f"take {needed[worst]:.4g} Wh, and the battery has {settings.battery.usable_wh:.4g} Wh "
+        f"take {needed[worst]:.4g} Wh, and the battery has {usable_wh:.4g} Wh "
         "above its reserve; put a depot nearer, or see mission.battery_wh"
     )
-
-
-def _home(network: Network, order: Order) -> int:
-    """Return the depot from which a sortie is nearest, there and back."""
-    return int(np.argmin(network.home_s[:, order[0]] + network.home_s[:, order[-1] ^ 1]))
 
 
 class _Drawn:

@@ -1,0 +1,156 @@
+"""Sorties for several tanks: plainly in the planned order, cut elsewhere, by bands, regrouped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from missions.bands import cut_across, main_course, outermost, to_and_fro
+from missions.demand import Demand
+from missions.network import home_ways_m
+from missions.plan import Settings
+from missions.refills import (
+    NOSE_DEG,
+    Limits,
+    Part,
+    Passes,
+    Times,
+    flown_by,
+    plainly,
+    split,
+)
+from missions.regroup import merged, regrouped
+from missions.strips import Floats
+from missions.turns import Motion
+from missions.ways import Ways
+
+Sorties = list[list[Part]]
+
+# A tank is flown in so many lines of one band, beginning so many shares of a band from the depot.
+LINES_A_TANK = {2: 8, 4: 4, 6: 4}
+# Bands are this wide or more: a turn in each must be worth it.
+BAND_MIN_M = 40.0
+# So many moves of the annealing are one trial of regrouping; a sortie needs no more than some.
+MOVES_A_TRIAL, TRIALS_A_SORTIE = 8, 60
+# The way home is known at places so far apart along lines that the depot does not see.
+BENT_STEP_M, BENT_MAX = 100.0, 2000
+
+
+def build_passes(
+    lines: Floats, demand: Sequence[Demand], ways: Ways, motion: Motion, pace_s_m: Floats | None
+) -> Passes:
+    """Return lines that may be flown in any parts."""
+    pace = np.full(len(lines), 1.0 / motion.speed_m_s) if pace_s_m is None else pace_s_m
+    passes = Passes(
+        lines=lines, demand=demand, times=Times(motion),
+        depots=[(float(x), float(y)) for x, y in ways.depots],
+        pace_s_m=pace.tolist(), speed_m_s=motion.speed_m_s, space=ways.inside,
+    )  # fmt: skip
+    if ways.inside.is_convex:
+        return passes
+    total_m = sum(passes.length_m)
+    step_m = max(BENT_STEP_M, total_m / BENT_MAX)
+    counts = [max(math.ceil(length_m / step_m), 1) + 1 for length_m in passes.length_m]
+    places = np.concatenate(
+        [
+            row[:2] + np.linspace(0.0, 1.0, count)[:, None] * (row[2:] - row[:2])
+            for row, count in zip(lines, counts, strict=True)
+        ]
+    )
+    home_m = home_ways_m(ways.depots, places, ways.inside).min(axis=0)
+    straight_m = np.hypot(*(places[None, :, :] - ways.depots[:, None, :]).transpose(2, 0, 1))
+    is_bent = home_m > straight_m.min(axis=0) + 1e-6
+    begin = 0
+    for line, count in enumerate(counts):
+        if is_bent[begin : begin + count].any():
+            passes.bent_m[line] = home_m[begin : begin + count].tolist()
+        begin += count
+    return passes
+
+
+def build_limits(settings: Settings, battery_share: float) -> Limits:
+    """Return what ends a sortie; of a battery this share is planned with."""
+    upright_s = settings.upright_s
+    nose_s = 0.0
+    if settings.nose_rate_deg_s is not None and settings.turn == "stop":
+        nose_s = NOSE_DEG / settings.nose_rate_deg_s
+    battery = settings.battery
+    if battery is not None and battery.capacity_wh is None:
+        battery = None
+    return Limits(
+        usable_l=settings.usable_l, reserve_l=settings.reserve_l,
+        landing_s=upright_s + settings.refill_s, upright_s=upright_s, nose_s=nose_s,
+        battery=battery,
+        usable_wh=math.inf if battery is None else battery.usable_wh * battery_share,
+    )  # fmt: skip
+
+
+def several(
+    passes: Passes,
+    limits: Limits,
+    planned: Sequence[Part],
+    known: Sequence[Sorties],
+    *,
+    moves: int,
+    seed: int,
+) -> list[Sorties]:
+    """Return sorties that fly the parts: the best ones, and the plain ones of the planned order.
+
+    `known` are sorties that were made elsewhere.
+    """
+    plain = plainly(passes, limits, planned)
+    found = [each for each in (plain, *known) if each]
+    course = main_course(passes.lines)
+    runs = [list(planned), *_by_bands(passes, limits, planned, course)]
+    for run in runs:
+        halves = split(passes, limits, run)
+        if halves is not None:
+            found.append(halves[1])
+    if not found:
+        return []
+    costs = [sum(flown_by(passes, limits, each).seconds for each in some) for some in found]
+    best = found[costs.index(min(costs))]
+    trials = min(moves // MOVES_A_TRIAL, TRIALS_A_SORTIE * len(best))
+    better = regrouped(passes, limits, best, course, trials=trials, seed=seed)
+    return [some for some in (better, best, plain) if some]
+
+
+def _by_bands(
+    passes: Passes, limits: Limits, planned: Sequence[Part], course: tuple[float, float]
+) -> Iterator[list[Part]]:
+    """Yield orders of the parts by bands across the course."""
+    east, north = course
+    parts = merged(planned)
+    litres = sum(passes.need_l(part) for part in parts)
+    metres = sum(abs(end_m - start_m) for _, start_m, end_m in parts)
+    tank_m = metres * limits.usable_l / litres if litres > 0.0 else metres
+    if limits.battery is not None:
+        tank_m = min(tank_m, _battery_m(passes, limits))
+    ends = (passes.lines.reshape(-1, 2) @ np.array(course)).tolist()
+    low_m, high_m = min(ends), max(ends)
+    home_m = sorted(x * east + y * north for x, y in passes.depots)[len(passes.depots) // 2]
+    widths = [(tank_m / lines, shifts) for lines, shifts in LINES_A_TANK.items()]
+    for width_m, shifts in [(math.inf, 1), *widths]:
+        if width_m < BAND_MIN_M or high_m - low_m < width_m < math.inf:
+            continue
+        for shift in range(shifts):
+            cuts = []
+            if math.isfinite(width_m):
+                first = home_m + shift / shifts * width_m
+                first += math.ceil((low_m - first) / width_m) * width_m
+                cuts = np.arange(first, high_m, width_m).tolist()
+            run: list[Part] = []
+            bands = cut_across(passes, parts, course, cuts)
+            for band in sorted(bands):
+                start = outermost(passes, bands[band], (-north, east))
+                run += to_and_fro(passes, bands[band], first=start)
+            yield run
+
+
+def _battery_m(passes: Passes, limits: Limits) -> float:
+    """Return how far a battery lasts for, take-off, landing and the way home left out."""
+    assert limits.battery is not None
+    seconds = 3600.0 * limits.usable_wh / max(limits.battery.cruise_w, 1.0) - limits.upright_s
+    return max(seconds, 1.0) * passes.speed_m_s
