@@ -3,7 +3,8 @@
 ArduCopter plans each leg from rest to rest, its jerk limited, and begins the next leg before the
 last one has ended: as soon as both together stay within the waypoint's radius, the speed and the
 corner's acceleration (AC_WPNav and SCurve of ArduPilot 4.1 and later). PX4 brakes to a speed that
-the corner's angle allows within its radius (PositionSmoothing and TrajectoryConstraints).
+the corner's angle allows within its radius, and from which it could stop at the end of the next leg
+(PositionSmoothing and TrajectoryConstraints).
 """
 
 from __future__ import annotations
@@ -27,8 +28,14 @@ JERK_COMES_S = 0.15
 # What a corner takes beyond that: the target waits for a vehicle that lags behind it. Measured
 # beside ArduCopter 4.7 at 3 to 8 m/s: 0 to 0.25 s, the most in narrow U turns.
 LAGS_S, LAGGING_DEG = 0.15, 60.0
-# PX4's NAV_ACC_RAD of a copter.
-PX4_RADIUS_M = 2.0
+# PX4's NAV_ACC_RAD of a copter, MPC_XY_TRAJ_P, and from which bend on it holds its speed back.
+PX4_RADIUS_M, PX4_CORNER_SHARE, PX4_TURNS_DEG, PX4_TURNING_S = 2.0, 0.5, 15.0, 0.3
+# Its velocity controller learns the drag of the air along each new course by its integral alone
+# (MPC_XY_VEL_I_ACC 0.4, MPC_XY_VEL_P_ACC 1.8), in seconds; meanwhile the aircraft flies slower, and
+# its target waits. Timed beside PX4 1.16: what a turn of 90 degrees costs at last, how much is not
+# yet felt, what is left after the braking.
+PX4_DRAG_S, PX4_LEARNS_S, PX4_UNFELT_S, PX4_KEPT = 2.4, 7.0, 1.0, 0.85
+LEAST_M_S = 1e-3
 # The overlap of two legs is tried in so many steps: to 0.02 s.
 OVERLAP_STEPS = 240
 
@@ -55,6 +62,28 @@ class Course:
         """Return how long reaching the leg's speed takes."""
         return self.reaching(self.speed_m_s)
 
+    @property
+    def reaching_m(self) -> float:
+        """Return how much way reaching the leg's speed takes; v^2 / 2a without a jerk.
+
+        >>> round(Course(speed_m_s=6.0, acceleration_m_s2=2.5, jerk_m_s3=None).reaching_m, 1)
+        7.2
+        >>> round(Course(speed_m_s=6.0, acceleration_m_s2=2.5, jerk_m_s3=1.0).reaching_m, 1)
+        15.6
+        """
+        return self.speed_m_s * self.reaching_s / 2.0
+
+    def reached_m_s(self, way_m: float) -> float:
+        """Return the speed that is reached from rest on a way, the leg's at most."""
+        if way_m >= self.reaching_m:
+            return self.speed_m_s
+        low, high = 0.0, self.speed_m_s
+        for _ in range(50):
+            middle = (low + high) / 2.0
+            fits = middle * self.reaching(middle) / 2.0 <= way_m
+            low, high = (middle, high) if fits else (low, middle)
+        return low
+
 
 def parts_s(
     lengths_m: Sequence[float],
@@ -64,7 +93,7 @@ def parts_s(
 ) -> list[float]:
     """Return the time of each straight part of a way from rest to rest; a bend between each two.
 
-    What a corner spares is taken from the part after it.
+    Bends to the left are below zero. What a corner spares is taken from the part after it.
     """
     if rule == "px4":
         return _slowed_s(lengths_m, bends_deg, courses)
@@ -92,10 +121,7 @@ class _Leg:
     def of(cls, length_m: float, course: Course) -> _Leg:
         peak = course.speed_m_s
         if peak * course.reaching(peak) > length_m:
-            low, high = 0.0, peak
-            for _ in range(50):
-                peak = (low + high) / 2.0
-                low, high = (low, peak) if peak * course.reaching(peak) > length_m else (peak, high)
+            peak = course.reached_m_s(length_m / 2.0)
         reaching_s = course.reaching(peak)
         cruise_m = max(length_m - peak * reaching_s, 0.0)
         cruise_s = cruise_m / peak if cruise_m else 0.0
@@ -151,61 +177,135 @@ def _sum(one: Floats, other: Floats, cosine: float) -> Floats:
     return length
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Slowed:
+    """PX4's speed on a leg that ends in a corner: it brakes for the corner's speed by distance.
+
+    The braking begins as if a change of acceleration from one end to the other came first, so that
+    the corner's speed is there `held_m` before the waypoint.
+    """
+
+    course: Course
+    corner_m_s: float
+
+    @property
+    def ramp_m_s(self) -> float:
+        """Return what the change of acceleration adds to the speed's square, by the speed."""
+        jerk = self.course.jerk_m_s3
+        return 0.0 if jerk is None else 4.0 * self.course.acceleration_m_s2**2 / jerk
+
+    @property
+    def held_m(self) -> float:
+        """Return how long before the waypoint the corner's speed is flown."""
+        return self.ramp_m_s * self.corner_m_s / (2.0 * self.course.acceleration_m_s2)
+
+    def before_m(self, speed_m_s: float) -> float:
+        """Return how far before the waypoint a speed has to be given up."""
+        if speed_m_s <= self.corner_m_s:
+            return 0.0
+        square = speed_m_s**2 + self.ramp_m_s * speed_m_s - self.corner_m_s**2
+        return square / (2.0 * self.course.acceleration_m_s2)
+
+    def at_m_s(self, distance_m: float) -> float:
+        """Return the highest speed so far before the waypoint."""
+        ramp = self.ramp_m_s
+        square = 2.0 * self.course.acceleration_m_s2 * distance_m + self.corner_m_s**2
+        return max((math.sqrt(ramp**2 + 4.0 * square) - ramp) / 2.0, self.corner_m_s)
+
+    def braking_s(self, high_m_s: float, low_m_s: float) -> float:
+        """Return the time between two speeds of the braking."""
+        ramping = self.ramp_m_s / 2.0 * math.log(high_m_s / low_m_s)
+        return (high_m_s - low_m_s + ramping) / self.course.acceleration_m_s2
+
+    def peak_m_s(self, from_m_s: float, room_m: float) -> float:
+        """Return the highest speed on a leg with so much room, begun at a speed."""
+
+        def needed_m(peak: float) -> float:
+            return _gaining(self.course, from_m_s, peak)[1] + max(self.before_m(peak), PX4_RADIUS_M)
+
+        low, high = max(from_m_s, LEAST_M_S), self.course.speed_m_s
+        if high <= low or needed_m(high) <= room_m:
+            return max(low, high)
+        for _ in range(40):
+            middle = (low + high) / 2.0
+            low, high = (low, middle) if needed_m(middle) > room_m else (middle, high)
+        return low
+
+    def flown(self, from_m_s: float, room_m: float) -> tuple[float, float]:
+        """Return time and last speed of a leg, up to the waypoint's radius."""
+        peak = self.peak_m_s(from_m_s, room_m)
+        taken_s, gained_m = _gaining(self.course, from_m_s, peak)
+        end_m_s = min(self.at_m_s(PX4_RADIUS_M), peak)
+        brakes = peak > self.corner_m_s and max(self.before_m(peak), self.held_m) > PX4_RADIUS_M
+        if not brakes:
+            return taken_s + max(room_m - PX4_RADIUS_M - gained_m, 0.0) / peak, peak
+        taken_s += max(room_m - gained_m - self.before_m(peak), 0.0) / peak
+        taken_s += self.braking_s(peak, end_m_s) if peak > end_m_s else 0.0
+        if self.held_m > PX4_RADIUS_M:
+            taken_s += (self.held_m - PX4_RADIUS_M) / self.corner_m_s
+        return taken_s, end_m_s
+
+
 def _slowed_s(
     lengths_m: Sequence[float], bends_deg: Sequence[float], courses: Sequence[Course]
 ) -> list[float]:
-    """Return the times of parts whose corners are flown at the speed that PX4 allows them."""
-    corners = [0.0]
-    for (one, other), bend_deg in zip(pairwise(courses), bends_deg, strict=True):
-        slowest = min(one.speed_m_s, other.speed_m_s)
-        half = math.radians(max(180.0 - abs(bend_deg), 0.0)) / 2.0
-        turning = slowest
-        if bend_deg:
-            turning = math.sqrt(one.acceleration_m_s2 * PX4_RADIUS_M * math.tan(half))
-        corners.append(min(slowest, turning))
-    corners.append(0.0)
-    for number in range(len(courses) - 1, -1, -1):
-        reached = _reached_m_s(courses[number], lengths_m[number], corners[number + 1])
-        corners[number] = min(corners[number], reached)
+    """Return the times of parts whose corners are flown at the speed that PX4 allows them.
+
+    A leg counts as ended within the radius of its waypoint; the velocity so far is then turned, and
+    what of it is along the next leg is kept. What the integral of the velocity's controller holds
+    against the drag is along the last leg too, and is learnt anew.
+    """
+    found = []
+    start_m_s, room_m = 0.0, lengths_m[0]
+    held_along = held_aside = 0.0
     for number, course in enumerate(courses):
-        reached = _reached_m_s(course, lengths_m[number], corners[number])
-        corners[number + 1] = min(corners[number + 1], reached)
-    return [
-        _between_corners_s(length, course, *speeds)
-        for length, course, speeds in zip(lengths_m, courses, pairwise(corners), strict=True)
-    ]
+        bend = 0.0
+        corner_m_s = 0.0
+        if number + 1 < len(courses):
+            bend = math.radians(bends_deg[number])
+            corner_m_s = _corner_m_s(lengths_m[number + 1], bend, course)
+        leg = _Slowed(course=course, corner_m_s=corner_m_s)
+        taken_s, end_m_s = leg.flown(start_m_s, room_m)
+        if number and abs(bends_deg[number - 1]) > PX4_TURNS_DEG:
+            taken_s += PX4_TURNING_S * abs(math.sin(math.radians(bends_deg[number - 1])))
+        learning_s = max(taken_s - PX4_UNFELT_S, 0.0)
+        lost_s = PX4_DRAG_S * (1.0 - held_along) * -math.expm1(-learning_s / PX4_LEARNS_S)
+        # Within the radius a corner is cut; no metre counts as flown faster for that.
+        found.append(max(taken_s + lost_s, lengths_m[number] / course.speed_m_s))
+        left = math.exp(-found[-1] / PX4_LEARNS_S)
+        held_along, held_aside = 1.0 - (1.0 - held_along) * left, held_aside * left
+        if abs(math.degrees(bend)) > PX4_TURNS_DEG:
+            held_along *= PX4_KEPT
+        cosine, sine = math.cos(bend), math.sin(bend)
+        held_along, held_aside = (
+            held_along * cosine + held_aside * sine,
+            held_aside * cosine - held_along * sine,
+        )
+        if number + 1 < len(courses):
+            start_m_s, room_m = end_m_s * cosine, lengths_m[number + 1] + PX4_RADIUS_M * cosine
+    return found
 
 
-def _change(course: Course, one_m_s: float, other_m_s: float) -> tuple[float, float]:
-    """Return time and way of a change of speed."""
-    taken_s = course.reaching(abs(other_m_s - one_m_s)) if one_m_s != other_m_s else 0.0
-    return taken_s, taken_s * (one_m_s + other_m_s) / 2.0
+def _corner_m_s(next_m: float, bend: float, course: Course) -> float:
+    """Return PX4's speed at a waypoint: it sees one leg more, and must be able to stop at its end.
+
+    A circle within the radius, at half of the acceleration (MPC_XY_TRAJ_P), joins both legs.
+    """
+    if next_m < PX4_RADIUS_M:
+        return 0.0
+    stopping = _Slowed(course=course, corner_m_s=0.0)
+    half = max(math.pi - abs(bend), 0.0) / 2.0
+    square = PX4_CORNER_SHARE * course.acceleration_m_s2 * PX4_RADIUS_M * math.tan(half)
+    return min(math.sqrt(max(square, 0.0)), stopping.at_m_s(next_m), course.speed_m_s)
 
 
-def _reached_m_s(course: Course, length_m: float, from_m_s: float) -> float:
-    """Return the highest speed that is reached on a length from another one."""
-    low, high = from_m_s, max(course.speed_m_s, from_m_s)
-    if _change(course, from_m_s, high)[1] <= length_m:
-        return high
-    for _ in range(40):
-        middle = (low + high) / 2.0
-        fits = _change(course, from_m_s, middle)[1] <= length_m
-        low, high = (middle, high) if fits else (low, middle)
-    return low
-
-
-def _between_corners_s(length_m: float, course: Course, start_m_s: float, end_m_s: float) -> float:
-    """Return the time of a part that begins and ends at speeds."""
-    low, high = max(start_m_s, end_m_s), max(course.speed_m_s, start_m_s, end_m_s)
-    for _ in range(40):
-        peak = (low + high) / 2.0 if low < high else high
-        up_s, up_m = _change(course, start_m_s, peak)
-        down_s, down_m = _change(course, peak, end_m_s)
-        if up_m + down_m > length_m:
-            high = peak
-        elif low < high and high - peak > 1e-9:
-            low = peak
-        else:
-            break
-    cruise_m = max(length_m - up_m - down_m, 0.0)
-    return up_s + down_s + (cruise_m / peak if cruise_m else 0.0)
+def _gaining(course: Course, from_m_s: float, to_m_s: float) -> tuple[float, float]:
+    """Return time and way of a gain of speed; what ends it is part of the braking."""
+    gain_m_s = max(to_m_s - from_m_s, 0.0)
+    most, jerk = course.acceleration_m_s2, course.jerk_m_s3
+    rising_s = 0.0 if jerk is None else min(math.sqrt(2.0 * gain_m_s / jerk), most / jerk)
+    risen_m_s = 0.0 if jerk is None else jerk * rising_s**2 / 2.0
+    risen_m = from_m_s * rising_s + risen_m_s * rising_s / 3.0
+    steady_s = (gain_m_s - risen_m_s) / most
+    mean_m_s = (from_m_s + risen_m_s + to_m_s) / 2.0
+    return rising_s + steady_s, risen_m + steady_s * mean_m_s

@@ -95,7 +95,9 @@ def sortie_wh(
     left_l = sortie.volume_l + reserve_l
     first_m, last_m = sortie.end_heights_m(height_m)
     used = battery.wh(cruise_s=0.0, other_s=vertical.climb_s(first_m), litres=left_l)
-    used += battery.wh(cruise_s=0.0, other_s=vertical.return_s(last_m), litres=reserve_l)
+    used += battery.wh(
+        cruise_s=0.0, other_s=vertical.return_s(last_m, sortie.home_m), litres=reserve_l
+    )
     middle_l = reserve_l + sortie.volume_l / 2.0
     used += battery.wh(cruise_s=0.0, other_s=nose_turn_s, litres=middle_l)
     for leg in sortie.legs:

@@ -168,6 +168,11 @@ class Sortie:
         return height_m if first is None else first, height_m if last is None else last
 
     @property
+    def home_m(self) -> float:
+        """Return how far the return flies, from the last waypoint."""
+        return math.dist(*self.legs[-1].points[-2:])
+
+    @property
     def lines(self) -> int:
         """Return the number of spray lines; one with several speeds is several legs."""
         kinds = [leg.kind == "spray" for leg in self.legs]
@@ -227,7 +232,7 @@ class Plan:
         """Return the time from take-off to landing."""
         vertical = self.settings.vertical
         first_m, last_m = sortie.end_heights_m(self.settings.height_m)
-        upright_s = vertical.climb_s(first_m) + vertical.return_s(last_m)
+        upright_s = vertical.climb_s(first_m) + vertical.return_s(last_m, sortie.home_m)
         return sortie.flight_s + self.nose_s(sortie) + upright_s
 
     def energy_wh(self, sortie: Sortie) -> float | None:

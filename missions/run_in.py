@@ -1,8 +1,8 @@
 """Run-in and run-out: passes that begin and end at speed, where there is room beyond their ends.
 
-From rest to a speed v takes v^2 / 2a of way. Where the ground beyond the end of a line may be
-flown over, the aircraft starts that far before it and brakes that far behind it; where it may
-not, the pass begins as fast as the room allows, and that is said.
+From rest to a speed takes the way that the autopilot's acceleration and jerk need. Where the
+ground beyond the end of a line may be flown over, the aircraft starts that far before it and brakes
+that far behind it; where it may not, the pass begins as fast as the room allows, and that is said.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
+from missions.corners import Course
 from missions.field import Field
 from missions.plan import Leg, Place, Settings, Sortie
+from missions.stops import RUN_M
 
-# Less room is not worth a waypoint: at 2.5 m/s2 it is 1.6 m/s.
+# Less room is not worth a waypoint: half a metre a second is reached on it.
 ROOM_MIN_M = 0.5
 TOUCH_M = 1e-6
 # A pass that begins at so much of its speed is not worth a word.
@@ -39,13 +41,16 @@ class RunIn:
     run_m: float | None = None
     ground: BaseGeometry | None = None
 
-    def wanted_m(self, speed_m_s: float, acceleration_m_s2: float) -> float:
+    def wanted_m(self, course: Course) -> float:
         """Return the way from rest to a speed, or what is asked for.
 
-        >>> RunIn().wanted_m(6.0, 2.5), RunIn(run_m=4.0).wanted_m(6.0, 2.5)
+        No more than needs no waypoint of its own, which would slow the aircraft down again.
+
+        >>> course = Course(speed_m_s=6.0, acceleration_m_s2=2.5, jerk_m_s3=None)
+        >>> round(RunIn().wanted_m(course), 1), RunIn(run_m=4.0).wanted_m(course)
         (7.2, 4.0)
         """
-        needed_m = speed_m_s**2 / (2.0 * acceleration_m_s2)
+        needed_m = min(course.reaching_m, RUN_M)
         return needed_m if self.run_m is None else min(self.run_m, needed_m)
 
 
@@ -55,7 +60,6 @@ class _End:
 
     at: Place
     beyond: Place
-    speed_m_s: float
 
 
 def with_run_ins(
@@ -74,7 +78,7 @@ def slow_starts(
 ) -> tuple[str, ...]:
     """Return how many passes begin below their speed, and where the slowest does."""
     starts = [
-        (_start_m_s(before, line, settings.acceleration_m_s2), line.speed_m_s, line.points[0])
+        (_start_m_s(before, line, settings), line.speed_m_s, line.points[0])
         for sortie in sorties
         for before, line in pairwise(sortie.legs)
         if line.kind == "spray" and before.kind != "spray" and not before.through
@@ -91,14 +95,14 @@ def slow_starts(
     )
 
 
-def _start_m_s(before: Leg, line: Leg, acceleration_m_s2: float) -> float:
+def _start_m_s(before: Leg, line: Leg, settings: Settings) -> float:
     """Return how fast a line can be begun from the straight part of the way before it."""
     straight = np.subtract(before.points[-1], before.points[-2])
     along = np.subtract(line.points[-1], line.points[0])
     room_m = float(np.hypot(*straight))
     if not float(straight @ along) > STRAIGHT * room_m * float(np.hypot(*along)):
         return 0.0
-    return min(line.speed_m_s, math.sqrt(2.0 * acceleration_m_s2 * room_m))
+    return settings.motion.at(line.speed_m_s).reached_m_s(room_m)
 
 
 class _Drawn:
@@ -128,14 +132,13 @@ class _Drawn:
         length_m = math.hypot(x1 - x0, y1 - y0)
         sign = 1.0 if onward else -1.0
         along = (sign * (x1 - x0) / length_m, sign * (y1 - y0) / length_m)
-        acceleration = self._settings.acceleration_m_s2
-        room_m = self._room_m(at, along, self._run_in.wanted_m(line.speed_m_s, acceleration))
+        course = self._settings.motion.at(line.speed_m_s)
+        room_m = self._room_m(at, along, self._run_in.wanted_m(course))
         if not room_m >= ROOM_MIN_M:
             return None
         return _End(
             at=at,
             beyond=(at[0] + along[0] * room_m, at[1] + along[1] * room_m),
-            speed_m_s=min(line.speed_m_s, math.sqrt(2.0 * acceleration * room_m)),
         )
 
     def _room_m(self, at: Place, along: Place, wanted_m: float) -> float:

@@ -42,7 +42,7 @@ class Surroundings:
         longer = with_run_ins(found.sorties, field, settings, self.run_in)
         if self.terrain is not None:
             longer = tuple(self._slowed(sortie, settings) for sortie in longer)
-        run_in_m = self.run_in.wanted_m(settings.speed_m_s, settings.acceleration_m_s2)
+        run_in_m = self.run_in.wanted_m(settings.motion.at(settings.speed_m_s))
         raised = at_ferry_height(longer, settings, run_in_m=run_in_m)
         return replace(found, sorties=timed(raised, settings))
 

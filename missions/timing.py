@@ -80,7 +80,7 @@ def _course(way: _Way, settings: Settings) -> Course:
 def _bend_deg(before: _Way, after: _Way) -> float:
     if before.upright_m or after.upright_m:
         return SQUARE_DEG
-    return abs((after.course_deg - before.course_deg + 180.0) % 360.0 - 180.0)
+    return (after.course_deg - before.course_deg + 180.0) % 360.0 - 180.0
 
 
 def _ways(sortie: Sortie, lines_m: float) -> list[_Way]:
@@ -101,7 +101,7 @@ def _ways(sortie: Sortie, lines_m: float) -> list[_Way]:
                     legs=((higher, abs(rise_m)),), upright_m=rise_m,
                 )
             )  # fmt: skip
-        if leg.through and leg.length_m < SAME_M:
+        if _is_no_way(sortie, number):
             # The ends of both lines are one waypoint.
             here = leg.points[-1]
             continue
@@ -115,6 +115,15 @@ def _ways(sortie: Sortie, lines_m: float) -> list[_Way]:
                 )  # fmt: skip
                 here = place
     return found
+
+
+def _is_no_way(sortie: Sortie, number: int) -> bool:
+    """Whether a leg joins two lines whose ends are written as one waypoint."""
+    leg = sortie.legs[number]
+    if leg.kind == "spray" or len(leg.points) > 2 or leg.length_m >= SAME_M:
+        return False
+    around = (*sortie.legs[max(number - 1, 0) : number], *sortie.legs[number + 1 : number + 2])
+    return [other.kind for other in around] == ["spray", "spray"]
 
 
 def _without_runs(ways: list[_Way]) -> list[_Way]:

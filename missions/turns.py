@@ -121,7 +121,9 @@ def _spared_at_corners_s(motion: Motion) -> Floats:
     course = motion.at(motion.speed_m_s)
     spared = []
     for aside_m in ASIDE_KNOTS_M.tolist():
-        parts_m = (long_m, aside_m, long_m)
-        flown_s = sum(parts_s(parts_m, (SQUARE_DEG, SQUARE_DEG), (course,) * 3, motion.corners))
-        spared.append(float(motion.legs_s(np.array(parts_m)).sum()) - flown_s)
+        # The third pass and the way to it: what the first takes more, from rest, counts once.
+        parts_m = (long_m, aside_m, long_m, aside_m, long_m)
+        bends_deg = (SQUARE_DEG, SQUARE_DEG, -SQUARE_DEG, -SQUARE_DEG)
+        found_s = parts_s(parts_m, bends_deg, (course,) * 5, motion.corners)
+        spared.append(float(motion.legs_s(np.array(parts_m[3:])).sum()) - sum(found_s[3:]))
     return np.array(spared)

@@ -41,8 +41,8 @@ def test_a_sortie_draws_power_for_its_time_and_its_load() -> None:
                volume_l=10.0)  # fmt: skip
     sortie = Sortie(number=1, depot=0, legs=(line,))
     vertical = Vertical(
-        ready_s=1.0, climb_m_s=2.5, descent_m_s=1.5, acceleration_m_s2=1e9, settled_s=0.5,
-        return_height_m=10.0, loiter_s=3.0, slow_m=2.0, land_m_s=0.5, down_s=1.5,
+        ready_s=1.0, climb_m_s=2.5, rise_m_s=2.5, descent_m_s=1.5, acceleration_m_s2=1e9,
+        settled_s=0.5, return_height_m=10.0, loiter_s=3.0, slow_m=2.0, land_m_s=0.5, down_s=1.5,
     )  # fmt: skip
     found = sortie_wh(
         sortie, DRAWN, vertical=vertical, height_m=5.0, reserve_l=2.0, nose_turn_s=4.0

@@ -20,14 +20,15 @@ from missions.files.write import write_plan
 from missions.plan import Leg, Plan, Settings
 from missions.planner import plan_mission
 from missions.run_in import RunIn
-from missions.stops import waypoints_of
+from missions.stops import RUN_M, waypoints_of
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from tests.bench.missions import FRAME, to_degrees
 from tests.unit.test_missions_cli import ANYANG, run, written
 from tests.unit.test_missions_wind import config_with
 
 GROUND = box(0, 0, 60, 200)
-NEEDED_M = 6.0**2 / (2.0 * 2.5)
+# A jerk of 1 m/s3 up and down again, 0.3 s of its own coming and going; half of 6 m/s meanwhile.
+NEEDED_M = (2.0 * math.sqrt(6.0) + 0.3) * 6.0 / 2.0
 
 
 def field_of(ground: Polygon = GROUND, **more: Any) -> Field:
@@ -72,7 +73,7 @@ def test_a_run_in_and_its_line_are_one_way_of_the_mission() -> None:
     assert longer.volume_l == plain.volume_l
     assert longer.coverage == plain.coverage
     assert longer.turns == 9
-    # Both runs of 7.2 m at full speed, and nothing more: a waypoint where a line begins would
+    # Both runs of 15.6 m at full speed, and nothing more: a waypoint where a line begins would
     # have an autopilot that plans from rest to rest creep over it.
     runs_s = 10 * 2.0 * NEEDED_M / 6.0
     assert runs_s - 4.0 < longer.flight_s - plain.flight_s < runs_s + 4.0
@@ -96,8 +97,9 @@ def test_half_of_the_room_gives_its_speed() -> None:
     field = field_of()
     room_m = 3.0
     plan = plan_of(field, RunIn(ground=field.outline.buffer(room_m, join_style="mitre")))
-    speed = math.sqrt(2.0 * 2.5 * room_m)
-    assert f"the slowest at {speed:.1f} instead of 6 m/s" in plan.warnings[0]
+    # 1.94 m/s is reached in 2 sqrt(1.94) + 0.3 s, with half of it in the mean.
+    assert 1.94 * (2.0 * math.sqrt(1.94) + 0.3) / 2.0 == pytest.approx(room_m, rel=0.01)
+    assert "the slowest at 1.9 instead of 6 m/s" in plan.warnings[0]
 
 
 def test_a_polygon_on_one_side_gives_room_there_only() -> None:
@@ -123,7 +125,11 @@ def test_runs_never_cross_an_obstacle() -> None:
 
 
 def test_a_shorter_run_than_speed_needs_is_what_was_asked_for() -> None:
-    assert RunIn(run_m=50.0).wanted_m(6.0, 2.5) == pytest.approx(NEEDED_M)
+    course = Settings(swath_width_m=6.0, speed_m_s=6.0).motion.at(6.0)
+    assert RunIn(run_m=50.0).wanted_m(course) == pytest.approx(NEEDED_M)
+    # A longer one would be a waypoint of its own.
+    quick = Settings(swath_width_m=6.0, speed_m_s=12.0).motion.at(12.0)
+    assert RunIn().wanted_m(quick) == RUN_M
     field = field_of()
     plan = plan_of(field, RunIn(run_m=2.0, ground=field.outline.buffer(50.0)))
     before, line = starts(plan)[3]

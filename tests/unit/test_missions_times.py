@@ -5,17 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from missions.corners import parts_s
+from missions.corners import LAGS_S, PX4_DRAG_S, PX4_TURNING_S, parts_s
 from missions.plan import JERKS_M_S3, Leg, Settings, Sortie
 from missions.timing import timed
 from missions.turns import Motion
 from missions.verticals import VERTICALS
+from sitl.vehicle import Leg as Flown
+from sitl.vehicle import Route, Vehicle
 
 Ways = Sequence[tuple[float, float]]
 
@@ -74,6 +77,75 @@ def test_a_way_takes_as_long_as_arducopter_took(name: str) -> None:
     assert sum(found[1:]) + spared_s / 2.0 == pytest.approx(flown_s, rel=0.025)
 
 
+# The same ways, in MISSION with all parameters as they come: PX4 1.16, SIH quadrotor, five times as
+# fast as the clock.
+FLOWN_BY_PX4 = {
+    "straight on, every 10 m": 31.14,
+    "straight on, every 3 m": 31.08,
+    "15 degrees every 12 m": 33.56,
+    "45 degrees every 15 m": 46.34,
+    "90 degrees every 8 m": 39.56,
+    "135 degrees every 20 m": 65.48,
+    "passes at 8 m/s": 61.24,
+    "passes at 3 m/s": 63.10,
+    "passes 30 m apart": 76.47,
+}
+
+
+# A zigzag of square corners, none of which the speed is reached between: no way of a field.
+LONGER = {"90 degrees every 8 m": 0.11}
+
+
+def turns_deg(places: Ways) -> list[float]:
+    courses = [math.degrees(math.atan2(b[0] - a[0], b[1] - a[1])) for a, b in pairwise(places)]
+    return [(b - a + 180.0) % 360.0 - 180.0 for a, b in pairwise(courses)]
+
+
+@pytest.mark.parametrize("name", FLOWN_BY_PX4)
+def test_a_way_takes_as_long_as_px4_took(name: str) -> None:
+    places, speed_m_s, _ = FLOWN[name]
+    motion = Settings(swath_width_m=6.0, speed_m_s=speed_m_s, autopilot="px4").motion
+    whole = [(0.0, 0.0), *places]
+    lengths_m = [math.dist(a, b) for a, b in pairwise(whole)]
+    courses = [motion.at(speed_m_s)] * len(lengths_m)
+    found = parts_s(lengths_m, turns_deg(whole), courses, "px4")
+    # A waypoint counts as reached where the next leg begins: 2 m before it.
+    assert -0.02 <= sum(found[1:]) / FLOWN_BY_PX4[name] - 1.0 <= LONGER.get(name, 0.05)
+
+
+@pytest.mark.parametrize("name", FLOWN)
+@pytest.mark.parametrize("corners", ["ardupilot", "px4"])
+def test_the_twin_takes_as_long_by_a_law_of_its_own(
+    corners: Literal["ardupilot", "px4"], name: str
+) -> None:
+    places, speed_m_s, flown_s = FLOWN[name]
+    legs = [Flown(east_m=east, north_m=north, speed_m_s=speed_m_s) for east, north in places]
+    route = Route(start_east_m=0.0, start_north_m=0.0, legs=tuple(legs))
+    path = Vehicle(
+        route, start_s=0.0, seed=1, corners=corners,
+        acceleration_m_s2=2.5 if corners == "ardupilot" else 3.0,
+    ).fly_to_end()  # fmt: skip
+    begins = int(np.searchsorted(path.leg, 1))
+    last_m = np.hypot(path.east_m - places[-1][0], path.north_m - places[-1][1])
+    ends = len(path.leg) - 1
+    if corners == "px4":
+        # Its last waypoint counts as reached within the radius, before it stands.
+        flown_s = FLOWN_BY_PX4[name]
+        ends = int(np.flatnonzero((last_m < 2.0) & (path.leg == len(legs) - 1))[0])
+    assert path.time_s[ends] - path.time_s[begins] == pytest.approx(flown_s, rel=0.035)
+
+
+def test_px4_from_the_last_waypoint_to_disarmed() -> None:
+    # Flown from 61 and 116 m away, 3.5 m high: 62.6 and 77.8 s; it returns at 30 m.
+    settings = Settings(swath_width_m=6.0, speed_m_s=5.0, autopilot="px4")
+    course = settings.motion.at(5.0)
+    # From 4 m away it lands without climbing: 17.2 s.
+    assert settings.vertical.return_s(3.5, 4.0) == pytest.approx(17.2, abs=4.0)
+    for away_m, flown_s in ((61.0, 62.6), (116.0, 77.8)):
+        (home_s,) = parts_s([away_m], [], [course], "px4")
+        assert settings.vertical.return_s(3.5) + home_s == pytest.approx(flown_s, rel=0.08)
+
+
 @pytest.mark.parametrize("rule", ["stop", "ardupilot", "px4"])
 @given(
     lengths_m=st.lists(st.floats(0.7, 400.0), min_size=1, max_size=12),
@@ -92,7 +164,11 @@ def test_no_way_is_flown_faster_than_its_speed_nor_slower_than_from_rest_to_rest
     # Two speedings up of one leg may overlap with its neighbours, but no metre is flown twice as
     # fast.
     assert sum(found) >= sum(lengths_m) / speed_m_s - 1e-6
-    assert sum(found) <= float(rest_s.sum()) + 0.15 * len(lengths_m) + 1e-6
+    # Corners flown late; behind PX4's the drag is learnt anew, at most from the opposite course.
+    # With less jerk than it comes with it brakes much longer than it speeds up.
+    late_s = 2.0 * PX4_DRAG_S + PX4_TURNING_S if rule == "px4" else LAGS_S
+    if rule != "px4" or jerk_m_s3 is None or jerk_m_s3 >= JERKS_M_S3["px4"]:
+        assert sum(found) <= float(rest_s.sum()) + late_s * len(lengths_m) + 1e-6
 
 
 @given(lengths_m=st.lists(st.floats(0.5, 300.0), min_size=2, max_size=40))
@@ -120,13 +196,14 @@ def test_an_outline_of_a_point_a_metre_is_not_flown_in_no_time() -> None:
     assert spraying_s > around_m / 1.6
 
 
-def test_ends_of_lines_that_are_one_waypoint_take_no_time() -> None:
+@pytest.mark.parametrize("through", [True, False])
+def test_ends_of_lines_that_are_one_waypoint_take_no_time(through: bool) -> None:
     def border(gap_m: float) -> float:
         half = (100.0 + gap_m, 0.0)
         legs = (
             Leg(kind="ferry", points=((0.0, -50.0), (0.0, 0.0)), speed_m_s=5.0),
             Leg(kind="spray", points=((0.0, 0.0), (100.0, 0.0)), speed_m_s=5.0),
-            Leg(kind="transit", points=((100.0, 0.0), half), speed_m_s=5.0, through=True),
+            Leg(kind="transit", points=((100.0, 0.0), half), speed_m_s=5.0, through=through),
             Leg(kind="spray", points=(half, (half[0] + 96.0, 28.0)), speed_m_s=5.0),
             Leg(kind="ferry", points=((half[0] + 96.0, 28.0), (0.0, -50.0)), speed_m_s=5.0),
         )
