@@ -38,6 +38,14 @@ class OutputPath(StrEnum):
     SERVO = "servo"
 
 
+class Corners(StrEnum):
+    """How the vehicle flies the corners of its way."""
+
+    STOP = "stop"
+    ARDUPILOT = "ardupilot"
+    PX4 = "px4"
+
+
 app = typer.Typer(
     help="The simulated flight: stub autopilot and twin.",
     no_args_is_help=True,
@@ -89,6 +97,10 @@ def serve(
         typer.Option(help="The true flow between measured points; default: the profile's own."),
     ] = None,
     gust: Annotated[float, typer.Option(help="Gusts in m/s.")] = 1.0,
+    corners: Annotated[
+        Corners | None,
+        typer.Option(help="How corners are flown; default: as the autopilot flies them."),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder for the truth.")] = None,
     sensors: Annotated[
@@ -130,6 +142,7 @@ def serve(
         flow_law=None if flow_law is None else flow_law.value,
         speed_m_s=speed,
         gust_m_s=gust,
+        corners=None if corners is None else corners.value,
         seed=seed,
         out=out,
         sensors=sensors,
@@ -169,6 +182,10 @@ def fly(
     speed: Annotated[
         float | None, typer.Option(help="m/s on every leg; default: the mission's.")
     ] = None,
+    corners: Annotated[
+        Corners | None,
+        typer.Option(help="How corners are flown; default: as the configuration's autopilot does."),
+    ] = None,
     meter_rate_hz: Annotated[
         float, typer.Option(help="How often the flow meter reports; 0: there is none.")
     ] = 50.0,
@@ -199,6 +216,7 @@ def fly(
         output=None if output is None else output.value,
         seed=seed,
         speed_m_s=speed,
+        corners=None if corners is None else corners.value,
         meter_rate_hz=meter_rate_hz,
         flow_law=None if flow_law is None else flow_law.value,
         out=out,

@@ -37,7 +37,7 @@ from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
 from sitl.stub.faults import Fault, read_scenario
 from sitl.stub.scenario import check_scenario
-from sitl.vehicle import Route, Trajectory, Vehicle
+from sitl.vehicle import Corners, Route, Trajectory, Vehicle
 from sitl.zero_rate import zero_rate_ml
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ class FlyOptions:
     fidelity: Fidelity | None = None
     output: Literal["gpio", "servo"] | None = None
     seed: int = 1
+    corners: Corners | None = None
     speed_m_s: float | None = None
     meter_rate_hz: float = 50.0
     flow_law: FlowLaw | None = None
@@ -134,7 +135,7 @@ def fly_mission(options: FlyOptions, say: Say) -> Flown:
     say(f"plant {task.profile.name}, {len(task.route.legs)} legs, {task.speed_m_s:g} m/s")
     for problem in task.warnings:
         say(f"warning: {problem.text}; {problem.fix}")
-    trajectory = _trajectory(task, options.seed)
+    trajectory = _trajectory(task, options.seed, options.corners)
     trace: list[Input | Decision] = []
     began_s = time.perf_counter()
     result = _flight(task, trajectory, options, say, trace if options.out is not None else None)
@@ -310,10 +311,15 @@ def _plant(name: str | None, setup: Setup) -> PlantProfile:
     return min(fitting, key=lambda p: abs(math.log(p.nozzle_sets[-1].flow_max_l_min) - full))
 
 
-def _trajectory(task: Task, seed: int) -> Trajectory:
+def _trajectory(task: Task, seed: int, corners: Corners | None) -> Trajectory:
+    """Fly the way as the configuration's autopilot does, or as is asked for."""
     mission = task.config.mission
     acceleration = DEFAULT_ACCELERATION_M_S2 if mission is None else mission.acceleration_m_s2
-    vehicle = Vehicle(task.route, start_s=0.0, seed=seed, acceleration_m_s2=acceleration)
+    flown_by: Corners = "ardupilot" if mission is None else mission.autopilot
+    vehicle = Vehicle(
+        task.route, start_s=0.0, seed=seed, acceleration_m_s2=acceleration,
+        corners=corners or flown_by,
+    )  # fmt: skip
     return vehicle.fly_to_end()
 
 

@@ -39,6 +39,7 @@ from sitl.stub.scenario import Scenario, load_scenario
 from sitl.stub.server import StubServer
 from sitl.stub.sprayer import BoardKind, Sprayer
 from sitl.stub.truth import TruthLog
+from sitl.vehicle import Corners
 from sitl.wire_truth import judge
 
 DEFAULT_LINK = "udpout:127.0.0.1:14550"
@@ -74,6 +75,7 @@ class ServeOptions:
     flow_law: FlowLaw | None = None
     speed_m_s: float = 5.0
     gust_m_s: float = 1.0
+    corners: Corners | None = None
     seed: int = 0
     out: Path | None = None
     sensors: Path | None = None
@@ -126,6 +128,7 @@ class _Run:
                 heading_deg=first_course_deg(items, home),
                 speed_m_s=options.speed_m_s,
                 gust_m_s=options.gust_m_s,
+                corners=options.corners or ("px4" if options.autopilot == "px4" else "ardupilot"),
                 scenario=scenario,
                 signing_time=round((time.time() - _EPOCH_2015_S) * 1e5),
                 seed=options.seed,

@@ -1,4 +1,8 @@
-"""The true flight: a copter that follows straight legs through gusts."""
+"""The true flight: a copter that follows straight legs through gusts.
+
+It stops and turns at every corner, which is all that a method of spraying needs; or it flies as one
+of the two autopilots does.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +11,12 @@ from typing import Literal
 
 import numpy as np
 
+from sitl.guidance import STEP_S, ArduCopter, Guidance, Px4
 from sitl.route import Leg, Route, lines_of
 from sitl.trajectory import Trajectory, Truth
 
-__all__ = ["Leg", "Route", "Trajectory", "Truth", "Vehicle"]
+__all__ = ["STEP_S", "Leg", "Route", "Trajectory", "Truth", "Vehicle"]
 
-STEP_S = 0.010
 TURN_SPEED_M_S = 0.5
 TURN_RATE_DEG_S = 90.0
 # Two legs that differ by less than this in course are flown through without a stop.
@@ -24,7 +28,14 @@ DRAG_1_S = 0.346
 # Cross-track: a critically damped position controller, driven so that 1 m/s of gust makes 3 cm.
 CROSS_RATE_1_S = 1.5
 CROSS_SD_M = 0.03
+# Whom an autopilot holds to a place on its way, the same gusts push against a spring: the drag is
+# such that their speed is as large as without it (from the Lyapunov equation of both).
+HELD_SPRING_1_S2, HELD_DRAG_1_S = 2.0, 0.505
+# The nose follows the way of whom is led at this share of the leg's speed or more.
+NOSE_SHARE = 0.05
 _BLOCK = 4096
+
+Corners = Literal["stop", "ardupilot", "px4"]
 
 
 class Vehicle:
@@ -44,6 +55,7 @@ class Vehicle:
         gust_m_s: float = 1.0,
         gust_time_s: float = 1.5,
         heading: Literal["course"] | float = "course",
+        corners: Corners = "stop",
     ) -> None:
         if not (acceleration_m_s2 > 0.0 and gust_m_s >= 0.0 and gust_time_s > 0.0):
             raise ValueError("acceleration and gust time must be positive, gusts not negative")
@@ -59,6 +71,10 @@ class Vehicle:
         self._legs = lines_of(route)
         self._leg = 0
         self._turning = False
+        self._led: Guidance | None = None
+        if corners != "stop":
+            self._led = (ArduCopter if corners == "ardupilot" else Px4)(route, acceleration_m_s2)
+        self._pushed = (0.0, 0.0, 0.0, 0.0)  # along, its speed, across, its speed
         self._along_m = self._speed = self._reference = 0.0
         self._cross_m = self._cross_speed = self._gust = 0.0
         self._heading_deg = self._course_of(0)
@@ -71,6 +87,11 @@ class Vehicle:
     def time_s(self) -> float:
         """Return the time that the flight has been computed to."""
         return self._start_s + STEP_S * (len(self._history) - 1)
+
+    @property
+    def leg_number(self) -> int:
+        """Return the number of the leg now flown."""
+        return self._leg
 
     @property
     def leg(self) -> Leg:
@@ -181,7 +202,9 @@ class Vehicle:
         return self._noise.pop()
 
     def _fly(self, steps: int) -> None:
-        while steps > 0 and not self.finished:
+        if self._led is not None and not self.finished:
+            self._follow(self._led, steps)
+        while steps > 0 and not self.finished and self._led is None:
             steps = self._turn(steps) if self._turning else self._run(steps)
 
     def _run(self, steps: int) -> int:
@@ -216,6 +239,57 @@ class Vehicle:
         if along >= length_m:
             self._end_leg()
         return steps
+
+    def _follow(self, led: Guidance, steps: int) -> None:
+        """Fly as an autopilot leads, for up to `steps`; gusts push the copter off that way."""
+        along, along_speed, across, across_speed = self._pushed
+        spring, damper = CROSS_RATE_1_S**2 * STEP_S, 2.0 * CROSS_RATE_1_S * STEP_S
+        for _ in range(steps):
+            leg = led.leg
+            led.step()
+            kick, cross_kick = self._draw()
+            self._gust = self._decay * self._gust + kick
+            along_speed += STEP_S * (
+                HELD_DRAG_1_S * self._gust - SPEED_GAIN_1_S * along_speed - HELD_SPRING_1_S2 * along
+            )
+            along += along_speed * STEP_S
+            across_speed += cross_kick - damper * across_speed - spring * across
+            across += across_speed * STEP_S
+            if led.leg != leg:
+                _, _, sin_0, cos_0, _ = self._legs[leg]
+                _, _, sin_1, cos_1, _ = self._legs[led.leg]
+                cosine, sine = sin_0 * sin_1 + cos_0 * cos_1, cos_0 * sin_1 - sin_0 * cos_1
+                along, across = along * cosine + across * sine, across * cosine - along * sine
+                along_speed, across_speed = (
+                    along_speed * cosine + across_speed * sine,
+                    across_speed * cosine - along_speed * sine,
+                )
+            self._leg = led.leg
+            start_east, start_north, sin, cos, _ = self._legs[self._leg]
+            copter = led.copter
+            east_m, north_m = copter.east_m - start_east, copter.north_m - start_north
+            ve, vn = copter.velocity_east_m_s, copter.velocity_north_m_s
+            self._along_m = east_m * sin + north_m * cos + along
+            self._cross_m = east_m * cos - north_m * sin + across
+            self._speed = ve * sin + vn * cos + along_speed
+            self._cross_speed = ve * cos - vn * sin + across_speed
+            self._turn_nose(led)
+            self._remember()
+            if led.finished:
+                self.finished = True
+                break
+        self._pushed = (along, along_speed, across, across_speed)
+
+    def _turn_nose(self, led: Guidance) -> None:
+        """Turn the nose towards where the copter is led, as fast as it turns."""
+        speed = math.hypot(led.lead_east_m_s, led.lead_north_m_s)
+        least = NOSE_SHARE * self.route.legs[self._leg].speed_m_s
+        if self._fixed_heading_deg is not None or speed < least:
+            return
+        target_deg = math.degrees(math.atan2(led.lead_east_m_s, led.lead_north_m_s))
+        left_deg = (target_deg - self._heading_deg + 180.0) % 360.0 - 180.0
+        most_deg = led.nose_deg_s * STEP_S
+        self._heading_deg += min(max(left_deg, -most_deg), most_deg)
 
     def _end_leg(self) -> None:
         if self._bend_deg(self._leg) < STRAIGHT_DEG:

@@ -22,6 +22,7 @@ from sitl.stub.px4 import COMMANDS_PER_S, nan_keeps, px4, px4_parameters
 from sitl.stub.px4_outputs import ActuatorOutputs
 from sitl.stub.scenario import Scenario
 from sitl.stub.world import Pose, World
+from sitl.vehicle import Corners
 
 AUTOPILOTS = ("ardupilot", "px4")
 
@@ -41,6 +42,7 @@ class StubOptions:
     items: tuple[MissionItem, ...] = ()
     speed_m_s: float = 5.0
     gust_m_s: float = 1.0
+    corners: Corners = "stop"
     noise: EstimatorNoise | None = None
     scenario: Scenario = field(default_factory=Scenario)
     faults: tuple[Fault, ...] = ()
@@ -67,6 +69,7 @@ def build_autopilot(
         gust_m_s=options.gust_m_s,
         seed=options.seed,
         zero_is_a_place=firmware.zero_is_a_place,
+        corners=options.corners,
     )
     flight.set_items(options.items, start_s)
     faults = FaultClock((*scenario.faults, *options.faults), start_s=start_s)

@@ -27,7 +27,7 @@ from sitl.stub.modes import (
 )
 from sitl.stub.parameters import AUTO_ARMING, AUTO_TAKE_OFF, Parameters
 from sitl.stub.world import Brake, Climb, Pose, Rest, RouteFlight, World
-from sitl.vehicle import Leg
+from sitl.vehicle import Corners, Leg
 
 _WAYPOINT_RADIUS_M = 2.0  # WPNAV_RADIUS of a default ArduCopter
 _HEIGHT_TOLERANCE_M = 0.1
@@ -47,6 +47,7 @@ class Flight:
         gust_m_s: float = 1.0,
         seed: int = 0,
         zero_is_a_place: bool = False,
+        corners: Corners = "stop",
     ) -> None:
         self.world = world
         self.frame = frame
@@ -62,6 +63,8 @@ class Flight:
         self._gust_m_s = gust_m_s
         self._zero_is_a_place = zero_is_a_place
         self._seed = seed
+        self._corners = corners
+        self._route: RouteFlight | None = None
         self._plan: FlightPlan | None = None
         self._leg = 0
         self.will_land = False  # once it hovers
@@ -234,20 +237,28 @@ class Flight:
 
     def _begin_route(self, pose: Pose, legs: tuple[Leg, ...]) -> None:
         self._seed += 1
-        motion = RouteFlight(pose, legs, gust_m_s=self._gust_m_s, seed=self._seed)
-        self.world.begin(motion, now_s=pose.time_s)
+        self._route = RouteFlight(
+            pose, legs, gust_m_s=self._gust_m_s, seed=self._seed, corners=self._corners
+        )
+        self.world.begin(self._route, now_s=pose.time_s)
         self.phase = Phase.ROUTE
 
     def _count_waypoints(self, now_s: float) -> None:
         if self._plan is None or self._leg >= len(self._plan.legs) - 1:
             return
-        leg, pose = self._plan.legs[self._leg], self.world.pose_at(now_s)
-        distance_m = math.hypot(leg.east_m - pose.east_m, leg.north_m - pose.north_m)
-        if not distance_m <= _WAYPOINT_RADIUS_M:
+        if not self._is_reached(self._plan.legs[self._leg], now_s):
             return
         self.events.append(FlightEvent(reached=self._plan.sequences[self._leg]))
         self._leg += 1
         self._reach(self._plan.sequences[self._leg])
+
+    def _is_reached(self, leg: Leg, now_s: float) -> bool:
+        """Whether a leg is over: to whom leads it, when the next one is, else within the radius."""
+        if self._corners != "stop" and self._route is not None:
+            return self._route.leg > self._leg
+        pose = self.world.pose_at(now_s)
+        distance_m = math.hypot(leg.east_m - pose.east_m, leg.north_m - pose.north_m)
+        return distance_m <= _WAYPOINT_RADIUS_M
 
     def _reach(self, sequence: int) -> None:
         """Make an item the current one, and do the actions that stand before it."""

@@ -11,7 +11,7 @@ from bisect import bisect_right
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from sitl.vehicle import Leg, Route, Truth, Vehicle
+from sitl.vehicle import Corners, Leg, Route, Truth, Vehicle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +127,9 @@ class Brake:
 class RouteFlight:
     """Flies the legs of a route with the twin's vehicle."""
 
-    def __init__(self, pose: Pose, legs: tuple[Leg, ...], *, gust_m_s: float, seed: int) -> None:
+    def __init__(
+        self, pose: Pose, legs: tuple[Leg, ...], *, gust_m_s: float, seed: int, corners: Corners
+    ) -> None:
         route = Route(
             start_east_m=pose.east_m,
             start_north_m=pose.north_m,
@@ -135,7 +137,14 @@ class RouteFlight:
             height_m=pose.height_m,
         )
         self._start_s = pose.time_s
-        self._vehicle = Vehicle(route, start_s=pose.time_s, gust_m_s=gust_m_s, seed=seed)
+        self._vehicle = Vehicle(
+            route, start_s=pose.time_s, gust_m_s=gust_m_s, seed=seed, corners=corners
+        )
+
+    @property
+    def leg(self) -> int:
+        """Return the number of the leg that is flown."""
+        return self._vehicle.leg_number
 
     def advance(self, until_s: float) -> None:
         """Integrate the vehicle up to a time."""

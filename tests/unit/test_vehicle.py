@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sitl.vehicle import Leg, Route, Trajectory, Vehicle
+from sitl.vehicle import Corners, Leg, Route, Trajectory, Vehicle
 
 
 def passes(speed_m_s: float = 5.0, count: int = 4) -> Route:
@@ -102,9 +102,39 @@ def test_a_change_of_speed_on_a_straight_line_is_flown_without_a_stop() -> None:
     assert flight.velocity_east_m_s[middle].min() > 2.9
 
 
-def test_flying_in_pieces_is_flying_at_once() -> None:
-    whole, pieces = fly(3), Vehicle(passes(), start_s=0.0, seed=3)
-    for i in range(400):
+LED: tuple[Corners, ...] = ("ardupilot", "px4")
+
+
+@pytest.mark.parametrize("corners", LED)
+def test_whom_an_autopilot_leads_does_not_stop_and_is_pushed_as_far(corners: Corners) -> None:
+    flight = Vehicle(passes(), start_s=0.0, seed=1, corners=corners).fly_to_end()
+    step_s = np.diff(flight.time_s)
+    for at_m, speeds in (
+        (flight.east_m, flight.velocity_east_m_s), (flight.north_m, flight.velocity_north_m_s),
+    ):  # fmt: skip
+        assert np.abs(np.cumsum(speeds[1:] * step_s) - (at_m[1:] - at_m[0])).max() < 0.02
+        assert np.abs(np.diff(at_m)).max() < 0.08
+    speed = np.hypot(flight.velocity_east_m_s, flight.velocity_north_m_s)
+    assert speed[400:-400].min() > 0.15
+    assert np.abs(np.diff(flight.heading_deg)).max() <= 0.6 + 1e-9
+    assert flight.leg.tolist() == sorted(flight.leg.tolist())
+
+
+@pytest.mark.parametrize("corners", LED)
+def test_gusts_are_as_large_for_whom_an_autopilot_leads(corners: Corners) -> None:
+    legs = (Leg(east_m=0.0, north_m=3000.0, speed_m_s=6.0),)
+    route = Route(start_east_m=0.0, start_north_m=0.0, legs=legs)
+    flight = Vehicle(route, start_s=0.0, seed=1, corners=corners).fly_to_end()
+    cruise = (flight.north_m > 300.0) & (flight.north_m < 2900.0)
+    assert flight.velocity_north_m_s[cruise].std() == pytest.approx(0.15, rel=0.15)
+    assert flight.east_m[cruise].std() == pytest.approx(0.03, rel=0.3)
+
+
+@pytest.mark.parametrize("corners", ["stop", *LED])
+def test_flying_in_pieces_is_flying_at_once(corners: Corners) -> None:
+    whole = Vehicle(passes(), start_s=0.0, seed=3, corners=corners).fly_to_end()
+    pieces = Vehicle(passes(), start_s=0.0, seed=3, corners=corners)
+    for i in range(500):
         pieces.advance(0.37 * i)
     assert pieces.finished
     again = pieces.trajectory()
