@@ -549,6 +549,52 @@ class Ground:
         return f"left {self.left_m2:.1f} m2, twice {self.twice_m2:.1f} m2 of {self.whole_m2:.0f} m2"
 
 
+def treated_share(
+    places: Sequence[Place],
+    pulses: Sequence[Pulses],
+    zones: Sequence[Zone],
+    lines: Sequence[shapely.LineString],
+    *,
+    sprayer: Sprayer | None = None,
+) -> float:
+    """Return the share of the ground under the strips of lines that got half its rate or more.
+
+    In cells of CELL_M that lie wholly under the strips, from the first to the last centimetre of
+    each line.
+    """
+    sprayer = sprayer or Sprayer()
+    middle = shapely.union_all([zone.outline for zone in zones]).centroid
+    plane = Plane(middle.y, middle.x)
+    path = true_path(places, vehicle_times(places, pulses), plane)
+    flows = flows_ml_s(pulses, path.at_s, sprayer, seed=1)
+    boom_m = sprayer.width_m * len(sprayer.right_m)
+    strips = [plane.of(line).buffer(boom_m / 2.0, cap_style="flat") for line in lines]
+    whole = shapely.union_all(strips)
+    west_m, south_m, east_m, north_m = whole.bounds
+    columns = int(np.ceil((east_m - west_m) / CELL_M))
+    rows = int(np.ceil((north_m - south_m) / CELL_M))
+    ml = np.zeros((rows, columns))
+    parts = round(sprayer.width_m / OFF_TARGET_ELEMENT_M)
+    for valve, right_m in enumerate(sprayer.right_m):
+        is_open = np.flatnonzero(flows[valve] > 0.0)
+        for part in range(parts):
+            aside_m = right_m + sprayer.width_m * ((part + 0.5) / parts - 0.5)
+            x = path.east_m[is_open] + aside_m * np.cos(path.yaw_rad[is_open])
+            y = path.north_m[is_open] - aside_m * np.sin(path.yaw_rad[is_open])
+            column = np.floor((x - west_m) / CELL_M).astype(int)
+            row = np.floor((y - south_m) / CELL_M).astype(int)
+            hits = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+            dose = flows[valve][is_open[hits]] * STEP_S / parts
+            np.add.at(ml, (row[hits], column[hits]), dose)
+    across, up = np.meshgrid(np.arange(columns), np.arange(rows))
+    x, y = west_m + (across + 0.5) * CELL_M, south_m + (up + 0.5) * CELL_M
+    core = whole.buffer(-CELL_M / np.sqrt(2.0))
+    flat = [Zone(plane.of(zone.outline), zone.rate_l_ha) for zone in zones]
+    wanted = rates_at(flat, x.ravel(), y.ravel()) * 0.1 * CELL_M**2
+    counts = shapely.contains_xy(core, x.ravel(), y.ravel()) & ~np.isnan(wanted)
+    return float(np.mean(ml.ravel()[counts] >= 0.5 * wanted[counts]))
+
+
 def treated_ground(
     places: Sequence[Place],
     pulses: Sequence[Pulses],
