@@ -59,7 +59,7 @@ HURRIED = 10.0
 # changes are held to their place where it has its speed.
 QUICK, MEAN_MAX_M, OFF_TARGET_MAX_ML = 0.9, 0.07, 0.1
 # The ends of lines in corners that are cut, or flown below `safety.speed_min_m_s`.
-TREATED_MIN = 0.93
+TREATED_MIN = 0.9
 
 
 def coarse(area_ha: float, seed: int) -> Drawn:
