@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -12,7 +11,8 @@ import typer
 
 from companion.cli.answer import AsJson, answer, note
 from companion.cli.map_grid import parse_mark
-from companion.config import load
+from companion.cli.map_options import Reading, reading_options
+from companion.wording import counted
 from missions.files.fence import fence_warnings
 from missions.files.fleet import write_fleet
 from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
@@ -37,6 +37,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
     epilog="Example: vrspray plan examples/anyang/boundary.geojson "
     "--config examples/anyang/config.toml --out field.plan"
 )
+@reading_options
 def plan(
     field: Annotated[
         Path, typer.Argument(metavar="FIELD", help="Outline, with holes, in any map format.")
@@ -44,11 +45,9 @@ def plan(
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE", help=".plan, .waypoints, .geojson or .kml.")
     ],
+    reading: Reading,
     prescription: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Map of rates, for the litres.")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="Of the flight: [mission].")
     ] = None,
     obstacle: Annotated[
         list[Path] | None, typer.Option(metavar="FILE", help="Not to be flown over; repeat it.")
@@ -145,13 +144,12 @@ def plan(
     """
     start = perf_counter()
     _check_outputs(out, png, pilot_sheet, first)
-    for name, value in (("--angle-deg", angle_deg), ("--rate-l-ha", rate_l_ha)):
-        if value is not None and not (math.isfinite(value) and abs(value) < 1e5):
-            raise typer.BadParameter(f"{name} is {value}; write a number")
     if rate_l_ha is not None and prescription is not None:
         raise typer.BadParameter("--rate-l-ha and --prescription exclude each other")
     asked = Asked(
         field=field,
+        answers=reading.answers,
+        crs=reading.crs,
         prescription=prescription,
         obstacles=tuple(obstacle or ()),
         no_spray=tuple(no_spray or ()),
@@ -184,8 +182,7 @@ def plan(
         "aircraft": aircraft,
         "ferry_height_m": ferry_height_m,
     }
-    configured = None if config is None else load(config)
-    task = read_task(asked, configured, changes)
+    task = read_task(asked, reading.config, changes)
     planned = plan_mission(
         task.field,
         task.settings,
@@ -211,7 +208,7 @@ def plan(
     }
     if pilot_sheet is not None:
         write_sheet(
-            planned, result, pilot_sheet, title=field.stem, product=product_of(configured),
+            planned, result, pilot_sheet, title=field.stem, product=product_of(reading.config),
             start_min=parse_start(first), picture=png,
         )  # fmt: skip
     answer(result, _lines(planned, result, files), as_json=as_json)
@@ -244,7 +241,7 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
     minutes = planned.flight_s / 60.0
     where = ", ".join(f"{lat:.6f} {lon:.6f}" for lat, lon in result["depots"])
     lines = [
-        f"{names_of(files)}: {len(planned.sorties)} sorties, {planned.volume_l:.1f} L, "
+        f"{names_of(files)}: {counted(len(planned.sorties), 'sortie')}, {planned.volume_l:.1f} L, "
         f"{minutes:.0f} min",
         f"covered   {coverage.percent:.2f} % of {result['area_ha']:.2f} ha, "
         f"{coverage.overlap_percent:.2f} % twice, {coverage.outside_m2:.1f} m2 outside",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -239,9 +240,9 @@ def _inset(spray: Area, kept_m: float, swath_width_m: float) -> Area:
 
 
 def _check_width(spray: Area, swath_width_m: float) -> None:
-    # The longer side of the hull is not longer than this: passes are at least that many.
-    hull = spray.convex_hull
-    passes = 2.0 * hull.area / hull.length / swath_width_m
+    # No pass is longer than the diagonal of the box: they are at least that many.
+    west, south, east, north = spray.bounds
+    passes = spray.area / math.hypot(east - west, north - south) / swath_width_m
     if not passes <= PASSES_MAX:
         raise PlanError(
             f"a swath of {swath_width_m:g} m needs {passes:.0f} passes or more, and a plan has "

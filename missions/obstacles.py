@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from companion.maps.local import make_valid, project_all
 from companion.maps.registry import Record, read_records
 from missions.errors import PlanError
 from missions.nearness import check_near
+from missions.reading_outline import told
 
 RADIUS_MAX_M, CORRIDOR_MAX_M, HEIGHT_MAX_M = 100.0, 500.0, 500.0
 # Points grow to polygons of 16 corners around their circle, not in it.
@@ -63,14 +65,19 @@ class Obstacle:
 
 
 def read_obstacles(
-    path: Path, frame: LocalFrame, *, radius_m: float | None = None, corridor_m: float | None = None
+    path: Path,
+    frame: LocalFrame,
+    *,
+    radius_m: float | None = None,
+    corridor_m: float | None = None,
+    opens: Mapping[str, str | None] | None = None,
 ) -> list[Obstacle]:
     """Return the obstacles in a file; what has no radius or corridor of its own takes those given.
 
     Raises:
         PlanError, MapError: in one line, which record lacks what, or that the file is of elsewhere.
     """
-    records = read_records(path)
+    records = told(partial(read_records, path), opens or {})
     west, south, east, north = shapely.total_bounds([each.geometry for each in records]).tolist()
     check_near(str(path), (south + north) / 2.0, (west + east) / 2.0, frame)
     return _together([_obstacle(path, record, radius_m, corridor_m) for record in records])

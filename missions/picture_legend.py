@@ -7,6 +7,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from companion.maps.picture.draw import Sheet, printable, scale_length_m
+from companion.wording import counted
 from missions.plan import Plan
 
 if TYPE_CHECKING:
@@ -86,7 +87,7 @@ def write_title(figure: Figure, plan: Plan, title: str) -> None:
     figures = (
         f"{plan.field.area_m2 / 1e4:.2f} ha    {plan.volume_l:,.1f} L    "
         f"{_duration(plan.total_s)} with refills    "
-        f"{count} sortie{'' if count == 1 else 's'}    covered {plan.coverage.percent:.2f} %    "
+        f"{counted(count, 'sortie')}    covered {plan.coverage.percent:.2f} %    "
         f"twice {plan.coverage.overlap_percent:.2f} %    "
         f"ferry {plan.length_m('ferry') / 1e3:.1f} km"
     )

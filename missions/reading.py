@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+from pydantic import TypeAdapter, ValidationError
 from shapely import MultiPolygon
 
 from companion.assembly import above_label, flow_range, read_configured_map
@@ -36,7 +38,7 @@ from missions.reading_ground import (
     terrain_of,
     wind_of,
 )
-from missions.reading_outline import near_area, outline_of
+from missions.reading_outline import near_area, outline_of, told
 from missions.remaining import Remaining
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from missions.treated_rates import untreated_rates
@@ -45,6 +47,11 @@ from missions.treated_rates import untreated_rates
 DEFAULTS = Settings(swath_width_m=6.0, speed_m_s=6.0)
 RATE_L_HA = 20.0
 FERRY_CLEARANCE_M = 5.0
+# Options that are not called as their keys are.
+OPTIONS = {"swath_width_m": "swath_m"}
+SPEED_MAX_M_S = 50.0
+# What a configuration says of its own map, and so of others of the same farm.
+OF_ALL_MAPS = ("unit", "crs", "density_kg_l", "flow_width_m", "flow_speed_m_s")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,7 +70,11 @@ class Task:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Asked:
-    """What the command line asks for; None leaves it to the configuration or the defaults."""
+    """What the command line asks for; None leaves it to the configuration or the defaults.
+
+    `answers` are what prescriptions leave open, by the arguments of `read_map`; `crs` is for each
+    file that does not say its own.
+    """
 
     field: Path
     prescription: Path | None = None
@@ -74,9 +85,15 @@ class Asked:
     depots: tuple[tuple[float, float], ...] = ()
     rate_l_ha: float | None = None
     crs: str | None = None
+    answers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     border_m: float = 0.0
     ground: GroundAsked = NOTHING_ASKED
     pause: BreakAsked = NO_BREAK
+
+    @property
+    def opens(self) -> dict[str, str | None]:
+        """Return what is answered for each file that leaves it open."""
+        return {"crs": self.crs, "layer": self.answers.get("layer")}
 
 
 def read_task(asked: Asked, config: Config | None, changes: dict[str, float | int | None]) -> Task:
@@ -88,15 +105,15 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
     settings = _spaced(_settings(config, changes), asked, config, changes)
     map_file = _map(asked, config)
     said: list[str] = []
-    boundary = outline_of(asked.field, map_file, said, crs=asked.crs)
+    boundary = outline_of(asked.field, map_file, said, asked.opens)
     frame = frame_of(boundary)
     table = None if config is None else config.prescription
     mission = None if config is None else config.mission
     offset_m = (0.0, 0.0) if table is None else (table.offset_east_m, table.offset_north_m)
     _check_places(asked, mission, map_file, frame)
-    closed = [near_area(path, frame) for path in asked.no_spray]
+    closed = [near_area(path, frame, asked.opens) for path in asked.no_spray]
     if config is not None and table is not None:
-        closed += [near_area(config.resolve(name), frame) for name in table.exclusions]
+        closed += _exclusions(asked, config, table, frame)
     ground = build_field(
         boundary,
         obstacles=_obstacles(asked, frame),
@@ -116,19 +133,26 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         ground = replace(ground, closes=rates.field)
     whole = ground
     if asked.pause.resume is None and asked.pause.done is not None:
-        ground = untreated(ground, asked.pause.done, settings.swath_width_m, offset_m)
+        ground = untreated(
+            ground, asked.pause.done, settings.swath_width_m, offset_m, opens=asked.opens
+        )
     configured = () if mission is None else mission.depots
     return Task(
         field=ground,
         settings=settings,
-        rates=untreated_rates(rates, asked.pause.ground, whole, offset_m),
+        rates=untreated_rates(rates, asked.pause.ground, whole, offset_m, opens=asked.opens),
         depots=asked.depots or tuple(configured),
         around=Surroundings(
             terrain=terrain_of(asked.ground, config, frame),
-            run_in=run_in_of(asked.ground, config, ground, offset_m),
+            run_in=run_in_of(asked.ground, config, ground, offset_m, opens=asked.opens),
         ),
         left=left_of(
-            asked.pause, mission, frame, width_m=settings.swath_width_m, offset_m=offset_m
+            asked.pause,
+            mission,
+            frame,
+            width_m=settings.swath_width_m,
+            offset_m=offset_m,
+            opens=asked.opens,
         ),
         said=tuple(said),
         wind=asked.ground.wind or (None if mission is None else mission.wind),
@@ -148,7 +172,11 @@ def _obstacles(asked: Asked, frame: LocalFrame) -> list[Obstacle]:
         obstacle
         for path in asked.obstacles
         for obstacle in read_obstacles(
-            path, frame, radius_m=asked.obstacle_radius_m, corridor_m=asked.corridor_m
+            path,
+            frame,
+            radius_m=asked.obstacle_radius_m,
+            corridor_m=asked.corridor_m,
+            opens=asked.opens,
         )
     ]
 
@@ -216,30 +244,56 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
     if config is not None and config.mission is not None:
         given.setdefault("ferry_height_m", config.mission.ferry_height_m)
     highest = given.pop("speed_max_m_s", None)
-    if highest is not None:
-        limit = math.inf if config is None else config.safety.speed_max_m_s
-        if not 0.0 < highest <= limit:
-            raise PlanError(f"--speed-max-m-s {highest:g}: safety.speed_max_m_s is {limit:g}")
-        given["speeds_m_s"] = (settings.speeds_m_s[0], highest)
+    for name, value in given.items():
+        _check_bounds(name, value)
     try:
-        return replace(settings, **given)
+        settings = replace(settings, **given)
     except ValueError as error:
         raise PlanError(f"this cannot be flown: {error}") from error
+    if highest is None:
+        return settings
+    limit = SPEED_MAX_M_S if config is None else config.safety.speed_max_m_s
+    if not settings.speed_m_s <= highest <= limit:
+        source = "" if config is None else " (safety.speed_max_m_s)"
+        raise PlanError(
+            f"--speed-max-m-s {highest:g}: write at least the speed of the passes, "
+            f"{settings.speed_m_s:g} m/s, and at most {limit:g} m/s{source}"
+        )
+    return replace(settings, speeds_m_s=(settings.speeds_m_s[0], highest))
+
+
+def _check_bounds(name: str, value: float) -> None:
+    """Refuse an option with a number that its key of the configuration could not have."""
+    key = MissionTable.model_fields.get(name)
+    if key is None:
+        return
+    try:
+        adapter: TypeAdapter[Any] = TypeAdapter(Annotated[key.annotation, key])  # type: ignore[arg-type]
+        adapter.validate_python(value)
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"].replace("Input should be", "write a number")
+        option = OPTIONS.get(name, name).replace("_", "-")
+        raise PlanError(f"--{option} {value:g}: {reason}") from None
 
 
 def _map(asked: Asked, config: Config | None) -> MapFile | None:
     """Return the prescription that is asked for, or the configuration's."""
     table = None if config is None else config.prescription
-    if asked.prescription is None:
-        if config is None or table is None or asked.rate_l_ha is not None:
-            return None
-        return read_configured_map(config)
+    path = asked.prescription
     if config is None or table is None:
-        return read_map(asked.prescription)
-    own = asked.prescription.resolve() == config.resolve(table.file).resolve()
-    if own:
-        return read_configured_map(config)
-    return read_map(asked.prescription, unit=table.unit, crs=table.crs)
+        return None if path is None else told(partial(read_map, path, **asked.answers), asked.opens)
+    if path is None and asked.rate_l_ha is not None:
+        return None
+
+    def own(**answers: str) -> MapFile:
+        changed = table.model_copy(update={**asked.answers, **answers})
+        return read_configured_map(config.model_copy(update={"prescription": changed}))
+
+    if path is None or path.resolve() == config.resolve(table.file).resolve():
+        return told(own, asked.opens)
+    # Which column and which layer a configuration names, it says of its own map alone.
+    said = {name: getattr(table, name) for name in OF_ALL_MAPS}
+    return told(partial(read_map, path, **{**said, **asked.answers}), {"crs": asked.crs})
 
 
 def _rates(
@@ -254,6 +308,7 @@ def _rates(
         rate = asked.rate_l_ha
         if rate is None:
             rate = RATE_L_HA if mission is None else mission.rate_l_ha
+        _check_bounds("rate_l_ha", rate)
         return Uniform(rate_l_ha=rate)
     if config is not None:
         label = above_label(config, map_file)
@@ -269,8 +324,8 @@ def _rates(
             frame,
             overlap=table.overlap,
             # As the companion does it: where it closes the valves there is no demand.
-            boundary=_own_boundary(config, table, frame) if is_own else _many(boundary),
-            exclusions=[near_area(config.resolve(name), frame) for name in table.exclusions],
+            boundary=_own_boundary(asked, config, table, frame) if is_own else _many(boundary),
+            exclusions=_exclusions(asked, config, table, frame),
             default_rate_l_ha=table.default_rate_l_ha,
             offset_east_m=table.offset_east_m,
             offset_north_m=table.offset_north_m,
@@ -287,10 +342,17 @@ def _is_flown(asked: Asked, config: Config | None) -> bool:
 
 
 def _own_boundary(
-    config: Config, table: PrescriptionTable, frame: LocalFrame
+    asked: Asked, config: Config, table: PrescriptionTable, frame: LocalFrame
 ) -> MultiPolygon | None:
     name = table.boundary
-    return None if name is None else near_area(config.resolve(name), frame)
+    return None if name is None else near_area(config.resolve(name), frame, asked.opens)
+
+
+def _exclusions(
+    asked: Asked, config: Config, table: PrescriptionTable, frame: LocalFrame
+) -> list[MultiPolygon]:
+    names = [config.resolve(name) for name in table.exclusions]
+    return [near_area(path, frame, asked.opens) for path in names]
 
 
 def _many(area: Area) -> MultiPolygon:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from companion.record.coverage_area import carried, carried_places
 from missions.energy import Battery
 from missions.errors import PlanError
 from missions.field import MARGIN_M, Field, local_area
+from missions.reading_outline import told
 from missions.remaining import Break, Remaining, read_lines, remaining
 from missions.strips import Floats
 
@@ -98,6 +101,7 @@ def left_of(
     *,
     width_m: float,
     offset_m: tuple[float, float],
+    opens: Mapping[str, str | None],
 ) -> Remaining | None:
     """Return what a plan that is gone on with leaves; None without one.
 
@@ -108,7 +112,7 @@ def left_of(
     is_flown = is_journal(asked.resume)
     rows = _flown_lines(asked.resume, frame) if is_flown else read_lines(asked.resume, frame)
     done = asked.ground
-    treated = None if done is None else treated_area(done, frame, width_m, offset_m)
+    treated = None if done is None else treated_area(done, frame, width_m, offset_m, opens=opens)
     since = Break(
         stop=None if asked.stop is None else frame.to_local(*asked.stop),
         sortie=asked.sortie,
@@ -136,7 +140,12 @@ def _flown_lines(journal: Path, frame: LocalFrame) -> list[tuple[int, Floats]]:
 
 
 def treated_area(
-    done: Path, frame: LocalFrame, width_m: float, offset_m: tuple[float, float]
+    done: Path,
+    frame: LocalFrame,
+    width_m: float,
+    offset_m: tuple[float, float],
+    *,
+    opens: Mapping[str, str | None],
 ) -> BaseGeometry:
     """Return the treated ground of a file; of a journal all that is not left of its own field.
 
@@ -145,7 +154,7 @@ def treated_area(
     on closes what is too much. Nobody flies for pieces much smaller than a swath is wide.
     """
     if not is_journal(done):
-        return translate(local_area(read_area(done), frame), *offset_m)
+        return translate(local_area(told(partial(read_area, done), opens), frame), *offset_m)
     found = read_treated_ground(done)
     field = found.setup.prescription.field
     left = rest_of(field, found.coverage, found.strip_m)
@@ -155,13 +164,20 @@ def treated_area(
     return carried(edge, found.frame, frame)
 
 
-def untreated(field: Field, done: Path, width_m: float, offset_m: tuple[float, float]) -> Field:
+def untreated(
+    field: Field,
+    done: Path,
+    width_m: float,
+    offset_m: tuple[float, float],
+    *,
+    opens: Mapping[str, str | None],
+) -> Field:
     """Return the field without the treated ground: it is flown over, and not sprayed again.
 
     Raises:
         PlanError: where nothing is left that a strip fits on.
     """
-    treated = treated_area(done, field.frame, width_m, offset_m)
+    treated = treated_area(done, field.frame, width_m, offset_m, opens=opens)
     kept = treated.buffer(MARGIN_M, join_style="mitre")
     spray = as_area(polygons_of(field.spray.difference(kept)))
     if spray is None or spray.buffer(-width_m / 2.0).is_empty:

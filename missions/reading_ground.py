@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -15,6 +16,7 @@ from companion.core.frame import LocalFrame
 from companion.maps.registry import read_area
 from missions.errors import PlanError
 from missions.field import Field, local_area
+from missions.reading_outline import told
 from missions.run_in import RunIn
 from missions.swath_table import SwathPoint, swath_width_m
 from missions.terrain.ground import Terrain
@@ -108,7 +110,12 @@ def no_spray_buffer_m(asked: GroundAsked, config: Config | None) -> float:
 
 
 def run_in_of(
-    asked: GroundAsked, config: Config | None, field: Field, offset_m: tuple[float, float]
+    asked: GroundAsked,
+    config: Config | None,
+    field: Field,
+    offset_m: tuple[float, float],
+    *,
+    opens: Mapping[str, str | None],
 ) -> RunIn | None:
     """Return the way before and behind passes, None where none is asked for."""
     mission = _table(config)
@@ -117,7 +124,8 @@ def run_in_of(
         return None
     areas = []
     if config is not None:
-        areas = [read_area(config.resolve(name)) for name in mission.overrun_areas]
+        paths = [config.resolve(name) for name in mission.overrun_areas]
+        areas = [told(partial(read_area, path), opens) for path in paths]
     outside = [
         shapely.transform(local_area(area, field.frame), lambda points: points + offset_m)
         for area in areas

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import shapely
@@ -19,19 +22,44 @@ from missions.errors import PlanError
 from missions.nearness import check_near
 from missions.strips import Floats
 
+T = TypeVar("T")
+
 # The nearest land is 1.4 degrees south and 5.6 east of 0, 0.
 AT_SEA_DEG = 1.0
 
 
+# What a file leaves open, by the code of its refusal, and what answers it.
+ANSWERS = {"no-crs": "crs", "several-layers": "layer"}
+
+
+def told(read: Callable[..., T], asked: Mapping[str, str | None]) -> T:
+    """Return what `read` makes of a file; it is told only what the file leaves open.
+
+    One plan reads several files: what is asked for the one without a CRS must not move the others.
+    """
+    answers: dict[str, str] = {}
+    while True:
+        try:
+            return read(**answers)
+        except MapError as error:
+            name = ANSWERS.get(error.code or "", "")
+            answer = asked.get(name)
+            if answer is None or name in answers:
+                raise
+            answers[name] = answer
+
+
 def outline_of(
-    path: Path, map_file: MapFile | None, said: list[str], *, crs: str | None = None
+    path: Path, map_file: MapFile | None, said: list[str], asked: Mapping[str, str | None]
 ) -> Area:
     """Return the field's outline; of a prescription in cells, that of its cells with a rate.
+
+    `asked` has the CRS and the layer, where they are given.
 
     Rings that cross themselves are repaired, and what that changes is added to `said`.
     """
     try:
-        outline = read_area(path, crs=crs, repairs=said)
+        outline = told(partial(read_area, path, repairs=said), asked)
         check_degrees(outline, path)
         return outline
     except MapError as error:
@@ -39,7 +67,7 @@ def outline_of(
             raise
         same = map_file is not None and map_file.path.resolve() == path.resolve()
         try:
-            cells = map_file if same else read_map(path)
+            cells = map_file if same else told(partial(read_map, path), asked)
         except MapError:
             raise error from None  # no map of cells either: what is missing is an outline
         if cells is None or cells.cells is None:
@@ -80,9 +108,9 @@ def _of_cells(map_file: MapFile) -> MultiPolygon | Area:
     return found
 
 
-def near_area(path: Path, frame: LocalFrame) -> MultiPolygon:
+def near_area(path: Path, frame: LocalFrame, asked: Mapping[str, str | None]) -> MultiPolygon:
     """Return the ground of a file, which must lie near the field to mean anything for it."""
-    area = read_area(path)
+    area = told(partial(read_area, path), asked)
     west, south, east, north = area.bounds
     check_near(str(path), (south + north) / 2.0, (west + east) / 2.0, frame)
     return area

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from companion.wording import counted
 from missions.files.items import items_of
 from missions.plan import Plan, Sortie
 from missions.schedule import separation_m
@@ -128,7 +129,8 @@ def _line(plan: Plan, sortie: Sortie, row: dict[str, Any]) -> str:
     texts = [
         f"sortie {sortie.number:3}  fill to {row['fill_l']:6.2f} L, spray {sortie.volume_l:6.2f} L"
         f"  {row['airborne_s'] / 60.0:5.1f} min from {sortie.start_s / 60.0:.0f} min  "
-        f"{sortie.lines} lines, {_speeds(sortie.speeds_m_s)}, {row['items']} items, "
+        f"{counted(sortie.lines, 'line')}, {_speeds(sortie.speeds_m_s)}, "
+        f"{counted(row['items'], 'item')}, "
         f"up to {row['farthest_m']:.0f} m away, {row['overlap_l']:.2f} L twice"
     ]
     used_wh = plan.energy_wh(sortie)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from companion.record.continuing import is_journal, read_treated_ground
 from companion.record.coverage_area import moved
 from missions.demand import Demand, Rates, demands
 from missions.field import Field, local_area
+from missions.reading_outline import told
 from missions.strips import Floats, rectangles
 
 
@@ -43,7 +46,12 @@ class UntreatedRates:
 
 
 def untreated_rates(
-    rates: Rates, done: Path | None, field: Field, offset_m: tuple[float, float]
+    rates: Rates,
+    done: Path | None,
+    field: Field,
+    offset_m: tuple[float, float],
+    *,
+    opens: Mapping[str, str | None],
 ) -> Rates:
     """Return the rates without what the file says is treated; as they are without one.
 
@@ -55,7 +63,7 @@ def untreated_rates(
         found = read_treated_ground(done)
         cells = moved(found.coverage, found.frame, field.frame)
         return UntreatedRates(rates=rates, treated=cells, limit=field.kept_in)
-    area = translate(local_area(read_area(done), field.frame), *offset_m)
+    area = translate(local_area(told(partial(read_area, done), opens), field.frame), *offset_m)
     shapely.prepare(area)
     return UntreatedRates(rates=rates, treated=area, limit=field.kept_in)
 

@@ -105,6 +105,14 @@ class Reading:
         changed = table.model_copy(update={"overlap": policy})
         return replace(self, config=self.config.model_copy(update={"prescription": changed}))
 
+    @property
+    def answers(self) -> dict[str, Any]:
+        """Return what is given for the map itself, its CRS apart."""
+        given = {each.name: getattr(self, each.name) for each in fields(self)}
+        for name in ("crs", "config", "policy"):
+            del given[name]
+        return {name: answer for name, answer in given.items() if answer is not None}
+
     def read(self, file: Path) -> MapFile:
         """Return the map, read as the options say and otherwise as the configuration does.
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.cli.answer import problem_line
-from companion.maps.lint.survey import counted
+from companion.wording import counted
 
 RATES_SHOWN_MAX = 12
 # Problems of one kind, and kinds, that are written out; all of them are in --json.

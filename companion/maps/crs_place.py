@@ -28,6 +28,8 @@ EXTENT_MAX_M = 100_000.0
 LATITUDE_MAX_DEG = 85.0
 # 100 km at that latitude.
 LONGITUDES_MAX_DEG = 11.0
+# What lies beyond it on both sides is cut by the 180th meridian.
+_NEAR_180_DEG = 150.0
 # Degrees beyond its area of use at which a CRS is a mistake. Maps are drawn in the next UTM zone
 # on purpose, 6 degrees wide; more than one zone away nobody does.
 _AREA_MARGIN_DEG = 6.0
@@ -111,13 +113,15 @@ def check_extent(box: _Box, path: Path) -> None:
             code="out-of-range",
         )
     if not east - west <= LONGITUDES_MAX_DEG:
-        local = west <= 1.0 and east >= -1.0 and south <= 1.0 and north >= -1.0
+        crosses = west < -_NEAR_180_DEG and east > _NEAR_180_DEG
         raise map_error(
             path,
-            f"the map reaches over {east - west:.4g} degrees of longitude",
-            fix="from 0, 0: these look like metres from a local origin; export it in degrees"
-            if local
-            else "split it where it crosses the 180th meridian; otherwise remove the stray zone",
+            f"the map reaches over {east - west:.4g} degrees of longitude "
+            f"(x {west:.6g} to {east:.6g}, y {south:.6g} to {north:.6g})",
+            fix="split it where it crosses the 180th meridian; otherwise remove the stray zone"
+            if crosses
+            else "if these are metres from a local origin, export them in degrees or with their "
+            "CRS; otherwise remove the stray zone",
             code="out-of-range",
         )
     narrow = np.cos(np.radians(min(abs(south), abs(north)) if south * north > 0 else 0.0))
@@ -144,6 +148,8 @@ def _out_of_range(raw: Floats, crs: CRS, path: Path) -> MapError:
     if crs.is_geographic and looks_like_metres(raw):
         fix = "they look like metres: give with --crs the projection that they were made in"
         code = "wrong-crs"
+    elif crs.is_geographic:
+        fix = "if they are metres, give with --crs their projection, or export them in degrees"
     text = f"coordinates ({span(raw)}) are outside what {crs_name(crs)} can hold"
     return map_error(path, text, fix=fix, code=code)
 

@@ -107,7 +107,11 @@ def read_map(
 
 
 def read_area(
-    path: Path, *, crs: str | None = None, repairs: list[str] | None = None
+    path: Path,
+    *,
+    crs: str | None = None,
+    layer: str | None = None,
+    repairs: list[str] | None = None,
 ) -> MultiPolygon:
     """Return the ground that a boundary or exclusion file covers, in longitude and latitude.
 
@@ -118,15 +122,15 @@ def read_area(
     ground, and finds there what each repair changed.
     """
     path = Path(path)
-    layer = _read(path, None)
-    if layer.boundary is not None:
-        return layer.boundary
-    layer = _no_grid(layer, path)
-    used_crs, _ = crs_of(layer, path, crs)
-    names = zone_names(layer)
-    ground = _strict_ground(layer, used_crs, names, path, repairs)
-    if layer.skipped:
-        index, reason = next(iter(layer.skipped.items()))
+    found = _read(path, layer)
+    if found.boundary is not None:
+        return found.boundary
+    found = _no_grid(found, path)
+    used_crs, _ = crs_of(found, path, crs)
+    names = zone_names(found)
+    ground = _strict_ground(found, used_crs, names, path, repairs)
+    if found.skipped:
+        index, reason = next(iter(found.skipped.items()))
         raise map_error(
             path,
             f"record {names[index]} is no area: {reason}",
@@ -151,20 +155,20 @@ class Record:
     values: Mapping[str, Value]
 
 
-def read_records(path: Path) -> list[Record]:
+def read_records(path: Path, *, crs: str | None = None, layer: str | None = None) -> list[Record]:
     """Return areas, points and lines of a file with their attributes, as obstacles are given.
 
     As strict as `read_area`: what is none of these could be what stands in the way.
     """
     path = Path(path)
-    layer = _read(path, None)
-    if layer.boundary is not None:
-        return [Record(name=BOUNDARY_NAME, geometry=layer.boundary, values={})]
-    layer = _no_grid(layer, path)
-    used_crs, _ = crs_of(layer, path, None)
-    names = zone_names(layer)
-    marks = dict(layer.marks)
-    for index, reason in layer.skipped.items():
+    given = _read(path, layer)
+    if given.boundary is not None:
+        return [Record(name=BOUNDARY_NAME, geometry=given.boundary, values={})]
+    read = _no_grid(given, path)
+    used_crs, _ = crs_of(read, path, crs)
+    names = zone_names(read)
+    marks = dict(read.marks)
+    for index, reason in read.skipped.items():
         if index not in marks:
             raise map_error(
                 path,
@@ -173,8 +177,8 @@ def read_records(path: Path) -> list[Record]:
                 code="no-polygon",
             )
     found: dict[int, BaseGeometry] = {}
-    if len(marks) < len(layer.geometries):
-        ground = _strict_ground(layer, used_crs, names, path, None)
+    if len(marks) < len(read.geometries):
+        ground = _strict_ground(read, used_crs, names, path, None)
         found = {index: area for index, area in enumerate(ground) if area is not None}
     if marks:
         native = np.array(list(marks.values()), dtype=object)
@@ -184,7 +188,7 @@ def read_records(path: Path) -> list[Record]:
         Record(
             name=names[index],
             geometry=found[index],
-            values={column.name.casefold(): column.values[index] for column in layer.columns},
+            values={column.name.casefold(): column.values[index] for column in read.columns},
         )
         for index in sorted(found)
     ]

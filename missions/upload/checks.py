@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from companion.wording import counted
 from missions.upload.items import (
     FENCE_FIRST,
     FENCE_LAST,
@@ -114,7 +115,7 @@ def compare(sent: Sequence[WireItem], back: Sequence[WireItem], firmware: Firmwa
     is_fence = bool(sent) and FENCE_FIRST <= sent[0].command <= FENCE_LAST
     first = 1 if firmware == "ardupilot" and not is_fence else 0
     if len(sent) != len(back):
-        text = f"{len(sent) - first} items were sent, {len(back) - first} are there"
+        text = f"{counted(len(sent) - first, 'item')} sent, {len(back) - first} are there"
         return Compared(differences=(text,), left_out=())
     differences: list[str] = []
     left_out: list[str] = []

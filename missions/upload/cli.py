@@ -13,6 +13,7 @@ import typer
 from companion.assembly import build_setup
 from companion.cli.answer import AsJson, answer, note
 from companion.config import load
+from companion.wording import counted
 from missions.errors import UploadError
 from missions.upload.checks import FIRMWARES
 from missions.upload.following import each_when_flown, sorties_from
@@ -152,7 +153,8 @@ class _Progress:
 def _line(file: Path, done: Uploaded) -> str:
     fence = f" and {done.fence_items} of its fence" if done.fence_items else ""
     again = f", at attempt {done.attempts}" if done.attempts > 1 else ""
+    verb = "is" if done.items == 1 and not fence else "are"
     return (
-        f"{file.name}: {done.items} items{fence} are on the vehicle "
+        f"{file.name}: {counted(done.items, 'item')}{fence} {verb} on the vehicle "
         f"({FIRMWARES[done.firmware]}), read back and the same{again}"
     )

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyogrio
 import pytest
 import shapely
+from pyproj import Transformer
 from shapely import Polygon, box
 
 from companion.cli.app import execute
@@ -135,8 +139,17 @@ BOW_TIE = Polygon([(0, 0), (100, 100), (100, 0), (0, 100)])
         (box(0, 0, 100, 100), ["--depot", "north"], "--depot"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "0"], "rate above zero"),
         (box(0, 0, 100, 100), ["--rate-l-ha", "nan"], "--rate-l-ha"),
-        (box(0, 0, 100, 100), ["--swath-m", "-6"], "swath_width_m must be positive"),
-        (box(0, 0, 100, 100), ["--speed-m-s", "nan"], "speed_m_s must be positive"),
+        (box(0, 0, 100, 100), ["--swath-m", "-6"], "--swath-m -6: write a number greater than 0"),
+        (box(0, 0, 100, 100), ["--swath-m", "0.05"], "passes or more, and a plan has 1000 at most"),
+        (box(0, 0, 100, 100), ["--swath-m", "1e-9"], "passes or more, and a plan has 1000 at most"),
+        (box(0, 0, 100, 100), ["--swath-m", "1e9"], "--swath-m 1e+09: write a number less than or"),
+        (box(0, 0, 100, 100), ["--speed-m-s", "nan"], "--speed-m-s nan: write a number"),
+        (box(0, 0, 100, 100), ["--speed-m-s", "1e-9"], "greater than or equal to 0.5"),
+        (box(0, 0, 100, 100), ["--speed-max-m-s", "nan"], "at least the speed of the passes, 6"),
+        (box(0, 0, 100, 100), ["--speed-max-m-s", "1e-9"], "and at most 50 m/s"),
+        (box(0, 0, 100, 100), ["--tank-l", "inf"], "--tank-l inf: write a number less than or"),
+        (box(0, 0, 100, 100), ["--angle-deg", "1000"], "less than or equal to 360"),
+        (box(0, 0, 100, 100), ["--rate-l-ha", "-1"], "--rate-l-ha -1: write a number"),
         (box(0, 0, 100, 100), ["--obstacle", "none.shp"], "none.shp"),
         (box(0, 0, 100, 100), ["--prescription", "none.shp"], "none.shp"),
         (box(0, 0, 60_000, 100), [], "the field spans 60 km"),
@@ -151,6 +164,88 @@ def test_a_refusal_is_one_line_and_no_file(
     assert says in found["error"]
     assert len(err.strip().splitlines()) == 1
     assert not (tmp_path / "m.plan").exists()
+
+
+def shapefile(ground: Polygon, path: Path, *, rate: float | None = None) -> Path:
+    """Write a polygon in metres of UTM's zone 32 without its .prj, by an independent writer."""
+    to_utm = Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
+    moved = shapely.transform(
+        to_degrees(ground), lambda points: np.column_stack(to_utm.transform(*points.T))
+    )
+    pyogrio.raw.write(
+        str(path),
+        np.array([shapely.to_wkb(moved)], dtype=object),
+        [] if rate is None else [np.array([rate])],
+        [] if rate is None else ["value"],
+        crs="EPSG:32632",
+        geometry_type="Polygon",
+        driver="ESRI Shapefile",
+    )
+    path.with_suffix(".prj").unlink()
+    return path
+
+
+def test_what_files_leave_open_is_told_by_the_options_that_the_refusals_name(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    ground = box(0, 0, 120, 120)
+    field = written(ground, tmp_path / "f.geojson")
+    rates = shapefile(ground, tmp_path / "r.shp", rate=20.0)
+    tree = shapefile(box(50, 50, 55, 55), tmp_path / "t.shp")
+    words: list[object] = [field, "--obstacle", tree, "--out", tmp_path / "m.kml"]
+    code, found, _ = run(capsys, *words)
+    assert (code, "t.shp" in found["error"], "--crs" in found["error"]) == (2, True, True)
+    # The field says its own CRS, and keeps it.
+    words += ["--crs", "EPSG:32632"]
+    code, plain, _ = run(capsys, *words)
+    assert code == 0
+    words += ["--prescription", rates]
+    code, found, _ = run(capsys, *words)
+    assert (code, "--unit" in found["error"]) == (2, True)
+    code, found, _ = run(capsys, *words, "--unit", "kg/ha")
+    assert (code, "--density-kg-l" in found["error"]) == (2, True)
+    code, light, _ = run(capsys, *words, "--unit", "kg/ha", "--density-kg-l", "0.8")
+    assert code == 0
+    code, found, _ = run(capsys, *words, "--unit", "L/ha", "--rate-field", "value")
+    assert code == 0
+    assert found["volume_l"] == pytest.approx(plain["volume_l"], rel=0.02)
+    assert light["volume_l"] == pytest.approx(found["volume_l"] / 0.8)
+
+
+def test_answers_on_the_command_line_hold_for_the_configurations_map_too(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    ground = box(0, 0, 120, 120)
+    field = written(ground, tmp_path / "f.geojson")
+    shapefile(ground, tmp_path / "r.shp", rate=20.0)
+    text = (ANYANG / "config.toml").read_text()
+    text = re.sub(r"(?ms)^\[prescription\].*?(?=^\[)", '[prescription]\nfile = "r.shp"\n\n', text)
+    (tmp_path / "c.toml").write_text(text)
+    words = [field, "--config", tmp_path / "c.toml", "--out", tmp_path / "m.kml"]
+    code, found, _ = run(capsys, *words)
+    assert (code, "prescription.file" in found["error"]) == (2, True)
+    code, found, _ = run(capsys, *words, "--crs", "EPSG:32632", "--unit", "L/ha")
+    assert code == 0
+    assert found["volume_l"] > 20.0
+
+
+def test_one_of_anything_is_singular(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    field = written(box(0, 0, 120, 120), tmp_path / "f.geojson")
+    assert execute(["plan", str(field), "--out", str(tmp_path / "m.kml")]) == 0
+    out, _ = capsys.readouterr()
+    assert "1 sortie," in out
+    assert not re.search(r"\b1 (sorties|lines|items|passes)\b", out)
+
+
+@pytest.mark.parametrize("size", [0.3, 40.0, 300.0])
+def test_metres_from_a_local_origin_are_not_planned_at_0_0(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, size: float
+) -> None:
+    ring = [[0, 0], [size, 0], [size, size], [0, size], [0, 0]]
+    path = tmp_path / "f.geojson"
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    code, found, _ = run(capsys, path, "--out", tmp_path / "m.kml")
+    assert (code, "metres" in found["error"]) == (2, True)
 
 
 def test_an_outline_that_crosses_itself_is_refused(

@@ -304,7 +304,7 @@ def test_what_firmwares_round_is_still_the_same() -> None:
 @pytest.mark.parametrize(
     ("back", "says"),
     [
-        (ITEMS[:-1], "4 items were sent, 3 are there"),
+        (ITEMS[:-1], "4 items sent, 3 are there"),
         (changed(2, command=82), "item 3 (WAYPOINT): SPLINE_WAYPOINT is there"),
         (changed(2, y=110_001_003), "was at 48.0001000 11.0001000"),
         (changed(2, z_m=3.4), "was 3.5 m high, 3.4 is there"),

@@ -8,9 +8,10 @@ import numpy as np
 import shapely
 from shapely import Geometry
 
-from companion.maps.lint.survey import PLACES_MAX, Objects, Survey, area_text, counted, some
+from companion.maps.lint.survey import PLACES_MAX, Objects, Survey, area_text, some
 from companion.maps.model import Problem
 from companion.maps.overlaps import OVERLAP_MAX_M2, PAIRS_MAX, Overlap, overlaps
+from companion.wording import counted
 
 SMALL_M2 = 1.0
 # Mean width of a strip, 2 area / perimeter, that no boom can follow.

@@ -19,10 +19,10 @@ from companion.maps.lint.survey import (
     Objects,
     Survey,
     area_text,
-    counted,
     some,
 )
 from companion.maps.model import Problem
+from companion.wording import counted
 
 # A zone as wide as a strip is not narrower because of a rounding in its coordinates.
 STRIP_SHARE = 0.999

@@ -244,15 +244,6 @@ def some(texts: Sequence[str], count: int) -> str:
     return "; ".join([*texts, *([f"and {left} more"] if left > 0 else [])])
 
 
-def counted(count: int, name: str) -> str:
-    """Return a number with its noun.
-
-    >>> counted(1, "hole"), counted(2, "hole")
-    ('1 hole', '2 holes')
-    """
-    return f"{count} {name}{'' if count == 1 else 's'}"
-
-
 def area_text(area_m2: float) -> str:
     """Return an area in the unit that suits it.
 
