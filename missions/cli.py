@@ -24,7 +24,7 @@ from missions.planner import plan_mission
 from missions.reading import Asked, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
-from missions.sheet import sheet, sortie_lines
+from missions.sheet import ground_text, sheet, sortie_lines
 from missions.treated_rates import UntreatedRates
 
 # Attempted moves of the search: about one second, ten, and a minute on an old laptop.
@@ -243,7 +243,7 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
     lines = [
         f"{names_of(files)}: {counted(len(planned.sorties), 'sortie')}, {planned.volume_l:.1f} L, "
         f"{minutes:.0f} min",
-        f"covered   {coverage.percent:.2f} % of {result['area_ha']:.2f} ha, "
+        f"covered   {coverage.percent:.2f} % of {ground_text(result)}, "
         f"{coverage.overlap_percent:.2f} % twice, {coverage.outside_m2:.1f} m2 outside",
         f"passes    {len(planned.lines)} at {planned.angle_deg:.1f} deg, "
         f"{result['spray_m'] / 1000:.2f} km; transit {result['transit_m'] / 1000:.2f} km, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -185,6 +186,12 @@ class Sortie:
         return min(speeds), max(speeds)
 
 
+def flown_lines(sorties: Sequence[Sortie]) -> Floats:
+    """Return all spray legs of some sorties as rows of both their ends."""
+    legs = [leg for sortie in sorties for leg in sortie.legs if leg.kind == "spray"]
+    return np.array([(*leg.points[0], *leg.points[-1]) for leg in legs]).reshape(-1, 4)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """The whole mission; `lines` are all spray lines before they were cut into sorties.
@@ -265,6 +272,7 @@ class Plan:
             "outside_m2": self.coverage.outside_m2,
             "largest_skip_m2": self.coverage.largest_skip_m2,
             "simpler_border_m2": self.field.given_up_m2,
+            "without_rate_ha": self.coverage.without_rate_m2 / 10_000.0,
             "area_ha": self.field.area_m2 / 10_000.0,
             "angle_deg": self.angle_deg,
             "swaths": len(self.lines),

@@ -9,8 +9,8 @@ import numpy as np
 from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
-from missions.coverage import measure
-from missions.demand import Demand, Rates, demands
+from missions.coverage import measure, of_rated_ground
+from missions.demand import Demand, Rates, Uniform, demands
 from missions.errors import PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
@@ -19,11 +19,11 @@ from missions.flown import flown
 from missions.layouts import spray_lines
 from missions.paced import Paced, range_warnings
 from missions.patches import narrow_patches
-from missions.plan import Plan, Settings, Sortie
+from missions.plan import Plan, Settings, Sortie, flown_lines
 from missions.remaining import Remaining
 from missions.schedule import scheduled
 from missions.short import short_warnings
-from missions.strips import Floats, joined
+from missions.strips import Floats, joined, no_lines
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from missions.treated_rates import UntreatedRates, demands_once
 from missions.ways import Ways, build_ways, edge_places, suggested_depot
@@ -111,12 +111,19 @@ def _planned(
                 replace(sortie, depot=used.index(sortie.depot)) for sortie in sorties.sorties
             ),
         )
+    coverage = measure(sprayed, field.limit, width_m)
+    if not isinstance(rates, Uniform):
+        done = no_lines() if left is None else left.done
+        coverage = of_rated_ground(
+            coverage, joined([done, flown_lines(sorties.sorties)]), field.limit, width_m,
+            rates=rates,
+        )  # fmt: skip
     plan = Plan(
         field=field,
         settings=settings,
         angle_deg=angle_deg,
         lines=lines,
-        coverage=measure(sprayed, field.limit, width_m),
+        coverage=coverage,
         depots=tuple((float(east_m), float(north_m)) for east_m, north_m in places),
         suggested_depot=not len(given),
         sorties=sorties.sorties,

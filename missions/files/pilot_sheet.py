@@ -17,6 +17,7 @@ from companion.config import Config
 from companion.maps.whole_file import write_whole
 from missions.errors import PlanError
 from missions.plan import Plan
+from missions.sheet import ground_text
 
 SUFFIXES = (".html", ".txt")
 PICTURES = {".png": "image/png", ".svg": "image/svg+xml"}
@@ -134,7 +135,7 @@ def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
     settings, rows = plan.settings, found["sorties"]
     adds_l = sum(row["add_l"] for row in rows)
     facts = [
-        ("Field", f"{found['area_ha']:.2f} ha, {found['coverage_percent']:.2f} % covered"),
+        ("Field", f"{found['coverage_percent']:.2f} % covered of {ground_text(found)}"),
         ("To mix", f"{adds_l:.1f} L: {found['volume_l']:.1f} L to spray, the rest is reserve"),
     ]
     if product.words is not None:

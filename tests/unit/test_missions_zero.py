@@ -7,15 +7,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from shapely import box
 
+from missions.coverage import measure, of_rated_ground
 from missions.field import build_field
-from missions.plan import Leg, Plan, Settings
+from missions.plan import Leg, Plan, Settings, flown_lines
 from missions.planner import plan_mission
 from missions.stretches import GAP_MIN_M, stretches
-from missions.strips import Floats
+from missions.strips import Floats, rectangles
 from tests.bench.missions import FRAME, to_degrees
 
 
@@ -87,3 +89,20 @@ def test_every_place_with_a_rate_lies_in_a_stretch_with_its_margin(
             low, high = max(number * step_m - margin_m, 0), min((number + 1) * step_m + margin_m,
                                                                 at_m[-1])  # fmt: skip
             assert any(start <= low + 1e-9 and high - 1e-9 <= end for start, end in found)
+
+
+def test_what_is_covered_is_ground_with_a_rate() -> None:
+    plan = planned(Bare(-1.0, 250.0))
+    assert plan.coverage.without_rate_m2 == pytest.approx(250.0 * 48.0, rel=0.005)
+    assert plan.coverage.percent > 99.8
+    # The whole field has lines, and those over bare ground are not flown.
+    strips = shapely.union_all(rectangles(flown_lines(plan.sorties), 6.0))
+    assert strips.intersection(plan.field.limit).area < 0.45 * plan.field.limit.area
+
+
+def test_a_missed_corner_counts_as_a_share_of_the_ground_with_a_rate() -> None:
+    lines = np.array([[3.0, 300.0, 3.0, 390.0]])
+    whole = measure(lines, box(0, 0, 48, 400), 6.0)
+    found = of_rated_ground(whole, lines, box(0, 0, 48, 400), 6.0, rates=Bare(-1.0, 250.0))
+    assert found.percent == pytest.approx(100.0 * 90.0 * 6.0 / (150.0 * 48.0), rel=0.01)
+    assert whole.percent == pytest.approx(100.0 * 90.0 * 6.0 / (400.0 * 48.0), rel=0.01)
