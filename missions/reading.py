@@ -7,14 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
 from shapely import MultiPolygon
 
 from companion.assembly import above_label, flow_range, read_configured_map
 from companion.config import Config
-from companion.config.tables import MissionTable, PrescriptionTable
+from companion.config.tables import MissionTable, PrescriptionTable, out_of_bounds
 from companion.core.frame import LocalFrame
 from companion.maps.build import build_prescription, frame_for
 from companion.maps.local import Area
@@ -264,16 +263,10 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
 
 def _check_bounds(name: str, value: float) -> None:
     """Refuse an option with a number that its key of the configuration could not have."""
-    key = MissionTable.model_fields.get(name)
-    if key is None:
-        return
-    try:
-        adapter: TypeAdapter[Any] = TypeAdapter(Annotated[key.annotation, key])  # type: ignore[arg-type]
-        adapter.validate_python(value)
-    except ValidationError as error:
-        reason = error.errors()[0]["msg"].replace("Input should be", "write a number")
+    reason = out_of_bounds(MissionTable, name, value)
+    if reason is not None:
         option = OPTIONS.get(name, name).replace("_", "-")
-        raise PlanError(f"--{option} {value:g}: {reason}") from None
+        raise PlanError(f"--{option} {value:g}: write a number {reason}")
 
 
 def _map(asked: Asked, config: Config | None) -> MapFile | None:

@@ -8,9 +8,9 @@ corrections and of the sensors have files of their own.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 
 Text = Annotated[str, Field(min_length=1, max_length=500)]
 Texts = Annotated[tuple[Text, ...], Field(strict=False, max_length=1000)]
@@ -378,3 +378,20 @@ class WebTable(Table):
     enabled: bool = Field(default=False, description="not part of this version")
     host: Text = Field(default="127.0.0.1", description="address to listen on")
     port: int = Field(default=8880, ge=1, le=65535, description="port to listen on")
+
+
+def out_of_bounds(table: type[Table], key: str, value: float) -> str | None:
+    """Return what a number for a key has to be, where it is not; None for what is no key.
+
+    >>> out_of_bounds(MissionTable, "speed_m_s", 0.1)
+    'greater than or equal to 0.5'
+    """
+    field = table.model_fields.get(key)
+    if field is None:
+        return None
+    adapter: TypeAdapter[Any] = TypeAdapter(Annotated[field.annotation, field])  # type: ignore[arg-type]
+    try:
+        adapter.validate_python(value)
+    except ValidationError as error:
+        return error.errors()[0]["msg"].removeprefix("Input should be ")
+    return None
