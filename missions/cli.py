@@ -247,7 +247,8 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
         f"{coverage.overlap_percent:.2f} % twice, {coverage.outside_m2:.1f} m2 outside",
         f"passes    {len(planned.lines)} at {planned.angle_deg:.1f} deg, "
         f"{result['spray_m'] / 1000:.2f} km; transit {result['transit_m'] / 1000:.2f} km, "
-        f"ferry {result['ferry_m'] / 1000:.2f} km",
+        f"ferry {result['ferry_m'] / 1000:.2f} km, both {result['least_idle_m'] / 1000:.2f} km "
+        "at least in any order",
         f"depot     {where}{' (suggested)' if planned.suggested_depot else ''}",
     ]
     if result["lines_file"] is not None:

@@ -33,7 +33,7 @@ LINES_A_TANK = {2: 8, 4: 4, 6: 4}
 # Bands are this wide or more: a turn in each must be worth it.
 BAND_MIN_M = 40.0
 # So many moves of the annealing are one trial of regrouping; a sortie needs no more than some.
-MOVES_A_TRIAL, TRIALS_A_SORTIE = 8, 60
+MOVES_A_TRIAL, TRIALS_A_SORTIE = 13, 60
 # The way home is known at places so far apart along lines that the depot does not see.
 BENT_STEP_M, BENT_MAX = 100.0, 2000
 

@@ -125,6 +125,7 @@ class Passes:
     starts: list[Place] = field(init=False)
     at_m: list[list[float]] = field(init=False)
     litres: list[list[float]] = field(init=False)
+    even_l_m: list[float] = field(init=False)
 
     def __post_init__(self) -> None:
         self.length_m = lengths_m(self.lines).tolist()
@@ -132,6 +133,10 @@ class Passes:
         self.starts = [(row[0], row[1]) for row in self.lines.tolist()]
         self.at_m = [need.at_m.tolist() for need in self.demand]
         self.litres = [need.litres.tolist() for need in self.demand]
+        self.even_l_m = [
+            litres[1] / at_m[1] if len(at_m) == 2 and at_m[0] == 0.0 else 0.0
+            for at_m, litres in zip(self.at_m, self.litres, strict=True)
+        ]
 
     def place(self, line: int, at_m: float) -> Place:
         """Return where a place of a line lies."""
@@ -146,10 +151,15 @@ class Passes:
             low = min(max(int(at), 0), len(bent) - 2)
             return bent[low] + (at - low) * (bent[low + 1] - bent[low])
         x, y = place
+        if len(self.depots) == 1:
+            ((east, north),) = self.depots
+            return math.hypot(x - east, y - north)
         return min(math.hypot(x - east, y - north) for east, north in self.depots)
 
     def used_l(self, line: int, at_m: float) -> float:
         """Return what a line needs up to a place."""
+        if self.even_l_m[line]:
+            return self.even_l_m[line] * at_m
         known, litres = self.at_m[line], self.litres[line]
         high = min(max(bisect_right(known, at_m), 1), len(known) - 1)
         one, other = known[high - 1], known[high]
@@ -164,6 +174,9 @@ class Passes:
     def after_m(self, part: Part, litres: float) -> float:
         """Return where on its line a part has used so much."""
         line, start_m, end_m = part
+        if self.even_l_m[line]:
+            done_m = litres / self.even_l_m[line]
+            return min(start_m + done_m, end_m) if end_m > start_m else max(start_m - done_m, end_m)
         begun = self.used_l(line, start_m)
         wanted = begun + litres if end_m > start_m else begun - litres
         known, used = self.at_m[line], self.litres[line]
@@ -307,14 +320,19 @@ def _lasts(passes: Passes, limits: Limits, sortie: list[Part], part: Part) -> fl
 
 
 def split(
-    passes: Passes, limits: Limits, run: Sequence[Part], *, shares: int = SHARES
+    passes: Passes,
+    limits: Limits,
+    run: Sequence[Part],
+    *,
+    shares: int = SHARES,
+    tanks: int = TANKS,
 ) -> tuple[float, list[list[Part]]] | None:
     """Return the time of the best sorties that fly the run in its order, and these; None if none.
 
     Places to cut at are the ends of parts, whole tanks from each of them, evenly spaced ones, and
     those nearest to a depot.
     """
-    cut = _Run(passes, limits, run, _litres_to_cut_at(passes, limits, run, shares))
+    cut = _Run(passes, limits, run, _litres_to_cut_at(passes, limits, run, shares, tanks))
     before = cut.by_tank() if limits.battery is None else cut.by_battery()
     if before is not None:
         return cut.sorties(before)
@@ -326,7 +344,7 @@ def split(
 
 
 def _litres_to_cut_at(
-    passes: Passes, limits: Limits, run: Sequence[Part], shares: int
+    passes: Passes, limits: Limits, run: Sequence[Part], shares: int, tanks: int
 ) -> list[float]:
     tank_l, total_l, ends = limits.usable_l, 0.0, [0.0]
     feet = []
@@ -341,7 +359,7 @@ def _litres_to_cut_at(
     if not tank_l > 0.0:
         return []
     found = feet
-    found += [end + many * tank_l for end in ends for many in range(-TANKS, TANKS + 1) if many]
+    found += [end + many * tank_l for end in ends for many in range(-tanks, tanks + 1) if many]
     found += (np.arange(1, int(total_l / tank_l * shares) + 1) * tank_l / shares).tolist()
     return sorted(each for each in found if 0.0 < each < total_l)
 

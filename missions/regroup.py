@@ -22,7 +22,7 @@ from missions.refills import TOUCH_M, Limits, Part, Passes, Place, flown_by, spl
 TOGETHER = (2, 2, 3, 3, 4, 5)
 WEIGHTS = (0.03, 0.15, 0.5, 1.0)
 # Fewer places to cut at than for a whole field: trials are many.
-SHARES = 3
+SHARES, TANKS = 3, 1
 LEAST_S = 1e-3
 # At first a layout may cost so much more than the one before, at last nothing.
 HOT_S = 6.0
@@ -56,7 +56,7 @@ def regrouped(
         some.sort()
         parts = merged(chain.from_iterable(known[each] for each in some))
         run = _laid_out(passes, limits, parts, course, draw)
-        found = split(passes, limits, run, shares=SHARES)
+        found = split(passes, limits, run, shares=SHARES, tanks=TANKS)
         if found is None:
             continue
         allowed_s = -HOT_S * (1.0 - number / trials) * math.log(1.0 - draw.random())

@@ -10,6 +10,7 @@ import shapely
 
 from companion.wording import counted
 from missions.files.items import items_of
+from missions.least_ferry import least_idle_of
 from missions.plan import Plan, Sortie
 from missions.schedule import separation_m
 from missions.strips import rectangles
@@ -20,7 +21,7 @@ def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict
 
     `once` is said of litres that already leave out what is sprayed twice.
     """
-    found: dict[str, Any] = plan.summary()
+    found: dict[str, Any] = plan.summary() | {"least_idle_m": least_idle_of(plan)}
     overlap_l = {} if once else _overlap_l(plan)
     aboard = _Aboard(plan)
     in_time = sorted(plan.sorties, key=lambda each: (each.start_s, each.number))

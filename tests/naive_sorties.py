@@ -9,12 +9,13 @@ there. `least_idle_m` is a lower bound of the ways without spraying.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from tests.mission_judge import Drawn
@@ -26,6 +27,8 @@ Place = tuple[float, float]
 UPRIGHT_S = 48.0
 # A copter's waypoint radius, and how straight is straight on.
 RADIUS_M, ON_DEG = 2.0, 1.0
+# Corners of a field are known so well for its ferries, which may touch its border.
+CORNER_M = 0.3
 # So many places of a pass, and slopes, are looked at for the bound.
 SAMPLES, SLOPES = 16, 41
 
@@ -177,6 +180,45 @@ def figures(sorties: dict[int, Legs], flight: Flight, *, refill_s: float) -> Fig
     )  # fmt: skip
 
 
+Ferry = Callable[[Place], list[Place]]
+
+
+def ferries_inside(drawn: Drawn, depot: Place) -> Ferry:
+    """Return what finds the shortest way home over the field, by its corners (Dijkstra 1959)."""
+    ground = drawn.flown().simplify(CORNER_M).buffer(2.0 * CORNER_M, join_style="mitre")
+    corners = shapely.get_coordinates(ground.buffer(-CORNER_M, join_style="mitre"))
+    stations = [depot, *((float(x), float(y)) for x, y in np.unique(corners, axis=0))]
+    shapely.prepare(ground)
+    known_m = [math.inf] * len(stations)
+    known_m[0], following, left = 0.0, [0] * len(stations), set(range(len(stations)))
+    while left:
+        here = min(left, key=lambda each: known_m[each])
+        left.discard(here)
+        nearer = [
+            each
+            for each in left
+            if known_m[here] + math.dist(stations[here], stations[each]) < known_m[each]
+        ]
+        ways = [shapely.LineString([stations[here], stations[each]]) for each in nearer]
+        for each in np.array(nearer, dtype=np.int64)[shapely.covers(ground, ways)].tolist():
+            known_m[each] = known_m[here] + math.dist(stations[here], stations[each])
+            following[each] = here
+
+    def home(place: Place) -> list[Place]:
+        order = sorted(
+            range(len(stations)), key=lambda each: known_m[each] + math.dist(stations[each], place)
+        )
+        for each in order:
+            if shapely.covers(ground, shapely.LineString([place, stations[each]])):
+                way = [each]
+                while way[-1]:
+                    way.append(following[way[-1]])
+                return [stations[station] for station in way]
+        return [depot]
+
+    return home
+
+
 def naive(
     passes: Sequence[Pass],
     depot: Place,
@@ -184,20 +226,27 @@ def naive(
     *,
     usable_l: float,
     limit_s: float = math.inf,
+    ferry: Ferry | None = None,
 ) -> dict[int, Legs]:
-    """Return the passes one after the other, cut where the tank or the battery demands it."""
+    """Return the passes one after the other, cut where the tank or the battery demands it.
+
+    Ferries are straight, whatever lies in their way, or those of `ferry`.
+    """
+    if ferry is None:
+        ferry = lambda _: [depot]  # noqa: E731
     sorties: list[Legs] = []
     legs: Legs = []
     left_l = usable_l
     for each in passes:
         done = 0.0
         while done < 1.0 - 1e-9:
-            way = [] if not legs or done > 0.0 else list(each.way)
-            here = legs[-1][1][-1] if legs else depot
-            kind = "transit" if legs else "ferry"
-            to: tuple[str, list[Place], float] = (kind, [here, *way, each.at(done)], 0.0)
+            to: tuple[str, list[Place], float] = (
+                ("transit", [legs[-1][1][-1], *each.way, each.at(done)], 0.0)
+                if legs
+                else ("ferry", [*ferry(each.at(done))[::-1], each.at(done)], 0.0)
+            )
             most = min(1.0, done + left_l / each.litres) if each.litres > 0.0 else 1.0
-            share = _lasts([*legs, to], each, (done, most), depot, flight, limit_s)
+            share = _lasts([*legs, to], each, (done, most), ferry, flight, limit_s)
             if share > done + 1e-9:
                 litres = each.litres * (share - done)
                 legs += [to, ("spray", [each.at(done), each.at(share)], litres)]
@@ -206,15 +255,20 @@ def naive(
             elif not legs:
                 raise ValueError("the battery does not last for any of a pass")
             if done < 1.0 - 1e-9:
-                sorties.append([*legs, ("ferry", [legs[-1][1][-1], depot], 0.0)])
+                sorties.append([*legs, _home(legs, ferry)])
                 legs, left_l = [], usable_l
     if legs:
-        sorties.append([*legs, ("ferry", [legs[-1][1][-1], depot], 0.0)])
+        sorties.append([*legs, _home(legs, ferry)])
     return dict(enumerate(sorties, start=1))
 
 
+def _home(legs: Legs, ferry: Ferry) -> tuple[str, list[Place], float]:
+    last = legs[-1][1][-1]
+    return ("ferry", [last, *ferry(last)], 0.0)
+
+
 def _lasts(
-    legs: Legs, each: Pass, range_of: tuple[float, float], depot: Place, flight: Flight,
+    legs: Legs, each: Pass, range_of: tuple[float, float], ferry: Ferry, flight: Flight,
     limit_s: float,
 ) -> float:  # fmt: skip
     """Return up to which share of a pass the battery lasts, and for the way home."""
@@ -224,7 +278,7 @@ def _lasts(
     before = [place for _, points, _ in legs for place in points]
 
     def lasts(share: float) -> bool:
-        return flight.sortie_s([*before, each.at(share), depot]) <= limit_s
+        return flight.sortie_s([*before, each.at(share), *ferry(each.at(share))]) <= limit_s
 
     if lasts(high):
         return high

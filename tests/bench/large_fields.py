@@ -2,7 +2,7 @@
 
     python -m tests.bench.large_fields [--only NAME] [--tank 10 --tank 40] [--json]
 
-The samples of 50 ha and more (VRSPRAY_SAMPLES) and made-up fields, depot in the middle and in a
+The samples of 100 ha and more (VRSPRAY_SAMPLES) and made-up fields, depot in the middle and in a
 corner. Times, naive sorties and the lower bound are those of `tests.naive_sorties`.
 """
 
@@ -36,6 +36,7 @@ from tests.mission_judge import Drawn
 from tests.naive_sorties import (
     UPRIGHT_S,
     Flight,
+    ferries_inside,
     figures,
     least_idle_m,
     legs_of,
@@ -43,7 +44,7 @@ from tests.naive_sorties import (
     passes_of,
 )
 
-WIDTH_M, RATE_L_HA, REFILL_S, LEAST_HA = 6.0, 20.0, 60.0, 50.0
+WIDTH_M, RATE_L_HA, REFILL_S, LEAST_HA = 6.0, 20.0, 60.0, 100.0
 FLIGHT = Flight()
 
 
@@ -102,15 +103,20 @@ def compared(
     home = float(home_x), float(home_y)
     passes = passes_of(endless[1])
     limit_s = math.inf if flight_s is None else flight_s
-    plain = naive(passes, home, FLIGHT, usable_l=tank_l, limit_s=limit_s)
+    plain = naive(
+        passes, home, FLIGHT, usable_l=tank_l, limit_s=limit_s, ferry=ferries_inside(drawn, home)
+    )
+    straight = naive(passes, home, FLIGHT, usable_l=tank_l, limit_s=limit_s)
     found = figures(sorties, FLIGHT, refill_s=REFILL_S)
     other = figures(plain, FLIGHT, refill_s=REFILL_S)
+    over_all = figures(straight, FLIGHT, refill_s=REFILL_S)
     longest_m = FLIGHT.speed_m_s * (limit_s - UPRIGHT_S)
     least_m = least_idle_m(passes, [home], usable_l=tank_l, longest_m=longest_m)
     return {
         "ha": field.area_m2 / 1e4,
         "hours": found.hours, "naive_hours": other.hours, "ratio": found.hours / other.hours,
         "least_ratio": least_hours(other.spray_km + least_m / 1e3, passes, tank_l) / other.hours,
+        "straight_ratio": found.hours / over_all.hours,
         "said_hours": plan.total_s / 3600.0,
         "idle_km": found.idle_km, "naive_idle_km": other.idle_km, "least_idle_km": least_m / 1e3,
         "spray_km": found.spray_km, "naive_spray_km": other.spray_km,

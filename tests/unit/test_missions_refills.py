@@ -22,12 +22,14 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.refills import Limits, Part, Passes, Times, flown_by, plainly, split
 from missions.regroup import merged, regrouped
+from missions.sheet import sheet
 from missions.strips import Floats
 from missions.turns import Motion
 from tests.bench.large_fields import compared, depots_of
 from tests.mission_fields import degrees
 from tests.mission_judge import Drawn
-from tests.naive_sorties import Flight, Pass, figures, least_idle_m, naive
+from tests.naive_sorties import Flight, Pass, figures, least_idle_m, legs_of, naive
+from tests.naive_sorties import passes_of as passes_in
 
 MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5, jerk_m_s3=1.0, corners="ardupilot")
 WIDTH_M, RATE_L_HA = 6.0, 20.0
@@ -183,6 +185,19 @@ def planned(drawn: Drawn, depot: tuple[float, float], **changes: Any) -> Plan:
         swath_width_m=drawn.width_m, speed_m_s=6.0, reserve_l=0.0, moves=4_000, **changes
     )
     return plan_mission(field, given, Uniform(rate_l_ha=RATE_L_HA), depots=(depot,))
+
+
+def test_the_bound_beside_a_plan_is_that_of_the_judge() -> None:
+    drawn = field_of(12.0)
+    where = depots_of(drawn)["corner"]
+    plan = planned(drawn, where, tank_l=6.0)
+    said_m = sheet(plan)["least_idle_m"]
+    legs = legs_of(drawn, json.loads(geojson_text(plan)))
+    passes = [each for sortie in legs.values() for each in passes_in(sortie)]
+    ((x, y),) = drawn.plane.metres(np.array([[where[1], where[0]]]))
+    home = (float(x), float(y))
+    assert said_m == pytest.approx(least_idle_m(passes, [home], usable_l=6.0), rel=0.01)
+    assert 0.0 < said_m <= plan.length_m("ferry") + plan.length_m("transit")
 
 
 def test_the_same_seed_gives_the_same_sorties() -> None:
