@@ -60,7 +60,8 @@ def plan_flight(
 ) -> FlightPlan:
     """Return what is flown from the item `first_sequence` on.
 
-    The whole route keeps one height, that of its first waypoint. To PX4, 0, 0 is a place
+    The whole route keeps one height, that of its lowest waypoint: the lines', where ferries are
+    higher. To PX4, 0, 0 is a place
     (`zero_is_a_place`), and it flies off towards it.
     """
     take_off_height_m: float | None = None
@@ -87,7 +88,7 @@ def plan_flight(
         if item.command != dialect.MAV_CMD_NAV_WAYPOINT:
             ending = Ending.LAND
             break
-        height_m = item_height_m if height_m is None else height_m
+        height_m = item_height_m if height_m is None else min(item_height_m, height_m)
     return FlightPlan(
         take_off_height_m=take_off_height_m,
         height_m=height_m,

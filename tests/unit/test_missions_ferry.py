@@ -255,3 +255,24 @@ def test_a_depot_on_the_end_of_a_line_needs_no_ferry_height() -> None:
     (sortie,) = at_ferry_height([Sortie(number=1, depot=0, legs=(out, spray, home))], settings)
     assert [leg.height_m for leg in sortie.legs] == [None, None, 20.0]
     assert LineString(sortie.legs[1].points).length > 0.0
+
+
+def test_the_twin_flies_such_a_mission_on_its_lines_at_their_height(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    from companion.core.frame import LocalFrame
+    from sitl.routes import read_route
+
+    routes = []
+    for name, more in (("low", []), ("high", ["--ferry-height-m", FERRY_M])):
+        planned(capsys, tmp_path, tmp_path / f"{name}.plan", *more)
+        frame = LocalFrame(latitude_deg=48.0, longitude_deg=11.0)
+        routes.append(
+            read_route(tmp_path / f"{name}.plan", frame, speed_m_s=None, default_speed_m_s=5.0)
+        )
+    assert [route.height_m for route in routes] == [LINE_M, LINE_M]
+    assert len(routes[0].legs) <= len(routes[1].legs)
+    assert all(
+        math.dist((a.east_m, a.north_m), (b.east_m, b.north_m)) > 0.1
+        for a, b in pairwise(routes[1].legs)
+    )
