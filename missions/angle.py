@@ -45,6 +45,14 @@ def edge_angles(ground: BaseGeometry) -> list[float]:
     return longest[:EDGES_MAX]
 
 
+def main_course_deg(lines: Floats) -> float:
+    """Return the course, 0 to 180, that most metres of lines are flown along, to a degree."""
+    step = lines[:, 2:] - lines[:, :2]
+    course = np.degrees(np.arctan2(step[:, 0], step[:, 1])) % 180.0
+    off = np.abs((course[:, None] - course[None, :] + 90.0) % 180.0 - 90.0)
+    return float(course[int(np.argmax((off < 1.0) @ lengths_m(lines)))])
+
+
 def _without_small_holes(ground: BaseGeometry, width_m: float) -> BaseGeometry:
     """Return the ground with holes of a few swaths filled: no course is better for a tree."""
     least_m2 = (SMALL_SWATHS * width_m) ** 2

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Annotated, Any, Literal
@@ -19,8 +19,9 @@ from missions.files.pilot_sheet import check_sheet, parse_start, product_of, wri
 from missions.files.write import check_suffix
 from missions.obstacles import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.picture import check_picture, draw_plan
-from missions.plan import Plan
+from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
+from missions.prices import overlap_warnings, prices
 from missions.reading import Asked, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
@@ -121,6 +122,19 @@ def plan(
     ferry_height_m: Annotated[
         float | None, typer.Option(metavar="M", help="Of ferries and long transits.")
     ] = None,
+    leave_max: Annotated[
+        float,
+        typer.Option(
+            metavar="PCT", help="Of the field, left where it saves time.", min=0.0, max=50.0
+        ),
+    ] = LEAVE_PERCENT,
+    overlap_max: Annotated[
+        float | None,
+        typer.Option(metavar="PCT", help="Of the litres, sprayed twice.", min=0.0, max=100.0),
+    ] = None,
+    choices_too: Annotated[
+        bool, typer.Option("--choices", help="Small fields: what leaving and overlap would change.")
+    ] = False,
     aircraft: Annotated[
         int | None, typer.Option(metavar="N", help="That share the field.", min=1, max=20)
     ] = None,
@@ -180,6 +194,8 @@ def plan(
         "tank_l": tank_l,
         "moves": MOVES[effort],
         "aircraft": aircraft,
+        "leave_max_percent": leave_max,
+        "overlap_max_percent": overlap_max,
         "ferry_height_m": ferry_height_m,
     }
     task = read_task(asked, reading.config, changes)
@@ -193,6 +209,10 @@ def plan(
     )
     planned = replace(planned, warnings=(*task.said, *planned.warnings), wind=task.wind)
     took_s = perf_counter() - start
+    choices = []
+    asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT
+    if asks and task.left is None and not isinstance(task.rates, UntreatedRates):
+        choices = list(prices(planned, task.rates, depots=task.depots, around=task.around))
     files, marks = write_fleet(planned, out, with_sprayer=sprayer)
     if png is not None:
         draw_plan(planned, png, title=field.stem)
@@ -205,13 +225,19 @@ def plan(
         "files": [str(path) for path in files],
         "lines_file": str(marks[0]) if marks else None,
         "lines_files": [str(path) for path in marks],
+        "prices": [asdict(price) for price, _ in choices],
     }
     if pilot_sheet is not None:
         write_sheet(
             planned, result, pilot_sheet, title=field.stem, product=product_of(reading.config),
             start_min=parse_start(first), picture=png,
         )  # fmt: skip
-    answer(result, _lines(planned, result, files), as_json=as_json)
+    warnings = (*warnings, *overlap_warnings(planned, result["overlap_litres_percent"]))
+    result["warnings"] = list(warnings)
+    answer(
+        result, [*_lines(planned, result, files), *(f"choice    {text}" for _, text in choices)],
+        as_json=as_json,
+    )  # fmt: skip
     if once:
         note(
             "note: fly it with `vrspray run --continue`: its guard closes the valves on treated "

@@ -10,7 +10,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from missions.demand import Rates
-from missions.strips import Floats, rectangles
+from missions.strips import Floats, rectangles, whole
 
 # Less than this is no ground but the last digits of large numbers.
 NOISE_M2 = 1e-6
@@ -41,7 +41,7 @@ def reachable(ground: BaseGeometry, width_m: float) -> BaseGeometry:
 def measure(lines: Floats, ground: BaseGeometry, width_m: float) -> Coverage:
     """Return what the whole strips of all lines cover of the ground, without help of valves."""
     strips = rectangles(lines, width_m)
-    covered = shapely.union_all(strips)
+    covered = whole(strips)
     area_m2 = ground.area
     if not area_m2 > 0.0:
         raise ValueError("there is no ground to cover")
@@ -80,7 +80,7 @@ def of_rated_ground(
     rated = rates.rates_at(east_m, north_m) > 0.0
     if rated.all() or not rated.any():
         return found
-    covered = shapely.union_all(rectangles(flown, width_m))
+    covered = whole(rectangles(flown, width_m))
     shapely.prepare(covered)
     treated = shapely.contains_xy(covered, east_m[rated], north_m[rated])
     return replace(

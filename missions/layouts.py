@@ -6,89 +6,200 @@ they are needed; such lines that begin anew at edges along them.
 
 from __future__ import annotations
 
-from missions.angle import LAYOUT_WEIGHT, cost_s, ranked
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from shapely.geometry.base import BaseGeometry
+
+from missions.angle import LAYOUT_WEIGHT, cost_s, edge_angles, main_course_deg, ranked
 from missions.coverage import reachable
 from missions.field import Field
 from missions.fitted_lines import fitted_lines, has_edges_along
-from missions.free_space import free_space
+from missions.free_space import FreeSpace, free_space
 from missions.one_tour import LINES_MAX, Tour, tour_of
 from missions.open_lines import LEFT_SHARE, needed_passes, open_lines
 from missions.patches import patches
-from missions.plan import Settings
-from missions.strips import Floats, joined, lengths_m
+from missions.plan import LEAVE_PERCENT, Settings
+from missions.selection import Aim, chosen, families
+from missions.strips import Floats, directions, joined, lengths_m, united
 from missions.swaths import border_passes, inner_ground, inner_lines
 from missions.turns import Motion
 from missions.worth import LEFT_SHARE as WORTH_LEFT
-from missions.worth import worthwhile
+from missions.worth import WORTH, worthwhile
 
 # Of the best courses so many are drawn in full; of the layouts so many are gone through line by
 # line, and only the best one where it has more lines than this.
 ANGLES_TRIED, LAYOUTS_TRIED, MANY_LINES = 2, 2, 100
 # Simpler borders and what lines leave out come to 0.2 % of the ground at most, with a little for
 # how both are measured; lines alone may always leave out 0.02 %.
-LOST_MAX, LEFT_MIN = 0.0018, 0.0002
+LOST_SHARE, LEFT_MIN = 0.9, 0.0002
+# Where more may be left than that, a line must bring half of what its time brings elsewhere.
+LEFT_WORTH = 0.5
+# Of smaller fields, 1 ha with a swath of 6 m, lines are chosen from all that could be flown.
+SMALL_SWATHS2 = 300.0
+# Lines as long as each other and along each other.
+EQUAL_M, EQUAL_SINE = 1.0, 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Covering:
+    """A field that is to be covered, and what layouts of lines are compared by."""
+
+    field: Field
+    settings: Settings
+    motion: Motion
+    space: FreeSpace
+    target: BaseGeometry
+    left_share: float
+    aim: Aim
+
+    @property
+    def width_m(self) -> float:
+        return self.settings.swath_width_m
+
+    def value_s(self, tour: Tour) -> float:
+        """Return the time of a tour, with what is left out and covered twice."""
+        covered = united(tour.lines, self.width_m)
+        doubled_m2 = float(lengths_m(tour.lines).sum()) * self.width_m - covered.area
+        left_m2 = self.target.difference(covered).area
+        return tour.seconds + self.aim.cost_s(left_m2=left_m2, doubled_m2=max(doubled_m2, 0.0))
+
+    def is_block(self, tour: Tour) -> bool:
+        """Return whether a tour is nothing but equal lines side by side, as on a rectangle."""
+        along, length_m = directions(tour.lines), lengths_m(tour.lines)
+        sines = along[:, 0] * along[0, 1] - along[:, 1] * along[0, 0]
+        as_long = float(np.ptp(length_m)) < EQUAL_M
+        return (
+            self.settings.leave_max_percent <= LEAVE_PERCENT
+            and as_long
+            and bool(np.abs(sines).max() < EQUAL_SINE)
+        )
+
+    def tour(self, lines: Floats) -> Tour:
+        """Return a good tour of lines."""
+        return tour_of(lines, self.space, self.motion)
+
+    def worthwhile(self, tour: Tour) -> Tour:
+        """Return a tour without the lines that are not worth their time."""
+        kept = worthwhile(
+            tour, self.target, self.width_m, left_share=self.left_share,
+            worth=LEFT_WORTH if self.settings.leave_max_percent > LEAVE_PERCENT else WORTH,
+        )  # fmt: skip
+        return self.tour(kept)
+
+    def selected(self, drawn: list[Floats], angles_deg: list[float]) -> Iterator[Tour]:
+        """Yield tours of lines that are chosen from all that could be flown, the best first."""
+        ground, width_m, aim = self.field.spray, self.width_m, self.aim
+        passes = border_passes(ground, width_m)
+        best = drawn[0]
+        some = families(ground, width_m, angles_deg, with_fans=self.settings.angle_deg is None)
+        # Of each course: from the passes along the border on, and lines of the best layout.
+        pools = [(joined([passes, family, best]), list(range(len(passes)))) for family in some]
+        pools.append((joined([best, passes, *some, *drawn[1:]]), list(range(len(best)))))
+        for lines in chosen(pools, ground, width_m, motion=self.motion, aim=aim):
+            if aim.covers_first:
+                more = patches(lines, ground, width_m, left_share=self.left_share)
+                lines = joined([lines, more])
+            if len(lines):
+                yield self.worthwhile(self.tour(lines))
 
 
 def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Floats, float]:
     """Return the lines that cover the field, and the course of the parallel ones."""
     width_m, area_m2 = settings.swath_width_m, field.spray.area
-    drawn = _layouts(field, settings, motion)
+    inner = inner_ground(field.spray, width_m)
+    angles = _courses(inner, field, settings, motion)
+    spare = _spare(field, settings)
+    leaves = settings.leave_max_percent > LEAVE_PERCENT
+    few = spare if leaves else min(LEFT_SHARE, spare / 2.0)
+    drawn = _layouts(field, settings, motion, inner, angles[:ANGLES_TRIED], left_share=few)
     if max(len(lines) for _, lines in drawn) > LINES_MAX:
         costs = [
             cost_s(lines, motion, width_m, area_m2, weight=LAYOUT_WEIGHT) for _, lines in drawn
         ]
         angle_deg, lines = drawn[costs.index(min(costs))]
         return lines, angle_deg
-    space = free_space(field.fly)
-
-    def cost(tour: Tour) -> float:
-        doubled_m2 = max(float(lengths_m(tour.lines).sum()) * width_m - area_m2, 0.0)
-        return tour.seconds + LAYOUT_WEIGHT * doubled_m2 / (width_m * settings.speed_m_s)
-
-    target = reachable(field.spray, width_m)
-    tours = [(angle_deg, tour_of(lines, space, motion)) for angle_deg, lines in drawn]
-    best = sorted(tours, key=lambda each: cost(each[1]))[:LAYOUTS_TRIED]
+    target, left_share = (
+        reachable(field.spray, width_m),
+        spare if leaves else min(WORTH_LEFT, spare),
+    )
+    covering = _Covering(
+        field=field, settings=settings, motion=motion, space=free_space(field.fly),
+        target=target, left_share=left_share, aim=_aim(settings, target.area, left_share),
+    )  # fmt: skip
+    tours = [(angle_deg, covering.tour(lines)) for angle_deg, lines in drawn]
+    best = sorted(tours, key=lambda each: covering.value_s(each[1]))[:LAYOUTS_TRIED]
     if len(best[0][1].lines) > MANY_LINES:
         best = best[:1]
-    better = [
-        (
-            angle_deg,
-            tour_of(
-                worthwhile(
-                    tour, target, width_m, left_share=min(WORTH_LEFT, _spare(field, settings))
-                ),
-                space,
-                motion,
-            ),
-        )
-        for angle_deg, tour in best
-    ]
-    angle_deg, tour = min(better, key=lambda each: cost(each[1]))
+    better = [(angle_deg, covering.worthwhile(tour)) for angle_deg, tour in best]
+    better.sort(key=lambda each: covering.value_s(each[1]))
+    angle_deg, tour = better[0]
+    is_asked = (
+        settings.leave_max_percent > LEAVE_PERCENT or settings.overlap_max_percent is not None
+    )
+    chooses = settings.moves and is_small(field, settings)
+    if chooses and (is_asked or not covering.is_block(tour)):
+        if settings.angle_deg is None:
+            angles = [*edge_angles(field.spray), *angles[:ANGLES_TRIED]]
+        layouts = [tour.lines, *(other for _, other in drawn)]
+        found = min(covering.selected(layouts, angles), key=covering.value_s, default=tour)
+        if covering.value_s(found) < covering.value_s(tour):
+            if settings.angle_deg is None:
+                angle_deg = main_course_deg(found.lines)
+            return found.lines, angle_deg
     return tour.lines, angle_deg
+
+
+def is_small(field: Field, settings: Settings) -> bool:
+    """Return whether lines are chosen from all that could be flown."""
+    return field.spray.area <= SMALL_SWATHS2 * settings.swath_width_m**2
 
 
 def _spare(field: Field, settings: Settings) -> float:
     """Return what share of the ground lines may leave out, beside what simpler borders gave up."""
+    lost_max = LOST_SHARE * settings.leave_max_percent / 100.0
     reached_m2 = reachable(field.limit, settings.swath_width_m).area
-    return max(LOST_MAX - field.given_up_m2 / reached_m2, LEFT_MIN)
+    return max(lost_max - field.given_up_m2 / reached_m2, LEFT_MIN)
 
 
-def _layouts(field: Field, settings: Settings, motion: Motion) -> list[tuple[float, Floats]]:
+def _aim(settings: Settings, area_m2: float, left_share: float) -> Aim:
+    """Return what lines may leave out and cover twice."""
+    once, cap = settings.closing_share, settings.overlap_max_percent
+    return Aim(
+        left_max_m2=left_share * area_m2,
+        doubled_s_m2=once * LAYOUT_WEIGHT / (settings.swath_width_m * settings.speed_m_s),
+        doubled_max_m2=None if cap is None else cap / 100.0 * area_m2 / once,
+        covers_first=cap is None or settings.leave_max_percent > LEAVE_PERCENT,
+    )
+
+
+def _courses(inner: BaseGeometry, field: Field, settings: Settings, motion: Motion) -> list[float]:
+    """Return the courses that may be flown, the best first."""
+    if settings.angle_deg is not None:
+        return [settings.angle_deg]
+    width_m = settings.swath_width_m
+    return [angle for _, angle in ranked(inner, field.spray, width_m=width_m, motion=motion)]
+
+
+def _layouts(
+    field: Field,
+    settings: Settings,
+    motion: Motion,
+    inner: BaseGeometry,
+    angles: list[float],
+    *,
+    left_share: float,
+) -> list[tuple[float, Floats]]:
     """Return (course, lines) of each layout."""
     width_m, ground = settings.swath_width_m, field.spray
-    left_share = min(LEFT_SHARE, _spare(field, settings) / 2.0)
-    inner, passes = inner_ground(ground, width_m), border_passes(ground, width_m)
-    if settings.angle_deg is None:
-        angles = [angle for _, angle in ranked(inner, ground, width_m=width_m, motion=motion)]
-        angles = angles[:ANGLES_TRIED]
-    else:
-        angles = [settings.angle_deg]
+    passes = border_passes(ground, width_m)
     drawn: list[tuple[float, Floats]] = []
     for number, angle_deg in enumerate(angles):
         choices = []
         if number == 0:
             choices.append(joined([passes, inner_lines(inner, width_m, angle_deg)]))
-        straights = [open_lines(ground, width_m, angle_deg)]
+        straights = [open_lines(ground, width_m, angle_deg, packed=settings.closing_share < 1.0)]
         if number == 0 and has_edges_along(ground, width_m, angle_deg):
             straights.append(fitted_lines(ground, width_m, angle_deg, motion))
         for straight in straights:

@@ -16,7 +16,7 @@ from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from missions.coverage import reachable
-from missions.strips import Floats, directions, joined, no_lines, rectangles, united
+from missions.strips import Floats, directions, joined, lengths_m, no_lines, rectangles, united
 from missions.swaths import LINE_MIN_M, axes, count_across
 
 # So much of the reachable ground may be left for patches.
@@ -28,17 +28,37 @@ LEAST_M2 = 1e-3
 SLACK_M = 0.001
 
 
-def open_lines(ground: BaseGeometry, width_m: float, angle_deg: float) -> Floats:
-    """Return evenly spaced lines, each as long as its strip stays on the ground."""
+def open_lines(
+    ground: BaseGeometry, width_m: float, angle_deg: float, *, packed: bool = False
+) -> Floats:
+    """Return lines each as long as its strip stays on the ground, evenly spaced or packed."""
     turned_by = axes(angle_deg)
     turned = shapely.transform(ground, lambda points: points @ turned_by.T)
-    lines = joined([_of_part(part, width_m) for part in shapely.get_parts(turned)])
+    of_part = _packed if packed else _of_part
+    lines = joined([of_part(part, width_m) for part in shapely.get_parts(turned)])
     return np.column_stack([lines[:, :2] @ turned_by, lines[:, 2:] @ turned_by])
 
 
 def _of_part(part: Polygon, width_m: float) -> Floats:
     _, low, _, high = part.bounds
     return across_part(part, evenly(low, high, width_m), width_m)
+
+
+def _packed(part: Polygon, width_m: float) -> Floats:
+    """Return lines side by side; only the first or the last two overlap, where that is less.
+
+    Where valves close over treated ground, less than one valve's width is sprayed twice so, and not
+    that much between any two lines.
+    """
+    _, low, _, high = part.bounds
+    even = evenly(low, high, width_m)
+    aside = width_m * np.arange(len(even))
+    if len(even) < 3:
+        return across_part(part, even, width_m)
+    at_end = np.minimum(even[0] + aside, even[-1])
+    at_start = np.maximum(even[-1] - aside, even[0])[::-1]
+    tried = [across_part(part, middles, width_m) for middles in (at_end, at_start)]
+    return min(tried, key=lambda lines: float(lengths_m(lines).sum()))
 
 
 def evenly(low: float, high: float, width_m: float) -> Floats:

@@ -7,7 +7,16 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from missions.coverage import reachable
-from missions.strips import NARROWER_M, Floats, joined, no_lines, rectangles, stretched, united
+from missions.strips import (
+    NARROWER_M,
+    Floats,
+    joined,
+    no_lines,
+    rectangles,
+    stretched,
+    united,
+    whole,
+)
 from missions.swaths import LINE_MIN_M
 
 # So much may stay uncovered of what can be reached: half of what the plan as a whole may miss.
@@ -54,7 +63,7 @@ def patches(
         if not len(new):
             break
         added = joined([added, new])
-        covered = shapely.union_all([covered, *rectangles(new, width_m)])
+        covered = whole(np.array([covered, *rectangles(new, width_m)]))
     return added
 
 

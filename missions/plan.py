@@ -24,6 +24,9 @@ Place = tuple[float, float]
 Kind = Literal["spray", "transit", "ferry"]
 
 # WPNAV_JERK of ArduCopter, MPC_JERK_AUTO of PX4, as they come.
+# A plan covers 99.8 % of what a strip can reach, simpler borders counted, where nothing else is
+# allowed.
+LEAVE_PERCENT = 0.2
 JERKS_M_S3 = {"ardupilot": 1.0, "px4": 4.0}
 
 
@@ -37,6 +40,8 @@ class Settings:
     `refill_s` and `swap_s` (of a battery) are on the ground; several aircraft keep
     `aircraft_gap_m` between them. `nose_rate_deg_s` is how fast the nose turns at a stop.
     Ferries and long transits are flown at `ferry_height_m`, where it is given.
+    `leave_max_percent` of what a strip can reach may be left, `overlap_max_percent` sprayed twice.
+    Valves close where `switch_off_percent` of their strip is treated, if they do.
     Without them, `jerk_m_s3` and `return_height_m` are those that the autopilot comes with.
     """
 
@@ -65,6 +70,9 @@ class Settings:
     aircraft: int = 1
     aircraft_gap_m: float = 20.0
     autopilot: Literal["ardupilot", "px4"] = "ardupilot"
+    leave_max_percent: float = LEAVE_PERCENT
+    overlap_max_percent: float | None = None
+    switch_off_percent: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
@@ -105,6 +113,14 @@ class Settings:
         return vertical.climb_s(high_m) + vertical.return_s(high_m) + changes_s
 
     @property
+    def closing_share(self) -> float:
+        """Return how much of ground under two passes is sprayed twice: one valve of the boom."""
+        if self.switch_off_percent is None or not self.valves:
+            return 1.0
+        widest_m = max(width_m for _, width_m in self.valves)
+        return min(1.0, widest_m / sum(width_m for _, width_m in self.valves))
+
+    @property
     def usable_l(self) -> float:
         """Return what of a full tank is sprayed before the refill."""
         return self.tank_l - self.reserve_l
@@ -115,7 +131,8 @@ class Leg:
     """A way at one speed: a straight spray line, or a transit or ferry that may bend.
 
     One flown `through` leads from a line into the next, which goes on straight. `seconds` are
-    those of `missions.timing`, once the whole sortie is known. `height_m` is None at that of the
+    those of `missions.timing`, once the whole sortie is known. `overlap_l` of `volume_l` fall on
+    treated ground though valves close there; None where none do. `height_m` is None at that of the
     lines.
     """
 
@@ -125,6 +142,7 @@ class Leg:
     seconds: float = 0.0
     volume_l: float = 0.0
     through: bool = False
+    overlap_l: float | None = None
     height_m: float | None = None
 
     @property

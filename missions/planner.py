@@ -26,6 +26,7 @@ from missions.short import short_warnings
 from missions.strips import Floats, joined, no_lines
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from missions.treated_rates import UntreatedRates, demands_once
+from missions.treated_twice import counted
 from missions.ways import Ways, build_ways, edge_places, suggested_depot
 
 # One sortie may begin and end anywhere: its depot is chosen among so many places of the edge.
@@ -75,6 +76,7 @@ def _planned(
         lines, angle_deg = left.lines, left.angle_deg
         sprayed = joined([left.done, lines])
     demand = _demand(lines, rates, field, settings)
+    counted_before = isinstance(rates, UntreatedRates)
     if isinstance(rates, UntreatedRates):
         rates = rates.rates
     litres = np.array([need.total_l for need in demand])
@@ -118,6 +120,9 @@ def _planned(
             coverage, joined([done, flown_lines(sorties.sorties)]), field.limit, width_m,
             rates=rates,
         )  # fmt: skip
+    flights = sorties.sorties
+    if not counted_before:
+        flights = counted(flights, rates, settings, field.kept_in)
     plan = Plan(
         field=field,
         settings=settings,
@@ -126,7 +131,7 @@ def _planned(
         coverage=coverage,
         depots=tuple((float(east_m), float(north_m)) for east_m, north_m in places),
         suggested_depot=not len(given),
-        sorties=sorties.sorties,
+        sorties=flights,
         warnings=(
             *range_warnings(sorties.misses, field.frame, settings),
             *short_warnings(sorties.sorties, rates, field.frame, settings),

@@ -237,6 +237,7 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             speeds_m_s=(config.safety.speed_min_m_s, 0.0),
             settle_s=_settle_s(config),
             border_buffer_m=_kept_m(config),
+            switch_off_percent=config.coverage.switch_off_percent,
             **fleet_settings(mission),
         )
     given: dict[str, Any] = {name: each for name, each in changes.items() if each is not None}

@@ -23,6 +23,8 @@ def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict
     """
     found: dict[str, Any] = plan.summary() | {"least_idle_m": least_idle_of(plan)}
     overlap_l = {} if once else _overlap_l(plan)
+    found["overlap_l"] = sum(overlap_l.values())
+    found["overlap_litres_percent"] = 100.0 * found["overlap_l"] / plan.volume_l
     aboard = _Aboard(plan)
     in_time = sorted(plan.sorties, key=lambda each: (each.start_s, each.number))
     filled = {sortie.number: aboard.fill(sortie) for sortie in in_time}
@@ -93,8 +95,13 @@ def _farthest_m(plan: Plan, sortie: Sortie) -> float:
 def _overlap_l(plan: Plan) -> dict[int, float]:
     """Return the litres of each sortie that fall on ground already sprayed.
 
-    A line's litres count evenly along it.
+    A line's litres count evenly along it; where valves close, they are counted by valve.
     """
+    if any(leg.overlap_l is not None for sortie in plan.sorties for leg in sortie.legs):
+        return {
+            sortie.number: sum(leg.overlap_l or 0.0 for leg in sortie.legs)
+            for sortie in plan.sorties
+        }
     flown = [
         (sortie.number, leg)
         for sortie in sorted(plan.sorties, key=lambda each: (each.start_s, each.number))

@@ -18,6 +18,8 @@ Objects = NDArray[np.object_]
 # Side by side with a border, floating point may see an overlap that is not there; strips are
 # tested this much narrower. What it lets through is less than 1e-5 m wide.
 NARROWER_M = 1e-5
+# Ground of many strips is put together on a grid of this.
+GRID_M = 1e-6
 
 
 def no_lines() -> Floats:
@@ -58,7 +60,16 @@ def rectangles(lines: Floats, width_m: float) -> Objects:
 
 def united(lines: Floats, width_m: float) -> BaseGeometry:
     """Return the ground of all strips together."""
-    return shapely.union_all(rectangles(lines, width_m))
+    return whole(rectangles(lines, width_m))
+
+
+def whole(strips: Objects) -> BaseGeometry:
+    """Return the ground of strips together.
+
+    On a grid: without one GEOS leaves strips out where sides of theirs nearly coincide, as those of
+    parallel passes do.
+    """
+    return shapely.union_all(strips, grid_size=GRID_M)
 
 
 def reach_inside(

@@ -12,7 +12,7 @@ from shapely.geometry.base import BaseGeometry
 
 from missions.network import JOIN_M
 from missions.one_tour import Tour
-from missions.strips import Floats, Objects, directions, lengths_m, rectangles, united
+from missions.strips import Floats, Objects, directions, lengths_m, rectangles, united, whole
 from missions.swaths import LINE_MIN_M
 from missions.tour import Ring
 
@@ -27,8 +27,9 @@ CRUMB_M2, LEAST_M = 0.02, 0.5
 
 
 def worthwhile(
-    tour: Tour, target: BaseGeometry, width_m: float, *, left_share: float = LEFT_SHARE
-) -> Floats:
+    tour: Tour, target: BaseGeometry, width_m: float, *, left_share: float = LEFT_SHARE,
+    worth: float = WORTH,
+) -> Floats:  # fmt: skip
     """Return the lines of a tour that are worth their time, without the ends that others cover."""
     lines, motion = tour.lines, tour.motion
     if len(lines) < 2:
@@ -36,7 +37,7 @@ def worthwhile(
     ground = _Ground(lines, target, width_m)
     spare_m2 = left_share * target.area - target.difference(united(lines, width_m)).area
     alone_m2 = np.array([ground.alone_m2(at) for at in range(len(lines))])
-    pays_m2_s = WORTH * motion.speed_m_s * width_m
+    pays_m2_s = worth * motion.speed_m_s * width_m
     taken_s = motion.legs_s(lengths_m(lines))
     few = np.flatnonzero(alone_m2 < spare_m2)
     few = few[np.argsort(alone_m2[few], kind="stable")][:TRIED_MAX]
@@ -88,7 +89,7 @@ class _Ground:
     def _alone(self, at: int) -> Objects:
         strip = self._strips[at]
         near = self._near.query(strip, predicate="intersects")
-        others = shapely.union_all(self._strips[near[self.kept[near] & (near != at)]])
+        others = whole(self._strips[near[self.kept[near] & (near != at)]])
         own = shapely.intersection(strip, self._target)
         parts: Objects = shapely.get_parts(shapely.difference(own, others))
         return parts

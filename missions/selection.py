@@ -1,0 +1,308 @@
+"""Few lines chosen from many: a small field's passes in any phase and course that fits it.
+
+On a small field most lines begin or end at a slanted border, and no single family of parallel
+lines fits it: where lines along one border meet those along another, which passes along the border
+are flown, and where what is too much falls twice, decide on a fifth of the time. Annealing over
+sets of lines weighs their time against ground that is left out and ground that is sprayed twice.
+All randomness comes from a seed, and it is counted in moves: the same field has the same lines.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
+from missions.coverage import reachable
+from missions.fitted_lines import edges_along
+from missions.open_lines import SLACK_M, evenly
+from missions.strips import Floats, directions, joined, lengths_m, no_lines, rectangles
+from missions.swaths import LINE_MIN_M, axes
+from missions.turns import Motion
+
+# The ground is looked at in so many points, one for 2.5 m2 of a hectare.
+POINTS, STEP_MIN_M = 4_000, 0.25
+# A move may cost so much at first, at last next to nothing.
+MOVES, HOT_S, COLD_S = 2_000, 6.0, 0.05
+# The best sets are annealed again, so many times as long.
+FINALISTS, FINAL = 4, 4
+# Ground left beyond what may be left costs so much: a patch of 2 m2 has a pass of its own.
+LEFT_S_M2 = 4.0
+# Two edges that face each other, so far off each other, have lines between their courses.
+FAN_MIN_DEG, FAN_MAX_DEG, FAN_EDGES = 0.3, 25.0, 5
+
+
+def families(
+    ground: BaseGeometry, width_m: float, angles_deg: list[float], *, with_fans: bool = True
+) -> list[Floats]:
+    """Return lines along each course, flush with each edge along them, and fans between edges."""
+    found = [_along(ground, width_m, angle_deg) for angle_deg in angles_deg]
+    if with_fans:
+        found += [_where_inside(fan, ground, width_m) for fan in _fans(ground, width_m)]
+    return [lines for lines in found if len(lines)]
+
+
+def _along(ground: BaseGeometry, width_m: float, angle_deg: float) -> Floats:
+    turned_by = axes(angle_deg)
+    turned = shapely.transform(ground, lambda points: points @ turned_by.T)
+    found = []
+    for part in shapely.get_parts(turned):
+        west, low, east, high = part.bounds
+        places = [evenly(low, high, width_m)]
+        for edge in edges_along(part, width_m).tolist():
+            first = low + (edge - low) % width_m - width_m / 2.0
+            flush = np.arange(first, high + width_m, width_m)
+            places.append(flush[(flush > low) & (flush < high)])
+        across = np.unique(np.round(np.concatenate(places), 3))
+        rows = np.column_stack(
+            [np.full(len(across), west - 1.0), across, np.full(len(across), east + 1.0), across]
+        )
+        back = np.column_stack([rows[:, :2] @ turned_by, rows[:, 2:] @ turned_by])
+        found.append(_where_inside(back, ground, width_m))
+    return joined(found)
+
+
+def _where_inside(lines: Floats, ground: BaseGeometry, width_m: float) -> Floats:
+    """Return the parts of lines whose strips lie on the ground."""
+    if not len(lines):
+        return no_lines()
+    bands = rectangles(lines, width_m - 2.0 * SLACK_M)
+    outside, line_of = shapely.get_parts(shapely.difference(bands, ground), return_index=True)
+    along, length_m = directions(lines), lengths_m(lines)
+    spans: list[list[tuple[float, float]]] = [[] for _ in lines]
+    for piece, number in zip(outside, line_of.tolist(), strict=True):
+        places = (shapely.get_coordinates(piece) - lines[number, :2]) @ along[number]
+        spans[number].append((float(places.min()), float(places.max())))
+    rows = []
+    for number, some in enumerate(spans):
+        reached = 0.0
+        for start, end in [*sorted(some), (float(length_m[number]), math.inf)]:
+            if start - reached > LINE_MIN_M:
+                a, b = lines[number, :2] + np.outer([reached, start], along[number])
+                rows.append([*a, *b])
+            reached = max(reached, end)
+    return np.array(rows) if rows else no_lines()
+
+
+def _fans(ground: BaseGeometry, width_m: float) -> list[Floats]:
+    """Return lines that lead over from the course of one long edge to that of another."""
+    hull = shapely.get_coordinates(ground.convex_hull.simplify(0.3))
+    edges = np.column_stack([hull[:-1], hull[1:]])
+    length_m = lengths_m(edges)
+    order = np.argsort(-length_m, kind="stable")[:FAN_EDGES]
+    edges = edges[order][length_m[order] > 2.0 * width_m]
+    middle = shapely.get_coordinates(ground.convex_hull.centroid)[0]
+    found = [
+        np.array(_fan(edges[one], edges[other], middle, ground, width_m))
+        for one in range(len(edges))
+        for other in range(one)
+    ]
+    return [lines for lines in found if len(lines)]
+
+
+def _fan(
+    one: Floats, other: Floats, middle: Floats, ground: BaseGeometry, width_m: float
+) -> list[list[float]]:
+    first, second = directions(one[None])[0], directions(other[None])[0]
+    if first @ second < 0.0:
+        second = -second
+    bend_deg = math.degrees(math.acos(min(1.0, float(first @ second))))
+    if not FAN_MIN_DEG < bend_deg < FAN_MAX_DEG:
+        return []
+    sides = []
+    for edge, along in ((one, first), (other, second)):
+        inwards = np.array([along[1], -along[0]])
+        if (middle - edge[:2]) @ inwards < 0.0:
+            inwards = -inwards
+        sides.append((edge[:2] + inwards * width_m / 2.0, along, inwards))
+    if sides[0][2] @ sides[1][2] > 0.0:
+        return []
+    # Two places on each side, cut square to the course between both.
+    along = (first + second) / np.hypot(*(first + second))
+    reach = shapely.get_coordinates(ground) @ along
+    ends = [
+        [start + own * ((place_m - start @ along) / (own @ along)) for start, own, _ in sides]
+        for place_m in (float(reach.min()), float(reach.max()))
+    ]
+    apart_m = max(float(np.hypot(*(high - low))) for low, high in ends)
+    count = math.ceil(apart_m / width_m - 1e-3) + 1
+    rows = []
+    for share in np.linspace(0.0, 1.0, count).tolist():
+        start, end = (low + (high - low) * share for low, high in ends)
+        rows.append([*(start - along), *(end + along)])
+    return rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Aim:
+    """What is wanted: ground that may be left, and what ground sprayed twice is worth.
+
+    `doubled_max_m2` is how much may be sprayed twice at most; None where time alone decides. Where
+    both cannot be kept, `covers_first` says which of them is.
+    """
+
+    left_max_m2: float
+    doubled_s_m2: float
+    doubled_max_m2: float | None = None
+    covers_first: bool = True
+
+    def cost_s(self, *, left_m2: float, doubled_m2: float) -> float:
+        """Return the time that ground left out and sprayed twice is worth."""
+        cost = self.doubled_s_m2 * doubled_m2
+        first, second = LEFT_S_M2, LEFT_S_M2 / 8.0
+        left_s_m2, twice_s_m2 = (first, second) if self.covers_first else (second, first)
+        cost += left_s_m2 * max(left_m2 - self.left_max_m2, 0.0)
+        if self.doubled_max_m2 is not None:
+            cost += twice_s_m2 * max(doubled_m2 - self.doubled_max_m2, 0.0)
+        return cost
+
+
+def chosen(
+    pools: list[tuple[Floats, list[int]]], ground: BaseGeometry, width_m: float, *, aim: Aim,
+    motion: Motion, moves: int = MOVES,
+) -> list[Floats]:  # fmt: skip
+    """Return sets of lines that cover the ground in little time, the best first.
+
+    A pool is lines, and those of them to start with.
+    """
+    points, each_m2 = _points(reachable(ground, width_m))
+    tried: list[tuple[float, int, list[int], _Set]] = []
+    for pool, first in pools:
+        cost_s = motion.legs_s(lengths_m(pool)) + motion.between_passes_s(width_m)
+        state = _Set(
+            covers=_covered(pool, points, width_m), count=len(points), each_m2=each_m2,
+            cost_s=cost_s.tolist(), aim=aim,
+        )  # fmt: skip
+        state.take(first)
+        value_s, lines = state.anneal(random.Random(1), moves)
+        tried.append((value_s, len(tried), lines, state))
+    found = []
+    for _, number, lines, state in sorted(tried, key=lambda each: each[:2])[:FINALISTS]:
+        state.take(lines)
+        again_s, better = state.anneal(random.Random(2), FINAL * moves)
+        pool = pools[number][0]
+        found.append((again_s, number, pool[sorted(better)]))
+    return [lines for _, _, lines in sorted(found, key=lambda each: each[:2])]
+
+
+def _points(target: BaseGeometry) -> tuple[Floats, float]:
+    """Return points all over the ground, and the area of each."""
+    west, south, east, north = target.bounds
+    step_m = max(math.sqrt(target.area / POINTS), STEP_MIN_M)
+    x, y = np.meshgrid(
+        np.arange(west + step_m / 2.0, east, step_m), np.arange(south + step_m / 2.0, north, step_m)
+    )
+    inside = shapely.contains_xy(target, x.ravel(), y.ravel())
+    points = np.column_stack([x.ravel()[inside], y.ravel()[inside]])
+    return points, target.area / max(len(points), 1)
+
+
+def _covered(pool: Floats, points: Floats, width_m: float) -> list[NDArray[np.int64]]:
+    """Return which points each line's strip covers."""
+    covers = []
+    for line, way, long_m in zip(pool, directions(pool), lengths_m(pool).tolist(), strict=True):
+        off = points - line[:2]
+        s, t = off @ way, off @ np.array([way[1], -way[0]])
+        on = (s >= 0.0) & (s <= long_m) & (np.abs(t) <= width_m / 2.0 + SLACK_M)
+        covers.append(np.flatnonzero(on))
+    return covers
+
+
+class _Set:
+    """The lines that are taken, and how often each point is covered."""
+
+    def __init__(
+        self, *, covers: list[NDArray[np.int64]], count: int, each_m2: float,
+        cost_s: list[float], aim: Aim,
+    ) -> None:  # fmt: skip
+        self._covers, self._each_m2, self._cost_s, self._aim = covers, each_m2, cost_s, aim
+        self._times = np.zeros(count, dtype=np.int16)
+        self._taken: list[int] = []
+        self._over: list[list[int]] = [[] for _ in range(count)]
+        for line, own in enumerate(covers):
+            for point in own.tolist():
+                self._over[point].append(line)
+        self._bare, self._doubled, self._spent_s = count, 0, 0.0
+
+    def take(self, lines: list[int]) -> None:
+        """Take these lines and no others."""
+        for line in list(self._taken):
+            self.drop(line)
+        for line in lines:
+            self.add(line)
+
+    def add(self, line: int) -> None:
+        own = self._covers[line]
+        times = self._times[own]
+        new = len(times) - int(np.count_nonzero(times))
+        self._bare -= new
+        self._doubled += len(times) - new
+        self._times[own] = times + 1
+        self._taken.append(line)
+        self._spent_s += self._cost_s[line]
+
+    def drop(self, line: int) -> None:
+        own = self._covers[line]
+        times = self._times[own] - 1
+        bared = len(times) - int(np.count_nonzero(times))
+        self._bare += bared
+        self._doubled -= len(times) - bared
+        self._times[own] = times
+        self._taken.remove(line)
+        self._spent_s -= self._cost_s[line]
+
+    def value_s(self) -> float:
+        each_m2 = self._each_m2
+        return self._spent_s + self._aim.cost_s(
+            left_m2=self._bare * each_m2, doubled_m2=self._doubled * each_m2
+        )
+
+    def anneal(self, draw: random.Random, moves: int) -> tuple[float, list[int]]:
+        best, best_s = list(self._taken), self.value_s()
+        now_s, heat = best_s, HOT_S
+        cooling = (COLD_S / HOT_S) ** (1.0 / moves)
+        for _ in range(moves):
+            heat *= cooling
+            undo = self._move(draw)
+            value_s = self.value_s()
+            if value_s - now_s > -heat * math.log(1.0 - draw.random()):
+                for line in undo[::-1]:
+                    self._flip(line)
+                continue
+            now_s = value_s
+            if now_s < best_s - 1e-9:
+                best, best_s = list(self._taken), now_s
+        return best_s, best
+
+    def _move(self, draw: random.Random) -> list[int]:
+        """Change the set; return the lines that were taken or dropped, in order."""
+        kind, changed = draw.random(), []
+        if kind < 0.75 and self._taken:
+            changed.append(self._taken[draw.randrange(len(self._taken))])
+            self._flip(changed[0])
+        if kind > 0.25:
+            line = self._drawn(draw, changed)
+            if line is not None and line not in changed:
+                self._flip(line)
+                changed.append(line)
+        return changed
+
+    def _drawn(self, draw: random.Random, changed: list[int]) -> int | None:
+        """Return a line over ground that is bare now."""
+        some = self._covers[changed[0]] if changed else np.arange(len(self._times))
+        bare = some[self._times[some] == 0]
+        if not len(bare):
+            return None
+        over = self._over[int(bare[draw.randrange(len(bare))])]
+        return over[draw.randrange(len(over))] if over else None
+
+    def _flip(self, line: int) -> None:
+        if line in self._taken:
+            self.drop(line)
+        else:
+            self.add(line)
