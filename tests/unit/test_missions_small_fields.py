@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from hypothesis import settings as tries
 from hypothesis import strategies as st
 from shapely import Polygon, box
 
+from companion.cli.app import execute
 from missions.coverage import measure, reachable
 from missions.demand import Uniform
 from missions.field import build_field
@@ -127,3 +130,18 @@ def test_packed_lines_overlap_in_one_place_alone() -> None:
 def test_the_course_that_is_asked_for_is_the_only_one_of_the_parallel_lines() -> None:
     plan = plan_of(made_up("quadrangle", 1001), angle_deg=30.0)
     assert plan.angle_deg == 30.0
+
+
+def test_choices_are_printed_with_their_price(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    geometry = json.loads(shapely.to_geojson(degrees(made_up("quadrangle", 1000))))
+    path = tmp_path / "field.geojson"
+    path.write_text(json.dumps({"type": "Feature", "properties": {}, "geometry": geometry}))
+    words = ["plan", str(path), "--out", str(tmp_path / "field.plan"), "--leave-max", "3", "--json"]
+    assert execute(words) == 0
+    found = json.loads(capsys.readouterr().out)
+    (price,) = found["prices"]
+    assert price["option"] == "without --leave-max"
+    assert price["swaths"] > found["swaths"]
+    assert price["left_percent"] < 0.2 < 100.0 - found["reachable_percent"]
