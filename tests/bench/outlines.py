@@ -39,6 +39,7 @@ from companion.errors import VrsprayError
 from missions.cli import plan as vrspray_plan
 from tests.bench.parcels import KINDS, Parcel, parcel, read_parcel
 from tests.bench.peers import PEERS, lines_of, tanks, way_of_lines
+from tests.mission_fields import trees
 from tests.mission_flight import (
     UPRIGHT_S,
     Power,
@@ -70,6 +71,7 @@ FENCE_CORNERS, FENCE_OUTSIDE_M, ITEMS = 70, 10.0, 649
 CPU_SMALL_S, CPU_LARGE_S, LARGE_HA, PEAK_MB = 5.0, 20.0, 150.0, 300.0
 # Beyond this there is no answer.
 CPU_LIMIT_S = 120
+TREES = ((1, 2.0), (15, 10.0), (20, 20.0), (50, 50.0), (100, 150.0))
 SIZES = ((1.0, "< 1 ha"), (10.0, "1 to 10 ha"), (100.0, "10 to 100 ha"), (np.inf, "> 100 ha"))
 
 
@@ -95,12 +97,18 @@ power_per_kg_w = {POWER.per_kg_w}
 
 
 def parcels(count: int, seed: int, folder: Path | None) -> Iterator[Parcel]:
-    """Yield the real outlines, then so many made-up ones, a third of each kind."""
+    """Yield the real outlines, rectangles with trees, then so many made-up ones of all kinds."""
     samples = os.environ.get("VRSPRAY_SAMPLES")
     for kind, each in (("real", samples and Path(samples) / "fields"), ("given", folder)):
         for path in sorted(Path(each).glob("*.geojson")) if each else ():
             if not path.stem.endswith(".obstacles"):
                 yield read_parcel(path, kind=kind)
+    for trees_count, area_ha in TREES:
+        made = trees(trees_count, corners=64, area_ha=area_ha, seed=seed)
+        yield Parcel(
+            name=f"trees-{trees_count}", kind="trees", outline=made.outline,
+            obstacles=tuple(made.obstacles),
+        )  # fmt: skip
     for number in range(count):
         yield parcel(KINDS[number % len(KINDS)], seed + number // len(KINDS))
 
@@ -382,6 +390,8 @@ def main() -> int:
             each.write(given.keep)
     for line in tables(list(results.values())):
         say(line)
+    spent = resource.getrusage(resource.RUSAGE_CHILDREN)
+    say(f"{(spent.ru_utime + spent.ru_stime) / 60.0:.1f} minutes of processor time")
     if given.json:
         given.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     return 1 if any(row["failed"] for row in results.values()) else 0
