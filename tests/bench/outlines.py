@@ -386,14 +386,15 @@ def main() -> int:
     for each, row in run_all(cases, given.jobs):
         results[each.name] = row | {"kind": each.kind, "failed": failed(row)}
         say(_line(each, results[each.name]))
+        if given.json:
+            # Each time: a run that is ended has told what it found.
+            given.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
         if results[each.name]["failed"] and given.keep is not None:
             each.write(given.keep)
     for line in tables(list(results.values())):
         say(line)
     spent = resource.getrusage(resource.RUSAGE_CHILDREN)
     say(f"{(spent.ru_utime + spent.ru_stime) / 60.0:.1f} minutes of processor time")
-    if given.json:
-        given.json.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
     return 1 if any(row["failed"] for row in results.values()) else 0
 
 
