@@ -26,7 +26,9 @@ from missions.files.plan_rules import FENCE_CORNERS_MAX
 from missions.plan import Plan, Sortie
 
 # The fence lies so far outside the field, at least; drawn with fewer corners, so much farther.
-OUT_M, QUICK_M, SIMPLER_M = 1.0, 0.2, (0.5, 1.0, 2.0, 4.0, 6.0, 8.0)
+# Lines end on the field's edge: PX4 in simulation went 1.24 m beyond one, and a fence at 1.2 m
+# held it there for good.
+OUT_M, QUICK_M, SIMPLER_M = 2.0, 0.2, (0.5, 1.0, 2.0, 4.0, 6.0, 8.0)
 # No fence lies farther outside of field and ways.
 OUTSIDE_MAX_M, STEP_M = 10.0, 2.0
 # A fence that lies farther outside than this is worth a word.

@@ -82,6 +82,20 @@ def test_the_fence_holds_the_whole_flight(plan: Plan, tmp_path: Path) -> None:
             assert not keep_out[0].intersects(place)
 
 
+def test_a_corner_taken_too_far_is_within_the_fence(plan: Plan, tmp_path: Path) -> None:
+    """PX4 in simulation is 1.24 m beyond the end of a line before it goes on aside."""
+    for path in write_plan(plan, tmp_path / "m.plan"):
+        content = json.loads(path.read_text("utf-8"))
+        corners = content["geoFence"]["polygons"][0]["polygon"]
+        shrunk = math.cos(math.radians(corners[0][0]))
+        fence = Polygon([(111_200.0 * lat, 111_200.0 * shrunk * lon) for lat, lon in corners])
+        for item in content["mission"]["items"]:
+            if item["command"] == 16:
+                lat, lon = item["params"][4:6]
+                corner = Point(111_200.0 * lat, 111_200.0 * shrunk * lon)
+                assert fence.exterior.distance(corner) >= 2.0
+
+
 def test_plan_and_waypoints_hold_the_same_mission(plan: Plan, tmp_path: Path) -> None:
     one = read_mission(write_plan(plan, tmp_path / "m.plan")[0])
     two = read_mission(write_plan(plan, tmp_path / "m.waypoints")[0])
