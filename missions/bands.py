@@ -12,9 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from missions.refills import STUB_M, Part, Passes
+from missions.refills import STUB_M, Part, Passes, turned
 from missions.strips import Floats
 
+# What lies behind an obstacle by less than this is flown around; of so many chains the nearest.
+AROUND, AROUND_M, NEAREST = 1.5, 30.0, 6
 # Cuts of other lines than those along the course fall where they may.
 PARALLEL = math.cos(math.radians(30.0))
 
@@ -85,6 +87,46 @@ def _few(passes: Passes, parts: Sequence[Part], first: int) -> list[Part]:
 def _entered(parts: Sequence[Part], end: int) -> Part:
     line, start_m, end_m = parts[end >> 1]
     return (line, end_m, start_m) if end & 1 else (line, start_m, end_m)
+
+
+def in_sight(passes: Passes, run: Sequence[Part]) -> list[list[Part]]:
+    """Return a run in chains, cut where the next part lies behind what must be flown around."""
+    chains = [[run[0]]]
+    for before, after in pairwise(run):
+        one, other = passes.place(before[0], before[2]), passes.place(after[0], after[1])
+        straight_m = math.dist(one, other)
+        if passes.gap_m(one, other) > AROUND * straight_m + AROUND_M:
+            chains.append([])
+        chains[-1].append(after)
+    return chains
+
+
+def linked(passes: Passes, chains: Sequence[list[Part]]) -> list[Part]:
+    """Return chains one after the other, each time the one that is nearest to fly to."""
+    left = [list(chain) for chain in chains]
+    run = left.pop(0)
+    while left:
+        here = passes.place(run[-1][0], run[-1][2])
+        ends = [
+            (math.dist(here, passes.place(line, at_m)), number, is_turned)
+            for number, chain in enumerate(left)
+            for is_turned, (line, at_m) in enumerate(
+                ((chain[0][0], chain[0][1]), (chain[-1][0], chain[-1][2]))
+            )
+        ]
+        ends.sort()
+        _, number, is_turned = min(
+            ends[:NEAREST],
+            key=lambda each: passes.gap_m(
+                here,
+                passes.place(left[each[1]][-1][0], left[each[1]][-1][2])
+                if each[2]
+                else passes.place(left[each[1]][0][0], left[each[1]][0][1]),
+            ),
+        )
+        chain = left.pop(number)
+        run += turned(chain) if is_turned else chain
+    return run
 
 
 def outermost(passes: Passes, parts: Sequence[Part], across: tuple[float, float]) -> int:

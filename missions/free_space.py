@@ -28,6 +28,8 @@ NEAREST = 40
 STATION_M = 1e-9
 # Rows of a table of ways are worked on together, so many: they stay in the processor's cache.
 TOGETHER = 64
+# Of a way so many corners are looked at first, those that lie least aside.
+FIRST = 24
 # Around one straight line so many corners are looked at, those that lie least aside.
 ASIDE = 60
 
@@ -127,32 +129,48 @@ class FreeSpace:
     def _over_corners(self, start: Place, end: Place) -> tuple[list[int], float]:
         """Return the corners of the shortest way, and its length.
 
-        The best first and last corner are looked at for sight first: most are never looked at.
+        Corners are looked at by how far aside they lie: no way over one is shorter than that.
         """
         if not len(self.corners):
             return [], math.inf
-        total_m = self.between_m + np.add.outer(
-            np.hypot(*(self.corners - start).T), np.hypot(*(self.corners - end).T)
-        )
-        shape, seen = shapely.LineString, self.space
-        visible: dict[tuple[int, int], bool] = {}
+        from_m = np.hypot(*(self.corners - start).T)
+        to_m = np.hypot(*(self.corners - end).T)
+        aside_m = from_m + to_m
+        order = np.argsort(aside_m, kind="stable")
+        count = FIRST
         while True:
-            pair = divmod(int(np.argmin(total_m)), len(self.corners))
-            if not math.isfinite(total_m[pair]):
-                return [], math.inf
-            for side, (place, corner) in enumerate(zip((start, end), pair, strict=True)):
-                if (side, corner) not in visible:
-                    straight = shape([place, self.corners[corner]])
-                    visible[side, corner] = bool(shapely.covers(seen, straight))
-                if not visible[side, corner]:
-                    total_m[(corner, slice(None)) if side == 0 else (slice(None), corner)] = np.inf
-            if all(visible.get((side, corner), False) for side, corner in enumerate(pair)):
+            some = order[:count]
+            total_m = self.between_m[np.ix_(some, some)] + from_m[some, None] + to_m[some]
+            row, column, length_m = self._in_sight(start, end, some, total_m)
+            if count >= len(order) or length_m <= aside_m[order[count]]:
                 break
-        chain = [pair[0]]
-        while chain[-1] != pair[1]:
-            over = self.direct_m[chain[-1]] + self.between_m[:, pair[1]]
+            count *= 4
+        if not math.isfinite(length_m):
+            return [], math.inf
+        chain, last = [int(some[row])], int(some[column])
+        while chain[-1] != last:
+            over = self.direct_m[chain[-1]] + self.between_m[:, last]
             chain.append(int(np.argmin(over)))
-        return chain, float(total_m[pair])
+        return chain, length_m
+
+    def _in_sight(
+        self, start: Place, end: Place, some: Ints, total_m: Floats
+    ) -> tuple[int, int, float]:
+        """Return the first and last corner of the shortest of these ways that are both seen."""
+        seen: dict[tuple[int, int], bool] = {}
+        while True:
+            pair = divmod(int(np.argmin(total_m)), len(some))
+            length_m = float(total_m[pair])
+            if not math.isfinite(length_m):
+                return (*pair, length_m)
+            for side, (place, at) in enumerate(zip((start, end), pair, strict=True)):
+                if (side, at) not in seen:
+                    straight = shapely.LineString([place, self.corners[some[at]]])
+                    seen[side, at] = bool(shapely.covers(self.space, straight))
+                if not seen[side, at]:
+                    total_m[(at, slice(None)) if side == 0 else (slice(None), at)] = np.inf
+            if seen[0, pair[0]] and seen[1, pair[1]]:
+                return (*pair, length_m)
 
     def _straightened(self, ends: Floats, chain: list[int]) -> list[Place]:
         """Return the shortest way over the corners that lie no farther aside than this one."""

@@ -7,7 +7,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from missions.bands import cut_across, main_course, outermost, to_and_fro
+from missions.bands import (
+    cut_across,
+    in_sight,
+    linked,
+    main_course,
+    outermost,
+    to_and_fro,
+)
 from missions.demand import Demand
 from missions.network import home_ways_m
 from missions.plan import Settings
@@ -32,8 +39,9 @@ Sorties = list[list[Part]]
 LINES_A_TANK = {2: 8, 4: 4, 6: 4}
 # Bands are this wide or more: a turn in each must be worth it.
 BAND_MIN_M = 40.0
-# So many moves of the annealing are one trial of regrouping; a sortie needs no more than some.
-MOVES_A_TRIAL, TRIALS_A_SORTIE = 13, 60
+# A part in a sortie that is regrouped takes as long as so many moves of the annealing; sorties of
+# few parts have a trial's own costs. A sortie needs no more trials than some.
+MOVES_A_PART, PARTS_MIN, TRIALS_A_SORTIE = 4, 3.3, 60
 # The way home is known at places so far apart along lines that the depot does not see.
 BENT_STEP_M, BENT_MAX = 100.0, 2000
 
@@ -112,7 +120,8 @@ def several(
         return []
     costs = [sum(flown_by(passes, limits, each).seconds for each in some) for some in found]
     best = found[costs.index(min(costs))]
-    trials = min(moves // MOVES_A_TRIAL, TRIALS_A_SORTIE * len(best))
+    parts = max(sum(len(sortie) for sortie in best) / len(best), PARTS_MIN)
+    trials = min(int(moves / (MOVES_A_PART * parts)), TRIALS_A_SORTIE * len(best))
     better = regrouped(passes, limits, best, course, trials=trials, seed=seed)
     return [some for some in (better, best, plain) if some]
 
@@ -141,12 +150,12 @@ def _by_bands(
                 first = home_m + shift / shifts * width_m
                 first += math.ceil((low_m - first) / width_m) * width_m
                 cuts = np.arange(first, high_m, width_m).tolist()
-            run: list[Part] = []
+            chains: list[list[Part]] = []
             bands = cut_across(passes, parts, course, cuts)
             for band in sorted(bands):
                 start = outermost(passes, bands[band], (-north, east))
-                run += to_and_fro(passes, bands[band], first=start)
-            yield run
+                chains += in_sight(passes, to_and_fro(passes, bands[band], first=start))
+            yield linked(passes, chains)
 
 
 def _battery_m(passes: Passes, limits: Limits) -> float:

@@ -194,12 +194,14 @@ class Passes:
         if gap_m < ACROSS_M and self._goes_on(before, after, one, other, gap_m):
             one_m, other_m = abs(before[2] - before[1]), abs(after[2] - after[1])
             return self.times.on_s(one_m, gap_m, other_m), gap_m
-        if gap_m > SEEN_M and not self.space.is_convex:
-            gap_m = self._bent_m(one, other, gap_m)
+        gap_m = self.gap_m(one, other)
         return self.times.way_s(gap_m), gap_m
 
-    def _bent_m(self, one: Place, other: Place, gap_m: float) -> float:
+    def gap_m(self, one: Place, other: Place) -> float:
         """Return the way between two places, over the best corners where one hides the other."""
+        gap_m = math.hypot(other[0] - one[0], other[1] - one[1])
+        if gap_m <= SEEN_M or self.space.is_convex:
+            return gap_m
         known = self.known_m.get((one, other))
         if known is None:
             known = gap_m

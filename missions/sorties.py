@@ -43,6 +43,8 @@ ANNEALED_MAX = 400
 TOUCH_M = 1e-3
 # What one kick of a tour takes, counted in moves of the search over many sorties.
 MOVES_A_KICK = 100
+# An order that is cut into many sorties is worth less of it.
+FEWER_KICKS = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,8 +69,10 @@ def plan_sorties(
     piece_max_l = _piece_max_l(demand, settings)
     run_in_m = settings.speed_m_s**2 / (2.0 * settings.acceleration_m_s2)
     whole = cut(lines, demand, piece_max_l=math.inf, margin_m=run_in_m)
-    planned = _in_one(whole, ways, settings, flying)
-    if not _has_battery(settings) and float(whole.litres.sum()) <= settings.usable_l:
+    is_one = not _has_battery(settings) and float(whole.litres.sum()) <= settings.usable_l
+    kicks = settings.moves // (MOVES_A_KICK if is_one else MOVES_A_KICK * FEWER_KICKS)
+    planned = _in_one(whole, ways, settings, flying, kicks=kicks)
+    if is_one:
         return _drawn(whole, [planned], ways, flying.motion)
     pieces = cut(
         lines, demand, piece_max_l=piece_max_l,
@@ -91,7 +95,7 @@ def plan_sorties(
     )
 
 
-def _in_one(whole: Pieces, ways: Ways, settings: Settings, flying: Flying) -> Order:
+def _in_one(whole: Pieces, ways: Ways, settings: Settings, flying: Flying, *, kicks: int) -> Order:
     """Return the order of all lines that an endless tank would take."""
     network = build_network(
         whole, ways.depots, ways.inside, flying.motion, refill_s=settings.refill_s
@@ -99,7 +103,6 @@ def _in_one(whole: Pieces, ways: Ways, settings: Settings, flying: Flying) -> Or
     if flying.any_depot:
         network.put_depot_anywhere()
     order = one_chain(network, by_savings(network, math.inf))
-    kicks = settings.moves // MOVES_A_KICK
     return shortest_tour(network, order, kicks=kicks, seed=settings.seed)
 
 
