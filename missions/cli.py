@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
+from types import FrameType
 from typing import Annotated, Any, Literal
 
 import typer
@@ -12,6 +16,7 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 from companion.cli.map_grid import parse_mark
 from companion.cli.map_options import Reading, reading_options
+from companion.cli.progress import Tell, progress
 from companion.wording import counted
 from missions.files.fence import fence_warnings
 from missions.files.fleet import write_fleet
@@ -25,11 +30,15 @@ from missions.prices import overlap_warnings, prices
 from missions.reading import Asked, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
+from missions.searching import Watch, watched
 from missions.sheet import ground_text, sheet, sortie_lines
 from missions.treated_rates import UntreatedRates
 
 # Attempted moves of the search: about one second, ten, and a minute on an old laptop.
 MOVES = {"quick": 40_000, "good": 300_000, "best": 2_000_000}
+
+# Below this no bar is worth looking at.
+BAR_AFTER_S = 2.0
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
 
@@ -199,14 +208,15 @@ def plan(
         "ferry_height_m": ferry_height_m,
     }
     task = read_task(asked, reading.config, changes)
-    planned = plan_mission(
-        task.field,
-        task.settings,
-        task.rates,
-        depots=task.depots,
-        left=task.left,
-        around=task.around,
-    )
+    with progress(after_s=BAR_AFTER_S) as tell, _stoppable(tell) as watch:
+        planned = plan_mission(
+            task.field,
+            task.settings,
+            task.rates,
+            depots=task.depots,
+            left=task.left,
+            around=task.around,
+        )
     planned = replace(planned, warnings=(*task.said, *planned.warnings), wind=task.wind)
     took_s = perf_counter() - start
     choices = []
@@ -222,6 +232,7 @@ def plan(
     once = isinstance(task.rates, UntreatedRates)
     result = sheet(planned, with_sprayer=sprayer, once=once) | {
         "planning_s": took_s,
+        "stopped": watch.stopped,
         "files": [str(path) for path in files],
         "lines_file": str(marks[0]) if marks else None,
         "lines_files": [str(path) for path in marks],
@@ -245,6 +256,26 @@ def plan(
         )
     for warning in warnings:
         note(f"warning: {warning}")
+    if watch.stopped:
+        note(f"stopped after {took_s:.0f} s: the best plan so far is written")
+
+
+@contextmanager
+def _stoppable(tell: Tell) -> Iterator[Watch]:
+    """Have Ctrl-C end the search, as soon as a plan comes of it; a second one ends the command."""
+    watch = Watch(tell=tell)
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        if watch.stopped or not watch.has_lines:
+            raise KeyboardInterrupt
+        watch.stopped = True
+
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        with watched(watch):
+            yield watch
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _check_outputs(

@@ -22,6 +22,7 @@ from missions.patches import narrow_patches
 from missions.plan import Plan, Settings, Sortie, flown_lines
 from missions.remaining import Remaining
 from missions.schedule import scheduled
+from missions.searching import lines_are_drawn
 from missions.short import short_warnings
 from missions.strips import Floats, joined, no_lines
 from missions.surroundings import NOTHING_AROUND, Surroundings
@@ -83,6 +84,7 @@ def _planned(
     if not float(litres.sum()) > 0.0:
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
     given = _depots(field.frame, depots)
+    lines_are_drawn()
 
     def one(some: Floats, needs: list[Demand], ways: Ways, any_depot: bool = False) -> Paced:
         def pace(sorties: Sequence[Sortie]) -> Paced:

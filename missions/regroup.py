@@ -16,6 +16,7 @@ import numpy as np
 
 from missions.bands import cut_across, outermost, to_and_fro
 from missions.refills import TOUCH_M, Limits, Part, Passes, Place, flown_by, split
+from missions.searching import steps
 
 # So many sorties are laid out together; neighbours are looked for along and across the course by
 # these weights: sorties of one band, or those behind each other on the same passes.
@@ -47,7 +48,7 @@ def regrouped(
     along, across = np.array(course), np.array([-course[1], course[0]])
     u, v = at @ along, at @ across
     best, best_s, now_s = [list(each) for each in known], 0.0, 0.0
-    for number in range(trials):
+    for number in steps("neighbouring sorties", trials):
         one = draw.randrange(len(known))
         weight = draw.choice(WEIGHTS)
         count = min(draw.choice(TOGETHER), len(known))

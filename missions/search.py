@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 from missions.network import Network
 from missions.savings import Lasts, Sortie, turned
+from missions.searching import steps
 
 # The first moves may cost some twenty seconds of flight, the last ones next to nothing.
 HOT_S, COLD_S = 20.0, 0.3
@@ -85,7 +86,7 @@ def improve(
     best, best_gain, gain = [list(sortie) for sortie in state.sorties], 0.0, 0.0
     cooling = (COLD_S / HOT_S) ** (1.0 / moves)
     heat = HOT_S
-    for _ in range(moves):
+    for _ in steps("sorties", moves):
         heat *= cooling
         # A move is taken if it costs less than this: exponentially rare for a large cost.
         allowed = -heat * math.log(1.0 - draw.random())

@@ -15,6 +15,7 @@ import numpy as np
 
 from missions.network import Network, rows_of
 from missions.savings import Sortie
+from missions.searching import steps
 
 NEAREST = 12
 # Parts that a kick exchanges have so many pieces at most.
@@ -32,7 +33,7 @@ def shortest_tour(network: Network, order: Sortie, *, kicks: int, seed: int = 1)
     ring = Ring(network, order)
     draw = random.Random(seed)
     best, now_s, best_s = ring.order(), 0.0, 0.0
-    for number in range(kicks):
+    for number in steps("ways between lines", kicks):
         before = ring.ends.copy()
         touched, change_s = ring.kick(draw)
         change_s += ring.improve(touched)

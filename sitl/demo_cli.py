@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import json
 import os
 import shutil
@@ -10,7 +11,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -19,10 +20,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from companion.cli.answer import AsJson, answer, note
+from companion.cli.progress import progress
 from companion.errors import ConfigError
 from sitl.cli import FlowLaw
 from sitl.demo_report import can_report, write_report
@@ -107,28 +108,13 @@ def demo_flights(
 def _flown(options: DemoOptions, stage: Path, *, quiet: bool) -> DemoResult:
     from sitl.demo import fly_demo, jobs_of
 
-    with _progress(len(jobs_of(options, None)), quiet=quiet) as advance:
-        return fly_demo(options, journal_folder=stage, on_flown=advance)
-
-
-@contextmanager
-def _progress(total: int, *, quiet: bool) -> Iterator[Callable[[], None]]:
-    """Yield what moves a bar on stderr; without a terminal there is none."""
-    console = Console(stderr=True)
-    if quiet or not console.is_terminal:
-        yield lambda: None
-        return
-    bar = Progress(
-        TextColumn("flights"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-        transient=True,
-    )
-    with bar:
-        task = bar.add_task("flights", total=total)
-        yield lambda: bar.advance(task)
+    total = len(jobs_of(options, None))
+    flown = itertools.count(1)
+    with progress(quiet=quiet) as tell:
+        tell("flights", 0, total)
+        return fly_demo(
+            options, journal_folder=stage, on_flown=lambda: tell("flights", next(flown), total)
+        )
 
 
 # ---------------------------------------------------------------------------------------- the files

@@ -1,0 +1,99 @@
+"""Ctrl-C while a plan is made: before there are lines, in the search, and a second time."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+import shapely
+from shapely import box
+
+import missions.planner
+import missions.search
+from companion.cli import app
+from missions.plan import Settings
+from missions.searching import steps
+from tests.mission_fields import degrees
+
+SAID = "the best plan so far is written"
+
+
+def press_ctrl_c() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def plan(folder: Path) -> tuple[int, Path]:
+    """Run the command on 5 ha, which take three tanks; return its code and what it writes."""
+    field, out = folder / "field.geojson", folder / "out.geojson"
+    field.write_text(shapely.to_geojson(degrees(box(0.0, 0.0, 250.0, 200.0))), encoding="utf-8")
+    given = ["--swath-m", "6", "--speed-m-s", "6", "--rate-l-ha", "20", "--json"]
+    return app.execute(["plan", str(field), "--out", str(out), *given]), out
+
+
+def test_ctrl_c_before_there_are_lines_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def drawn(*_: object) -> NoReturn:
+        press_ctrl_c()
+        raise AssertionError("went on")
+
+    monkeypatch.setattr(missions.planner, "spray_lines", drawn)
+    code, out = plan(tmp_path)
+    assert code == app.INTERRUPTED
+    assert not out.exists()
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def pressed_at(monkeypatch: pytest.MonkeyPatch, *presses: int) -> list[int]:
+    """Have Ctrl-C pressed at these steps of the search; return the list of those it does."""
+    done: list[int] = []
+
+    def watched_steps(what: str, count: int) -> Iterator[int]:
+        for step in steps(what, count):
+            done.append(step)
+            if step in presses:
+                press_ctrl_c()
+            yield step
+
+    monkeypatch.setattr(missions.search, "steps", watched_steps)
+    return done
+
+
+def test_ctrl_c_in_the_search_writes_the_best_plan_so_far(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = pressed_at(monkeypatch, 1000)
+    code, out = plan(tmp_path)
+    assert code == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["stopped"] is True
+    assert said.err.splitlines()[-1].endswith(SAID)
+    assert out.exists()
+    assert 1000 < len(done) < Settings(swath_width_m=6.0, speed_m_s=6.0).moves / 10
+    # Later keys are the terminal's again.
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_ctrl_c_ends_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pressed_at(monkeypatch, 1000, 1001)
+    code, out = plan(tmp_path)
+    assert code == app.INTERRUPTED
+    assert not out.exists()
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_an_undisturbed_plan_says_nothing_of_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _ = plan(tmp_path)
+    said = capsys.readouterr()
+    assert code == 0
+    assert json.loads(said.out)["stopped"] is False
+    assert SAID not in said.err
