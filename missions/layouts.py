@@ -65,6 +65,10 @@ class _Covering:
         left_m2 = self.target.difference(covered).area
         return tour.seconds + self.aim.cost_s(left_m2=left_m2, doubled_m2=max(doubled_m2, 0.0))
 
+    def left_m2(self, tour: Tour) -> float:
+        """Return what lines leave of what a strip can reach."""
+        return float(self.target.difference(united(tour.lines, self.width_m)).area)
+
     def is_block(self, tour: Tour) -> bool:
         """Return whether a tour is nothing but equal lines side by side, as on a rectangle."""
         along, length_m = directions(tour.lines), lengths_m(tour.lines)
@@ -143,7 +147,17 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
         if settings.angle_deg is None:
             angles = [*edge_angles(field.spray), *angles[:ANGLES_TRIED]]
         layouts = [tour.lines, *(other for _, other in drawn)]
-        found = min(covering.selected(layouts, angles), key=covering.value_s, default=tour)
+        # The time of many short lines along a ragged border buys no ground that may not be left.
+        most_m2 = max(covering.aim.left_max_m2, covering.left_m2(tour))
+        found = min(
+            (
+                other
+                for other in covering.selected(layouts, angles)
+                if not covering.aim.covers_first or covering.left_m2(other) <= most_m2
+            ),
+            key=covering.value_s,
+            default=tour,
+        )
         if covering.value_s(found) < covering.value_s(tour):
             if settings.angle_deg is None:
                 angle_deg = main_course_deg(found.lines)
