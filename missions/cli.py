@@ -18,7 +18,7 @@ from companion.cli.map_grid import parse_mark
 from companion.cli.map_options import Reading, reading_options
 from companion.cli.progress import Tell, progress
 from companion.wording import counted
-from missions.files.fence import fence_warnings
+from missions.files.fence import Fences, fence_warnings
 from missions.files.fleet import write_fleet
 from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
 from missions.files.write import check_suffix
@@ -216,6 +216,7 @@ def plan(
             depots=task.depots,
             left=task.left,
             around=task.around,
+            with_sprayer=sprayer,
         )
     planned = replace(planned, warnings=(*task.said, *planned.warnings), wind=task.wind)
     took_s = perf_counter() - start
@@ -223,11 +224,12 @@ def plan(
     asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT
     if asks and task.left is None and not isinstance(task.rates, UntreatedRates):
         choices = list(prices(planned, task.rates, depots=task.depots, around=task.around))
-    files, marks = write_fleet(planned, out, with_sprayer=sprayer)
+    fences = Fences(planned)
+    files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
     if png is not None:
         draw_plan(planned, png, title=field.stem)
     if out.suffix.casefold() == ".plan":
-        planned = replace(planned, warnings=(*planned.warnings, *fence_warnings(planned)))
+        planned = replace(planned, warnings=(*planned.warnings, *fence_warnings(planned, fences)))
     warnings = planned.warnings
     once = isinstance(task.rates, UntreatedRates)
     result = sheet(planned, with_sprayer=sprayer, once=once) | {

@@ -23,7 +23,7 @@ from companion.maps.local import make_valid, project_all
 from companion.maps.registry import Record, read_records
 from missions.errors import PlanError
 from missions.nearness import check_near
-from missions.reading_outline import told
+from missions.reading_outline import NOTHING_TOLD, told
 
 RADIUS_MAX_M, CORRIDOR_MAX_M, HEIGHT_MAX_M = 100.0, 500.0, 500.0
 # Points grow to polygons of 16 corners around their circle, not in it.
@@ -70,14 +70,14 @@ def read_obstacles(
     *,
     radius_m: float | None = None,
     corridor_m: float | None = None,
-    opens: Mapping[str, str | None] | None = None,
+    opens: Mapping[str, str | None] = NOTHING_TOLD,
 ) -> list[Obstacle]:
     """Return the obstacles in a file; what has no radius or corridor of its own takes those given.
 
     Raises:
         PlanError, MapError: in one line, which record lacks what, or that the file is of elsewhere.
     """
-    records = told(partial(read_records, path), opens or {})
+    records = told(partial(read_records, path), opens)
     west, south, east, north = shapely.total_bounds([each.geometry for each in records]).tolist()
     check_near(str(path), (south + north) / 2.0, (west + east) / 2.0, frame)
     return _together([_obstacle(path, record, radius_m, corridor_m) for record in records])

@@ -14,6 +14,8 @@ from missions.demand import Demand, Rates, Uniform, demands
 from missions.errors import PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
+from missions.files.items import count_of, stops_of
+from missions.files.plan_rules import ITEMS_MAX
 from missions.fleet import fleet_sorties
 from missions.flown import flown
 from missions.layouts import spray_lines
@@ -21,6 +23,7 @@ from missions.paced import Paced, range_warnings
 from missions.patches import narrow_patches
 from missions.plan import Plan, Settings, Sortie, flown_lines
 from missions.remaining import Remaining
+from missions.room import in_room
 from missions.schedule import scheduled
 from missions.searching import lines_are_drawn
 from missions.short import short_warnings
@@ -28,7 +31,7 @@ from missions.strips import Floats, joined, no_lines
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from missions.treated_rates import UntreatedRates, demands_once
 from missions.treated_twice import counted
-from missions.ways import Ways, build_ways, edge_places, suggested_depot
+from missions.ways import Ways, build_ways, edge_places, far_warnings, suggested_depot
 
 # One sortie may begin and end anywhere: its depot is chosen among so many places of the edge.
 EDGE_STEP_M, EDGE_PLACES = 25.0, 24
@@ -42,9 +45,11 @@ def plan_mission(
     depots: tuple[tuple[float, float], ...] = (),
     left: Remaining | None = None,
     around: Surroundings = NOTHING_AROUND,
+    with_sprayer: bool = False,
 ) -> Plan:
     """Return the mission for a field; depots are (latitude, longitude).
 
+    No sortie has more items than its autopilot has room for; `with_sprayer` they are more.
     With `left` its lines are flown, and no others. `around` is the ground that the plan follows,
     and the room that passes get beyond their ends.
 
@@ -52,7 +57,7 @@ def plan_mission(
         PlanError: where there is none, in one line with what to change.
     """
     try:
-        return _planned(field, settings, rates, depots, left, around)
+        return _planned(field, settings, rates, depots, left, around, with_sprayer)
     except ShapelyError as error:
         raise PlanError(
             f"the field's geometry cannot be used ({str(error)[:120]}); simplify its outline"
@@ -66,6 +71,7 @@ def _planned(
     depots: tuple[tuple[float, float], ...],
     left: Remaining | None,
     around: Surroundings,
+    with_sprayer: bool,
 ) -> Plan:
     width_m = settings.swath_width_m
     motion = settings.motion
@@ -87,8 +93,18 @@ def _planned(
     lines_are_drawn()
 
     def one(some: Floats, needs: list[Demand], ways: Ways, any_depot: bool = False) -> Paced:
+        def count(sortie: Sortie) -> int:
+            home = ways.depots[sortie.depot].tolist()
+            stops = stops_of(
+                sortie, settings, around.terrain, home=(home[0], home[1]), with_sprayer=with_sprayer
+            )
+            return count_of(stops, settings, with_sprayer=with_sprayer)
+
         def pace(sorties: Sequence[Sortie]) -> Paced:
-            return around.paced(sorties, rates, field, settings)
+            return in_room(
+                sorties, ways, lambda some: around.paced(some, rates, field, settings), count,
+                room=ITEMS_MAX[settings.autopilot],
+            )  # fmt: skip
 
         around.check(field, ways.depots)
         return flown(
@@ -137,6 +153,7 @@ def _planned(
         warnings=(
             *range_warnings(sorties.misses, field.frame, settings),
             *short_warnings(sorties.sorties, rates, field.frame, settings),
+            *far_warnings(sorties.sorties, places, field, has_battery=settings.battery is not None),
             *around.warnings(sorties.sorties, places, field.frame, settings),
         ),
         terrain=around.terrain,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TypeVar
 
 import numpy as np
@@ -29,6 +30,7 @@ AT_SEA_DEG = 1.0
 
 
 # What a file leaves open, by the code of its refusal, and what answers it.
+NOTHING_TOLD: Mapping[str, str | None] = MappingProxyType({})
 ANSWERS = {"no-crs": "crs", "several-layers": "layer"}
 
 
@@ -50,7 +52,10 @@ def told(read: Callable[..., T], asked: Mapping[str, str | None]) -> T:
 
 
 def outline_of(
-    path: Path, map_file: MapFile | None, said: list[str], asked: Mapping[str, str | None]
+    path: Path,
+    map_file: MapFile | None,
+    said: list[str],
+    asked: Mapping[str, str | None] = NOTHING_TOLD,
 ) -> Area:
     """Return the field's outline; of a prescription in cells, that of its cells with a rate.
 

@@ -10,6 +10,7 @@ import shapely
 
 from companion.wording import counted
 from missions.files.items import items_of
+from missions.files.plan_rules import ITEMS_MAX
 from missions.least_ferry import least_idle_of
 from missions.plan import Plan, Sortie
 from missions.schedule import separation_m
@@ -34,6 +35,7 @@ def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict
         row["farthest_m"] = _farthest_m(plan, sortie)
         row["overlap_l"] = overlap_l.get(sortie.number, 0.0)
         row |= filled[sortie.number]
+    found["items_max"] = ITEMS_MAX[plan.settings.autopilot]
     if plan.settings.aircraft > 1:
         found["aircraft"] = _crafts(plan)
         found["separation_m"] = separation_m(plan)
@@ -151,7 +153,7 @@ def _line(plan: Plan, sortie: Sortie, row: dict[str, Any]) -> str:
         f"sortie {sortie.number:3}  fill to {row['fill_l']:6.2f} L, spray {sortie.volume_l:6.2f} L"
         f"  {row['airborne_s'] / 60.0:5.1f} min from {sortie.start_s / 60.0:.0f} min  "
         f"{counted(sortie.lines, 'line')}, {_speeds(sortie.speeds_m_s)}, "
-        f"{counted(row['items'], 'item')}, "
+        f"{row['items']} of {ITEMS_MAX[plan.settings.autopilot]} items, "
         f"up to {row['farthest_m']:.0f} m away, {row['overlap_l']:.2f} L twice"
     ]
     used_wh = plan.energy_wh(sortie)

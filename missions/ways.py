@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,9 +12,11 @@ import shapely
 from shapely import Point
 from shapely.geometry.base import BaseGeometry
 
+from companion.wording import counted
 from missions.errors import PlanError
 from missions.field import Field
 from missions.free_space import FreeSpace, free_space
+from missions.plan import Sortie
 from missions.strips import Floats
 
 Place = tuple[float, float]
@@ -23,6 +26,8 @@ AROUND_M = 50.0
 # A depot this close to the field stands on its edge.
 ON_EDGE_M = 0.05
 DEPOT_FAR_M = 20_000.0
+# A depot farther from the field than this is worth a word: each flight is mostly ferry.
+DEPOT_FERRY_M = 500.0
 
 
 @dataclass(frozen=True)
@@ -110,6 +115,9 @@ def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
     """Return places along the edge of the field, evenly apart, where one gets to from outside.
 
     Obstacles that reach over the edge, or cut the field in two, have edges in it: none of those.
+
+    Raises:
+        PlanError: where obstacles leave no place.
     """
     rings = [shapely.get_exterior_ring(part) for part in shapely.get_parts(field.fly)]
     step_m = max(step_m, sum(ring.length for ring in rings) / count_max)
@@ -127,7 +135,12 @@ def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
     far_m = shapely.distance(edges, shapely.points(places))
     # So far inside the border may be drawn.
     outer: Floats = places[far_m <= max(field.tolerance_m, ON_EDGE_M)]
-    return outer if len(outer) else places
+    if not len(outer):
+        raise PlanError(
+            "obstacles stand along the whole edge of the field, and no place on it can be "
+            "suggested to take off from; give one with --depot LAT,LON (mission.depots)"
+        )
+    return outer
 
 
 def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:
@@ -141,3 +154,25 @@ def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:
     )
     best: Floats = places[[int(np.argmin(far_m @ weight))]]
     return best
+
+
+def far_warnings(
+    sorties: Sequence[Sortie], depots: Floats, field: Field, *, has_battery: bool
+) -> tuple[str, ...]:
+    """Return what flying from depots far from the field costs."""
+    said = []
+    for number, depot in enumerate(depots, start=1):
+        own = [each for each in sorties if each.depot == number - 1]
+        far_m = float(field.outline.distance(Point(depot)))
+        if not own or far_m <= DEPOT_FERRY_M:
+            continue
+        most = max(own, key=lambda each: each.legs[0].seconds + each.legs[-1].seconds)
+        ferry_min = (most.legs[0].seconds + most.legs[-1].seconds) / 60.0
+        text = (
+            f"depot {number} lies {far_m / 1000.0:.1f} km from the field: the ferries there and "
+            f"back take {ferry_min:.0f} min of each of its {counted(len(own), 'sortie')}"
+        )
+        if not has_battery:
+            text += "; give mission.battery_wh and power_hover_w, or nobody looks whether it lasts"
+        said.append(text)
+    return tuple(said)

@@ -9,7 +9,8 @@ and counted.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,6 +20,7 @@ from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
 from companion.maps.local import polygons_of
+from companion.wording import counted
 from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners
 from missions.files.limits import NAMES
@@ -29,6 +31,9 @@ from missions.plan import Plan, Sortie
 # Lines end on the field's edge: PX4 in simulation went 1.24 m beyond one, and a fence at 1.2 m
 # held it there for good.
 OUT_M, QUICK_M, SIMPLER_M = 2.0, 0.2, (0.5, 1.0, 2.0, 4.0, 6.0, 8.0)
+# Where the whole field has too many corners, the ground so far beside the way of a sortie, drawn
+# with as few corners as the field leaves room for.
+ASIDE_M, PART_SIMPLER_M = (20.0, 6.0), (*SIMPLER_M, 12.0, 18.0)
 # No fence lies farther outside of field and ways.
 OUTSIDE_MAX_M, STEP_M = 10.0, 2.0
 # A fence that lies farther outside than this is worth a word.
@@ -52,12 +57,16 @@ Shape = tuple[Polygon, tuple[float, float, float] | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fence:
-    """Shapes in metres; `left_out` are the obstacles that found no room."""
+    """Shapes in metres; `left_out` are the obstacles that found no room.
+
+    `aside_m` is how far beside its way the ground is held, None where the whole field is.
+    """
 
     border: Polygon
     polygons: tuple[Polygon, ...] = ()
     circles: tuple[tuple[float, float, float], ...] = ()
     left_out: int = 0
+    aside_m: float | None = None
     crossed: int = 0
     outside_m: float = 0.0
 
@@ -67,6 +76,7 @@ class Fences:
     """The fences of all sorties of a plan."""
 
     plan: Plan
+    drawn: dict[int, Fence] = field(default_factory=dict)
 
     @property
     def room_bytes(self) -> int:
@@ -103,9 +113,20 @@ class Fences:
     @cached_property
     def borders(self) -> list[tuple[float, BaseGeometry]]:
         """Return the borders of the field with its ways outside, which most sorties share."""
-        return self._borders(self.plan.field.outline)
+        outline = self.plan.field.outline
+        return self._borders(outline, outline, SIMPLER_M)
 
     def of(self, sortie: Sortie) -> Fence:
+        """Return the fence of one sortie, drawn once.
+
+        Raises:
+            PlanError: where none has room that keeps near the field and holds the way.
+        """
+        if sortie.number not in self.drawn:
+            self.drawn[sortie.number] = self._of(sortie)
+        return self.drawn[sortie.number]
+
+    def _of(self, sortie: Sortie) -> Fence:
         """Return the fence of one sortie.
 
         Raises:
@@ -115,27 +136,51 @@ class Fences:
         outline = self.plan.field.outline
         beyond = way.difference(outline.buffer(OUT_M / 2.0))
         borders, obstacles = self.borders, self.obstacles_of(way)
+        whole: BaseGeometry = outline
         if not beyond.is_empty:
             whole = outline.union(beyond.buffer(FERRY_M, quad_segs=2))
-            borders = self._borders(whole)
-        fitting = [
-            found
+            borders = self._borders(whole, whole, SIMPLER_M)
+        tried = list(borders)
+        fitting = self._fitting(borders, way, obstacles, aside_m=None)
+        for aside_m in ASIDE_M:
+            if fitting:
+                break
+            part = whole.intersection(way.buffer(aside_m, quad_segs=2))
+            near = shapely.union_all([Polygon(each.exterior) for each in polygons_of(part)])
+            borders = self._borders(near, whole, PART_SIMPLER_M)
+            tried += borders
+            fitting = self._fitting(borders, way, obstacles, aside_m=aside_m)
+        if not fitting:
+            raise self._refusal(sortie, tried, way)
+        fence = min(fitting, key=lambda found: found.left_out)
+        self._check(fence, way, sortie)
+        return fence
+
+    def _fitting(
+        self,
+        borders: list[tuple[float, BaseGeometry]],
+        way: BaseGeometry,
+        obstacles: list[Shape],
+        *,
+        aside_m: float | None,
+    ) -> list[Fence]:
+        """Return the fences of these borders that hold the way and have room."""
+        return [
+            replace(found, aside_m=aside_m)
             for outside_m, drawn in borders
             for border in polygons_of(drawn)
             if border.covers(way)
             if (found := self._with_obstacles(border, outside_m, obstacles)) is not None
         ]
-        if not fitting:
-            raise self._refusal(sortie, borders, way)
-        fence = min(fitting, key=lambda found: found.left_out)
-        self._check(fence, way, sortie)
-        return fence
 
-    def _borders(self, ground: BaseGeometry) -> list[tuple[float, BaseGeometry]]:
-        """Return borders around some ground and how far outside they lie, the nearest first."""
+    def _borders(
+        self, ground: BaseGeometry, field: BaseGeometry, simpler: Sequence[float]
+    ) -> list[tuple[float, BaseGeometry]]:
+        """Return borders around some ground and how far outside the field, the nearest first."""
         shapely.prepare(ground)
+        shapely.prepare(field)
         found = []
-        for simpler_m in SIMPLER_M:
+        for simpler_m in simpler:
             # Bays in which it would be no farther from the field are closed, and a first, quick
             # simplification is made up for by a wider buffer.
             wide_m = OUT_M + QUICK_M + simpler_m
@@ -143,7 +188,7 @@ class Fences:
             closed = wider.buffer(-simpler_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
             border = around_with_fewer_corners(closed.simplify(QUICK_M), simpler_m)
             points = shapely.points(shapely.get_coordinates(shapely.segmentize(border, STEP_M)))
-            outside_m = float(shapely.distance(ground, points).max())
+            outside_m = float(shapely.distance(field, points).max())
             if outside_m <= OUTSIDE_MAX_M and border.covers(ground):
                 found.append((outside_m, border))
         return found
@@ -185,8 +230,9 @@ class Fences:
         room = FENCE_CORNERS_MAX[self.plan.settings.autopilot]
         return PlanError(
             f"sortie {sortie.number}: a fence within {OUTSIDE_MAX_M:.0f} m of the field has "
-            f"{corners} corners, and {NAMES[self.plan.settings.autopilot]} stores {room}; write "
-            ".waypoints, which has no fence, or draw the outline with fewer corners"
+            f"{corners} corners, and {NAMES[self.plan.settings.autopilot]} stores {room}; make the "
+            "sorties shorter (mission.tank_l), draw the outline with fewer corners, or write "
+            ".waypoints, which has no fence"
         )
 
     def _check(self, fence: Fence, way: BaseGeometry, sortie: Sortie) -> None:
@@ -215,9 +261,8 @@ def fence_content(plan: Plan, fence: Fence) -> dict[str, Any]:
     return {"circles": circles, "polygons": polygons, "version": 2}
 
 
-def fence_warnings(plan: Plan) -> tuple[str, ...]:
+def fence_warnings(plan: Plan, fences: Fences) -> tuple[str, ...]:
     """Return what the fences of a plan lack: room for obstacles, and nearness to the field."""
-    fences = Fences(plan)
     found = [fences.of(sortie) for sortie in plan.sorties]
     most = max((fence.left_out for fence in found), default=0)
     outside_m = max((fence.outside_m for fence in found), default=0.0)
@@ -227,6 +272,13 @@ def fence_warnings(plan: Plan) -> tuple[str, ...]:
         said.append(
             f"the fence lies up to {outside_m:.0f} m outside the field: {name} has no room for "
             "the corners of a nearer one"
+        )
+    narrow = [fence.aside_m for fence in found if fence.aside_m is not None]
+    if narrow:
+        said.append(
+            f"the fence of {counted(len(narrow), 'sortie')} holds only the ground "
+            f"{min(narrow):g} m beside the way: {name} has no room for the corners of the whole "
+            "field, and a return in a straight line may cross it"
         )
     crossed = max((fence.crossed for fence in found), default=0)
     if crossed:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from missions.files.fence import Fences
 from missions.files.write import lines_path, write_plan
 from missions.plan import Plan
 
@@ -19,7 +20,7 @@ def fleet_path(out: Path, aircraft: int, count: int) -> Path:
 
 
 def write_fleet(
-    plan: Plan, out: Path, *, with_sprayer: bool = False
+    plan: Plan, out: Path, *, with_sprayer: bool = False, fences: Fences | None = None
 ) -> tuple[list[Path], list[Path]]:
     """Write the files of every aircraft; return the missions, and the lines for their sprayers.
 
@@ -32,7 +33,9 @@ def write_fleet(
     for aircraft in crafts:
         own = [sortie for sortie in plan.sorties if sortie.aircraft == aircraft]
         path = fleet_path(out, aircraft, count)
-        files += write_plan(replace(plan, sorties=tuple(own)), path, with_sprayer=with_sprayer)
+        files += write_plan(
+            replace(plan, sorties=tuple(own)), path, with_sprayer=with_sprayer, fences=fences
+        )
         lines = lines_path(path)
         if lines is not None:
             marks.append(lines)

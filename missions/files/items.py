@@ -5,11 +5,14 @@ Home is not among them: a plan has it apart, a waypoint file as its row 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
-from missions.files.limits import check_items, check_sprayer
-from missions.plan import Plan, Sortie
+from missions.files.limits import check_sprayer
+from missions.plan import Place, Plan, Settings, Sortie
 from missions.stops import Stop, waypoints_of
+from missions.terrain.ground import Terrain
 from missions.terrain.heights import raised
 
 WAYPOINT, RETURN_TO_LAUNCH, TAKEOFF, CHANGE_SPEED, SPRAYER = 16, 20, 22, 178, 216
@@ -47,10 +50,10 @@ def items_of(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) -> tuple
         PlanError: for what the autopilot would refuse.
     """
     check_sprayer(plan, with_sprayer=with_sprayer)
-    stops = waypoints_of(sortie, apart=with_sprayer)
-    terrain, height_m = plan.terrain, plan.settings.height_m
-    if terrain is not None and not terrain.by_vehicle:
-        stops = raised(stops, terrain, home=plan.depots[sortie.depot], height_m=height_m)
+    stops = stops_of(
+        sortie, plan.settings, plan.terrain, home=plan.depots[sortie.depot],
+        with_sprayer=with_sprayer,
+    )  # fmt: skip
     yaw_deg = _fixed_yaw(plan)
     speed_m_s = plan.settings.speed_m_s
     items = [_placed(plan, TAKEOFF, stops[0]), _speed(speed_m_s)]
@@ -66,8 +69,31 @@ def items_of(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) -> tuple
     if speed_m_s != plan.settings.speed_m_s:
         items.append(_speed(plan.settings.speed_m_s))
     items.append(Item(command=RETURN_TO_LAUNCH, frame=NO_PLACE, params=(0.0, 0.0, 0.0, 0.0)))
-    check_items(plan, sortie, len(items))
     return tuple(items)
+
+
+def stops_of(
+    sortie: Sortie,
+    settings: Settings,
+    terrain: Terrain | None,
+    *,
+    home: Place,
+    with_sprayer: bool = False,
+) -> list[Stop]:
+    """Return the places of a sortie, with those that the ground under it needs."""
+    stops = waypoints_of(sortie, apart=with_sprayer)
+    if terrain is not None and not terrain.by_vehicle:
+        return raised(stops, terrain, home=home, height_m=settings.height_m)
+    return stops
+
+
+def count_of(stops: Sequence[Stop], settings: Settings, *, with_sprayer: bool = False) -> int:
+    """Return how many items a sortie of these stops has."""
+    speeds = [settings.speed_m_s, *(stop.speed_m_s for stop in stops[1:]), settings.speed_m_s]
+    changes = sum(one != other for one, other in pairwise(speeds))
+    orders = sum(stop.opens is not None for stop in stops[1:]) if with_sprayer else 0
+    # Take-off, which is the first stop, the speed before it, and the return.
+    return len(stops) + 2 + changes + orders
 
 
 def _speed(speed_m_s: float) -> Item:

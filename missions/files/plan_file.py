@@ -13,7 +13,7 @@ from typing import Any
 
 from missions.files.fence import Fences, fence_content
 from missions.files.items import ABOVE_GROUND, RELATIVE, Item, items_of
-from missions.files.limits import check_content
+from missions.files.limits import check_content, check_items
 from missions.plan import Plan, Sortie
 
 FIRMWARES = {"ardupilot": 3, "px4": 12}  # MAV_AUTOPILOT
@@ -30,6 +30,7 @@ def plan_text(
     fence = (fences or Fences(plan)).of(sortie)
     home = plan.frame.to_geographic(*plan.depots[sortie.depot])
     items = items_of(plan, sortie, with_sprayer=with_sprayer)
+    check_items(plan, sortie, len(items))
     content = {
         "fileType": "Plan",
         "geoFence": fence_content(plan, fence),

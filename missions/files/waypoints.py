@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from missions.files.items import RELATIVE, WAYPOINT, Item, items_of
+from missions.files.limits import check_items
 from missions.plan import Plan, Sortie
 
 ABSOLUTE = 0  # MAV_FRAME_GLOBAL: the frame of home
@@ -18,7 +19,9 @@ def waypoints_text(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) ->
         latitude_deg=latitude_deg,
         longitude_deg=longitude_deg,
     )
-    items = (home, *items_of(plan, sortie, with_sprayer=with_sprayer))
+    own = items_of(plan, sortie, with_sprayer=with_sprayer)
+    check_items(plan, sortie, len(own))
+    items = (home, *own)
     lines = ["QGC WPL 110", *(_row(number, item) for number, item in enumerate(items))]
     return "\n".join(lines) + "\n"
 

@@ -52,7 +52,9 @@ def lines_path(out: Path) -> Path | None:
     return out.with_name(f"{out.stem}.lines.geojson") if suffix in ONE_SORTIE else None
 
 
-def write_plan(plan: Plan, out: Path, *, with_sprayer: bool = False) -> list[Path]:
+def write_plan(
+    plan: Plan, out: Path, *, with_sprayer: bool = False, fences: Fences | None = None
+) -> list[Path]:
     """Write the plan and return its files; all texts are made before the first is written.
 
     The lines, beside missions that have no marks for them, are not among these files.
@@ -64,7 +66,7 @@ def write_plan(plan: Plan, out: Path, *, with_sprayer: bool = False) -> list[Pat
     elif suffix == ".kml":
         texts = [kml_text(plan)]
     elif suffix == ".plan":
-        fences = Fences(plan)
+        fences = fences or Fences(plan)
         texts = [
             plan_text(plan, each, with_sprayer=with_sprayer, fences=fences) for each in plan.sorties
         ]

@@ -278,14 +278,14 @@ def test_a_fence_among_many_trees_fits_and_says_which_found_no_room() -> None:
     drawn = trees(50, corners=8, area_ha=8.0)
     plan = planned(drawn)
     assert not fence_faults(plan, drawn)
-    assert "the fence has no room for" in fence_warnings(plan)[0]
+    assert "the fence has no room for" in fence_warnings(plan, Fences(plan))[0]
 
 
 def test_a_fence_around_an_outline_of_a_point_every_metre_is_near_it() -> None:
     drawn = recorded(blob(2.0, seed=3), step_m=1.0)
     plan = planned(drawn)
     assert not fence_faults(plan, drawn)
-    assert fence_warnings(plan) == ()
+    assert fence_warnings(plan, Fences(plan)) == ()
 
 
 def test_two_parts_of_a_field_have_no_fence_around_all_between_them() -> None:
@@ -295,11 +295,24 @@ def test_two_parts_of_a_field_have_no_fence_around_all_between_them() -> None:
     assert not fence_faults(plan, drawn)
 
 
-def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:
-    comb_like = shapely.union_all(
-        [box(0, 0, 1000, 20), *(box(40 * k, 0, 40 * k + 8, 60) for k in range(25))]
+def comb(teeth: int) -> shapely.Geometry:
+    return shapely.union_all(
+        [box(0, 0, 40 * teeth, 20), *(box(40 * k, 0, 40 * k + 8, 60) for k in range(teeth))]
     )
-    plan = planned(Drawn(outline=degrees(comb_like)))
+
+
+def test_a_fence_without_room_for_the_whole_field_holds_the_ground_beside_the_way() -> None:
+    drawn = Drawn(outline=degrees(comb(25)))
+    plan = planned(drawn)
+    fences = Fences(plan)
+    content = json.loads(plan_text(plan, plan.sorties[0], fences=fences))
+    room = FENCE_CORNERS_MAX["ardupilot"]
+    assert not judge_fence(drawn, content, corners_max=room, outside_max_m=10.0)
+    assert "6 m beside the way" in " ".join(fence_warnings(plan, fences))
+
+
+def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:
+    plan = planned(Drawn(outline=degrees(comb(45))))
     with pytest.raises(PlanError, match=r"sortie 1: a fence within 10 m .* ArduPilot stores 70"):
         plan_text(plan, plan.sorties[0])
 
