@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from missions.errors import UploadError
-from missions.upload.checks import FIRMWARES, Compared, blame, compare, refusal
+from missions.upload.checks import FIRMWARES, Compared, blame, compare, crowded, refusal
 from missions.upload.items import Firmware, MissionFile, WireItem
 from missions.upload.places import misplaced
 
@@ -85,6 +85,8 @@ async def put(
     reason = refusal(file, vehicle.firmware) or misplaced(
         file, vehicle.firmware, with_fence=with_fence
     )
+    if reason is None and with_fence:
+        reason = crowded(file, vehicle.firmware)
     if reason is not None:
         raise UploadError(reason)
     fence = file.fence if with_fence else ()

@@ -103,6 +103,26 @@ def test_every_mission_of_the_examples_is_uploaded_and_there(
                 assert one.height_m == pytest.approx(other.height_m, abs=0.02)
 
 
+@both
+def test_the_plan_of_a_real_field_is_taken_with_its_fence(
+    firmware: str, firmwares: Path, samples: Path, tmp_path: Path
+) -> None:
+    field, file = samples / "fields" / "r_us_ca_scm.geojson", tmp_path / "field.plan"
+    planned = vrspray("plan", str(field), "--autopilot", firmware, "--out", str(file))
+    assert planned.returncode == 0, planned.stderr
+    content = json.loads(file.read_text())
+    corners = sum(len(each["polygon"]) for each in content["geoFence"]["polygons"])
+    assert corners > 40
+    with on_the_ground(firmware, firmwares, tmp_path / firmware) as station:
+        done = vrspray("upload", str(file), "--link", LINKS[firmware], "--json")
+        assert done.returncode == 0, (done.stdout, done.stderr)
+        found = json.loads(done.stdout)
+        assert found["fence_items"] == corners + len(content["geoFence"]["circles"])
+        kept = station.mission()[firmware == "ardupilot" :]
+        sent = content["mission"]["items"]
+        assert [item.command for item in kept] == [item["command"] for item in sent]
+
+
 def test_px4_begins_a_mission_anew_that_it_left(firmwares: Path, tmp_path: Path) -> None:
     file = str(ROOT / "examples" / "anyang" / "mission.plan")
     with on_the_ground("px4", firmwares, tmp_path / "px4") as station:

@@ -16,7 +16,7 @@ import shapely
 from companion.cli.app import execute
 from companion.core.frame import LocalFrame
 from missions.errors import UploadError
-from missions.upload.checks import compare, refusal
+from missions.upload.checks import compare, crowded, refusal
 from missions.upload.items import Firmware, MissionFile, WireItem
 from missions.upload.places import elsewhere
 from missions.upload.reading import read_mission_file
@@ -239,6 +239,26 @@ def corners(command: int, *places: tuple[int, int]) -> tuple[WireItem, ...]:
         WireItem(command=command, frame=0, params=(len(places), 0, 0, 0), x=x, y=y)
         for x, y in places
     )
+
+
+@pytest.mark.parametrize(
+    ("sizes", "circles", "is_sent"),
+    [
+        # As ArduCopter 4.7 answered: accepted, refused by itself, or halted ("Fence corrupt").
+        ((69,), 0, True), ((64, 4), 0, True), ((61,), 5, True), ((67,), 1, True),
+        ((47, 4, 4, 4, 4, 4), 0, True), ((), 42, True), ((71,), 0, True), ((200,), 0, True),
+        ((65, 4), 0, False), ((48, 4, 4, 4, 4, 4), 0, False), ((70,), 0, False),
+        ((68,), 1, False), ((), 43, False),
+    ],
+)  # fmt: skip
+def test_a_fence_that_would_halt_arducopter_is_not_sent(
+    sizes: tuple[int, ...], circles: int, is_sent: bool
+) -> None:
+    fence = [item for size in sizes for item in corners(5002, *((k, k) for k in range(size)))]
+    fence += [WireItem(command=5004, frame=0, params=(5, 0, 0, 0), x=1, y=1)] * circles
+    file = replace(FILE, fence=tuple(fence))
+    assert (crowded(file, "ardupilot") is None) == is_sent
+    assert crowded(file, "px4") is None
 
 
 AROUND = corners(
