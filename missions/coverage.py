@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from missions.demand import Rates
+from missions.demand import Rates, Uniform
 from missions.strips import Floats, rectangles, whole
 
 # Less than this is no ground but the last digits of large numbers.
@@ -70,6 +70,8 @@ def of_rated_ground(
     The rates are looked at in the middles of cells, so many that none is wider than a boom's valve
     on most fields.
     """
+    if isinstance(rates, Uniform):
+        return found
     west, south, east, north = ground.bounds
     cell_m = max(CELL_M, math.sqrt((east - west) * (north - south) / CELLS_MAX))
     steps = [np.arange(a + cell_m / 2.0, b, cell_m) for a, b in ((west, east), (south, north))]

@@ -10,7 +10,7 @@ from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
 from missions.coverage import measure, of_rated_ground
-from missions.demand import Demand, Rates, Uniform, demands
+from missions.demand import Demand, Rates, demands
 from missions.errors import PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
@@ -131,13 +131,11 @@ def _planned(
                 replace(sortie, depot=used.index(sortie.depot)) for sortie in sorties.sorties
             ),
         )
-    coverage = measure(sprayed, field.limit, width_m)
-    if not isinstance(rates, Uniform):
-        done = no_lines() if left is None else left.done
-        coverage = of_rated_ground(
-            coverage, joined([done, flown_lines(sorties.sorties)]), field.limit, width_m,
-            rates=rates,
-        )  # fmt: skip
+    done = no_lines() if left is None else left.done
+    coverage = of_rated_ground(
+        measure(sprayed, field.limit, width_m), joined([done, flown_lines(sorties.sorties)]),
+        field.limit, width_m, rates=rates,
+    )  # fmt: skip
     flights = sorties.sorties
     if not counted_before:
         flights = counted(flights, rates, settings, field.kept_in)
