@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -312,7 +313,11 @@ def test_a_fence_without_room_for_the_whole_field_holds_the_ground_beside_the_wa
 
 
 def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:
-    plan = planned(Drawn(outline=degrees(comb(45))))
+    settings = replace(SETTINGS, tank_l=400.0)
+    plan = plan_mission(
+        field_of(Drawn(outline=degrees(comb(45)))), settings, Uniform(rate_l_ha=20.0)
+    )
+    assert len(plan.sorties) == 1
     with pytest.raises(PlanError, match=r"sortie 1: a fence within 10 m .* ArduPilot stores 70"):
         plan_text(plan, plan.sorties[0])
 
