@@ -16,7 +16,7 @@ from missions.refills import STUB_M, Part, Passes, turned
 from missions.strips import Floats
 
 # What lies behind an obstacle by less than this is flown around; of so many chains the nearest.
-AROUND, AROUND_M, NEAREST = 1.5, 30.0, 6
+AROUND, AROUND_M, NEAREST = 1.5, 30.0, 2
 # Cuts of other lines than those along the course fall where they may.
 PARALLEL = math.cos(math.radians(30.0))
 

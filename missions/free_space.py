@@ -157,20 +157,11 @@ class FreeSpace:
         self, start: Place, end: Place, some: Ints, total_m: Floats
     ) -> tuple[int, int, float]:
         """Return the first and last corner of the shortest of these ways that are both seen."""
-        seen: dict[tuple[int, int], bool] = {}
-        while True:
-            pair = divmod(int(np.argmin(total_m)), len(some))
-            length_m = float(total_m[pair])
-            if not math.isfinite(length_m):
-                return (*pair, length_m)
-            for side, (place, at) in enumerate(zip((start, end), pair, strict=True)):
-                if (side, at) not in seen:
-                    straight = shapely.LineString([place, self.corners[some[at]]])
-                    seen[side, at] = bool(shapely.covers(self.space, straight))
-                if not seen[side, at]:
-                    total_m[(at, slice(None)) if side == 0 else (slice(None), at)] = np.inf
-            if seen[0, pair[0]] and seen[1, pair[1]]:
-                return (*pair, length_m)
+        places = self.corners[some]
+        total_m[~self.sees(np.tile(start, (len(some), 1)), places)] = np.inf
+        total_m[:, ~self.sees(np.tile(end, (len(some), 1)), places)] = np.inf
+        pair = divmod(int(np.argmin(total_m)), len(some))
+        return (*pair, float(total_m[pair]))
 
     def _straightened(self, ends: Floats, chain: list[int]) -> list[Place]:
         """Return the shortest way over the corners that lie no farther aside than this one."""

@@ -106,7 +106,7 @@ def several(
 ) -> list[Sorties]:
     """Return sorties that fly the parts: the best ones, and the plain ones of the planned order.
 
-    `known` are sorties that were made elsewhere.
+    `known` are sorties that were made elsewhere. Both are timed as they are flown in the end.
     """
     plain = plainly(passes, limits, planned)
     found = [each for each in (plain, *known) if each]
@@ -123,7 +123,7 @@ def several(
     parts = max(sum(len(sortie) for sortie in best) / len(best), PARTS_MIN)
     trials = min(int(moves / (MOVES_A_PART * parts)), TRIALS_A_SORTIE * len(best))
     better = regrouped(passes, limits, best, course, trials=trials, seed=seed)
-    return [some for some in (better, best, plain) if some]
+    return [some for some in (better, plain) if some]
 
 
 def _by_bands(
