@@ -123,7 +123,9 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
 
 def _is_new_way(before: Way | None, now: Way | None) -> bool:
     """Return whether another leg is flown than before."""
-    return now is None or before is None or replace(before, received_s=now.received_s) != now
+    if now is None or before is None:
+        return True
+    return replace(before, received_s=now.received_s, longer=now.longer) != now
 
 
 # Reports of which only the last one counts.

@@ -241,7 +241,9 @@ class LegReport:
     """The leg of its mission that the vehicle now flies: from which place to which.
 
     `stops` says whether the vehicle comes to a stop at its end, `speed_m_s` is the speed that the
-    mission asks for on it. `received_s` is when the autopilot last said which leg it is.
+    mission asks for on it. `received_s` is when the autopilot last said which leg it is. `longer`
+    is another leg of the mission on which this one lies whole, the shortest of them: from where to
+    where, latitude and longitude in degrees.
     """
 
     received_s: float
@@ -251,6 +253,7 @@ class LegReport:
     to_longitude_deg: float
     stops: bool
     speed_m_s: float | None = None
+    longer: tuple[tuple[float, float], tuple[float, float]] | None = None
 
 
 Input = (

@@ -9,7 +9,7 @@ fly along the leg; whoever is off it, or too fast to stop at its end, is predict
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from companion.core.frame import LocalFrame
@@ -80,15 +80,25 @@ def leg_of(report: LegReport, frame: LocalFrame, braking_m_s2: float | None) -> 
 
 def way_of(report: LegReport, frame: LocalFrame) -> Way | None:
     """Return the way of a leg, whether it ends in a stop or not; None where it is no place."""
-    places = (
+    way = _way(
+        report.received_s,
         (report.from_latitude_deg, report.from_longitude_deg),
         (report.to_latitude_deg, report.to_longitude_deg),
+        frame,
     )
-    if not all(abs(latitude) <= 90.0 and abs(longitude) <= 180.0 for latitude, longitude in places):
+    if way is None or report.longer is None:
+        return way
+    return replace(way, longer=_way(report.received_s, *report.longer, frame))
+
+
+def _way(
+    received_s: float, start: tuple[float, float], end: tuple[float, float], frame: LocalFrame
+) -> Way | None:
+    if not all(abs(place[0]) <= 90.0 and abs(place[1]) <= 180.0 for place in (start, end)):
         return None
-    (east_m, north_m), (to_east_m, to_north_m) = (frame.to_local(*place) for place in places)
+    (east_m, north_m), (to_east_m, to_north_m) = frame.to_local(*start), frame.to_local(*end)
     return Way(
-        received_s=report.received_s,
+        received_s=received_s,
         from_east_m=east_m,
         from_north_m=north_m,
         to_east_m=to_east_m,

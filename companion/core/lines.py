@@ -183,7 +183,17 @@ def _is_onwards(state: VehicleState, way: Way) -> bool:
 
 def _is_told(piece: Piece, ways: tuple[Way, ...] | None, course: float) -> bool:
     """Return whether a leg that is flown lies along a piece; off the mission any piece will do."""
-    return ways is None or any(_is_along(piece, way, course) for way in ways)
+    return ways is None or any(_sprays(piece, way, course) for way in ways)
+
+
+def _sprays(piece: Piece, way: Way, course: float) -> bool:
+    """Return whether a leg is one that sprays a piece.
+
+    A way to the next line may lie on one that a longer leg flies whole, before or afterwards: that
+    leg sprays it, or its ground would be sprayed twice.
+    """
+    is_other = way.longer is not None and _is_along(piece, way.longer, course)
+    return _is_along(piece, way, course) and not is_other
 
 
 def _is_along(piece: Piece, way: Way, course: float) -> bool:

@@ -170,13 +170,17 @@ class FaultKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Way:
-    """The leg of its mission that the vehicle now flies, in the flight's frame."""
+    """The leg of its mission that the vehicle now flies, in the flight's frame.
+
+    `longer` is another leg of the mission, on which this one lies whole.
+    """
 
     received_s: float
     from_east_m: float
     from_north_m: float
     to_east_m: float
     to_north_m: float
+    longer: Way | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

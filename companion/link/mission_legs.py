@@ -7,7 +7,7 @@ a change, one that is not foreseen is seen by the positions a moment later.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from companion.core.types import LegReport
 from companion.link.mission_messages import MissionItem
@@ -22,6 +22,13 @@ _STRAIGHT_FROM = frozenset({_WAYPOINT, _LOITER_UNLIMITED, _LOITER_TIME, _TAKE_OF
 # A copter that is not told to wait flies through a bend; one as sharp as this it brakes for: each
 # leg is a ramp down to its end, and the next one's first acceleration leads across.
 _STOPS_FROM_DEG = 60.0
+# A leg lies on another as near as one lies along a line (`core.lines`), and is shorter by a width
+# of that: two over the same line, there and back, are none the other's part.
+_ON_M = 0.5
+_LONGER_M = 1.0
+_DEG_M = 111_320.0  # a degree of latitude, to 0.6 % everywhere
+
+Place = tuple[float, float]
 
 
 def leg_report(items: Sequence[MissionItem], sequence: int, received_s: float) -> LegReport | None:
@@ -45,7 +52,46 @@ def leg_report(items: Sequence[MissionItem], sequence: int, received_s: float) -
         to_longitude_deg=end[1],
         stops=_stops(items, number, start, end),
         speed_m_s=_speed_m_s(items, number),
+        longer=_longer(items, start, end),
     )
+
+
+def _longer(items: Sequence[MissionItem], start: Place, end: Place) -> tuple[Place, Place] | None:
+    """Return the shortest other leg on which that from `start` to `end` lies whole; None: none.
+
+    In metres on a plane about `start`: legs are short beside the Earth.
+    """
+    east_deg_m = _DEG_M * math.cos(math.radians(start[0]))
+    end_m = ((end[1] - start[1]) * east_deg_m, (end[0] - start[0]) * _DEG_M)
+    least_m = math.hypot(*end_m) + _LONGER_M
+    found: tuple[float, tuple[Place, Place]] | None = None
+    for before, after in _legs(items):
+        x0, y0 = (before[1] - start[1]) * east_deg_m, (before[0] - start[0]) * _DEG_M
+        x1, y1 = (after[1] - start[1]) * east_deg_m, (after[0] - start[0]) * _DEG_M
+        length_m = math.hypot(x1 - x0, y1 - y0)
+        if not length_m >= least_m or (found is not None and length_m >= found[0]):
+            continue
+        ux, uy = (x1 - x0) / length_m, (y1 - y0) / length_m
+        for x, y in ((0.0, 0.0), end_m):
+            along = (x - x0) * ux + (y - y0) * uy
+            if not (
+                -_ON_M <= along <= length_m + _ON_M and abs(ux * (y - y0) - uy * (x - x0)) <= _ON_M
+            ):
+                break
+        else:
+            found = (length_m, (before, after))
+    return None if found is None else found[1]
+
+
+def _legs(items: Sequence[MissionItem]) -> Iterator[tuple[Place, Place]]:
+    """Yield all straight legs between two places, one after the other."""
+    start: Place | None = None
+    for item in items:
+        if item.command >= _NAVIGATION_END or (item.command == _TAKE_OFF and item.place is None):
+            continue
+        if start is not None and item.place is not None and item.command in _STRAIGHT_TO:
+            yield start, item.place
+        start = item.place if item.command in _STRAIGHT_FROM else None
 
 
 def _homewards(place: tuple[float, float] | None, received_s: float) -> LegReport | None:

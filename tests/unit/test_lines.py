@@ -235,6 +235,17 @@ def test_a_leg_that_was_left_counts_to_its_last_metres_but_not_on_the_way_back()
     assert not opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=old))
 
 
+def test_a_way_on_a_line_that_a_longer_leg_flies_is_not_sprayed() -> None:
+    given, side_step = on_lines(), way((18.0, 3.0), (30.0, 3.0))
+    assert opens(given, flying(10.0, 20.0, way=side_step))
+    for ends in (((12.0, 3.0), (36.0, 3.0)), ((36.0, 3.0), (12.0, 3.0))):
+        known = replace(side_step, longer=way(*ends))
+        assert not opens(given, flying(10.0, 20.0, way=known))
+    # One that leads far beyond the line is a ferry: it sprays nothing, so that this one has to.
+    ferry = replace(side_step, longer=way((12.0, 3.0), (90.0, 3.0)))
+    assert opens(given, flying(10.0, 20.0, way=ferry))
+
+
 def test_a_leg_without_length_is_along_no_line() -> None:
     assert not opens(on_lines(), flying(10.0, 20.0, way=way((40.0, 3.0), (40.0, 3.0))))
 

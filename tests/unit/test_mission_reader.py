@@ -56,6 +56,40 @@ def stops(*items: MissionItem) -> bool:
     return found.stops
 
 
+def north(metres: float, east_m: float = 0.0) -> tuple[float, float]:
+    return (36.0 + metres / 110_958.0, 114.0 + east_m / 90_164.0)
+
+
+LINE, FAR = (north(0.0), north(100.0)), (north(-300.0), north(500.0))
+
+
+@pytest.mark.parametrize(
+    ("ends", "longer"),
+    [
+        (((0.0, 0.0), (60.0, 0.0)), LINE),
+        (((80.0, 0.0), (20.0, 0.0)), LINE),
+        (((20.0, 0.4), (60.0, -0.4)), LINE),
+        (((20.0, 0.0), (102.0, 0.0)), FAR),  # beyond its end
+        (((0.3, 0.0), (99.8, 0.0)), FAR),  # there and back: the same
+        (((20.0, 0.7), (60.0, 0.7)), None),  # beside it
+        (((50.0, 0.0), (50.0, 30.0)), None),  # from it
+    ],
+)
+def test_a_leg_that_lies_on_a_longer_one_is_told_with_it(
+    ends: tuple[tuple[float, float], tuple[float, float]],
+    longer: tuple[tuple[float, float], tuple[float, float]] | None,
+) -> None:
+    places = (*FAR, north(0.0, 90.0), *LINE, north(0.0, 50.0), *(north(*end) for end in ends))
+    items = [item(WAYPOINT, place) for place in places]
+    found = leg(items, len(items) - 1)
+    assert found is not None
+    assert found.longer == longer
+    # A leg that begins at a turn or a take-off without a place is none that could be flown again.
+    alone = leg([items[3], item(LOITER_TURNS, LINE[1]), *items[-2:]], 3)
+    assert alone is not None
+    assert alone.longer is None
+
+
 def test_a_leg_leads_from_the_waypoint_before_to_the_one_flown_to() -> None:
     assert leg(MISSION, 5) == LegReport(
         received_s=10.0,
