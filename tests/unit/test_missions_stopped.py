@@ -17,7 +17,7 @@ import missions.planner
 import missions.search
 from companion.cli import app
 from missions.plan import Settings
-from missions.searching import steps
+from missions.searching import Watch, lines_are_drawn, steps, watched
 from tests.mission_fields import degrees
 
 SAID = "the best plan so far is written"
@@ -33,6 +33,14 @@ def plan(folder: Path) -> tuple[int, Path]:
     field.write_text(shapely.to_geojson(degrees(box(0.0, 0.0, 250.0, 200.0))), encoding="utf-8")
     given = ["--swath-m", "6", "--speed-m-s", "6", "--rate-l-ha", "20", "--json"]
     return app.execute(["plan", str(field), "--out", str(out), *given]), out
+
+
+def test_nobody_looks_on_any_more_after_an_error() -> None:
+    watch = Watch()
+    with pytest.raises(ValueError, match="broken"), watched(watch):
+        raise ValueError("broken")
+    lines_are_drawn()
+    assert not watch.has_lines
 
 
 def test_ctrl_c_before_there_are_lines_writes_nothing(
