@@ -50,10 +50,10 @@ def planning(folder: Path, *more: str) -> Iterator[tuple[subprocess.Popen[bytes]
         os.close(terminal)
 
 
-def said_until(terminal: int, text: bytes) -> bytes:
-    """Return what the terminal shows up to some text, or to the end."""
+def said_until(terminal: int, *texts: bytes) -> bytes:
+    """Return what the terminal shows up to one of some texts, or to the end."""
     said = b""
-    while text not in said:
+    while not any(text in said for text in texts):
         try:
             some = os.read(terminal, 4096)
         except OSError:  # the other side is closed
@@ -67,8 +67,9 @@ def said_until(terminal: int, text: bytes) -> bytes:
 @pytest.mark.timeout(120)
 def test_ctrl_c_ends_the_search_and_the_best_plan_so_far_is_written(tmp_path: Path) -> None:
     with planning(tmp_path, *SEARCH) as (process, terminal):
-        shown = said_until(terminal, b"ways between lines")
-        assert b"ways between lines" in shown, shown  # the bar
+        # The bar, above 2 s: a quick computer is at the sorties by then. Lines there are with both.
+        shown = said_until(terminal, b"ways between lines", b"sorties")
+        assert b"ways between lines" in shown or b"sorties" in shown, shown
         process.send_signal(signal.SIGINT)
         rest = said_until(terminal, b"is written")
         assert process.wait() == 0
