@@ -187,6 +187,10 @@ def test_what_falls_off_the_lines_is_off_target_and_nothing_is_asked_there() -> 
         ([(2.0, 4.5), (46.0, 4.5)], 0),
         ([(2.0, 1.2), (46.0, 4.8)], 0),  # drifts across it
         ([(25.0, 30.0), (25.0, -30.0)], 0),
+        ([(7.0, 0.0), (12.0, 2.9), (38.5, 3.1), (43.0, 6.0)], 1),  # corners cut at both ends
+        ([(43.0, 6.0), (38.5, 3.1), (12.0, 2.9), (7.0, 0.0)], 1),
+        ([(30.0, 6.0), (18.0, 4.0), (10.0, 3.0), (4.0, 2.0)], 0),  # a ferry to the line's start
+        ([(30.0, 9.0), (36.0, 3.5), (45.0, 2.0)], 0),  # joins just before the end
     ],
 )
 def test_a_visit_comes_and_goes_by_the_ends(places: list[Place], visits: int) -> None:
