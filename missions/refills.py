@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import shapely
@@ -38,6 +38,8 @@ TABLED_M, KNOTS = 400.0, 1600
 NOSE_DEG = 180.0
 TOUCH_M = 1e-3
 ROUNDS = 30
+# So many places are tried at once as ends of a sortie, each with all its beginnings.
+BLOCK = 128
 # Neighbouring passes see each other. No way through: far apart, whatever the ferry around costs.
 SEEN_M = 9.0
 HIDDEN, HIDDEN_M = 3.0, 1000.0
@@ -375,6 +377,32 @@ def _nearest_l(passes: Passes, part: Part) -> list[float]:
     return [passes.need_l((line, start_m, foot)) for foot in feet if low < foot < high]
 
 
+# One number, or many beside each other.
+_Some = TypeVar("_Some", float, Floats)
+
+
+def _used_wh(
+    limits: Limits, battery: Battery, *,
+    between_s: _Some, cruise_s: _Some, gone: tuple[_Some, _Some], litres: _Some,
+    out_s: _Some, back_s: _Some,
+) -> _Some:  # fmt: skip
+    """Return what sorties take that are away from first to last place for `between_s`.
+
+    `gone` is the load at the end over that time, and the integral of what was sprayed by then; the
+    ferries' times have half of a landing in them.
+    """
+    half_s, reserve_l = limits.landing_s / 2.0, limits.reserve_l
+    out_s, back_s = out_s - half_s, back_s - half_s
+    carried = reserve_l * between_s + gone[0] - gone[1]
+    carried += (litres + reserve_l) * (out_s + limits.upright_s) + reserve_l * back_s
+    hover_s = between_s - cruise_s + (limits.upright_s + limits.nose_s)
+    used = battery.hover_w * hover_s + battery.cruise_w * cruise_s
+    # Ferries count as the costlier of both: how far they are at speed is not known here.
+    used += max(battery.cruise_w, battery.hover_w) * (out_s + back_s)
+    used += battery.per_kg_w * KG_L * carried
+    return used / J_WH
+
+
 class _Sum(NamedTuple):
     """Time, time at speed, and the integral of what was sprayed over time, up to some place."""
 
@@ -479,27 +507,22 @@ class _Run:
 
     def flown(self, one: int, other: int) -> Flown:
         """Return what a sortie from behind one place, -1 for the start, to another takes."""
-        limits, stop = self._limits, self.stops[other]
+        stop = self.stops[other]
         load, begun, out_s = 0.0, _Sum(), self._first_home_s
         if one >= 0:
             start = self.stops[one]
             load, begun, out_s = start.load, start.on, start.home_on_s
         between_s, litres = stop.to.seconds - begun.seconds, stop.load - load
-        seconds = out_s + between_s + stop.home_s
-        battery = limits.battery
-        if battery is None:
-            return Flown(seconds=seconds, litres=litres, wh=0.0)
-        half_s, reserve_l = limits.landing_s / 2.0, limits.reserve_l
-        out_s, back_s = out_s - half_s, stop.home_s - half_s
-        cruise_s = stop.to.cruise_s - begun.cruise_s
-        carried = (reserve_l + stop.load) * between_s - (stop.to.weight - begun.weight)
-        carried += (reserve_l + litres) * (out_s + limits.upright_s) + reserve_l * back_s
-        hover_s = limits.upright_s + between_s - cruise_s + limits.nose_s
-        used = battery.hover_w * hover_s + battery.cruise_w * cruise_s
-        # Ferries count as the costlier of both: how far they are at speed is not known here.
-        used += max(battery.cruise_w, battery.hover_w) * (out_s + back_s)
-        used += battery.per_kg_w * KG_L * carried
-        return Flown(seconds=seconds, litres=litres, wh=used / J_WH)
+        wh = 0.0
+        if self._limits.battery is not None:
+            wh = _used_wh(
+                self._limits, self._limits.battery,
+                between_s=between_s,
+                cruise_s=stop.to.cruise_s - begun.cruise_s,
+                gone=(stop.load * between_s, stop.to.weight - begun.weight),
+                litres=litres, out_s=out_s, back_s=stop.home_s,
+            )  # fmt: skip
+        return Flown(seconds=out_s + between_s + stop.home_s, litres=litres, wh=wh)
 
     def by_tank(self) -> list[int] | None:
         """Return, for each place, from behind which one its sortie comes at the least time."""
@@ -522,28 +545,49 @@ class _Run:
 
     def by_battery(self) -> list[int] | None:
         """Return the same where the battery must last for each sortie."""
-        usable_l, usable_wh = self._limits.usable_l + 1e-9, self._limits.usable_wh
-        battery = self._limits.battery
+        limits, battery = self._limits, self._limits.battery
         assert battery is not None
-        longest_s = usable_wh * J_WH / min(battery.hover_w, battery.cruise_w)
-        best_s: list[float] = []
+        stops = self.stops
+        begun = [_Sum(), *(stop.on for stop in stops)]
+        load = np.array([0.0, *(stop.load for stop in stops)])
+        out_s = np.array([self._first_home_s, *(stop.home_on_s for stop in stops)])
+        on_s, on_cruise_s, on_weight = np.array(begun).T
+        to_s, to_cruise_s, to_weight = np.array([stop.to for stop in stops]).T
+        home_s = np.array([stop.home_s for stop in stops])
+        longest_s = limits.usable_wh * J_WH / min(battery.hover_w, battery.cruise_w)
+        # A sortie to a place begins behind one of these at the earliest; `known` begins at -1.
+        first = np.maximum(
+            np.searchsorted(load, load[1:] - limits.usable_l - 1e-9),
+            np.searchsorted(np.maximum.accumulate(on_s), to_s - longest_s),
+        )
+        known_s = np.full(len(stops) + 1, math.inf)
+        known_s[0] = 0.0
         before: list[int] = []
-        for at, stop in enumerate(self.stops):
-            least_s, best = math.inf, -1
-            for one in range(at - 1, -2, -1):
-                start_l = self.stops[one].load if one >= 0 else 0.0
-                start_s = self.stops[one].on.seconds if one >= 0 else 0.0
-                if stop.load - start_l > usable_l or stop.to.seconds - start_s > longest_s:
-                    break
-                known_s = best_s[one] if one >= 0 else 0.0
-                if not known_s < least_s:
-                    continue
-                found = self.flown(one, at)
-                if found.wh <= usable_wh and known_s + found.seconds < least_s:
-                    least_s, best = known_s + found.seconds, one
-            best_s.append(least_s)
-            before.append(best)
-        return before if math.isfinite(best_s[-1]) else None
+        for block in range(0, len(stops), BLOCK):
+            end = min(block + BLOCK, len(stops))
+            low = min(int(first[block:end].min()), end - 1)
+            some, rows = slice(low, end), slice(block, end)
+            between_s = to_s[rows, None] - on_s[some]
+            wh = _used_wh(
+                limits, battery,
+                between_s=between_s,
+                cruise_s=to_cruise_s[rows, None] - on_cruise_s[some],
+                gone=(load[1:][rows, None] * between_s, to_weight[rows, None] - on_weight[some]),
+                litres=load[1:][rows, None] - load[some],
+                out_s=np.broadcast_to(out_s[some], between_s.shape),
+                back_s=np.broadcast_to(home_s[rows, None], between_s.shape),
+            )  # fmt: skip
+            seconds = out_s[some] + between_s + home_s[rows, None]
+            place = np.arange(low, end)
+            is_too_far = (place < first[rows, None]) | (place > np.arange(block, end)[:, None])
+            seconds[is_too_far | ~(wh <= limits.usable_wh)] = math.inf
+            for at, row in enumerate(seconds, start=block):
+                whole_s = known_s[some] + row
+                # The nearest of those that take the same.
+                best = len(whole_s) - 1 - int(whole_s[::-1].argmin())
+                known_s[at + 1] = whole_s[best]
+                before.append(low + best - 1)
+        return before if math.isfinite(known_s[-1]) else None
 
     def sorties(self, before: list[int]) -> tuple[float, list[list[Part]]]:
         """Return the time and the sorties that these choices lead to."""
