@@ -145,7 +145,7 @@ class Fences:
         for aside_m in ASIDE_M:
             if fitting:
                 break
-            part = whole.intersection(way.buffer(aside_m, quad_segs=2))
+            part = whole.intersection(_beside(way, aside_m))
             near = shapely.union_all([Polygon(each.exterior) for each in polygons_of(part)])
             borders = self._borders(near, whole, PART_SIMPLER_M)
             tried += borders
@@ -293,6 +293,14 @@ def fence_warnings(plan: Plan, fences: Fences) -> tuple[str, ...]:
         f"the fence has no room for {most} of {len(fences.obstacles)} obstacles, the smallest: the "
         f"passes keep clear of them, but {name} would not stop the aircraft there",
     )
+
+
+def _beside(way: BaseGeometry, aside_m: float) -> BaseGeometry:
+    """Return the ground within a distance of a way.
+
+    A swept way crosses its own buffer everywhere: leg by leg it takes a tenth of the time.
+    """
+    return shapely.union_all(shapely.buffer(shapely.get_parts(way), aside_m, quad_segs=2))
 
 
 def _corners(part: Polygon) -> int:
