@@ -12,7 +12,8 @@ from missions.energy import nose_s, sortie_wh
 from missions.errors import PlanError
 from missions.paced import Paced
 from missions.plan import Leg, Settings, Sortie
-from missions.sorties import Flying, plan_sorties
+from missions.refills import Part
+from missions.sorties import Flying, SortieSearch
 from missions.speeds import choices, chosen, stretches_of
 from missions.strips import Floats
 from missions.turns import Motion
@@ -46,12 +47,18 @@ def flown(
     battery = settings.battery
     usable_wh = math.inf if battery is None else battery.usable_wh
     pace_s_m = line_pace(lines, rates, settings) if math.isfinite(usable_wh) else None
+    flying = Flying(motion=motion, pace_s_m=pace_s_m, any_depot=any_depot)
+    search = SortieSearch(lines=lines, demand=demand, ways=ways, settings=settings, flying=flying)
+    one = search.in_one()
+    if one is not None:
+        found = pace(one)
+        if most_wh(found.sorties, settings) <= usable_wh:
+            return found
     share = 1.0
+    parts: list[list[Part]] = []
     for _ in range(ROUNDS):
-        flying = Flying(
-            motion=motion, pace_s_m=pace_s_m, battery_share=share, any_depot=any_depot
-        )  # fmt: skip
-        found = pace(plan_sorties(lines, demand, ways, settings, flying))
+        parts, sorties = search.several(share, before=parts)
+        found = pace(sorties)
         worst_wh = most_wh(found.sorties, settings)
         if worst_wh <= usable_wh:
             return found

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from missions.refills import (
     Passes,
     Times,
     flown_by,
+    joined_parts,
     plainly,
     split,
 )
@@ -42,6 +44,8 @@ BAND_MIN_M = 40.0
 # A part in a sortie that is regrouped takes as long as so many moves of the annealing; sorties of
 # few parts have a trial's own costs. A sortie needs no more trials than some.
 MOVES_A_PART, PARTS_MIN, TRIALS_A_SORTIE = 4, 3.3, 60
+# A search that goes on from sorties that were found before needs fewer.
+AGAIN = 4
 # The way home is known at places so far apart along lines that the depot does not see.
 BENT_STEP_M, BENT_MAX = 100.0, 2000
 
@@ -101,17 +105,23 @@ def several(
     planned: Sequence[Part],
     known: Sequence[Sorties],
     *,
+    before: Sequence[list[Part]] = (),
     moves: int,
     seed: int,
 ) -> list[Sorties]:
     """Return sorties that fly the parts: the best ones, and the plain ones of the planned order.
 
-    `known` are sorties that were made elsewhere. Both are timed as they are flown in the end.
+    `known` are sorties that were made elsewhere; all are timed as they are flown in the end. With
+    `before`, sorties for which the battery did not last, the search goes on from these.
     """
     plain = plainly(passes, limits, planned)
     found = [each for each in (plain, *known) if each]
     course = main_course(passes.lines)
-    runs = [list(planned), *_by_bands(passes, limits, planned, course)]
+    if before:
+        runs: Iterable[list[Part]] = [joined_parts([*chain.from_iterable(before)])]
+        moves //= AGAIN
+    else:
+        runs = chain([list(planned)], _by_bands(passes, limits, planned, course))
     for run in runs:
         halves = split(passes, limits, run)
         if halves is not None:

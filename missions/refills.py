@@ -275,35 +275,40 @@ class Flown:
 
 def flown_by(passes: Passes, limits: Limits, run: Sequence[Part]) -> Flown:
     """Return what a sortie along these parts takes."""
-    cut = _Run(passes, limits, run, [])
-    return cut.flown(-1, len(cut.stops) - 1)
+    begun = None
+    for part in run:
+        begun = _begun(passes, limits, begun, part)
+    assert begun is not None
+    return begun.flown(passes, limits)
 
 
 def plainly(passes: Passes, limits: Limits, run: Sequence[Part]) -> list[list[Part]] | None:
     """Return the run in sorties: home where the tank or the battery demands, and on from there."""
     sorties: list[list[Part]] = []
     sortie: list[Part] = []
+    begun = None
     left_l = limits.usable_l
     waiting = list(reversed(run))
     while waiting:
         part = waiting.pop()
         line, start_m, end_m = part
         to_m = end_m if passes.need_l(part) <= left_l else passes.after_m(part, left_l)
-        to_m = _lasts(passes, limits, sortie, (line, start_m, to_m))
+        to_m = _lasts(passes, limits, begun, (line, start_m, to_m))
         if abs(to_m - start_m) > TOUCH_M:
             sortie.append((line, start_m, to_m))
+            begun = _begun(passes, limits, begun, sortie[-1])
             left_l -= passes.need_l(sortie[-1])
         elif not sortie:
             return None
         if abs(end_m - to_m) <= TOUCH_M:
             continue
         sorties.append(sortie)
-        sortie, left_l = [], limits.usable_l
+        sortie, begun, left_l = [], None, limits.usable_l
         waiting.append((line, to_m, end_m))
     return [*sorties, sortie] if sortie else sorties
 
 
-def _lasts(passes: Passes, limits: Limits, sortie: list[Part], part: Part) -> float:
+def _lasts(passes: Passes, limits: Limits, begun: _Begun | None, part: Part) -> float:
     """Return up to where on a part the battery lasts, the way home with it."""
     line, low, high = part
     if limits.battery is None or abs(high - low) <= TOUCH_M:
@@ -312,8 +317,8 @@ def _lasts(passes: Passes, limits: Limits, sortie: list[Part], part: Part) -> fl
     def lasts(at_m: float) -> bool:
         if abs(at_m - part[1]) <= TOUCH_M:
             return True
-        whole = flown_by(passes, limits, [*sortie, (line, part[1], at_m)])
-        return whole.wh <= limits.usable_wh
+        whole = _begun(passes, limits, begun, (line, part[1], at_m))
+        return whole.flown(passes, limits).wh <= limits.usable_wh
 
     if lasts(high):
         return high
@@ -411,6 +416,79 @@ class _Sum(NamedTuple):
     weight: float = 0.0
 
 
+class _Begun(NamedTuple):
+    """A sortie up to the end of some part: the ferry to its first, the sums, the litres."""
+
+    out_s: float
+    sums: _Sum
+    load: float
+    last: Part
+
+    def flown(self, passes: Passes, limits: Limits) -> Flown:
+        """Return what the sortie takes that flies home from here."""
+        back_s = _home_s(passes, limits, self.last[0], self.last[2])
+        return _flown(
+            limits, self.sums, end_l=self.load, litres=self.load, out_s=self.out_s, back_s=back_s
+        )
+
+
+def _begun(passes: Passes, limits: Limits, before: _Begun | None, part: Part) -> _Begun:
+    """Return a sortie that flies one part more, or begins with it."""
+    need_l = passes.need_l(part)
+    if before is None:
+        out_s = _home_s(passes, limits, part[0], part[1])
+        return _Begun(out_s, _flown_on(passes, _Sum(), part, 0.0, need_l), need_l, part)
+    here = _joined(passes, limits, before.sums, (before.last, part), before.load)
+    sums = _flown_on(passes, here, part, before.load, need_l)
+    return _Begun(before.out_s, sums, before.load + need_l, part)
+
+
+def _flown(
+    limits: Limits, between: _Sum, *, end_l: float, litres: float, out_s: float, back_s: float
+) -> Flown:
+    """Return what a sortie takes between the sums of its ends; its last place is at `end_l`."""
+    wh = 0.0
+    if limits.battery is not None:
+        wh = _used_wh(
+            limits, limits.battery,
+            between_s=between.seconds, cruise_s=between.cruise_s,
+            gone=(end_l * between.seconds, between.weight),
+            litres=litres, out_s=out_s, back_s=back_s,
+        )  # fmt: skip
+    return Flown(seconds=out_s + between.seconds + back_s, litres=litres, wh=wh)
+
+
+def _home_s(passes: Passes, limits: Limits, line: int, at_m: float) -> float:
+    """Return the time of a ferry, with half of a landing."""
+    home_m = passes.home_m(line, at_m, passes.place(line, at_m))
+    return limits.landing_s / 2.0 + passes.times.leg_s(home_m)
+
+
+def _part_s(passes: Passes, line: int, length_m: float) -> float:
+    slow_s_m = passes.pace_s_m[line] - 1.0 / passes.speed_m_s
+    return passes.times.leg_s(length_m) + slow_s_m * length_m
+
+
+def _flown_on(passes: Passes, here: _Sum, part: Part, load: float, need_l: float) -> _Sum:
+    line, start_m, end_m = part
+    length_m = abs(end_m - start_m)
+    seconds = _part_s(passes, line, length_m)
+    return _Sum(
+        here.seconds + seconds,
+        here.cruise_s + passes.pace_s_m[line] * length_m,
+        here.weight + (load + need_l / 2.0) * seconds,
+    )
+
+
+def _joined(
+    passes: Passes, limits: Limits, here: _Sum, parts: tuple[Part, Part], load: float
+) -> _Sum:
+    seconds, gap_m = passes.join_s(*parts)
+    seconds += limits.nose_s
+    moving_s = min(gap_m / passes.speed_m_s, max(seconds, 0.0))
+    return _Sum(here.seconds + seconds, here.cruise_s + moving_s, here.weight + load * seconds)
+
+
 class _Stop(NamedTuple):
     """A place at which a run may be cut, behind so many litres.
 
@@ -439,12 +517,12 @@ class _Run:
         self._passes, self._limits, self._run = passes, limits, run
         self.stops: list[_Stop] = []
         line, start_m, _ = run[0]
-        self._first_home_s = self._home_s(line, start_m)
+        self._first_home_s = _home_s(passes, limits, line, start_m)
         load, here, cut = 0.0, _Sum(), 0
         for number, part in enumerate(run):
             line, start_m, end_m = part
             need_l = passes.need_l(part)
-            end = self._flown_on(here, part, load, need_l)
+            end = _flown_on(passes, here, part, load, need_l)
             until = bisect_left(cuts_l, load + need_l, cut)
             self._cut(number, here, end, (load, need_l), cuts_l[cut:until])
             cut = until
@@ -452,57 +530,32 @@ class _Run:
             here, home_on_s = end, 0.0
             if number < len(run) - 1:
                 following = run[number + 1]
-                here = self._joined(end, part, following, load)
-                home_on_s = self._home_s(following[0], following[1])
-            home_s = self._home_s(line, end_m)
+                here = _joined(passes, limits, end, (part, following), load)
+                home_on_s = _home_s(passes, limits, following[0], following[1])
+            home_s = _home_s(passes, limits, line, end_m)
             self.stops.append(_Stop(load, number, end_m, end, here, home_s, home_on_s))
-
-    def _home_s(self, line: int, at_m: float) -> float:
-        """Return the time of a ferry, with half of a landing."""
-        passes = self._passes
-        home_m = passes.home_m(line, at_m, passes.place(line, at_m))
-        return self._limits.landing_s / 2.0 + passes.times.leg_s(home_m)
-
-    def _part_s(self, line: int, length_m: float) -> float:
-        slow_s_m = self._passes.pace_s_m[line] - 1.0 / self._passes.speed_m_s
-        return self._passes.times.leg_s(length_m) + slow_s_m * length_m
-
-    def _flown_on(self, here: _Sum, part: Part, load: float, need_l: float) -> _Sum:
-        line, start_m, end_m = part
-        length_m = abs(end_m - start_m)
-        seconds = self._part_s(line, length_m)
-        return _Sum(
-            here.seconds + seconds,
-            here.cruise_s + self._passes.pace_s_m[line] * length_m,
-            here.weight + (load + need_l / 2.0) * seconds,
-        )
-
-    def _joined(self, here: _Sum, part: Part, following: Part, load: float) -> _Sum:
-        seconds, gap_m = self._passes.join_s(part, following)
-        seconds += self._limits.nose_s
-        moving_s = min(gap_m / self._passes.speed_m_s, max(seconds, 0.0))
-        return _Sum(here.seconds + seconds, here.cruise_s + moving_s, here.weight + load * seconds)
 
     def _cut(
         self, number: int, here: _Sum, end: _Sum, loads: tuple[float, float],
         cuts_l: Sequence[float],
     ) -> None:  # fmt: skip
         """Add the places inside a part, those too near to its ends left out."""
+        passes, limits = self._passes, self._limits
         (load, need_l), part = loads, self._run[number]
         line, start_m, end_m = part
         last_m = start_m
         for cut_l in cuts_l:
             used_l = cut_l - load
-            cut_m = self._passes.after_m(part, used_l) if used_l > 0.0 else start_m
+            cut_m = passes.after_m(part, used_l) if used_l > 0.0 else start_m
             done_m, left_m = abs(cut_m - start_m), abs(end_m - cut_m)
             if done_m < STUB_M or left_m < STUB_M or abs(cut_m - last_m) < TOUCH_M:
                 continue
             last_m = cut_m
-            to = self._flown_on(here, (line, start_m, cut_m), load, used_l)
-            left_s = self._part_s(line, left_m)
+            to = _flown_on(passes, here, (line, start_m, cut_m), load, used_l)
+            left_s = _part_s(passes, line, left_m)
             left_weight = (load + (used_l + need_l) / 2.0) * left_s
             on = _Sum(end.seconds - left_s, to.cruise_s, end.weight - left_weight)
-            home_s = self._home_s(line, cut_m)
+            home_s = _home_s(passes, limits, line, cut_m)
             self.stops.append(_Stop(cut_l, number, cut_m, to, on, home_s, home_s))
 
     def flown(self, one: int, other: int) -> Flown:
@@ -512,17 +565,11 @@ class _Run:
         if one >= 0:
             start = self.stops[one]
             load, begun, out_s = start.load, start.on, start.home_on_s
-        between_s, litres = stop.to.seconds - begun.seconds, stop.load - load
-        wh = 0.0
-        if self._limits.battery is not None:
-            wh = _used_wh(
-                self._limits, self._limits.battery,
-                between_s=between_s,
-                cruise_s=stop.to.cruise_s - begun.cruise_s,
-                gone=(stop.load * between_s, stop.to.weight - begun.weight),
-                litres=litres, out_s=out_s, back_s=stop.home_s,
-            )  # fmt: skip
-        return Flown(seconds=out_s + between_s + stop.home_s, litres=litres, wh=wh)
+        between = _Sum(*(end - start for end, start in zip(stop.to, begun, strict=True)))
+        return _flown(
+            self._limits, between,
+            end_l=stop.load, litres=stop.load - load, out_s=out_s, back_s=stop.home_s,
+        )  # fmt: skip
 
     def by_tank(self) -> list[int] | None:
         """Return, for each place, from behind which one its sortie comes at the least time."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import shapely
@@ -45,78 +46,140 @@ TOUCH_M = 1e-3
 MOVES_A_KICK = 100
 # An order that is cut into many sorties is worth less of it.
 FEWER_KICKS = 8
+# A sortie that needs so much of a battery by the search's model may, as it is flown, need all.
+NEARLY = 1.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flying:
     """How lines are flown: `pace_s_m` is the time of a metre of each line, where rates slow it.
 
-    `battery_share` is how much of what the battery may give a sortie is planned with: the search
-    knows turns and speeds only nearly. With `any_depot` the depots are a choice, of which one is
-    taken when the sortie is known.
+    With `any_depot` the depots are a choice, of which one is taken when the sortie is known.
     """
 
     motion: Motion
     pace_s_m: Floats | None = None
-    battery_share: float = 1.0
     any_depot: bool = False
 
 
-def plan_sorties(
-    lines: Floats, demand: list[Demand], ways: Ways, settings: Settings, flying: Flying
-) -> tuple[Sortie, ...]:
-    """Return all sorties, each within a tank and a battery."""
-    piece_max_l = _piece_max_l(demand, settings)
-    run_in_m = settings.speed_m_s**2 / (2.0 * settings.acceleration_m_s2)
-    whole = cut(lines, demand, piece_max_l=math.inf, margin_m=run_in_m)
-    is_one = not _has_battery(settings) and float(whole.litres.sum()) <= settings.usable_l
-    kicks = settings.moves // (MOVES_A_KICK if is_one else MOVES_A_KICK * FEWER_KICKS)
-    planned = _in_one(whole, ways, settings, flying, kicks=kicks)
-    if is_one:
-        return _drawn(whole, [planned], ways, flying.motion)
-    pieces = cut(
-        lines, demand, piece_max_l=piece_max_l,
-        piece_max_m=_piece_max_m(demand, settings, flying), margin_m=run_in_m,
-    )  # fmt: skip
-    passes = build_passes(lines, demand, ways, flying.motion, flying.pace_s_m)
-    limits = build_limits(settings, flying.battery_share)
-    run = [_part(passes, whole, enter) for enter in planned]
-    known: list[list[list[Part]]] = []
-    if len(pieces) <= ANNEALED_MAX:
-        orders = _annealed(pieces, ways, settings, flying)
-        known = [[[_part(passes, pieces, enter) for enter in order] for order in orders]]
-    found = several(passes, limits, run, known, moves=settings.moves, seed=settings.seed)
-    if not found:
-        parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
-        raise _too_far(passes, limits, parts, ways, settings)
-    return min(
-        (_drawn(*_as_pieces(passes, each), ways, flying.motion) for each in found),
-        key=lambda sorties: _total_s(sorties, settings),
-    )
+@dataclass(frozen=True, kw_only=True)
+class SortieSearch:
+    """The search for the sorties of some lines, each within a tank and a battery.
 
+    It knows turns and speeds only nearly. Where the battery does not last for what it found, it is
+    asked again with a share of the battery: what does not depend on that share is known then, and
+    it goes on from the sorties before.
+    """
 
-def _in_one(whole: Pieces, ways: Ways, settings: Settings, flying: Flying, *, kicks: int) -> Order:
-    """Return the order of all lines that an endless tank would take."""
-    network = build_network(
-        whole, ways.depots, ways.inside, flying.motion, refill_s=settings.refill_s
-    )
-    if flying.any_depot:
-        network.put_depot_anywhere()
-    order = one_chain(network, by_savings(network, math.inf))
-    return shortest_tour(network, order, kicks=kicks, seed=settings.seed)
+    lines: Floats
+    demand: list[Demand]
+    ways: Ways
+    settings: Settings
+    flying: Flying
 
+    def in_one(self) -> tuple[Sortie, ...] | None:
+        """Return one sortie for everything; None where tank or battery cannot last for it."""
+        settings = self.settings
+        whole = self._whole
+        if not float(whole.litres.sum()) <= settings.usable_l:
+            return None
+        if _has_battery(settings):
+            limits = build_limits(settings, 1.0)
+            run = self._run(self._in_order(settings.moves // (MOVES_A_KICK * FEWER_KICKS)))
+            if flown_by(self._passes, limits, run).wh > NEARLY * limits.usable_wh:
+                return None
+        order = self._in_order(settings.moves // MOVES_A_KICK)
+        return _drawn(whole, [order], self.ways, self.flying.motion)
 
-def _annealed(pieces: Pieces, ways: Ways, settings: Settings, flying: Flying) -> list[Order]:
-    """Return sorties of pieces that were joined by savings and moved about."""
-    network = build_network(
-        pieces, ways.depots, ways.inside, flying.motion, refill_s=settings.refill_s
-    )
-    budget = _budget(network, pieces, settings, flying)
-    lasts = None if budget is None else budget.lasts
-    orders = by_savings(network, settings.usable_l, lasts=lasts)
-    return improve(
-        network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed, lasts=lasts
-    )
+    def several(
+        self, battery_share: float = 1.0, *, before: Sequence[list[Part]] = ()
+    ) -> tuple[list[list[Part]], tuple[Sortie, ...]]:
+        """Return the parts of lines that each sortie flies, and the sorties.
+
+        Raises:
+            PlanError: where a tank or a battery does not last for any.
+        """
+        passes, settings, pieces = self._passes, self.settings, self._pieces
+        limits = build_limits(settings, battery_share)
+        order = self._in_order(settings.moves // (MOVES_A_KICK * FEWER_KICKS))
+        known: list[list[list[Part]]] = []
+        if not before and len(pieces) <= ANNEALED_MAX:
+            orders = self._annealed(battery_share)
+            known = [[[_part(passes, pieces, enter) for enter in order] for order in orders]]
+        found = several(
+            passes, limits, self._run(order), known,
+            before=before, moves=settings.moves, seed=settings.seed,
+        )  # fmt: skip
+        if not found:
+            parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
+            raise _too_far(passes, limits, parts, self.ways, settings)
+        drawn = [_drawn(*_as_pieces(passes, each), self.ways, self.flying.motion) for each in found]
+        taken = min(range(len(found)), key=lambda at: _total_s(drawn[at], settings))
+        return found[taken], drawn[taken]
+
+    @cached_property
+    def _margin_m(self) -> float:
+        return self.settings.speed_m_s**2 / (2.0 * self.settings.acceleration_m_s2)
+
+    @cached_property
+    def _whole(self) -> Pieces:
+        """Return the lines, none cut."""
+        return cut(self.lines, self.demand, piece_max_l=math.inf, margin_m=self._margin_m)
+
+    @cached_property
+    def _pieces(self) -> Pieces:
+        settings = self.settings
+        return cut(
+            self.lines, self.demand, piece_max_l=_piece_max_l(self.demand, settings),
+            piece_max_m=_piece_max_m(self.demand, settings, self.flying), margin_m=self._margin_m,
+        )  # fmt: skip
+
+    @cached_property
+    def _passes(self) -> Passes:
+        flying = self.flying
+        return build_passes(self.lines, self.demand, self.ways, flying.motion, flying.pace_s_m)
+
+    def _run(self, order: Order) -> list[Part]:
+        return [_part(self._passes, self._whole, enter) for enter in order]
+
+    @cached_property
+    def _network(self) -> Network:
+        network = self._network_of(self._whole)
+        if self.flying.any_depot:
+            network.put_depot_anywhere()
+        return network
+
+    def _network_of(self, pieces: Pieces) -> Network:
+        return build_network(
+            pieces, self.ways.depots, self.ways.inside, self.flying.motion,
+            refill_s=self.settings.refill_s,
+        )  # fmt: skip
+
+    def _in_order(self, kicks: int) -> Order:
+        """Return the order of all lines that an endless tank would take."""
+        if kicks not in self._orders:
+            network = self._network
+            order = one_chain(network, by_savings(network, math.inf))
+            self._orders[kicks] = shortest_tour(
+                network, order, kicks=kicks, seed=self.settings.seed
+            )
+        return self._orders[kicks]
+
+    @cached_property
+    def _orders(self) -> dict[int, Order]:
+        return {}
+
+    def _annealed(self, battery_share: float) -> list[Order]:
+        """Return sorties of pieces that were joined by savings and moved about."""
+        settings = self.settings
+        network = self._network_of(self._pieces)
+        budget = _budget(network, self._pieces, settings, self.flying, battery_share)
+        lasts = None if budget is None else budget.lasts
+        orders = by_savings(network, settings.usable_l, lasts=lasts)
+        return improve(
+            network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed,
+            lasts=lasts,
+        )  # fmt: skip
 
 
 def _has_battery(settings: Settings) -> bool:
@@ -214,7 +277,9 @@ def _piece_max_m(demand: Sequence[Demand], settings: Settings, flying: Flying) -
     return max(run_m / PIECES_A_TANK, least_m, settings.speed_m_s**2 / settings.acceleration_m_s2)
 
 
-def _budget(network: Network, pieces: Pieces, settings: Settings, flying: Flying) -> Budget | None:
+def _budget(
+    network: Network, pieces: Pieces, settings: Settings, flying: Flying, battery_share: float
+) -> Budget | None:
     """Return what a battery lasts for; None without one."""
     battery = settings.battery
     if battery is None or battery.capacity_wh is None:
@@ -227,7 +292,7 @@ def _budget(network: Network, pieces: Pieces, settings: Settings, flying: Flying
         vertical=settings.vertical, height_m=settings.height_m,
         ferry_height_m=settings.ferry_height_m, reserve_l=settings.reserve_l,
         nose_rate_deg_s=settings.nose_rate_deg_s, refill_s=settings.refill_s,
-        limit_wh=battery.usable_wh * flying.battery_share,
+        limit_wh=battery.usable_wh * battery_share,
     )  # fmt: skip
 
 
