@@ -207,7 +207,7 @@ class Passes:
         known = self.known_m.get((one, other))
         if known is None:
             known = gap_m
-            if not shapely.covers(self.space.space, shapely.LineString([one, other])):
+            if not shapely.contains_properly(self.space.space, shapely.LineString([one, other])):
                 known = self.space.around_m(one, other)
                 known = known if math.isfinite(known) else HIDDEN * gap_m + HIDDEN_M
             self.known_m[one, other] = self.known_m[other, one] = known
