@@ -14,8 +14,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import shapely
-from shapely import LineString, Polygon
+from shapely import LineString, Polygon, STRtree
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
@@ -179,6 +180,7 @@ class Fences:
         """Return borders around some ground and how far outside the field, the nearest first."""
         shapely.prepare(ground)
         shapely.prepare(field)
+        edges = _edges(field)
         found = []
         for simpler_m in simpler:
             # Bays in which it would be no farther from the field are closed, and a first, quick
@@ -187,8 +189,7 @@ class Fences:
             wider = ground.buffer(wide_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
             closed = wider.buffer(-simpler_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
             border = around_with_fewer_corners(closed.simplify(QUICK_M), simpler_m)
-            points = shapely.points(shapely.get_coordinates(shapely.segmentize(border, STEP_M)))
-            outside_m = float(shapely.distance(field, points).max())
+            outside_m = _outside_m(border, field, edges)
             if outside_m <= OUTSIDE_MAX_M and border.covers(ground):
                 found.append((outside_m, border))
         return found
@@ -301,6 +302,22 @@ def _beside(way: BaseGeometry, aside_m: float) -> BaseGeometry:
     A swept way crosses its own buffer everywhere: leg by leg it takes a tenth of the time.
     """
     return shapely.union_all(shapely.buffer(shapely.get_parts(way), aside_m, quad_segs=2))
+
+
+def _edges(field: BaseGeometry) -> STRtree:
+    """Return the edges of a field, quick to find the nearest of."""
+    rings = shapely.get_rings(shapely.get_parts(field))
+    points, ring = shapely.get_coordinates(rings, return_index=True)
+    both = np.stack([points[:-1], points[1:]], axis=1)[ring[1:] == ring[:-1]]
+    return STRtree(shapely.linestrings(both))
+
+
+def _outside_m(border: BaseGeometry, field: BaseGeometry, edges: STRtree) -> float:
+    """Return how far outside the field a border lies at most."""
+    places = shapely.get_coordinates(shapely.segmentize(border, STEP_M))
+    places = places[~shapely.contains_xy(field, places)]
+    _, far_m = edges.query_nearest(shapely.points(places), return_distance=True, all_matches=False)
+    return float(far_m.max(initial=0.0))
 
 
 def _corners(part: Polygon) -> int:

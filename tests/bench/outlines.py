@@ -32,11 +32,9 @@ from time import process_time
 from typing import Any
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 
-from companion.errors import VrsprayError
-from missions.cli import plan as vrspray_plan
+from companion.cli.app import execute
 from tests.bench.parcels import KINDS, Parcel, parcel, read_parcel
 from tests.bench.peers import PEERS, lines_of, tanks, way_of_lines
 from tests.mission_fields import trees
@@ -127,6 +125,10 @@ class Planned:
     fence_refused: str | None
 
 
+class RefusedError(Exception):
+    """No plan, and the command says why."""
+
+
 def run(each: Parcel) -> dict[str, Any]:
     """Return all figures of an outline, or why there is no plan."""
     with tempfile.TemporaryDirectory(prefix="vrspray-bench-") as scratch:
@@ -138,7 +140,7 @@ def run(each: Parcel) -> dict[str, Any]:
         _limit_cpu(begun + CPU_LIMIT_S)
         try:
             planned, took_s = _planned(outline, obstacles, config)
-        except (VrsprayError, typer.BadParameter) as error:
+        except RefusedError as error:
             return {"refused": str(error), "cpu_s": process_time() - begun}
         except Exception:  # noqa: BLE001 - a traceback is what this looks for
             return {"broken": traceback.format_exc(limit=-4), "cpu_s": process_time() - begun}
@@ -164,19 +166,17 @@ def _planned(outline: Path, obstacles: Path | None, config: Path) -> tuple[Plann
     for suffix in (".plan", ".waypoints"):
         said = io.StringIO()
         begun = process_time()
-        try:
-            with redirect_stdout(said), redirect_stderr(io.StringIO()):
-                vrspray_plan(
-                    outline, outline.with_suffix(suffix), config=config, as_json=True,
-                    obstacle=None if obstacles is None else [obstacles],
-                )  # fmt: skip
-        except VrsprayError as error:
-            if suffix == ".waypoints" or "fence" not in str(error):
-                raise
-            refused, took_s = str(error), process_time() - begun
+        command = ["plan", outline, "--out", outline.with_suffix(suffix), "--config", config]
+        command += ["--json"] if obstacles is None else ["--json", "--obstacle", obstacles]
+        with redirect_stdout(said), redirect_stderr(io.StringIO()):
+            code = execute([str(each) for each in command])
+        told = json.loads(said.getvalue())
+        if code:
+            if suffix == ".waypoints" or "fence" not in told["error"]:
+                raise RefusedError(told["error"])
+            refused, took_s = told["error"], process_time() - begun
             continue
         took_s = took_s or process_time() - begun
-        told = json.loads(said.getvalue())
         missions = [Path(path) for path in told["files"]]
         texts = [path.read_text(encoding="utf-8") for path in missions]
         fenced = [json.loads(text) for text in texts] if suffix == ".plan" else []
