@@ -46,6 +46,8 @@ BAND_MIN_M = 40.0
 MOVES_A_PART, PARTS_MIN, TRIALS_A_SORTIE = 4, 3.3, 60
 # A search that goes on from sorties that were found before needs fewer.
 AGAIN = 4
+# The search knows the time of a flight to a few percent.
+CLEARLY = 1.1
 # The way home is known at places so far apart along lines that the depot does not see.
 BENT_STEP_M, BENT_MAX = 100.0, 2000
 
@@ -109,7 +111,7 @@ def several(
     moves: int,
     seed: int,
 ) -> list[Sorties]:
-    """Return sorties that fly the parts: the best ones, and the plain ones of the planned order.
+    """Return sorties that fly the parts: the best ones, and plain ones that take hardly longer.
 
     `known` are sorties that were made elsewhere; all are timed as they are flown in the end. With
     `before`, sorties for which the battery did not last, the search goes on from these.
@@ -133,7 +135,10 @@ def several(
     parts = max(sum(len(sortie) for sortie in best) / len(best), PARTS_MIN)
     trials = min(int(moves / (MOVES_A_PART * parts)), TRIALS_A_SORTIE * len(best))
     better = regrouped(passes, limits, best, course, trials=trials, seed=seed)
-    return [some for some in (better, plain) if some]
+    # What takes clearly longer by the search's model is not drawn and timed as it is flown.
+    longest_s = CLEARLY * min(costs)
+    is_near = plain is not None and costs[0] <= longest_s
+    return [better, plain] if plain and is_near else [better]
 
 
 def _by_bands(

@@ -16,7 +16,6 @@ from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-import shapely
 
 from missions.demand import Demand
 from missions.energy import J_WH, KG_L, Battery
@@ -28,6 +27,7 @@ from missions.turns import Motion
 # A line, and from where to where along it [m]; the second is the lesser where it is flown back.
 Part = tuple[int, float, float]
 Place = tuple[float, float]
+Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 # A cut leaves no part shorter than this, which is a tenth of what a refill's ferry mostly is.
 STUB_M = 10.0
@@ -64,8 +64,10 @@ class Times:
     def __init__(self, motion: Motion) -> None:
         self._scale: float = KNOTS / math.sqrt(TABLED_M)
         knots_m = (np.arange(KNOTS + 2) / self._scale) ** 2
+        self._roots: Floats = np.sqrt(knots_m)
         self._legs: list[float] = motion.legs_s(knots_m).tolist()
         self._ways: list[float] = motion.ways_s(knots_m).tolist()
+        self._leg_knots_s, self._way_knots_s = np.array(self._legs), np.array(self._ways)
         self._speed_m_s: float = motion.speed_m_s
         self._leg_more_s: float = self._legs[KNOTS] - float(knots_m[KNOTS]) / motion.speed_m_s
         self._way_more_s: float = self._ways[KNOTS] - float(knots_m[KNOTS]) / motion.speed_m_s
@@ -90,6 +92,20 @@ class Times:
         one_s, other_s = self._ways[low], self._ways[low + 1]
         return one_s + (at - low) * (other_s - one_s)
 
+    def legs_s(self, length_m: Floats) -> Floats:
+        """Return `leg_s` of many lengths."""
+        near_s: Floats = np.interp(np.sqrt(length_m), self._roots, self._leg_knots_s)
+        is_long = length_m >= TABLED_M
+        found_s: Floats = np.where(is_long, length_m / self._speed_m_s + self._leg_more_s, near_s)
+        return found_s
+
+    def ways_s(self, length_m: Floats) -> Floats:
+        """Return `way_s` of many lengths."""
+        near_s: Floats = np.interp(np.sqrt(length_m), self._roots, self._way_knots_s)
+        is_long = length_m >= TABLED_M
+        found_s: Floats = np.where(is_long, length_m / self._speed_m_s + self._way_more_s, near_s)
+        return found_s
+
     def on_s(self, before_m: float, gap_m: float, after_m: float) -> float:
         """Return what a gap adds between two parts of a line that is flown straight on."""
         if gap_m < JOIN_M:
@@ -103,6 +119,95 @@ class Times:
         if self._begins_early:
             return min(one_s / 2.0, other_s / 2.0, self._reaching_s)
         return (one_s + other_s - (one_m + other_m) / self._speed_m_s) / 2.0
+
+
+class _Many:
+    """What `Passes` knows of one place or part, for many of them at once."""
+
+    def __init__(self, passes: Passes) -> None:
+        self._passes = passes
+        self._starts, self._along = passes.lines[:, :2], directions(passes.lines)
+        self._length_m = np.array(passes.length_m)
+        self._even_l_m = np.array(passes.even_l_m)
+        self.pace_s_m = np.array(passes.pace_s_m)
+        self._slow_s_m = self.pace_s_m - 1.0 / passes.speed_m_s
+        self._depots = np.array(passes.depots)
+        self._bent: tuple[Floats, Ints, Ints] | None = None
+
+    def places(self, lines: Ints, at_m: Floats) -> Floats:
+        """Return `Passes.place`."""
+        found: Floats = self._starts[lines] + at_m[:, None] * self._along[lines]
+        return found
+
+    def home_m(self, lines: Ints, at_m: Floats) -> Floats:
+        """Return `Passes.home_m`."""
+        places = self.places(lines, at_m)
+        found_m = np.full(len(lines), math.inf)
+        for east_m, north_m in self._passes.depots:
+            far_m = np.hypot(places[:, 0] - east_m, places[:, 1] - north_m)
+            np.minimum(found_m, far_m, out=found_m)
+        if not self._passes.bent_m:
+            return found_m
+        bent_m, begin, count = self._bent_ways()
+        some = np.flatnonzero(count[lines])
+        line = lines[some]
+        at = at_m[some] / self._length_m[line] * (count[line] - 1)
+        low = np.clip(at.astype(np.int64), 0, count[line] - 2)
+        one_m, other_m = bent_m[begin[line] + low], bent_m[begin[line] + low + 1]
+        found_m[some] = one_m + (at - low) * (other_m - one_m)
+        return found_m
+
+    def _bent_ways(self) -> tuple[Floats, Ints, Ints]:
+        """Return all bent ways home, and of each line where its own begin and how many."""
+        if self._bent is None:
+            count = np.zeros(len(self._length_m), dtype=np.int64)
+            for line, bent_m in self._passes.bent_m.items():
+                count[line] = len(bent_m)
+            ways_m = np.concatenate([bent_m for _, bent_m in sorted(self._passes.bent_m.items())])
+            self._bent = ways_m, np.cumsum(count) - count, count
+        return self._bent
+
+    def needs_l(self, lines: Ints, start_m: Floats, end_m: Floats) -> Floats:
+        """Return `Passes.need_l`."""
+        needs_l = self._even_l_m[lines] * np.abs(end_m - start_m)
+        for at in np.flatnonzero(self._even_l_m[lines] == 0.0).tolist():
+            needs_l[at] = self._passes.need_l((int(lines[at]), start_m[at], end_m[at]))
+        return needs_l
+
+    def after_m(self, lines: Ints, ends_m: Floats, litres: Floats) -> Floats:
+        """Return `Passes.after_m` of parts from and to `ends_m`, shape (2, n)."""
+        start_m, end_m = ends_m
+        even = self._even_l_m[lines]
+        is_even = even > 0.0
+        done_m = np.divide(litres, even, out=np.zeros_like(litres), where=is_even)
+        done_m = np.minimum(done_m, np.abs(end_m - start_m))
+        found_m: Floats = start_m + np.where(end_m > start_m, done_m, -done_m)
+        for at in np.flatnonzero(~is_even).tolist():
+            part = int(lines[at]), float(start_m[at]), float(end_m[at])
+            found_m[at] = self._passes.after_m(part, float(litres[at]))
+        return found_m
+
+    def parts_s(self, lines: Ints, length_m: Floats) -> Floats:
+        """Return how long parts of lines take, from rest to rest."""
+        found_s: Floats = self._passes.times.legs_s(length_m) + self._slow_s_m[lines] * length_m
+        return found_s
+
+    def joins_s(self, lines: Ints, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
+        """Return `Passes.join_s` between each part and the next."""
+        ends, starts = self.places(lines[:-1], end_m[:-1]), self.places(lines[1:], start_m[1:])
+        gap_m: Floats = np.hypot(*(starts - ends).T)
+        is_back = (end_m < start_m)[:, None]
+        away = np.where(is_back, -self._along[lines], self._along[lines])
+        is_on = (gap_m < ACROSS_M) & ((away[:-1] * away[1:]).sum(axis=1) > COSINE)
+        hidden = np.flatnonzero((gap_m > SEEN_M) & ~is_on)
+        if len(hidden) and not self._passes.space.is_convex:
+            gap_m[hidden] = self._passes.gaps_m(ends[hidden], starts[hidden])
+        joins_s: Floats = self._passes.times.ways_s(gap_m)
+        for at in np.flatnonzero(is_on).tolist():
+            before = int(lines[at]), float(start_m[at]), float(end_m[at])
+            after = int(lines[at + 1]), float(start_m[at + 1]), float(end_m[at + 1])
+            joins_s[at], gap_m[at] = self._passes.join_s(before, after)
+        return joins_s, gap_m
 
 
 @dataclass(slots=True, kw_only=True)
@@ -128,6 +233,7 @@ class Passes:
     at_m: list[list[float]] = field(init=False)
     litres: list[list[float]] = field(init=False)
     even_l_m: list[float] = field(init=False)
+    many: _Many = field(init=False)
 
     def __post_init__(self) -> None:
         self.length_m = lengths_m(self.lines).tolist()
@@ -139,6 +245,7 @@ class Passes:
             litres[1] / at_m[1] if len(at_m) == 2 and at_m[0] == 0.0 else 0.0
             for at_m, litres in zip(self.at_m, self.litres, strict=True)
         ]
+        self.many = _Many(self)
 
     def place(self, line: int, at_m: float) -> Place:
         """Return where a place of a line lies."""
@@ -204,14 +311,25 @@ class Passes:
         gap_m = math.hypot(other[0] - one[0], other[1] - one[1])
         if gap_m <= SEEN_M or self.space.is_convex:
             return gap_m
-        known = self.known_m.get((one, other))
-        if known is None:
-            known = gap_m
-            if not shapely.contains_properly(self.space.space, shapely.LineString([one, other])):
-                known = self.space.around_m(one, other)
-                known = known if math.isfinite(known) else HIDDEN * gap_m + HIDDEN_M
-            self.known_m[one, other] = self.known_m[other, one] = known
-        return known
+        return float(self.gaps_m(np.array([one]), np.array([other]))[0])
+
+    def gaps_m(self, ones: Floats, others: Floats) -> Floats:
+        """Return `gap_m` between places that may not see each other."""
+        pairs = [
+            ((x, y), (u, v)) for (x, y), (u, v) in zip(ones.tolist(), others.tolist(), strict=True)
+        ]
+        new = [at for at, pair in enumerate(pairs) if pair not in self.known_m]
+        if new:
+            seen = self.space.sees(ones[new], others[new]).tolist()
+            for at, is_seen in zip(new, seen, strict=True):
+                one, other = pairs[at]
+                gap_m = math.hypot(other[0] - one[0], other[1] - one[1])
+                if not is_seen:
+                    around_m = self.space.around_m(one, other)
+                    is_way = math.isfinite(around_m)
+                    gap_m = around_m if is_way else HIDDEN * gap_m + HIDDEN_M
+                self.known_m[one, other] = self.known_m[other, one] = gap_m
+        return np.array([self.known_m[pair] for pair in pairs])
 
     def _goes_on(self, before: Part, after: Part, one: Place, other: Place, gap_m: float) -> bool:
         (east, north), (x, y) = self.along[before[0]], self.along[after[0]]
@@ -489,86 +607,89 @@ def _joined(
     return _Sum(here.seconds + seconds, here.cruise_s + moving_s, here.weight + load * seconds)
 
 
-class _Stop(NamedTuple):
-    """A place at which a run may be cut, behind so many litres.
-
-    `to` are the sums up to it, `on` those from which a sortie that begins here counts: behind a
-    cut it speeds up again, and behind the end of a part it has been flown to the next one.
-    """
-
-    load: float
-    part: int
-    at_m: float
-    to: _Sum
-    on: _Sum
-    home_s: float
-    home_on_s: float
-
-
 class _Run:
     """A run with the places at which it may be cut, in its order.
 
-    What a sortie takes is a difference of sums, whichever two places it lies between.
+    What a sortie takes is a difference of sums, whichever two places it lies between: of `to`,
+    time, time at speed and weight up to a place, and of `on`, from which a sortie that begins
+    there counts. Behind a cut it speeds up again, and behind the end of a part it has been flown
+    to the next one.
     """
 
     def __init__(
         self, passes: Passes, limits: Limits, run: Sequence[Part], cuts_l: Sequence[float]
     ) -> None:
-        self._passes, self._limits, self._run = passes, limits, run
-        self.stops: list[_Stop] = []
-        line, start_m, _ = run[0]
-        self._first_home_s = _home_s(passes, limits, line, start_m)
-        load, here, cut = 0.0, _Sum(), 0
-        for number, part in enumerate(run):
-            line, start_m, end_m = part
-            need_l = passes.need_l(part)
-            end = _flown_on(passes, here, part, load, need_l)
-            until = bisect_left(cuts_l, load + need_l, cut)
-            self._cut(number, here, end, (load, need_l), cuts_l[cut:until])
-            cut = until
-            load += need_l
-            here, home_on_s = end, 0.0
-            if number < len(run) - 1:
-                following = run[number + 1]
-                here = _joined(passes, limits, end, (part, following), load)
-                home_on_s = _home_s(passes, limits, following[0], following[1])
-            home_s = _home_s(passes, limits, line, end_m)
-            self.stops.append(_Stop(load, number, end_m, end, here, home_s, home_on_s))
+        self._limits, self._run = limits, run
+        many = passes.many
+        lines = np.array([part[0] for part in run])
+        start_m, end_m = np.array([part[1:] for part in run]).T
+        needs_l = many.needs_l(lines, start_m, end_m)
+        load = np.cumsum(needs_l)
+        length_m = np.abs(end_m - start_m)
+        part_s = many.parts_s(lines, length_m)
+        join_s, gap_m = many.joins_s(lines, start_m, end_m)
+        join_s += limits.nose_s
+        # Parts and the ways between them, in turn.
+        steps = np.zeros((3, 2 * len(run)))
+        steps[0, ::2], steps[0, 1:-1:2] = part_s, join_s
+        steps[1, ::2] = many.pace_s_m[lines] * length_m
+        steps[1, 1:-1:2] = np.minimum(gap_m / passes.speed_m_s, np.maximum(join_s, 0.0))
+        steps[2, ::2], steps[2, 1:-1:2] = (load - needs_l / 2.0) * part_s, load[:-1] * join_s
+        sums = np.cumsum(steps, axis=1)
+        ends, joined = sums[:, ::2], sums[:, 1::2]
+        begun = np.concatenate([np.zeros((3, 1)), joined[:, :-1]], axis=1)
 
-    def _cut(
-        self, number: int, here: _Sum, end: _Sum, loads: tuple[float, float],
-        cuts_l: Sequence[float],
-    ) -> None:  # fmt: skip
-        """Add the places inside a part, those too near to its ends left out."""
-        passes, limits = self._passes, self._limits
-        (load, need_l), part = loads, self._run[number]
-        line, start_m, end_m = part
-        last_m = start_m
-        for cut_l in cuts_l:
-            used_l = cut_l - load
-            cut_m = passes.after_m(part, used_l) if used_l > 0.0 else start_m
-            done_m, left_m = abs(cut_m - start_m), abs(end_m - cut_m)
-            if done_m < STUB_M or left_m < STUB_M or abs(cut_m - last_m) < TOUCH_M:
-                continue
-            last_m = cut_m
-            to = _flown_on(passes, here, (line, start_m, cut_m), load, used_l)
-            left_s = _part_s(passes, line, left_m)
-            left_weight = (load + (used_l + need_l) / 2.0) * left_s
-            on = _Sum(end.seconds - left_s, to.cruise_s, end.weight - left_weight)
-            home_s = _home_s(passes, limits, line, cut_m)
-            self.stops.append(_Stop(cut_l, number, cut_m, to, on, home_s, home_s))
+        # Places inside parts, those too near to their ends left out.
+        cut_l = np.array(cuts_l)
+        part = np.searchsorted(load, cut_l, side="right")
+        cut_l, part = cut_l[part < len(run)], part[part < len(run)]
+        used_l = np.maximum(cut_l - (load - needs_l)[part], 0.0)
+        cut_m = many.after_m(lines[part], np.stack([start_m[part], end_m[part]]), used_l)
+        is_apart = np.ones(len(part), dtype=np.bool_)
+        is_apart[1:] = (np.diff(part) > 0) | (np.abs(np.diff(cut_m)) >= TOUCH_M)
+        is_apart &= np.minimum(np.abs(cut_m - start_m[part]), np.abs(end_m[part] - cut_m)) >= STUB_M
+        cut_l, part, used_l, cut_m = (
+            cut_l[is_apart],
+            part[is_apart],
+            used_l[is_apart],
+            cut_m[is_apart],
+        )
+        line, done_m = lines[part], np.abs(cut_m - start_m[part])
+        done_s = many.parts_s(line, done_m)
+        to = begun[:, part] + [
+            done_s, many.pace_s_m[line] * done_m, (cut_l - used_l / 2.0) * done_s
+        ]  # fmt: skip
+        left_s = many.parts_s(line, np.abs(end_m[part] - cut_m))
+        on = ends[:, part].copy()
+        on[0] -= left_s
+        on[1] = to[1]
+        on[2] -= (cut_l + load[part]) / 2.0 * left_s
 
-    def flown(self, one: int, other: int) -> Flown:
+        order = np.argsort(np.concatenate([2 * part, 2 * np.arange(len(run)) + 1]), kind="stable")
+        self.part = np.concatenate([part, np.arange(len(run))])[order]
+        self.load = np.concatenate([cut_l, load])[order]
+        self.at_m = np.concatenate([cut_m, end_m])[order]
+        self.to = np.concatenate([to, ends], axis=1)[:, order]
+        self.on = np.concatenate([on, joined], axis=1)[:, order]
+        home_m = many.home_m(
+            np.concatenate([lines, line, lines]), np.concatenate([start_m, cut_m, end_m])
+        )
+        home_s = limits.landing_s / 2.0 + passes.times.legs_s(home_m)
+        start_s, end_s = home_s[: len(run)], home_s[len(run) :]
+        self._first_home_s = float(start_s[0])
+        self.home_s = end_s[order]
+        self.home_on_s = np.concatenate([end_s[: len(part)], start_s[1:], [0.0]])[order]
+
+    def _flown(self, one: int, other: int) -> Flown:
         """Return what a sortie from behind one place, -1 for the start, to another takes."""
-        stop = self.stops[other]
-        load, begun, out_s = 0.0, _Sum(), self._first_home_s
+        load, begun, out_s = 0.0, np.zeros(3), self._first_home_s
         if one >= 0:
-            start = self.stops[one]
-            load, begun, out_s = start.load, start.on, start.home_on_s
-        between = _Sum(*(end - start for end, start in zip(stop.to, begun, strict=True)))
+            load, begun = float(self.load[one]), self.on[:, one]
+            out_s = float(self.home_on_s[one])
+        end_l = float(self.load[other])
         return _flown(
-            self._limits, between,
-            end_l=stop.load, litres=stop.load - load, out_s=out_s, back_s=stop.home_s,
+            self._limits, _Sum(*(self.to[:, other] - begun).tolist()),
+            end_l=end_l, litres=end_l - load, out_s=out_s, back_s=float(self.home_s[other]),
         )  # fmt: skip
 
     def by_tank(self) -> list[int] | None:
@@ -577,41 +698,41 @@ class _Run:
         before = []
         # Places from which a sortie may still come, the best of them first.
         waiting: deque[tuple[int, float, float]] = deque([(-1, 0.0, self._first_home_s)])
-        for at, stop in enumerate(self.stops):
-            while waiting and waiting[0][1] < stop.load - usable_l:
+        more_s = self.to[0] + self.home_s + self.home_on_s - self.on[0]
+        both = zip(self.load.tolist(), more_s.tolist(), strict=True)
+        for at, (load, taken_s) in enumerate(both):
+            while waiting and waiting[0][1] < load - usable_l:
                 waiting.popleft()
             if not waiting:
                 return None
             from_at, _, cost_s = waiting[0]
             before.append(from_at)
-            cost_s += stop.to.seconds + stop.home_s + stop.home_on_s - stop.on.seconds
+            cost_s += taken_s
             while waiting and waiting[-1][2] >= cost_s:
                 waiting.pop()
-            waiting.append((at, stop.load, cost_s))
+            waiting.append((at, load, cost_s))
         return before
 
     def by_battery(self) -> list[int] | None:
         """Return the same where the battery must last for each sortie."""
         limits, battery = self._limits, self._limits.battery
         assert battery is not None
-        stops = self.stops
-        begun = [_Sum(), *(stop.on for stop in stops)]
-        load = np.array([0.0, *(stop.load for stop in stops)])
-        out_s = np.array([self._first_home_s, *(stop.home_on_s for stop in stops)])
-        on_s, on_cruise_s, on_weight = np.array(begun).T
-        to_s, to_cruise_s, to_weight = np.array([stop.to for stop in stops]).T
-        home_s = np.array([stop.home_s for stop in stops])
+        count = len(self.load)
+        load = np.concatenate([[0.0], self.load])
+        out_s = np.concatenate([[self._first_home_s], self.home_on_s])
+        on_s, on_cruise_s, on_weight = np.concatenate([np.zeros((3, 1)), self.on], axis=1)
+        (to_s, to_cruise_s, to_weight), home_s = self.to, self.home_s
         longest_s = limits.usable_wh * J_WH / min(battery.hover_w, battery.cruise_w)
         # A sortie to a place begins behind one of these at the earliest; `known` begins at -1.
         first = np.maximum(
             np.searchsorted(load, load[1:] - limits.usable_l - 1e-9),
             np.searchsorted(np.maximum.accumulate(on_s), to_s - longest_s),
         )
-        known_s = np.full(len(stops) + 1, math.inf)
+        known_s = np.full(count + 1, math.inf)
         known_s[0] = 0.0
         before: list[int] = []
-        for block in range(0, len(stops), BLOCK):
-            end = min(block + BLOCK, len(stops))
+        for block in range(0, count, BLOCK):
+            end = min(block + BLOCK, count)
             low = min(int(first[block:end].min()), end - 1)
             some, rows = slice(low, end), slice(block, end)
             between_s = to_s[rows, None] - on_s[some]
@@ -638,24 +759,25 @@ class _Run:
 
     def sorties(self, before: list[int]) -> tuple[float, list[list[Part]]]:
         """Return the time and the sorties that these choices lead to."""
-        cuts = [len(self.stops) - 1]
+        cuts = [len(self.load) - 1]
         while before[cuts[-1]] >= 0:
             cuts.append(before[cuts[-1]])
         cuts.reverse()
-        seconds = sum(self.flown(one, other).seconds for one, other in pairwise([-1, *cuts]))
+        seconds = sum(self._flown(one, other).seconds for one, other in pairwise([-1, *cuts]))
         found = []
         waiting = list(reversed(self._run))
         number = 0
         for cut in cuts:
-            stop, sortie = self.stops[cut], []
-            while number < stop.part:
+            sortie: list[Part] = []
+            part, at_m = int(self.part[cut]), float(self.at_m[cut])
+            while number < part:
                 sortie.append(waiting.pop())
                 number += 1
             line, start_m, end_m = waiting.pop()
-            sortie.append((line, start_m, stop.at_m))
-            if stop.at_m == end_m:
+            sortie.append((line, start_m, at_m))
+            if at_m == end_m:
                 number += 1
             else:
-                waiting.append((line, stop.at_m, end_m))
+                waiting.append((line, at_m, end_m))
             found.append(sortie)
         return seconds, found

@@ -118,6 +118,42 @@ def test_sorties_fly_everything_once_and_are_never_worse_than_plain_ones(
     assert seconds_of(passes, limits, better) <= seconds + 0.01
 
 
+class Strips:
+    """A rate that changes from strip to strip, and none in some."""
+
+    def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
+        return np.array([8.0, 0.0, 30.0, 14.0])[(north_m // 90.0).astype(int) % 4]
+
+
+@settings(max_examples=25)
+@given(shape=runs, tank_l=st.floats(0.9, 12.0), wh=st.none() | st.floats(600.0, 1200.0))
+def test_what_is_counted_at_once_is_what_each_sortie_takes(
+    shape: tuple[int, float, float], tank_l: float, wh: float | None
+) -> None:
+    """Rates that change, ways around a lake, ways home that are known from place to place."""
+    count, length_m, east_m = shape
+    lines = np.array(
+        [[east_m + number * WIDTH_M, 10.0, east_m + number * WIDTH_M, 10.0 + length_m]
+         for number in range(count)]
+    )  # fmt: skip
+    lake = box(east_m + 5.0, 12.0 + length_m, east_m + count * WIDTH_M - 8.0, 60.0 + length_m)
+    passes = Passes(
+        lines=lines, demand=demands(lines, Strips(), width_m=WIDTH_M), times=Times(MOTION),
+        depots=[(0.0, 0.0), (100.0, 400.0)], pace_s_m=[1.0 / 6.0 + 0.01 * n for n in range(count)],
+        speed_m_s=6.0, space=free_space(box(-3000.0, -3000.0, 3000.0, 3000.0) - lake),
+    )  # fmt: skip
+    passes.bent_m[count - 1] = [length_m, 1.5 * length_m, 2.0 * length_m]
+    passes.bent_m[0] = [300.0, 200.0]
+    run = [(n, 0.0, length_m) if n % 3 else (n, length_m, 0.0) for n in range(count)]
+    limits = limits_of(tank_l, wh)
+    found = split(passes, limits, run)
+    assert found is not None
+    flown = [flown_by(passes, limits, sortie) for sortie in found[1]]
+    assert found[0] == pytest.approx(sum(each.seconds for each in flown), abs=0.01)
+    assert max(each.litres for each in flown) <= tank_l + 1e-6
+    assert max(each.wh for each in flown) <= (wh or math.inf) + 1e-3
+
+
 def test_a_tank_of_two_passes_is_empty_where_it_began() -> None:
     """Out on one pass and back on the next: only the ways across are ferries."""
     passes, run = serpentine(8, 800.0, 0.0)
