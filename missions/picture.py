@@ -35,7 +35,7 @@ from missions.picture_legend import (
     write_title,
 )
 from missions.plan import Leg, Plan, Sortie
-from missions.strips import Objects, rectangles
+from missions.strips import GRID_M, Objects, rectangles, united, whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,7 +80,7 @@ def sprayed_twice(strips: Objects) -> BaseGeometry:
     tree = shapely.STRtree(strips)
     one, other = tree.query(strips, predicate="intersects")
     keep = one < other
-    return shapely.union_all(shapely.intersection(strips[one[keep]], strips[other[keep]]))
+    return whole(shapely.intersection(strips[one[keep]], strips[other[keep]], grid_size=GRID_M))
 
 
 def _figure(plan: Plan, sheet: Sheet, title: str) -> Figure:
@@ -162,9 +162,9 @@ def _draw_strips(axes: Axes, plan: Plan, *, swath_pt: float) -> dict[str, bool]:
     strips = np.concatenate(everything)
     twice = _seen(sprayed_twice(strips))
     # Ground of a line on which nothing is prescribed is not missed.
-    planned = shapely.union_all(rectangles(plan.lines, width_m))
+    planned = united(plan.lines, width_m)
     skipped = _seen(shapely.difference(plan.field.limit, planned))
-    bare = _seen(shapely.difference(planned, shapely.union_all(strips)))
+    bare = _seen(shapely.difference(planned, whole(strips)))
     _fill(axes, [twice], facecolors=TWICE, alpha=0.38, linewidths=0.0, zorder=3.0)
     _fill(axes, [skipped], facecolors=SKIPPED, edgecolors=SKIPPED, linewidths=1.0, zorder=6.0)
     found = {"twice": twice, "skipped": skipped, "bare": bare}

@@ -14,7 +14,7 @@ from missions.files.plan_rules import ITEMS_MAX
 from missions.least_ferry import least_idle_of
 from missions.plan import Plan, Sortie
 from missions.schedule import separation_m
-from missions.strips import rectangles
+from missions.strips import GRID_M, rectangles, whole
 
 
 def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict[str, Any]:
@@ -119,7 +119,7 @@ def _overlap_l(plan: Plan) -> dict[int, float]:
             earlier.setdefault(at, []).append(before)
     found: dict[int, float] = {}
     for at, before in earlier.items():
-        twice = shapely.intersection(strips[at], shapely.union_all(strips[before]))
+        twice = shapely.intersection(strips[at], whole(strips[before]), grid_size=GRID_M)
         number, leg = flown[at]
         share = float(twice.area) / float(strips[at].area)
         found[number] = found.get(number, 0.0) + leg.volume_l * share

@@ -67,7 +67,8 @@ def whole(strips: Objects) -> BaseGeometry:
     """Return the ground of strips together.
 
     On a grid: without one GEOS leaves strips out where sides of theirs nearly coincide, as those of
-    parallel passes do.
+    parallel passes do. For the same reason an intersection of strips needs one: GEOS may give a
+    whole strip as what it shares with the one that it touches.
     """
     return shapely.union_all(strips, grid_size=GRID_M)
 

@@ -26,6 +26,7 @@ AXIS_M, FLATTENING = 6_378_137.0, 1.0 / 298.257_223_563
 STRAIGHT_M = 0.03
 # A strip and the border that it is flown along differ by the digits of coordinates in files.
 DIGITS_M = 1e-3
+STRIPS_GRID_M = 1e-6
 
 
 def _centred(lon_lat: Floats) -> Floats:
@@ -123,7 +124,8 @@ def judge_legs(drawn: Drawn, legs: Legs, *, speed_m_s: float, a_m_s2: float) -> 
             for a, b in pairwise(points):
                 strips.append(_strip(a, b, drawn.width_m))
                 lengths_m.append(float(np.hypot(*(b - a))))
-    covered = shapely.union_all(strips)
+    # Without a grid GEOS leaves strips out where sides of theirs nearly coincide.
+    covered = shapely.union_all(strips, grid_size=STRIPS_GRID_M)
     ground, reachable = drawn.ground, drawn.reachable
     reached = covered.intersection(reachable).area
     off = covered.difference(ground.buffer(STRAIGHT_M))

@@ -1,4 +1,8 @@
-"""The whole plan as KML, to look at: a folder for each sortie, a colour for each kind of leg."""
+"""The whole plan as KML, to look at: a folder for each sortie, a colour for each kind of leg.
+
+With an elevation model heights are above sea level, as the model has them; without one they are
+above whatever ground the viewer knows, because nothing says how high the depot is.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +44,21 @@ def _place(plan: Plan, place: Place) -> str:
 
 
 def _leg(plan: Plan, leg: Leg) -> str:
-    line = " ".join(_place(plan, point) for point in leg.points)
+    height_m = plan.settings.height_m if leg.height_m is None else leg.height_m
+    if plan.terrain is None:
+        mode, heights = "relativeToGround", [(place, height_m) for place in leg.points]
+    else:
+        way = plan.terrain.straight_parts(leg.points)
+        mode = "absolute"
+        heights = [
+            ((east_m, north_m), ground_m + height_m)
+            for (east_m, north_m), ground_m in zip(
+                way.places.tolist(), way.ground_m.tolist(), strict=True
+            )
+        ]
+    line = " ".join(f"{_place(plan, place)},{above_m:.2f}" for place, above_m in heights)
     return (
         f"<Placemark><name>{leg.kind}</name><styleUrl>#{leg.kind}</styleUrl>"
-        f"<LineString><coordinates>{line}</coordinates></LineString></Placemark>"
+        f"<LineString><altitudeMode>{mode}</altitudeMode>"
+        f"<coordinates>{line}</coordinates></LineString></Placemark>"
     )

@@ -26,7 +26,8 @@ _STYLE = """@page { size: A4 landscape; margin: 10mm; }
 body { font: 10pt sans-serif; margin: 8mm; color: #000; }
 h1 { font-size: 16pt; margin: 0 0 2mm; }
 ul { margin: 0 0 4mm; padding: 0; list-style: none; columns: 2; }
-li b { display: inline-block; min-width: 28mm; }
+li { break-inside: avoid; padding-left: 34mm; text-indent: -34mm; }
+li b { display: inline-block; min-width: 34mm; text-indent: 0; }
 table { border-collapse: collapse; width: 100%; }
 th, td { border: 0.2mm solid #777; padding: 0.8mm 1.5mm; text-align: right; }
 th { background: #eee; font-size: 8.5pt; }
@@ -92,12 +93,12 @@ def parse_start(text: str | None) -> int | None:
 
 
 def clock(seconds: float, start_min: int | None = None) -> str:
-    """Return a time as hours and minutes: of the day, or since the first take-off.
+    """Return a time to the nearest minute: of the day, or since the first take-off.
 
     >>> clock(4000.0), clock(4000.0, 450), clock(120.0, 23 * 60 + 59)
-    ('1:06', '08:36', '00:01 +1 d')
+    ('1:07', '08:37', '00:01 +1 d')
     """
-    minutes = math.floor(seconds / 60.0)
+    minutes = math.floor(seconds / 60.0 + 0.5)
     if start_min is None:
         return f"{minutes // 60}:{minutes % 60:02}"
     days, minutes = divmod(minutes + start_min, _DAY_MIN)
@@ -144,7 +145,8 @@ def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
         facts.append(("Dose", f"{adds_l * product.per_l:.2f} {product.unit} of it in that mix"))
     facts += [
         ("Time", f"{clock(found['total_s'])} (h:min) from first take-off to last landing"),
-        ("Refill", f"{settings.refill_s:g} s, battery {settings.swap_s:g} s, in that time"),
+        ("Refill", f"{settings.refill_s:g} s, fresh battery {settings.swap_s:g} s; the clock "
+         "counts both"),
         ("Speed, height", f"{_speeds(rows)} m/s, {settings.height_m:g} m above "
          f"{'the ground' if plan.terrain is not None else 'the depot'}{_ferries(plan)}"),
         ("Swath", f"{settings.swath_width_m:g} m, course {plan.angle_deg:.0f} deg"),

@@ -33,7 +33,7 @@ from missions.demand import Uniform
 from missions.field import Field, build_field
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
-from missions.strips import Floats, lengths_m, rectangles
+from missions.strips import Floats, lengths_m, united
 from missions.turns import Motion
 from tests.bench.peers import grid_lines, longest_edge_deg, nearest_order
 
@@ -101,7 +101,7 @@ def pattern(field: Field, *, in_pairs: bool) -> dict[str, Any]:
     lines = nearest_order(grid_lines(ground, angle_deg, in_pairs=in_pairs, width_m=WIDTH_M))
     took_s = process_time() - begun
     hops = np.hypot(*(lines[1:, :2] - lines[:-1, 2:]).T)
-    covered = shapely.union_all(rectangles(lines, WIDTH_M))
+    covered = united(lines, WIDTH_M)
     strips_m2 = float(lengths_m(lines).sum()) * WIDTH_M
     return {
         "coverage_percent": 100.0 * covered.intersection(field.spray).area / field.area_m2,
@@ -239,7 +239,7 @@ def outside_m2(plan: Plan, ground: Area) -> float:
         for leg in sortie.legs
         if leg.kind == "spray"
     ]
-    covered = shapely.union_all(rectangles(np.array(rows), plan.settings.swath_width_m))
+    covered = united(np.array(rows), plan.settings.swath_width_m)
     return float(covered.difference(ground).area)
 
 

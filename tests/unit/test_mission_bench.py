@@ -9,6 +9,7 @@ import shapely
 from tests.bench.outlines import CRITERIA, failed
 from tests.bench.parcels import KINDS, parcel
 from tests.bench.peers import PEERS, lines_of, tanks
+from tests.mission_fields import degrees
 from tests.mission_flight import Way, flown_s, items_of_plan, items_of_waypoints
 from tests.mission_judge import Drawn, judge_legs
 from tests.unit.test_missions_times import FLOWN
@@ -55,6 +56,16 @@ def test_items_are_the_same_in_both_files() -> None:
         "3\t0\t3\t16\t0\t0\t0\t0\t48.001\t11.0\t3.5\t1",
     ]
     assert items_of_waypoints("\n".join(rows) + "\n") == items_of_plan(plan)
+
+
+def test_passes_side_by_side_are_judged_as_sprayed_once() -> None:
+    # A plain union of these leaves four of sixty passes out (GEOS 3.13).
+    along, across = np.array([np.cos(0.37), np.sin(0.37)]), np.array([-np.sin(0.37), np.cos(0.37)])
+    starts = [number * 6.0 * across for number in range(60)]
+    legs = [("spray", np.array([start, start + 500.0 * along])) for start in starts]
+    drawn = Drawn(outline=degrees(shapely.box(0.0, 0.0, 600.0, 500.0)), width_m=6.0)
+    found = judge_legs(drawn, legs, speed_m_s=6.0, a_m_s2=2.5)
+    assert found["twice_percent"] == pytest.approx(0.0, abs=0.01)
 
 
 @pytest.mark.parametrize("kind", KINDS)

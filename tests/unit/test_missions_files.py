@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import pyogrio
 import pytest
+import shapely
 from pymavlink import mavwp
 from shapely import Point, Polygon, box
 
@@ -153,6 +156,25 @@ def test_geojson_has_a_line_for_each_leg_and_a_point_for_each_depot(
 def test_kml_has_a_folder_for_each_sortie(plan: Plan, tmp_path: Path) -> None:
     root = ElementTree.parse(write_plan(plan, tmp_path / "m.kml")[0]).getroot()
     assert len(root.findall(".//{*}Folder")) == len(plan.sorties)
+
+
+def test_kml_has_the_heights_that_are_flown(plan: Plan, tmp_path: Path) -> None:
+    high = replace(
+        plan, sorties=(replace(plan.sorties[0], legs=tuple(
+            replace(leg, height_m=20.0) if leg.kind == "ferry" else leg
+            for leg in plan.sorties[0].legs)),),
+    )  # fmt: skip
+    path = write_plan(high, tmp_path / "m.kml")[0]
+    (layer,) = (name for name in pyogrio.list_layers(path)[:, 0] if name.startswith("Sortie"))
+    _, _, shapes, (kinds,) = pyogrio.raw.read(path, layer=layer, columns=["Name"])
+    found = {
+        (str(kind), float(height_m))
+        for kind, shape in zip(kinds, shapely.from_wkb(shapes), strict=True)
+        for height_m in shapely.get_coordinates(shape, include_z=True)[:, 2]
+    }
+    assert found - {("transit", 3.5)} == {("spray", 3.5), ("ferry", 20.0)}
+    modes = {each.text for each in ElementTree.parse(path).iterfind(".//{*}altitudeMode")}
+    assert modes == {"relativeToGround"}
 
 
 def test_an_unknown_suffix_is_refused(plan: Plan, tmp_path: Path) -> None:

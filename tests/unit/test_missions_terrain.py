@@ -8,6 +8,7 @@ from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from missions.demand import Uniform
 from missions.errors import PlanError
 from missions.field import build_field
 from missions.files.items import ABOVE_GROUND, CHANGE_SPEED, TAKEOFF, WAYPOINT, items_of
+from missions.files.write import write_plan
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.strips import Floats
@@ -295,3 +297,19 @@ def test_nothing_is_kept_of_a_straight_profile_but_its_ends() -> None:
     at = np.linspace(0.0, 100.0, 50)
     assert kept_points(at, 0.3 * at + 7.0, 0.01).tolist() == [0, 49]
     assert execute(["plan", "--help"]) == 0
+
+
+def test_kml_follows_the_ground_above_the_sea(tmp_path: Path) -> None:
+    plan = plan_over(Terrain(dem=dem_of(hill), frame=FRAME))
+    path = write_plan(plan, tmp_path / "m.kml")[0]
+    root = ElementTree.parse(path)
+    assert {each.text for each in root.iterfind(".//{*}altitudeMode")} == {"absolute"}
+    rows = [
+        [float(part) for part in word.split(",")]
+        for each in root.iterfind(".//{*}LineString/{*}coordinates")
+        for word in (each.text or "").split()
+    ]
+    places = np.array([FRAME.to_local(latitude, longitude) for longitude, latitude, _ in rows])
+    above_m = np.array(rows)[:, 2] - hill(places[:, 0], places[:, 1])
+    assert np.abs(above_m - 3.5).max() < 0.2  # cells of 5 m on a hill
+    assert np.array(rows)[:, 2].max() > 514.0
