@@ -30,14 +30,13 @@ ACROSS_M, STRAIGHT_M, ONWARD = 60.0, 0.05, 1.0 - 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Network:
-    """Ends 2 i and 2 i + 1 are start and end of piece i; `home_s` is by depot and end.
+    """Ends 2 i and 2 i + 1 are start and end of piece i.
 
     `between_s` has a last row and column for the depot that is nearest to the other end, with
     half of a refill: one more landing costs the search, too, not only its ferry.
     """
 
     between_s: Floats
-    home_s: Floats
     near: Ints
     litres: Floats
 
@@ -57,9 +56,18 @@ class Network:
 
 
 def build_network(
-    pieces: Pieces, depots: Floats, space: FreeSpace, motion: Motion, *, refill_s: float
+    pieces: Pieces,
+    space: FreeSpace,
+    motion: Motion,
+    *,
+    home_m: Floats | None = None,
+    refill_s: float = 0.0,
 ) -> Network:
-    """Return the network; of pairs far apart that do not see each other, a lower bound."""
+    """Return the network; of pairs far apart that do not see each other, a lower bound.
+
+    `home_m` are the ways from every depot to every end, shape (depots, 2 n); without them the
+    depot is anywhere.
+    """
     ends = pieces.ends.reshape(-1, 2)
     count = len(ends)
     between = np.zeros((count + 1, count + 1))
@@ -82,9 +90,10 @@ def build_network(
     onward_s = _onward_s(motion, length_m[rows >> 1], along_m, length_m[columns >> 1])
     between[rows, columns] = between[columns, rows] = onward_s
     _know(near, rows, columns)
-    home = motion.legs_s(home_ways_m(depots, ends, space))
-    between[count, :count] = between[:count, count] = home.min(axis=0) + refill_s / 2.0
-    return Network(between_s=between, home_s=home, near=near, litres=pieces.litres)
+    if home_m is not None:
+        home_s = motion.legs_s(home_m).min(axis=0) + refill_s / 2.0
+        between[count, :count] = between[:count, count] = home_s
+    return Network(between_s=between, near=near, litres=pieces.litres)
 
 
 def rows_of(table: Floats) -> list[Sequence[float]]:
@@ -196,40 +205,3 @@ def _see_each_other(ends: Floats, rows: Ints, columns: Ints, space: FreeSpace) -
     low, high = np.minimum(rows, columns), np.maximum(rows, columns)
     pairs, which = np.unique(low * len(ends) + high, return_inverse=True)
     return space.sees(ends[pairs // len(ends)], ends[pairs % len(ends)])[which]
-
-
-def home_ways_m(depots: Floats, ends: Floats, space: FreeSpace) -> Floats:
-    """Return the way from every depot to every end, bent where it does not see it."""
-    far_m: Floats = np.hypot(
-        depots[:, 0][:, None] - ends[:, 0][None, :], depots[:, 1][:, None] - ends[:, 1][None, :]
-    )
-    if space.is_convex:
-        return far_m
-    for number, depot in enumerate(depots):
-        hidden = np.flatnonzero(~space.sees(np.tile(depot, (len(ends), 1)), ends))
-        reach = space.to_corners_m(depot[None, :], nearest=None)
-        if not len(hidden) or not reach.size:
-            continue
-        to_corner_m = np.min(reach[0][:, None] + space.between_m, axis=0)
-        bent = _over_corners_m(to_corner_m, ends[hidden], space)
-        far_m[number, hidden] = np.where(np.isfinite(bent), bent, far_m[number, hidden])
-    return far_m
-
-
-def _over_corners_m(to_corner_m: Floats, ends: Floats, space: FreeSpace) -> Floats:
-    """Return the shortest way to each end over a corner that it sees; infinite without one."""
-    ways_m = to_corner_m + np.hypot(
-        ends[:, 0][:, None] - space.corners[:, 0][None, :],
-        ends[:, 1][:, None] - space.corners[:, 1][None, :],
-    )
-    order = np.argsort(ways_m, axis=1, kind="stable")
-    found = np.full(len(ends), np.inf)
-    waiting = np.arange(len(ends))
-    # The first corner in sight is the best one: few are looked at.
-    for corner in order.T:
-        seen = space.sees(ends[waiting], space.corners[corner[waiting]])
-        found[waiting[seen]] = ways_m[waiting[seen], corner[waiting[seen]]]
-        waiting = waiting[~seen]
-        if not len(waiting):
-            break
-    return found

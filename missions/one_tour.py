@@ -43,10 +43,8 @@ class Tour:
 def tour_of(lines: Floats, space: FreeSpace, motion: Motion) -> Tour:
     """Return a good tour of some lines."""
     count = len(lines)
-    middle = lines.reshape(-1, 2).mean(axis=0, keepdims=True)
     pieces = Pieces(ends=lines, litres=np.zeros(count), line=np.arange(count))
-    network = build_network(pieces, middle, space, motion, refill_s=0.0)
-    network.put_depot_anywhere()
+    network = build_network(pieces, space, motion)
     order = one_chain(network, by_savings(network, 1.0))
     kicks = min(max(KICKS_MIN, KICKS // count**2), KICKS_MAX)
     order = shortest_tour(network, order, kicks=kicks)

@@ -17,7 +17,6 @@ from missions.bands import (
     to_and_fro,
 )
 from missions.demand import Demand
-from missions.network import home_ways_m
 from missions.plan import Settings
 from missions.refills import (
     NOSE_DEG,
@@ -62,7 +61,7 @@ def build_passes(
         depots=[(float(x), float(y)) for x, y in ways.depots],
         pace_s_m=pace.tolist(), speed_m_s=motion.speed_m_s, space=ways.inside,
     )  # fmt: skip
-    if ways.inside.is_convex:
+    if ways.are_straight:
         return passes
     total_m = sum(passes.length_m)
     step_m = max(BENT_STEP_M, total_m / BENT_MAX)
@@ -73,13 +72,13 @@ def build_passes(
             for row, count in zip(lines, counts, strict=True)
         ]
     )
-    home_m = home_ways_m(ways.depots, places, ways.inside).min(axis=0)
+    homes_m = ways.home_ways_m(places)
     straight_m = np.hypot(*(places[None, :, :] - ways.depots[:, None, :]).transpose(2, 0, 1))
-    is_bent = home_m > straight_m.min(axis=0) + 1e-6
+    is_bent = (homes_m > straight_m + 1e-6).any(axis=0)
     begin = 0
     for line, count in enumerate(counts):
         if is_bent[begin : begin + count].any():
-            passes.bent_m[line] = home_m[begin : begin + count].tolist()
+            passes.bent_m[line] = homes_m[:, begin : begin + count].tolist()
         begin += count
     return passes
 

@@ -139,13 +139,12 @@ class _Many:
         found: Floats = self._starts[lines] + at_m[:, None] * self._along[lines]
         return found
 
-    def home_m(self, lines: Ints, at_m: Floats) -> Floats:
-        """Return `Passes.home_m`."""
+    def homes_m(self, lines: Ints, at_m: Floats) -> Floats:
+        """Return `Passes.homes_m`, shape (depots, n)."""
         places = self.places(lines, at_m)
-        found_m = np.full(len(lines), math.inf)
-        for east_m, north_m in self._passes.depots:
-            far_m = np.hypot(places[:, 0] - east_m, places[:, 1] - north_m)
-            np.minimum(found_m, far_m, out=found_m)
+        found_m: Floats = np.hypot(
+            places[:, 0] - self._depots[:, :1], places[:, 1] - self._depots[:, 1:]
+        )
         if not self._passes.bent_m:
             return found_m
         bent_m, begin, count = self._bent_ways()
@@ -153,17 +152,18 @@ class _Many:
         line = lines[some]
         at = at_m[some] / self._length_m[line] * (count[line] - 1)
         low = np.clip(at.astype(np.int64), 0, count[line] - 2)
-        one_m, other_m = bent_m[begin[line] + low], bent_m[begin[line] + low + 1]
-        found_m[some] = one_m + (at - low) * (other_m - one_m)
+        one_m, other_m = bent_m[:, begin[line] + low], bent_m[:, begin[line] + low + 1]
+        found_m[:, some] = one_m + (at - low) * (other_m - one_m)
         return found_m
 
     def _bent_ways(self) -> tuple[Floats, Ints, Ints]:
-        """Return all bent ways home, and of each line where its own begin and how many."""
+        """Return all bent ways, by depot, and of each line where its own begin and how many."""
         if self._bent is None:
             count = np.zeros(len(self._length_m), dtype=np.int64)
             for line, bent_m in self._passes.bent_m.items():
-                count[line] = len(bent_m)
-            ways_m = np.concatenate([bent_m for _, bent_m in sorted(self._passes.bent_m.items())])
+                count[line] = len(bent_m[0])
+            ways = sorted(self._passes.bent_m.items())
+            ways_m = np.concatenate([bent_m for _, bent_m in ways], axis=1)
             self._bent = ways_m, np.cumsum(count) - count, count
         return self._bent
 
@@ -212,10 +212,10 @@ class _Many:
 
 @dataclass(slots=True, kw_only=True)
 class Passes:
-    """Lines that are flown in any parts: where they lie, what they need, how far home is.
+    """Lines that are flown in any parts: where they lie, what they need, how far each depot is.
 
     `pace_s_m` is the time of a metre of each. `bent_m` has, for lines that a depot does not see,
-    the way home from places evenly apart.
+    the ways to every depot from places evenly apart, by depot and place.
     """
 
     lines: Floats
@@ -225,7 +225,7 @@ class Passes:
     pace_s_m: Sequence[float]
     speed_m_s: float
     space: FreeSpace
-    bent_m: dict[int, list[float]] = field(default_factory=dict)
+    bent_m: dict[int, list[list[float]]] = field(default_factory=dict)
     known_m: dict[tuple[Place, Place], float] = field(default_factory=dict)
     length_m: list[float] = field(init=False)
     along: list[tuple[float, float]] = field(init=False)
@@ -252,18 +252,15 @@ class Passes:
         (x, y), (east, north) = self.starts[line], self.along[line]
         return x + at_m * east, y + at_m * north
 
-    def home_m(self, line: int, at_m: float, place: Place) -> float:
-        """Return the way from a place of a line to the nearest depot."""
+    def homes_m(self, line: int, at_m: float) -> list[float]:
+        """Return the ways from a place of a line to every depot."""
         bent = self.bent_m.get(line)
         if bent is not None:
-            at = at_m / self.length_m[line] * (len(bent) - 1)
-            low = min(max(int(at), 0), len(bent) - 2)
-            return bent[low] + (at - low) * (bent[low + 1] - bent[low])
-        x, y = place
-        if len(self.depots) == 1:
-            ((east, north),) = self.depots
-            return math.hypot(x - east, y - north)
-        return min(math.hypot(x - east, y - north) for east, north in self.depots)
+            at = at_m / self.length_m[line] * (len(bent[0]) - 1)
+            low = min(max(int(at), 0), len(bent[0]) - 2)
+            return [ways[low] + (at - low) * (ways[low + 1] - ways[low]) for ways in bent]
+        x, y = self.place(line, at_m)
+        return [math.hypot(x - east, y - north) for east, north in self.depots]
 
     def used_l(self, line: int, at_m: float) -> float:
         """Return what a line needs up to a place."""
@@ -535,18 +532,19 @@ class _Sum(NamedTuple):
 
 
 class _Begun(NamedTuple):
-    """A sortie up to the end of some part: the ferry to its first, the sums, the litres."""
+    """A sortie up to the end of some part: ferries from every depot, the sums, the litres."""
 
-    out_s: float
+    out_s: list[float]
     sums: _Sum
     load: float
     last: Part
 
     def flown(self, passes: Passes, limits: Limits) -> Flown:
-        """Return what the sortie takes that flies home from here."""
-        back_s = _home_s(passes, limits, self.last[0], self.last[2])
+        """Return what the sortie takes that flies home from here, to where it began."""
+        homes_s = _homes_s(passes, limits, self.last[0], self.last[2])
+        out_s, back_s = min(zip(self.out_s, homes_s, strict=True), key=sum)
         return _flown(
-            limits, self.sums, end_l=self.load, litres=self.load, out_s=self.out_s, back_s=back_s
+            limits, self.sums, end_l=self.load, litres=self.load, out_s=out_s, back_s=back_s
         )
 
 
@@ -554,7 +552,7 @@ def _begun(passes: Passes, limits: Limits, before: _Begun | None, part: Part) ->
     """Return a sortie that flies one part more, or begins with it."""
     need_l = passes.need_l(part)
     if before is None:
-        out_s = _home_s(passes, limits, part[0], part[1])
+        out_s = _homes_s(passes, limits, part[0], part[1])
         return _Begun(out_s, _flown_on(passes, _Sum(), part, 0.0, need_l), need_l, part)
     here = _joined(passes, limits, before.sums, (before.last, part), before.load)
     sums = _flown_on(passes, here, part, before.load, need_l)
@@ -576,10 +574,10 @@ def _flown(
     return Flown(seconds=out_s + between.seconds + back_s, litres=litres, wh=wh)
 
 
-def _home_s(passes: Passes, limits: Limits, line: int, at_m: float) -> float:
-    """Return the time of a ferry, with half of a landing."""
-    home_m = passes.home_m(line, at_m, passes.place(line, at_m))
-    return limits.landing_s / 2.0 + passes.times.leg_s(home_m)
+def _homes_s(passes: Passes, limits: Limits, line: int, at_m: float) -> list[float]:
+    """Return the times of the ferries from every depot, each with half of a landing."""
+    half_s = limits.landing_s / 2.0
+    return [half_s + passes.times.leg_s(home_m) for home_m in passes.homes_m(line, at_m)]
 
 
 def _part_s(passes: Passes, line: int, length_m: float) -> float:
@@ -613,7 +611,8 @@ class _Run:
     What a sortie takes is a difference of sums, whichever two places it lies between: of `to`,
     time, time at speed and weight up to a place, and of `on`, from which a sortie that begins
     there counts. Behind a cut it speeds up again, and behind the end of a part it has been flown
-    to the next one.
+    to the next one. A sortie flies home to the depot that it came from: ferries are by depot, from
+    the start, `first_s`, from each place, `home_s`, and to where it is gone on from, `home_on_s`.
     """
 
     def __init__(
@@ -671,46 +670,56 @@ class _Run:
         self.at_m = np.concatenate([cut_m, end_m])[order]
         self.to = np.concatenate([to, ends], axis=1)[:, order]
         self.on = np.concatenate([on, joined], axis=1)[:, order]
-        home_m = many.home_m(
+        homes_m = many.homes_m(
             np.concatenate([lines, line, lines]), np.concatenate([start_m, cut_m, end_m])
         )
-        home_s = limits.landing_s / 2.0 + passes.times.legs_s(home_m)
-        start_s, end_s = home_s[: len(run)], home_s[len(run) :]
-        self._first_home_s = float(start_s[0])
-        self.home_s = end_s[order]
-        self.home_on_s = np.concatenate([end_s[: len(part)], start_s[1:], [0.0]])[order]
+        homes_s = limits.landing_s / 2.0 + passes.times.legs_s(homes_m)
+        start_s, end_s = homes_s[:, : len(run)], homes_s[:, len(run) :]
+        none_s = np.zeros((len(homes_s), 1))
+        self.first_s = start_s[:, 0]
+        self.home_s = end_s[:, order]
+        self.home_on_s = np.concatenate(
+            [end_s[:, : len(part)], start_s[:, 1:], none_s], axis=1
+        )[:, order]  # fmt: skip
 
     def _flown(self, one: int, other: int) -> Flown:
         """Return what a sortie from behind one place, -1 for the start, to another takes."""
-        load, begun, out_s = 0.0, np.zeros(3), self._first_home_s
+        load, begun, out_s = 0.0, np.zeros(3), self.first_s
         if one >= 0:
-            load, begun = float(self.load[one]), self.on[:, one]
-            out_s = float(self.home_on_s[one])
-        end_l = float(self.load[other])
+            load, begun, out_s = float(self.load[one]), self.on[:, one], self.home_on_s[:, one]
+        end_l, back_s = float(self.load[other]), self.home_s[:, other]
+        depot = int((out_s + back_s).argmin())
         return _flown(
             self._limits, _Sum(*(self.to[:, other] - begun).tolist()),
-            end_l=end_l, litres=end_l - load, out_s=out_s, back_s=float(self.home_s[other]),
+            end_l=end_l, litres=end_l - load,
+            out_s=float(out_s[depot]), back_s=float(back_s[depot]),
         )  # fmt: skip
 
     def by_tank(self) -> list[int] | None:
         """Return, for each place, from behind which one its sortie comes at the least time."""
         usable_l = self._limits.usable_l + 1e-9
         before = []
-        # Places from which a sortie may still come, the best of them first.
-        waiting: deque[tuple[int, float, float]] = deque([(-1, 0.0, self._first_home_s)])
-        more_s = self.to[0] + self.home_s + self.home_on_s - self.on[0]
-        both = zip(self.load.tolist(), more_s.tolist(), strict=True)
-        for at, (load, taken_s) in enumerate(both):
-            while waiting and waiting[0][1] < load - usable_l:
-                waiting.popleft()
-            if not waiting:
+        # Of each depot: places from which a sortie may still come, the best of them first.
+        all_waiting = [deque([(-1, 0.0, first_s)]) for first_s in self.first_s.tolist()]
+        to_s = (self.to[0] + self.home_s).T.tolist()
+        on_s = (self.home_on_s - self.on[0]).T.tolist()
+        for at, (load, ends_s, begins_s) in enumerate(
+            zip(self.load.tolist(), to_s, on_s, strict=True)
+        ):
+            known_s, from_at = math.inf, -1
+            for waiting, end_s in zip(all_waiting, ends_s, strict=True):
+                while waiting and waiting[0][1] < load - usable_l:
+                    waiting.popleft()
+                if waiting and waiting[0][2] + end_s < known_s:
+                    known_s, from_at = waiting[0][2] + end_s, waiting[0][0]
+            if not math.isfinite(known_s):
                 return None
-            from_at, _, cost_s = waiting[0]
             before.append(from_at)
-            cost_s += taken_s
-            while waiting and waiting[-1][2] >= cost_s:
-                waiting.pop()
-            waiting.append((at, load, cost_s))
+            for waiting, begin_s in zip(all_waiting, begins_s, strict=True):
+                cost_s = known_s + begin_s
+                while waiting and waiting[-1][2] >= cost_s:
+                    waiting.pop()
+                waiting.append((at, load, cost_s))
         return before
 
     def by_battery(self) -> list[int] | None:
@@ -719,9 +728,9 @@ class _Run:
         assert battery is not None
         count = len(self.load)
         load = np.concatenate([[0.0], self.load])
-        out_s = np.concatenate([[self._first_home_s], self.home_on_s])
+        outs_s = np.concatenate([self.first_s[:, None], self.home_on_s], axis=1)
         on_s, on_cruise_s, on_weight = np.concatenate([np.zeros((3, 1)), self.on], axis=1)
-        (to_s, to_cruise_s, to_weight), home_s = self.to, self.home_s
+        to_s, to_cruise_s, to_weight = self.to
         longest_s = limits.usable_wh * J_WH / min(battery.hover_w, battery.cruise_w)
         # A sortie to a place begins behind one of these at the earliest; `known` begins at -1.
         first = np.maximum(
@@ -736,16 +745,16 @@ class _Run:
             low = min(int(first[block:end].min()), end - 1)
             some, rows = slice(low, end), slice(block, end)
             between_s = to_s[rows, None] - on_s[some]
+            out_s, back_s = self._ferries_s(outs_s[:, some], self.home_s[:, rows])
             wh = _used_wh(
                 limits, battery,
                 between_s=between_s,
                 cruise_s=to_cruise_s[rows, None] - on_cruise_s[some],
                 gone=(load[1:][rows, None] * between_s, to_weight[rows, None] - on_weight[some]),
                 litres=load[1:][rows, None] - load[some],
-                out_s=np.broadcast_to(out_s[some], between_s.shape),
-                back_s=np.broadcast_to(home_s[rows, None], between_s.shape),
+                out_s=out_s, back_s=back_s,
             )  # fmt: skip
-            seconds = out_s[some] + between_s + home_s[rows, None]
+            seconds = out_s + between_s + back_s
             place = np.arange(low, end)
             is_too_far = (place < first[rows, None]) | (place > np.arange(block, end)[:, None])
             seconds[is_too_far | ~(wh <= limits.usable_wh)] = math.inf
@@ -756,6 +765,17 @@ class _Run:
                 known_s[at + 1] = whole_s[best]
                 before.append(low + best - 1)
         return before if math.isfinite(known_s[-1]) else None
+
+    @staticmethod
+    def _ferries_s(outs_s: Floats, homes_s: Floats) -> tuple[Floats, Floats]:
+        """Return the ferries from and to the best depot, of ends by beginnings of sorties."""
+        shape = homes_s.shape[1], outs_s.shape[1]
+        out_s = np.broadcast_to(outs_s[0], shape)
+        back_s = np.broadcast_to(homes_s[0][:, None], shape)
+        for other_s, home_s in zip(outs_s[1:], homes_s[1:, :, None], strict=True):
+            is_better = other_s + home_s < out_s + back_s
+            out_s, back_s = np.where(is_better, other_s, out_s), np.where(is_better, home_s, back_s)
+        return out_s, back_s
 
     def sorties(self, before: list[int]) -> tuple[float, list[list[Part]]]:
         """Return the time and the sorties that these choices lead to."""

@@ -21,7 +21,6 @@ from missions.network import (
     STRAIGHT_M,
     Network,
     build_network,
-    home_ways_m,
 )
 from missions.plan import Kind, Leg, Place, Settings, Sortie
 from missions.refill_search import build_limits, build_passes, several
@@ -151,7 +150,8 @@ class SortieSearch:
 
     def _network_of(self, pieces: Pieces) -> Network:
         return build_network(
-            pieces, self.ways.depots, self.ways.inside, self.flying.motion,
+            pieces, self.ways.inside, self.flying.motion,
+            home_m=self.ways.home_ways_m(pieces.ends.reshape(-1, 2)),
             refill_s=self.settings.refill_s,
         )  # fmt: skip
 
@@ -230,7 +230,7 @@ def _drawn(pieces: Pieces, orders: list[Order], ways: Ways, motion: Motion) -> t
     """Return the sorties that fly these pieces, each from the depot that is best for it."""
     ends = pieces.ends.reshape(-1, 2)
     outer = np.array([[ends[order[0]], ends[order[-1] ^ 1]] for order in orders])
-    home_m = home_ways_m(ways.depots, outer.reshape(-1, 2), ways.inside)
+    home_m = ways.home_ways_m(outer.reshape(-1, 2))
     both = motion.legs_s(home_m).reshape(len(ways.depots), -1, 2).sum(axis=2)
     homes = np.argmin(both, axis=0).tolist()
     ranked = sorted(range(len(orders)), key=lambda at: (homes[at], min(orders[at])))

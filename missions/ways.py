@@ -48,6 +48,23 @@ class Ways:
         return free_space(space)
 
     @cached_property
+    def gates(self) -> Floats:
+        """Return where the way from each depot enters the field: the nearest place of it."""
+        return shapely.get_coordinates(
+            shapely.shortest_line(self.field.fly, shapely.points(self.depots))
+        )[::2]
+
+    @cached_property
+    def _to_gates(self) -> list[list[Place]]:
+        """Return the way from each depot to its gate; one that stands there has none."""
+        ways: list[list[Place]] = []
+        for depot, gate in zip(self.depots.tolist(), self.gates.tolist(), strict=True):
+            start, entry = (depot[0], depot[1]), (gate[0], gate[1])
+            is_there = math.dist(start, entry) < ON_EDGE_M
+            ways.append([start] if is_there else self.around.way(start, entry))
+        return ways
+
+    @cached_property
     def high(self) -> Ways | None:
         """Return the ways of ferries, which cross low obstacles; None where they cross none."""
         high = self.field.high
@@ -75,12 +92,64 @@ class Ways:
         """Return the way from a depot to a place of the field: the shortest way in, then inside."""
         if self.high is not None:
             return self.high.home(depot, end)
-        start = (float(self.depots[depot][0]), float(self.depots[depot][1]))
-        entry = shapely.get_coordinates(shapely.shortest_line(self.field.fly, Point(start)))[0]
-        gate = (float(entry[0]), float(entry[1]))
-        if math.dist(start, gate) < ON_EDGE_M:
-            return [start, *self.between(gate, end)[0][1:]]
-        return [*self.around.way(start, gate), *self.between(gate, end)[0][1:]]
+        gate = (float(self.gates[depot][0]), float(self.gates[depot][1]))
+        return [*self._to_gates[depot], *self.between(gate, end)[0][1:]]
+
+    def home_ways_m(self, ends: Floats) -> Floats:
+        """Return how long the way is from every depot to every place, shape (depots, n)."""
+        if self.high is not None:
+            return self.high.home_ways_m(ends)
+        found: Floats = self._outside_m[:, None] + _inside_m(self.gates, ends, self.inside)
+        return found
+
+    @property
+    def are_straight(self) -> bool:
+        """Return whether the way from any depot to any place is straight."""
+        if self.high is not None:
+            return self.high.are_straight
+        return self.inside.is_convex and not self._outside_m.any()
+
+    @cached_property
+    def _outside_m(self) -> Floats:
+        """Return how long the way from each depot to its gate is."""
+        return np.array([sum(map(math.dist, way, way[1:])) for way in self._to_gates])
+
+
+def _inside_m(depots: Floats, ends: Floats, space: FreeSpace) -> Floats:
+    """Return the way from every depot in a space to every end, bent where it does not see it."""
+    far_m: Floats = np.hypot(
+        depots[:, 0][:, None] - ends[:, 0][None, :], depots[:, 1][:, None] - ends[:, 1][None, :]
+    )
+    if space.is_convex:
+        return far_m
+    for number, depot in enumerate(depots):
+        hidden = np.flatnonzero(~space.sees(np.tile(depot, (len(ends), 1)), ends))
+        reach = space.to_corners_m(depot[None, :], nearest=None)
+        if not len(hidden) or not reach.size:
+            continue
+        to_corner_m = np.min(reach[0][:, None] + space.between_m, axis=0)
+        bent = _over_corners_m(to_corner_m, ends[hidden], space)
+        far_m[number, hidden] = np.where(np.isfinite(bent), bent, far_m[number, hidden])
+    return far_m
+
+
+def _over_corners_m(to_corner_m: Floats, ends: Floats, space: FreeSpace) -> Floats:
+    """Return the shortest way to each end over a corner that it sees; infinite without one."""
+    ways_m = to_corner_m + np.hypot(
+        ends[:, 0][:, None] - space.corners[:, 0][None, :],
+        ends[:, 1][:, None] - space.corners[:, 1][None, :],
+    )
+    order = np.argsort(ways_m, axis=1, kind="stable")
+    found = np.full(len(ends), np.inf)
+    waiting = np.arange(len(ends))
+    # The first corner in sight is the best one: few are looked at.
+    for corner in order.T:
+        seen = space.sees(ends[waiting], space.corners[corner[waiting]])
+        found[waiting[seen]] = ways_m[waiting[seen], corner[waiting[seen]]]
+        waiting = waiting[~seen]
+        if not len(waiting):
+            break
+    return found
 
 
 def build_ways(field: Field, depots: Floats) -> Ways:

@@ -92,7 +92,8 @@ def test_every_piece_is_flown_once_and_no_tank_runs_dry(seed: int, tank_l: float
     pieces = cut(lines, demands(lines, Uniform(rate_l_ha=20.0), width_m=WIDTH_M), piece_max_l=1.0)
     assert lengths_m(pieces.ends).sum() == pytest.approx(lengths_m(lines).sum())
     assert pieces.litres.max() <= 1.0 + 1e-9
-    network = build_network(pieces, lines[:1, :2], free_space(ground), MOTION, refill_s=120.0)
+    home_m = np.hypot(*(pieces.ends.reshape(-1, 2) - lines[0, :2]).T)[None, :]
+    network = build_network(pieces, free_space(ground), MOTION, home_m=home_m, refill_s=120.0)
     first = by_savings(network, tank_l)
     better = improve(network, first, tank_l, moves=800)
     for orders in (first, better):

@@ -142,8 +142,10 @@ def test_what_is_counted_at_once_is_what_each_sortie_takes(
         depots=[(0.0, 0.0), (100.0, 400.0)], pace_s_m=[1.0 / 6.0 + 0.01 * n for n in range(count)],
         speed_m_s=6.0, space=free_space(box(-3000.0, -3000.0, 3000.0, 3000.0) - lake),
     )  # fmt: skip
-    passes.bent_m[count - 1] = [length_m, 1.5 * length_m, 2.0 * length_m]
-    passes.bent_m[0] = [300.0, 200.0]
+    passes.bent_m[count - 1] = [
+        [length_m, 1.5 * length_m, 2.0 * length_m], [1.8 * length_m, 1.6 * length_m, length_m],
+    ]  # fmt: skip
+    passes.bent_m[0] = [[300.0, 200.0], [500.0, 90.0]]
     run = [(n, 0.0, length_m) if n % 3 else (n, length_m, 0.0) for n in range(count)]
     limits = limits_of(tank_l, wh)
     found = split(passes, limits, run)

@@ -32,8 +32,9 @@ def network_of(lines: Floats) -> Network:
     """Return the network of lines on open ground, from a depot at the origin."""
     count = len(lines)
     pieces = Pieces(ends=lines, litres=np.zeros(count), line=np.arange(count))
+    ends = lines.reshape(-1, 2)
     ground = box(-1000.0, -1000.0, 1000.0, 1000.0)
-    return build_network(pieces, np.zeros((1, 2)), free_space(ground), MOTION, refill_s=0.0)
+    return build_network(pieces, free_space(ground), MOTION, home_m=np.hypot(*ends.T)[None, :])
 
 
 @given(
