@@ -9,5 +9,9 @@ class PlanError(VrsprayError):
     """A mission cannot be planned: the message says what, where and what to change."""
 
 
+class OutOfReachError(PlanError):
+    """No battery lasts to some place and back from any depot."""
+
+
 class UploadError(VrsprayError):
     """A mission is not uploaded: the message says why and what to do."""

@@ -13,7 +13,7 @@ import numpy as np
 from companion.core.frame import LocalFrame
 from missions.corners import CornerRule
 from missions.coverage import Coverage
-from missions.energy import Battery, nose_s, sortie_wh
+from missions.energy import J_WH, Battery, nose_s, sortie_wh
 from missions.field import Field
 from missions.strips import Floats
 from missions.terrain.ground import Terrain
@@ -111,6 +111,15 @@ class Settings:
         high_m = low_m if self.ferry_height_m is None else self.ferry_height_m
         changes_s = vertical.change_s(high_m, low_m) + vertical.change_s(low_m, high_m)
         return vertical.climb_s(high_m) + vertical.return_s(high_m) + changes_s
+
+    @property
+    def reach_m(self) -> float:
+        """Return how far the battery lasts there and back at speed, without liquid."""
+        battery = self.battery
+        if battery is None:
+            return math.inf
+        left_wh = battery.usable_wh - battery.wh(cruise_s=0.0, other_s=self.upright_s, litres=0.0)
+        return left_wh * J_WH / battery.cruise_w * self.speed_m_s / 2.0
 
     @property
     def closing_share(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 from shapely.errors import ShapelyError
@@ -11,7 +12,7 @@ from shapely.errors import ShapelyError
 from companion.core.frame import LocalFrame
 from missions.coverage import measure, of_rated_ground
 from missions.demand import Demand, Rates, demands
-from missions.errors import PlanError
+from missions.errors import OutOfReachError, PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
 from missions.files.items import count_of, stops_of
@@ -35,6 +36,19 @@ from missions.ways import Ways, build_ways, edge_places, far_warnings, suggested
 
 # One sortie may begin and end anywhere: its depot is chosen among so many places of the edge.
 EDGE_STEP_M, EDGE_PLACES = 25.0, 24
+# Where the battery does not reach everything from one depot, more are suggested, so many at most;
+# flights to places farther than this part of what it reaches spray little.
+DEPOTS_MAX, REACH = 6, 0.8
+
+
+class One(Protocol):
+    """Plans the sorties of some lines from the depots of some ways."""
+
+    def __call__(
+        self, some: Floats, needs: list[Demand], ways: Ways, *, any_depot: bool = False
+    ) -> Paced:
+        """Return the sorties; with `any_depot`, one from the best of the depots."""
+        ...
 
 
 def plan_mission(
@@ -86,13 +100,12 @@ def _planned(
     counted_before = isinstance(rates, UntreatedRates)
     if isinstance(rates, UntreatedRates):
         rates = rates.rates
-    litres = np.array([need.total_l for need in demand])
-    if not float(litres.sum()) > 0.0:
+    if not sum(need.total_l for need in demand) > 0.0:
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
     given = _depots(field.frame, depots)
     lines_are_drawn()
 
-    def one(some: Floats, needs: list[Demand], ways: Ways, any_depot: bool = False) -> Paced:
+    def one(some: Floats, needs: list[Demand], ways: Ways, *, any_depot: bool = False) -> Paced:
         def count(sortie: Sortie) -> int:
             home = ways.depots[sortie.depot].tolist()
             stops = stops_of(
@@ -117,20 +130,8 @@ def _planned(
             field, lines, demand, settings, angle_deg=angle_deg, depots=given, one=one
         )
         sorties, places = fleet.paced, fleet.depots
-    elif len(given) or not _is_one(settings, litres):
-        places = given if len(given) else suggested_depot(field, lines, litres)
-        sorties = one(lines, demand, build_ways(field, places))
     else:
-        edge = edge_places(field, step_m=EDGE_STEP_M, count_max=EDGE_PLACES)
-        sorties = one(lines, demand, build_ways(field, edge), any_depot=True)
-        used = sorted({sortie.depot for sortie in sorties.sorties})
-        places = edge[used]
-        sorties = replace(
-            sorties,
-            sorties=tuple(
-                replace(sortie, depot=used.index(sortie.depot)) for sortie in sorties.sorties
-            ),
-        )
+        sorties, places = _from_depots(field, lines, demand, settings, given, one)
     done = no_lines() if left is None else left.done
     coverage = of_rated_ground(
         measure(sprayed, field.limit, width_m), joined([done, flown_lines(sorties.sorties)]),
@@ -157,6 +158,55 @@ def _planned(
         terrain=around.terrain,
     )
     return scheduled(plan)
+
+
+def _from_depots(
+    field: Field,
+    lines: Floats,
+    demand: list[Demand],
+    settings: Settings,
+    given: Floats,
+    one: One,
+) -> tuple[Paced, Floats]:
+    """Return the sorties of one aircraft and their depots: those given, else the best ones."""
+    if len(given):
+        return one(lines, demand, build_ways(field, given)), given
+    litres = np.array([need.total_l for need in demand])
+    if _is_one(settings, litres):
+        edge = edge_places(field, step_m=EDGE_STEP_M, count_max=EDGE_PLACES)
+        found = one(lines, demand, build_ways(field, edge), any_depot=True)
+        used = sorted({sortie.depot for sortie in found.sorties})
+        sorties = [replace(each, depot=used.index(each.depot)) for each in found.sorties]
+        return replace(found, sorties=tuple(sorties)), edge[used]
+    ways = _in_reach(field, lines, litres, REACH * settings.reach_m)
+    while True:
+        try:
+            return one(lines, demand, ways), ways.depots
+        except OutOfReachError:
+            if len(ways.depots) >= DEPOTS_MAX:
+                raise
+        ways = _with_another(ways, lines, litres)
+
+
+def _in_reach(field: Field, lines: Floats, litres: Floats, reach_m: float) -> Ways:
+    """Return the ways from the best depot, and from more where it is too far from some line."""
+    ways = build_ways(field, suggested_depot(field, lines, litres))
+    ends = lines.reshape(-1, 2)
+    home_m = ways.home_ways_m(ends)
+    while float(home_m.min(axis=0).max()) > reach_m and len(ways.depots) < DEPOTS_MAX:
+        ways = _with_another(ways, lines, litres)
+        home_m = ways.home_ways_m(ends)
+    needed = list(range(len(ways.depots)))
+    for depot in needed[:-1]:
+        others = [each for each in needed if each != depot]
+        if float(home_m[others].min(axis=0).max()) <= reach_m:
+            needed = others
+    return ways if len(needed) == len(ways.depots) else build_ways(field, ways.depots[needed])
+
+
+def _with_another(ways: Ways, lines: Floats, litres: Floats) -> Ways:
+    another = suggested_depot(ways.field, lines, litres, besides=ways)
+    return build_ways(ways.field, np.concatenate([ways.depots, another]))
 
 
 def _demand(lines: Floats, rates: Rates, field: Field, settings: Settings) -> list[Demand]:

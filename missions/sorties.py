@@ -13,7 +13,7 @@ import shapely
 from missions.budget import Budget, build_budget
 from missions.demand import Demand, Pieces, cut
 from missions.energy import J_WH, KG_L, nose_s
-from missions.errors import PlanError
+from missions.errors import OutOfReachError, PlanError
 from missions.network import (
     ACROSS_M,
     JOIN_DEG,
@@ -100,11 +100,16 @@ class SortieSearch:
         """
         passes, settings, pieces = self._passes, self.settings, self._pieces
         limits = build_limits(settings, battery_share)
+        if not before:
+            self._check_reach()
         order = self._in_order(settings.moves // (MOVES_A_KICK * FEWER_KICKS))
         known: list[list[list[Part]]] = []
         if not before and len(pieces) <= ANNEALED_MAX:
             orders = self._annealed(battery_share)
-            known = [[[_part(passes, pieces, enter) for enter in order] for order in orders]]
+            annealed = [[_part(passes, pieces, enter) for enter in order] for order in orders]
+            # Its budget lets each ferry take the nearest depot; a sortie ends where it began.
+            if all(flown_by(passes, limits, each).wh <= limits.usable_wh for each in annealed):
+                known = [annealed]
         found = several(
             passes, limits, self._run(order), known,
             before=before, moves=settings.moves, seed=settings.seed,
@@ -115,6 +120,29 @@ class SortieSearch:
         drawn = [_drawn(*_as_pieces(passes, each), self.ways, self.flying.motion) for each in found]
         taken = min(range(len(found)), key=lambda at: _total_s(drawn[at], settings))
         return found[taken], drawn[taken]
+
+    def _check_reach(self) -> None:
+        """Raise OutOfReachError where the battery lasts for no flight to some end and back."""
+        passes, settings = self._passes, self.settings
+        battery = settings.battery
+        if battery is None or battery.capacity_wh is None:
+            return
+        lines = np.arange(len(self.lines))
+        ends_m = np.concatenate([np.zeros(len(lines)), np.array(passes.length_m)])
+        far_m = passes.many.homes_m(np.tile(lines, 2), ends_m).min(axis=0)
+        worst = int(far_m.argmax())
+        upright_s = settings.upright_s
+        away_s = 2.0 * float(passes.times.legs_s(far_m[worst : worst + 1])[0])
+        # What it takes in any case: spraying draws less on the way than a ferry is counted with.
+        needed_wh = battery.wh(
+            cruise_s=away_s * min(battery.cruise_w, battery.hover_w) / battery.cruise_w,
+            other_s=0.0,
+            litres=0.0,
+        )
+        needed_wh += upright_s * battery.hover_w / J_WH
+        if needed_wh > battery.usable_wh:
+            place = passes.place(worst % len(lines), float(ends_m[worst]))
+            raise _out_of_reach(place, float(far_m[worst]), needed_wh, self.ways, settings)
 
     @cached_property
     def _margin_m(self) -> float:
@@ -299,16 +327,25 @@ def _budget(
 def _too_far(
     passes: Passes, limits: Limits, parts: Sequence[Part], ways: Ways, settings: Settings
 ) -> PlanError:
-    """Return that a battery does not last to some place, there and back, or for any sortie."""
-    needed = [flown_by(passes, limits, [part]).wh for part in parts]
-    worst = int(np.argmax(needed))
-    line, start_m, _ = parts[worst]
-    place = ways.field.frame.to_geographic(*passes.place(line, start_m))
+    """Return that a battery does not last to some place, there and back."""
+    ends = [(line, at_m) for line, *both_m in parts for at_m in both_m]
+    far_m = [min(passes.homes_m(line, at_m)) for line, at_m in ends]
+    worst = int(np.argmax(far_m))
+    line, at_m = ends[worst]
+    bare_wh = flown_by(passes, limits, [(line, at_m, at_m)]).wh
+    return _out_of_reach(passes.place(line, at_m), far_m[worst], bare_wh, ways, settings)
+
+
+def _out_of_reach(
+    place: Place, far_m: float, needed_wh: float, ways: Ways, settings: Settings
+) -> OutOfReachError:
+    latitude_deg, longitude_deg = ways.field.frame.to_geographic(*place)
     usable_wh = math.inf if settings.battery is None else settings.battery.usable_wh
-    return PlanError(
-        f"one piece of a line near {place[0]:.6f}, {place[1]:.6f} and the ferry there and back "
-        f"take {needed[worst]:.4g} Wh, and the battery has {usable_wh:.4g} Wh "
-        "above its reserve; put a depot nearer, or see mission.battery_wh"
+    return OutOfReachError(
+        f"{latitude_deg:.6f}, {longitude_deg:.6f} is {far_m:.0f} m from the nearest depot as it is "
+        f"flown: there and back alone takes {needed_wh:.0f} Wh of the {usable_wh:.0f} Wh that the "
+        "battery has above its reserve; put a depot nearer (--depot, as often as needed), or see "
+        "mission.battery_wh"
     )
 
 

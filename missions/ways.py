@@ -212,8 +212,13 @@ def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
     return outer
 
 
-def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:
-    """Return the place on the edge of the field from which the litres are nearest."""
+def suggested_depot(
+    field: Field, lines: Floats, litres: Floats, *, besides: Ways | None = None
+) -> Floats:
+    """Return the place on the edge of the field from which the litres are nearest, shape (1, 2).
+
+    With `besides` it is one more depot: of each litre counts the nearer of the two ways.
+    """
     places = edge_places(field, step_m=25.0, count_max=120)
     middle = (lines[:, :2] + lines[:, 2:]) / 2.0
     thirds = np.concatenate([middle, (lines[:, :2] + middle) / 2, (lines[:, 2:] + middle) / 2])
@@ -221,6 +226,8 @@ def suggested_depot(field: Field, lines: Floats, litres: Floats) -> Floats:
     far_m = np.hypot(
         places[:, 0][:, None] - thirds[:, 0][None, :], places[:, 1][:, None] - thirds[:, 1][None, :]
     )
+    if besides is not None:
+        far_m = np.minimum(far_m, besides.home_ways_m(thirds).min(axis=0))
     best: Floats = places[[int(np.argmin(far_m @ weight))]]
     return best
 

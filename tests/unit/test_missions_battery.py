@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from shapely import box
+from shapely import Polygon, box
 
 from companion.config.tables import MissionTable
 from missions.demand import Uniform
@@ -18,6 +19,7 @@ from missions.plan import Leg, Plan, Settings, Sortie
 from missions.planner import plan_mission
 from missions.reading_fleet import battery_of
 from missions.verticals import Vertical
+from missions.ways import build_ways
 from tests.unit.test_missions_plan import field_of, plan_of
 
 DRAWN = Battery(hover_w=4000.0, cruise_w=3500.0, per_kg_w=60.0)
@@ -107,7 +109,7 @@ def test_a_fresh_battery_is_put_in_only_where_the_old_one_does_not_last() -> Non
 
 
 def test_a_battery_that_does_not_reach_the_field_is_refused_with_the_place() -> None:
-    with pytest.raises(PlanError, match=r"near 48\.\d+, 11\.\d+ .* mission\.battery_wh"):
+    with pytest.raises(PlanError, match=r"48\.\d+, 11\.\d+ is \d+ m .* mission\.battery_wh"):
         with_battery(20.0)
 
 
@@ -134,3 +136,36 @@ def test_more_load_never_draws_less(
 ) -> None:
     split = {"cruise_s": seconds * cruise, "other_s": seconds * (1.0 - cruise)}
     assert DRAWN.wh(**split, litres=litres) <= DRAWN.wh(**split, litres=litres + more)
+
+
+# A bay in the middle of the southern edge.
+BAY = Polygon(
+    [(0.0, 0.0), (250.0, 0.0), (250.0, 300.0), (350.0, 300.0), (350.0, 0.0), (600.0, 0.0),
+     (600.0, 400.0), (0.0, 400.0)]
+)  # fmt: skip
+
+
+def test_the_way_to_a_depot_outside_is_as_long_as_it_is_drawn() -> None:
+    field = field_of(BAY)
+    depots = np.array([[300.0, 100.0], [-80.0, 200.0], [300.0, 450.0], [0.0, 0.0], [260.0, -40.0]])
+    ways = build_ways(field, depots)
+    ends = np.array([[20.0, 10.0], [240.0, 150.0], [360.0, 20.0], [590.0, 390.0], [300.0, 350.0]])
+    drawn = [[ways.home(depot, (x, y)) for x, y in ends.tolist()] for depot in range(len(depots))]
+    drawn_m = [[sum(map(math.dist, way, way[1:])) for way in row] for row in drawn]
+    assert ways.home_ways_m(ends) == pytest.approx(np.array(drawn_m), abs=0.01)
+    assert not ways.are_straight
+
+
+def test_where_the_battery_does_not_reach_everything_more_depots_are_suggested() -> None:
+    settings = Settings(
+        swath_width_m=6.0, speed_m_s=6.0, reserve_l=0.0, tank_l=20.0, moves=400,
+        battery=replace(DRAWN, capacity_wh=300.0),
+    )  # fmt: skip
+    field = field_of(box(0.0, 0.0, 24.0, 1600.0))
+    plan = plan_mission(field, settings, Uniform(rate_l_ha=20.0))
+    assert len(plan.depots) > 1
+    assert plan.suggested_depot
+    assert max(drawn_wh(plan)) <= 240.0
+    one = (field.frame.to_geographic(*plan.depots[0]),)
+    with pytest.raises(PlanError, match=r"from the nearest depot .* as often as needed"):
+        plan_mission(field, settings, Uniform(rate_l_ha=20.0), depots=one)

@@ -156,6 +156,18 @@ def test_what_is_counted_at_once_is_what_each_sortie_takes(
     assert max(each.wh for each in flown) <= (wh or math.inf) + 1e-3
 
 
+def test_a_sortie_lands_where_it_took_off() -> None:
+    """Along one line from depot to depot: the other end is near the other depot, and of no use."""
+    lines = np.array([[0.0, 10.0, 0.0, 1010.0]])
+    passes = passes_of(lines)
+    passes.depots = [(0.0, 0.0), (0.0, 1020.0)]
+    limits = limits_of(40.0)
+    found = flown_by(passes, limits, [(0, 0.0, 1000.0)])
+    ferries_s = MOTION.legs_s(np.array([10.0, 1010.0])).sum()
+    spraying_s = float(MOTION.legs_s(np.array([1000.0]))[0])
+    assert found.seconds == pytest.approx(LANDING_S + ferries_s + spraying_s, abs=0.5)
+
+
 def test_a_tank_of_two_passes_is_empty_where_it_began() -> None:
     """Out on one pass and back on the next: only the ways across are ferries."""
     passes, run = serpentine(8, 800.0, 0.0)
