@@ -30,7 +30,7 @@ def at_ferry_height(
     for sortie in sorties:
         legs: list[Leg] = []
         for number, leg in enumerate(sortie.legs):
-            if not _is_high(leg):
+            if not is_high(leg):
                 legs.append(leg)
                 continue
             before = sortie.legs[number - 1] if number else None
@@ -40,7 +40,8 @@ def at_ferry_height(
     return tuple(found)
 
 
-def _is_high(leg: Leg) -> bool:
+def is_high(leg: Leg) -> bool:
+    """Return whether a way is one that is flown at the height of ferries, where there is one."""
     if leg.kind == "spray" or leg.through:
         return False
     return leg.length_m >= (SHORT_M if leg.kind == "ferry" else LONG_TRANSIT_M)

@@ -28,6 +28,7 @@ from missions.room import in_room
 from missions.schedule import scheduled
 from missions.searching import lines_are_drawn
 from missions.short import short_warnings
+from missions.spacing import Spacing, near_warnings
 from missions.strips import Floats, joined, no_lines
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from missions.treated_rates import UntreatedRates, demands_once
@@ -106,6 +107,8 @@ def _planned(
     lines_are_drawn()
 
     def one(some: Floats, needs: list[Demand], ways: Ways, *, any_depot: bool = False) -> Paced:
+        spacing = Spacing(ways=ways, settings=settings, apart=with_sprayer)
+
         def count(sortie: Sortie) -> int:
             home = ways.depots[sortie.depot].tolist()
             stops = stops_of(
@@ -115,7 +118,7 @@ def _planned(
 
         def pace(sorties: Sequence[Sortie]) -> Paced:
             return in_room(
-                sorties, ways, lambda some: around.paced(some, rates, field, settings), count,
+                sorties, ways, lambda some: around.paced(some, rates, spacing, settings), count,
                 room=ITEMS_MAX[settings.autopilot],
             )  # fmt: skip
 
@@ -153,6 +156,7 @@ def _planned(
             *range_warnings(sorties.misses, field.frame, settings),
             *short_warnings(sorties.sorties, rates, field.frame, settings),
             *far_warnings(sorties.sorties, places, field, has_battery=settings.battery is not None),
+            *near_warnings(sorties.sorties, field.frame, apart=with_sprayer),
             *around.warnings(sorties.sorties, places, field.frame, settings),
         ),
         terrain=around.terrain,

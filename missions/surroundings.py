@@ -12,6 +12,7 @@ from missions.field import Field
 from missions.paced import Paced, paced
 from missions.plan import Settings, Sortie
 from missions.run_in import RunIn, slow_starts, with_run_ins
+from missions.spacing import Spacing
 from missions.strips import Floats
 from missions.terrain.ground import Terrain
 from missions.terrain.heights import return_warnings
@@ -32,17 +33,17 @@ class Surroundings:
             self.terrain.check_field(field, depots)
 
     def paced(
-        self, sorties: Sequence[Sortie], rates: Rates, field: Field, settings: Settings
+        self, sorties: Sequence[Sortie], rates: Rates, spacing: Spacing, settings: Settings
     ) -> Paced:
         """Return the sorties with the speeds of rates and slopes, their run-ins and times."""
         found = paced(sorties, rates, settings, self.terrain)
-        if self.run_in is None:
-            raised = at_ferry_height(found.sorties, settings)
-            return replace(found, sorties=timed(raised, settings))
-        longer = with_run_ins(found.sorties, field, settings, self.run_in)
+        longer, run_in_m = found.sorties, 0.0
+        if self.run_in is not None:
+            longer = with_run_ins(longer, spacing.ways.field, settings, self.run_in)
+            run_in_m = self.run_in.wanted_m(settings.motion.at(settings.speed_m_s))
+        longer = spacing.spaced(longer)
         if self.terrain is not None:
             longer = tuple(self._slowed(sortie, settings) for sortie in longer)
-        run_in_m = self.run_in.wanted_m(settings.motion.at(settings.speed_m_s))
         raised = at_ferry_height(longer, settings, run_in_m=run_in_m)
         return replace(found, sorties=timed(raised, settings))
 

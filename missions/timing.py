@@ -12,7 +12,7 @@ from itertools import pairwise
 
 from missions.corners import Course, parts_s
 from missions.plan import Place, Settings, Sortie
-from missions.stops import SAME_M, is_run
+from missions.stops import SAME_M, is_passed, is_run
 
 # Places nearer than this are one.
 TOUCH_M = 1e-3
@@ -50,7 +50,8 @@ def timed(sorties: Sequence[Sortie], settings: Settings) -> tuple[Sortie, ...]:
 def _timed(sortie: Sortie, settings: Settings) -> Sortie:
     ways, motion = _ways(sortie, settings.height_m), settings.motion
     seconds = [0.0] * len(sortie.legs)
-    for some in (_without_runs(ways[:-1]), ways[-1:]):
+    sprays = [leg.kind == "spray" for leg in sortie.legs]
+    for some in (_without_runs(ways[:-1], sprays), ways[-1:]):
         found = parts_s(
             [way.length_m for way in some],
             [_bend_deg(before, after) for before, after in pairwise(some)],
@@ -126,14 +127,22 @@ def _is_no_way(sortie: Sortie, number: int) -> bool:
     return [other.kind for other in around] == ["spray", "spray"]
 
 
-def _without_runs(ways: list[_Way]) -> list[_Way]:
-    """Return the ways between waypoints: those that lead straight on are one."""
-    kept = ways[:1]
+def _without_runs(ways: list[_Way], sprays: Sequence[bool]) -> list[_Way]:
+    """Return the ways between waypoints: those that lead straight on are one.
+
+    `sprays` says of which legs are lines.
+    """
+    kept, passed = ways[:1], list[Place]()
     for way in ways[1:]:
         last = kept[-1]
+        ends = (last.start, last.end, way.end)
+        on_line = sprays[last.legs[-1][0]] or sprays[way.legs[0][0]]
         level = not way.upright_m and not last.upright_m
-        if level and way.speed_m_s == last.speed_m_s and is_run(last.start, last.end, way.end):
+        same = level and way.speed_m_s == last.speed_m_s
+        if same and (is_run(*ends) or (on_line and is_passed(*ends, passed))):
+            passed.append(last.end)
             kept[-1] = replace(last, end=way.end, legs=(*last.legs, *way.legs))
         else:
+            passed = []
             kept.append(way)
     return kept

@@ -16,6 +16,7 @@ from missions.coverage import reachable
 from missions.demand import Uniform, cut, demands
 from missions.field import build_field
 from missions.free_space import free_space
+from missions.layouts import spray_lines
 from missions.network import build_network
 from missions.open_lines import needed_passes, open_lines
 from missions.patches import patches
@@ -23,13 +24,20 @@ from missions.plan import Settings
 from missions.planner import plan_mission
 from missions.savings import by_savings, cost_s
 from missions.search import improve
+from missions.sorties import Flying, SortieSearch
+from missions.spacing import Spacing
+from missions.stops import near_pairs, waypoints_of
 from missions.strips import joined, lengths_m, rectangles, united
 from missions.swaths import border_passes, inner_ground, inner_lines
 from missions.turns import Motion
+from missions.ways import build_ways
 from tests.bench.missions import FRAME, random_field, to_degrees
 
 WIDTH_M = 7.0
 MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5)
+SETTINGS = Settings(swath_width_m=WIDTH_M, speed_m_s=6.0, moves=0)
+# Of pairs of waypoints that are too near so many may stay, where there is no room.
+NEAR_LEFT = 0.1
 seeds = st.integers(min_value=0, max_value=5_000)
 angles = st.floats(min_value=0.0, max_value=180.0)
 
@@ -130,3 +138,26 @@ def test_a_strip_is_as_long_and_wide_as_its_line_says(
     row = [x, y, x + length_m * math.cos(course), y + length_m * math.sin(course)]
     strip = rectangles(np.array([row]), width_m)[0]
     assert strip.area == pytest.approx(length_m * width_m, rel=1e-6)
+
+
+@given(seed=seeds)
+@settings(max_examples=10)
+def test_waypoints_are_apart_and_lines_end_where_they_end(seed: int) -> None:
+    field = build_field(to_degrees(ground_of(seed)), swath_width_m=WIDTH_M, frame=FRAME)
+    lines = spray_lines(field, SETTINGS, MOTION)[0]
+    ways = build_ways(field, lines[:1, :2])
+    needs = demands(lines, Uniform(rate_l_ha=9.0), width_m=WIDTH_M)
+    search = SortieSearch(
+        lines=lines, demand=needs, ways=ways, settings=SETTINGS, flying=Flying(motion=MOTION)
+    )
+    given_ones = search.in_one() or search.several()[1]
+    found_ones = Spacing(ways=ways, settings=SETTINGS).spaced(given_ones)
+    for one, found in zip(given_ones, found_ones, strict=True):
+        before, after = (len(near_pairs(waypoints_of(each))) for each in (one, found))
+        assert after <= before * NEAR_LEFT
+        for leg, given_leg in zip(found.legs, one.legs, strict=True):
+            if leg.kind == "spray":
+                assert leg == given_leg
+            assert (leg.points[0], leg.points[-1]) == (given_leg.points[0], given_leg.points[-1])
+            if leg.points != given_leg.points and leg.kind == "transit":
+                assert ways.inside.space.covers(shapely.LineString(leg.points))

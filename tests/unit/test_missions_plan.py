@@ -157,11 +157,15 @@ def test_no_spray_ground_is_flown_over_but_not_sprayed() -> None:
 
 
 def test_a_depot_outside_is_reached_by_the_shortest_way_in() -> None:
-    plan = plan_of(box(0.0, 0.0, 200.0, 100.0), depots=((-50.0, 50.0),))
+    # No line begins less than 2 m from where it enters the field: that would be one waypoint.
+    plan = plan_of(box(0.0, 0.0, 200.0, 100.0), depots=((-50.0, 54.0),))
     first = plan.sorties[0].legs[0]
     assert first.kind == "ferry"
-    assert first.points[0] == pytest.approx((-50.0, 50.0), abs=1e-3)
-    assert first.points[1] == pytest.approx((0.0, 50.0), abs=0.05)
+    assert first.points[0] == pytest.approx((-50.0, 54.0), abs=1e-3)
+    assert first.points[1] == pytest.approx((0.0, 54.0), abs=0.05)
+    near = plan_of(box(0.0, 0.0, 200.0, 100.0), depots=((-50.0, 50.0),)).sorties[0].legs[0]
+    assert near.points[1] == pytest.approx((0.0, 50.0), abs=0.06)
+    assert len(near.points) == 2
 
 
 def test_every_sortie_starts_at_the_depot_that_is_nearest() -> None:

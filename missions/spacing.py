@@ -1,0 +1,478 @@
+"""Ways between lines whose waypoints are far enough apart for an autopilot to fly each.
+
+Lines end where they end. Where a waypoint would come too near to the one before, the way begins
+farther along the line and ends in the direction of the next one, its corners move outwards or are
+left out, as long as it stays on free ground. What is straight on from a line is one way with it
+(`missions.stops`), so that such a way has no waypoint where its line ends.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from companion.core.frame import LocalFrame
+from companion.wording import counted
+from missions.ferries import is_high
+from missions.plan import Leg, Place, Settings, Sortie
+from missions.stops import NEAR_M, SAME_M, is_passed, near_pairs, waypoints_of
+from missions.strips import Floats
+from missions.ways import Ways
+
+# A little more than the least distance: places are rounded when they are written.
+APART_M = NEAR_M + 0.01
+# So far a way may go on straight from one line, or straight into the next.
+BEYOND_M = (0.0, 0.5, 1.0, 1.5, 2.02, 2.5, 3.0, 4.0)
+# Where both lines meet farther beyond their ends than this, no waypoint is put there.
+MEET_MAX_M = 8.0
+# Corners are tried so far outwards, and along the ways beside them.
+OUT_M, ALONG_M = (1.0, 2.02, 3.0), (1.0, 2.02)
+RING = 12
+# Corners farther than this from the next waypoint stay; so many are left out in a row.
+CROWDED_M, SKIPPED_MAX = 4.0, 3
+# A waypoint more is worth so much way, and one that is too near more than any detour tried here.
+WAYPOINT_M, TOO_NEAR_M = 6.0, 1000.0
+# Cosine of what is straight on.
+STRAIGHT = 1.0 - 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Option:
+    """A way between two lines; `first` and `last` are its waypoints next to them."""
+
+    points: tuple[Place, ...]
+    first: Place
+    last: Place
+    cost_m: float
+    near: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _End:
+    """The end of a line, or home, and the direction in which a way may go on from it.
+
+    `least_m` is how far it goes on at least; `keeps` says that the end stays a waypoint then.
+    """
+
+    at: Place
+    along: Place | None = None
+    least_m: float = 0.0
+    keeps: bool = True
+    is_home: bool = False
+
+    def beyond(self, far_m: float) -> Place:
+        """Return the place so far beyond the end."""
+        if self.along is None or not far_m:
+            return self.at
+        return self.at[0] + self.along[0] * far_m, self.at[1] + self.along[1] * far_m
+
+    def tried_m(self, inside: BaseGeometry) -> list[float]:
+        """Return how far a way may go on from here inside the field."""
+        if self.along is None:
+            return [0.0]
+        longer = [far_m for far_m in BEYOND_M if far_m > self.least_m]
+        free = _are_free(inside, [(self.at, self.beyond(far_m)) for far_m in longer])
+        return [
+            self.least_m,
+            *(far_m for far_m, is_free in zip(longer, free, strict=True) if is_free),
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Free:
+    """Where a way may go on straight from a line, and where its corners may lie."""
+
+    inside: BaseGeometry
+    corners: BaseGeometry
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spacing:
+    """Keeps waypoints apart; `apart`, lines have waypoints at both ends whatever comes.
+
+    What was found for a way between two lines is known when it comes again.
+    """
+
+    ways: Ways
+    settings: Settings
+    apart: bool = False
+    _known: dict[tuple[object, ...], list[_Option]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def spaced(self, sorties: Sequence[Sortie]) -> tuple[Sortie, ...]:
+        """Return the sorties with their ways between lines so that waypoints are far apart."""
+        return tuple(self._spaced(each) for each in sorties)
+
+    def _spaced(self, sortie: Sortie) -> Sortie:
+        found = replace(sortie, legs=self._legs(sortie.legs, frozenset()))
+        near = near_pairs(waypoints_of(found, apart=self.apart))
+        if not near:
+            return found
+        places = [place for pair in near for place in pair]
+        # Ends of lines that are thought to be passed may stay waypoints, where several lines in a
+        # row are short: once more, as if all there did.
+        kept = frozenset(
+            number
+            for number, leg in enumerate(sortie.legs)
+            if leg.kind != "spray" and _distance_m(found.legs[number].points, places) < SAME_M
+        )
+        again = replace(sortie, legs=self._legs(sortie.legs, kept))
+        fewer = len(near_pairs(waypoints_of(again, apart=self.apart))) < len(near)
+        return again if fewer else found
+
+    def _legs(self, legs: tuple[Leg, ...], kept: frozenset[int]) -> tuple[Leg, ...]:
+        """Return the legs; at the ways in `kept` ends of lines are waypoints whatever comes."""
+        joins = [number for number, leg in enumerate(legs) if leg.kind != "spray"]
+        plain = [self._plain(legs, number, keeps=number in kept) for number in joins]
+        # Places at which the speed changes inside a line.
+        inner = [
+            tuple(leg.points[-1] for leg in legs[one + 1 : other - 1])
+            for one, other in pairwise(joins)
+        ]
+        short = [
+            _near(option.last, places, following.first) > 0
+            for (option, following), places in zip(pairwise(plain), inner, strict=True)
+        ]
+        options = []
+        for at, number in enumerate(joins):
+            coupled = any(short[max(at - 1, 0) : at + 1])
+            some = [plain[at]]
+            if coupled or plain[at].near:
+                found = self._others(legs, number, keeps=number in kept)
+                some += found if coupled else found[:1]
+            options.append(some)
+        if all(len(some) == 1 for some in options):
+            return legs
+        chosen = _cheapest(options, inner)
+        found_legs = list(legs)
+        for number, option in zip(joins, chosen, strict=True):
+            found_legs[number] = replace(legs[number], points=option.points)
+        return tuple(found_legs)
+
+    def _plain(self, legs: Sequence[Leg], number: int, *, keeps: bool) -> _Option:
+        """Return a way as it is."""
+        leg = legs[number]
+        before, after = _beside(legs, number)
+        if before is not None and after is not None and len(leg.points) == 2 and not self.apart:
+            known = _as_one(before, leg, after, keeps=keeps)
+            if known is not None:
+                return known
+        ends = self._ends(legs, number, keeps=keeps)
+        inner = leg.points[1 + bool(ends[0].least_m) : len(leg.points) - 1 - bool(ends[1].least_m)]
+        return _option(ends, (ends[0].least_m, ends[1].least_m), inner)
+
+    def _ends(self, legs: Sequence[Leg], number: int, *, keeps: bool) -> tuple[_End, _End]:
+        """Return where a way begins and ends."""
+        leg = legs[number]
+        high = self.settings.ferry_height_m is not None and is_high(leg)
+        ways = (leg.points, leg.points[::-1])
+        found = []
+        for line, points, sign in zip(_beside(legs, number), ways, (1.0, -1.0), strict=True):
+            if line is None or high:
+                found.append(_End(at=points[0], is_home=line is None))
+                continue
+            east, north = np.subtract(line.points[-1], line.points[0]) * sign / line.length_m
+            along = (float(east), float(north))
+            stays = keeps or self.apart or line.speed_m_s != leg.speed_m_s
+            found.append(
+                _End(at=points[0], along=along, least_m=_run_m(points, along), keeps=stays)
+            )
+        return found[0], found[1]
+
+    def _others(self, legs: Sequence[Leg], number: int, *, keeps: bool) -> list[_Option]:
+        """Return other ways for one, the best first."""
+        leg = legs[number]
+        if leg.through:
+            return []
+        before, after = _beside(legs, number)
+        key = (keeps, before and before.points, before and before.speed_m_s, leg,
+               after and after.points, after and after.speed_m_s)  # fmt: skip
+        if key not in self._known:
+            ends, free = self._ends(legs, number, keeps=keeps), self._free(leg)
+            inner = leg.points[
+                1 + bool(ends[0].least_m) : len(leg.points) - 1 - bool(ends[1].least_m)
+            ]
+            found = [*_meeting(ends, free.inside), *_around(ends, inner, free)]
+            if all(each.near for each in found):
+                found += _around(ends, inner, free, anywhere=True)
+            self._known[key] = sorted(found, key=lambda each: (each.near, each.cost_m))
+        return self._known[key]
+
+    def _free(self, leg: Leg) -> _Free:
+        """Return the ground that a way may use: the field's, unless it leaves the field."""
+        inside = self.ways.inside.space
+        if leg.kind != "ferry" or shapely.covers(inside, shapely.LineString(leg.points)):
+            return _Free(inside=inside, corners=inside)
+        return _Free(inside=inside, corners=self._outside)
+
+    @cached_property
+    def _outside(self) -> BaseGeometry:
+        space = (self.ways.high or self.ways).around.space
+        shapely.prepare(space)
+        return space
+
+
+def near_warnings(
+    sorties: Sequence[Sortie], frame: LocalFrame, *, apart: bool = False
+) -> tuple[str, ...]:
+    """Return how many waypoints are too near to the one before all the same, and where."""
+    pairs = [pair for each in sorties for pair in near_pairs(waypoints_of(each, apart=apart))]
+    if not pairs:
+        return ()
+    nearest = min(pairs, key=lambda pair: math.dist(*pair))
+    latitude_deg, longitude_deg = frame.to_geographic(*nearest[1])
+    why = (
+        "DO_SPRAYER needs one at both ends of each line; plan without --sprayer"
+        if apart
+        else "lines and free ground leave no room there; leave that nook out of the outline"
+    )
+    return (
+        f"{counted(len(pairs), 'waypoint')} less than {NEAR_M:g} m from the one before, the "
+        f"nearest {math.dist(*nearest):.1f} m near {latitude_deg:.6f}, {longitude_deg:.6f}: {why}",
+    )
+
+
+def _beside(legs: Sequence[Leg], number: int) -> tuple[Leg | None, Leg | None]:
+    """Return the lines before and after a way."""
+    before = legs[number - 1] if number else None
+    after = legs[number + 1] if number + 1 < len(legs) else None
+    return (
+        before if before is not None and before.kind == "spray" else None,
+        after if after is not None and after.kind == "spray" else None,
+    )
+
+
+def _as_one(before: Leg, leg: Leg, after: Leg, *, keeps: bool) -> _Option | None:
+    """Return a way whose ends are one waypoint, or none; None for one that has two."""
+    end, start = leg.points
+    far_m = math.dist(end, start)
+    one, other = before.points[0], after.points[-1]
+    at: Place | None = None
+    if far_m < SAME_M:
+        at = ((end[0] + start[0]) / 2.0, (end[1] + start[1]) / 2.0)
+        both_are_short = max(math.dist(one, at), math.dist(at, other)) < NEAR_M
+        if is_passed(one, at, other) and not both_are_short and not keeps:
+            at = None
+    elif not leg.through:
+        if keeps:
+            return None
+        at = start if is_passed(one, end, start) else end
+        if at == end and not is_passed(end, start, other):
+            return None
+    if at is None:
+        return _Option(points=leg.points, first=other, last=one, cost_m=far_m)
+    return _Option(points=leg.points, first=at, last=at, cost_m=far_m + WAYPOINT_M)
+
+
+def _run_m(points: Sequence[Place], along: Place) -> float:
+    """Return how far a way that bends later goes on straight from its line."""
+    if len(points) < 3:
+        return 0.0
+    east_m, north_m = points[1][0] - points[0][0], points[1][1] - points[0][1]
+    far_m = math.hypot(east_m, north_m)
+    return far_m if east_m * along[0] + north_m * along[1] > STRAIGHT * far_m > 0.0 else 0.0
+
+
+def _distance_m(points: Sequence[Place], others: Sequence[Place]) -> float:
+    """Return how far the nearest two of some places are apart."""
+    return min(math.dist(a, b) for a in points for b in others)
+
+
+def _near(first: Place, inner: Sequence[Place], last: Place) -> int:
+    """Return how many places are too near to the one before."""
+    return sum(math.dist(a, b) < NEAR_M for a, b in pairwise((first, *inner, last)))
+
+
+def _are_free(space: BaseGeometry, ways: Sequence[tuple[Place, Place]]) -> list[bool]:
+    """Return of each straight way whether it is free; the border lies a little outside."""
+    if not ways:
+        return []
+    lines = shapely.linestrings(np.array(ways))
+    found: list[bool] = np.asarray(shapely.contains_properly(space, lines)).tolist()
+    return found
+
+
+def _option(
+    ends: tuple[_End, _End], beyond_m: tuple[float, float], corners: Sequence[Place]
+) -> _Option:
+    """Return the way that goes on so far from both lines, and its cost."""
+    begin = [ends[0].at, ends[0].beyond(beyond_m[0])][: 1 + bool(beyond_m[0])]
+    end = [ends[1].beyond(beyond_m[1]), ends[1].at][not beyond_m[1] :]
+    points = (*begin, *corners, *(end[1:] if begin[-1] == end[0] else end))
+    # The end of a line that is straight on is no waypoint, nor is home.
+    first = int(bool(beyond_m[0]) and not ends[0].keeps)
+    last = len(points) - int(bool(beyond_m[1]) and not ends[1].keeps)
+    flown = points[first + ends[0].is_home : last - ends[1].is_home]
+    near = sum(math.dist(a, b) < NEAR_M for a, b in pairwise(flown))
+    length_m = sum(math.dist(a, b) for a, b in pairwise(points))
+    return _Option(
+        points=points, first=points[first], last=points[last - 1],
+        cost_m=length_m + WAYPOINT_M * (last - first), near=near,
+    )  # fmt: skip
+
+
+def _meeting(ends: tuple[_End, _End], inside: BaseGeometry) -> list[_Option]:
+    """Return the way over the place where both lines, longer, meet."""
+    one, other = ends
+    if one.along is None or other.along is None:
+        return []
+    (ux, uy), (vx, vy) = one.along, other.along
+    x, y = other.at[0] - one.at[0], other.at[1] - one.at[1]
+    sine = ux * vy - uy * vx
+    if abs(sine) < 1e-6:
+        return []
+    beyond_m = ((x * vy - y * vx) / sine, (x * uy - y * ux) / sine)
+    lengths = zip(beyond_m, ends, strict=True)
+    if not all(max(end.least_m, 1e-3) <= far_m <= MEET_MAX_M for far_m, end in lengths):
+        return []
+    place = one.beyond(beyond_m[0])
+    if not all(_are_free(inside, [(one.at, place), (place, other.at)])):
+        return []
+    # To the last digit the same place for both.
+    met = replace(
+        other,
+        along=((place[0] - other.at[0]) / beyond_m[1], (place[1] - other.at[1]) / beyond_m[1]),
+    )
+    found = _option((one, met), beyond_m, ())
+    return [found]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Nodes:
+    """Places that a way may lead over, by rank: 0 where it begins, the last where it ends."""
+
+    places: Floats
+    ranks: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    beyond_m: tuple[float, ...]
+
+
+def _around(
+    ends: tuple[_End, _End],
+    corners: Sequence[Place],
+    free: _Free,
+    *,
+    anywhere: bool = False,
+) -> list[_Option]:
+    """Return ways over corners as they are or moved, one for each pair of begin and end.
+
+    They are moved outwards, or `anywhere`; a way without corners then has one.
+    """
+    nodes = _nodes(ends, corners, free.inside, anywhere=anywhere)
+    steps_m = _steps_m(nodes, (ends[0].is_home, ends[1].is_home), free.corners)
+    last = int(nodes.ranks[-1])
+    starts, goals = np.flatnonzero(nodes.ranks == 0), np.flatnonzero(nodes.ranks == last)
+    found = []
+    for start in starts.tolist():
+        cost_m = np.full(len(nodes.ranks), math.inf)
+        cost_m[start] = 0.0
+        before = np.zeros(len(nodes.ranks), dtype=np.int64)
+        for node in range(len(starts), len(nodes.ranks)):
+            over = cost_m + steps_m[:, node]
+            before[node] = int(np.argmin(over))
+            cost_m[node] = over[before[node]]
+        for goal in goals.tolist():
+            if not math.isfinite(cost_m[goal]):
+                continue
+            chain = [goal]
+            while chain[-1] != start:
+                chain.append(int(before[chain[-1]]))
+            places = [_place(nodes.places[each]) for each in chain[-2:0:-1]]
+            found.append(_option(ends, (nodes.beyond_m[start], nodes.beyond_m[goal]), places))
+    return found
+
+
+def _place(point: Floats) -> Place:
+    return float(point[0]), float(point[1])
+
+
+def _nodes(
+    ends: tuple[_End, _End], corners: Sequence[Place], inside: BaseGeometry, *, anywhere: bool
+) -> _Nodes:
+    one, other = ends
+    way = (one.beyond(one.least_m), *corners, other.beyond(other.least_m))
+    if anywhere:
+        moved = [_ring(corner) for corner in corners] or [[*_ring(one.at), *_ring(other.at)]]
+    else:
+        moved = [_moved(*some) for some in zip(way[:-2], way[1:-1], way[2:], strict=True)]
+    first, last = one.tried_m(inside), other.tried_m(inside)
+    groups = [[one.beyond(each) for each in first], *moved, [other.beyond(each) for each in last]]
+    between = sum(len(some) for some in moved)
+    return _Nodes(
+        places=np.array([place for some in groups for place in some]),
+        ranks=np.repeat(np.arange(len(groups)), [len(some) for some in groups]),
+        beyond_m=(*first, *[0.0] * between, *last),
+    )
+
+
+def _ring(middle: Place) -> list[Place]:
+    """Return a place and others all around it."""
+    return [
+        middle,
+        *(
+            (middle[0] + far_m * math.cos(turn), middle[1] + far_m * math.sin(turn))
+            for far_m in OUT_M
+            for turn in (math.tau * step / RING for step in range(RING))
+        ),
+    ]
+
+
+def _moved(before: Place, corner: Place, after: Place) -> list[Place]:
+    """Return a corner, and where it has another one near by, places that it may move to."""
+    back, on = np.subtract(before, corner), np.subtract(after, corner)
+    back_m, on_m = float(np.hypot(*back)), float(np.hypot(*on))
+    if min(back_m, on_m) > CROWDED_M or min(back_m, on_m) < 1e-6:
+        return [corner]
+    back, on = back / back_m, on / on_m
+    out = -(back + on)
+    wide = float(np.hypot(*out))
+    out = out / wide if wide > 1e-3 else np.array([-on[1], on[0]])
+    steps = [far_m * out for far_m in OUT_M]
+    steps += [far_m * along for far_m in ALONG_M for along in (back, on)]
+    return [corner, *(_place(np.add(corner, step)) for step in steps)]
+
+
+def _steps_m(nodes: _Nodes, homes: tuple[bool, bool], space: BaseGeometry) -> Floats:
+    """Return what a step from one place to another one costs, infinite where there is none."""
+    ranks, places = nodes.ranks, nodes.places
+    ahead = ranks[None, :] - ranks[:, None]
+    rows, columns = np.nonzero((ahead > 0) & (ahead <= SKIPPED_MAX))
+    far_m = np.hypot(*(places[rows] - places[columns]).T)
+    at_home = (homes[0] & (ranks[rows] == 0)) | (homes[1] & (ranks[columns] == ranks[-1]))
+    far_m += WAYPOINT_M + np.where((far_m < APART_M) & ~at_home, TOO_NEAR_M, 0.0)
+    free = shapely.contains_properly(
+        space, shapely.linestrings(np.stack([places[rows], places[columns]], axis=1))
+    )
+    found = np.full((len(ranks), len(ranks)), math.inf)
+    found[rows[free], columns[free]] = far_m[free]
+    return found
+
+
+def _cheapest(
+    options: Sequence[Sequence[_Option]], inner: Sequence[Sequence[Place]]
+) -> list[_Option]:
+    """Return one option for each way, so that they are the best of all in a row."""
+    cost_m = np.array([_cost_m(each) for each in options[0]])
+    before = []
+    for some, following, places in zip(options[:-1], options[1:], inner, strict=True):
+        near = np.array(
+            [[_near(one.last, places, other.first) for other in following] for one in some]
+        )
+        over = cost_m[:, None] + TOO_NEAR_M * near
+        before.append(over.argmin(axis=0))
+        cost_m = over.min(axis=0) + np.array([_cost_m(each) for each in following])
+    chain = [int(cost_m.argmin())]
+    for step in reversed(before):
+        chain.append(int(step[chain[-1]]))
+    return [some[at] for some, at in zip(options, reversed(chain), strict=True)]
+
+
+def _cost_m(option: _Option) -> float:
+    return option.cost_m + TOO_NEAR_M * option.near

@@ -1,0 +1,157 @@
+"""Waypoints that are far enough apart, whatever the lines and obstacles between them."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import shapely
+from shapely import LineString, box
+
+from missions.demand import Uniform
+from missions.field import build_field
+from missions.plan import Leg, Place, Plan, Settings, Sortie
+from missions.planner import plan_mission
+from missions.spacing import Spacing, near_warnings
+from missions.stops import NEAR_M, near_pairs, waypoints_of
+from missions.ways import build_ways
+from tests.bench.missions import FRAME, to_degrees
+from tests.mission_fields import trees
+
+SETTINGS = Settings(swath_width_m=6.0, speed_m_s=6.0, moves=500)
+Line = tuple[Place, Place]
+
+
+def sortie_of(*lines: Line, corners: tuple[Place, ...] = ()) -> Sortie:
+    """Return a sortie over some lines; the first way between two has these corners."""
+    home = (0.0, 0.0)
+    legs = [Leg(kind="ferry", points=(home, lines[0][0]), speed_m_s=6.0)]
+    for number, (before, after) in enumerate(pairwise(lines)):
+        bends = () if number else corners
+        legs.append(Leg(kind="spray", points=before, speed_m_s=6.0))
+        legs.append(Leg(kind="transit", points=(before[1], *bends, after[0]), speed_m_s=6.0))
+    legs.append(Leg(kind="spray", points=lines[-1], speed_m_s=6.0))
+    legs.append(Leg(kind="ferry", points=(lines[-1][1], home), speed_m_s=6.0))
+    return Sortie(number=1, depot=0, legs=tuple(legs))
+
+
+def spacing_of(
+    ground: shapely.Geometry, *, settings: Settings = SETTINGS, apart: bool = False
+) -> Spacing:
+    field = build_field(
+        to_degrees(ground), swath_width_m=min(6.0, settings.swath_width_m), frame=FRAME
+    )
+    return Spacing(
+        ways=build_ways(field, np.array([[0.0, 0.0]])), settings=settings, apart=apart
+    )  # fmt: skip
+
+
+def checked(spacing: Spacing, sortie: Sortie) -> Sortie:
+    """Return the sortie spaced, after a look at what may not change."""
+    (found,) = spacing.spaced([sortie])
+    assert [leg for leg in found.legs if leg.kind == "spray"] == [
+        leg for leg in sortie.legs if leg.kind == "spray"
+    ]
+    for leg, given in zip(found.legs, sortie.legs, strict=True):
+        assert (leg.points[0], leg.points[-1]) == (given.points[0], given.points[-1])
+        if leg.kind == "transit":
+            assert spacing.ways.inside.space.covers(LineString(leg.points))
+    return found
+
+
+FIELD = box(-20.0, -20.0, 120.0, 120.0)
+
+
+@pytest.mark.parametrize(
+    "following",
+    [
+        # The two lines meet beyond their ends, before, or beyond one of them only.
+        ((41.2, 11.2), (42.0, 40.0)),
+        ((39.4, 9.4), (60.0, -15.0)),
+        ((40.0, 11.5), (70.0, 30.0)),
+        ((39.5, 8.6), (60.0, 18.0)),
+        # Back beside it, and on beside it.
+        ((39.0, 11.2), (10.0, 11.6)),
+        ((41.2, 11.0), (90.0, 11.5)),
+    ],
+)
+def test_ends_of_two_lines_that_are_near_are_flown_as_waypoints_apart(following: Line) -> None:
+    sortie = sortie_of(((0.0, 10.0), (40.0, 10.0)), following)
+    assert near_pairs(waypoints_of(sortie))
+    found = checked(spacing_of(FIELD), sortie)
+    stops = waypoints_of(found)
+    assert not near_pairs(stops)
+    # Both lines are flown from end to end, but for what two ends that are one waypoint lie aside.
+    way = LineString([stop.place for stop in stops])
+    for line in (sortie.legs[1], sortie.legs[3]):
+        assert max(way.distance(shapely.Point(place)) for place in line.points) < 0.3
+
+
+def test_a_line_shorter_than_a_leg_may_be_is_flown_longer() -> None:
+    lines = (((0.0, 10.0), (40.0, 10.0)), ((60.0, 30.0), (60.0, 31.2)), ((0.0, 50.0), (40.0, 50.0)))
+    sortie = sortie_of(*lines)
+    assert near_pairs(waypoints_of(sortie))
+    found = checked(spacing_of(FIELD), sortie)
+    assert not near_pairs(waypoints_of(found))
+    way = LineString([stop.place for stop in waypoints_of(found)])
+    assert all(way.distance(shapely.Point(place)) < 1e-6 for line in lines for place in line)
+
+
+def test_corners_move_away_from_what_they_lead_around() -> None:
+    # A post at the middle of the way: its corners are 0.9 m apart, and near the second line.
+    post = box(49.7, 14.4, 50.3, 15.0)
+    corners = ((49.4, 14.0), (50.6, 14.0))
+    lines = (((40.0, 60.0), (40.0, 15.0)), ((51.4, 15.0), (51.4, 60.0)))
+    sortie = sortie_of(*lines, corners=corners)
+    assert len(near_pairs(waypoints_of(sortie))) == 2
+    found = checked(spacing_of(FIELD.difference(post)), sortie)
+    assert not near_pairs(waypoints_of(found))
+
+
+def test_where_there_is_no_room_it_is_counted_and_said() -> None:
+    # A nook shorter than a leg may be, with lines to its very walls.
+    nook = box(0.0, 0.0, 1.8, 1.7)
+    lines = (((0.1, 0.4), (1.7, 0.4)), ((1.7, 1.2), (0.1, 1.2)))
+    sortie = sortie_of(*lines)
+    settings = Settings(swath_width_m=1.0, speed_m_s=6.0)
+    found = checked(spacing_of(nook, settings=settings), sortie)
+    assert len(near_pairs(waypoints_of(found))) == 3
+    (said,) = near_warnings([found], FRAME)
+    assert "3 waypoints less than 2 m from the one before, the nearest 0.8 m near" in said
+
+
+@pytest.mark.parametrize("words", ["plain", "ferry height", "px4"])
+def test_no_waypoint_of_a_field_of_trees_is_near_the_one_before(words: str) -> None:
+    plan = planned(
+        Settings(
+            swath_width_m=6.0, speed_m_s=6.0, moves=500,
+            ferry_height_m=15.0 if words == "ferry height" else None,
+            autopilot="px4" if words == "px4" else "ardupilot",
+        )
+    )  # fmt: skip
+    for sortie in plan.sorties:
+        for one, other in pairwise(waypoints_of(sortie)[1:]):
+            upright = one.height_m != other.height_m
+            assert math.dist(one.place, other.place) >= NEAR_M or upright
+    assert not near_warnings(plan.sorties, plan.field.frame)
+    inside = plan.field.fly.buffer(1e-5)
+    legs = [leg for sortie in plan.sorties for leg in sortie.legs if leg.kind == "transit"]
+    assert all(inside.covers(LineString(leg.points)) for leg in legs)
+
+
+def test_with_orders_at_their_ends_lines_keep_waypoints_there() -> None:
+    sortie = sortie_of(((0.0, 10.0), (40.0, 10.0)), ((40.0, 11.5), (70.0, 30.0)))
+    found = checked(spacing_of(FIELD, apart=True), sortie)
+    stops = waypoints_of(found, apart=True)
+    assert not near_pairs(stops)
+    assert [stop.opens for stop in stops if stop.opens is not None] == [True, False] * 2
+
+
+def planned(settings: Settings) -> Plan:
+    drawn = trees(15, corners=64, area_ha=6.0)
+    field = build_field(
+        drawn.outline, obstacles=list(drawn.obstacles), swath_width_m=6.0  # type: ignore[arg-type]
+    )  # fmt: skip
+    return plan_mission(field, settings, Uniform(rate_l_ha=20.0))
