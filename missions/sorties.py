@@ -121,6 +121,11 @@ class SortieSearch:
         taken = min(range(len(found)), key=lambda at: _total_s(drawn[at], settings))
         return found[taken], drawn[taken]
 
+    def most_wh(self, sorties: Sequence[list[Part]]) -> float:
+        """Return what the sortie takes that takes most, by the search's model."""
+        limits = build_limits(self.settings, 1.0)
+        return max(flown_by(self._passes, limits, each).wh for each in sorties)
+
     def _check_reach(self) -> None:
         """Raise OutOfReachError where the battery lasts for no flight to some end and back."""
         passes, settings = self._passes, self.settings
