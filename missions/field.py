@@ -28,12 +28,14 @@ from missions.wind import WindBuffer
 MARGIN_M = 0.0025
 # Borders are drawn anew with fewer corners so far inside, at most, and those of obstacles so far
 # outside of their buffers: a circle of 5 m becomes one of ten corners. Where many obstacles would
-# take more of the ground than that share, it is the lesser distance.
-OUTLINE_TOLERANCE_M, OBSTACLE_TOLERANCE_M, OBSTACLE_LESS_M = 0.1, 0.5, 0.25
-OBSTACLE_SHARE = 0.001
-# A simpler outline leaves so much of what a strip can reach; if not, the tolerance is made less,
-# and after so many times the outline stays as it was drawn. A plan covers 99.8 %.
-REACHED_MIN, TOLERANCE_LESS, TOLERANCES = 0.9982, 0.6, 6
+# take more of the ground than that share, it is the next lesser distance.
+OUTLINE_TOLERANCE_M = 0.1
+OBSTACLE_TOLERANCES_M = (0.5, 0.35, 0.25, 0.18, 0.12, 0.08, 0.05, 0.03)
+OBSTACLE_SHARE = 0.0009
+# Simpler borders leave out so little of what a strip can reach, what obstacles take among it; if
+# not, the outline's tolerance is made less, and after so many times it stays as it was drawn. A
+# plan covers 99.8 %.
+LOST_MAX, TOLERANCE_LESS, TOLERANCES = 0.0018, 0.6, 6
 EXTENT_MAX_M = 20_000.0
 # 383 ha with a swath of 1 m have so many.
 PASSES_MAX = 1_000
@@ -126,17 +128,21 @@ def build_field(
     kept = shapely.union_all(grounds)
     blocked = shapely.union_all([*holes, kept])
     flown = outline.difference(kept)
-    inside, tolerance_m = _simpler(outline, tolerance_m, swath_width_m)
+    around = _around(outline, kept)
+    inside, tolerance_m = _simpler(outline, kept, around, tolerance_m, swath_width_m)
     fly, high = None, None
     if inside is not None:
-        fly = _apart(inside, kept, tolerance_m)
+        fly = as_area(polygons_of(inside.difference(around)))
         tall = [
             ground
             for ground, each in zip(grounds, given, strict=True)
             if ferry_over_m is None or each.height_m is None or each.height_m > ferry_over_m
         ]
-        over = _apart(inside, shapely.union_all(tall), tolerance_m)
-        if len(tall) < len(grounds) and over is not None:
+        over = None
+        if len(tall) < len(grounds):
+            beside = _around(outline, shapely.union_all(tall))
+            over = as_area(polygons_of(inside.difference(beside)))
+        if over is not None:
             high = High(fly=over, blocked=shapely.union_all([*holes, *tall]))
     off = [translate(local_area(area, frame), *offset_m) for area in no_spray]
     closed = shapely.union_all(
@@ -170,17 +176,17 @@ def build_field(
     )
 
 
-def _apart(inside: Area, kept: BaseGeometry, tolerance_m: float) -> Area | None:
-    """Return the ground inside that is off the obstacles, drawn around them with few corners."""
+def _around(outline: Area, kept: BaseGeometry) -> BaseGeometry:
+    """Return the ground of obstacles, drawn with few corners."""
     grown = _grown(kept, MARGIN_M)
-    free = inside.difference(grown)
-    left: BaseGeometry = free
-    for least_m in (OBSTACLE_TOLERANCE_M, OBSTACLE_LESS_M):
-        apart = around_with_fewer_corners(grown, max(tolerance_m, least_m))
-        left = inside.difference(apart)
-        if left.area >= (1.0 - OBSTACLE_SHARE) * free.area:
-            break
-    return as_area(polygons_of(left))
+    if grown.is_empty:
+        return grown
+    free_m2 = outline.difference(grown).area
+    for tolerance_m in OBSTACLE_TOLERANCES_M:
+        around = around_with_fewer_corners(grown, tolerance_m)
+        if outline.difference(around).area >= (1.0 - OBSTACLE_SHARE) * free_m2:
+            return around
+    return grown
 
 
 def local_area(area: Area, frame: LocalFrame) -> Area:
@@ -212,18 +218,26 @@ def _grown(area: BaseGeometry, by_m: float) -> BaseGeometry:
     return area.buffer(by_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
 
 
-def _simpler(outline: Area, tolerance_m: float, swath_width_m: float) -> tuple[Area | None, float]:
+def _simpler(
+    outline: Area,
+    kept: BaseGeometry,
+    around: BaseGeometry,
+    tolerance_m: float,
+    swath_width_m: float,
+) -> tuple[Area | None, float]:
     """Return the ground a margin inside the outline, few-cornered, and within which tolerance.
 
-    It is less where a ditch would become narrower than a swath by it.
+    It is less where a ditch would become narrower than a swath by it, or where obstacles drawn as
+    `around` take of the ground beside what is `kept` clear.
     """
     inside = as_area(polygons_of(outline.buffer(-MARGIN_M, join_style="mitre")))
     if inside is None:
         return None, 0.0
-    wanted_m2 = REACHED_MIN * reachable(inside, swath_width_m).area
+    reached_m2 = reachable(inside.difference(kept), swath_width_m).area
     for _ in range(TOLERANCES if tolerance_m > 0.0 else 0):
         simple = inside_with_fewer_corners(inside, tolerance_m)
-        if reachable(simple, swath_width_m).area >= wanted_m2:
+        left = reachable(simple.difference(around), swath_width_m)
+        if left.area >= (1.0 - LOST_MAX) * reached_m2:
             return simple, tolerance_m
         tolerance_m *= TOLERANCE_LESS
     return inside, 0.0

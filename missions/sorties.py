@@ -210,8 +210,8 @@ class SortieSearch:
         lasts = None if budget is None else budget.lasts
         orders = by_savings(network, settings.usable_l, lasts=lasts)
         return improve(
-            network, orders, settings.usable_l, moves=settings.moves, seed=settings.seed,
-            lasts=lasts,
+            network, orders, settings.usable_l,
+            moves=settings.moves * len(self._pieces) // PIECES_MAX, seed=settings.seed, lasts=lasts,
         )  # fmt: skip
 
 
