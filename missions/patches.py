@@ -26,7 +26,7 @@ PATCH_MIN_M2 = 0.02
 PLACE_M2 = 2.0
 ROUNDS = 4
 PATCHES_MAX = 200
-ANGLES = 12
+ANGLES, ASIDE = 12, 7
 # A line grows to both sides from a seed of this half length.
 SEED_M = 0.05
 
@@ -110,18 +110,15 @@ def _candidates(patch: BaseGeometry, ground: BaseGeometry, width_m: float) -> Fl
     courses = np.concatenate([courses, courses + np.pi / 2.0])
     corners = shapely.get_coordinates(patch)
     middle = shapely.get_coordinates(patch.representative_point())[0]
-    rows, before_m, after_m = [], [], []
-    for course in courses.tolist():
-        along = np.array([np.cos(course), np.sin(course)])
-        right = np.array([along[1], -along[0]])
-        s, t = corners @ along, corners @ right
-        here = float(middle @ along)
-        for aside in np.linspace(t.max() - width_m / 2.0, t.min() + width_m / 2.0, 7).tolist():
-            place = along * here + right * aside
-            rows.append([*(place - along * SEED_M), *(place + along * SEED_M)])
-            before_m.append(here - float(s.min()))
-            after_m.append(float(s.max()) - here)
-    seeds = np.array(rows)
+    along = np.column_stack([np.cos(courses), np.sin(courses)])
+    right = np.column_stack([along[:, 1], -along[:, 0]])
+    s, t, here = corners @ along.T, corners @ right.T, along @ middle
+    half_m = width_m / 2.0
+    aside = np.linspace(t.max(axis=0) - half_m, t.min(axis=0) + half_m, ASIDE)
+    places = (along * here[:, None])[None, :, :] + right * aside[:, :, None]
+    seeds = np.concatenate([places - along * SEED_M, places + along * SEED_M], axis=2)
+    seeds = seeds.reshape(-1, 4)
+    before_m, after_m = np.tile(here - s.min(axis=0), ASIDE), np.tile(s.max(axis=0) - here, ASIDE)
     inside = shapely.covers(ground, rectangles(seeds, width_m - 2.0 * NARROWER_M))
-    wanted = np.maximum(np.array([before_m, after_m])[:, inside], LINE_MIN_M / 2.0)
+    wanted = np.maximum(np.stack([before_m, after_m])[:, inside], LINE_MIN_M / 2.0)
     return stretched(seeds[inside], wanted[0], wanted[1], ground, width_m)
