@@ -19,7 +19,7 @@ from companion.maps.local import places as places_of
 from missions.coverage import reachable
 from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
-from missions.obstacles import MITRE_LIMIT, Obstacle
+from missions.obstacles import Obstacle
 from missions.strips import Floats
 from missions.wind import WindBuffer
 
@@ -32,6 +32,10 @@ MARGIN_M = 0.0025
 OUTLINE_TOLERANCE_M = 0.1
 OBSTACLE_TOLERANCES_M = (0.5, 0.35, 0.25, 0.18, 0.12, 0.08, 0.05, 0.03)
 OBSTACLE_SHARE = 0.0009
+# What blocks ways around the field is drawn with few corners, too, so close outside.
+BLOCKED_TOLERANCE_M = 0.03
+# Corners sharper than 23 degrees are cut off beyond 5 times the margin.
+MITRE_LIMIT = 5.0
 # Simpler borders leave out so little of what a strip can reach, what obstacles take among it; if
 # not, the outline's tolerance is made less, and after so many times it stays as it was drawn. A
 # plan covers 99.8 %.
@@ -126,7 +130,7 @@ def build_field(
     given = [each if isinstance(each, Obstacle) else Obstacle(geometry=each) for each in obstacles]
     grounds = [each.ground(frame, obstacle_buffer_m, offset_m) for each in given]
     kept = shapely.union_all(grounds)
-    blocked = shapely.union_all([*holes, kept])
+    blocked = shapely.union_all([*holes, around_with_fewer_corners(kept, BLOCKED_TOLERANCE_M)])
     flown = outline.difference(kept)
     around = _around(outline, kept)
     inside, tolerance_m = _simpler(outline, kept, around, tolerance_m, swath_width_m)
@@ -143,7 +147,8 @@ def build_field(
             beside = _around(outline, shapely.union_all(tall))
             over = as_area(polygons_of(inside.difference(beside)))
         if over is not None:
-            high = High(fly=over, blocked=shapely.union_all([*holes, *tall]))
+            above = around_with_fewer_corners(shapely.union_all(tall), BLOCKED_TOLERANCE_M)
+            high = High(fly=over, blocked=shapely.union_all([*holes, above]))
     off = [translate(local_area(area, frame), *offset_m) for area in no_spray]
     closed = shapely.union_all(
         [

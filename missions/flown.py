@@ -12,7 +12,6 @@ from missions.energy import nose_s, sortie_wh
 from missions.errors import PlanError
 from missions.paced import Paced
 from missions.plan import Leg, Settings, Sortie
-from missions.refills import Part
 from missions.sorties import Flying, SortieSearch
 from missions.speeds import choices, chosen, stretches_of
 from missions.strips import Floats
@@ -20,10 +19,10 @@ from missions.turns import Motion
 from missions.ways import Ways
 
 # What the search does not know, bends and turns of the nose, is so much that it needs no more.
-ROUNDS = 6
+ROUNDS = 8
 LESS = 0.995
 # Flights take up to 0.2 % more of a battery than they are planned with.
-MARGIN = 0.995
+MARGIN = 0.9975
 
 Pace = Callable[[Sequence[Sortie]], Paced]
 
@@ -54,30 +53,36 @@ def flown(
     one = search.in_one()
     if one is not None:
         found = pace(one)
-        if most_wh(found.sorties, settings) <= usable_wh:
+        if max(each_wh(found.sorties, settings)) <= usable_wh:
             return found
     share = 1.0
-    parts: list[list[Part]] = []
+    parts, sorties = search.several()
     for _ in range(ROUNDS):
-        parts, sorties = search.several(share, before=parts)
         found = pace(sorties)
-        worst_wh = most_wh(found.sorties, settings)
+        used_wh = each_wh(found.sorties, settings)
+        worst_wh = max(used_wh)
         if worst_wh <= usable_wh:
             return found
-        # Below what the search takes its worst sortie for, else it would find the same again.
-        share = min(share, search.most_wh(parts) / usable_wh) * LESS * usable_wh / worst_wh
+        better = None
+        # Those with more items than an autopilot has room for are flown as several.
+        if len(used_wh) == len(parts):
+            better = search.with_less(parts, used_wh, usable_wh)
+        if better is None:
+            share *= LESS * usable_wh / worst_wh
+            better = search.several(share, before=parts)
+        parts, sorties = better
     raise PlanError(
         f"a sortie takes {worst_wh:.4g} Wh, and may take {usable_wh:.4g} Wh of what the battery "
         "has above its reserve; see mission.battery_wh"
     )
 
 
-def most_wh(sorties: Sequence[Sortie], settings: Settings) -> float:
-    """Return what the sortie takes that takes most; 0 where no power is given."""
+def each_wh(sorties: Sequence[Sortie], settings: Settings) -> list[float]:
+    """Return what each sortie takes; 0 where no power is given."""
     battery = settings.battery
     if battery is None:
-        return 0.0
-    return max(
+        return [0.0] * len(sorties)
+    return [
         sortie_wh(
             sortie, battery, vertical=settings.vertical, height_m=settings.height_m,
             reserve_l=settings.reserve_l,
@@ -86,7 +91,7 @@ def most_wh(sorties: Sequence[Sortie], settings: Settings) -> float:
             ),
         )
         for sortie in sorties
-    )  # fmt: skip
+    ]  # fmt: skip
 
 
 def line_pace(lines: Floats, rates: Rates, settings: Settings) -> Floats:

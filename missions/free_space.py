@@ -18,8 +18,10 @@ from missions.strips import Floats
 
 # Ways bend this far from a corner, so that rounding does not put them behind it.
 CLEAR_M, MITRE_LIMIT = 0.3, 2.0
-# Places on the border count as inside.
-TOUCH_M = 1e-6
+# Places on the border count as inside, and ends of lines a little outside (`NARROWER_M`).
+TOUCH_M = 2e-5
+# Ways as long as each other, but for rounding.
+SAME_M = 1e-6
 # With more corners than these it is drawn simpler, inside of itself, up to the last tolerance.
 CORNERS_MAX, SIMPLER_M = 300, (0.4, 1.6)
 # Free sight is looked for to so many of the nearest corners, and to all where that is no way.
@@ -179,7 +181,7 @@ class FreeSpace:
         bound_m = np.minimum(
             far_m[0, rows] + far_m[columns, -1], far_m[0, columns] + far_m[rows, -1]
         )
-        some = np.flatnonzero(bound_m + far_m[rows, columns] <= known_m + TOUCH_M)
+        some = np.flatnonzero(bound_m + far_m[rows, columns] <= known_m + SAME_M)
         rows, columns = rows[some], columns[some]
         seen = self.sees(places[rows], places[columns])
         rows, columns = rows[seen], columns[seen]

@@ -29,7 +29,7 @@ from missions.refills import (
     plainly,
     split,
 )
-from missions.regroup import merged, regrouped
+from missions.regroup import merged, middle, regrouped
 from missions.strips import Floats
 from missions.turns import Motion
 from missions.ways import Ways
@@ -42,7 +42,7 @@ LINES_A_TANK = {2: 8, 4: 4, 6: 4}
 BAND_MIN_M = 40.0
 # A part in a sortie that is regrouped takes as long as so many moves of the annealing; sorties of
 # few parts have a trial's own costs. A sortie needs no more trials than some.
-MOVES_A_PART, PARTS_MIN, TRIALS_A_SORTIE = 4, 3.3, 60
+MOVES_A_PART, PARTS_MIN, TRIALS_A_SORTIE = 8, 3.3, 60
 # A search that goes on from sorties that were found before needs fewer.
 AGAIN = 4
 # The search knows the time of a flight to a few percent.
@@ -138,6 +138,19 @@ def several(
     longest_s = CLEARLY * min(costs)
     is_near = plain is not None and costs[0] <= longest_s
     return [better, plain] if plain and is_near else [better]
+
+
+def beside(
+    passes: Passes, sorties: Sequence[list[Part]], some: Sequence[int], count: int
+) -> list[int]:
+    """Return which sorties are some of them, or one of so many nearest to each of these."""
+    at = np.array([middle(passes, sortie) for sortie in sorties])
+    found = set(some)
+    for one in some:
+        far_m = np.hypot(*(at - at[one]).T)
+        far_m[list(some)] = np.inf
+        found.update(np.argsort(far_m, kind="stable")[:count].tolist())
+    return sorted(found)
 
 
 def _by_bands(

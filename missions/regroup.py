@@ -44,7 +44,7 @@ def regrouped(
     draw = random.Random(seed)
     known = [list(sortie) for sortie in sorties]
     cost_s = [flown_by(passes, limits, sortie).seconds for sortie in known]
-    at = np.array([_middle(passes, sortie) for sortie in known])
+    at = np.array([middle(passes, sortie) for sortie in known])
     along, across = np.array(course), np.array([-course[1], course[0]])
     u, v = at @ along, at @ across
     best, best_s, now_s = [list(each) for each in known], 0.0, 0.0
@@ -75,8 +75,8 @@ def regrouped(
         for place, sortie in zip(some, new, strict=False):
             known[place] = sortie
             cost_s[place] = flown_by(passes, limits, sortie).seconds
-            middle = _middle(passes, sortie)
-            u[place], v[place] = middle @ along, middle @ across
+            at_place = middle(passes, sortie)
+            u[place], v[place] = at_place @ along, at_place @ across
         for place in sorted(some[len(new) :], reverse=True):
             known[place], cost_s[place] = known[-1], cost_s[-1]
             u[place], v[place] = u[-1], v[-1]
@@ -157,7 +157,8 @@ def _tank_m(passes: Passes, limits: Limits, parts: Sequence[Part]) -> float:
     return metres * limits.usable_l / litres if litres > 0.0 else metres
 
 
-def _middle(passes: Passes, sortie: Sequence[Part]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+def middle(passes: Passes, sortie: Sequence[Part]) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    """Return the middle of the ground that a sortie sprays."""
     weight = sum(abs(end_m - start_m) for _, start_m, end_m in sortie) or 1.0
     x = y = 0.0
     for line, start_m, end_m in sortie:

@@ -23,7 +23,7 @@ from missions.network import (
     build_network,
 )
 from missions.plan import Kind, Leg, Place, Settings, Sortie
-from missions.refill_search import build_limits, build_passes, several
+from missions.refill_search import beside, build_limits, build_passes, several
 from missions.refills import Limits, Part, Passes, flown_by
 from missions.savings import Sortie as Order
 from missions.savings import by_savings, one_chain
@@ -47,6 +47,9 @@ MOVES_A_KICK = 100
 FEWER_KICKS = 8
 # A sortie that needs so much of a battery by the search's model may, as it is flown, need all.
 NEARLY = 1.1
+# Where no more of the sorties than that take too much, they alone are laid out anew, each with so
+# many neighbours, for a little less than the battery gives.
+FEW, NEIGHBOURS, LASTS = 0.3, 3, 0.995
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +91,7 @@ class SortieSearch:
             if flown_by(self._passes, limits, run).wh > NEARLY * limits.usable_wh:
                 return None
         order = self._in_order(settings.moves // MOVES_A_KICK)
-        return _drawn(whole, [order], self.ways, self.flying.motion)
+        return _drawn(whole, [order], self.ways, self.flying.motion)[1]
 
     def several(
         self, battery_share: float = 1.0, *, before: Sequence[list[Part]] = ()
@@ -117,14 +120,40 @@ class SortieSearch:
         if not found:
             parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
             raise _too_far(passes, limits, parts, self.ways, settings)
-        drawn = [_drawn(*_as_pieces(passes, each), self.ways, self.flying.motion) for each in found]
-        taken = min(range(len(found)), key=lambda at: _total_s(drawn[at], settings))
-        return found[taken], drawn[taken]
+        drawn = [self._drawn(each) for each in found]
+        return min(drawn, key=lambda each: _total_s(each[1], settings))
 
-    def most_wh(self, sorties: Sequence[list[Part]]) -> float:
-        """Return what the sortie takes that takes most, by the search's model."""
-        limits = build_limits(self.settings, 1.0)
-        return max(flown_by(self._passes, limits, each).wh for each in sorties)
+    def with_less(
+        self, parts: Sequence[list[Part]], used_wh: Sequence[float], usable_wh: float
+    ) -> tuple[list[list[Part]], tuple[Sortie, ...]] | None:
+        """Return sorties as `several` does: those that take too much anew with their neighbours.
+
+        `used_wh` is what each takes as it is flown. None where they are too many for that.
+        """
+        passes, settings = self._passes, self.settings
+        over = [at for at, wh in enumerate(used_wh) if wh > usable_wh]
+        if len(over) > FEW * len(parts):
+            return None
+        whole = build_limits(settings, 1.0)
+        # So much less than the search takes them for that they last as they are flown.
+        share = min(
+            flown_by(passes, whole, parts[at]).wh / used_wh[at] for at in over
+        ) * LASTS * usable_wh / whole.usable_wh  # fmt: skip
+        group = beside(passes, parts, over, NEIGHBOURS)
+        found = several(
+            passes, build_limits(settings, share), [], [], before=[parts[at] for at in group],
+            moves=settings.moves, seed=settings.seed,
+        )  # fmt: skip
+        if not found:
+            return None
+        kept = [each for at, each in enumerate(parts) if at not in group]
+        return self._drawn([*kept, *found[0]])
+
+    def _drawn(self, parts: list[list[Part]]) -> tuple[list[list[Part]], tuple[Sortie, ...]]:
+        """Return the parts in the order of their sorties, and these."""
+        pieces, orders = _as_pieces(self._passes, parts)
+        ranks, sorties = _drawn(pieces, orders, self.ways, self.flying.motion)
+        return [parts[at] for at in ranks], sorties
 
     def _check_reach(self) -> None:
         """Raise OutOfReachError where the battery lasts for no flight to some end and back."""
@@ -259,8 +288,13 @@ def _total_s(sorties: tuple[Sortie, ...], settings: Settings) -> float:
     )
 
 
-def _drawn(pieces: Pieces, orders: list[Order], ways: Ways, motion: Motion) -> tuple[Sortie, ...]:
-    """Return the sorties that fly these pieces, each from the depot that is best for it."""
+def _drawn(
+    pieces: Pieces, orders: list[Order], ways: Ways, motion: Motion
+) -> tuple[list[int], tuple[Sortie, ...]]:
+    """Return the sorties that fly these pieces, each from its best depot, and whose order each is.
+
+    Those of one depot follow each other.
+    """
     ends = pieces.ends.reshape(-1, 2)
     outer = np.array([[ends[order[0]], ends[order[-1] ^ 1]] for order in orders])
     home_m = ways.home_ways_m(outer.reshape(-1, 2))
@@ -268,7 +302,7 @@ def _drawn(pieces: Pieces, orders: list[Order], ways: Ways, motion: Motion) -> t
     homes = np.argmin(both, axis=0).tolist()
     ranked = sorted(range(len(orders)), key=lambda at: (homes[at], min(orders[at])))
     drawn = _Drawn(pieces=pieces, ways=ways, speed_m_s=motion.speed_m_s)
-    return tuple(
+    return ranked, tuple(
         Sortie(number=number, depot=homes[at], legs=drawn.legs(orders[at], homes[at]))
         for number, at in enumerate(ranked, start=1)
     )
