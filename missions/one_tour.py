@@ -19,7 +19,7 @@ from missions.tour import shortest_tour
 from missions.turns import Motion
 
 # With more lines a plan has so many turns that one more or less does not count.
-LINES_MAX = 1000
+LINES_MAX = 500
 # Few lines are searched for longer: 300 kicks for 40 of them, 20 for 155.
 KICKS, KICKS_MIN, KICKS_MAX = 480_000, 20, 300
 

@@ -95,6 +95,7 @@ def build_limits(settings: Settings, battery_share: float) -> Limits:
     return Limits(
         usable_l=settings.usable_l, reserve_l=settings.reserve_l,
         landing_s=upright_s + settings.refill_s, upright_s=upright_s, nose_s=nose_s,
+        reaching_s=settings.motion.at(settings.speed_m_s).reaching_s,
         battery=battery,
         usable_wh=math.inf if battery is None else battery.usable_wh * battery_share,
     )  # fmt: skip

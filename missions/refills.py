@@ -47,13 +47,17 @@ HIDDEN, HIDDEN_M = 3.0, 1000.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """What ends a sortie: `landing_s` is what one more takes, `usable_wh` what a battery gives."""
+    """What ends a sortie: `landing_s` is what one more takes, `usable_wh` what a battery gives.
+
+    Speeding up and braking take a ferry `reaching_s`.
+    """
 
     usable_l: float
     reserve_l: float
     landing_s: float
     upright_s: float
     nose_s: float = 0.0
+    reaching_s: float = 0.0
     battery: Battery | None = None
     usable_wh: float = math.inf
 
@@ -517,8 +521,8 @@ def _used_wh(
     carried += (litres + reserve_l) * (out_s + limits.upright_s) + reserve_l * back_s
     hover_s = between_s - cruise_s + (limits.upright_s + limits.nose_s)
     used = battery.hover_w * hover_s + battery.cruise_w * cruise_s
-    # Ferries count as the costlier of both: how far they are at speed is not known here.
-    used += max(battery.cruise_w, battery.hover_w) * (out_s + back_s)
+    stops_s = np.minimum(out_s, limits.reaching_s) + np.minimum(back_s, limits.reaching_s)
+    used += battery.cruise_w * (out_s + back_s - stops_s) + battery.hover_w * stops_s
     used += battery.per_kg_w * KG_L * carried
     return used / J_WH
 
