@@ -524,7 +524,8 @@ def _used_wh(
     stops_s = np.minimum(out_s, limits.reaching_s) + np.minimum(back_s, limits.reaching_s)
     used += battery.cruise_w * (out_s + back_s - stops_s) + battery.hover_w * stops_s
     used += battery.per_kg_w * KG_L * carried
-    return used / J_WH
+    found: _Some = used / J_WH
+    return found
 
 
 class _Sum(NamedTuple):
