@@ -90,7 +90,7 @@ def test_ctrl_c_in_the_search_writes_the_best_plan_so_far(
 def test_a_second_ctrl_c_ends_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pressed_at(monkeypatch, 1000, 1001)
+    pressed_at(monkeypatch, 1, 2)
     code, out = plan(tmp_path)
     assert code == app.INTERRUPTED
     assert not out.exists()
