@@ -94,6 +94,9 @@ def plan(
         float,
         typer.Option(metavar="M", help="Passes keep so far from every border.", min=0.0, max=50.0),
     ] = 0.0,
+    ends_over: Annotated[
+        bool, typer.Option("--ends-over", help="Small fields: boom ends beyond it, valves closed.")
+    ] = False,
     angle_deg: Annotated[
         float | None, typer.Option(metavar="DEG", help="Course of the passes; else the best.")
     ] = None,
@@ -188,6 +191,7 @@ def plan(
         depots=tuple(parse_mark(text, "--depot") for text in depot or ()),
         rate_l_ha=rate_l_ha,
         border_m=border_m,
+        ends_over=ends_over,
         pause=BreakAsked(
             done=done,
             resume=resume,
@@ -207,6 +211,8 @@ def plan(
         "overlap_max_percent": overlap_max,
         "ferry_height_m": ferry_height_m,
     }
+    if sprayer and ends_over:
+        raise typer.BadParameter("--ends-over needs valves that close one by one, not --sprayer")
     task = read_task(asked, reading.config, changes)
     with progress(after_s=BAR_AFTER_S) as tell, _stoppable(tell) as watch:
         planned = plan_mission(

@@ -10,7 +10,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from missions.demand import Rates, Uniform
-from missions.strips import Floats, rectangles, whole
+from missions.strips import Floats, Objects, rectangles, whole
 
 # Less than this is no ground but the last digits of large numbers.
 NOISE_M2 = 1e-6
@@ -38,9 +38,11 @@ def reachable(ground: BaseGeometry, width_m: float) -> BaseGeometry:
     return ground.buffer(-width_m / 2.0).buffer(width_m / 2.0 * (1.0 - 1e-9))
 
 
-def measure(lines: Floats, ground: BaseGeometry, width_m: float) -> Coverage:
-    """Return what the whole strips of all lines cover of the ground, without help of valves."""
-    strips = rectangles(lines, width_m)
+def measure(
+    lines: Floats, ground: BaseGeometry, width_m: float, *, strips: Objects | None = None
+) -> Coverage:
+    """Return what all lines cover of the ground: their whole strips, or those that are given."""
+    strips = rectangles(lines, width_m) if strips is None else strips
     covered = whole(strips)
     area_m2 = ground.area
     if not area_m2 > 0.0:
@@ -63,9 +65,9 @@ def measure(lines: Floats, ground: BaseGeometry, width_m: float) -> Coverage:
 
 
 def of_rated_ground(
-    found: Coverage, flown: Floats, ground: BaseGeometry, width_m: float, *, rates: Rates
+    found: Coverage, flown: Objects, ground: BaseGeometry, *, rates: Rates
 ) -> Coverage:
-    """Return the coverage of the ground that has a rate, by the lines that are flown for it.
+    """Return the coverage of the ground that has a rate, by the strips that are flown for it.
 
     The rates are looked at in the middles of cells, so many that none is wider than a boom's valve
     on most fields.
@@ -82,7 +84,7 @@ def of_rated_ground(
     rated = rates.rates_at(east_m, north_m) > 0.0
     if rated.all() or not rated.any():
         return found
-    covered = whole(rectangles(flown, width_m))
+    covered = whole(flown)
     shapely.prepare(covered)
     treated = shapely.contains_xy(covered, east_m[rated], north_m[rated])
     return replace(

@@ -7,13 +7,16 @@ they are needed; such lines that begin anew at edges along them.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import shapely
 from shapely.geometry.base import BaseGeometry
 
 from missions.angle import LAYOUT_WEIGHT, cost_s, edge_angles, main_course_deg, ranked
+from missions.boom import Boom, boom_of
 from missions.coverage import reachable
+from missions.ends_over import lines_over, passes_over
 from missions.field import Field
 from missions.fitted_lines import fitted_lines, has_edges_along
 from missions.free_space import FreeSpace, free_space
@@ -22,7 +25,7 @@ from missions.open_lines import LEFT_SHARE, needed_passes, open_lines
 from missions.patches import patches
 from missions.plan import LEAVE_PERCENT, Settings
 from missions.selection import Aim, chosen, families
-from missions.strips import Floats, directions, joined, lengths_m, united
+from missions.strips import Floats, directions, joined, lengths_m, no_lines, whole
 from missions.swaths import border_passes, inner_ground, inner_lines
 from missions.turns import Motion
 from missions.worth import LEFT_SHARE as WORTH_LEFT
@@ -53,6 +56,7 @@ class _Covering:
     target: BaseGeometry
     left_share: float
     aim: Aim
+    boom: Boom
 
     @property
     def width_m(self) -> float:
@@ -60,14 +64,15 @@ class _Covering:
 
     def value_s(self, tour: Tour) -> float:
         """Return the time of a tour, with what is left out and covered twice."""
-        covered = united(tour.lines, self.width_m)
-        doubled_m2 = float(lengths_m(tour.lines).sum()) * self.width_m - covered.area
+        strips = self.boom.strips(tour.lines)
+        covered = whole(strips)
+        doubled_m2 = float(shapely.area(strips).sum()) - covered.area
         left_m2 = self.target.difference(covered).area
         return tour.seconds + self.aim.cost_s(left_m2=left_m2, doubled_m2=max(doubled_m2, 0.0))
 
     def left_m2(self, tour: Tour) -> float:
         """Return what lines leave of what a strip can reach."""
-        return float(self.target.difference(united(tour.lines, self.width_m)).area)
+        return float(self.target.difference(self.boom.united(tour.lines)).area)
 
     def is_block(self, tour: Tour) -> bool:
         """Return whether a tour is nothing but equal lines side by side, as on a rectangle."""
@@ -75,7 +80,8 @@ class _Covering:
         sines = along[:, 0] * along[0, 1] - along[:, 1] * along[0, 0]
         as_long = float(np.ptp(length_m)) < EQUAL_M
         return (
-            self.settings.leave_max_percent <= LEAVE_PERCENT
+            not self.boom.closes
+            and self.settings.leave_max_percent <= LEAVE_PERCENT
             and as_long
             and bool(np.abs(sines).max() < EQUAL_SINE)
         )
@@ -87,7 +93,7 @@ class _Covering:
     def worthwhile(self, tour: Tour) -> Tour:
         """Return a tour without the lines that are not worth their time."""
         kept = worthwhile(
-            tour, self.target, self.width_m, left_share=self.left_share,
+            tour, self.target, self.boom, left_share=self.left_share,
             worth=LEFT_WORTH if self.settings.leave_max_percent > LEAVE_PERCENT else WORTH,
         )  # fmt: skip
         return self.tour(kept)
@@ -97,13 +103,19 @@ class _Covering:
         ground, width_m, aim = self.field.spray, self.width_m, self.aim
         passes = border_passes(ground, width_m)
         best = drawn[0]
-        some = families(ground, width_m, angles_deg, with_fans=self.settings.angle_deg is None)
+        over = passes_over(ground, self.boom) if self.boom.closes else no_lines()
+        some = families(ground, self.boom, angles_deg, with_fans=self.settings.angle_deg is None)
+        if self.boom.closes:
+            some = [joined([family, over]) for family in some]
         # Of each course: from the passes along the border on, and lines of the best layout.
         pools = [(joined([passes, family, best]), list(range(len(passes)))) for family in some]
         pools.append((joined([best, passes, *some, *drawn[1:]]), list(range(len(best)))))
-        for lines in chosen(pools, ground, width_m, motion=self.motion, aim=aim):
+        for lines in chosen(pools, ground, self.boom, motion=self.motion, aim=aim):
             if aim.covers_first:
-                more = patches(lines, ground, width_m, left_share=self.left_share)
+                more = patches(
+                    lines, ground, width_m, left_share=self.left_share,
+                    covered=self.boom.united(lines),
+                )  # fmt: skip
                 lines = joined([lines, more])
             if len(lines):
                 yield self.worthwhile(self.tour(lines))
@@ -112,12 +124,16 @@ class _Covering:
 def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Floats, float]:
     """Return the lines that cover the field, and the course of the parallel ones."""
     width_m, area_m2 = settings.swath_width_m, field.spray.area
+    plain = None
+    if settings.ends_over:
+        plain = spray_lines(field, replace(settings, ends_over=False), motion)
     inner = inner_ground(field.spray, width_m)
     angles = _courses(inner, field, settings, motion)
     spare = _spare(field, settings)
     leaves = settings.leave_max_percent > LEAVE_PERCENT
     few = spare if leaves else min(LEFT_SHARE, spare / 2.0)
-    drawn = _layouts(field, settings, motion, inner, angles[:ANGLES_TRIED], left_share=few)
+    boom = boom_of(settings, field)
+    drawn = _layouts(field, settings, motion, inner, angles[:ANGLES_TRIED], boom, left_share=few)
     if max(len(lines) for _, lines in drawn) > LINES_MAX:
         costs = [
             cost_s(lines, motion, width_m, area_m2, weight=LAYOUT_WEIGHT) for _, lines in drawn
@@ -131,12 +147,15 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
     covering = _Covering(
         field=field, settings=settings, motion=motion, space=free_space(field.fly),
         target=target, left_share=left_share, aim=_aim(settings, target.area, left_share),
+        boom=boom,
     )  # fmt: skip
     tours = [(angle_deg, covering.tour(lines)) for angle_deg, lines in drawn]
     best = sorted(tours, key=lambda each: covering.value_s(each[1]))[:LAYOUTS_TRIED]
     if len(best[0][1].lines) > MANY_LINES:
         best = best[:1]
     better = [(angle_deg, covering.worthwhile(tour)) for angle_deg, tour in best]
+    if plain is not None:
+        better.append((plain[1], covering.tour(plain[0])))
     better.sort(key=lambda each: covering.value_s(each[1]))
     angle_deg, tour = better[0]
     is_asked = (
@@ -202,6 +221,7 @@ def _layouts(
     motion: Motion,
     inner: BaseGeometry,
     angles: list[float],
+    boom: Boom,
     *,
     left_share: float,
 ) -> list[tuple[float, Floats]]:
@@ -214,13 +234,20 @@ def _layouts(
         if number == 0:
             choices.append(joined([passes, inner_lines(inner, width_m, angle_deg)]))
         straights = [open_lines(ground, width_m, angle_deg, packed=settings.closing_share < 1.0)]
+        if boom.closes:
+            straights.append(lines_over(ground, boom, angle_deg))
         if number == 0 and has_edges_along(ground, width_m, angle_deg):
             straights.append(fitted_lines(ground, width_m, angle_deg, motion))
         for straight in straights:
             if len(straight):
-                more = needed_passes(straight, passes, ground, width_m, left_share=left_share)
+                more = needed_passes(
+                    straight, passes, ground, width_m, left_share=left_share,
+                    covered=boom.united(straight),
+                )  # fmt: skip
                 choices.append(joined([more, straight]))
         for lines in choices:
-            more = patches(lines, ground, width_m, left_share=left_share)
+            more = patches(
+                lines, ground, width_m, left_share=left_share, covered=boom.united(lines)
+            )
             drawn.append((angle_deg, joined([lines, more])))
     return drawn

@@ -15,6 +15,7 @@ import shapely
 from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
+from missions.boom import SLACK_M
 from missions.coverage import reachable
 from missions.strips import Floats, directions, joined, lengths_m, no_lines, rectangles, united
 from missions.swaths import LINE_MIN_M, axes, count_across
@@ -23,9 +24,6 @@ from missions.swaths import LINE_MIN_M, axes, count_across
 LEFT_SHARE = 0.0005
 # A pass that covers less is none.
 LEAST_M2 = 1e-3
-# An edge that is a hair off the lines' course must not cut them short. The ground keeps a larger
-# margin from what may be sprayed (`field.MARGIN_M`).
-SLACK_M = 0.001
 
 
 def open_lines(
@@ -112,10 +110,12 @@ def needed_passes(
     width_m: float,
     *,
     left_share: float = LEFT_SHARE,
+    covered: BaseGeometry | None = None,
 ) -> Floats:
     """Return the parts of passes along the border that cover what the lines leave out."""
     target = reachable(ground, width_m)
-    missing = shapely.get_parts(target.difference(united(lines, width_m)))
+    covered = united(lines, width_m) if covered is None else covered
+    missing = shapely.get_parts(target.difference(covered))
     allowed_m2 = left_share * target.area
     left_m2 = float(shapely.area(missing).sum())
     strips = rectangles(passes, width_m)

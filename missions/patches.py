@@ -38,6 +38,7 @@ def patches(
     *,
     left_share: float = LEFT_SHARE,
     target: BaseGeometry | None = None,
+    covered: BaseGeometry | None = None,
 ) -> Floats:
     """Return more lines, for ground that the others miss though a strip could reach it.
 
@@ -45,7 +46,8 @@ def patches(
     """
     if target is None:
         target = reachable(ground, width_m)
-    covered = united(lines, width_m)
+    if covered is None:
+        covered = united(lines, width_m)
     allowed_m2 = left_share * target.area
     tight = ground.buffer(NARROWER_M)
     shapely.prepare(tight)

@@ -18,6 +18,7 @@ from shapely.geometry.base import BaseGeometry
 from companion.maps.local import polygons_of
 from companion.maps.picture.draw import Sheet, sheet_for
 from companion.maps.whole_file import write_whole
+from missions.boom import boom_of
 from missions.errors import PlanError
 from missions.picture_legend import (
     ABOVE_IN,
@@ -35,7 +36,7 @@ from missions.picture_legend import (
     write_title,
 )
 from missions.plan import Leg, Plan, Sortie
-from missions.strips import GRID_M, Objects, rectangles, united, whole
+from missions.strips import GRID_M, Objects, whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -146,13 +147,13 @@ def _draw_field(axes: Axes, plan: Plan) -> bool:
 
 def _draw_strips(axes: Axes, plan: Plan, *, swath_pt: float) -> dict[str, bool]:
     """Draw what each sortie sprays, what is sprayed twice and what is left; say what there is."""
-    width_m = plan.settings.swath_width_m
+    boom = boom_of(plan.settings, plan.field)
     everything = []
     for sortie in plan.sorties:
         lines = np.array([[*leg.points[0], *leg.points[-1]] for leg in _sprayed(sortie)])
         if not len(lines):
             continue
-        strips = rectangles(lines, width_m)
+        strips = boom.strips(lines)
         everything.append(strips)
         colour = colour_of(sortie.number)
         _fill(
@@ -162,7 +163,7 @@ def _draw_strips(axes: Axes, plan: Plan, *, swath_pt: float) -> dict[str, bool]:
     strips = np.concatenate(everything)
     twice = _seen(sprayed_twice(strips))
     # Ground of a line on which nothing is prescribed is not missed.
-    planned = united(plan.lines, width_m)
+    planned = boom.united(plan.lines)
     skipped = _seen(shapely.difference(plan.field.limit, planned))
     bare = _seen(shapely.difference(planned, whole(strips)))
     _fill(axes, [twice], facecolors=TWICE, alpha=0.38, linewidths=0.0, zorder=3.0)

@@ -41,7 +41,8 @@ class Settings:
     `aircraft_gap_m` between them. `nose_rate_deg_s` is how fast the nose turns at a stop.
     Ferries and long transits are flown at `ferry_height_m`, where it is given.
     `leave_max_percent` of what a strip can reach may be left, `overlap_max_percent` sprayed twice.
-    Valves close where `switch_off_percent` of their strip is treated, if they do.
+    Valves close where `switch_off_percent` of their strip is treated, if they do. With `ends_over`
+    an end of the boom may be beyond the border, where its valves are closed.
     Without them, `jerk_m_s3` and `return_height_m` are those that the autopilot comes with.
     """
 
@@ -73,6 +74,7 @@ class Settings:
     leave_max_percent: float = LEAVE_PERCENT
     overlap_max_percent: float | None = None
     switch_off_percent: float | None = None
+    ends_over: bool = False
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
@@ -85,6 +87,8 @@ class Settings:
             )
         if not 0.0 <= self.reserve_l < self.tank_l:
             raise ValueError(f"a reserve of {self.reserve_l} L leaves nothing of {self.tank_l} L")
+        if self.ends_over and (len(self.valves) < 2 or self.border_buffer_m is None):
+            raise ValueError("ends of the boom beyond the border need valves that close there")
 
     @property
     def motion(self) -> Motion:

@@ -10,6 +10,7 @@ import numpy as np
 from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
+from missions.boom import boom_of
 from missions.coverage import measure, of_rated_ground
 from missions.demand import Demand, Rates, demands
 from missions.errors import OutOfReachError, PlanError
@@ -19,7 +20,7 @@ from missions.files.items import count_of, stops_of
 from missions.files.plan_rules import ITEMS_MAX
 from missions.fleet import fleet_sorties
 from missions.flown import flown
-from missions.layouts import spray_lines
+from missions.layouts import is_small, spray_lines
 from missions.paced import Paced, range_warnings
 from missions.patches import narrow_patches
 from missions.plan import Plan, Settings, Sortie, flown_lines
@@ -89,7 +90,8 @@ def _planned(
     with_sprayer: bool,
 ) -> Plan:
     width_m = settings.swath_width_m
-    motion = settings.motion
+    settings = _of_its_size(settings, field)
+    boom, motion = boom_of(settings, field), settings.motion
     if left is None:
         lines, angle_deg = spray_lines(field, settings, motion)
         lines = joined([lines, narrow_patches(lines, field.spray, field.limit, width_m)])
@@ -137,12 +139,12 @@ def _planned(
         sorties, places = _from_depots(field, lines, demand, settings, given, one)
     done = no_lines() if left is None else left.done
     coverage = of_rated_ground(
-        measure(sprayed, field.limit, width_m), joined([done, flown_lines(sorties.sorties)]),
-        field.limit, width_m, rates=rates,
+        measure(sprayed, field.limit, width_m, strips=boom.strips(sprayed)),
+        boom.strips(joined([done, flown_lines(sorties.sorties)])), field.limit, rates=rates,
     )  # fmt: skip
     flights = sorties.sorties
     if not counted_before:
-        flights = counted(flights, rates, settings, field.kept_in)
+        flights = counted(flights, rates, settings, field.kept_in, boom)
     plan = Plan(
         field=field,
         settings=settings,
@@ -211,6 +213,12 @@ def _in_reach(field: Field, lines: Floats, litres: Floats, reach_m: float) -> Wa
 def _with_another(ways: Ways, lines: Floats, litres: Floats) -> Ways:
     another = suggested_depot(ways.field, lines, litres, besides=ways)
     return build_ways(ways.field, np.concatenate([ways.depots, another]))
+
+
+def _of_its_size(settings: Settings, field: Field) -> Settings:
+    """Return settings whose boom stays whole on large fields, where little falls twice."""
+    ends_over = settings.ends_over and is_small(field, settings)
+    return replace(settings, ends_over=ends_over)
 
 
 def _demand(lines: Floats, rates: Rates, field: Field, settings: Settings) -> list[Demand]:

@@ -40,7 +40,8 @@ def prices(
     if not is_small(plan.field, settings) or settings.aircraft > 1:
         return
     now = _price("", plan)
-    for option, other in _choices(settings, now):
+    closes = plan.field.closes is not None and settings.border_buffer_m is not None
+    for option, other in _choices(settings, now, closes=closes):
         try:
             there = plan_mission(plan.field, other, rates, depots=depots, around=around)
         except PlanError:
@@ -69,7 +70,7 @@ def overlap_warnings(plan: Plan, overlap_litres_percent: float) -> tuple[str, ..
     )
 
 
-def _choices(settings: Settings, now: Price) -> Iterator[tuple[str, Settings]]:
+def _choices(settings: Settings, now: Price, *, closes: bool) -> Iterator[tuple[str, Settings]]:
     """Yield the options that are not taken, and the defaults of those that are."""
     if settings.leave_max_percent > LEAVE_PERCENT:
         yield "without --leave-max", replace(settings, leave_max_percent=LEAVE_PERCENT)
@@ -84,6 +85,8 @@ def _choices(settings: Settings, now: Price) -> Iterator[tuple[str, Settings]]:
         if settings.valves and settings.switch_off_percent is None:
             closing = replace(settings, switch_off_percent=100.0)
             yield "with coverage.switch_off_percent = 100", closing
+        if closes and len(settings.valves) > 1 and not settings.ends_over:
+            yield "with --ends-over", replace(settings, ends_over=True)
 
 
 def _price(option: str, plan: Plan) -> Price:

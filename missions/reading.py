@@ -86,6 +86,7 @@ class Asked:
     crs: str | None = None
     answers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     border_m: float = 0.0
+    ends_over: bool = False
     ground: GroundAsked = NOTHING_ASKED
     pause: BreakAsked = NO_BREAK
 
@@ -130,6 +131,8 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
     rates = _rates(asked, config, map_file, boundary, frame)
     if isinstance(rates, MapRates) and _is_flown(asked, config):
         ground = replace(ground, closes=rates.field)
+    if asked.ends_over:
+        settings = _with_ends_over(asked, settings, ground)
     whole = ground
     if asked.pause.resume is None and asked.pause.done is not None:
         ground = untreated(
@@ -156,6 +159,18 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         said=tuple(said),
         wind=asked.ground.wind or (None if mission is None else mission.wind),
     )
+
+
+def _with_ends_over(asked: Asked, settings: Settings, ground: Field) -> Settings:
+    """Return settings that let ends of the boom be beyond the border, where valves close there."""
+    if asked.pause.done is not None:
+        raise PlanError("--ends-over knows no treated ground; leave it out with --done")
+    if ground.closes is None or settings.border_buffer_m is None or len(settings.valves) < 2:
+        raise PlanError(
+            "--ends-over needs valves that close at the border: a configuration with two valves or "
+            'more whose own prescription is planned for, and border = "inside"'
+        )
+    return replace(settings, ends_over=True)
 
 
 def _ferry_over_m(settings: Settings, mission: MissionTable | None) -> float | None:

@@ -18,11 +18,12 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
+from missions.boom import SLACK_M, Boom, where_inside
 from missions.coverage import reachable
 from missions.fitted_lines import edges_along
-from missions.open_lines import SLACK_M, evenly
-from missions.strips import Floats, directions, joined, lengths_m, no_lines, rectangles
-from missions.swaths import LINE_MIN_M, axes
+from missions.open_lines import evenly
+from missions.strips import Floats, directions, joined, lengths_m
+from missions.swaths import axes
 from missions.turns import Motion
 
 # The ground is looked at in so many points, one for 2.5 m2 of a hectare.
@@ -38,16 +39,24 @@ FAN_MIN_DEG, FAN_MAX_DEG, FAN_EDGES = 0.3, 25.0, 5
 
 
 def families(
-    ground: BaseGeometry, width_m: float, angles_deg: list[float], *, with_fans: bool = True
+    ground: BaseGeometry, boom: Boom, angles_deg: list[float], *, with_fans: bool = True
 ) -> list[Floats]:
     """Return lines along each course, flush with each edge along them, and fans between edges."""
-    found = [_along(ground, width_m, angle_deg) for angle_deg in angles_deg]
+    found = [_along(ground, boom, angle_deg) for angle_deg in angles_deg]
     if with_fans:
-        found += [_where_inside(fan, ground, width_m) for fan in _fans(ground, width_m)]
+        fans = _fans(ground, boom.width_m)
+        found += [joined(_parts(fan, ground, boom)) for fan in fans]
     return [lines for lines in found if len(lines)]
 
 
-def _along(ground: BaseGeometry, width_m: float, angle_deg: float) -> Floats:
+def _parts(lines: Floats, ground: BaseGeometry, boom: Boom) -> list[Floats]:
+    """Return the parts of lines that may be flown, by whole booms and by those that close."""
+    whole = where_inside(lines, ground, boom.width_m)
+    return [whole, boom.where_open(lines)] if boom.closes else [whole]
+
+
+def _along(ground: BaseGeometry, boom: Boom, angle_deg: float) -> Floats:
+    width_m = boom.width_m
     turned_by = axes(angle_deg)
     turned = shapely.transform(ground, lambda points: points @ turned_by.T)
     found = []
@@ -55,38 +64,17 @@ def _along(ground: BaseGeometry, width_m: float, angle_deg: float) -> Floats:
         west, low, east, high = part.bounds
         places = [evenly(low, high, width_m)]
         for edge in edges_along(part, width_m).tolist():
-            first = low + (edge - low) % width_m - width_m / 2.0
-            flush = np.arange(first, high + width_m, width_m)
-            places.append(flush[(flush > low) & (flush < high)])
+            for over_m in {each % width_m for own in boom.over_m for each in (own, -own)}:
+                first = low + (edge - low + over_m) % width_m - width_m / 2.0
+                flush = np.arange(first, high + width_m, width_m)
+                places.append(flush[(flush > low) & (flush < high)])
         across = np.unique(np.round(np.concatenate(places), 3))
         rows = np.column_stack(
             [np.full(len(across), west - 1.0), across, np.full(len(across), east + 1.0), across]
         )
         back = np.column_stack([rows[:, :2] @ turned_by, rows[:, 2:] @ turned_by])
-        found.append(_where_inside(back, ground, width_m))
+        found += _parts(back, ground, boom)
     return joined(found)
-
-
-def _where_inside(lines: Floats, ground: BaseGeometry, width_m: float) -> Floats:
-    """Return the parts of lines whose strips lie on the ground."""
-    if not len(lines):
-        return no_lines()
-    bands = rectangles(lines, width_m - 2.0 * SLACK_M)
-    outside, line_of = shapely.get_parts(shapely.difference(bands, ground), return_index=True)
-    along, length_m = directions(lines), lengths_m(lines)
-    spans: list[list[tuple[float, float]]] = [[] for _ in lines]
-    for piece, number in zip(outside, line_of.tolist(), strict=True):
-        places = (shapely.get_coordinates(piece) - lines[number, :2]) @ along[number]
-        spans[number].append((float(places.min()), float(places.max())))
-    rows = []
-    for number, some in enumerate(spans):
-        reached = 0.0
-        for start, end in [*sorted(some), (float(length_m[number]), math.inf)]:
-            if start - reached > LINE_MIN_M:
-                a, b = lines[number, :2] + np.outer([reached, start], along[number])
-                rows.append([*a, *b])
-            reached = max(reached, end)
-    return np.array(rows) if rows else no_lines()
 
 
 def _fans(ground: BaseGeometry, width_m: float) -> list[Floats]:
@@ -163,19 +151,19 @@ class Aim:
 
 
 def chosen(
-    pools: list[tuple[Floats, list[int]]], ground: BaseGeometry, width_m: float, *, aim: Aim,
+    pools: list[tuple[Floats, list[int]]], ground: BaseGeometry, boom: Boom, *, aim: Aim,
     motion: Motion, moves: int = MOVES,
 ) -> list[Floats]:  # fmt: skip
     """Return sets of lines that cover the ground in little time, the best first.
 
     A pool is lines, and those of them to start with.
     """
-    points, each_m2 = _points(reachable(ground, width_m))
+    points, each_m2 = _points(reachable(ground, boom.width_m))
     tried: list[tuple[float, int, list[int], _Set]] = []
     for pool, first in pools:
-        cost_s = motion.legs_s(lengths_m(pool)) + motion.between_passes_s(width_m)
+        cost_s = motion.legs_s(lengths_m(pool)) + motion.between_passes_s(boom.width_m)
         state = _Set(
-            covers=_covered(pool, points, width_m), count=len(points), each_m2=each_m2,
+            covers=_covered(pool, points, boom), count=len(points), each_m2=each_m2,
             cost_s=cost_s.tolist(), aim=aim,
         )  # fmt: skip
         state.take(first)
@@ -202,13 +190,19 @@ def _points(target: BaseGeometry) -> tuple[Floats, float]:
     return points, target.area / max(len(points), 1)
 
 
-def _covered(pool: Floats, points: Floats, width_m: float) -> list[NDArray[np.int64]]:
+def _covered(pool: Floats, points: Floats, boom: Boom) -> list[NDArray[np.int64]]:
     """Return which points each line's strip covers."""
+    spans = boom.spans(pool)
+    ways = directions(pool)
     covers = []
-    for line, way, long_m in zip(pool, directions(pool), lengths_m(pool).tolist(), strict=True):
+    for number, (line, way) in enumerate(zip(pool, ways, strict=True)):
         off = points - line[:2]
         s, t = off @ way, off @ np.array([way[1], -way[0]])
-        on = (s >= 0.0) & (s <= long_m) & (np.abs(t) <= width_m / 2.0 + SLACK_M)
+        on = np.zeros(len(points), dtype=np.bool_)
+        first, last = np.searchsorted(spans[:, 0], [number, number + 1])
+        for left_m, right_m, start_m, end_m in spans[first:last, 1:].tolist():
+            aside = (t >= left_m - SLACK_M) & (t <= right_m + SLACK_M)
+            on |= aside & (s >= start_m) & (s <= end_m)
         covers.append(np.flatnonzero(on))
     return covers
 

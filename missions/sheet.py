@@ -9,12 +9,13 @@ import numpy as np
 import shapely
 
 from companion.wording import counted
+from missions.boom import boom_of
 from missions.files.items import items_of
 from missions.files.plan_rules import ITEMS_MAX
 from missions.least_ferry import least_idle_of
 from missions.plan import Plan, Sortie
 from missions.schedule import separation_m
-from missions.strips import GRID_M, rectangles, whole
+from missions.strips import GRID_M, whole
 
 
 def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict[str, Any]:
@@ -111,7 +112,7 @@ def _overlap_l(plan: Plan) -> dict[int, float]:
         if leg.kind == "spray"
     ]
     lines = np.array([[*leg.points[0], *leg.points[-1]] for _, leg in flown])
-    strips = rectangles(lines, plan.settings.swath_width_m)
+    strips = boom_of(plan.settings, plan.field).strips(lines)
     one, other = shapely.STRtree(strips).query(strips, predicate="intersects")
     earlier: dict[int, list[int]] = {}
     for at, before in zip(one.tolist(), other.tolist(), strict=True):

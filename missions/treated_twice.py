@@ -14,26 +14,31 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from missions.boom import Boom
 from missions.demand import M2_PER_HA, Rates, valve_places
 from missions.extents import Extents, extents_of
 from missions.plan import Settings, Sortie
-from missions.strips import Floats, Objects, directions, lengths_m, rectangles, whole
+from missions.strips import Floats, Objects, directions, lengths_m, whole
 
 # Treated ground is looked at so often along a line, and in so many places across a valve's strip.
 ALONG_M, ACROSS = 0.5, 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Boom:
-    """The valves' strips as (right_m, width_m); they close from this share of treated ground on."""
+class _Closing:
+    """The boom, and its valves' strips as (right_m, width_m).
 
+    They close from this share of treated ground on.
+    """
+
+    flown: Boom
     places: Floats
     closes_from: float
     extents: Extents | None
 
 
 def counted(
-    sorties: Sequence[Sortie], rates: Rates, settings: Settings, limit: BaseGeometry
+    sorties: Sequence[Sortie], rates: Rates, settings: Settings, limit: BaseGeometry, flown: Boom
 ) -> tuple[Sortie, ...]:
     """Return the sorties with what each leg needs, and what of it falls on treated ground.
 
@@ -43,7 +48,8 @@ def counted(
     if share is None or not settings.valves:
         return tuple(sorties)
     kept_m = settings.border_buffer_m
-    boom = _Boom(
+    boom = _Closing(
+        flown=flown,
         places=valve_places(settings.swath_width_m, settings.valves),
         closes_from=share / 100.0,
         extents=None
@@ -53,13 +59,13 @@ def counted(
     return tuple(_counted(sortie, rates, boom) for sortie in sorties)
 
 
-def _counted(sortie: Sortie, rates: Rates, boom: _Boom) -> Sortie:
+def _counted(sortie: Sortie, rates: Rates, boom: _Closing) -> Sortie:
     flown = [number for number, leg in enumerate(sortie.legs) if leg.kind == "spray"]
     if not flown:
         return sortie
     legs = list(sortie.legs)
     lines = np.array([[*legs[at].points[0], *legs[at].points[-1]] for at in flown])
-    strips = rectangles(lines, float(boom.places[:, 1].sum()))
+    strips = boom.flown.strips(lines)
     earlier = _earlier(strips)
     for row, at in enumerate(flown):
         litres_l, twice_l = legs[at].volume_l, 0.0
@@ -79,7 +85,9 @@ def _earlier(strips: Objects) -> list[list[int]]:
     return found
 
 
-def _litres(line: Floats, treated: BaseGeometry, rates: Rates, boom: _Boom) -> tuple[float, float]:
+def _litres(
+    line: Floats, treated: BaseGeometry, rates: Rates, boom: _Closing
+) -> tuple[float, float]:
     """Return what a line needs, and what of it falls on treated ground."""
     shapely.prepare(treated)
     length_m = float(lengths_m(line[None])[0])

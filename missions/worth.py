@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from missions.boom import Boom
 from missions.network import JOIN_M
 from missions.one_tour import Tour
-from missions.strips import Floats, Objects, directions, lengths_m, rectangles, united, whole
+from missions.strips import Floats, Objects, directions, lengths_m, whole
 from missions.swaths import LINE_MIN_M
 from missions.tour import Ring
 
@@ -27,17 +28,17 @@ CRUMB_M2, LEAST_M = 0.02, 0.5
 
 
 def worthwhile(
-    tour: Tour, target: BaseGeometry, width_m: float, *, left_share: float = LEFT_SHARE,
+    tour: Tour, target: BaseGeometry, boom: Boom, *, left_share: float = LEFT_SHARE,
     worth: float = WORTH,
 ) -> Floats:  # fmt: skip
     """Return the lines of a tour that are worth their time, without the ends that others cover."""
     lines, motion = tour.lines, tour.motion
     if len(lines) < 2:
         return lines
-    ground = _Ground(lines, target, width_m)
-    spare_m2 = left_share * target.area - target.difference(united(lines, width_m)).area
+    ground = _Ground(lines, target, boom)
+    spare_m2 = left_share * target.area - target.difference(boom.united(lines)).area
     alone_m2 = np.array([ground.alone_m2(at) for at in range(len(lines))])
-    pays_m2_s = worth * motion.speed_m_s * width_m
+    pays_m2_s = worth * motion.speed_m_s * boom.width_m
     taken_s = motion.legs_s(lengths_m(lines))
     few = np.flatnonzero(alone_m2 < spare_m2)
     few = few[np.argsort(alone_m2[few], kind="stable")][:TRIED_MAX]
@@ -72,14 +73,14 @@ def _change_s(ring: Ring, piece: int) -> float:
 class _Ground:
     """Lines and their strips while they are dropped and cut."""
 
-    def __init__(self, lines: Floats, target: BaseGeometry, width_m: float) -> None:
+    def __init__(self, lines: Floats, target: BaseGeometry, boom: Boom) -> None:
         self.lines = lines.copy()
         self.kept = np.ones(len(lines), dtype=np.bool_)
         self._along = directions(lines)
-        self._strips = rectangles(lines, width_m)
+        self._strips = boom.strips(lines)
         self._near = shapely.STRtree(self._strips.copy())
         self._target = target
-        self._width_m = width_m
+        self._boom = boom
         shapely.prepare(target)
 
     def alone_m2(self, at: int) -> float:
@@ -113,7 +114,7 @@ class _Ground:
         end_m = min(max(end_m, start_m + LINE_MIN_M), length_m)
         start_m = max(min(start_m, end_m - LINE_MIN_M), 0.0)
         self.lines[at] = [*(first + along * start_m), *(first + along * end_m)]
-        self._strips[at] = rectangles(self.lines[[at]], self._width_m)[0]
+        self._strips[at] = self._boom.strips(self.lines[[at]])[0]
 
     def _joins(self, at: int, end: Floats) -> bool:
         """Return whether another line begins or ends here: it may be flown without a stop."""

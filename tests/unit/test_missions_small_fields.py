@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from shapely import Polygon, box
 
 from companion.cli.app import execute
+from missions.boom import Boom
 from missions.coverage import measure, reachable
 from missions.demand import Uniform
 from missions.field import build_field
@@ -102,11 +103,11 @@ def test_lines_chosen_from_many_stay_on_the_field_and_cover_it(kind: str, seed: 
     passes = border_passes(ground, WIDTH_M)
     pools = [
         (joined([passes, family]), list(range(len(passes))))
-        for family in families(ground, WIDTH_M, [10.0, 100.0])
+        for family in families(ground, Boom(width_m=WIDTH_M), [10.0, 100.0])
     ]
     target = reachable(ground, WIDTH_M)
     aim = Aim(left_max_m2=0.001 * target.area, doubled_s_m2=0.01)
-    found = chosen(pools, ground, WIDTH_M, aim=aim, motion=MOTION, moves=500)
+    found = chosen(pools, ground, Boom(width_m=WIDTH_M), aim=aim, motion=MOTION, moves=500)
     for lines in found:
         covered = united(lines, WIDTH_M)
         assert covered.difference(ground.buffer(0.005)).area == pytest.approx(0.0, abs=1e-3)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely import Polygon, box
 
+from missions.boom import Boom
 from missions.coverage import measure, reachable
 from missions.demand import Pieces, Uniform
 from missions.field import build_field
@@ -26,6 +27,7 @@ from tests.bench.missions import FRAME, comb, to_degrees
 
 MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5)
 WIDTH_M = 7.0
+BOOM = Boom(width_m=WIDTH_M)
 
 
 def network_of(lines: Floats) -> Network:
@@ -81,7 +83,7 @@ def test_a_line_for_a_sliver_beside_a_hole_is_left_out() -> None:
     whole = np.array([[x, 0.0, x, 300.0] for x in np.arange(30.0) * 7.0 + 3.5])
     more = np.array([[104.0, 100.0, 104.0, 140.0]])
     tour = tour_of(joined([whole, more]), free_space(ground), MOTION)
-    left = worthwhile(tour, reachable(ground, WIDTH_M), WIDTH_M)
+    left = worthwhile(tour, reachable(ground, WIDTH_M), BOOM)
     assert lengths_m(left) == pytest.approx([300.0] * 30)
 
 
@@ -102,7 +104,7 @@ def test_what_is_left_out_stays_below_a_thousandth() -> None:
 def test_ends_that_others_cover_are_cut_off_and_borders_that_go_on_are_not() -> None:
     ground = Polygon([(0, 0), (100, 0), (100, 14), (0, 14)])
     lines = np.array([[0.0, 3.5, 100.0, 3.5], [0.0, 10.5, 100.0, 10.5], [96.5, 0.0, 96.5, 14.0]])
-    left = worthwhile(tour_of(lines, free_space(ground), MOTION), ground, WIDTH_M)
+    left = worthwhile(tour_of(lines, free_space(ground), MOTION), ground, BOOM)
     assert measure(left, ground, WIDTH_M).percent == pytest.approx(100.0)
     assert len(left) == 2
 

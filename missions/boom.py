@@ -1,0 +1,190 @@
+"""What a boom sprays along lines: all of its swath, or only the valves whose strips lie inside.
+
+With `border = "inside"` the companion closes each valve before its strip leaves the field. A line
+may then have an end of its boom beyond the border: nothing falls there, and less falls twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from missions.demand import valve_places
+from missions.field import Field
+from missions.plan import Settings
+from missions.strips import Floats, Objects, directions, lengths_m, no_lines, rectangles, whole
+from missions.swaths import LINE_MIN_M
+
+# An edge that is a hair off a line's course must not cut it short, nor close a valve. The ground
+# keeps a larger margin from what may be sprayed (`field.MARGIN_M`).
+SLACK_M = 0.001
+# The aircraft itself stays so far inside of borders beside it.
+INSIDE_M = 0.5
+# Ground on which a valve would be open that may not be sprayed, and is no rounding.
+WRONG_M2 = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Boom:
+    """Valves as rows (right_m, width_m); they close at the border of `ground`, where it is given.
+
+    On `unguarded` ground they would be open though it may not be sprayed: no end goes there.
+    """
+
+    width_m: float
+    places: Floats = field(default_factory=lambda: np.empty((0, 2)))
+    ground: BaseGeometry | None = None
+    unguarded: BaseGeometry | None = None
+
+    @property
+    def closes(self) -> bool:
+        """Return whether lines may have an end of the boom beyond the border."""
+        return self.ground is not None
+
+    @property
+    def over_m(self) -> list[float]:
+        """Return by how much an end of the boom may be beyond an edge: whole valves, or none.
+
+        Less than half of the swath: the aircraft stays inside.
+        """
+        if self.ground is None:
+            return [0.0]
+        inner = np.cumsum(self.places[:, 1])[:-1]
+        return [0.0, *inner[inner <= self.width_m / 2.0 - INSIDE_M].tolist()]
+
+    def spans(self, lines: Floats) -> Floats:
+        """Return rows (line, left_m, right_m, from_m, to_m) of what is sprayed along each line."""
+        half_m, length_m = self.width_m / 2.0, lengths_m(lines)
+        count = len(lines)
+        found = np.column_stack(
+            [
+                np.arange(count), np.full(count, -half_m), np.full(count, half_m),
+                np.zeros(count), length_m,
+            ]
+        )  # fmt: skip
+        if self.ground is None or not count:
+            return found
+        shapely.prepare(self.ground)
+        is_inside = shapely.covers(self.ground, rectangles(lines, self.width_m - 2.0 * SLACK_M))
+        over = np.flatnonzero(~is_inside)
+        parts = [found[is_inside]]
+        for right_m, width_m in self.places.tolist():
+            along = directions(lines[over])
+            aside = np.column_stack([along[:, 1], -along[:, 0]]) * right_m
+            row_of, start_m, end_m = _inside(
+                lines[over] + np.column_stack([aside, aside]), self.ground, width_m
+            )
+            ends = (np.full(len(row_of), right_m + side * width_m / 2.0) for side in (-1, 1))
+            parts.append(np.column_stack([over[row_of], *ends, start_m, end_m]))
+        rows = np.concatenate(parts)
+        ordered: Floats = rows[np.argsort(rows[:, 0], kind="stable")]
+        return ordered
+
+    def strips(self, lines: Floats) -> Objects:
+        """Return the ground that is sprayed along every line."""
+        strips = rectangles(lines, self.width_m)
+        if self.ground is None or not len(lines):
+            return strips
+        spans = self.spans(lines)
+        line_of = spans[:, 0].astype(np.int64)
+        half_m, length_m = self.width_m / 2.0, lengths_m(lines)
+        is_whole = (spans[:, 2] - spans[:, 1] >= 2.0 * half_m) & (
+            spans[:, 4] - spans[:, 3] >= length_m[line_of]
+        )
+        parts = _parts(lines[line_of], spans)
+        for number in sorted(set(range(len(lines))) - set(line_of[is_whole].tolist())):
+            strips[number] = whole(parts[line_of == number])
+        return strips
+
+    def united(self, lines: Floats) -> BaseGeometry:
+        """Return the ground of all lines together."""
+        return whole(self.strips(lines))
+
+    def where_open(self, lines: Floats) -> Floats:
+        """Return the parts of lines on which the aircraft is inside and some valve is open."""
+        if self.ground is None or not len(lines):
+            return no_lines()
+        inside = where_inside(lines, self.ground, 2.0 * INSIDE_M)
+        spans = self.spans(inside)
+        line_of = spans[:, 0].astype(np.int64)
+        some = np.unique(line_of)
+        start_m, end_m = np.full(len(inside), np.inf), np.zeros(len(inside))
+        np.minimum.at(start_m, line_of, spans[:, 3])
+        np.maximum.at(end_m, line_of, spans[:, 4])
+        along, start = directions(inside)[some], inside[some, :2]
+        open_ = np.column_stack(
+            [start + along * start_m[some, None], start + along * end_m[some, None]]
+        )
+        if self.unguarded is None or self.unguarded.is_empty:
+            return open_
+        wrong = shapely.intersection(rectangles(open_, self.width_m), self.unguarded)
+        kept: Floats = open_[shapely.area(wrong) < WRONG_M2]
+        return kept
+
+
+def boom_of(settings: Settings, ground: Field) -> Boom:
+    """Return the boom of a plan."""
+    if not settings.ends_over:
+        return Boom(width_m=settings.swath_width_m)
+    places = valve_places(settings.swath_width_m, settings.valves)
+    places = places[np.argsort(places[:, 0])]
+    return Boom(
+        width_m=settings.swath_width_m, places=places, ground=ground.spray,
+        unguarded=ground.kept_in.difference(ground.limit),
+    )  # fmt: skip
+
+
+def where_inside(lines: Floats, ground: BaseGeometry, width_m: float) -> Floats:
+    """Return the parts of lines whose strips lie on the ground."""
+    if not len(lines):
+        return no_lines()
+    line_of, start_m, end_m = _inside(lines, ground, width_m)
+    along, start = directions(lines)[line_of], lines[line_of, :2]
+    return np.column_stack([start + along * start_m[:, None], start + along * end_m[:, None]])
+
+
+def _inside(
+    lines: Floats, ground: BaseGeometry, width_m: float
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], Floats, Floats]:
+    """Return line, from and to [m] of all parts of lines whose strips lie on the ground."""
+    shapely.prepare(ground)
+    bands = rectangles(lines, width_m - 2.0 * SLACK_M)
+    crossing = np.flatnonzero(~shapely.covers(ground, bands))
+    outside, band_of = shapely.get_parts(
+        shapely.difference(bands[crossing], ground), return_index=True
+    )
+    along, length_m = directions(lines), lengths_m(lines)
+    beyond: list[list[tuple[float, float]]] = [[] for _ in lines]
+    for piece, number in zip(outside, crossing[band_of].tolist(), strict=True):
+        places = (shapely.get_coordinates(piece) - lines[number, :2]) @ along[number]
+        if len(places):
+            beyond[number].append((float(places.min()), float(places.max())))
+    rows = []
+    for number, some in enumerate(beyond):
+        reached = 0.0
+        for start, end in [*sorted(some), (float(length_m[number]), np.inf)]:
+            if start - reached > LINE_MIN_M:
+                rows.append((number, reached, start))
+            reached = max(reached, end)
+    found = np.array(rows).reshape(-1, 3)
+    return found[:, 0].astype(np.int64), found[:, 1], found[:, 2]
+
+
+def _parts(lines: Floats, spans: Floats) -> Objects:
+    """Return the ground of each span, along the line of the same row."""
+    along = directions(lines)
+    right = np.column_stack([along[:, 1], -along[:, 0]])
+    start, (left_m, right_m, from_m, to_m) = lines[:, :2], (spans[:, [at]] for at in range(1, 5))
+    corners = [
+        start + right * aside_m + along * along_m
+        for aside_m, along_m in (
+            (right_m, from_m),
+            (right_m, to_m),
+            (left_m, to_m),
+            (left_m, from_m),
+        )
+    ]
+    return np.asarray(shapely.polygons(np.stack(corners, axis=1)), dtype=object)
