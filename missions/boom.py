@@ -131,9 +131,10 @@ def boom_of(settings: Settings, ground: Field) -> Boom:
         return Boom(width_m=settings.swath_width_m)
     places = valve_places(settings.swath_width_m, settings.valves)
     places = places[np.argsort(places[:, 0])]
+    guarded = ground.kept_in.buffer(-(settings.border_buffer_m or 0.0))
     return Boom(
         width_m=settings.swath_width_m, places=places, ground=ground.spray,
-        unguarded=ground.kept_in.difference(ground.limit),
+        unguarded=guarded.difference(ground.limit),
     )  # fmt: skip
 
 

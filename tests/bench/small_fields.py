@@ -1,5 +1,8 @@
 """Small and narrow fields: time and product beside the grid that Mission Planner flies.
 
+Equal coverage is the grid's, which sprays beyond the border: `outside_percent` of the field. Where
+its lines end as soon as a strip would leave the field, it covers `grid_inside_reached`.
+
 python -m tests.bench.small_fields [--only NAME] [--seed 1] [--each 4] [--json]
 """
 
@@ -7,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import statistics
 import sys
 from time import process_time
@@ -17,10 +21,11 @@ import shapely
 
 from missions.demand import Uniform
 from missions.field import Field, build_field
+from missions.layouts import LOST_SHARE
 from missions.plan import LEAVE_PERCENT, Leg, Plan, Settings, Sortie
 from missions.planner import plan_mission
 from missions.sheet import sheet
-from missions.strips import Floats, rectangles
+from missions.strips import Floats, directions, lengths_m, rectangles
 from missions.timing import timed
 from tests.bench.missions import say
 from tests.bench.peers import lines_of
@@ -30,6 +35,8 @@ from tests.small_fields import small_fields
 # Six valves of a metre, as in examples/anyang.
 VALVES = tuple((-2.5 + number, 1.0) for number in range(6))
 SPEED_M_S, RATE_L_HA, TANK_L = 6.0, 20.0, 99_999.0
+# Valves that close at the border are looked at so often along a line.
+ALONG_M = 0.1
 
 
 def settings(width_m: float, **changes: Any) -> Settings:
@@ -38,23 +45,68 @@ def settings(width_m: float, **changes: Any) -> Settings:
 
 
 def grid(drawn: Drawn, field: Field) -> dict[str, Any]:
-    """Return the figures of a grid along the longest edge."""
+    """Return the figures of a grid along the longest edge, and of what of it stays inside."""
     lines = lines_of("grid", field.outline, drawn.width_m)
-    return {"minutes": minutes(legs_of(lines), drawn.width_m)} | covered(
-        lines, field, drawn.width_m
-    )
+    strips = shapely.union_all(rectangles(lines, drawn.width_m), grid_size=1e-6)
+    inside = _kept_inside(lines, field, drawn.width_m)
+    return {
+        "minutes": minutes(legs_of(lines), drawn.width_m),
+        "outside_percent": 100.0 * strips.difference(field.limit).area / field.area_m2,
+        "inside_minutes": minutes(legs_of(inside), drawn.width_m) if len(inside) else 0.0,
+        "inside_reached_percent": covered(inside, field, drawn.width_m)["reached_percent"],
+    } | covered(lines, field, drawn.width_m)
 
 
-def covered(lines: Floats, field: Field, width_m: float) -> dict[str, Any]:
+def _kept_inside(lines: Floats, field: Field, width_m: float) -> Floats:
+    """Return the lines as far as their strips lie on the field: of each the longest part."""
+    rows = []
+    for line, way in zip(lines, directions(lines), strict=True):
+        strip = rectangles(line[None], width_m - 0.01)[0]
+        outside = shapely.get_parts(strip.difference(field.limit))
+        reached_m, best = 0.0, (0.0, 0.0)
+        spans = [((shapely.get_coordinates(part) - line[:2]) @ way) for part in outside]
+        ends = sorted((float(span.min()), float(span.max())) for span in spans if len(span))
+        for start_m, end_m in [*ends, (float(lengths_m(line[None])[0]), math.inf)]:
+            best = max(best, (reached_m, start_m), key=lambda each: each[1] - each[0])
+            reached_m = max(reached_m, end_m)
+        if best[1] - best[0] > 0.5:
+            rows.append([*(line[:2] + way * best[0]), *(line[:2] + way * best[1])])
+    return np.array(rows).reshape(-1, 4)
+
+
+def by_valves(lines: Floats, field: Field) -> Any:
+    """Return the ground of each step of each valve that lies on the field with all its width."""
+    ground = field.limit.buffer(0.002)
+    shapely.prepare(ground)
+    found = []
+    for line, way, long_m in zip(lines, directions(lines), lengths_m(lines), strict=True):
+        right = np.array([way[1], -way[0]])
+        at_m = np.linspace(0.0, long_m, max(2, round(long_m / ALONG_M) + 1))[:, None]
+        for right_m, width_m in VALVES:
+            sides = [
+                line[:2] + way * at_m + right * (right_m + side * width_m / 2.0) for side in (-1, 1)
+            ]
+            on = shapely.covers(ground, shapely.linestrings(np.stack(sides, axis=1)))
+            both = np.flatnonzero(on[:-1] & on[1:])
+            left, other = sides
+            corners = [left[both], left[both + 1], other[both + 1], other[both]]
+            found.append(shapely.polygons(np.stack(corners, axis=1)))
+    return np.concatenate(found)
+
+
+def covered(
+    lines: Floats, field: Field, width_m: float, *, ends_over: bool = False
+) -> dict[str, Any]:
     """Return what lines cover, in % of the ground that a strip can reach, and what twice."""
     half_m = width_m / 2.0
     ground = field.limit
     reach = ground.buffer(-half_m, quad_segs=32).buffer(half_m, quad_segs=32)
-    strips = rectangles(lines, width_m)
+    strips = by_valves(lines, field) if ends_over else rectangles(lines, width_m)
     all_of_it = shapely.union_all(strips, grid_size=1e-6)
     return {
         "lines": len(lines),
         "reached_percent": 100.0 * all_of_it.intersection(reach).area / reach.area,
+        "off_m2": all_of_it.difference(ground).area,
         "twice_percent": 100.0 * (float(shapely.area(strips).sum()) - all_of_it.area) / ground.area,
     }
 
@@ -96,7 +148,20 @@ def planned(drawn: Drawn, **changes: Any) -> tuple[Plan, dict[str, Any]]:
         "minutes": minutes(legs, drawn.width_m),
         "twice_l_percent": sheet(plan)["overlap_litres_percent"],
         "cpu_s": took_s,
-    } | covered(lines, field, drawn.width_m)
+    } | covered(lines, field, drawn.width_m, ends_over=plan.settings.ends_over)
+
+
+def at_equal_coverage(drawn: Drawn, reached_percent: float, **changes: Any) -> dict[str, Any]:
+    """Return the figures of the quickest plan that covers as much as another."""
+    left_percent = 100.0 - reached_percent
+    found = [
+        planned(
+            drawn, leave_max_percent=min(max(left_percent / share, LEAVE_PERCENT), 50.0), **changes
+        )[1]
+        for share in (LOST_SHARE, 1.0)
+    ]
+    enough = [each for each in found if each["reached_percent"] >= reached_percent]
+    return min(enough or found[1:], key=lambda each: each["minutes"])
 
 
 def compared(drawn: Drawn) -> dict[str, float]:
@@ -104,21 +169,35 @@ def compared(drawn: Drawn) -> dict[str, float]:
     plan, ours = planned(drawn)
     _, family = planned(drawn, moves=0)
     theirs = grid(drawn, plan.field)
-    left_percent = 100.0 - theirs["reached_percent"]
-    _, equal = planned(drawn, leave_max_percent=min(max(left_percent, LEAVE_PERCENT), 50.0))
+    equal = at_equal_coverage(drawn, theirs["reached_percent"])
+    inside = at_equal_coverage(drawn, theirs["inside_reached_percent"])
+    closes = {"valves": VALVES, "border_buffer_m": 0.0, "ends_over": True}
+    _, over = planned(drawn, **closes)
+    over_equal = at_equal_coverage(drawn, theirs["reached_percent"], **closes)
     _, closing = planned(drawn, valves=VALVES, switch_off_percent=100.0)
     return {
         "ha": plan.field.area_m2 / 1e4,
         "grid_reached": theirs["reached_percent"],
+        "outside_percent": theirs["outside_percent"],
+        "grid_inside_reached": theirs["inside_reached_percent"],
         "time_family": family["minutes"] / theirs["minutes"],
         "time": ours["minutes"] / theirs["minutes"],
         "reached": ours["reached_percent"],
         "equal_time": equal["minutes"] / theirs["minutes"],
         "equal_reached": equal["reached_percent"],
+        "inside_time": inside["minutes"] / max(theirs["inside_minutes"], 1e-3),
+        "inside_reached": inside["reached_percent"],
+        "over_time": over["minutes"] / theirs["minutes"],
+        "over_reached": over["reached_percent"],
+        "over_off_m2": over["off_m2"],
+        "over_equal_time": over_equal["minutes"] / theirs["minutes"],
+        "over_equal_reached": over_equal["reached_percent"],
         "twice_l_percent_family": family["twice_l_percent"],
         "twice_l_percent": ours["twice_l_percent"],
+        "twice_l_percent_over": over["twice_l_percent"],
         "twice_l_percent_closing": closing["twice_l_percent"],
         "cpu_s": ours["cpu_s"],
+        "over_cpu_s": over["cpu_s"],
     }
 
 

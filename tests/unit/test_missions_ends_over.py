@@ -115,6 +115,21 @@ def test_no_end_is_beyond_a_border_at_which_no_valve_closes() -> None:
     assert sheet(closing)["overlap_litres_percent"] < sheet(plan)["overlap_litres_percent"]
 
 
+def test_its_price_is_offered_where_valves_close_at_the_border(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    anyang = Path("examples/anyang")
+    words = ["plan", str(anyang / "boundary.geojson"), "--config", str(anyang / "config.toml"),
+             "--border-m", "0.3", "--json", "--choices", "--out", str(tmp_path / "m.plan")]  # fmt: skip
+    assert execute(words) == 0
+    (price,) = [
+        each
+        for each in json.loads(capsys.readouterr().out)["prices"]
+        if each["option"] == "with --ends-over"
+    ]
+    assert price["overlap_litres_percent"] < 10.0
+
+
 def test_large_fields_keep_whole_booms() -> None:
     plan = plan_of(field_of(box(0.0, 0.0, 200.0, 81.0)))
     assert not plan.settings.ends_over

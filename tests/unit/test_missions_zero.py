@@ -103,6 +103,7 @@ def test_what_is_covered_is_ground_with_a_rate() -> None:
 def test_a_missed_corner_counts_as_a_share_of_the_ground_with_a_rate() -> None:
     lines = np.array([[3.0, 300.0, 3.0, 390.0]])
     whole = measure(lines, box(0, 0, 48, 400), 6.0)
-    found = of_rated_ground(whole, lines, box(0, 0, 48, 400), 6.0, rates=Bare(-1.0, 250.0))
+    strips = rectangles(lines, 6.0)
+    found = of_rated_ground(whole, strips, box(0, 0, 48, 400), rates=Bare(-1.0, 250.0))
     assert found.percent == pytest.approx(100.0 * 90.0 * 6.0 / (150.0 * 48.0), rel=0.01)
     assert whole.percent == pytest.approx(100.0 * 90.0 * 6.0 / (400.0 * 48.0), rel=0.01)
