@@ -171,6 +171,10 @@ def compared(drawn: Drawn) -> dict[str, float]:
     theirs = grid(drawn, plan.field)
     equal = at_equal_coverage(drawn, theirs["reached_percent"])
     inside = at_equal_coverage(drawn, theirs["inside_reached_percent"])
+    # On ditches next to nothing of the grid stays inside.
+    inside_time = math.nan
+    if theirs["inside_reached_percent"] > 50.0:
+        inside_time = inside["minutes"] / theirs["inside_minutes"]
     closes = {"valves": VALVES, "border_buffer_m": 0.0, "ends_over": True}
     _, over = planned(drawn, **closes)
     over_equal = at_equal_coverage(drawn, theirs["reached_percent"], **closes)
@@ -185,7 +189,7 @@ def compared(drawn: Drawn) -> dict[str, float]:
         "reached": ours["reached_percent"],
         "equal_time": equal["minutes"] / theirs["minutes"],
         "equal_reached": equal["reached_percent"],
-        "inside_time": inside["minutes"] / max(theirs["inside_minutes"], 1e-3),
+        "inside_time": inside_time,
         "inside_reached": inside["reached_percent"],
         "over_time": over["minutes"] / theirs["minutes"],
         "over_reached": over["reached_percent"],
@@ -215,7 +219,9 @@ def main() -> int:
             rows[name] = row = compared(drawn)
             say(f"{name:20}" + "".join(f"  {key} {value:.2f}" for key, value in row.items()))
     for key in next(iter(rows.values()), {}):
-        values = [row[key] for row in rows.values()]
+        values = [row[key] for row in rows.values() if not math.isnan(row[key])]
+        if not values:
+            continue
         say(
             f"{key:24} median {statistics.median(values):8.3f}  mean {statistics.mean(values):8.3f}"
             f"  least {min(values):8.3f}  most {max(values):8.3f}"
