@@ -120,7 +120,8 @@ def test_its_price_is_offered_where_valves_close_at_the_border(
 ) -> None:
     anyang = Path("examples/anyang")
     words = ["plan", str(anyang / "boundary.geojson"), "--config", str(anyang / "config.toml"),
-             "--border-m", "0.3", "--json", "--choices", "--out", str(tmp_path / "m.plan")]  # fmt: skip
+             "--border-m", "0.3", "--json", "--choices",
+             "--out", str(tmp_path / "m.plan")]  # fmt: skip
     assert execute(words) == 0
     (price,) = [
         each
