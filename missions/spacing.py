@@ -462,16 +462,31 @@ def _cheapest(
     cost_m = np.array([_cost_m(each) for each in options[0]])
     before = []
     for some, following, places in zip(options[:-1], options[1:], inner, strict=True):
-        near = np.array(
-            [[_near(one.last, places, other.first) for other in following] for one in some]
-        )
-        over = cost_m[:, None] + TOO_NEAR_M * near
+        ends = np.array([one.last for one in some])
+        over = cost_m[:, None] + TOO_NEAR_M * _all_near(ends, places, following)
         before.append(over.argmin(axis=0))
         cost_m = over.min(axis=0) + np.array([_cost_m(each) for each in following])
     chain = [int(cost_m.argmin())]
     for step in reversed(before):
         chain.append(int(step[chain[-1]]))
     return [some[at] for some, at in zip(options, reversed(chain), strict=True)]
+
+
+def _all_near(ends: Floats, inner: Sequence[Place], following: Sequence[_Option]) -> Floats:
+    """Return `_near` from each end to the first place of each option."""
+    starts = np.array([other.first for other in following])
+    if not inner:
+        return _are_near(ends, starts)
+    between = _near(inner[0], inner[1:-1], inner[-1]) if len(inner) > 1 else 0
+    found: Floats = (
+        _are_near(ends, np.array(inner[:1])) + _are_near(np.array(inner[-1:]), starts) + between
+    )
+    return found
+
+
+def _are_near(ones: Floats, others: Floats) -> Floats:
+    far_m = np.hypot(*(ones[:, None, :] - others[None, :, :]).transpose(2, 0, 1))
+    return np.where(far_m < NEAR_M, 1.0, 0.0)
 
 
 def _cost_m(option: _Option) -> float:
