@@ -30,8 +30,10 @@ MARGIN_M = 0.0025
 # outside of their buffers: a circle of 5 m becomes one of ten corners. Where many obstacles would
 # take more of the ground than that share, it is the next lesser distance.
 OUTLINE_TOLERANCE_M = 0.1
-OBSTACLE_TOLERANCES_M = (0.5, 0.35, 0.25, 0.18, 0.12, 0.08, 0.05, 0.03)
+OBSTACLE_TOLERANCES_M = (0.5, 0.25, 0.12, 0.06, 0.03)
 OBSTACLE_SHARE = 0.0009
+# Of round corners those are left out first that lie so close to the chord, on ground grown by it.
+CLOSE_M = 0.003
 # What blocks ways around the field is drawn with few corners, too, so close outside.
 BLOCKED_TOLERANCE_M = 0.03
 # Corners sharper than 23 degrees are cut off beyond 5 times the margin.
@@ -130,7 +132,7 @@ def build_field(
     given = [each if isinstance(each, Obstacle) else Obstacle(geometry=each) for each in obstacles]
     grounds = [each.ground(frame, obstacle_buffer_m, offset_m) for each in given]
     kept = shapely.union_all(grounds)
-    blocked = shapely.union_all([*holes, around_with_fewer_corners(kept, BLOCKED_TOLERANCE_M)])
+    blocked = shapely.union_all([*holes, _simply_around(kept, BLOCKED_TOLERANCE_M)])
     flown = outline.difference(kept)
     around = _around(outline, kept)
     inside, tolerance_m = _simpler(outline, kept, around, tolerance_m, swath_width_m)
@@ -147,7 +149,7 @@ def build_field(
             beside = _around(outline, shapely.union_all(tall))
             over = as_area(polygons_of(inside.difference(beside)))
         if over is not None:
-            above = around_with_fewer_corners(shapely.union_all(tall), BLOCKED_TOLERANCE_M)
+            above = _simply_around(shapely.union_all(tall), BLOCKED_TOLERANCE_M)
             high = High(fly=over, blocked=shapely.union_all([*holes, above]))
     off = [translate(local_area(area, frame), *offset_m) for area in no_spray]
     closed = shapely.union_all(
@@ -183,7 +185,7 @@ def build_field(
 
 def _around(outline: Area, kept: BaseGeometry) -> BaseGeometry:
     """Return the ground of obstacles, drawn with few corners."""
-    grown = _grown(kept, MARGIN_M)
+    grown = _simply_around(_grown(kept, MARGIN_M), CLOSE_M)
     if grown.is_empty:
         return grown
     free_m2 = outline.difference(grown).area
@@ -192,6 +194,12 @@ def _around(outline: Area, kept: BaseGeometry) -> BaseGeometry:
         if outline.difference(around).area >= (1.0 - OBSTACLE_SHARE) * free_m2:
             return around
     return grown
+
+
+def _simply_around(area: BaseGeometry, tolerance_m: float) -> BaseGeometry:
+    """Return ground with all of the area in it, up to twice the tolerance beyond."""
+    found: BaseGeometry = shapely.simplify(_grown(area, tolerance_m), tolerance_m)
+    return found
 
 
 def local_area(area: Area, frame: LocalFrame) -> Area:
