@@ -17,11 +17,12 @@ from companion.cli.answer import AsJson, answer, note
 from companion.cli.map_grid import parse_mark
 from companion.cli.map_options import Reading, reading_options
 from companion.cli.progress import Tell, progress
+from companion.maps.whole_file import check_folder
 from companion.wording import counted
 from missions.files.fence import Fences, fence_warnings
 from missions.files.fleet import write_fleet
 from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
-from missions.files.write import check_suffix
+from missions.files.write import check_suffix, older_sorties
 from missions.obstacles import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
@@ -231,7 +232,9 @@ def plan(
     if asks and task.left is None and not isinstance(task.rates, UntreatedRates):
         choices = list(prices(planned, task.rates, depots=task.depots, around=task.around))
     fences = Fences(planned)
-    files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
+    with _undisturbed():
+        files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
+    planned = replace(planned, warnings=(*planned.warnings, *_older(older_sorties(out, files))))
     if png is not None:
         draw_plan(planned, png, title=field.stem)
     if out.suffix.casefold() == ".plan":
@@ -286,6 +289,28 @@ def _stoppable(tell: Tell) -> Iterator[Watch]:
         signal.signal(signal.SIGINT, before)
 
 
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Have Ctrl-C wait: some sorties of this plan beside some of an earlier one would be flown."""
+    pressed: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: pressed.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
+
+
+def _older(files: list[Path]) -> tuple[str, ...]:
+    if not files:
+        return ()
+    return (
+        f"{names_of(files)} {'are' if len(files) > 1 else 'is'} not of this plan, though named as "
+        "its sorties are: an earlier plan had more; delete what is not to be flown",
+    )
+
+
 def _check_outputs(
     out: Path, png: Path | None, pilot_sheet: Path | None, first: str | None
 ) -> None:
@@ -298,6 +323,9 @@ def _check_outputs(
     elif first is not None:
         raise typer.BadParameter("--start is for --sheet, whose times it sets")
     parse_start(first)
+    for path in (out, png, pilot_sheet):
+        if path is not None:
+            check_folder(path)
 
 
 def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str]:

@@ -17,6 +17,21 @@ def write_whole(path: Path, content: bytes) -> None:
         raise not_written(path, error) from None
 
 
+def check_folder(path: Path) -> None:
+    """Refuse a file that no folder is there for, before there is anything to write.
+
+    Raises:
+        MapError: as `write_whole` would.
+    """
+    if not path.parent.is_dir():
+        raise map_error(
+            path,
+            f"cannot be written (no folder {path.parent})",
+            fix="make the folder first, or name another",
+            code="not-written",
+        )
+
+
 def not_written(path: Path, error: OSError) -> MapError:
     """Return the refusal of a file that the system does not let us write."""
     return map_error(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from companion.maps.whole_file import write_whole
@@ -50,6 +52,19 @@ def lines_path(out: Path) -> Path | None:
     if suffix == ".geojson":
         return out
     return out.with_name(f"{out.stem}.lines.geojson") if suffix in ONE_SORTIE else None
+
+
+def older_sorties(out: Path, written: Sequence[Path]) -> list[Path]:
+    """Return missions that are named as if they were more sorties of this plan."""
+    if out.suffix.casefold() not in ONE_SORTIE:
+        return []
+    names = re.compile(re.escape(out.stem) + r"(-a\d+)?(-\d+)?" + re.escape(out.suffix))
+    found = [
+        path
+        for path in out.parent.iterdir()
+        if names.fullmatch(path.name) and path not in written and path.is_file()
+    ]
+    return sorted(found, key=lambda path: (len(path.name), path.name))
 
 
 def write_plan(

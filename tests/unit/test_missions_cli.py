@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,10 @@ import shapely
 from pyproj import Transformer
 from shapely import Polygon, box
 
-from companion.cli.app import execute
+import missions.cli
+import missions.files.write
+from companion.cli.app import INTERRUPTED, execute
+from missions.upload.following import sorties_from
 from sitl.stub.mission_file import read_mission
 from tests.bench.missions import to_degrees
 
@@ -334,3 +339,58 @@ def test_an_obstacle_keeps_its_buffer(capsys: pytest.CaptureFixture[str], tmp_pa
     assert ways
     assert not any(way.intersects(around) for way in ways)
     assert found["coverage_percent"] > 99.8
+
+
+@pytest.mark.parametrize("option", ["--out", "--png", "--sheet"])
+def test_a_folder_that_is_not_there_is_said_before_planning(
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    option: str,
+) -> None:
+    def planned(*_: object, **__: object) -> None:
+        raise AssertionError("planned")
+
+    monkeypatch.setattr(missions.cli, "plan_mission", planned)
+    suffix = {"--out": ".plan", "--png": ".png", "--sheet": ".html"}[option]
+    words = {"--out": tmp_path / "m.plan"} | {option: tmp_path / "no" / f"m{suffix}"}
+    code, found, _ = run(
+        capsys, ANYANG / "boundary.geojson", "--config", ANYANG / "config.toml",
+        *(word for pair in words.items() for word in pair),
+    )  # fmt: skip
+    assert code == 2
+    assert re.search(r"no folder .*no.*make the folder first", found["error"])
+
+
+def test_sorties_of_an_earlier_plan_are_said(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = written(box(0.0, 0.0, 200.0, 100.0), tmp_path / "field.geojson")
+    given = ["--swath-m", 6, "--speed-m-s", 6, "--rate-l-ha", 20, "--out", tmp_path / "m.plan"]
+    _, three, _ = run(capsys, field, *given, "--tank-l", 16)
+    code, one, err = run(capsys, field, *given, "--tank-l", 60)
+    assert code == 0
+    assert len(three["files"]) > 2
+    assert len(one["files"]) == 1
+    (said,) = [each for each in one["warnings"] if "not of this plan" in each]
+    assert said.startswith("m-2.plan, m-3.plan")
+    assert said in err
+
+
+def test_ctrl_c_while_files_are_written_leaves_all_of_one_plan(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = missions.files.write.write_whole
+
+    def pressed(path: Path, content: bytes) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        write(path, content)
+
+    monkeypatch.setattr(missions.files.write, "write_whole", pressed)
+    field = written(box(0.0, 0.0, 200.0, 100.0), tmp_path / "field.geojson")
+    given = ["--swath-m", 6, "--speed-m-s", 6, "--rate-l-ha", 20, "--out", tmp_path / "m.plan"]
+    code = execute(["plan", str(field), *map(str, given), "--tank-l", "16"])
+    assert code == INTERRUPTED
+    sorties = sorties_from(tmp_path / "m.plan")
+    assert len(sorties) > 2
+    assert sorted(tmp_path.glob("m*.plan")) == sorted(sorties)
