@@ -2,8 +2,9 @@
 
 Autopilots store few corners. The border is drawn with the fewest that keep it near the field, and
 round obstacles as circles where there is no room for all. What cannot hold the whole way is no
-fence: the plan is refused. Obstacles for which there is no room are left out, the smallest first,
-and counted.
+fence: the plan is refused. Where nothing else has room, border and obstacles are drawn simpler;
+obstacles for which there is none are left out, those far from the way and the smallest first, and
+counted.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from shapely.geometry.polygon import orient
 from companion.maps.local import polygons_of
 from companion.wording import counted
 from missions.errors import PlanError
-from missions.fewer_corners import around_with_fewer_corners
+from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
+from missions.files.fence_corners import with_corners
 from missions.files.limits import NAMES
 from missions.files.plan_rules import FENCE_CORNERS_MAX
 from missions.plan import Plan, Sortie
@@ -42,18 +44,28 @@ NEAR_M = 6.0
 # On each side of a way outside the field.
 FERRY_M = 2.0
 # Obstacles are fenced so much smaller than their buffers: no rounding puts a pass into them.
-OBSTACLE_LESS_M, OBSTACLE_SIMPLER_M = 0.5, 0.4
+OBSTACLE_LESS_M, OBSTACLE_SIMPLE_M = 0.5, 0.4
+# Where there is no room for them, they are drawn simpler, but keep so much of their ground.
+OBSTACLE_SIMPLER_M, OBSTACLE_SHARE = (OBSTACLE_SIMPLE_M, 2.0, 4.0, 8.0), 0.6
 # A circle stands for an obstacle of which it is so much.
 ROUND_SHARE = 0.6
 # ArduPilot keeps a fence in 560 bytes, 8 for a corner: beside the corners it notes where the fence
 # begins and ends (5 bytes), kind and number of corners of each polygon (2), and circles (13).
 CORNER_BYTES, ENDS_BYTES, POLYGON_BYTES, CIRCLE_BYTES = 8, 5, 2, 13
 DIGITS = 9
+# Ground that may be added to a fence keeps so much from the limit: it is drawn with arcs.
+ROUNDED_M = 0.1
+# A border with so many times the corners that have room is not tried.
+TIMES_MAX = 3
+# A place is crowded with corners by so many to both sides.
+CROWD = 4
 MITRE_LIMIT = 2.0
 
 
 # A polygon, and the circle (east, north, radius) that may stand for it.
 Shape = tuple[Polygon, tuple[float, float, float] | None]
+# How far beside the way ground is held, None for all of the field; how far outside; the border.
+Tried = tuple[float | None, float, BaseGeometry]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,11 +90,17 @@ class Fences:
 
     plan: Plan
     drawn: dict[int, Fence] = field(default_factory=dict)
+    _simpler: dict[tuple[Polygon, float], Shape] = field(default_factory=dict, repr=False)
 
     @property
     def room_bytes(self) -> int:
         """Return what the autopilot keeps a fence in, as if all counted corners as ArduPilot."""
         return FENCE_CORNERS_MAX[self.plan.settings.autopilot] * CORNER_BYTES - ENDS_BYTES
+
+    @property
+    def room(self) -> int:
+        """Return how many corners a fence without obstacles may have."""
+        return (self.room_bytes - POLYGON_BYTES) // CORNER_BYTES
 
     @cached_property
     def obstacles(self) -> list[Shape]:
@@ -98,12 +116,20 @@ class Fences:
         return self._fenced(high.blocked), self._fenced(blocked.difference(high.blocked))
 
     def obstacles_of(self, way: BaseGeometry) -> list[Shape]:
-        """Return the obstacles that a way does not cross: fences know no height."""
-        if not any(part.intersects(way) for part, _ in self.obstacles):
-            return self.obstacles
-        tall, low = self.tall_and_low
-        found = [*tall, *(each for each in low if not each[0].intersects(way))]
-        return sorted(found, key=lambda each: -each[0].area)
+        """Return the obstacles that a way does not cross, those beside it first, then the largest.
+
+        Fences know no height.
+        """
+        found = self.obstacles
+        if any(part.intersects(way) for part, _ in found):
+            tall, low = self.tall_and_low
+            found = [*tall, *(each for each in low if not each[0].intersects(way))]
+        far_m = shapely.distance(way, [part for part, _ in found]).tolist()
+        ranked = [
+            (beside_m > ASIDE_M[0], -each[0].area, number)
+            for number, (beside_m, each) in enumerate(zip(far_m, found, strict=True))
+        ]
+        return [found[number] for *_, number in sorted(ranked)]
 
     @staticmethod
     def _fenced(blocked: BaseGeometry) -> list[Shape]:
@@ -141,7 +167,7 @@ class Fences:
         if not beyond.is_empty:
             whole = outline.union(beyond.buffer(FERRY_M, quad_segs=2))
             borders = self._borders(whole, whole, SIMPLER_M)
-        tried = list(borders)
+        tried: list[Tried] = [(None, *each) for each in borders]
         fitting = self._fitting(borders, way, obstacles, aside_m=None)
         for aside_m in ASIDE_M:
             if fitting:
@@ -149,13 +175,75 @@ class Fences:
             part = whole.intersection(_beside(way, aside_m))
             near = shapely.union_all([Polygon(each.exterior) for each in polygons_of(part)])
             borders = self._borders(near, whole, PART_SIMPLER_M)
-            tried += borders
+            tried += [(aside_m, *each) for each in borders]
             fitting = self._fitting(borders, way, obstacles, aside_m=aside_m)
+        if not fitting:
+            fitting = self._with_few_corners(tried, whole, way, obstacles)
         if not fitting:
             raise self._refusal(sortie, tried, way)
         fence = min(fitting, key=lambda found: found.left_out)
+        if fence.left_out:
+            fence = self._with_more_obstacles(fence, whole, obstacles)
         self._check(fence, way, sortie)
         return fence
+
+    def _with_few_corners(
+        self, borders: list[Tried], whole: BaseGeometry, way: BaseGeometry, obstacles: list[Shape]
+    ) -> list[Fence]:
+        """Return a fence of one of these borders that need not keep near inside the field.
+
+        Outside of the field it keeps within `OUTSIDE_MAX_M`, as all do.
+        """
+        allowed = whole.buffer(OUTSIDE_MAX_M - ROUNDED_M)
+        for aside_m in (None, *ASIDE_M):
+            drawn = [
+                border
+                for far_m, _, parts in borders
+                for border in polygons_of(parts)
+                if far_m == aside_m and border.covers(way)
+            ]
+            simplest = min(drawn, key=_corners, default=None)
+            if simplest is None or _corners(simplest) > TIMES_MAX * self.room:
+                continue
+            fewer = with_corners(simplest, allowed, self.room)
+            outside_m = _outside_m(fewer, whole, _edges(whole))
+            found = self._with_obstacles(fewer, outside_m, obstacles)
+            if found is not None:
+                return [replace(found, aside_m=aside_m)]
+        return []
+
+    def _with_more_obstacles(
+        self, fence: Fence, whole: BaseGeometry, obstacles: list[Shape]
+    ) -> Fence:
+        """Return a fence with more obstacles: its border, then they, have fewer corners."""
+        near = [each for each in obstacles if fence.border.intersects(each[0])]
+        allowed = whole.buffer(max(NEAR_M, fence.outside_m) - ROUNDED_M)
+        edges, best = _edges(whole), fence
+        for simpler_m in OBSTACLE_SIMPLER_M:
+            drawn = [self._simpler_obstacle(each, simpler_m) for each in obstacles]
+            wanted = sum(
+                _polygon_bytes(self._simpler_obstacle(each, simpler_m)[0]) for each in near
+            )
+            most = (self.room_bytes - wanted - POLYGON_BYTES) // CORNER_BYTES
+            border = with_corners(fence.border, allowed, most)
+            found = self._with_obstacles(border, _outside_m(border, whole, edges), drawn)
+            if found is not None and found.left_out < best.left_out:
+                best = replace(found, aside_m=fence.aside_m)
+            if not best.left_out:
+                break
+        return best
+
+    def _simpler_obstacle(self, shape: Shape, simpler_m: float) -> Shape:
+        """Return an obstacle with fewer corners, within itself; most of its ground stays."""
+        key = (shape[0], simpler_m)
+        if key not in self._simpler:
+            inside = max(
+                polygons_of(inside_with_fewer_corners(shape[0], simpler_m)),
+                key=lambda part: part.area,
+            )
+            kept = inside.area >= OBSTACLE_SHARE * shape[0].area
+            self._simpler[key] = (inside, shape[1]) if kept else shape
+        return self._simpler[key]
 
     def _fitting(
         self,
@@ -211,7 +299,7 @@ class Fences:
             if not border.intersects(polygon):
                 continue
             if taken > left:
-                break
+                continue
             left -= taken
             if circle is None:
                 polygons.append(polygon)
@@ -223,18 +311,32 @@ class Fences:
             crossed=len(self.obstacles) - len(obstacles), outside_m=outside_m,
         )  # fmt: skip
 
-    def _refusal(
-        self, sortie: Sortie, borders: list[tuple[float, BaseGeometry]], way: BaseGeometry
-    ) -> PlanError:
-        drawn = [part for _, border in borders for part in polygons_of(border) if part.covers(way)]
-        corners = min((_corners(part) for part in drawn), default=0)
-        room = FENCE_CORNERS_MAX[self.plan.settings.autopilot]
+    def _refusal(self, sortie: Sortie, borders: list[Tried], way: BaseGeometry) -> PlanError:
+        drawn = [part for *_, border in borders for part in polygons_of(border) if part.covers(way)]
+        allowed = self.plan.field.outline.union(way).buffer(OUTSIDE_MAX_M - ROUNDED_M)
+        fewest = [with_corners(part, allowed, self.room) for part in drawn]
+        best = min(fewest, key=_corners, default=None)
+        name = NAMES[self.plan.settings.autopilot]
+        if best is None:
+            place = self._place(sortie.legs[0].points[-1])
+            why = (
+                f"no fence within {OUTSIDE_MAX_M:.0f} m of field and ways holds it from {place} on"
+            )
+        else:
+            why = (
+                f"a fence within {OUTSIDE_MAX_M:.0f} m of the field has {_corners(best)} corners "
+                f"or more, most of them near {self._place(_crowded(best))}, and {name} has room "
+                f"for {self.room} ({self.room_bytes + ENDS_BYTES} bytes, {CORNER_BYTES} for each "
+                f"and {ENDS_BYTES + POLYGON_BYTES} beside them)"
+            )
         return PlanError(
-            f"sortie {sortie.number}: a fence within {OUTSIDE_MAX_M:.0f} m of the field has "
-            f"{corners} corners, and {NAMES[self.plan.settings.autopilot]} stores {room}; make the "
-            "sorties shorter (mission.tank_l), draw the outline with fewer corners, or write "
-            ".waypoints, which has no fence"
+            f"sortie {sortie.number}: {why}; make the sorties shorter (mission.tank_l), draw the "
+            "outline with fewer corners, or write .waypoints, which has no fence"
         )
+
+    def _place(self, point: tuple[float, float]) -> str:
+        latitude_deg, longitude_deg = self.plan.field.frame.to_geographic(*point)
+        return f"{latitude_deg:.6f}, {longitude_deg:.6f}"
 
     def _check(self, fence: Fence, way: BaseGeometry, sortie: Sortie) -> None:
         """Refuse a fence that the sortie itself would break."""
@@ -291,8 +393,9 @@ def fence_warnings(plan: Plan, fences: Fences) -> tuple[str, ...]:
         return tuple(said)
     return (
         *said,
-        f"the fence has no room for {most} of {len(fences.obstacles)} obstacles, the smallest: the "
-        f"passes keep clear of them, but {name} would not stop the aircraft there",
+        f"the fence has no room for {most} of {len(fences.obstacles)} obstacles, those far from "
+        f"the way and the smallest: the passes keep clear of them, but {name} would not stop the "
+        "aircraft there",
     )
 
 
@@ -324,13 +427,22 @@ def _corners(part: Polygon) -> int:
     return len(part.exterior.coords) - 1
 
 
+def _crowded(part: Polygon) -> tuple[float, float]:
+    """Return the corner of a polygon where the corners around it are nearest."""
+    points = shapely.get_coordinates(part.exterior)[:-1]
+    shifts = range(-CROWD, CROWD + 1)
+    far_m = sum(np.hypot(*(points - np.roll(points, shift, axis=0)).T) for shift in shifts)
+    east_m, north_m = points[int(np.argmin(far_m))].tolist()
+    return east_m, north_m
+
+
 def _polygon_bytes(part: Polygon) -> int:
     return POLYGON_BYTES + CORNER_BYTES * _corners(part)
 
 
 def _smaller(part: Polygon) -> Polygon:
     """Return an obstacle with few corners, within itself."""
-    found = Polygon(part.exterior).simplify(OBSTACLE_SIMPLER_M)
+    found = Polygon(part.exterior).simplify(OBSTACLE_SIMPLE_M)
     return found if isinstance(found, Polygon) and not found.is_empty else part
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from shapely import Polygon, box
 from shapely.affinity import rotate, translate
 
@@ -20,6 +22,7 @@ from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
 from missions.field import Field, build_field
 from missions.files.fence import Fences, fence_warnings
+from missions.files.fence_corners import with_corners
 from missions.files.geojson import geojson_text
 from missions.files.plan_file import plan_text
 from missions.files.plan_rules import FENCE_CORNERS_MAX
@@ -318,8 +321,61 @@ def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:
         field_of(Drawn(outline=degrees(comb(45)))), settings, Uniform(rate_l_ha=20.0)
     )
     assert len(plan.sorties) == 1
-    with pytest.raises(PlanError, match=r"sortie 1: a fence within 10 m .* ArduPilot stores 70"):
+    # 560 bytes: 5 for where it begins and ends, 2 for a polygon, and 8 for each of 69 corners.
+    said = (
+        r"sortie 1: a fence within 10 m .* near 4\d\.\d+, 11\.\d+, .* has room for 69 \(560 bytes"
+    )
+    with pytest.raises(PlanError, match=said):
         plan_text(plan, plan.sorties[0])
+
+
+def test_a_border_without_room_need_not_keep_near_inside_the_field(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    each = parcel("drawn", 5)
+    drawn = Drawn(outline=each.outline)
+    plan = planned(drawn)
+    monkeypatch.setitem(FENCE_CORNERS_MAX, "ardupilot", 11)
+    fences = Fences(plan)
+    for sortie in plan.sorties:
+        content = json.loads(plan_text(plan, sortie, fences=fences))
+        assert not judge_fence(drawn, content, corners_max=11, outside_max_m=10.0)
+
+
+def test_obstacles_without_room_are_drawn_simpler_before_any_is_left_out() -> None:
+    around = np.linspace(0.0, math.tau, 32, endpoint=False)
+    pond = Polygon(np.column_stack([22.0 * np.cos(around), 7.0 * np.sin(around)]))
+    ponds = [
+        rotate(translate(pond, 40.0 + 60.0 * (k % 4), 30.0 + 50.0 * (k // 4)), 20.0 * k)
+        for k in range(8)
+    ]
+    drawn = Drawn(
+        outline=degrees(box(0.0, 0.0, 270.0, 110.0)), obstacles=[degrees(each) for each in ponds]
+    )
+    plan = planned(drawn)
+    assert not fence_faults(plan, drawn)
+    assert fence_warnings(plan, Fences(plan)) == ()
+    content = json.loads(plan_text(plan, plan.sorties[0]))
+    assert sum(not each["inclusion"] for each in content["geoFence"]["polygons"]) == 8
+
+
+@given(seed=st.integers(0, 5_000), most=st.integers(3, 30), far_m=st.floats(0.0, 60.0))
+@settings(max_examples=25, deadline=None)
+def test_a_border_with_fewer_corners_holds_all_of_it_on_allowed_ground(
+    seed: int, most: int, far_m: float
+) -> None:
+    border = parcel("recorded", seed % 40).outline
+    drawn = Drawn(outline=border)
+    area = Polygon(shapely.get_parts(drawn.plane.area(border))[0].exterior).simplify(1.0)
+    assert isinstance(area, Polygon)
+    found = with_corners(area, area.buffer(far_m), most)
+    assert found.is_valid
+    assert found.buffer(1e-6).covers(area)
+    assert area.buffer(far_m + 1e-6).covers(found)
+    assert corners(found) <= corners(area)
+    if far_m > 0.0 and corners(found) - 1 > max(most, 3):
+        again = with_corners(found, area.buffer(far_m), most)
+        assert corners(again) == corners(found)
 
 
 def test_ways_among_many_obstacles_are_the_shortest() -> None:
