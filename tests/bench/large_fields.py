@@ -101,7 +101,8 @@ def compared(
     endless = in_one(drawn, field, depot)
     ((home_x, home_y),) = drawn.plane.metres(np.array([[depot[1], depot[0]]]))
     home = float(home_x), float(home_y)
-    passes = passes_of(endless[1])
+    # Several where one has more items than an autopilot has room for: as if it went on.
+    passes = [each for number in sorted(endless) for each in passes_of(endless[number])]
     limit_s = math.inf if flight_s is None else flight_s
     plain = naive(
         passes, home, FLIGHT, usable_l=tank_l, limit_s=limit_s, ferry=ferries_inside(drawn, home)
