@@ -150,6 +150,7 @@ def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
         ("Speed, height", f"{_speeds(rows)} m/s, {settings.height_m:g} m above "
          f"{'the ground' if plan.terrain is not None else 'the depot'}{_ferries(plan)}"),
         ("Swath", f"{settings.swath_width_m:g} m, course {plan.angle_deg:.0f} deg"),
+        ("Way", _way(found)),
         ("Wind", _wind(plan)),
     ]  # fmt: skip
     for number, (latitude_deg, longitude_deg) in enumerate(found["depots"], start=1):
@@ -162,6 +163,14 @@ def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
 def _ferries(plan: Plan) -> str:
     height_m = plan.settings.ferry_height_m
     return "" if height_m is None else f", ferries {height_m:g} m"
+
+
+def _way(found: dict[str, Any]) -> str:
+    """Return what is flown along passes and beside them, and how little that could be."""
+    beside_m = found["transit_m"] + found["ferry_m"]
+    text = f"{found['spray_m'] / 1e3:.1f} km of passes, {beside_m / 1e3:.1f} km of other ways"
+    least_m = found["least_idle_m"]
+    return text if least_m < 50.0 else f"{text} (in any order {least_m / 1e3:.1f} km or more)"
 
 
 def _wind(plan: Plan) -> str:

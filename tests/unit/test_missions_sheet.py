@@ -215,3 +215,20 @@ def test_what_is_no_sheet_is_refused_before_any_work(
     assert execute(["plan", str(field), "--out", str(tmp_path / "m.plan"), *words]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "m.plan").exists()
+
+
+def test_the_sheet_says_how_little_ways_beside_passes_could_be(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, config: Path
+) -> None:
+    field = written(box(0, 0, 600, 300), tmp_path / "f.geojson")
+    sheet = tmp_path / "s.txt"
+    found = planned(
+        capsys, field, "--config", config, "--out", tmp_path / "m.kml", "--sheet", sheet
+    )
+    beside_km = (found["transit_m"] + found["ferry_m"]) / 1000.0
+    (way,) = [line for line in sheet.read_text().splitlines() if line.startswith("Way ")]
+    assert 0.05 < found["least_idle_m"] / 1000.0 < beside_km
+    assert way.split(None, 1)[1] == (
+        f"{found['spray_m'] / 1000.0:.1f} km of passes, {beside_km:.1f} km of other ways "
+        f"(in any order {found['least_idle_m'] / 1000.0:.1f} km or more)"
+    )
