@@ -28,7 +28,7 @@ from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
 from missions.prices import overlap_warnings, prices
-from missions.reading import Asked, names_of, read_task
+from missions.reading import Asked, Task, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
 from missions.searching import Watch, watched
@@ -216,14 +216,8 @@ def plan(
         raise typer.BadParameter("--ends-over needs valves that close one by one, not --sprayer")
     task = read_task(asked, reading.config, changes)
     with progress(after_s=BAR_AFTER_S) as tell, _stoppable(tell) as watch:
-        planned = plan_mission(
-            task.field,
-            task.settings,
-            task.rates,
-            depots=task.depots,
-            left=task.left,
-            around=task.around,
-            with_sprayer=sprayer,
+        planned, fences = _fenced(
+            task, with_sprayer=sprayer, looks=out.suffix.casefold() == ".plan"
         )
     planned = replace(planned, warnings=(*task.said, *planned.warnings), wind=task.wind)
     took_s = perf_counter() - start
@@ -231,7 +225,6 @@ def plan(
     asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT
     if asks and task.left is None and not isinstance(task.rates, UntreatedRates):
         choices = list(prices(planned, task.rates, depots=task.depots, around=task.around))
-    fences = Fences(planned)
     with _undisturbed():
         files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
     planned = replace(planned, warnings=(*planned.warnings, *_older(older_sorties(out, files))))
@@ -269,6 +262,29 @@ def plan(
         note(f"warning: {warning}")
     if watch.stopped:
         note(f"stopped after {took_s:.0f} s: the best plan so far is written")
+
+
+def _fenced(task: Task, *, with_sprayer: bool, looks: bool) -> tuple[Plan, Fences]:
+    """Return the plan and its fences; where one has no room, with more sorties."""
+
+    def planned(*, fenced: bool = False) -> Plan:
+        return plan_mission(
+            task.field, task.settings, task.rates, depots=task.depots, left=task.left,
+            around=task.around, with_sprayer=with_sprayer, fenced=fenced,
+        )  # fmt: skip
+
+    plan = planned()
+    fences = Fences(plan)
+    lack = sum(not fences.has_room(each) for each in plan.sorties) if looks else 0
+    if not lack:
+        return plan, fences
+    more = planned(fenced=True)
+    text = (
+        f"{counted(lack, 'sortie')} would have a fence with more corners than the autopilot has "
+        f"room for: they are flown as several, {counted(len(more.sorties), 'sortie')} in place of "
+        f"{len(plan.sorties)}"
+    )
+    return replace(more, warnings=(*more.warnings, text)), Fences(more)
 
 
 @contextmanager

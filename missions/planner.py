@@ -16,6 +16,7 @@ from missions.demand import Demand, Rates, demands
 from missions.errors import OutOfReachError, PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
+from missions.files.fence import Fences, Ground
 from missions.files.items import count_of, stops_of
 from missions.files.plan_rules import ITEMS_MAX
 from missions.fleet import fleet_sorties
@@ -62,10 +63,12 @@ def plan_mission(
     left: Remaining | None = None,
     around: Surroundings = NOTHING_AROUND,
     with_sprayer: bool = False,
+    fenced: bool = False,
 ) -> Plan:
     """Return the mission for a field; depots are (latitude, longitude).
 
     No sortie has more items than its autopilot has room for; `with_sprayer` they are more.
+    With `fenced` those for whose fence it has no room are flown as several, too.
     With `left` its lines are flown, and no others. `around` is the ground that the plan follows,
     and the room that passes get beyond their ends.
 
@@ -73,7 +76,7 @@ def plan_mission(
         PlanError: where there is none, in one line with what to change.
     """
     try:
-        return _planned(field, settings, rates, depots, left, around, with_sprayer)
+        return _planned(field, settings, rates, depots, left, around, with_sprayer, fenced)
     except ShapelyError as error:
         raise PlanError(
             f"the field's geometry cannot be used ({str(error)[:120]}); simplify its outline"
@@ -88,6 +91,7 @@ def _planned(
     left: Remaining | None,
     around: Surroundings,
     with_sprayer: bool,
+    fenced: bool,
 ) -> Plan:
     width_m = settings.swath_width_m
     settings = _of_its_size(settings, field)
@@ -107,6 +111,7 @@ def _planned(
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
     given = _depots(field.frame, depots)
     lines_are_drawn()
+    fences = Fences(Ground(field=field, settings=settings)) if fenced else None
 
     def one(some: Floats, needs: list[Demand], ways: Ways, *, any_depot: bool = False) -> Paced:
         spacing = Spacing(ways=ways, settings=settings, apart=with_sprayer)
@@ -122,6 +127,7 @@ def _planned(
             return in_room(
                 sorties, ways, lambda some: around.paced(some, rates, spacing, settings), count,
                 room=ITEMS_MAX[settings.autopilot],
+                fenced=None if fences is None else fences.has_room,
             )  # fmt: skip
 
         around.check(field, ways.depots)

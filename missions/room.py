@@ -1,4 +1,7 @@
-"""Sorties that fit into the autopilot's memory: one with too many items is flown as several."""
+"""Sorties that fit into the autopilot's memory: one with too many items is flown as several.
+
+So is one whose fence has no room, where fences are looked at.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,12 @@ def in_room(
     items: Callable[[Sortie], int],
     *,
     room: int,
+    fenced: Callable[[Sortie], bool] | None = None,
 ) -> Paced:
     """Return the sorties with their speeds; one with more items than room is cut between lines.
 
-    Speeds and slopes add items: only what is paced can be counted.
+    Speeds and slopes add items: only what is paced can be counted. With `fenced`, which says
+    whether there is a fence for one, those without are cut as long as they have two lines.
 
     Raises:
         PlanError: where one line alone has too many.
@@ -29,6 +34,8 @@ def in_room(
     while True:
         found = pace(sorties)
         over = {each.number for each in found.sorties if items(each) > room}
+        if fenced is not None:
+            over |= {each.number for each in found.sorties if _joins(each) and not fenced(each)}
         if not over:
             return found
         parts = [
@@ -41,7 +48,7 @@ def in_room(
 
 def _halves(sortie: Sortie, ways: Ways, room: int) -> tuple[Sortie, Sortie]:
     legs = sortie.legs
-    joins = [number for number in range(1, len(legs) - 1) if legs[number].kind != "spray"]
+    joins = _joins(sortie)
     if not joins:
         raise PlanError(
             f"a line of sortie {sortie.number} alone has more items than the {room} for which the "
@@ -57,3 +64,9 @@ def _halves(sortie: Sortie, ways: Ways, room: int) -> tuple[Sortie, Sortie]:
         replace(sortie, legs=(*legs[:middle], back)),
         replace(sortie, legs=(again, *legs[middle + 1 :])),
     )
+
+
+def _joins(sortie: Sortie) -> list[int]:
+    """Return the numbers of the ways between lines."""
+    inner = range(1, len(sortie.legs) - 1)
+    return [number for number in inner if sortie.legs[number].kind != "spray"]

@@ -13,7 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import shapely
@@ -23,12 +23,13 @@ from shapely.geometry.polygon import orient
 
 from companion.maps.local import polygons_of
 from companion.wording import counted
-from missions.errors import PlanError
+from missions.errors import FenceError, PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
+from missions.field import Field
 from missions.files.fence_corners import with_corners
 from missions.files.limits import NAMES
 from missions.files.plan_rules import FENCE_CORNERS_MAX
-from missions.plan import Plan, Sortie
+from missions.plan import Place, Plan, Settings, Sortie
 
 # The fence lies so far outside the field, at least; drawn with fewer corners, so much farther.
 # Lines end on the field's edge: PX4 in simulation went 1.24 m beyond one, and a fence at 1.2 m
@@ -64,6 +65,7 @@ MITRE_LIMIT = 2.0
 
 # A polygon, and the circle (east, north, radius) that may stand for it.
 Shape = tuple[Polygon, tuple[float, float, float] | None]
+Way = tuple[tuple[Place, ...], ...]
 # How far beside the way ground is held, None for all of the field; how far outside; the border.
 Tried = tuple[float | None, float, BaseGeometry]
 
@@ -84,12 +86,35 @@ class Fence:
     outside_m: float = 0.0
 
 
+class Fenced(Protocol):
+    """What fences are drawn for: a plan, or the field of one that is made."""
+
+    @property
+    def field(self) -> Field:
+        """Return the field."""
+        ...
+
+    @property
+    def settings(self) -> Settings:
+        """Return what the plan is made for."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ground:
+    """A field for which a plan is made."""
+
+    field: Field
+    settings: Settings
+
+
 @dataclass(frozen=True)
 class Fences:
     """The fences of all sorties of a plan."""
 
-    plan: Plan
-    drawn: dict[int, Fence] = field(default_factory=dict)
+    plan: Fenced
+    drawn: dict[Way, Fence] = field(default_factory=dict, repr=False)
+    lacking: set[Way] = field(default_factory=set, repr=False)
     _simpler: dict[tuple[Polygon, float], Shape] = field(default_factory=dict, repr=False)
 
     @property
@@ -149,9 +174,22 @@ class Fences:
         Raises:
             PlanError: where none has room that keeps near the field and holds the way.
         """
-        if sortie.number not in self.drawn:
-            self.drawn[sortie.number] = self._of(sortie)
-        return self.drawn[sortie.number]
+        way = _points(sortie)
+        if way not in self.drawn:
+            self.drawn[way] = self._of(sortie)
+        return self.drawn[way]
+
+    def has_room(self, sortie: Sortie) -> bool:
+        """Return whether there is a fence for a sortie."""
+        way = _points(sortie)
+        if way in self.lacking:
+            return False
+        try:
+            self.of(sortie)
+        except FenceError:
+            self.lacking.add(way)
+            return False
+        return True
 
     def _of(self, sortie: Sortie) -> Fence:
         """Return the fence of one sortie.
@@ -311,7 +349,7 @@ class Fences:
             crossed=len(self.obstacles) - len(obstacles), outside_m=outside_m,
         )  # fmt: skip
 
-    def _refusal(self, sortie: Sortie, borders: list[Tried], way: BaseGeometry) -> PlanError:
+    def _refusal(self, sortie: Sortie, borders: list[Tried], way: BaseGeometry) -> FenceError:
         drawn = [part for *_, border in borders for part in polygons_of(border) if part.covers(way)]
         allowed = self.plan.field.outline.union(way).buffer(OUTSIDE_MAX_M - ROUNDED_M)
         fewest = [with_corners(part, allowed, self.room) for part in drawn]
@@ -329,7 +367,7 @@ class Fences:
                 f"for {self.room} ({self.room_bytes + ENDS_BYTES} bytes, {CORNER_BYTES} for each "
                 f"and {ENDS_BYTES + POLYGON_BYTES} beside them)"
             )
-        return PlanError(
+        return FenceError(
             f"sortie {sortie.number}: {why}; make the sorties shorter (mission.tank_l), draw the "
             "outline with fewer corners, or write .waypoints, which has no fence"
         )
@@ -397,6 +435,10 @@ def fence_warnings(plan: Plan, fences: Fences) -> tuple[str, ...]:
         f"the way and the smallest: the passes keep clear of them, but {name} would not stop the "
         "aircraft there",
     )
+
+
+def _points(sortie: Sortie) -> Way:
+    return tuple(leg.points for leg in sortie.legs)
 
 
 def _beside(way: BaseGeometry, aside_m: float) -> BaseGeometry:

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from shapely import Polygon, box
 from shapely.affinity import rotate, translate
 
+from companion.cli.app import execute
 from companion.errors import MapError
 from companion.maps.local import make_valid
 from missions.demand import Uniform
@@ -327,6 +328,29 @@ def test_a_border_for_which_the_autopilot_has_no_room_is_refused() -> None:
     )
     with pytest.raises(PlanError, match=said):
         plan_text(plan, plan.sorties[0])
+
+
+def test_a_sortie_for_whose_fence_there_is_no_room_is_flown_as_several(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room, drawn = 24, Drawn(outline=degrees(comb(8)))
+    monkeypatch.setitem(FENCE_CORNERS_MAX, "ardupilot", room)
+    path = tmp_path / "f.geojson"
+    path.write_text(shapely.to_geojson(drawn.outline))
+    words = [path, "--rate-l-ha", "20", "--tank-l", "400", "--json", "--out"]
+    code = execute(["plan", *map(str, words), str(tmp_path / "m.plan")])
+    found = json.loads(capsys.readouterr().out)
+    assert code == 0, found
+    assert len(found["sorties"]) > 1
+    assert any(
+        "1 sortie would have a fence with more corners" in each for each in found["warnings"]
+    )
+    for name in found["files"]:
+        content = json.loads(Path(name).read_text(encoding="utf-8"))
+        assert not judge_fence(drawn, content, corners_max=room, outside_max_m=10.0)
+    # A file without a fence has one sortie as before.
+    assert execute(["plan", *map(str, words), str(tmp_path / "m.waypoints")]) == 0
+    assert len(json.loads(capsys.readouterr().out)["sorties"]) == 1
 
 
 def test_a_border_without_room_need_not_keep_near_inside_the_field(
