@@ -75,7 +75,7 @@ def _kept_inside(lines: Floats, field: Field, width_m: float) -> Floats:
 
 
 def by_valves(lines: Floats, field: Field) -> Any:
-    """Return the ground of each step of each valve that lies on the field with all its width."""
+    """Return the ground over which a valve lies on the field with all its width."""
     ground = field.limit.buffer(0.002)
     shapely.prepare(ground)
     found = []
@@ -87,9 +87,11 @@ def by_valves(lines: Floats, field: Field) -> Any:
                 line[:2] + way * at_m + right * (right_m + side * width_m / 2.0) for side in (-1, 1)
             ]
             on = shapely.covers(ground, shapely.linestrings(np.stack(sides, axis=1)))
-            both = np.flatnonzero(on[:-1] & on[1:])
-            left, other = sides
-            corners = [left[both], left[both + 1], other[both + 1], other[both]]
+            change = np.diff(np.concatenate([[0], on.astype(np.int8), [0]]))
+            first, last = np.flatnonzero(change == 1), np.flatnonzero(change == -1) - 1
+            some = last > first
+            first, last, (left, other) = first[some], last[some], sides
+            corners = [left[first], left[last], other[last], other[first]]
             found.append(shapely.polygons(np.stack(corners, axis=1)))
     return np.concatenate(found)
 
@@ -154,14 +156,13 @@ def planned(drawn: Drawn, **changes: Any) -> tuple[Plan, dict[str, Any]]:
 def at_equal_coverage(drawn: Drawn, reached_percent: float, **changes: Any) -> dict[str, Any]:
     """Return the figures of the quickest plan that covers as much as another."""
     left_percent = 100.0 - reached_percent
+    most = {min(max(left_percent / share, LEAVE_PERCENT), 50.0) for share in (LOST_SHARE, 1.0)}
     found = [
-        planned(
-            drawn, leave_max_percent=min(max(left_percent / share, LEAVE_PERCENT), 50.0), **changes
-        )[1]
-        for share in (LOST_SHARE, 1.0)
+        planned(drawn, leave_max_percent=percent, **changes)[1]
+        for percent in sorted(most, reverse=True)
     ]
     enough = [each for each in found if each["reached_percent"] >= reached_percent]
-    return min(enough or found[1:], key=lambda each: each["minutes"])
+    return min(enough or found[-1:], key=lambda each: each["minutes"])
 
 
 def compared(drawn: Drawn) -> dict[str, float]:
@@ -170,11 +171,12 @@ def compared(drawn: Drawn) -> dict[str, float]:
     _, family = planned(drawn, moves=0)
     theirs = grid(drawn, plan.field)
     equal = at_equal_coverage(drawn, theirs["reached_percent"])
-    inside = at_equal_coverage(drawn, theirs["inside_reached_percent"])
     # On ditches next to nothing of the grid stays inside.
-    inside_time = math.nan
+    inside_time = inside_reached = math.nan
     if theirs["inside_reached_percent"] > 50.0:
+        inside = at_equal_coverage(drawn, theirs["inside_reached_percent"])
         inside_time = inside["minutes"] / theirs["inside_minutes"]
+        inside_reached = inside["reached_percent"]
     closes = {"valves": VALVES, "border_buffer_m": 0.0, "ends_over": True}
     _, over = planned(drawn, **closes)
     over_equal = at_equal_coverage(drawn, theirs["reached_percent"], **closes)
@@ -190,7 +192,7 @@ def compared(drawn: Drawn) -> dict[str, float]:
         "equal_time": equal["minutes"] / theirs["minutes"],
         "equal_reached": equal["reached_percent"],
         "inside_time": inside_time,
-        "inside_reached": inside["reached_percent"],
+        "inside_reached": inside_reached,
         "over_time": over["minutes"] / theirs["minutes"],
         "over_reached": over["reached_percent"],
         "over_off_m2": over["off_m2"],
