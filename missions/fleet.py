@@ -16,6 +16,7 @@ import numpy as np
 from missions.demand import Demand
 from missions.errors import PlanError
 from missions.field import Field
+from missions.free_space import free_space
 from missions.paced import Paced
 from missions.plan import Settings, Sortie
 from missions.strips import Floats, directions, lengths_m
@@ -154,10 +155,11 @@ def _depots(
     if len(depots):
         return [depots] * count
     found = []
+    inside = free_space(field.fly)
     for aircraft in range(count):
         some = np.flatnonzero(share == aircraft)
         litres = np.array([demand[at].total_l for at in some])
-        found.append(suggested_depot(field, lines[some], litres))
+        found.append(suggested_depot(field, lines[some], litres, inside))
     return found
 
 

@@ -21,6 +21,7 @@ from missions.files.items import count_of, stops_of
 from missions.files.plan_rules import ITEMS_MAX
 from missions.fleet import fleet_sorties
 from missions.flown import flown
+from missions.free_space import free_space
 from missions.layouts import is_small, spray_lines
 from missions.paced import Paced, range_warnings
 from missions.patches import narrow_patches
@@ -202,7 +203,8 @@ def _from_depots(
 
 def _in_reach(field: Field, lines: Floats, litres: Floats, reach_m: float) -> Ways:
     """Return the ways from the best depot, and from more where it is too far from some line."""
-    ways = build_ways(field, suggested_depot(field, lines, litres))
+    inside = free_space(field.fly)
+    ways = build_ways(field, suggested_depot(field, lines, litres, inside), inside)
     ends = lines.reshape(-1, 2)
     home_m = ways.home_ways_m(ends)
     while float(home_m.min(axis=0).max()) > reach_m and len(ways.depots) < DEPOTS_MAX:
@@ -213,12 +215,14 @@ def _in_reach(field: Field, lines: Floats, litres: Floats, reach_m: float) -> Wa
         others = [each for each in needed if each != depot]
         if float(home_m[others].min(axis=0).max()) <= reach_m:
             needed = others
-    return ways if len(needed) == len(ways.depots) else build_ways(field, ways.depots[needed])
+    if len(needed) == len(ways.depots):
+        return ways
+    return build_ways(field, ways.depots[needed], inside)
 
 
 def _with_another(ways: Ways, lines: Floats, litres: Floats) -> Ways:
-    another = suggested_depot(ways.field, lines, litres, besides=ways)
-    return build_ways(ways.field, np.concatenate([ways.depots, another]))
+    another = suggested_depot(ways.field, lines, litres, ways.inside, besides=ways)
+    return build_ways(ways.field, np.concatenate([ways.depots, another]), ways.inside)
 
 
 def _of_its_size(settings: Settings, field: Field) -> Settings:

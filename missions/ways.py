@@ -26,6 +26,8 @@ AROUND_M = 50.0
 # A depot this close to the field stands on its edge.
 ON_EDGE_M = 0.05
 DEPOT_FAR_M = 20_000.0
+# Of a field that does not see all of itself so many places stand for the lines.
+SOME_POINTS = 150
 # A depot farther from the field than this is worth a word: each flight is mostly ferry.
 DEPOT_FERRY_M = 500.0
 
@@ -152,8 +154,10 @@ def _over_corners_m(to_corner_m: Floats, ends: Floats, space: FreeSpace) -> Floa
     return found
 
 
-def build_ways(field: Field, depots: Floats) -> Ways:
+def build_ways(field: Field, depots: Floats, inside: FreeSpace | None = None) -> Ways:
     """Return the ways of a field with its depots, which must be places one can stand at.
+
+    `inside` is the free space of the field, where it is known.
 
     Raises:
         PlanError: for a depot in an obstacle or hole, or beyond reach.
@@ -173,7 +177,7 @@ def build_ways(field: Field, depots: Floats) -> Ways:
                 f"depot {number} at {latitude_deg:.6f}, {longitude_deg:.6f} lies in an obstacle "
                 "or its buffer; move it (mission.depots)"
             )
-    return Ways(field=field, depots=depots, inside=free_space(field.fly))
+    return Ways(field=field, depots=depots, inside=inside or free_space(field.fly))
 
 
 def _is_in(blocked: BaseGeometry, east_m: float, north_m: float) -> bool:
@@ -213,23 +217,45 @@ def edge_places(field: Field, *, step_m: float, count_max: int) -> Floats:
 
 
 def suggested_depot(
-    field: Field, lines: Floats, litres: Floats, *, besides: Ways | None = None
+    field: Field, lines: Floats, litres: Floats, inside: FreeSpace, *, besides: Ways | None = None
 ) -> Floats:
     """Return the place on the edge of the field from which the litres are nearest, shape (1, 2).
 
-    With `besides` it is one more depot: of each litre counts the nearer of the two ways.
+    Near is what is flown inside the field, around its bays and obstacles. With `besides` it is one
+    more depot: of each litre counts the nearer of the two ways.
     """
-    places = edge_places(field, step_m=25.0, count_max=120)
+    places = edge_places(field, step_m=25.0, count_max=120 if inside.is_convex else 60)
     middle = (lines[:, :2] + lines[:, 2:]) / 2.0
-    thirds = np.concatenate([middle, (lines[:, :2] + middle) / 2, (lines[:, 2:] + middle) / 2])
-    weight = np.tile(np.maximum(litres, 1e-9), 3)
-    far_m = np.hypot(
-        places[:, 0][:, None] - thirds[:, 0][None, :], places[:, 1][:, None] - thirds[:, 1][None, :]
-    )
+    thirds = np.stack([(lines[:, :2] + middle) / 2, middle, (lines[:, 2:] + middle) / 2], axis=1)
+    points, weight = thirds.reshape(-1, 2), np.repeat(np.maximum(litres, 1e-9), 3)
+    if not inside.is_convex:
+        # Lines in a row lie beside each other: one of them stands for some.
+        first = np.linspace(0, len(points), min(len(points), SOME_POINTS), endpoint=False)
+        first = first.astype(np.int64)
+        weight = np.add.reduceat(weight, first)
+        points = points[(first + np.append(first[1:], len(points))) // 2]
+    far_m = _ways_m(places, points, inside)
     if besides is not None:
-        far_m = np.minimum(far_m, besides.home_ways_m(thirds).min(axis=0))
+        far_m = np.minimum(far_m, besides.home_ways_m(points).min(axis=0))
     best: Floats = places[[int(np.argmin(far_m @ weight))]]
     return best
+
+
+def _ways_m(places: Floats, points: Floats, inside: FreeSpace) -> Floats:
+    """Return how long the ways from places to points are, over a few corners near to them."""
+    far_m: Floats = np.hypot(*(places[:, None, :] - points[None, :, :]).transpose(2, 0, 1))
+    if inside.is_convex:
+        return far_m
+    rows, columns = np.divmod(np.arange(far_m.size), len(points))
+    is_seen = inside.sees(places[rows], points[columns]).reshape(far_m.shape)
+    from_points_m = inside.to_corners_m(points)
+    found_m = np.empty_like(far_m)
+    for at, reach_m in enumerate(inside.to_corners_m(places)):
+        seen = np.flatnonzero(np.isfinite(reach_m))
+        over_m = np.min(reach_m[seen, None] + inside.between_m[seen], axis=0, initial=np.inf)
+        found_m[at] = np.min(over_m + from_points_m, axis=1)
+    # Where none is inside, from one part of a field to another, ferries fly around outside.
+    return np.where(is_seen | ~np.isfinite(found_m), far_m, found_m)
 
 
 def far_warnings(

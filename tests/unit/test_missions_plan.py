@@ -20,6 +20,7 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.strips import lengths_m, rectangles
 from missions.turns import Motion
+from missions.ways import build_ways, edge_places
 from tests.bench.missions import FRAME, comb, outside_m2, to_degrees, transit_outside_m
 
 WIDTH_M = 6.0
@@ -242,3 +243,18 @@ def test_a_depot_in_the_wrong_hemisphere_is_refused() -> None:
 def test_a_map_of_nothing_but_zero_is_refused() -> None:
     with pytest.raises(PlanError, match="rate above zero"):
         plan_of(box(0, 0, 100, 100), rates=Uniform(rate_l_ha=0.0))
+
+
+def test_the_suggested_depot_is_near_as_it_is_flown_around_a_bay() -> None:
+    """Two arms of 800 m that only meet at their northern ends: from there, not from one of them."""
+    ground = box(0.0, 0.0, 300.0, 860.0) - box(60.0, -1.0, 240.0, 800.0)
+    field = field_of(ground)
+    plan = plan_of(ground, tank_l=8.0)
+    assert len(plan.sorties) > 4
+    lines, litres = plan.lines, lengths_m(plan.lines)
+    places = edge_places(field, step_m=20.0, count_max=200)
+    home_m = build_ways(field, places).home_ways_m((lines[:, :2] + lines[:, 2:]) / 2.0) @ litres
+    suggested = build_ways(field, np.array(plan.depots))
+    found_m = suggested.home_ways_m((lines[:, :2] + lines[:, 2:]) / 2.0) @ litres
+    assert float(found_m[0]) < 1.05 * home_m.min()
+    assert home_m.max() > 1.5 * home_m.min()
