@@ -230,10 +230,9 @@ def suggested_depot(
     points, weight = thirds.reshape(-1, 2), np.repeat(np.maximum(litres, 1e-9), 3)
     if not inside.is_convex:
         # Lines in a row lie beside each other: one of them stands for some.
-        first = np.linspace(0, len(points), min(len(points), SOME_POINTS), endpoint=False)
-        first = first.astype(np.int64)
-        weight = np.add.reduceat(weight, first)
-        points = points[(first + np.append(first[1:], len(points))) // 2]
+        some = np.array_split(np.arange(len(points)), min(len(points), SOME_POINTS))
+        weight = np.array([weight[group].sum() for group in some])
+        points = points[[group[len(group) // 2] for group in some]]
     far_m = _ways_m(places, points, inside)
     if besides is not None:
         far_m = np.minimum(far_m, besides.home_ways_m(points).min(axis=0))
