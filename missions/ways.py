@@ -252,7 +252,7 @@ def _ways_m(places: Floats, points: Floats, inside: FreeSpace) -> Floats:
     for at, reach_m in enumerate(inside.to_corners_m(places)):
         seen = np.flatnonzero(np.isfinite(reach_m))
         over_m = np.min(reach_m[seen, None] + inside.between_m[seen], axis=0, initial=np.inf)
-        found_m[at] = np.min(over_m + from_points_m, axis=1)
+        found_m[at] = np.min(over_m + from_points_m, axis=1, initial=np.inf)
     # Where none is inside, from one part of a field to another, ferries fly around outside.
     return np.where(is_seen | ~np.isfinite(found_m), far_m, found_m)
 
