@@ -10,12 +10,32 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from companion.wording import counted
 from missions.boom import Boom
-from missions.strips import Floats, directions, joined, lengths_m
+from missions.strips import Floats, directions, joined, lengths_m, rectangles, whole
 from missions.swaths import axes, count_across
 
 # What may be missing to a whole valve is a gap that nobody can see.
 ROUND_M = 0.01
+# What margins and rounding leave beyond the border.
+BEYOND_M2 = 0.1
+
+
+def over_warnings(lines: Floats, ground: BaseGeometry, boom: Boom) -> tuple[str, ...]:
+    """Return what whole booms would spray off the ground, where ends are beyond its border."""
+    if not boom.closes:
+        return ()
+    strips = rectangles(lines, boom.width_m)
+    beyond_m2 = shapely.area(shapely.difference(strips, ground))
+    count = int(np.count_nonzero(beyond_m2 > BEYOND_M2))
+    if not count:
+        return ()
+    off_m2 = float(whole(strips).difference(ground).area)
+    return (
+        f"{counted(count, 'line')} with an end of the boom beyond the border: to be flown "
+        f'with the companion and border = "inside" alone; whole booms would spray {off_m2:.0f} m2 '
+        "off the field",
+    )
 
 
 def lines_over(ground: BaseGeometry, boom: Boom, angle_deg: float) -> Floats:

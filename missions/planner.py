@@ -13,6 +13,7 @@ from companion.core.frame import LocalFrame
 from missions.boom import boom_of
 from missions.coverage import measure, of_rated_ground
 from missions.demand import Demand, Rates, demands
+from missions.ends_over import over_warnings
 from missions.errors import OutOfReachError, PlanError
 from missions.extents import extents_of
 from missions.field import Field, local_points
@@ -166,6 +167,7 @@ def _planned(
             *short_warnings(sorties.sorties, rates, field.frame, settings),
             *far_warnings(sorties.sorties, places, field, has_battery=settings.battery is not None),
             *near_warnings(sorties.sorties, field.frame, apart=with_sprayer),
+            *over_warnings(lines, field.limit, boom),
             *around.warnings(sorties.sorties, places, field.frame, settings),
         ),
         terrain=around.terrain,

@@ -104,6 +104,14 @@ def test_nothing_is_sprayed_outside_and_the_aircraft_stays_inside(kind: str, see
     )
 
 
+def test_what_whole_booms_would_spray_off_the_field_is_said() -> None:
+    field = field_of(box(0.0, 0.0, 90.0, DITCH_M))
+    # Two metres on both sides.
+    (warning,) = plan_of(field).warnings
+    assert "2 lines" in warning and "360 m2" in warning and "companion" in warning
+    assert not plan_of(field, ends_over=False).warnings
+
+
 def test_no_end_is_beyond_a_border_at_which_no_valve_closes() -> None:
     field = field_of(box(0.0, 0.0, 90.0, 20.5))
     # The companion's map goes on behind the northern border, where nobody asked for spraying.
