@@ -66,8 +66,11 @@ def _split(leg: Leg, parts: Stretches, taken: Floats, settings: Settings) -> lis
     for number in range(1, len(speeds)):
         slows = speeds[number - 1] ** 2 - speeds[number] ** 2
         brake_m = max(slows, 0.0) / (2.0 * settings.acceleration_m_s2)
-        cuts[number] = max(cuts[number] - brake_m, cuts[number - 1] + PART_MIN_M)
-        cuts[number] = min(cuts[number], length_m)
+        cut = max(cuts[number] - brake_m, cuts[number - 1] + PART_MIN_M)
+        if cut > length_m - PART_MIN_M:
+            # No part so short at the end: it is begun earlier, where it is slower, or not at all.
+            cut = _earlier(cuts[number - 1], length_m) if slows > 0.0 else length_m
+        cuts[number] = cut
     at_m = np.concatenate([[0.0], parts.ends_m])
     at_m[-1] = length_m
     litres = np.interp(cuts, at_m, np.concatenate([[0.0], np.cumsum(parts.litres)]))
@@ -87,6 +90,12 @@ def _split(leg: Leg, parts: Stretches, taken: Floats, settings: Settings) -> lis
     legs[0] = replace(legs[0], points=(ends[0], legs[0].points[1]))
     legs[-1] = replace(legs[-1], points=(legs[-1].points[0], ends[1]))
     return legs
+
+
+def _earlier(before_m: float, length_m: float) -> float:
+    """Return where the last, slower part of a line begins: with the one before if that is short."""
+    cut = length_m - PART_MIN_M
+    return cut if cut >= before_m + PART_MIN_M else before_m
 
 
 def _joined(legs: list[Leg], settings: Settings) -> tuple[Leg, ...]:

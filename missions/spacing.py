@@ -30,6 +30,8 @@ from missions.ways import Ways
 APART_M = NEAR_M + 0.01
 # So far a way may go on straight from one line, or straight into the next.
 BEYOND_M = (0.0, 0.5, 1.0, 1.5, 2.02, 2.5, 3.0, 4.0)
+# Room is used but for so much, and where that is more than other tries by so much.
+ROOM_M = 0.01
 # Where both lines meet farther beyond their ends than this, no waypoint is put there.
 MEET_MAX_M = 8.0
 # Corners are tried so far outwards, and along the ways beside them.
@@ -39,6 +41,8 @@ RING = 12
 CROWDED_M, SKIPPED_MAX = 4.0, 3
 # A waypoint more is worth so much way, and one that is too near more than any detour tried here.
 WAYPOINT_M, TOO_NEAR_M = 6.0, 1000.0
+# So many pairs that stay too near are looked at one by one.
+PAIRS_MAX, TOUCH_M = 20, 1e-6
 # Cosine of what is straight on.
 STRAIGHT = 1.0 - 1e-6
 
@@ -79,10 +83,18 @@ class _End:
             return [0.0]
         longer = [far_m for far_m in BEYOND_M if far_m > self.least_m]
         free = _are_free(inside, [(self.at, self.beyond(far_m)) for far_m in longer])
-        return [
-            self.least_m,
-            *(far_m for far_m, is_free in zip(longer, free, strict=True) if is_free),
-        ]
+        found = [far_m for far_m, is_free in zip(longer, free, strict=True) if is_free]
+        room_m = self.least_m if all(free) else self._room_m(inside)
+        if room_m > (found[-1] if found else self.least_m) + ROOM_M:
+            found.append(room_m)
+        return [self.least_m, *found]
+
+    def _room_m(self, inside: BaseGeometry) -> float:
+        """Return how far the ground beyond the end is free, but for a little."""
+        ray = shapely.LineString([self.at, self.beyond(BEYOND_M[-1])])
+        parts = shapely.get_parts(shapely.intersection(ray, inside))
+        near = parts[shapely.distance(parts, shapely.Point(self.at)) < ROOM_M]
+        return float(shapely.length(near).max(initial=0.0)) - ROOM_M
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,6 +103,30 @@ class _Free:
 
     inside: BaseGeometry
     corners: BaseGeometry
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Crowded:
+    """Ways at which waypoints stay too near, by what is tried there.
+
+    In `passed` no end of a line is passed aside, in `straight` none lies straight on, and in `few`
+    corners may be anywhere, though there are ways without, and a line is left before the next one
+    that goes on from it.
+    """
+
+    passed: frozenset[int] = frozenset()
+    straight: frozenset[int] = frozenset()
+    few: frozenset[int] = frozenset()
+
+    def with_more(self, ways: frozenset[int]) -> tuple[_Crowded, ...]:
+        """Return what may be tried at more ways, one after the other."""
+        passed, straight = self.passed | ways, self.straight | ways
+        return (
+            replace(self, passed=passed),
+            replace(self, straight=straight),
+            replace(self, passed=passed, straight=straight),
+            replace(self, few=self.few | ways),
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,26 +148,23 @@ class Spacing:
         return tuple(self._spaced(each) for each in sorties)
 
     def _spaced(self, sortie: Sortie) -> Sortie:
-        found = replace(sortie, legs=self._legs(sortie.legs, frozenset()))
-        near = near_pairs(waypoints_of(found, apart=self.apart))
-        if not near:
-            return found
-        places = [place for pair in near for place in pair]
-        # Ends of lines that are thought to be passed may stay waypoints, where several lines in a
-        # row are short: once more, as if all there did.
-        kept = frozenset(
-            number
-            for number, leg in enumerate(sortie.legs)
-            if leg.kind != "spray" and _distance_m(found.legs[number].points, places) < SAME_M
-        )
-        again = replace(sortie, legs=self._legs(sortie.legs, kept))
-        fewer = len(near_pairs(waypoints_of(again, apart=self.apart))) < len(near)
-        return again if fewer else found
+        known = _Crowded()
+        best = replace(sortie, legs=self._legs(sortie.legs, known))
+        near = near_pairs(waypoints_of(best, apart=self.apart))
+        for pair in near[:PAIRS_MAX]:
+            # What is thought of the ends of short lines in a row, that they are passed or straight
+            # on, need not come so: once more as if not. Then with corners anywhere.
+            for crowded in known.with_more(_at(best.legs, pair)):
+                again = replace(sortie, legs=self._legs(sortie.legs, crowded))
+                left = near_pairs(waypoints_of(again, apart=self.apart))
+                if len(left) < len(near):
+                    best, near, known = again, left, crowded
+                    break
+        return best
 
-    def _legs(self, legs: tuple[Leg, ...], kept: frozenset[int]) -> tuple[Leg, ...]:
-        """Return the legs; at the ways in `kept` ends of lines are waypoints whatever comes."""
+    def _legs(self, legs: tuple[Leg, ...], crowded: _Crowded) -> tuple[Leg, ...]:
         joins = [number for number, leg in enumerate(legs) if leg.kind != "spray"]
-        plain = [self._plain(legs, number, keeps=number in kept) for number in joins]
+        plain = [self._plain(legs, number, crowded) for number in joins]
         # Places at which the speed changes inside a line.
         inner = [
             tuple(leg.points[-1] for leg in legs[one + 1 : other - 1])
@@ -146,7 +179,7 @@ class Spacing:
             coupled = any(short[max(at - 1, 0) : at + 1])
             some = [plain[at]]
             if coupled or plain[at].near:
-                found = self._others(legs, number, keeps=number in kept)
+                found = self._others(legs, number, crowded)
                 some += found if coupled else found[:1]
             options.append(some)
         if all(len(some) == 1 for some in options):
@@ -154,18 +187,19 @@ class Spacing:
         chosen = _cheapest(options, inner)
         found_legs = list(legs)
         for number, option in zip(joins, chosen, strict=True):
-            found_legs[number] = replace(legs[number], points=option.points)
+            through = legs[number].through and option.points == legs[number].points
+            found_legs[number] = replace(legs[number], points=option.points, through=through)
         return tuple(found_legs)
 
-    def _plain(self, legs: Sequence[Leg], number: int, *, keeps: bool) -> _Option:
+    def _plain(self, legs: Sequence[Leg], number: int, crowded: _Crowded) -> _Option:
         """Return a way as it is."""
         leg = legs[number]
         before, after = _beside(legs, number)
         if before is not None and after is not None and len(leg.points) == 2 and not self.apart:
-            known = _as_one(before, leg, after, keeps=keeps)
+            known = _as_one(before, leg, after, keeps=number in crowded.passed)
             if known is not None:
                 return known
-        ends = self._ends(legs, number, keeps=keeps)
+        ends = self._ends(legs, number, keeps=number in crowded.straight)
         inner = leg.points[1 + bool(ends[0].least_m) : len(leg.points) - 1 - bool(ends[1].least_m)]
         return _option(ends, (ends[0].least_m, ends[1].least_m), inner)
 
@@ -187,13 +221,14 @@ class Spacing:
             )
         return found[0], found[1]
 
-    def _others(self, legs: Sequence[Leg], number: int, *, keeps: bool) -> list[_Option]:
+    def _others(self, legs: Sequence[Leg], number: int, crowded: _Crowded) -> list[_Option]:
         """Return other ways for one, the best first."""
         leg = legs[number]
-        if leg.through:
+        if leg.through and number not in crowded.few:
             return []
         before, after = _beside(legs, number)
-        key = (keeps, before and before.points, before and before.speed_m_s, leg,
+        keeps, anywhere = number in crowded.straight, number in crowded.few
+        key = (keeps, anywhere, before and before.points, before and before.speed_m_s, leg,
                after and after.points, after and after.speed_m_s)  # fmt: skip
         if key not in self._known:
             ends, free = self._ends(legs, number, keeps=keeps), self._free(leg)
@@ -201,7 +236,7 @@ class Spacing:
                 1 + bool(ends[0].least_m) : len(leg.points) - 1 - bool(ends[1].least_m)
             ]
             found = [*_meeting(ends, free.inside), *_around(ends, inner, free)]
-            if all(each.near for each in found):
+            if anywhere or all(each.near for each in found):
                 found += _around(ends, inner, free, anywhere=True)
             self._known[key] = sorted(found, key=lambda each: (each.near, each.cost_m))
         return self._known[key]
@@ -257,7 +292,7 @@ def _as_one(before: Leg, leg: Leg, after: Leg, *, keeps: bool) -> _Option | None
     one, other = before.points[0], after.points[-1]
     at: Place | None = None
     if far_m < SAME_M:
-        at = ((end[0] + start[0]) / 2.0, (end[1] + start[1]) / 2.0)
+        at = _middle(end, start)
         both_are_short = max(math.dist(one, at), math.dist(at, other)) < NEAR_M
         if is_passed(one, at, other) and not both_are_short and not keeps:
             at = None
@@ -281,9 +316,22 @@ def _run_m(points: Sequence[Place], along: Place) -> float:
     return far_m if east_m * along[0] + north_m * along[1] > STRAIGHT * far_m > 0.0 else 0.0
 
 
-def _distance_m(points: Sequence[Place], others: Sequence[Place]) -> float:
-    """Return how far the nearest two of some places are apart."""
-    return min(math.dist(a, b) for a in points for b in others)
+def _at(legs: Sequence[Leg], pair: tuple[Place, Place]) -> frozenset[int]:
+    """Return the ways between lines that have waypoints at one of two places."""
+    return frozenset(
+        number
+        for number, leg in enumerate(legs)
+        if leg.kind != "spray"
+        and any(
+            math.dist(one, place) < TOUCH_M
+            for one in (*leg.points, _middle(leg.points[0], leg.points[-1]))
+            for place in pair
+        )
+    )
+
+
+def _middle(one: Place, other: Place) -> Place:
+    return (one[0] + other[0]) / 2.0, (one[1] + other[1]) / 2.0
 
 
 def _near(first: Place, inner: Sequence[Place], last: Place) -> int:

@@ -104,6 +104,18 @@ def test_parts_meet_keep_the_litres_and_stay_in_range(rates: tuple[float, ...]) 
         assert rate == 0.0 or 2.0 - 1e-6 <= flow <= 8.0 + 1e-6
 
 
+@given(
+    ends=st.lists(st.sampled_from([0.0, 10.0, 20.0, 40.0, 70.0]), min_size=1, max_size=6),
+    braking=st.sampled_from([2.5, 1e4]),
+)
+def test_no_part_of_a_line_is_shorter_than_a_leg_may_be(ends: list[float], braking: float) -> None:
+    rates = (20.0,) * (100 - 2 * len(ends)) + tuple(rate for rate in ends for _ in range(2))
+    for each in (rates, rates[::-1], (*rates[:-1], 70.0)):
+        legs, _ = one_line(Bands(each), settings(acceleration_m_s2=braking))
+        assert legs[-1].points[-1] == (0.0, LENGTH_M)
+        assert min(leg.length_m for leg in legs) >= 2.0 - 1e-6
+
+
 def plan_with_speeds() -> Plan:
     plan = planned(Bare(0.0, 0.0))
     done = paced(plan.sorties, Bands((15.0, 60.0)), settings())
