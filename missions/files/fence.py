@@ -115,7 +115,10 @@ class Fences:
     plan: Fenced
     drawn: dict[Way, Fence] = field(default_factory=dict, repr=False)
     lacking: set[Way] = field(default_factory=set, repr=False)
-    _simpler: dict[tuple[Polygon, float], Shape] = field(default_factory=dict, repr=False)
+    _simpler: dict[tuple[int, float], Shape] = field(default_factory=dict, repr=False)
+    _fewer: dict[tuple[Polygon, BaseGeometry, int], tuple[Polygon, float]] = field(
+        default_factory=dict, repr=False
+    )
 
     @property
     def room_bytes(self) -> int:
@@ -255,25 +258,36 @@ class Fences:
     ) -> Fence:
         """Return a fence with more obstacles: its border, then they, have fewer corners."""
         near = [each for each in obstacles if fence.border.intersects(each[0])]
-        allowed = whole.buffer(max(NEAR_M, fence.outside_m) - ROUNDED_M)
-        edges, best = _edges(whole), fence
+        best = fence
         for simpler_m in OBSTACLE_SIMPLER_M:
             drawn = [self._simpler_obstacle(each, simpler_m) for each in obstacles]
             wanted = sum(
                 _polygon_bytes(self._simpler_obstacle(each, simpler_m)[0]) for each in near
             )
             most = (self.room_bytes - wanted - POLYGON_BYTES) // CORNER_BYTES
-            border = with_corners(fence.border, allowed, most)
-            found = self._with_obstacles(border, _outside_m(border, whole, edges), drawn)
+            border, outside_m = self._with_corners(fence, whole, most)
+            found = self._with_obstacles(border, outside_m, drawn)
             if found is not None and found.left_out < best.left_out:
                 best = replace(found, aside_m=fence.aside_m)
             if not best.left_out:
                 break
         return best
 
+    def _with_corners(self, fence: Fence, whole: BaseGeometry, most: int) -> tuple[Polygon, float]:
+        """Return a fence's border with so few corners, and how far outside it lies.
+
+        Most sorties share it.
+        """
+        key = (fence.border, whole, most)
+        if key not in self._fewer:
+            allowed = whole.buffer(max(NEAR_M, fence.outside_m) - ROUNDED_M)
+            border = with_corners(fence.border, allowed, most)
+            self._fewer[key] = border, _outside_m(border, whole, _edges(whole))
+        return self._fewer[key]
+
     def _simpler_obstacle(self, shape: Shape, simpler_m: float) -> Shape:
         """Return an obstacle with fewer corners, within itself; most of its ground stays."""
-        key = (shape[0], simpler_m)
+        key = (id(shape), simpler_m)  # they are those of this plan, and stay
         if key not in self._simpler:
             inside = max(
                 polygons_of(inside_with_fewer_corners(shape[0], simpler_m)),
@@ -466,7 +480,7 @@ def _outside_m(border: BaseGeometry, field: BaseGeometry, edges: STRtree) -> flo
 
 
 def _corners(part: Polygon) -> int:
-    return len(part.exterior.coords) - 1
+    return int(shapely.get_num_points(shapely.get_exterior_ring(part))) - 1
 
 
 def _crowded(part: Polygon) -> tuple[float, float]:
