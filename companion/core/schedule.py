@@ -39,6 +39,9 @@ TRIM_HOLD_S = 0.03
 # How far ahead of its time a change that was already ordered is left alone when the prediction
 # moves it back: without this, noise would revert it for a moment and order it again.
 STICKY_S = 0.1
+# How near its duty is to be for that: where the curve is flat, 1 % of speed is 3 % of duty, and a
+# large change of zone would be taken back for a moment. So a part of the step counts too.
+NEAR_SHARE, NEAR_STEP_SHARE = 0.03, 0.3
 # At the border this long, as a way: what the buffer leaves, or what a position is known to.
 STICKY_BORDER_M = 0.02
 
@@ -398,7 +401,10 @@ def _already_ordered(
     if not following.at_s - now_s < min(most_s, now_s - now.at_s):
         return False
     to_next = abs(following.duty - in_force)
-    return to_next <= 0.03 * max(following.duty, in_force) and to_next < abs(now.duty - in_force)
+    near = NEAR_SHARE * max(following.duty, in_force)
+    if min(now.duty, following.duty, in_force) > 0.0:
+        near = max(near, NEAR_STEP_SHARE * abs(following.duty - now.duty))
+    return to_next <= near and to_next < abs(now.duty - in_force)
 
 
 def rate_at(route: Route, now_s: float) -> float | None:

@@ -14,6 +14,7 @@ import pytest
 from companion.core.crossings import Crossing, Route
 from companion.core.estimator import Track, estimate, observe
 from companion.core.interlock import Limits, closed_plan, guard, inhibits
+from companion.core.rate import flow_for_rate
 from companion.core.schedule import Timing, orders, resolve, schedule
 from companion.core.types import (
     ClockReport,
@@ -27,7 +28,7 @@ from companion.core.types import (
 from companion.output.pwm import RESTART_DUTY
 from sitl.board import SERVO_FRAME_S
 from tests import builders
-from tests.builders import LAG, SPRAYING, setup
+from tests.builders import CURVE, LAG, SPRAYING, setup
 
 NAN = math.nan
 BOUNDS = (0.0, -1.0, 48.0, 7.0)
@@ -157,8 +158,10 @@ def test_what_is_on_no_globe_is_no_place(change: dict[str, float]) -> None:
 # -------------------------------------------------------------------------------- schedule
 
 
-def route(*entries: tuple[float, float | None], border: bool = False) -> Route:
-    return tuple(Crossing(at_s, rate, border, 5.0) for at_s, rate in entries)
+def route(
+    *entries: tuple[float, float | None], border: bool = False, speed_m_s: float = 5.0
+) -> Route:
+    return tuple(Crossing(at_s, rate, border, speed_m_s) for at_s, rate in entries)
 
 
 def rates(resolved: Route) -> list[Any]:
@@ -257,6 +260,31 @@ def trimmed(in_force: float, *crossings: tuple[float, float | None]) -> list[Any
         until_s=1.3,
     )
     return [(change.at_s, change.duty) for change in found.changes]
+
+
+@pytest.mark.parametrize("slower", [1.0, 0.985, 1.015])
+def test_a_change_that_was_ordered_is_not_taken_back_when_the_speed_wavers(slower: float) -> None:
+    """On the flat part of the curve 1 % of speed is 3 % of duty, and the crossing moves a little.
+
+    Beside PX4 the valves went half way back to the zone before, for 0.1 s.
+    """
+
+    def duty(rate_l_ha: float, speed_m_s: float) -> float:
+        return CURVE.duty_for(flow_for_rate(rate_l_ha, speed_m_s, 6.0))
+
+    lead_s = timing().down_s
+    found = schedule(
+        route((0.0, 21.0), (1.0 + lead_s + 0.03, 18.0), speed_m_s=4.75 * slower),
+        valve=0,
+        timing=timing(),
+        dosing=duty,
+        in_force=duty(18.0, 4.75),
+        speed_soon_m_s=4.75 * slower,
+        now_s=1.0,
+        until_s=1.3,
+    )
+    for change in found.changes:
+        assert change.duty == pytest.approx(duty(18.0, 4.75 * slower), abs=0.002)
 
 
 def test_no_trim_holds_up_a_change_that_is_nearly_due() -> None:
