@@ -123,3 +123,12 @@ class ServoOptions:
         full_us = sign * (self.full_us - self.closed_us)
         low_us = min(open_us - self.dither_us // 2, full_us - self.dither_us)
         return self.closed_us + sign * (low_us + (self.dither_us if is_up else 0))
+
+    def is_move(self, from_us: int, to_us: int) -> bool:
+        """Return whether a board that wants to see its width move counts this: half the dither.
+
+        >>> options = ServoOptions(channels=(9,), dither_us=8)
+        >>> options.is_move(1500, 1496), options.is_move(1500, 1503)
+        (True, False)
+        """
+        return 2 * abs(to_us - from_us) >= self.dither_us

@@ -25,6 +25,8 @@ _logger = logging.getLogger(__name__)
 _CLOSE_AGAIN_S = 0.05
 # After a refusal the closing orders go on, but seldom: each costs a text on the pilot's screen.
 _REFRESH_FAULT_S = 5.0
+# An output takes what was ordered with its next frame, of 50 a second at the least.
+SERVO_FRAME_S = 0.020
 # An order that may have been more than the autopilot's queue takes is said again after this.
 _SAY_AGAIN_S = 0.1
 
@@ -66,6 +68,10 @@ class ServoExecutor(TimedExecutor):
         self._is_staged = False
         self._next_refresh = self._next_dither = 0
         self._is_up = [False] * len(self._outputs)
+        self._given_us: list[int | None] = [None] * len(self._outputs)
+        self._given_at_s = [0.0] * len(self._outputs)
+        self._moved_us: list[int | None] = [None] * len(self._outputs)
+        self._moved_at_s = [0.0] * len(self._outputs)
         self._refresh_at_s: float | None = None
         self._dither_at_s: float | None = None
         self._was_started = False
@@ -196,18 +202,19 @@ class ServoExecutor(TimedExecutor):
             return False
         return True
 
-    def _give(self, valve: int, pulse_us: int) -> bool:
-        """Send one order; where it cannot leave, what the output does is unknown."""
+    def _give(self, valve: int, pulse_us: int, *, is_turn: bool = False) -> bool:
+        """Send one order, of a dither's turn or not; where it cannot leave, nothing is known."""
         sent_us = pulse_us
         self._held_us.pop(valve, None)
+        now_s = asyncio.get_running_loop().time()
         if valve < self._count:
-            sent_us = self._options.dithered_us(pulse_us, is_up=self._is_up[valve])
+            sent_us = self._dithered_us(valve, pulse_us, now_s, is_turn=is_turn)
         has_left = self._order(self._outputs[valve], sent_us)
         self._sent_us[valve] = pulse_us if has_left else None
         if not has_left:
             self.unsent_count += 1
             return False
-        now_s = asyncio.get_running_loop().time()
+        self._given_us[valve], self._given_at_s[valve] = sent_us, now_s
         self._guard.sent(valve, sent_us, now_s)
         self.order_count += 1
         if self._is_joint:
@@ -215,6 +222,31 @@ class ServoExecutor(TimedExecutor):
         else:
             self._budget.spend(1, now_s)
         return True
+
+    def _dithered_us(self, valve: int, pulse_us: int, now_s: float, *, is_turn: bool) -> int:
+        """Return the width to send for a pulse: one that the board sees move, if it is time.
+
+        To and fro by turns does that where the pulse stands still. A trim against the dither would
+        undo it; and of two orders within a servo frame the outputs have only the second.
+        """
+        given_us, options = self._given_us[valve], self._options
+        if given_us is not None and now_s - self._given_at_s[valve] >= SERVO_FRAME_S:
+            self._stood(valve, given_us)
+        sent_us = options.dithered_us(pulse_us, is_up=self._is_up[valve])
+        moved_us, is_time = self._moved_us[valve], is_turn
+        if moved_us is not None:
+            if options.is_move(moved_us, sent_us):
+                return sent_us
+            is_time = is_turn or now_s - self._moved_at_s[valve] >= 0.9 * DITHER_S
+        if is_time:
+            self._is_up[valve] = not self._is_up[valve]
+        return options.dithered_us(pulse_us, is_up=self._is_up[valve])
+
+    def _stood(self, valve: int, width_us: int) -> None:
+        """Take down that an output has had a width, as its board counts moves."""
+        moved_us = self._moved_us[valve]
+        if moved_us is None or self._options.is_move(moved_us, width_us):
+            self._moved_us[valve], self._moved_at_s[valve] = width_us, self._given_at_s[valve]
 
     def _flush(self) -> bool:
         """Send what was gathered, with the trims that had to wait: they cost nothing more."""
@@ -284,5 +316,4 @@ class ServoExecutor(TimedExecutor):
         for valve in range(self._count) if self._is_together else (turn,):
             sent_us = self._sent_us[valve]
             if sent_us is not None and self._dithers(valve):
-                self._is_up[valve] = not self._is_up[valve]
-                self._give(valve, self._held_us.get(valve, sent_us))
+                self._give(valve, self._held_us.get(valve, sent_us), is_turn=True)

@@ -212,6 +212,41 @@ async def test_all_outputs_dither_at_once_where_one_order_carries_them(wire: Wir
     assert wire.times_s[1] - wire.times_s[0] < wire.times_s[2] - wire.times_s[1]
 
 
+@pytest.mark.parametrize("after_s", [0.0, 0.005, 0.05])
+async def test_no_trim_makes_a_valve_look_dead(wire: Wire, after_s: float) -> None:
+    """A board closes a valve whose width has moved by less than half the dither for 0.3 s.
+
+    Each trim here comes so long after a dither and puts the width back to where it had been.
+    """
+    options = ServoOptions(channels=(9,), dither_us=8)
+    executor = ServoExecutor(options, wire.order)
+    await executor.start()
+    executor.submit(plan(1, 0.5))
+    seen = [(now(), 1496)]  # what stood for a servo frame
+    for number in range(2, 12):
+        count = len(wire.orders)
+        await wire.until(lambda count=count: len(wire.orders) > count)  # type: ignore[misc]
+        if after_s > 0.0:
+            await asyncio.sleep(after_s)
+        back_us = seen[-1][1] - wire.orders[-1][1]
+        pulse_us = 1500 if number % 2 else 1500 + back_us
+        executor.submit(plan(number, (pulse_us - 1000) / 1000.0))
+        seen.append((now(), wire.orders[-1][1]))
+    await executor.stop()
+    widths = [
+        (at_s, pulse)
+        for at_s, (_, pulse), next_s in zip(
+            wire.times_s, wire.orders, [*wire.times_s[1:], now()], strict=True
+        )
+        if pulse > 1000 and next_s - at_s >= 0.02
+    ]
+    moved_s, moved_us = widths[0]
+    for at_s, pulse in widths:
+        assert at_s - moved_s < 0.25
+        if abs(pulse - moved_us) >= 4:
+            moved_s, moved_us = at_s, pulse
+
+
 async def test_the_end_of_the_lease_ends_the_dither(wire: Wire) -> None:
     executor = ServoExecutor(ServoOptions(channels=(9,), dither_us=8), wire.order)
     await executor.start()
