@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from companion.core.clock import Clock, on_time_s, tick
 from companion.core.frozen import Stand, look
 from companion.core.leg import Approach, Leg, approach, learned, leg_of, stop_ahead, way_of
-from companion.core.motion import BRIDGED_MAX_S, Axis
+from companion.core.motion import BRIDGED_MAX_S, Told
 from companion.core.order import Order, Place, noted, sorted_in
 from companion.core.rate import is_override
 from companion.core.types import (
@@ -371,6 +371,8 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         acceleration_east_m_s2=east.acceleration_m_s2,
         acceleration_north_m_s2=north.acceleration_m_s2,
         acceleration_fade_s=motion.acceleration_fade_s,
+        outrun_east_m_s=east.outrun_m_s,
+        outrun_north_m_s=north.outrun_m_s,
         heading_deg=heading,
         yaw_rate_deg_s=motion.yaw_rate_deg_s,
         height_m=_height(track, motion, now_s),
@@ -425,7 +427,7 @@ def _learned_braking(track: Track, motion: Motion, now_s: float) -> float | None
     return learned(leg.braking_m_s2, usual_m_s2, seen)
 
 
-def _stop_ahead(track: Track, east: Axis, north: Axis, now_s: float) -> StopAhead | None:
+def _stop_ahead(track: Track, east: Told, north: Told, now_s: float) -> StopAhead | None:
     """Return the stop at the end of the mission's leg, if one is about to be made."""
     leg = track.leg
     seen = None if leg is None else _approach(track, leg, east, north, now_s)
@@ -434,7 +436,7 @@ def _stop_ahead(track: Track, east: Axis, north: Axis, now_s: float) -> StopAhea
     return stop_ahead(leg.braking_m_s2 if track.braking_m_s2 is None else track.braking_m_s2, seen)
 
 
-def _approach(track: Track, leg: Leg, east: Axis, north: Axis, now_s: float) -> Approach | None:
+def _approach(track: Track, leg: Leg, east: Told, north: Told, now_s: float) -> Approach | None:
     """Return how the vehicle comes to the end of its leg, while the mission is being flown."""
     if track.heartbeat is None or track.heartbeat.mode not in MISSION_MODES:
         return None
@@ -482,7 +484,7 @@ def _checked_speed(track: Track, now_s: float) -> float | None:
     return math.nan if told_m_s is None else told_m_s
 
 
-def _reported_velocity(east: Axis, north: Axis, speed_m_s: float) -> tuple[float, float, bool]:
+def _reported_velocity(east: Told, north: Told, speed_m_s: float) -> tuple[float, float, bool]:
     """Return the reported ground speed along the course that the positions show."""
     seen_m_s = math.hypot(east.velocity_m_s, north.velocity_m_s)
     if not seen_m_s > 0.5:

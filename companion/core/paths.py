@@ -103,17 +103,29 @@ def predict(
     )
 
 
+def place_velocity(state: VehicleState) -> tuple[float, float]:
+    """Return how fast the place goes, east and north: where it is told, not how it is dosed."""
+    return (
+        state.velocity_east_m_s + state.outrun_east_m_s,
+        state.velocity_north_m_s + state.outrun_north_m_s,
+    )
+
+
 def _carried(
     state: VehicleState, dt_s: float, ae: float, an: float
 ) -> tuple[float, float, float, float]:
-    """Return velocity (east, north) and place (east, north) of the reference at `dt_s` from now."""
+    """Return velocity (east, north) and place (east, north) of the reference at `dt_s` from now.
+
+    The place outruns the velocity where an autopilot tells two motions.
+    """
     ahead_s, fade_s = max(dt_s, 0.0), state.acceleration_fade_s
+    goes_east, goes_north = place_velocity(state)
     gained, carried = gained_s(ahead_s, fade_s), carried_s2(ahead_s, fade_s)
     return (
         state.velocity_east_m_s + ae * gained,
         state.velocity_north_m_s + an * gained,
-        state.east_m + state.velocity_east_m_s * dt_s + ae * carried,
-        state.north_m + state.velocity_north_m_s * dt_s + an * carried,
+        state.east_m + goes_east * dt_s + ae * carried,
+        state.north_m + goes_north * dt_s + an * carried,
     )
 
 

@@ -9,7 +9,7 @@ from companion.core.crossings import Route, find_routes
 from companion.core.drift import Offset, is_same, offset
 from companion.core.lines import Piece
 from companion.core.overlap_guard import guarded
-from companion.core.paths import STRAIGHT_YAW_RATE_DEG_S
+from companion.core.paths import STRAIGHT_YAW_RATE_DEG_S, place_velocity
 from companion.core.types import VehicleState
 
 if TYPE_CHECKING:
@@ -77,16 +77,17 @@ def _shift(
     turning = max(abs(before.yaw_rate_deg_s), abs(state.yaw_rate_deg_s))
     if not (0.0 <= age_s <= ROUTES_KEPT_S and turning < STRAIGHT_YAW_RATE_DEG_S):
         return None
-    then_east = before.velocity_east_m_s + before.acceleration_east_m_s2 * age_s
-    then_north = before.velocity_north_m_s + before.acceleration_north_m_s2 * age_s
-    east, north = state.velocity_east_m_s, state.velocity_north_m_s
+    went_east, went_north = place_velocity(before)
+    then_east = went_east + before.acceleration_east_m_s2 * age_s
+    then_north = went_north + before.acceleration_north_m_s2 * age_s
+    east, north = place_velocity(state)
     speed, then = math.hypot(east, north), math.hypot(then_east, then_north)
     if not (speed > 0.5 and then > 0.5):
         return None
     half = 0.5 * age_s * age_s
-    off_east = state.east_m - before.east_m - before.velocity_east_m_s * age_s
+    off_east = state.east_m - before.east_m - went_east * age_s
     off_east -= before.acceleration_east_m_s2 * half
-    off_north = state.north_m - before.north_m - before.velocity_north_m_s * age_s
+    off_north = state.north_m - before.north_m - went_north * age_s
     off_north -= before.acceleration_north_m_s2 * half
     aside = abs(off_north * east - off_east * north) / speed
     bend = abs(then_east * north - then_north * east) / (speed * then)

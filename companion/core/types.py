@@ -231,6 +231,9 @@ class VehicleState:
     position_frozen: bool = False  # the place stands still, the vehicle does not
     rc_switch_on: bool | None = None  # None: no switch, or nothing young is known of it
     acceleration_fade_s: float = 0.5  # the acceleration's time constant in every prediction
+    # How much faster the place goes than the velocity by which it is dosed (`motion.py`).
+    outrun_east_m_s: float = 0.0
+    outrun_north_m_s: float = 0.0
     stop_ahead: StopAhead | None = None  # None: no mission is used, or it says of no stop
     horizontal_accuracy_m: float | None = None  # None: the receiver does not tell
     link_up: bool = True

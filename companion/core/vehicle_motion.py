@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from companion.core import drawn
 from companion.core.arithmetic import exp
+from companion.core.drawn import NOT_DRAWN, Drawn
 from companion.core.motion import (
     BELIEVING,
     BRIDGED_MAX_S,
@@ -16,6 +18,7 @@ from companion.core.motion import (
     Belief,
     Pair,
     Seen,
+    Told,
     agreed,
     doubted,
     follow_pair,
@@ -35,7 +38,8 @@ CONFIRM_COUNT = 5
 class Motion:
     """What the filters make of the positions, true at `time_s` on our clock.
 
-    `agreed` is what all of them say together.
+    `agreed` is what all of them say together; `seen` is the last message, to the east and to the
+    north, and `drawn` how the place is drawn beside the velocities of these.
     """
 
     time_s: float
@@ -45,25 +49,29 @@ class Motion:
     doubting: Pair
     doubt_share: float
     agreed: Pair
+    seen: tuple[Seen, Seen]
+    drawn: tuple[Drawn, Drawn]
     heading_deg: float | None
     yaw_rate_deg_s: float
     height_m: float
     velocity_known: bool
     confirm_left: int
 
-    def after(self, dt_s: float) -> tuple[Axis, Axis]:
+    def after(self, dt_s: float) -> tuple[Told, Told]:
         """Return the motion to the east and to the north `dt_s` later: the place as it is told.
 
-        The velocity is the told one too, not that of the place: what draws the place comes and
-        goes within a second, and a dose that follows it half a second late is worse than one that
-        does not.
+        The velocity is the told one too, not that of the place, but for what has begun to draw the
+        place just now, as far as the velocity is doubted at all (`drawn.py`).
         """
         cruise, manoeuvre, share = self.agreed.cruise, self.agreed.manoeuvre, self.agreed.share
         calm, nimble = stretch(CRUISE.fade_s, dt_s), stretch(MANOEUVRE.fade_s, dt_s)
-        return (
-            told(mixed(moved(cruise.east, calm), moved(manoeuvre.east, nimble), share)),
-            told(mixed(moved(cruise.north, calm), moved(manoeuvre.north, nimble), share)),
-        )
+        east = told(mixed(moved(cruise.east, calm), moved(manoeuvre.east, nimble), share))
+        north = told(mixed(moved(cruise.north, calm), moved(manoeuvre.north, nimble), share))
+        return self._drawn(east, self.drawn[0], dt_s), self._drawn(north, self.drawn[1], dt_s)
+
+    def _drawn(self, axis: Told, by: Drawn, dt_s: float) -> Told:
+        velocity_m_s = axis.velocity_m_s + self.doubt_share * by.after(dt_s)
+        return axis._replace(velocity_m_s=velocity_m_s)
 
     @property
     def acceleration_fade_s(self) -> float:
@@ -87,6 +95,8 @@ def begun(item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
         doubting=pair,
         doubt_share=SHARE_MIN,
         agreed=pair,
+        seen=(east, north),
+        drawn=(NOT_DRAWN, NOT_DRAWN),
         heading_deg=item.heading_deg,
         yaw_rate_deg_s=0.0,
         height_m=item.relative_altitude_m,
@@ -120,6 +130,11 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
         doubting=doubting[0],
         doubt_share=share,
         agreed=agreed(believing[0], doubting[0], share),
+        seen=(east, north),
+        drawn=(
+            _drawn_after(before.drawn[0], dt_s, before.seen[0], east),
+            _drawn_after(before.drawn[1], dt_s, before.seen[1], north),
+        ),
         heading_deg=item.heading_deg,
         yaw_rate_deg_s=_yaw_rate(before, item.heading_deg, dt_s),
         height_m=item.relative_altitude_m,
@@ -134,6 +149,13 @@ def _seen(item: Telemetry, place: tuple[float, float]) -> tuple[Seen, Seen]:
     if east_m_s is None or north_m_s is None:
         return Seen(place[0], None), Seen(place[1], None)
     return Seen(place[0], east_m_s), Seen(place[1], north_m_s)
+
+
+def _drawn_after(by: Drawn, dt_s: float, before: Seen, now: Seen) -> Drawn:
+    if before.velocity_m_s is None or now.velocity_m_s is None:
+        return NOT_DRAWN
+    told_m_s = 0.5 * (before.velocity_m_s + now.velocity_m_s)
+    return drawn.followed(by, dt_s, now.position_m - before.position_m, told_m_s)
 
 
 def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:

@@ -19,6 +19,7 @@ from companion.core.motion import CRUISE
 from companion.core.nozzle import FlowCurve
 from companion.core.paths import predict
 from companion.core.prescription import Prescription, Zone
+from companion.core.routes import routes_ahead
 from companion.core.types import VehicleState
 from tests.builders import flying, setup
 
@@ -246,3 +247,32 @@ def test_in_a_turn_crossings_are_found_anew() -> None:
     )
     assert carried.routes_from is not None
     assert carried.routes_from.time_s == 10.01
+
+
+def test_a_place_that_outruns_its_velocity_crosses_sooner_and_is_dosed_by_the_velocity() -> None:
+    zones = [
+        Zone(name="a", polygon=shapely.box(0, 0, 12, 6), rate_l_ha=20.0),
+        Zone(name="b", polygon=shapely.box(12, 0, 48, 6), rate_l_ha=25.0),
+    ]
+    for outrun_m_s in (0.0, 0.5, -0.5):
+        state = flying(10.0, 10.0, outrun_east_m_s=outrun_m_s)
+        (found,) = find_routes(
+            Prescription(zones), state, one_valve(), back_s=0.3, ahead_s=1.0,
+            border="volume", border_buffer_m=0.1, across="centre",
+        )  # fmt: skip
+        assert found[1].at_s == pytest.approx(10.0 + 2.0 / (5.0 + outrun_m_s), abs=1e-6)
+        assert found[1].speed_m_s == pytest.approx(5.0)
+
+
+def test_carried_routes_go_with_the_place_that_outruns_its_velocity() -> None:
+    """A step later the vehicle is where it was expected: the crossing keeps its time."""
+    made = setup()
+    first = flying(10.0, 9.0, outrun_east_m_s=0.4)
+    routes, found_from, drift_m = routes_ahead(made, first, Memory(), 10.0)
+    memory = Memory(routes=routes, routes_from=found_from, drift_m=drift_m)
+    later = flying(10.05, 9.0 + 5.4 * 0.05, outrun_east_m_s=0.4)
+    again, still_from, _ = routes_ahead(made, later, memory, 10.05)
+    assert still_from is found_from
+    for route, before in zip(again, routes, strict=True):
+        assert len(route) == 2
+        assert [one.at_s for one in route[1:]] == pytest.approx([one.at_s for one in before[1:]])

@@ -104,7 +104,7 @@ DAMAGED: dict[str, tuple[Damage, str]] = {
     "half": (kept(0.5), "the file is shorter than it was"),
     "end": (kept(0.99), "it ends within a page"),
     "a page": (garbled(0.5), "a part of the file is damaged"),
-    "last page": (garbled(0.999), "a part of the file is damaged"),
+    "last page": (garbled(1.0), "a part of the file is damaged"),
     "pages 2 to 4": (garbled(2, 3, 4), "a part of the file is damaged"),
     "version 99": (
         sql(VERSION.format(99)),
