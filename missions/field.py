@@ -41,7 +41,7 @@ MITRE_LIMIT = 5.0
 # Simpler borders leave out so little of what a strip can reach, what obstacles take among it; if
 # not, the outline's tolerance is made less, and after so many times it stays as it was drawn. A
 # plan covers 99.8 %.
-LOST_MAX, TOLERANCE_LESS, TOLERANCES = 0.0018, 0.6, 6
+LOST_MAX, TOLERANCE_LESS, TOLERANCES = 0.0017, 0.6, 6
 EXTENT_MAX_M = 20_000.0
 # 383 ha with a swath of 1 m have so many.
 PASSES_MAX = 1_000
