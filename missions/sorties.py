@@ -37,6 +37,8 @@ from missions.ways import Ways
 # A tank is flown in so many pieces or more, so that cuts need not fall where a line ends.
 PIECES_A_TANK = 6
 PIECES_MAX = 600
+# A quick search moves fewer pieces about for less long; a longer one was asked for.
+QUICK_MOVES = 40_000
 TANKS_MAX = 1500
 # With more pieces the annealing finds little in its time that regrouping does not find sooner.
 ANNEALED_MAX = 400
@@ -240,7 +242,8 @@ class SortieSearch:
         orders = by_savings(network, settings.usable_l, lasts=lasts)
         return improve(
             network, orders, settings.usable_l,
-            moves=settings.moves * len(self._pieces) // PIECES_MAX, seed=settings.seed, lasts=lasts,
+            moves=max(settings.moves * len(self._pieces) // PIECES_MAX, settings.moves - QUICK_MOVES),
+            seed=settings.seed, lasts=lasts,
         )  # fmt: skip
 
 
