@@ -240,9 +240,9 @@ class SortieSearch:
         budget = _budget(network, self._pieces, settings, self.flying, battery_share)
         lasts = None if budget is None else budget.lasts
         orders = by_savings(network, settings.usable_l, lasts=lasts)
+        few = settings.moves * len(self._pieces) // PIECES_MAX
         return improve(
-            network, orders, settings.usable_l,
-            moves=max(settings.moves * len(self._pieces) // PIECES_MAX, settings.moves - QUICK_MOVES),
+            network, orders, settings.usable_l, moves=max(few, settings.moves - QUICK_MOVES),
             seed=settings.seed, lasts=lasts,
         )  # fmt: skip
 
