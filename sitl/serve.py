@@ -100,9 +100,12 @@ async def serve(options: ServeOptions, say: Say) -> dict[str, Any]:
 
 
 class _Run:
-    """One flight: the parts, what is said of it, and how it ends."""
+    """One flight: the parts, what is said of it, and how it ends.
 
-    def __init__(self, options: ServeOptions, say: Say) -> None:
+    It begins now, or at `start_s` of a clock of its own.
+    """
+
+    def __init__(self, options: ServeOptions, say: Say, *, start_s: float | None = None) -> None:
         if not 0.0 <= options.gust_m_s <= 10.0:
             raise ConfigError(f"--gust {options.gust_m_s:g}: give 0 to 10 m/s")
         if options.wait_s is not None and not options.wait_s >= 0.0:
@@ -118,7 +121,7 @@ class _Run:
         # Read before the flight: lines or a map that cannot be used are told now, not after it.
         self._setup = build_setup(config) if options.wait_mission or options.lines else None
         home, items = _start(options, scenario, config, self._setup)
-        start_s = time.monotonic()
+        start_s = time.monotonic() if start_s is None else start_s
         self.sprayer = Sprayer(sprayer_options(options, config, scenario), start_s=start_s)
         self.autopilot = build_autopilot(
             StubOptions(
@@ -136,7 +139,7 @@ class _Run:
             start_s=start_s,
             written=self.sprayer.take,
         )
-        self.autopilot.utc_offset_s = time.time() - time.monotonic()
+        self.autopilot.utc_offset_s = time.time() - start_s
         self.autopilot.batteries = self.sprayer.batteries
         self.mission = MissionWatch(self.autopilot, say)
         self.operator = Operator(
