@@ -122,7 +122,7 @@ class SortieSearch:
         if not found:
             parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
             raise _too_far(passes, limits, parts, self.ways, settings)
-        drawn = [self._drawn(each) for each in found]
+        drawn = [self._as_flown(each) for each in found]
         return min(drawn, key=lambda each: _total_s(each[1], settings))
 
     def with_less(
@@ -149,9 +149,9 @@ class SortieSearch:
         if not found:
             return None
         kept = [each for at, each in enumerate(parts) if at not in group]
-        return self._drawn([*kept, *found[0]])
+        return self._as_flown([*kept, *found[0]])
 
-    def _drawn(self, parts: list[list[Part]]) -> tuple[list[list[Part]], tuple[Sortie, ...]]:
+    def _as_flown(self, parts: list[list[Part]]) -> tuple[list[list[Part]], tuple[Sortie, ...]]:
         """Return the parts in the order of their sorties, and these."""
         pieces, orders = _as_pieces(self._passes, parts)
         ranks, sorties = _drawn(pieces, orders, self.ways, self.flying.motion)
@@ -167,15 +167,10 @@ class SortieSearch:
         ends_m = np.concatenate([np.zeros(len(lines)), np.array(passes.length_m)])
         far_m = passes.many.homes_m(np.tile(lines, 2), ends_m).min(axis=0)
         worst = int(far_m.argmax())
-        upright_s = settings.upright_s
         away_s = 2.0 * float(passes.times.legs_s(far_m[worst : worst + 1])[0])
-        # What it takes in any case: spraying draws less on the way than a ferry is counted with.
-        needed_wh = battery.wh(
-            cruise_s=away_s * min(battery.cruise_w, battery.hover_w) / battery.cruise_w,
-            other_s=0.0,
-            litres=0.0,
-        )
-        needed_wh += upright_s * battery.hover_w / J_WH
+        # What it takes in any case: spraying may draw less on the way than a ferry is counted with.
+        away_w = min(battery.cruise_w, battery.hover_w)
+        needed_wh = (away_s * away_w + settings.upright_s * battery.hover_w) / J_WH
         if needed_wh > battery.usable_wh:
             place = passes.place(worst % len(lines), float(ends_m[worst]))
             raise _out_of_reach(place, float(far_m[worst]), needed_wh, self.ways, settings)
