@@ -13,7 +13,7 @@ from enum import Enum
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.errors import ConfigError
 
 # Where the configuration file and the set-up name the same thing differently.

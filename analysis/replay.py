@@ -19,8 +19,9 @@ from analysis.flown.read_applied import read_applied
 from analysis.overrides import override
 from analysis.replayed_ground import ReplayedGround
 from analysis.what_if import Moved, Orders, Sprayed, compared
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.estimator import Track, estimate, observe
+from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import UnreadableError
 from companion.record.codec import FIELD_NAMES, FieldNames, encode

@@ -17,7 +17,8 @@ from companion.core.swath import expected
 from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
 
 if TYPE_CHECKING:
-    from companion.core.controller import Memory, Setup
+    from companion.core.controller import Memory
+    from companion.core.setup import Setup
     from companion.core.types import VehicleState
 
 # The commit before a cut has the last told one, or the one before it.

@@ -19,7 +19,6 @@ from companion.config.rules import mismatches
 from companion.config.sensor_rules import tank_capacity_l
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
-from companion.core.controller import Setup
 from companion.core.detection import Detection
 from companion.core.flow_trim import FlowTrim
 from companion.core.frame import LocalFrame
@@ -31,6 +30,7 @@ from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.overlap_guard import OverlapGuard
 from companion.core.prescription import FIELD, Prescription
 from companion.core.rate import flow_for_rate
+from companion.core.setup import Setup
 from companion.errors import ConfigError, MapError
 from companion.maps.build import build_prescription, frame_for
 from companion.maps.model import MapFile, Problem

@@ -20,9 +20,10 @@ import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from typing import Any, TypeVar
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.setup import Setup
 from companion.core.swath import expected
 from companion.core.types import (
     Decision,

@@ -15,7 +15,7 @@ from typing import Literal
 from analysis.evaluation import P1_RESULTS, Evaluation, evaluate, limit_ratio, whole_boom
 from analysis.flight_record import Fidelity
 from companion.assembly import deliverable
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.errors import ConfigError
 from companion.record.journal import Journal
 from sitl.demo_field import (

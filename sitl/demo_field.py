@@ -7,9 +7,9 @@ from functools import cache
 
 from companion.assembly import build_setup
 from companion.config import Config, load
-from companion.core.controller import Setup
 from companion.core.prescription import Prescription
 from companion.core.schedule import LagModel
+from companion.core.setup import Setup
 from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_lag, anyang_route
 from sitl.route import Route
 from sitl.trajectory import Trajectory

@@ -17,8 +17,8 @@ from sitl.deposit import L_HA_PER_ML_M2
 
 if TYPE_CHECKING:
     from analysis.flight_record import FlightRecord
-    from companion.core.controller import Setup
     from companion.core.frame import LocalFrame
+    from companion.core.setup import Setup
 
 Floats = NDArray[np.float64]
 

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from analysis.flight_record import Fidelity, FlightMeta, FlightRecord, Floats
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.setup import Setup
 from companion.core.swath import expected
 from companion.core.types import (
     Decision,

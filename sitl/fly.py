@@ -22,9 +22,9 @@ import shapely
 from analysis.evaluation import Evaluation, evaluate, limit_ratio
 from companion.assembly import build_setup, deliverable, refuse_mismatch
 from companion.config import Config, load
-from companion.core.controller import Setup
 from companion.core.nozzle import allowed_duty
 from companion.core.rate import flow_for_rate
+from companion.core.setup import Setup
 from companion.errors import ConfigError
 from companion.maps.model import Problem
 from sitl.board import SERVO_FRAME_S

@@ -23,7 +23,7 @@ from sitl.profile import draw_scatter, flow_table
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
     from companion.core.types import SprayPlan, TimedChange
     from sitl.edges import Edge
     from sitl.outputs import Output, TakesDuties, TakesEdges

@@ -26,9 +26,9 @@ from analysis.lag import Verdict, measure_steps
 from analysis.marks import Mark, MarksFit, fit_marks
 from analysis.strips import strips_of
 from companion.core.boom import Boom
-from companion.core.controller import Setup
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription, Zone
+from companion.core.setup import Setup
 from sitl.anyang import anyang_lag
 from sitl.demo_field import example
 from sitl.flight import MESSAGE_DELAY_S, FlightOptions, fly

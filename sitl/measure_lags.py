@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from analysis.evaluation import evaluate
 from companion.assembly import build_setup
 from companion.config import load
-from companion.core.controller import Setup
 from companion.core.schedule import LagModel
+from companion.core.setup import Setup
 from companion.core.types import SprayPlan, TimedChange
 from sitl.anyang import anyang_route
 from sitl.flight import FlightOptions, fly, sprayer

@@ -12,7 +12,7 @@ from companion.errors import ConfigError
 
 if TYPE_CHECKING:
     from companion.config import Config
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
     from sitl.drives import DriveTruth, Ranges
     from sitl.profile import PlantProfile
 

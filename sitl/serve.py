@@ -16,7 +16,7 @@ from typing import Any
 
 from companion.assembly import build_setup
 from companion.config import Config, load
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.errors import ConfigError
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth

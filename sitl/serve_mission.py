@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from companion.config import Config
-from companion.core.controller import Setup
 from companion.core.frame import course_deg
+from companion.core.setup import Setup
 from companion.errors import ConfigError
 from sitl.anyang import anyang_items
 from sitl.earth import Earth

@@ -20,7 +20,7 @@ from companion.core.rate import flow_for_rate
 from companion.core.types import SprayPlan, Telemetry, TimedChange
 
 if TYPE_CHECKING:
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
 
 POLL_S = 0.2  # 5 Hz
 PROGRAM_S = 0.42  # T2, P1's "program execution time"

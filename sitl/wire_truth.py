@@ -15,7 +15,7 @@ from sitl.earth import Earth
 from sitl.profile import load_profile
 
 if TYPE_CHECKING:
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
 
 
 def evaluate_truth(folder: Path, setup: Setup, *, closed_us: float, full_us: float) -> Evaluation:

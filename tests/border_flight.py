@@ -18,7 +18,8 @@ import shapely
 from shapely import Polygon
 from shapely.affinity import rotate
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
+from companion.core.setup import Setup
 from companion.core.types import SprayPlan, VehicleState
 from tests.builders import flying
 

@@ -12,11 +12,12 @@ from dataclasses import dataclass, field, replace
 
 import shapely
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.prescription import Prescription
 from companion.core.pump import Pump, Way
 from companion.core.schedule import LagModel
+from companion.core.setup import Setup
 from companion.core.types import Decision, SprayPlan
 from tests.builders import boom, flying, plots, setup
 

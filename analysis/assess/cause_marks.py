@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.strips import Strip
     from analysis.track import Bools, Floats
-    from companion.core.controller import Setup
     from companion.core.prescription import Prescription
+    from companion.core.setup import Setup
 
 # Where nothing is prescribed, this part of a usual dose is nothing either.
 NOTHING = 0.02

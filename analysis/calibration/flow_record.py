@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from companion.core.types import Decision, FlowReport
 
 if TYPE_CHECKING:
-    from companion.core.controller import Setup
     from companion.core.schedule import LagModel
+    from companion.core.setup import Setup
     from companion.core.types import Input, SprayPlan, TimedChange
 
 Floats = NDArray[np.float64]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.spans import Spans
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.record.writer import Event
 
 Floats = NDArray[np.float64]

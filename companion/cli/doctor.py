@@ -23,7 +23,7 @@ from companion.cli.service_unit import is_ours, quoted, watchdog_is_on
 from companion.cli.servo_parts import servo_options
 from companion.cli.systemd import properties, read_unit, unit_path
 from companion.config import Config
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.doctor.application import application_check
 from companion.doctor.check import Check, Status, fail, is_ready, split_advice
 from companion.doctor.computer import computer_checks

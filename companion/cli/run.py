@@ -26,7 +26,7 @@ from companion.cli.sensor_parts import build_sensors, follow_refills
 from companion.config import Config
 from companion.config.application_table import missing, told
 from companion.config.rules import unbounded, without_effect
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.errors import ActuatorError, LinkError, SensorError
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 from companion.core import detection, flow_trim, sprayer_state, swath
-from companion.core.crossings import Across, Border, Route
+from companion.core.crossings import Route
 from companion.core.detection import WatchMemory
 from companion.core.dosing import dosing_of, overdrive_of, skew_of, speed_soon
 from companion.core.drift import Offset
@@ -34,8 +34,6 @@ from companion.core.types import (
     TimedChange,
     VehicleState,
 )
-
-__all__ = ["Across", "Border", "Memory", "Setup", "step"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,7 +22,7 @@ from companion.core.schedule import ValveSchedule, rate_at, schedule, sticky_bor
 from companion.core.types import DrivePlan, SprayPlan, VehicleState
 
 if TYPE_CHECKING:
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
 
 
 def ways(

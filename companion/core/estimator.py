@@ -49,7 +49,7 @@ from companion.core.types import (
 from companion.core.vehicle_motion import CONFIRM_COUNT, Motion, begun, followed
 
 if TYPE_CHECKING:
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
 
 SPEED_REPORT_AGE_MAX_S = 1.0
 # Fix, estimator and landed state come at 1 to 5 Hz; older than this they count as not known.

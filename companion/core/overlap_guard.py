@@ -23,7 +23,8 @@ from companion.core.drift import Offset, landed
 from companion.core.paths import Floats, Paths, predict
 
 if TYPE_CHECKING:
-    from companion.core.controller import Memory, Setup
+    from companion.core.controller import Memory
+    from companion.core.setup import Setup
     from companion.core.types import VehicleState
 
 Bools = NDArray[np.bool_]

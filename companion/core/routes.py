@@ -13,7 +13,8 @@ from companion.core.paths import STRAIGHT_YAW_RATE_DEG_S, place_velocity
 from companion.core.types import VehicleState
 
 if TYPE_CHECKING:
-    from companion.core.controller import Memory, Setup
+    from companion.core.controller import Memory
+    from companion.core.setup import Setup
 
 # Crossings found in one step are carried on for this long, if the path does not leave its
 # prediction by more than these and none of them is to be ordered within this time.

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from companion.core.boom import Boom
-    from companion.core.controller import Memory, Setup
+    from companion.core.controller import Memory
     from companion.core.drift import Offset
+    from companion.core.setup import Setup
 
 # The way is stamped after this time: a swath of 10 m at 5 m/s is one look at some 2000 cells.
 STAMP_EVERY_S = 2.0

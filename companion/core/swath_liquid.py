@@ -14,8 +14,8 @@ from companion.core.drives import liquid_of
 from companion.core.types import FaultKind, Finding, SprayPlan
 
 if TYPE_CHECKING:
-    from companion.core.controller import Setup
     from companion.core.schedule import LagModel
+    from companion.core.setup import Setup
 
 # Found in the liquid: nothing, or not what was ordered, comes out.
 NO_LIQUID = frozenset({FaultKind.NO_FLOW, FaultKind.PUMP_OFF, FaultKind.TANK_EMPTY, FaultKind.AIR})

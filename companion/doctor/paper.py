@@ -8,7 +8,7 @@ from datetime import date
 from companion.assembly import build_setup, deliverable
 from companion.config import Config
 from companion.config.rules import mismatches, without_effect
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.doctor.check import Check, fail, not_applicable, ok, split_advice, warn
 from companion.errors import ConfigError, LinkError, MapError
 from companion.link.signing import read_key

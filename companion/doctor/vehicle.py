@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from companion.config import Config
 from companion.config.model import FIXES
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.core.types import Fix
 from companion.doctor.check import Check, fail, not_applicable, ok, split_advice, warn
 from companion.doctor.vehicle_facts import Heard

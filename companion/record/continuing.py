@@ -12,10 +12,10 @@ import shapely
 from shapely import MultiPolygon
 from shapely.geometry.base import BaseGeometry
 
-from companion.core.controller import Setup
 from companion.core.coverage import CELL_M, Coverage
 from companion.core.frame import LocalFrame
 from companion.core.overlap_guard import OverlapGuard
+from companion.core.setup import Setup
 from companion.errors import JournalError, UnreadableError
 from companion.record.coverage_area import as_polygons, moved, polygons
 from companion.record.coverage_table import read_coverage

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import JournalError
 from companion.ports import COMMIT_EVERY_S

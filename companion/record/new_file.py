@@ -13,7 +13,7 @@ from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.record.coverage_table import write_treated
 from companion.record.geopackage import SCHEMA
 from companion.record.layers import write_layers

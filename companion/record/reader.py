@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import NoMapError, UnreadableError
 from companion.record.blocks import Entry

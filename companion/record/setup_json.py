@@ -10,8 +10,8 @@ import json
 from dataclasses import fields
 from typing import Any, cast
 
-from companion.core.controller import Setup
 from companion.core.prescription import Overlap, Prescription, Zone
+from companion.core.setup import Setup
 from companion.record.codec import FIELD_NAMES, FieldNames, from_plain, to_plain
 from companion.record.layers import Ground
 

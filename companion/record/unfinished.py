@@ -8,7 +8,7 @@ from pathlib import Path
 
 from shapely.errors import ShapelyError
 
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.errors import VrsprayError
 from companion.record.continuing import Treated, read_treated_ground, rest_of
 from companion.record.folder import journals

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.core.controller import Setup
 from companion.core.coverage import Coverage
+from companion.core.setup import Setup
 from companion.core.types import Decision, Input, OperatorCommand, Telemetry
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink

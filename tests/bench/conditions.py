@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from companion.core.controller import Setup
 from companion.core.rate import flow_for_rate
+from companion.core.setup import Setup
 from sitl.hard_fields import bands, deliverable_rates, drawn_rates, edges_of, plots
 from sitl.hard_paths import CentreLine, Pace, hard_trajectory, laid_on
 from sitl.trajectory import Floats, Trajectory

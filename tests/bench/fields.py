@@ -10,11 +10,11 @@ import numpy as np
 import shapely
 
 from companion.core.boom import Boom, Valve
-from companion.core.controller import Setup
 from companion.core.estimator import Track, estimate, observe
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.prescription import Prescription, Zone
+from companion.core.setup import Setup
 from companion.core.types import (
     EstimatorReport,
     Fix,

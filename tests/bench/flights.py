@@ -32,7 +32,7 @@ from tests.bench.sprayers import (
 )
 
 if TYPE_CHECKING:
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
     from sitl.trajectory import Trajectory
 
 SLOW_M_S = (2.0, 3.0, 4.0, 5.0, 6.0)

@@ -43,7 +43,7 @@ from tests.bench.sprayers import PLANT, nominal_lag, scaled_flow, scaled_lag, wi
 if TYPE_CHECKING:
     from analysis.calibration.lag_fit import Fit
     from analysis.flight_record import FlightRecord, Floats
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
     from companion.core.types import Input
     from sitl.vehicle import Route
 

@@ -32,7 +32,7 @@ from tests.bench.sprayers import (
 )
 
 if TYPE_CHECKING:
-    from companion.core.controller import Setup
+    from companion.core.setup import Setup
 
 UNKNOWN, RECOVERED = "wrong", "recovered"
 TOO_LONG, TOO_SHORT = 1.5, 0.5

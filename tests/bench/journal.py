@@ -28,8 +28,8 @@ from typing import Any
 import pyogrio
 
 from analysis.flown.read_applied import read_applied
-from companion.core.controller import Setup
 from companion.core.coverage import Coverage
+from companion.core.setup import Setup
 from companion.record.codec import encode
 from companion.record.events import LinkSample
 from companion.record.journal import Journal

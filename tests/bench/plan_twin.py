@@ -27,7 +27,7 @@ from analysis.border import off_target_ml
 from analysis.strips import strips_of
 from companion.assembly import build_setup
 from companion.config import Config, load
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from missions.files.geojson import geojson_text
 from missions.plan import Plan, Sortie
 from missions.planner import plan_mission

@@ -17,10 +17,10 @@ from typing import Any
 import shapely
 
 from analysis.evaluation import Evaluation, evaluate
-from companion.core.controller import Setup
 from companion.core.frame import LocalFrame
 from companion.core.interlock import Limits
 from companion.core.prescription import Prescription, Zone
+from companion.core.setup import Setup
 from companion.core.types import Method
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import boom, measured_sets, pwm_limits

@@ -22,8 +22,8 @@ from analysis.evaluation import Evaluation, evaluate
 from analysis.flight_record import FlightRecord
 from companion.assembly import build_setup
 from companion.config import load
-from companion.core.controller import Setup
 from companion.core.rate import flow_for_rate
+from companion.core.setup import Setup
 from sitl.flight import FlightOptions, fly
 from sitl.motor_parts import droplet_figures, ranges_us
 from sitl.profile import PlantProfile, load_profile

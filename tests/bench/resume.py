@@ -21,9 +21,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.core.controller import Memory, Setup
+from companion.core.controller import Memory
 from companion.core.coverage import Coverage
 from companion.core.overlap_guard import OverlapGuard
+from companion.core.setup import Setup
 from companion.core.swath import expected
 from companion.core.types import Input, OperatorCommand, VehicleState
 from companion.ports import COMMIT_EVERY_S

@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from companion.core.controller import Setup
 from companion.core.schedule import LagModel
+from companion.core.setup import Setup
 from sitl.anyang import anyang_lag
 from sitl.demo_field import MAP_SPEED_M_S, demo_setup
 from sitl.flight import FlightOptions

@@ -9,7 +9,8 @@ import numpy as np
 import shapely
 from shapely import STRtree
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
+from companion.core.setup import Setup
 from sitl.demo_field import demo_route
 from tests.bench.fields import (
     PLOT_LENGTH_M,

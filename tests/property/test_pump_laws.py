@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.atomiser import Atomiser, DropletLaw
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.drive_plans import behind_path
 from companion.core.nozzle import FlowCurve
 from companion.core.pump import Pump, Way
+from companion.core.setup import Setup
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from tests.builders import SPRAYING, flying
 from tests.pump_flight import PUMP_LAG, fly, is_open, prescribed_ml, pump_setup

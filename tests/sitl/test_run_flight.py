@@ -13,7 +13,7 @@ from statistics import median
 
 import pytest
 
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.core.types import Decision, Inhibit, Input, SprayPlan
 from companion.errors import LinkError
 from companion.link.component import ComponentOptions

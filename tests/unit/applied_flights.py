@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from analysis.flown.applied_flight import AppliedFlight, Series, ValveChanges
-from companion.core.controller import Setup
 from companion.core.rate import flow_for_rate
+from companion.core.setup import Setup
 from tests.builders import setup
 
 SPEED_M_S = 5.0

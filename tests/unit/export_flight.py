@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
+from companion.core.setup import Setup
 from companion.core.types import PressureReport
 from companion.record.journal import Journal
 from tests.builders import along, flying, setup

@@ -13,9 +13,9 @@ import shapely
 
 from companion.assembly import above_label, build_setup, deliverable, read_configured_map
 from companion.config import load
-from companion.core.controller import Setup
 from companion.core.frame import LocalFrame
 from companion.core.rate import flow_for_rate
+from companion.core.setup import Setup
 from companion.core.types import Method
 from companion.errors import ConfigError, MapError
 

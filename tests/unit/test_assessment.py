@@ -24,8 +24,8 @@ from analysis.flown.applied_record import record_of
 from analysis.strips import strips_of
 from analysis.student import t_factor
 from companion.core.cells import CellGrid, Warp
-from companion.core.controller import Setup
 from companion.core.prescription import Prescription, Zone
+from companion.core.setup import Setup
 from companion.record.events import Event
 from tests.builders import plots, setup
 from tests.unit.applied_flights import SPEED_M_S, changes_of, eastwards

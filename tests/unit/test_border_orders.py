@@ -10,13 +10,14 @@ import shapely
 
 from companion.assembly import build_setup
 from companion.config.load import load
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
 from companion.core.lines import Lines
 from companion.core.overdrive import Overdrive
 from companion.core.prescription import Prescription, Zone
 from companion.core.pump import Way as PumpWay
 from companion.core.schedule import LagModel, Order, Timing, orders, schedule, shut_spans
+from companion.core.setup import Setup
 from tests.border_flight import Way, flows, orders_of, pump_orders_of, spilled_by_valve, spilled_s
 from tests.builders import plots, setup
 from tests.pump_flight import PUMP_LAG, pump_setup

@@ -13,12 +13,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.core.boom import Boom, Valve
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.coverage import Coverage
 from companion.core.crossings import Crossing, Route
 from companion.core.overlap_guard import STRETCH_MIN_M, OverlapGuard, cut, wake_m
 from companion.core.prescription import Prescription
 from companion.core.schedule import orders, rate_at
+from companion.core.setup import Setup
 from companion.core.swath import SNAPSHOTS_MAX
 from companion.core.types import TimedChange
 from tests.builders import LAG, along, flying, plots, setup

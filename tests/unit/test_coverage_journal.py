@@ -20,11 +20,12 @@ import shapely
 from analysis.flown.read_applied import read_applied
 from analysis.replay import replay
 from companion.cli.app import execute
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
 from companion.core.frame import LocalFrame
 from companion.core.overlap_guard import OverlapGuard
+from companion.core.setup import Setup
 from companion.core.swath import expected
 from companion.core.types import (
     Decision,

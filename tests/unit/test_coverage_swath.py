@@ -10,9 +10,10 @@ import pytest
 import shapely
 
 from companion.core import swath_liquid as law
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.coverage import Coverage
 from companion.core.prescription import Prescription
+from companion.core.setup import Setup
 from companion.core.swath import Swath, expected, follow
 from companion.core.swath_liquid import Toggle
 from companion.core.types import FaultKind, Finding, SprayPlan, TimedChange, VehicleState

@@ -13,12 +13,12 @@ from dataclasses import replace
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.core.controller import Setup
 from companion.core.detection import Detection
 from companion.core.drift import Drift
 from companion.core.flow_trim import FlowTrim
 from companion.core.lines import Lines
 from companion.core.liquid_law import AutopilotLiquid
+from companion.core.setup import Setup
 from companion.core.swath import expected
 from companion.core.types import SpeedReport, WindReport
 from companion.link.codec import Codec

@@ -13,11 +13,12 @@ from analysis.replay import FlownCore, replay
 from companion.assembly import build_setup
 from companion.config import load
 from companion.core import flow_trim
-from companion.core.controller import Memory, Setup, duty_in_force, step
+from companion.core.controller import Memory, duty_in_force, step
 from companion.core.flow_trim import FlowTrim
 from companion.core.flow_window import Sample, flows_over, with_order
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.prescription import Prescription
+from companion.core.setup import Setup
 from companion.core.types import (
     Decision,
     EstimatorReport,

@@ -21,8 +21,9 @@ import pyproj
 import pytest
 import shapely
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.prescription import Prescription, Zone
+from companion.core.setup import Setup
 from companion.core.types import (
     BatteryReport,
     ClockReport,

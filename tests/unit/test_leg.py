@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.estimator import Track, estimate, observe
 from companion.core.leg import (
     Approach,
@@ -24,6 +24,7 @@ from companion.core.leg import (
     stop_ahead,
 )
 from companion.core.paths import predict
+from companion.core.setup import Setup
 from companion.core.types import (
     HeartbeatReport,
     LegReport,

@@ -8,10 +8,11 @@ from dataclasses import replace
 import pytest
 import shapely
 
-from companion.core.controller import Memory, Setup, duty_in_force, step
+from companion.core.controller import Memory, duty_in_force, step
 from companion.core.estimator import Track, observe
 from companion.core.lines import Lines, Polyline
 from companion.core.prescription import Prescription, Zone
+from companion.core.setup import Setup
 from companion.core.types import LegReport, TimedChange, VehicleState, Way
 from tests import builders
 from tests.builders import LAG, along, boom, setup

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from analysis.evaluation import Distances, evaluate
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.core.types import ClockReport, Input, Telemetry
 from sitl.demo_field import ACCELERATION_M_S2, START_S, demo_lags, demo_route, demo_setup
 from sitl.flight import FlightOptions, fly

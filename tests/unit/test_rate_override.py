@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.estimator import Track, observe
 from companion.core.rate import overridden
+from companion.core.setup import Setup
 from companion.core.types import Decision, RateOverride
 from tests import builders
 

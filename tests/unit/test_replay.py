@@ -20,7 +20,7 @@ from numpy._core import _multiarray_umath
 from analysis.overrides import override
 from analysis.replay import FlownCore, first_difference, replay
 from companion.cli.app import execute
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.core.types import (
     Decision,
     EstimatorReport,

@@ -16,7 +16,7 @@ from analysis.flight_record import Fidelity, FlightRecord
 from analysis.strips import Strip, strips_of
 from companion.assembly import build_setup
 from companion.config import load
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.core.types import Decision
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.profile import PlantProfile, load_profile

@@ -9,9 +9,10 @@ from dataclasses import replace
 import pytest
 import shapely
 
-from companion.core.controller import Memory, Setup, step
+from companion.core.controller import Memory, step
 from companion.core.nozzle import choose_set
 from companion.core.prescription import Prescription
+from companion.core.setup import Setup
 from companion.core.types import TimedChange
 from sitl.knowledge import measured_sets
 from sitl.profile import load_profile
