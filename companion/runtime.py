@@ -291,6 +291,7 @@ async def run(
     sensors: Sequence[Sensor] = (),
     duration_s: float | None = None,
     clock: Callable[[], float] = time.monotonic,
+    boot_clock: Callable[[], float] | None = None,
     on_step: Callable[[], None] | None = None,
     record_fault: Callable[[], str | None] | None = None,
     commit_every_s: float = COMMIT_EVERY_S,
@@ -298,8 +299,9 @@ async def run(
     """Spray until a signal comes or `duration_s` is over; return 0 then.
 
     `on_step` is called after each step that was carried out, and at no other time: a watchdog that
-    it feeds sees a loop that stands still. `record_fault`, if given, says why the record cannot be
-    kept: a flight then does not begin to spray; one that has begun goes on. `commit_every_s` is how
+    it feeds sees a loop that stands still. `boot_clock`, the computer's if not given, shows that
+    this process itself stood still. `record_fault`, if given, says why the record cannot be kept:
+    a flight then does not begin to spray; one that has begun goes on. `commit_every_s` is how
     often the recorder commits.
 
     Raises what went wrong otherwise, a `LinkError` for a link that cannot be opened, a
@@ -331,6 +333,7 @@ async def run(
                         recorder=taken,
                         clock=clock,
                         sensors=sensors,
+                        boot_clock=boot_clock,
                         record_fault=record_fault,
                         commit_every_s=commit_every_s,
                     )

@@ -24,8 +24,9 @@ from typing import Any
 from companion.assembly import build_setup
 from companion.cli.run import build_executor, component_options
 from companion.config import load
+from companion.core.setup import Setup
 from companion.link.vehicle_link import VehicleLink
-from companion.ports import Recorder
+from companion.ports import PlanExecutor, Recorder
 from companion.runtime import run
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.channel import Channel
@@ -100,6 +101,9 @@ class WireLink(VehicleLink):
         self._on_bytes(data)
 
 
+# Gets the link and the outputs of a flight before it begins.
+Wired = Callable[[VehicleLink, PlanExecutor], None]
+
 # How long, at a time, the vehicle and the wire stand still.
 Holds = Callable[[float], float]
 
@@ -144,16 +148,30 @@ async def _fly(
     stub: _Run,
     recorder: Recorder | None,
     held_s: Holds,
+    *,
+    setup: Setup | None,
+    wired: Wired | None,
+    duration_s: float | None,
 ) -> str | None:
     """Fly the stub's mission with the companion; return what was the matter with the outputs."""
     loop = asyncio.get_running_loop()
     config = load(config_file)
     link = WireLink(config.link.url, component_options(config), clock=loop.time)
     executor = build_executor(config, link)
+    if wired is not None:
+        wired(link, executor)
     vehicle = asyncio.create_task(_vehicle(stub, link, held_s))
     await asyncio.sleep(0.1)
     companion = asyncio.create_task(
-        run(build_setup(config), link=link, executor=executor, recorder=recorder, clock=loop.time)
+        run(
+            build_setup(config) if setup is None else setup,
+            link=link,
+            executor=executor,
+            recorder=recorder,
+            duration_s=duration_s,
+            clock=loop.time,
+            boot_clock=loop.time,
+        )
     )
     await asyncio.wait({vehicle, companion}, return_when=asyncio.FIRST_COMPLETED)
     fault = executor.fault
@@ -172,16 +190,31 @@ def fly(
     *,
     recorder: Recorder | None = None,
     held_s: Holds = _never,
+    setup: Setup | None = None,
+    wired: Wired | None = None,
+    duration_s: float | None = None,
 ) -> tuple[dict[str, Any], str | None]:
     """Fly a mission; return what the stub says, and the fault of the outputs at the end.
 
     `held_s` gives for how long the vehicle and the wire stand still at a time since the start.
+    `setup` is flown instead of the configuration's own, `wired` gets link and outputs before the
+    flight, `duration_s` ends the companion before its landing.
     """
     stub = _Run(options, lambda _: None, start_s=START_S)
     start_s = stub._start_s
     loop = JumpingLoop(start_s)
     with asyncio.Runner(loop_factory=lambda: loop) as runner:
-        fault = runner.run(_fly(config, stub, recorder, lambda at_s: held_s(at_s - start_s)))
+        fault = runner.run(
+            _fly(
+                config,
+                stub,
+                recorder,
+                lambda at_s: held_s(at_s - start_s),
+                setup=setup,
+                wired=wired,
+                duration_s=duration_s,
+            )
+        )
     return stub.result(cancelled=False), fault
 
 

@@ -1,0 +1,144 @@
+"""Replaying golden flights: the decisions have to be the recorded ones, field by field.
+
+To the bit, as a refactoring leaves them; or, for a step that makes the core faster, the same
+valves, inhibits and nozzle sets, with times within 1 us and all other numbers within 1e-9.
+"""
+
+from __future__ import annotations
+
+import lzma
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from analysis.replay import FlownCore
+from companion.core.setup import Setup
+from companion.core.types import Decision
+from companion.record.coverage_table import read_coverage
+from companion.record.reader import opened, read_journal
+
+FOLDER = Path(__file__).parent / "journals"
+TIME_WITHIN_S = 1e-6
+WITHIN = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replayed:
+    """What came of one flight; `cells` is how many cells of treated ground differ."""
+
+    decisions: int
+    differences: int
+    first: str | None
+    cells: int | None
+    is_left_out: bool = False
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether every decision and the treated ground are as they were recorded."""
+        return not self.differences and not self.cells
+
+
+def names() -> list[str]:
+    """Return the names of all recorded flights."""
+    return sorted(path.name.removesuffix(".gpkg.xz") for path in FOLDER.glob("*.gpkg.xz"))
+
+
+@contextmanager
+def unpacked(name: str, folder: Path = FOLDER) -> Iterator[Path]:
+    """Give a recorded flight's journal as a file."""
+    with TemporaryDirectory(prefix="golden-") as scratch:
+        path = Path(scratch) / f"{name}.gpkg"
+        path.write_bytes(lzma.decompress((folder / f"{name}.gpkg.xz").read_bytes()))
+        yield path
+
+
+def replayed(
+    path: Path,
+    *,
+    is_tolerant: bool = False,
+    until_s: float = math.inf,
+    core: Callable[[Setup], FlownCore] = FlownCore,
+) -> Replayed:
+    """Return how the decisions of today differ from those in a journal.
+
+    What comes more than `until_s` after the first decision is left out, as is the treated ground.
+    """
+    content = read_journal(path)
+    flown = core(content.setup)
+    decisions = differences = 0
+    first, begin_s, is_left_out = None, None, False
+    for recorded in content.items():
+        if not isinstance(recorded, Decision):
+            flown.observe(recorded)
+            continue
+        begin_s = recorded.now_s if begin_s is None else begin_s
+        if recorded.now_s > begin_s + until_s:
+            is_left_out = True
+            break
+        decisions += 1
+        found = difference(recorded, flown.decide(recorded.now_s), is_tolerant=is_tolerant)
+        if found is not None:
+            differences += 1
+            first = first or f"decision {decisions} at {recorded.now_s:.3f} s: {found}"
+    cells = None
+    if not is_left_out:
+        with opened(path) as journal:
+            kept = read_coverage(journal.connection)
+        if kept is not None:
+            cells = flown.ground.differing(kept, is_closed=content.is_closed)
+    return Replayed(
+        decisions=decisions,
+        differences=differences,
+        first=first,
+        cells=cells,
+        is_left_out=is_left_out,
+    )
+
+
+def difference(was: Any, now: Any, name: str = "", *, is_tolerant: bool = False) -> str | None:
+    """Return the first field in which two values of the core differ; None where none does.
+
+    NaN equals NaN and 0.0 is not -0.0, but for a tolerant comparison.
+
+    >>> difference((1.0, 2.0), (1.0, 2.5), "duty")
+    'duty[1] was 2.0, is 2.5'
+    """
+    if isinstance(was, float) and isinstance(now, float):
+        is_same = _near(was, now, name) if is_tolerant else _to_the_bit(was, now)
+        return None if is_same else f"{name} was {was!r}, is {now!r}"
+    if type(was) is not type(now):
+        return f"{name} was {was!r}, is {now!r}"
+    if is_dataclass(was):
+        pairs: Sequence[tuple[Any, Any, str]] = [
+            (getattr(was, one.name), getattr(now, one.name), f"{name}.{one.name}".strip("."))
+            for one in fields(was)
+        ]
+    elif isinstance(was, tuple) and len(was) == len(now):
+        pairs = [(a, b, f"{name}[{i}]") for i, (a, b) in enumerate(zip(was, now, strict=True))]
+    else:
+        is_known = isinstance(was, Enum | str | int | frozenset | tuple) or was is None
+        assert is_known, f"{name}: {type(was).__name__} is no value of the core"
+        return None if was == now else f"{name} was {was!r}, is {now!r}"
+    return next(
+        (found for one in pairs if (found := difference(*one, is_tolerant=is_tolerant))), None
+    )
+
+
+def _to_the_bit(was: float, now: float) -> bool:
+    if math.isnan(was) or math.isnan(now):
+        return math.isnan(was) and math.isnan(now)
+    return was == now and math.copysign(1.0, was) == math.copysign(1.0, now)
+
+
+def _near(was: float, now: float, name: str) -> bool:
+    if math.isnan(was) or math.isnan(now) or math.isinf(was):
+        return was == now or (math.isnan(was) and math.isnan(now))
+    is_time = name.endswith("_s") and not name.endswith(("m_s", "deg_s"))
+    if is_time:
+        return abs(was - now) <= TIME_WITHIN_S
+    return abs(was - now) <= WITHIN * max(1.0, abs(was))
