@@ -12,8 +12,8 @@ from collections import deque
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from companion.core.controller import expected_coverage
 from companion.core.coverage import Coverage
-from companion.core.swath import expected
 from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
 
 if TYPE_CHECKING:
@@ -55,14 +55,14 @@ class ReplayedGround:
     def _at_the_end(
         self, kept: Coverage, memory: Memory, state: VehicleState | None, now_s: float
     ) -> int:
-        least = Coverage() if memory.swath is None else memory.swath.coverage
+        least = Coverage() if memory.watched.swath is None else memory.watched.swath.coverage
         most = self._expected(memory, state, now_s, ahead_s=END_WITHIN_S)
         return cells_without(least, kept) + cells_without(kept, most.joined(least))
 
     def _expected(
         self, memory: Memory, state: VehicleState | None, now_s: float, *, ahead_s: float
     ) -> Coverage:
-        return expected(self._setup, memory, state, now_s=now_s, cut_s=now_s + ahead_s)
+        return expected_coverage(self._setup, memory, state, now_s=now_s, cut_s=now_s + ahead_s)
 
 
 def cells_without(one: Coverage, other: Coverage) -> int:

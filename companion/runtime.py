@@ -20,11 +20,10 @@ import time
 from collections.abc import Callable, Coroutine, Iterator, Sequence
 from typing import Any, TypeVar
 
-from companion.core.controller import Memory, step
+from companion.core.controller import Memory, expected_coverage, step
 from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
 from companion.core.setup import Setup
-from companion.core.swath import expected
 from companion.core.types import (
     Decision,
     EstopReport,
@@ -166,7 +165,7 @@ class ControlLoop:
         self._coverage_s = now_s
         cut_s = now_s + ahead_s
         self._recorder.record_coverage(
-            expected(self._setup, self._memory, state, now_s=now_s, cut_s=cut_s)
+            expected_coverage(self._setup, self._memory, state, now_s=now_s, cut_s=cut_s)
         )
 
     def _standstill(self) -> Iterator[Input]:

@@ -15,11 +15,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from analysis.flight_record import Fidelity, FlightMeta, FlightRecord, Floats
-from companion.core.controller import Memory, step
+from companion.core.controller import Memory, expected_coverage, step
 from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
 from companion.core.setup import Setup
-from companion.core.swath import expected
 from companion.core.types import (
     Decision,
     EstimatorReport,
@@ -383,7 +382,7 @@ def _treated(
     """Return what a flight that ends now has treated; None where it is not kept."""
     if not setup.records_coverage:
         return None
-    return expected(setup, memory, state, now_s=now_s, cut_s=now_s)
+    return expected_coverage(setup, memory, state, now_s=now_s, cut_s=now_s)
 
 
 def _fly_wang(

@@ -1,91 +1,311 @@
 """The whole application as a function: from a vehicle state to a plan.
 
-Read `step` from top to bottom: reasons not to spray, routes of the valves, changes of duty, plan,
-interlock.
+`step` has five stages, each a function of what it is given: what came of the last plan (`_watch`),
+whether anything may be sprayed (`permit`), the routes of the valves (`_routes`), their changes of
+duty (`_orders`), and the plan (`_plan`).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
-from companion.core import detection, flow_trim, sprayer_state, swath
-from companion.core.crossings import Route
+from companion.core import detection, flow_trim, swath
+from companion.core.atomiser import spinning
+from companion.core.border import Intervals
+from companion.core.coverage import Coverage
+from companion.core.crossings import Route, find_routes
 from companion.core.detection import WatchMemory
 from companion.core.dosing import dosing_of, overdrive_of, skew_of, speed_soon
-from companion.core.drift import Offset
-from companion.core.drives import liquid_of, ran, ways, with_drives, with_rates
+from companion.core.drift import Offset, is_same, landed, offset
+from companion.core.drive_plans import constant_drive
+from companion.core.drives import flows_ahead, liquid_of, modulated
 from companion.core.flow_trim import TrimMemory
-from companion.core.interlock import Held, closed_plan, guard, inhibits, settled
-from companion.core.pump import DRY, PumpMemory, on_off
+from companion.core.interlock import closed_plan, guard
+from companion.core.lines import add_off_lines
+from companion.core.overlap_guard import guarded, treated_before
+from companion.core.paths import Paths
+from companion.core.pump import on_off, sections
 from companion.core.rate import flow_for_rate, overridden
-from companion.core.routes import routes_ahead
-from companion.core.schedule import Dosing, ValveSchedule, schedule, sticky_border_s
+from companion.core.routes import NO_ROUTES, KnownRoutes, carried_on
+from companion.core.schedule import Dosing, ValveSchedule, rate_at, schedule, sticky_border_s
 from companion.core.sets import SetOfRate, dosing_by_valve, sets_ahead
 from companion.core.setup import Setup
-from companion.core.sprayer_state import BOOT, Machine, shown
+from companion.core.sprayer_state import UNASKED, Permission, permit, shown
 from companion.core.swath import Swath
 from companion.core.types import (
     Decision,
+    DrivePlan,
     Finding,
-    Inhibit,
-    SprayerState,
     SprayPlan,
     TimedChange,
     VehicleState,
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Memory:
-    """What one step leaves to the next; a restart begins with nothing, closed."""
+class Watched(NamedTuple):
+    """What came of the plans so far: faults of the liquid, and the ground that was treated.
 
-    plan: SprayPlan | None = None
+    `ran_s` is when something was last to flow, where a motor wants to know.
+    """
+
+    watch: WatchMemory | None = None
+    swath: Swath | None = None
+    ran_s: float = -math.inf
+
+
+class Ordering(NamedTuple):
+    """What the orders of one step leave to the next: sets in use, trims, a valve opened early."""
+
     set_index: int = 0
     set_of_rate: SetOfRate = ()
-    routes: tuple[Route, ...] = ()
-    routes_from: VehicleState | None = None
-    drift_m: Offset | None = None
     trim: TrimMemory | None = None
-    watch: WatchMemory | None = None
-    reasons: frozenset[Inhibit] = frozenset()
-    held: Held = ()
-    machine: Machine = BOOT
-    pump: PumpMemory = DRY
-    swath: Swath | None = None
+    is_early: bool = False
+
+
+NOTHING_WATCHED = Watched()
+NOTHING_ORDERED = Ordering()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Memory:
+    """What one step leaves to the next, a part for each stage; a restart begins with nothing."""
+
+    plan: SprayPlan | None = None
+    watched: Watched = NOTHING_WATCHED
+    permission: Permission = UNASKED
+    routes: KnownRoutes = NO_ROUTES
+    ordering: Ordering = NOTHING_ORDERED
+
+
+class Orders(NamedTuple):
+    """The schedule of each valve, and by which set, speed, skew and gain it was made."""
+
+    valves: list[ValveSchedule]
+    ordering: Ordering
+    speed_m_s: float
+    skew: float
+    gain: float
 
 
 def step(
     setup: Setup, state: VehicleState | None, memory: Memory, now_s: float
 ) -> tuple[Decision, Memory]:
     """Return what to do from `now_s` on, and what the next step has to know."""
-    memory = _watched(setup, state, memory, now_s)
-    reasons = inhibits(
+    before, ordering = memory.plan, memory.ordering
+    liquid = liquid_of(setup.pumping, before)
+    watched = _watch(
+        setup, state, memory.watched, before, liquid,
+        set_index=ordering.set_index, drift_m=memory.routes.drift_m, now_s=now_s,
+    )  # fmt: skip
+    permission = permit(
+        memory.permission,
         state,
         setup.limits,
+        faults=detection.inhibits_of(watched.watch),
         field_bounds_m=setup.prescription.bounds_m,
         now_s=now_s,
-        before=memory.reasons,
     )
-    reasons, held = settled(reasons | detection.inhibits_of(memory.watch), memory.held, now_s)
-    machine, reasons = sprayer_state.follow(memory.machine, reasons, state)
-    memory = replace(
-        memory,
-        held=held,
-        machine=machine,
-        pump=ran(setup, memory.pump, memory.plan, now_s),
-        swath=_swept(setup, state, memory, now_s),
+    sequence = 1 if before is None else before.sequence + 1
+    if permission.reasons or state is None:
+        return _closed(setup, state, permission, watched, ordering.trim, sequence, now_s)
+    in_force = _in_force(setup, before, now_s)
+    routes = _routes(setup, state, memory.routes, watched.swath, now_s)
+    orders = _orders(
+        setup, state, routes.routes, ordering, liquid,
+        in_force=in_force, ran_s=watched.ran_s, now_s=now_s,
+    )  # fmt: skip
+    plan = SprayPlan(
+        sequence=sequence,
+        issued_s=now_s,
+        duty=in_force,
+        changes=_in_order(orders.valves),
+        lease_until_s=now_s + setup.lease_s,
     )
-    sequence = 1 if memory.plan is None else memory.plan.sequence + 1
-    if reasons or state is None:
-        return _closed(setup, state, reasons, sequence, memory, now_s)
-    in_force = duty_in_force(memory.plan, now_s, len(setup.boom.valves))
-    routes, routes_from, drift_m = routes_ahead(setup, state, memory, now_s)
+    if setup.pump is not None or setup.atomisers:
+        drives = _drives(setup, state, plan, routes.routes, orders, before, watched.ran_s)
+        plan = replace(plan, drives=drives)
+    plan = guard(plan, permission.reasons, lease_s=setup.lease_s)
+    decision, ordering = _decision(setup, state, plan, routes.routes, orders, watched, permission)
+    return decision, Memory(
+        plan=plan, watched=watched, permission=permission, routes=routes, ordering=ordering
+    )
+
+
+# --------------------------------------------------------------------- what came of the last plan
+
+
+def _watch(
+    setup: Setup,
+    state: VehicleState | None,
+    before: Watched,
+    plan: SprayPlan | None,
+    liquid: SprayPlan | None,
+    *,
+    set_index: int,
+    drift_m: Offset | None,
+    now_s: float,
+) -> Watched:
+    """Return what flow, pressure and tank say of the plan until now, and what it treated."""
+    watch, area, ran_s = before
+    if setup.watching is not None:
+        watch = detection.follow(
+            setup.watching, watch or WatchMemory(), liquid, state, index=set_index, now_s=now_s
+        )
+    if setup.swathing is not None:
+        area = swath.follow(
+            setup.swathing, area, plan, state,
+            pumped=liquid if setup.pumping is not None else None,
+            findings=_findings(setup, watch), drift_m=drift_m, now_s=now_s,
+        )  # fmt: skip
+    has_motors = setup.pump is not None or bool(setup.atomisers)
+    if has_motors and liquid is not None and any(liquid.duty_at(now_s)):
+        ran_s = now_s
+    return Watched(watch, area, ran_s)
+
+
+def _findings(setup: Setup, watch: WatchMemory | None) -> tuple[Finding, ...]:
+    if watch is None:
+        return ()
+    if setup.pumping is None:
+        return watch.findings
+    # The one valve that was watched is the pump: nothing tells which section it is.
+    return tuple(replace(finding, valve=None) for finding in watch.findings)
+
+
+def expected_coverage(
+    setup: Setup, memory: Memory, state: VehicleState | None, *, now_s: float, cut_s: float
+) -> Coverage:
+    """Return the ground treated if all goes on until `cut_s` and every valve closes then.
+
+    With `cut_s` at `now_s` it is that of a flight that ends now. `memory` is what the step of
+    `now_s` has left; nothing is treated where no record is kept.
+    """
+    if setup.swathing is None:
+        return Coverage()
+    pumped = None if setup.pumping is None else liquid_of(setup.pumping, memory.plan)
+    return swath.expected(
+        setup.swathing, memory.watched.swath, memory.plan, state,
+        pumped=pumped, findings=_findings(setup, memory.watched.watch),
+        drift_m=memory.routes.drift_m, now_s=now_s, cut_s=cut_s,
+    )  # fmt: skip
+
+
+# ------------------------------------------------------------------------- where nothing may fall
+
+
+def _closed(
+    setup: Setup,
+    state: VehicleState | None,
+    permission: Permission,
+    watched: Watched,
+    trim: TrimMemory | None,
+    sequence: int,
+    now_s: float,
+) -> tuple[Decision, Memory]:
+    count = len(setup.boom.valves)
+    plan = closed_plan(sequence=sequence, valve_count=count, now_s=now_s, lease_s=setup.lease_s)
+    if setup.trimming is not None:
+        trim = trim or flow_trim.begin(len(setup.nozzle_sets))
+        trim = flow_trim.pause(trim, None if state is None else state.flow, now_s=now_s)
+    decision = Decision(
+        now_s=now_s,
+        state=state,
+        inhibits=permission.reasons,
+        plan=plan,
+        rate_l_ha=(None,) * count,
+        target_flow_l_min=0.0,
+        flow_l_min=0.0,
+        flow_trim=None if trim is None else trim.sets[trim.set_index].trim,
+        flow_trim_state=None if trim is None else trim.state,
+        findings=_findings(setup, watched.watch),
+        sprayer=shown(permission.machine, is_open=False),
+    )
+    return decision, Memory(
+        plan=plan, watched=watched, permission=permission, ordering=Ordering(trim=trim)
+    )
+
+
+# --------------------------------------------------------------------------- routes of the valves
+
+
+def _routes(
+    setup: Setup, state: VehicleState, before: KnownRoutes, area: Swath | None, now_s: float
+) -> KnownRoutes:
+    """Return what each valve is prescribed along its way: carried on, or found anew."""
+    drift_m = offset(setup.drift, state, now_s)
+    if is_same(drift_m, before.drift_m):
+        carried = carried_on(
+            before,
+            state,
+            longest_s=setup.longest_s,
+            reach_m=setup.boom.reach_m,
+            now_s=now_s,
+        )
+        if carried is not None:
+            return carried
+    there = state if drift_m is None else landed(state, drift_m)
+    routes = find_routes(
+        setup.prescription,
+        there,
+        setup.boom,
+        back_s=setup.back_s,
+        ahead_s=setup.ahead_s,
+        border=setup.border,
+        border_buffer_m=setup.border_buffer_m,
+        across=setup.across,
+        drift_m=drift_m,
+        close_more=_off_lines(setup, state, before),
+    )
+    if setup.overlap is not None:
+        treated = treated_before(
+            setup.overlap, area, there, setup.boom, back_s=setup.back_s, now_s=now_s
+        )
+        routes = guarded(
+            setup.overlap, routes, setup.treated if treated is None else treated, there,
+            setup.boom, back_s=setup.back_s, ahead_s=setup.ahead_s,
+        )  # fmt: skip
+    return KnownRoutes(routes, state, drift_m)
+
+
+def _off_lines(
+    setup: Setup, state: VehicleState, before: KnownRoutes
+) -> Callable[[Paths, list[Intervals]], None] | None:
+    """Return what closes valves off the planned lines; None where spraying needs no line."""
+    if setup.lines is None:
+        return None
+    was_on_one = any(zone.rate_l_ha is not None for route in before.routes for zone in route)
+    flown = setup.lines.flown(
+        state,
+        back_s=setup.back_s,
+        ahead_s=setup.ahead_s,
+        reach_m=setup.boom.reach_m,
+        entering=not was_on_one,
+    )
+    return partial(add_off_lines, flown=flown, boom=setup.boom, strict=setup.border == "inside")
+
+
+# -------------------------------------------------------------------------------- changes of duty
+
+
+def _orders(
+    setup: Setup,
+    state: VehicleState,
+    routes: tuple[Route, ...],
+    before: Ordering,
+    liquid: SprayPlan | None,
+    *,
+    in_force: tuple[float, ...],
+    ran_s: float,
+    now_s: float,
+) -> Orders:
+    """Return the changes of each valve along its route; `liquid` is what the meter's flow is of."""
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
-    index, set_of_rate = _nozzle_sets(setup, state, routes, memory, speed_m_s)
-    until_s = now_s + setup.lease_s
-    trim = _trim(setup, state, memory, now_s)
-    gain = 1.0 if trim is None else trim.sets[index].trim
+    index, set_of_rate = _nozzle_sets(setup, state, routes, before, speed_m_s)
+    trim = _trim(setup, state, before, liquid, now_s)
     skew = skew_of(state, speed_m_s)
 
     def dose(number: int) -> Dosing:
@@ -96,9 +316,14 @@ def step(
     soon_m_s = speed_soon(setup, state, speed_m_s)
     overdrive = overdrive_of(setup, index)
     sticky_s = sticky_border_s(setup.border_buffer_m, speed_m_s)
+    until_s = now_s + setup.lease_s
+    is_early, own_routes = False, routes
+    if setup.pumping is not None:
+        own_routes, is_early = sections(
+            setup.pumping, routes, ran_s=ran_s, was_early=before.is_early, now_s=now_s
+        )
     valves = []
-    own_ways, pump_memory = ways(setup, routes, memory.pump, now_s)
-    for valve, route in enumerate(own_ways):
+    for valve, route in enumerate(own_routes):
         # In a turn each valve has a speed of its own.
         own = route[0].speed_m_s / speed_m_s if abs(state.yaw_rate_deg_s) > 1.0 else 1.0
         valves.append(
@@ -115,100 +340,28 @@ def step(
                 sticky_border_s=sticky_s,
             )
         )
-    plan = SprayPlan(
-        sequence=sequence,
-        issued_s=now_s,
-        duty=in_force,
-        changes=_in_order(valves),
-        lease_until_s=until_s,
-    )
-    plan = with_drives(
-        setup, state, plan, routes,
-        before=memory.plan, memory=pump_memory, speed_m_s=speed_m_s, skew=skew, gain=gain,
-    )  # fmt: skip
-    plan = guard(plan, reasons, lease_s=setup.lease_s)
-    flow_l_min = _flow(setup, plan, index)
-    if setup.trimming is not None and trim is not None:
-        trim = flow_trim.ordered(
-            setup.trimming, trim, flow_l_min=flow_l_min, index=index, now_s=now_s
-        )
-    decision = _decision(
-        setup, state, plan, with_rates(setup, valves, routes, now_s),
-        index=index, speed_m_s=speed_m_s, flow_l_min=flow_l_min * gain, trim=trim,
-        findings=_findings(setup, memory), sprayer=shown(machine, is_open=plan.opens),
-    )  # fmt: skip
-    return decision, Memory(
-        plan=plan,
-        set_index=index,
-        set_of_rate=set_of_rate,
-        routes=routes,
-        routes_from=routes_from,
-        drift_m=drift_m,
-        trim=trim,
-        watch=memory.watch,
-        held=held,
-        machine=machine,
-        pump=pump_memory,
-        swath=memory.swath,
-    )
-
-
-def _watched(setup: Setup, state: VehicleState | None, memory: Memory, now_s: float) -> Memory:
-    """Return the memory with what flow, pressure and tank say of the plan until now."""
-    if setup.watching is None:
-        return memory
-    watch = detection.follow(
-        setup.watching,
-        memory.watch or WatchMemory(),
-        liquid_of(setup, memory.plan),
-        state,
-        index=memory.set_index,
-        now_s=now_s,
-    )
-    return replace(memory, watch=watch)
-
-
-def _swept(setup: Setup, state: VehicleState | None, memory: Memory, now_s: float) -> Swath | None:
-    """Return what was treated until now; None where it is not kept."""
-    if not setup.records_coverage:
-        return None
-    return swath.follow(
-        setup, memory.swath, memory.plan, state,
-        findings=_findings(setup, memory), drift_m=memory.drift_m, now_s=now_s,
-    )  # fmt: skip
-
-
-def _findings(setup: Setup, memory: Memory) -> tuple[Finding, ...]:
-    if memory.watch is None:
-        return ()
-    if setup.pumping is None:
-        return memory.watch.findings
-    # The one valve that was watched is the pump: nothing tells which section it is.
-    return tuple(replace(finding, valve=None) for finding in memory.watch.findings)
+    gain = 1.0 if trim is None else trim.sets[index].trim
+    return Orders(valves, Ordering(index, set_of_rate, trim, is_early), speed_m_s, skew, gain)
 
 
 def _trim(
-    setup: Setup,
-    state: VehicleState,
-    memory: Memory,
-    now_s: float,
+    setup: Setup, state: VehicleState, before: Ordering, liquid: SprayPlan | None, now_s: float
 ) -> TrimMemory | None:
     """Return the trims after the meter's newest count; None where no trim is configured."""
     if setup.trimming is None:
         return None
-    before = memory.trim or flow_trim.begin(len(setup.nozzle_sets))
-    plan, doses = liquid_of(setup, memory.plan), setup.doses
-    is_steady = plan is not None
-    for change in plan.changes if plan is not None else ():
+    doses = setup.doses
+    is_steady = liquid is not None
+    for change in liquid.changes if liquid is not None else ():
         if change.at_s > now_s:
             break
         is_steady = is_steady and not change.restart
-    in_force = duty_in_force(plan, now_s, len(setup.boom.valves))
-    duties = [in_force[valve] for valve in doses.nozzle_sets[memory.set_index].valves]
+    in_force = _in_force(setup, liquid, now_s)
+    duties = [in_force[valve] for valve in doses.nozzle_sets[before.set_index].valves]
     low, high = min(duties), max(duties)
     return flow_trim.follow(
         setup.trimming,
-        before,
+        before.trim or flow_trim.begin(len(setup.nozzle_sets)),
         state.flow,
         is_steady=is_steady and low > 0.0,
         is_saturated=not doses.pwm.duty_min < low <= high < doses.pwm.duty_max,
@@ -216,62 +369,11 @@ def _trim(
     )
 
 
-def duty_in_force(plan: SprayPlan | None, now_s: float, valve_count: int) -> tuple[float, ...]:
-    """Return what `plan` has brought about by `now_s`: its changes so far; closed after it."""
-    if plan is None or not now_s < plan.lease_until_s:
-        return (0.0,) * valve_count
-    duty = list(plan.duty)
-    for change in plan.changes:
-        if change.at_s > now_s:
-            break
-        duty[change.valve] = change.duty
-    return tuple(duty)
-
-
-def _closed(
-    setup: Setup,
-    state: VehicleState | None,
-    reasons: frozenset[Inhibit],
-    sequence: int,
-    memory: Memory,
-    now_s: float,
-) -> tuple[Decision, Memory]:
-    count = len(setup.boom.valves)
-    plan = closed_plan(sequence=sequence, valve_count=count, now_s=now_s, lease_s=setup.lease_s)
-    trim = None
-    if setup.trimming is not None:
-        trim = memory.trim or flow_trim.begin(len(setup.nozzle_sets))
-        trim = flow_trim.pause(trim, None if state is None else state.flow, now_s=now_s)
-    decision = Decision(
-        now_s=now_s,
-        state=state,
-        inhibits=reasons,
-        plan=plan,
-        rate_l_ha=(None,) * count,
-        target_flow_l_min=0.0,
-        flow_l_min=0.0,
-        flow_trim=None if trim is None else trim.sets[trim.set_index].trim,
-        flow_trim_state=None if trim is None else trim.state,
-        findings=_findings(setup, memory),
-        sprayer=shown(memory.machine, is_open=False),
-    )
-    return decision, Memory(
-        plan=plan,
-        trim=trim,
-        watch=memory.watch,
-        reasons=reasons,
-        held=memory.held,
-        machine=memory.machine,
-        pump=memory.pump._replace(is_early=False),
-        swath=memory.swath,
-    )
-
-
 def _nozzle_sets(
     setup: Setup,
     state: VehicleState,
     routes: tuple[Route, ...],
-    memory: Memory,
+    before: Ordering,
     speed_m_s: float,
 ) -> tuple[int, SetOfRate]:
     """Return the set in use and those of the rates ahead; the middle of the boom decides."""
@@ -283,11 +385,19 @@ def _nozzle_sets(
     return sets_ahead(
         setup.nozzle_sets,
         routes[len(routes) // 2],
-        in_use=memory.set_index,
-        before=memory.set_of_rate,
+        in_use=before.set_index,
+        before=before.set_of_rate,
         flow_of=flow_of,
         now_s=state.time_s,
     )
+
+
+# -------------------------------------------------------------------------------- plan and record
+
+
+def _in_force(setup: Setup, plan: SprayPlan | None, now_s: float) -> tuple[float, ...]:
+    """Return the duties that a plan has brought about by now; closed where there is none."""
+    return (0.0,) * len(setup.boom.valves) if plan is None else plan.duty_at(now_s)
 
 
 def _in_order(valves: list[ValveSchedule]) -> tuple[TimedChange, ...]:
@@ -296,53 +406,98 @@ def _in_order(valves: list[ValveSchedule]) -> tuple[TimedChange, ...]:
     return tuple(changes)
 
 
+def _drives(
+    setup: Setup,
+    state: VehicleState,
+    plan: SprayPlan,
+    routes: tuple[Route, ...],
+    orders: Orders,
+    before: SprayPlan | None,
+    ran_s: float,
+) -> tuple[DrivePlan, ...]:
+    """Return what the motors do beside a plan of the valves; `before` is the last whole plan."""
+    now_s, until_s = plan.issued_s, plan.lease_until_s
+    drives: list[DrivePlan] = []
+    if setup.pumping is not None:
+        drives.append(
+            modulated(
+                setup.pumping, state, plan, routes,
+                in_force=0.0 if before is None else before.fraction_at(0, now_s),
+                speed_m_s=orders.speed_m_s, skew=orders.skew / orders.gain,
+                border_buffer_m=setup.border_buffer_m,
+            )
+        )  # fmt: skip
+    elif setup.pump is not None:
+        drives.append(constant_drive(setup.pump, plan))
+    if setup.atomisers:
+        flows = flows_ahead(
+            setup.boom, routes,
+            skew=orders.skew, percent=state.rate_percent, limit_l_ha=setup.rate_max_l_ha,
+        )  # fmt: skip
+        for number, atomiser in enumerate(setup.atomisers, start=len(drives)):
+            drives.append(
+                spinning(
+                    atomiser, flows,
+                    in_force=0.0 if before is None else before.fraction_at(number, now_s),
+                    ran_s=ran_s, output_s=setup.lag.output_s, now_s=now_s, until_s=until_s,
+                )
+            )  # fmt: skip
+    return tuple(drives)
+
+
 def _decision(
     setup: Setup,
     state: VehicleState,
     plan: SprayPlan,
-    valves: list[ValveSchedule],
-    *,
-    index: int,
-    speed_m_s: float,
-    flow_l_min: float,
-    trim: TrimMemory | None,
-    findings: tuple[Finding, ...],
-    sprayer: SprayerState,
-) -> Decision:
+    routes: tuple[Route, ...],
+    orders: Orders,
+    watched: Watched,
+    permission: Permission,
+) -> tuple[Decision, Ordering]:
+    """Return the record of a step that may spray, and its trims with the flow that it orders."""
+    now_s, ordering = plan.issued_s, orders.ordering
+    index, trim = ordering.set_index, ordering.trim
     nozzles = setup.nozzle_sets[index]
+    rates = [valve.rate_now_l_ha for valve in orders.valves]
+    if setup.pumping is not None:  # of sections: what is prescribed for them, not open or shut
+        rates = [rate_at(route, now_s) for route in routes]
     percent, limit_l_ha = state.rate_percent, setup.rate_max_l_ha
     # As if all valves of the set had the rate of this one.
     flows = [
         flow_for_rate(
-            overridden(valves[valve].rate_now_l_ha or 0.0, percent, limit_l_ha),
-            speed_m_s,
+            overridden(rates[valve] or 0.0, percent, limit_l_ha),
+            orders.speed_m_s,
             setup.boom.width_m,
         )
         for valve in nozzles.valves
     ]
-    target = sum(flows) / len(flows)
-    return Decision(
-        now_s=plan.issued_s,
+    flow_l_min = _flow(setup, plan, index)
+    if setup.trimming is not None and trim is not None:
+        trim = flow_trim.ordered(
+            setup.trimming, trim, flow_l_min=flow_l_min, index=index, now_s=now_s
+        )
+    decision = Decision(
+        now_s=now_s,
         state=state,
         inhibits=frozenset(),
         plan=plan,
-        rate_l_ha=tuple(valve.rate_now_l_ha for valve in valves),
-        target_flow_l_min=target,
-        flow_l_min=flow_l_min,
-        late_count=sum(valve.late for valve in valves),
-        unresolved_count=sum(valve.unresolved_count for valve in valves),
+        rate_l_ha=tuple(rates),
+        target_flow_l_min=sum(flows) / len(flows),
+        flow_l_min=flow_l_min * orders.gain,
+        late_count=sum(valve.late for valve in orders.valves),
+        unresolved_count=sum(valve.unresolved_count for valve in orders.valves),
         flow_trim=None if trim is None else trim.sets[index].trim,
         flow_trim_state=None if trim is None else trim.state,
-        findings=findings,
-        sprayer=sprayer,
+        findings=_findings(setup, watched.watch),
+        sprayer=shown(permission.machine, is_open=plan.opens),
         out_of_range_count=sum(not nozzles.curve.delivers(flow) for flow in flows),
     )
+    return decision, ordering._replace(trim=trim)
 
 
 def _flow(setup: Setup, plan: SprayPlan, index: int) -> float:
     """Return the flow [L/min] that the table says of the duties in force from now on."""
-    liquid = liquid_of(setup, plan)
     nozzles = setup.doses.nozzle_sets[index]
-    now = duty_in_force(liquid, plan.issued_s, len(setup.boom.valves))
+    now = _in_force(setup, liquid_of(setup.pumping, plan), plan.issued_s)
     flows = {duty: nozzles.curve.flow_for(duty) for duty in set(now)}
     return sum(flows[now[valve]] for valve in nozzles.valves) / len(nozzles.valves)

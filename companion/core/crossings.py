@@ -12,6 +12,7 @@ outside (`border.py`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,8 +20,7 @@ from numpy.typing import NDArray
 
 from companion.core.boom import Boom
 from companion.core.border import Intervals, add_contacts
-from companion.core.drift import Offset, joined, landed, swept
-from companion.core.lines import Piece, add_off_lines
+from companion.core.drift import Offset, joined, swept
 from companion.core.paths import Floats, Paths, predict
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
 from companion.core.types import VehicleState
@@ -128,16 +128,15 @@ def find_routes(
     border_buffer_m: float,
     across: Across,
     drift_m: Offset | None = None,
-    flown: tuple[Piece, ...] | None = None,
+    close_more: Callable[[Paths, list[Intervals]], None] | None = None,
 ) -> tuple[Route, ...]:
     """Return what each valve is prescribed along its predicted path, left to right.
 
-    With `drift_m` it is what the ground prescribes where the liquid lands; see `drift.py`. With
-    `flown`, the planned lines that are flown on, valves are closed off them; see `lines.py`.
+    `state` is where the liquid lands, `drift_m` how far that is from the nozzles (`drift.py`).
+    `close_more` adds when valves are closed for a reason that is not in the map (`lines.py`).
     """
     reach_m = boom.reach_m + border_buffer_m + SLIVER_M
     if drift_m is not None:
-        state = landed(state, drift_m)
         reach_m += math.hypot(*drift_m)
     paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
     ends, owner = prescription.edges_near(*paths.box(reach_m))
@@ -157,8 +156,8 @@ def find_routes(
             edges = swept(edges, drift_m)
         merge = None if drift_m is None else joined
         add_contacts(paths, edges, boom, border_buffer_m, closed, merge)
-    if flown is not None:
-        add_off_lines(paths, flown, boom, closed, strict=border == "inside")
+    if close_more is not None:
+        close_more(paths, closed)
     speeds = paths.speed_m_s[:, (0, -1)].tolist()
     return tuple(
         _combine(rates[valve], closed[valve], paths, speeds[valve], border)

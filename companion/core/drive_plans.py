@@ -11,13 +11,6 @@ from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 RESTART_FRACTION = 0.02
 
 
-def fraction_in_force(plan: SprayPlan | None, drive: int, now_s: float) -> float:
-    """Return what `plan` has brought a drive to by `now_s`; 0 after its lease."""
-    if plan is None or not now_s < plan.lease_until_s or drive >= len(plan.drives):
-        return 0.0
-    return plan.drives[drive].at(now_s)
-
-
 def as_drive(fraction: float, changes: Sequence[TimedChange]) -> DrivePlan:
     """Return a motor's plan from the changes of duty that the schedule made for it."""
     return DrivePlan(

@@ -2,95 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
-
-from companion.core.atomiser import Flow, spinning
+from companion.core.atomiser import Flow
+from companion.core.boom import Boom
 from companion.core.boom_route import boom_route
 from companion.core.crossings import Route
 from companion.core.dosing import dosing_of, overdrive_of, speed_soon
 from companion.core.drive_plans import (
     as_drive,
     behind_path,
-    constant_drive,
-    fraction_in_force,
     liquid_plan,
 )
-from companion.core.pump import Pumping, PumpMemory, pump_route, sections
+from companion.core.pump import Pumping, pump_route
 from companion.core.rate import flow_for_rate, overridden
-from companion.core.schedule import ValveSchedule, rate_at, schedule, sticky_border_s
+from companion.core.schedule import schedule, sticky_border_s
 from companion.core.types import DrivePlan, SprayPlan, VehicleState
 
-if TYPE_CHECKING:
-    from companion.core.setup import Setup
 
-
-def ways(
-    setup: Setup, routes: tuple[Route, ...], memory: PumpMemory, now_s: float
-) -> tuple[tuple[Route, ...], PumpMemory]:
-    """Return the routes that the valves follow: their own, or those of on-off sections."""
-    if setup.pumping is None:
-        return routes, memory
-    found, is_early = sections(setup.pumping, routes, memory, now_s)
-    return found, memory._replace(is_early=is_early)
-
-
-def with_rates(
-    setup: Setup, valves: list[ValveSchedule], routes: tuple[Route, ...], now_s: float
-) -> list[ValveSchedule]:
-    """Return schedules of sections with what is prescribed for them now."""
-    if setup.pumping is None:
-        return valves
-    return [
-        valve._replace(rate_now_l_ha=rate_at(route, now_s))
-        for valve, route in zip(valves, routes, strict=True)
-    ]
-
-
-def with_drives(
-    setup: Setup,
-    state: VehicleState,
-    plan: SprayPlan,
-    routes: tuple[Route, ...],
-    *,
-    before: SprayPlan | None,
-    memory: PumpMemory,
-    speed_m_s: float,
-    skew: float,
-    gain: float,
-) -> SprayPlan:
-    """Return a plan of the valves with those of the drives: the pump's, the atomisers'.
-
-    `before` is the last plan, `gain` the flow trim's. Without drives it is the plan as it is.
-    """
-    if setup.pump is None and not setup.atomisers:
-        return plan
-    now_s, until_s = plan.issued_s, plan.lease_until_s
-    drives: list[DrivePlan] = []
-    if setup.pumping is not None:
-        drives.append(
-            _pump(
-                setup.pumping, state, plan, routes,
-                in_force=fraction_in_force(before, 0, now_s),
-                speed_m_s=speed_m_s, skew=skew / gain, border_buffer_m=setup.border_buffer_m,
-            )
-        )  # fmt: skip
-    elif setup.pump is not None:
-        drives.append(constant_drive(setup.pump, plan))
-    if setup.atomisers:
-        flows = _flows(setup, state, routes, skew)
-        for number, atomiser in enumerate(setup.atomisers, start=len(drives)):
-            drives.append(
-                spinning(
-                    atomiser, flows,
-                    in_force=fraction_in_force(before, number, now_s), ran_s=memory.ran_s,
-                    output_s=setup.lag.output_s, now_s=now_s, until_s=until_s,
-                )
-            )  # fmt: skip
-    return replace(plan, drives=tuple(drives))
-
-
-def _pump(
+def modulated(
     pumping: Pumping,
     state: VehicleState,
     plan: SprayPlan,
@@ -101,6 +29,7 @@ def _pump(
     skew: float,
     border_buffer_m: float,
 ) -> DrivePlan:
+    """Return the plan of a pump that makes the flow, behind the valves' `plan`."""
     found = schedule(
         pump_route(pumping, routes),
         valve=0,
@@ -117,37 +46,24 @@ def _pump(
     return behind_path(plan, drive) if pumping.pump.way == "valves" else drive
 
 
-def _flows(setup: Setup, state: VehicleState, routes: tuple[Route, ...], skew: float) -> list[Flow]:
+def flows_ahead(
+    boom: Boom, routes: tuple[Route, ...], *, skew: float, percent: float, limit_l_ha: float | None
+) -> list[Flow]:
     """Return the boom's flow along its way, as it comes out of the nozzles."""
-    width_m, percent = setup.boom.width_m * skew, state.rate_percent
+    width_m = boom.width_m * skew
     return [
         Flow(
             step.at_s,
             flow_for_rate(
-                overridden(step.rate_l_ha or 0.0, percent, setup.rate_max_l_ha),
+                overridden(step.rate_l_ha or 0.0, percent, limit_l_ha),
                 step.speed_m_s,
                 width_m,
             ),
         )
-        for step in boom_route(routes, setup.boom)
+        for step in boom_route(routes, boom)
     ]
 
 
-def liquid_of(setup: Setup, plan: SprayPlan | None) -> SprayPlan | None:
+def liquid_of(pumping: Pumping | None, plan: SprayPlan | None) -> SprayPlan | None:
     """Return the plan that the meter's flow follows: the valves', or that of the pump."""
-    if setup.pumping is None:
-        return plan
-    return liquid_plan(plan, setup.pumping.pump.way)
-
-
-def ran(setup: Setup, memory: PumpMemory, plan: SprayPlan | None, now_s: float) -> PumpMemory:
-    """Return the memory with the last moment at which something was to flow."""
-    liquid = liquid_of(setup, plan)
-    if liquid is None or not now_s < liquid.lease_until_s:
-        return memory
-    duty = list(liquid.duty)
-    for change in liquid.changes:
-        if not change.at_s <= now_s:
-            break
-        duty[change.valve] = change.duty
-    return memory._replace(ran_s=now_s) if any(duty) else memory
+    return plan if pumping is None else liquid_plan(plan, pumping.pump.way)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from companion.core.clock import Clock, on_time_s, tick
 from companion.core.frozen import Stand, look
@@ -19,6 +19,7 @@ from companion.core.leg import Approach, Leg, approach, learned, leg_of, stop_ah
 from companion.core.motion import BRIDGED_MAX_S, Told
 from companion.core.order import Order, Place, noted, sorted_in
 from companion.core.rate import is_override
+from companion.core.setup import Setup
 from companion.core.types import (
     BatteryReport,
     ClockReport,
@@ -47,9 +48,6 @@ from companion.core.types import (
     WindReport,
 )
 from companion.core.vehicle_motion import CONFIRM_COUNT, Motion, begun, followed
-
-if TYPE_CHECKING:
-    from companion.core.setup import Setup
 
 SPEED_REPORT_AGE_MAX_S = 1.0
 # Fix, estimator and landed state come at 1 to 5 Hz; older than this they count as not known.

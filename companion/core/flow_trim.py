@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from companion.core.flow_window import (
     ML_S_PER_L_MIN,
@@ -24,11 +24,9 @@ from companion.core.flow_window import (
     with_count,
     with_order,
 )
+from companion.core.nozzle import PwmLimits
+from companion.core.schedule import LagModel
 from companion.core.types import FlowReport, FlowTrimState
-
-if TYPE_CHECKING:
-    from companion.core.nozzle import PwmLimits
-    from companion.core.schedule import LagModel
 
 # Flows are compared over whole PWM periods of about this time: the pulses cancel in them, and 4.6
 # pulses a millilitre over a second tell 4 L/min to 0.3 %.

@@ -7,16 +7,12 @@ geodesic its scale error is x^2 / (2 R^2): 0.3 mm per km at 5 km east of the ori
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from pyproj import CRS, Geod, Transformer
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import NDArray
 
 WGS84 = Geod(ellps="WGS84")
 

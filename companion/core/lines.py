@@ -221,7 +221,7 @@ def _is_along(piece: Piece, way: Way, course: float) -> bool:
 
 
 def add_off_lines(
-    paths: Paths, flown: tuple[Piece, ...], boom: Boom, closed: list[Intervals], *, strict: bool
+    paths: Paths, closed: list[Intervals], *, flown: tuple[Piece, ...], boom: Boom, strict: bool
 ) -> None:
     """Add to `closed` when a valve is beyond the ends of all lines that are flown.
 

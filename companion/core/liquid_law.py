@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 from companion.core.flow_window import ML_S_PER_L_MIN
 from companion.core.liquid_bins import BIN_S, Order, bin_length_s
 from companion.core.liquid_naming import RESTLESS_SHARE
+from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.schedule import LagModel
 from companion.core.types import BatteryReport, FlowReport, TankReport
-
-if TYPE_CHECKING:
-    from companion.core.nozzle import NozzleSet, PwmLimits
-    from companion.core.schedule import LagModel
 
 # A sprayer that follows more slowly than this is judged only when it has settled.
 SLOW_S = 0.5

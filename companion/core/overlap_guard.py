@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +18,9 @@ from numpy.typing import NDArray
 from companion.core.boom import Boom
 from companion.core.coverage import CELL_M, Coverage
 from companion.core.crossings import Crossing, Route
-from companion.core.drift import Offset, landed
 from companion.core.paths import Floats, Paths, predict
-
-if TYPE_CHECKING:
-    from companion.core.controller import Memory
-    from companion.core.setup import Setup
-    from companion.core.types import VehicleState
+from companion.core.swath import Swath, wake_m
+from companion.core.types import VehicleState
 
 Bools = NDArray[np.bool_]
 # From when until when a strip is over treated ground.
@@ -37,11 +32,6 @@ ACROSS_MIN = 5
 # Treated or bare stretches of a way that are shorter are the raster's own noise, or slivers: half
 # of a strip of 1 m.
 STRETCH_MIN_M = 0.5
-# Ground of the last metres of the way is the wake of this very pass: as far as the boom's strips
-# lie one behind the other, a raster's cell, and a gust or two. Whoever has strips farther apart
-# than any aircraft is long has a wrong figure, and half a field is not left unlooked at for it.
-WAKE_MARGIN_M = 1.0
-WAKE_MAX_M = 25.0
 # Below this nothing is sprayed: a way that hardly leads anywhere has no stretches.
 WAY_MIN_M = 0.05
 WAY_MAX_M = 500.0
@@ -67,49 +57,51 @@ class OverlapGuard:
             raise ValueError(f"fresh_s must lie in [0.5, 5] s, got {self.fresh_s}")
 
 
-def wake_m(boom: Boom) -> float:
-    """Return on how much of the last way what is treated is this pass's own."""
-    spread_m = float(boom.forward_m.max() - boom.forward_m.min())
-    return min(spread_m + WAKE_MARGIN_M, WAKE_MAX_M)
-
-
 def guarded(
-    setup: Setup,
-    memory: Memory,
-    state: VehicleState,
+    guard: OverlapGuard,
     routes: tuple[Route, ...],
-    now_s: float,
+    treated: Coverage | None,
+    state: VehicleState,
+    boom: Boom,
     *,
-    drift_m: Offset | None,
+    back_s: float,
+    ahead_s: float,
 ) -> tuple[Route, ...]:
-    """Return the routes, closed over treated ground; as they are where no guard is set."""
-    guard = setup.overlap
-    if guard is None or all(each.rate_l_ha is None for route in routes for each in route):
+    """Return the routes, closed over ground that is `treated`; `state` is where liquid lands."""
+    if all(each.rate_l_ha is None for route in routes for each in route):
         return routes
-    if drift_m is not None:
-        state = landed(state, drift_m)
-    boom = setup.boom
-    seen = None
-    if memory.swath is not None:
-        # The paths begin behind the boom, and their beginning is looked at too.
-        speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
-        behind_m = wake_m(boom) + speed_m_s * setup.back_s
-        here = (state.east_m, state.north_m)
-        seen = memory.swath.before(now_s - guard.fresh_s, here=here, behind_m=behind_m)
-    treated = seen if seen is not None else setup.treated
-    if treated is None or _is_far(setup, treated, state):
+    if treated is None or _is_far(treated, state, boom, ahead_s):
         return routes
-    paths = predict(state, boom.right_m, boom.forward_m, back_s=setup.back_s, ahead_s=setup.ahead_s)
+    paths = predict(state, boom.right_m, boom.forward_m, back_s=back_s, ahead_s=ahead_s)
     spans = treated_spans(treated, paths, boom, share=guard.switch_off_percent / 100.0)
     return tuple(
         cut(route, own) if own else route for route, own in zip(routes, spans, strict=True)
     )
 
 
-def _is_far(setup: Setup, treated: Coverage, state: VehicleState) -> bool:
+def treated_before(
+    guard: OverlapGuard,
+    swath: Swath | None,
+    state: VehicleState,
+    boom: Boom,
+    *,
+    back_s: float,
+    now_s: float,
+) -> Coverage | None:
+    """Return the ground that counts as treated: none of what was sprayed a moment ago."""
+    if swath is None:
+        return None
+    # The paths begin behind the boom, and their beginning is looked at too.
+    speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+    behind_m = wake_m(boom) + speed_m_s * back_s
+    here = (state.east_m, state.north_m)
+    return swath.before(now_s - guard.fresh_s, here=here, behind_m=behind_m)
+
+
+def _is_far(treated: Coverage, state: VehicleState, boom: Boom, ahead_s: float) -> bool:
     """Return whether nothing is treated anywhere near the way of the boom."""
     speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
-    reach_m = setup.boom.reach_m + speed * setup.ahead_s + 12.0  # a wind's offset, a gain of speed
+    reach_m = boom.reach_m + speed * ahead_s + 12.0  # a wind's offset, a gain of speed
     return treated.is_bare(
         state.east_m - reach_m,
         state.north_m - reach_m,

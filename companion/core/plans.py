@@ -109,6 +109,33 @@ class SprayPlan:
         """Whether every valve is closed and every drive stopped, now and later."""
         return not self.opens and all(drive.is_off for drive in self.drives)
 
+    def duty_at(self, at_s: float) -> tuple[float, ...]:
+        """Return what the plan has brought about by a time: its changes so far; closed after it.
+
+        >>> off = TimedChange(at_s=0.2, valve=0, duty=0.0)
+        >>> plan = SprayPlan(
+        ...     sequence=1, issued_s=0.0, duty=(0.5, 0.5), changes=(off,), lease_until_s=0.3)
+        >>> plan.duty_at(0.1), plan.duty_at(0.2), plan.duty_at(0.3)
+        ((0.5, 0.5), (0.0, 0.5), (0.0, 0.0))
+        """
+        if not at_s < self.lease_until_s:
+            return (0.0,) * len(self.duty)
+        changes = self.changes
+        if not changes or changes[0].at_s > at_s:
+            return self.duty
+        duty = list(self.duty)
+        for change in changes:
+            if change.at_s > at_s:
+                break
+            duty[change.valve] = change.duty
+        return tuple(duty)
+
+    def fraction_at(self, drive: int, at_s: float) -> float:
+        """Return what the plan has brought a drive to by a time; 0 after it, or without it."""
+        if not at_s < self.lease_until_s or drive >= len(self.drives):
+            return 0.0
+        return self.drives[drive].at(at_s)
+
     @property
     def opens(self) -> bool:
         """Whether a valve is open, now or later."""

@@ -9,7 +9,7 @@ there are any, are on-off sections then. Whatever the laws say, the last word ha
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from companion.core.boom import Boom
 from companion.core.boom_route import boom_route, bridged
@@ -139,30 +139,21 @@ def _by_way(pump: Pump, own: Timing, valve: Timing) -> Timing:
     return replace(shut, on_s=ready_s, border_on_s=ready_s)
 
 
-class PumpMemory(NamedTuple):
-    """When liquid last flowed by what was ordered, and whether a valve is open ahead of it."""
-
-    ran_s: float = float("-inf")
-    is_early: bool = False
-
-
-DRY = PumpMemory()
-
-
 def sections(
-    pumping: Pumping, routes: tuple[Route, ...], memory: PumpMemory, now_s: float
+    pumping: Pumping, routes: tuple[Route, ...], *, ran_s: float, was_early: bool, now_s: float
 ) -> tuple[tuple[Route, ...], bool]:
     """Return the routes of on-off valves, and whether the first one opens ahead of the flow.
 
     Without a return valve the pump can only start behind an open valve. The first valve to open
     does so early enough for the pump's first flow to be in time, if the pump has stood still for
-    long enough that nothing comes out before.
+    long enough that nothing comes out before: `ran_s` is when something was last to flow, by the
+    orders. `was_early` says that a valve is open ahead of it already.
     """
     dwell_s = pumping.valve_timing.dwell_min_s
     shut = tuple(_on_off(route, dwell_s) for route in routes)
     is_open = any(_is_open_at(route, now_s) for route in shut)
-    is_dry = now_s - memory.ran_s >= pumping.lag.off_end_s
-    is_early = not is_open and (memory.is_early or is_dry) and pumping.early_s > 0.0
+    is_dry = now_s - ran_s >= pumping.lag.off_end_s
+    is_early = not is_open and (was_early or is_dry) and pumping.early_s > 0.0
     if not is_early:
         return shut, False
     starts = [_start_s(route, now_s) for route in shut]

@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
-from companion.core.crossings import Route, find_routes
-from companion.core.drift import Offset, is_same, offset
-from companion.core.lines import Piece
-from companion.core.overlap_guard import guarded
+from companion.core.crossings import Route
+from companion.core.drift import Offset
 from companion.core.paths import STRAIGHT_YAW_RATE_DEG_S, place_velocity
 from companion.core.types import VehicleState
-
-if TYPE_CHECKING:
-    from companion.core.controller import Memory
-    from companion.core.setup import Setup
 
 # Crossings found in one step are carried on for this long, if the path does not leave its
 # prediction by more than these and none of them is to be ordered within this time.
@@ -24,54 +18,40 @@ ROUTES_ALONG_M = 0.2
 ROUTES_EXACT_S = 0.15
 
 
-def routes_ahead(
-    setup: Setup, state: VehicleState, memory: Memory, now_s: float
-) -> tuple[tuple[Route, ...], VehicleState, Offset | None]:
-    """Return the valves' routes, the state that they were found from, and their wind offset.
+class KnownRoutes(NamedTuple):
+    """The routes in view, the state that they were found from, and the wind's offset then."""
+
+    routes: tuple[Route, ...] = ()
+    found_from: VehicleState | None = None
+    drift_m: Offset | None = None
+
+
+NO_ROUTES = KnownRoutes()
+
+
+def carried_on(
+    known: KnownRoutes, state: VehicleState, *, longest_s: float, reach_m: float, now_s: float
+) -> KnownRoutes | None:
+    """Return the routes of before at the times that the new position gives; None if they are over.
 
     On a straight pass the same edges are crossed at every step: as long as the prediction holds
-    and no crossing is due soon, the last ones are carried on and only their times are shifted.
+    and no crossing is due within `longest_s`, the longest lead, the last ones are carried on.
     """
-    found_from = memory.routes_from
-    drift_m = offset(setup.drift, state, now_s)
-    if found_from is not None and is_same(drift_m, memory.drift_m):
-        shift = _shift(setup, found_from, state, now_s)
-        if shift is not None:
-            routes = _shifted(memory.routes, shift, now_s)
-            soon_s = now_s + setup.longest_s + ROUTES_EXACT_S
-            if all(len(route) == 1 or route[1].at_s > soon_s for route in routes):
-                return routes, found_from, memory.drift_m
-    routes = find_routes(
-        setup.prescription,
-        state,
-        setup.boom,
-        back_s=setup.back_s,
-        ahead_s=setup.ahead_s,
-        border=setup.border,
-        border_buffer_m=setup.border_buffer_m,
-        across=setup.across,
-        drift_m=drift_m,
-        flown=_flown(setup, state, memory),
-    )
-    return guarded(setup, memory, state, routes, now_s, drift_m=drift_m), state, drift_m
-
-
-def _flown(setup: Setup, state: VehicleState, memory: Memory) -> tuple[Piece, ...] | None:
-    """Return the planned lines that the vehicle is on; None where spraying needs none."""
-    if setup.lines is None:
+    if known.found_from is None:
         return None
-    was_on_one = any(zone.rate_l_ha is not None for route in memory.routes for zone in route)
-    return setup.lines.flown(
-        state,
-        back_s=setup.back_s,
-        ahead_s=setup.ahead_s,
-        reach_m=setup.boom.reach_m,
-        entering=not was_on_one,
-    )
+    exact_s = longest_s + ROUTES_EXACT_S
+    shift = _shift(known.found_from, state, exact_s=exact_s, reach_m=reach_m, now_s=now_s)
+    if shift is None:
+        return None
+    routes = _shifted(known.routes, shift, now_s)
+    soon_s = now_s + exact_s
+    if not all(len(route) == 1 or route[1].at_s > soon_s for route in routes):
+        return None
+    return known._replace(routes=routes)
 
 
 def _shift(
-    setup: Setup, before: VehicleState, state: VehicleState, now_s: float
+    before: VehicleState, state: VehicleState, *, exact_s: float, reach_m: float, now_s: float
 ) -> tuple[float, float, float] | None:
     """Return how far along, how fast then and how fast now; None where the prediction fails."""
     age_s = now_s - before.time_s
@@ -93,8 +73,8 @@ def _shift(
     aside = abs(off_north * east - off_east * north) / speed
     bend = abs(then_east * north - then_north * east) / (speed * then)
     turned_deg = ((state.heading_deg or 0.0) - (before.heading_deg or 0.0) + 180.0) % 360.0 - 180.0
-    aside += bend * speed * (setup.longest_s + ROUTES_EXACT_S)
-    aside += math.radians(abs(turned_deg)) * setup.boom.reach_m
+    aside += bend * speed * exact_s
+    aside += math.radians(abs(turned_deg)) * reach_m
     along = (off_east * east + off_north * north) / speed
     if not (aside <= ROUTES_ASIDE_M and abs(along) <= ROUTES_ALONG_M):
         return None

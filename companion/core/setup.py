@@ -22,6 +22,8 @@ from companion.core.prescription import Prescription
 from companion.core.pump import Pump, Pumping
 from companion.core.routes import ROUTES_KEPT_S
 from companion.core.schedule import LagModel, Timing
+from companion.core.swath import SwathSettings
+from companion.core.swath_liquid import Lags
 from companion.core.types import Method
 
 
@@ -59,6 +61,7 @@ class Setup:
     pumping: Pumping | None = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
     watching: Watching | None = field(init=False, repr=False, compare=False)
+    swathing: SwathSettings | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.lease_s <= 5.0:
@@ -87,6 +90,15 @@ class Setup:
         if self.detection is not None:
             watching = Watching.of(self.detection, doses.nozzle_sets, doses.lag, doses.pwm)
         object.__setattr__(self, "watching", watching)
+        object.__setattr__(self, "swathing", self._swathing() if self.records_coverage else None)
+
+    def _swathing(self) -> SwathSettings:
+        return SwathSettings(
+            boom=self.boom,
+            lags=Lags(valve=self.lag, flow=self.doses.lag),
+            is_pumped=self.pumping is not None,
+            treated=self.treated,
+        )
 
     def _pumping(self) -> Pumping | None:
         if self.pump is None:

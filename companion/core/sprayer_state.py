@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from companion.core.interlock import Held, Limits, inhibits, settled
 from companion.core.types import Inhibit, SprayerState, VehicleState
 
 # Somebody has to see to the sprayer.
@@ -99,3 +100,35 @@ def _unlatched(before: SprayerState, reasons: frozenset[Inhibit]) -> SprayerStat
 def shown(machine: Machine, *, is_open: bool) -> SprayerState:
     """Return the state to be told: SPRAYING where a valve is open or about to be."""
     return SprayerState.SPRAYING if is_open else machine.state
+
+
+class Permission(NamedTuple):
+    """Every reason not to spray now, those that stay for a while, and the sprayer's state."""
+
+    reasons: frozenset[Inhibit] = frozenset()
+    held: Held = ()
+    machine: Machine = BOOT
+
+
+UNASKED = Permission()
+
+
+def permit(
+    before: Permission,
+    state: VehicleState | None,
+    limits: Limits,
+    *,
+    faults: frozenset[Inhibit],
+    field_bounds_m: tuple[float, float, float, float],
+    now_s: float,
+) -> Permission:
+    """Return whether anything may be sprayed now: only where there is no reason against it.
+
+    `faults` are what flow, pressure and tank say.
+    """
+    reasons = inhibits(
+        state, limits, field_bounds_m=field_bounds_m, now_s=now_s, before=before.reasons
+    )
+    reasons, held = settled(reasons | faults, before.held, now_s)
+    machine, reasons = follow(before.machine, reasons, state)
+    return Permission(reasons, held, machine)

@@ -11,21 +11,16 @@ long as they are straight: a step stays cheap.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
 
+from companion.core.boom import Boom
 from companion.core.coverage import Coverage, Place
-from companion.core.overlap_guard import wake_m
-from companion.core.swath_liquid import Toggle, open_at, ordered_until
+from companion.core.drift import Offset
+from companion.core.swath_liquid import Lags, Toggle, open_at, ordered_until
 from companion.core.swath_way import Front, swept
 from companion.core.types import Finding, SprayPlan, VehicleState
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from companion.core.boom import Boom
-    from companion.core.controller import Memory
-    from companion.core.drift import Offset
-    from companion.core.setup import Setup
 
 # The way is stamped after this time: a swath of 10 m at 5 m/s is one look at some 2000 cells.
 STAMP_EVERY_S = 2.0
@@ -41,6 +36,27 @@ JUMP_MAX_M = 25.0
 # are a stamp's time and a fifth of the wake apart, so seven go back beyond both.
 SNAPSHOTS_MAX = 8
 SNAPSHOT_WAKES = 0.2
+# Ground of the last metres of the way is the wake of this very pass: as far as the boom's strips
+# lie one behind the other, a raster's cell, and a gust or two. The gap is capped at the length of
+# the longest aircraft, so that a wrong figure cannot leave half the field unchecked.
+WAKE_MARGIN_M = 1.0
+WAKE_MAX_M = 25.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwathSettings:
+    """What the record of treated ground has to know of the sprayer, and of earlier flights."""
+
+    boom: Boom
+    lags: Lags
+    is_pumped: bool
+    treated: Coverage | None = None
+
+
+def wake_m(boom: Boom) -> float:
+    """Return on how much of the last way what is treated is this pass's own."""
+    spread_m = float(boom.forward_m.max() - boom.forward_m.min())
+    return min(spread_m + WAKE_MARGIN_M, WAKE_MAX_M)
 
 
 class Snapshot(NamedTuple):
@@ -97,40 +113,39 @@ class Swath(NamedTuple):
         return self._replace(way_m=self.came_m(places), place=places[-1])
 
 
-def begin(setup: Setup) -> Swath:
+def begin(settings: SwathSettings) -> Swath:
     """Return the swath of a flight that has not sprayed yet."""
-    treated = setup.treated or Coverage()
-    shut = (False,) * len(setup.boom.valves)
+    treated = settings.treated or Coverage()
+    shut = (False,) * len(settings.boom.valves)
     return Swath(treated, (Snapshot(-math.inf, -math.inf, treated),), (), shut, shut)
 
 
 def follow(
-    setup: Setup,
+    settings: SwathSettings,
     swath: Swath | None,
     plan: SprayPlan | None,
     state: VehicleState | None,
     *,
+    pumped: SprayPlan | None = None,
     findings: tuple[Finding, ...],
     drift_m: Offset | None,
     now_s: float,
-) -> Swath | None:
-    """Return the swath until `now_s`, where `plan` was the one in force; None without a record."""
-    if not setup.records_coverage:
-        return None
+) -> Swath:
+    """Return the swath until `now_s`, where `plan` was the one in force, `pumped` its pump's."""
     if swath is None:
-        swath = begin(setup)
-    if not (findings or setup.pumping is not None) and _stays_so(swath, plan, state, now_s):
+        swath = begin(settings)
+    if not (findings or settings.is_pumped) and _stays_so(swath, plan, state, now_s):
         return swath
-    swath = _ordered(setup, swath, plan, findings, now_s)
+    swath = _ordered(settings, swath, plan, pumped, findings, now_s=now_s)
     is_at_work = any(swath.is_open) or any(swath.ordered) or bool(swath.toggles)
     if not (is_at_work or (plan is not None and plan.opens)):
         return swath.come()._replace(fronts=()) if swath.fronts else swath
     front = _front(state, drift_m)
     if front is None or not swath.fronts:
-        return _broken_off(setup, swath, front, now_s)
+        return _broken_off(settings, swath, front, now_s)
     if not is_at_work:
         return swath.come(front)._replace(fronts=(front,))
-    return _moved(setup, swath, front, now_s)
+    return _moved(settings, swath, front, now_s)
 
 
 def _stays_so(
@@ -156,32 +171,42 @@ def _stays_so(
     return away_m < FRONT_STEP_M and state.time_s - last_s < FRONT_EVERY_S
 
 
-def _moved(setup: Setup, swath: Swath, front: Front, now_s: float) -> Swath:
+def _moved(settings: SwathSettings, swath: Swath, front: Front, now_s: float) -> Swath:
     last = swath.fronts[-1]
     moved_m = math.hypot(front.east_m - last.east_m, front.north_m - last.north_m)
     if not (0.0 <= front.time_s - last.time_s <= GAP_MAX_S and moved_m <= JUMP_MAX_M):
-        return _broken_off(setup, swath, front, now_s)
+        return _broken_off(settings, swath, front, now_s)
     if now_s - swath.fronts[0].time_s >= STAMP_EVERY_S:
-        return _stamped(setup.boom, swath, front)
+        return _stamped(settings.boom, swath, front)
     if moved_m < FRONT_STEP_M and front.time_s - last.time_s < FRONT_EVERY_S:
         return swath
     return swath._replace(fronts=(*swath.fronts, front))
 
 
 def expected(
-    setup: Setup, memory: Memory, state: VehicleState | None, *, now_s: float, cut_s: float
+    settings: SwathSettings,
+    swath: Swath | None,
+    plan: SprayPlan | None,
+    state: VehicleState | None,
+    *,
+    pumped: SprayPlan | None = None,
+    findings: tuple[Finding, ...],
+    drift_m: Offset | None,
+    now_s: float,
+    cut_s: float,
 ) -> Coverage:
     """Return the coverage as it will be if all goes on until `cut_s` and every valve closes then.
 
-    With `cut_s` at `now_s` it is that of a flight that ends now. `memory` is what the step of
-    `now_s` has left.
+    With `cut_s` at `now_s` it is that of a flight that ends now. `swath` and `plan` are what the
+    step of `now_s` has left.
     """
-    swath = memory.swath or begin(setup)
-    front = _front(state, memory.drift_m)
+    swath = swath or begin(settings)
+    front = _front(state, drift_m)
     if front is None or state is None or not swath.fronts:
         return swath.coverage
-    ahead = _ordered(setup, swath, memory.plan, _found(memory), max(cut_s, now_s), lapses=False)
-    closes_s = cut_s + max(setup.lag.off_s, setup.doses.lag.off_s) + setup.lag.output_s
+    ahead = _ordered(settings, swath, plan, pumped, findings, now_s=max(cut_s, now_s), lapses=False)
+    lags = settings.lags
+    closes_s = cut_s + max(lags.valve.off_s, lags.flow.off_s) + lags.valve.output_s
     toggles = [toggle for toggle in ahead.toggles if toggle.opens is False or toggle.at_s <= cut_s]
     for valve, is_open in enumerate(ahead.ordered):
         if is_open:
@@ -198,12 +223,8 @@ def expected(
         front.heading_deg + state.yaw_rate_deg_s * carried_s,
     )
     ahead = ahead._replace(fronts=tuple(fronts), toggles=tuple(toggles))
-    made = _stamped(setup.boom, ahead, end).coverage
+    made = _stamped(settings.boom, ahead, end).coverage
     return Coverage(tiles=made.tiles, ahead_s=max(cut_s - now_s, 0.0))
-
-
-def _found(memory: Memory) -> tuple[Finding, ...]:
-    return () if memory.watch is None else memory.watch.findings
 
 
 def _front(state: VehicleState | None, drift_m: Offset | None) -> Front | None:
@@ -217,16 +238,17 @@ def _front(state: VehicleState | None, drift_m: Offset | None) -> Front | None:
 
 
 def _ordered(
-    setup: Setup,
+    settings: SwathSettings,
     swath: Swath,
     plan: SprayPlan | None,
+    pumped: SprayPlan | None,
     findings: tuple[Finding, ...],
-    now_s: float,
     *,
+    now_s: float,
     lapses: bool = True,
 ) -> Swath:
     ordered, toggles = ordered_until(
-        setup, plan, findings, now_s,
+        plan, pumped, findings, now_s=now_s, lags=settings.lags,
         ordered=swath.ordered, toggles=swath.toggles, lapses=lapses,
     )  # fmt: skip
     if ordered is swath.ordered:
@@ -234,10 +256,10 @@ def _ordered(
     return swath._replace(ordered=ordered, toggles=toggles)
 
 
-def _broken_off(setup: Setup, swath: Swath, front: Front | None, now_s: float) -> Swath:
+def _broken_off(settings: SwathSettings, swath: Swath, front: Front | None, now_s: float) -> Swath:
     """Return the swath stamped as far as its way is known, and begun anew at `front`."""
     if len(swath.fronts) > 1:
-        swath = _stamped(setup.boom, swath._replace(fronts=swath.fronts[:-1]), swath.fronts[-1])
+        swath = _stamped(settings.boom, swath._replace(fronts=swath.fronts[:-1]), swath.fronts[-1])
     is_open, toggles = open_at(swath.is_open, swath.toggles, now_s)
     fronts = () if front is None else (front,)
     return swath.come(*fronts)._replace(fronts=fronts, is_open=is_open, toggles=toggles)

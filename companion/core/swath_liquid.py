@@ -8,17 +8,20 @@ the rise or fall.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from companion.core.drives import liquid_of
+from companion.core.schedule import LagModel
 from companion.core.types import FaultKind, Finding, SprayPlan
-
-if TYPE_CHECKING:
-    from companion.core.schedule import LagModel
-    from companion.core.setup import Setup
 
 # Found in the liquid: nothing, or not what was ordered, comes out.
 NO_LIQUID = frozenset({FaultKind.NO_FLOW, FaultKind.PUMP_OFF, FaultKind.TANK_EMPTY, FaultKind.AIR})
+
+
+class Lags(NamedTuple):
+    """The lag of the valves, and that of what makes the flow: the same, or a pump's."""
+
+    valve: LagModel
+    flow: LagModel
 
 
 class Toggle(NamedTuple):
@@ -30,42 +33,43 @@ class Toggle(NamedTuple):
 
 
 def ordered_until(
-    setup: Setup,
     plan: SprayPlan | None,
+    pumped: SprayPlan | None,
     findings: tuple[Finding, ...],
-    now_s: float,
     *,
+    now_s: float,
+    lags: Lags,
     ordered: tuple[bool, ...],
     toggles: tuple[Toggle, ...],
     lapses: bool,
 ) -> tuple[tuple[bool, ...], tuple[Toggle, ...]]:
     """Return what is ordered by `now_s` and what becomes of it, after what was until then.
 
-    With `lapses` a plan ends with its lease, as an executor has it.
+    `pumped` is the flow of a pump that makes it, where there is one. With `lapses` a plan ends with
+    its lease, as an executor has it.
     """
-    for at_s, opened, lag in _openings(setup, plan, now_s, lapses=lapses):
+    for at_s, opened, lag in _openings(plan, pumped, lags, now_s, lapses=lapses):
         wanted = _real(opened, findings) if findings else opened
         if wanted == ordered:
             continue
         for valve, (was, opens) in enumerate(zip(ordered, wanted, strict=True)):
             if was != opens:
-                lag_s = (lag.on_s if opens else lag.off_s) + setup.lag.output_s
+                lag_s = (lag.on_s if opens else lag.off_s) + lags.valve.output_s
                 toggles = toggled(toggles, Toggle(at_s + lag_s, valve, opens))
         ordered = wanted
     return ordered, toggles
 
 
 def _openings(
-    setup: Setup, plan: SprayPlan | None, now_s: float, *, lapses: bool
+    plan: SprayPlan | None, pumped: SprayPlan | None, lags: Lags, now_s: float, *, lapses: bool
 ) -> list[tuple[float, tuple[bool, ...], LagModel]]:
     """Return which valves let liquid out, from when on, and by the lag of what."""
     if plan is None:
         return []
     duty = [each > 0.0 for each in plan.duty]
     until_s = min(now_s, plan.lease_until_s) if lapses else now_s
-    pumped = None if setup.pumping is None else liquid_of(setup, plan)
     runs = pumped is None or pumped.duty[0] > 0.0
-    lag = setup.lag
+    lag = lags.valve
     found = [(plan.issued_s, tuple(each and runs for each in duty), lag)]
     changes = [(change.at_s, change.valve, change.duty > 0.0) for change in plan.changes]
     if pumped is not None:
@@ -78,10 +82,10 @@ def _openings(
             runs = opens
         else:
             duty[valve] = opens
-        lag = setup.doses.lag if valve < 0 else setup.lag
+        lag = lags.flow if valve < 0 else lags.valve
         found.append((at_s, tuple(each and runs for each in duty), lag))
     if lapses and not now_s < plan.lease_until_s:
-        found.append((plan.lease_until_s, (False,) * len(duty), setup.lag))
+        found.append((plan.lease_until_s, (False,) * len(duty), lags.valve))
     return found
 
 

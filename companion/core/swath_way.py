@@ -5,15 +5,13 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from companion.core.boom import Boom
 from companion.core.coverage import Place, Quad
-
-if TYPE_CHECKING:
-    from companion.core.boom import Boom
-    from companion.core.swath_liquid import Toggle
+from companion.core.swath_liquid import Toggle
 
 # So far a tip of the boom may be off a straight piece: below the noise of an RTK position.
 STRAIGHT_M = 0.03

@@ -21,11 +21,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.core.controller import Memory
+from companion.core.controller import Memory, expected_coverage
 from companion.core.coverage import Coverage
 from companion.core.overlap_guard import OverlapGuard
 from companion.core.setup import Setup
-from companion.core.swath import expected
 from companion.core.types import Input, OperatorCommand, VehicleState
 from companion.ports import COMMIT_EVERY_S
 from companion.record.commit_pace import commit_every_s
@@ -164,8 +163,8 @@ class _Journal:
             self._told_s = now_s
             ahead_s = coverage_ahead_s(self._every_s)
             self._told = (
-                expected(self._setup, memory, state, now_s=now_s, cut_s=now_s + ahead_s),
-                expected(self._setup, memory, state, now_s=now_s, cut_s=now_s),
+                expected_coverage(self._setup, memory, state, now_s=now_s, cut_s=now_s + ahead_s),
+                expected_coverage(self._setup, memory, state, now_s=now_s, cut_s=now_s),
             )
 
 

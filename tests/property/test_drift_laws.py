@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.crossings import Route, find_routes
-from companion.core.drift import Drift, Offset, offset
+from companion.core.drift import Drift, Offset, landed, offset
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import VehicleState, WindReport
 from tests.builders import SPRAYING, along, boom, flying
@@ -37,6 +37,8 @@ BOOM = boom()
 
 
 def routes(state: VehicleState, drift_m: Offset | None, buffer_m: float = 0.0) -> tuple[Route, ...]:
+    if drift_m is not None:
+        state = landed(state, drift_m)
     return find_routes(
         FIELD, state, BOOM, back_s=BACK_S, ahead_s=AHEAD_S, border="inside",
         border_buffer_m=buffer_m, across="centre", drift_m=drift_m,

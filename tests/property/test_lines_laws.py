@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import shapely
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.crossings import Route, find_routes
-from companion.core.lines import Lines, Piece, Polyline
+from companion.core.lines import Lines, Piece, Polyline, add_off_lines
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import VehicleState, Way
 from tests.builders import along, boom, flying
@@ -34,7 +35,8 @@ def found(lines: Lines, state: VehicleState, ground: Prescription = FIELD) -> tu
     flown = lines.flown(state, back_s=BACK_S, ahead_s=AHEAD_S, reach_m=BOOM.reach_m)
     return find_routes(
         ground, state, BOOM, back_s=BACK_S, ahead_s=AHEAD_S, border="inside",
-        border_buffer_m=0.05, across="centre", flown=flown,
+        border_buffer_m=0.05, across="centre",
+        close_more=partial(add_off_lines, flown=flown, boom=BOOM, strict=True),
     )  # fmt: skip
 
 

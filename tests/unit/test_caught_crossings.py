@@ -19,7 +19,6 @@ from companion.core.motion import CRUISE
 from companion.core.nozzle import FlowCurve
 from companion.core.paths import predict
 from companion.core.prescription import Prescription, Zone
-from companion.core.routes import routes_ahead
 from companion.core.types import VehicleState
 from tests.builders import flying, setup
 
@@ -221,23 +220,23 @@ def second_step(first: VehicleState, second: VehicleState) -> tuple[Memory, Memo
 
 
 def times(memory: Memory) -> list[list[float]]:
-    return [[crossing.at_s for crossing in each[1:]] for each in memory.routes]
+    return [[crossing.at_s for crossing in each[1:]] for each in memory.routes.routes]
 
 
 @pytest.mark.parametrize("off_m", [-0.02, 0.0, 0.02])
 def test_crossings_carried_on_are_where_the_new_position_has_them(off_m: float) -> None:
     # 0.75 s ahead of the boundary at 12 m.
     carried, anew = second_step(flying(10.0, 8.0), flying(10.05, 8.25 + off_m))
-    assert carried.routes_from is not None
-    assert carried.routes_from.time_s == 10.0  # not found anew
+    assert carried.routes.found_from is not None
+    assert carried.routes.found_from.time_s == 10.0  # not found anew
     assert [each[0] for each in times(carried)] == pytest.approx([10.05 + (3.75 - off_m) / 5.0] * 6)
     assert [each[0] for each in times(anew)] == pytest.approx([10.05 + (3.75 - off_m) / 5.0] * 6)
 
 
 def test_crossings_that_are_due_soon_are_found_anew() -> None:
     carried, _ = second_step(flying(10.0, 11.0), flying(10.05, 11.25))
-    assert carried.routes_from is not None
-    assert carried.routes_from.time_s == 10.05
+    assert carried.routes.found_from is not None
+    assert carried.routes.found_from.time_s == 10.05
 
 
 def test_in_a_turn_crossings_are_found_anew() -> None:
@@ -245,8 +244,8 @@ def test_in_a_turn_crossings_are_found_anew() -> None:
     carried, _ = second_step(
         flying(10.0, 8.0, **turning), flying(10.01, 8.05, heading_deg=90.035, **turning)
     )
-    assert carried.routes_from is not None
-    assert carried.routes_from.time_s == 10.01
+    assert carried.routes.found_from is not None
+    assert carried.routes.found_from.time_s == 10.01
 
 
 def test_a_place_that_outruns_its_velocity_crosses_sooner_and_is_dosed_by_the_velocity() -> None:
@@ -268,11 +267,10 @@ def test_carried_routes_go_with_the_place_that_outruns_its_velocity() -> None:
     """A step later the vehicle is where it was expected: the crossing keeps its time."""
     made = setup()
     first = flying(10.0, 9.0, outrun_east_m_s=0.4)
-    routes, found_from, drift_m = routes_ahead(made, first, Memory(), 10.0)
-    memory = Memory(routes=routes, routes_from=found_from, drift_m=drift_m)
+    _, memory = step(made, first, Memory(), 10.0)
     later = flying(10.05, 9.0 + 5.4 * 0.05, outrun_east_m_s=0.4)
-    again, still_from, _ = routes_ahead(made, later, memory, 10.05)
-    assert still_from is found_from
-    for route, before in zip(again, routes, strict=True):
+    again = step(made, later, memory, 10.05)[1].routes
+    assert again.found_from is first
+    for route, before in zip(again.routes, memory.routes.routes, strict=True):
         assert len(route) == 2
         assert [one.at_s for one in route[1:]] == pytest.approx([one.at_s for one in before[1:]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from companion.core.controller import Memory, duty_in_force, step
+from companion.core.controller import Memory, step
 from companion.core.crossings import Across, find_routes
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.prescription import Prescription, Zone
@@ -106,7 +106,7 @@ def test_settled_reference_puts_the_end_of_the_rise_on_the_boundary() -> None:
 def test_a_strip_that_touches_the_outside_stays_closed() -> None:
     memory = Memory()
     decision, _ = step(setup(), flying(10.0, 24.0, north_m=5.0), memory, 10.0)
-    duty = duty_in_force(decision.plan, 10.0, 6)
+    duty = decision.plan.duty_at(10.0)
     # The boom reaches from north 8 (left) to 2; the boundary lies at 7, its buffer at 6.9.
     assert [value > 0.0 for value in duty] == [False, False, True, True, True, True]
 
@@ -114,7 +114,7 @@ def test_a_strip_that_touches_the_outside_stays_closed() -> None:
 def test_flying_backwards_keeps_each_valve_on_its_side() -> None:
     state = flying(10.0, 24.0, north_m=5.0, heading_deg=270.0)
     decision, _ = step(setup(), state, Memory(), 10.0)
-    duty = duty_in_force(decision.plan, 10.0, 6)
+    duty = decision.plan.duty_at(10.0)
     assert [value > 0.0 for value in duty] == [True, True, True, True, False, False]
 
 
@@ -122,7 +122,7 @@ def test_the_heading_and_not_the_course_turns_the_boom() -> None:
     # Course east, nose 40 degrees off: the left end of the boom is 2.5 * sin(40) m behind.
     state = flying(10.0, 10.0, heading_deg=130.0)
     given = setup()
-    routes = step(given, state, Memory(), 10.0)[1].routes
+    routes = step(given, state, Memory(), 10.0)[1].routes.routes
     ahead = [route[1].at_s - 10.0 for route in routes]
     offset = [valve.right_m * math.cos(math.radians(130.0)) for valve in given.boom.valves]
     assert ahead == pytest.approx([(2.0 - east) / SPEED for east in offset], abs=1e-9)
@@ -234,11 +234,11 @@ def test_noise_does_not_take_an_issued_change_back() -> None:
     # Order at crossing - 0.114 s: due at 10.286; position says that it is just past.
     decision, memory = step(given, flying(10.29, 11.45), memory, 10.29)
     assert all(value == pytest.approx(duty_of(25.0)) for value in
-               duty_in_force(decision.plan, 10.29, 6))  # fmt: skip
+               decision.plan.duty_at(10.29))  # fmt: skip
     # The next position says that it is 15 ms ahead again: the change stands.
     decision, _ = step(given, flying(10.30, 11.36), memory, 10.30)
     assert all(value == pytest.approx(duty_of(25.0), abs=0.01) for value in
-               duty_in_force(decision.plan, 10.30, 6))  # fmt: skip
+               decision.plan.duty_at(10.30))  # fmt: skip
 
 
 # Wang et al. 2024, Table 2: one of twelve nozzles. Not `CURVE`: a judge has its own numbers.
@@ -258,7 +258,7 @@ def test_a_sprayer_straight_between_its_measured_points_gives_what_was_asked(
     rate_l_ha = wanted_l_min / (0.006 * 6.0 * SPEED)
     field = Prescription(plots([[rate_l_ha] * 4]), boundary=shapely.box(0.0, -1.0, 48.0, 7.0))
     decision, _ = step(setup(prescription=field), flying(10.0, 6.0), Memory(), 10.0)
-    duty = duty_in_force(decision.plan, 10.0, 6)
+    duty = decision.plan.duty_at(10.0)
     assert [given_l_min(each) for each in duty] == pytest.approx([wanted_l_min] * 6, rel=1e-6)
 
 
@@ -289,13 +289,13 @@ def test_the_nozzle_set_changes_with_hysteresis_and_not_inside_a_zone() -> None:
     )
     given = setup(nozzle_sets=(small, large))
     decision, memory = step(given, flying(10.0, 26.0), Memory(), 10.0)  # 15 L/ha: 2.7 L/min
-    assert memory.set_index == 0
-    duty = duty_in_force(decision.plan, 10.0, 6)
+    assert memory.ordering.set_index == 0
+    duty = decision.plan.duty_at(10.0)
     assert [value > 0 for value in duty] == [True] * 4 + [False] * 2
     # Faster in the same zone: 3.9 L/min is still within the small set; it stays.
     state = flying(10.05, 26.3, velocity_east_m_s=7.2, checked_speed_m_s=7.2)
     _, memory = step(given, state, memory, 10.05)
-    assert memory.set_index == 0
+    assert memory.ordering.set_index == 0
 
 
 def test_plans_expire_and_what_is_in_force_after_that_is_closed() -> None:
@@ -306,10 +306,9 @@ def test_plans_expire_and_what_is_in_force_after_that_is_closed() -> None:
         changes=(TimedChange(at_s=1.1, valve=0, duty=0.7),),
         lease_until_s=1.3,
     )
-    assert duty_in_force(plan, 1.05, 1) == (0.5,)
-    assert duty_in_force(plan, 1.1, 1) == (0.7,)
-    assert duty_in_force(plan, 1.3, 1) == (0.0,)
-    assert duty_in_force(None, 1.3, 1) == (0.0,)
+    assert plan.duty_at(1.05) == (0.5,)
+    assert plan.duty_at(1.1) == (0.7,)
+    assert plan.duty_at(1.3) == (0.0,)
 
 
 def test_in_a_turn_each_valve_is_dosed_by_its_own_speed() -> None:
@@ -319,7 +318,7 @@ def test_in_a_turn_each_valve_is_dosed_by_its_own_speed() -> None:
         boundary=shapely.box(-60, -60, 100, 100),
     )
     decision, _ = step(setup(prescription=field), state, Memory(), 10.0)
-    duty = duty_in_force(decision.plan, 10.0, 6)
+    duty = decision.plan.duty_at(10.0)
     assert all(left > right for left, right in itertools.pairwise(duty))
     assert CURVE.flow_for(duty[0]) / CURVE.flow_for(duty[5]) == pytest.approx(
         (SPEED + 2.5 * math.radians(20)) / (SPEED - 2.5 * math.radians(20)), rel=0.02

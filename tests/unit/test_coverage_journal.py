@@ -20,13 +20,12 @@ import shapely
 from analysis.flown.read_applied import read_applied
 from analysis.replay import replay
 from companion.cli.app import execute
-from companion.core.controller import Memory, step
+from companion.core.controller import Memory, expected_coverage, step
 from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
 from companion.core.frame import LocalFrame
 from companion.core.overlap_guard import OverlapGuard
 from companion.core.setup import Setup
-from companion.core.swath import expected
 from companion.core.types import (
     Decision,
     EstimatorReport,
@@ -204,8 +203,8 @@ def journal(folder: Path, own: Setup, until_s: float = 17.0, **how: Any) -> Path
             decision: Decision
             decision, memory = step(own, estimate(track, now_s), memory, now_s)
             made.record_decision(decision)
-            if memory.swath is not None:
-                made.record_coverage(memory.swath.coverage)
+            if memory.watched.swath is not None:
+                made.record_coverage(memory.watched.swath.coverage)
         return made.path
 
 
@@ -323,7 +322,9 @@ def test_a_replay_of_a_cut_flight_compares_what_was_to_be(tmp_path: Path) -> Non
             if now_s >= told_s + 0.1:
                 told_s = now_s
                 cut_s = now_s + coverage_ahead_s(1.0)
-                made.record_coverage(expected(own, memory, state, now_s=now_s, cut_s=cut_s))
+                made.record_coverage(
+                    expected_coverage(own, memory, state, now_s=now_s, cut_s=cut_s)
+                )
     with closing(sqlite3.connect(made.path)) as connection, connection:
         connection.execute("UPDATE meta SET value = 'recovered' WHERE key = 'closed'")
     assert replay(made.path).coverage_differs == 0

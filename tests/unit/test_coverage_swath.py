@@ -10,11 +10,11 @@ import pytest
 import shapely
 
 from companion.core import swath_liquid as law
-from companion.core.controller import Memory, step
+from companion.core.controller import Memory, expected_coverage, step
 from companion.core.coverage import Coverage
 from companion.core.prescription import Prescription
 from companion.core.setup import Setup
-from companion.core.swath import Swath, expected, follow
+from companion.core.swath import Swath, follow
 from companion.core.swath_liquid import Toggle
 from companion.core.types import FaultKind, Finding, SprayPlan, TimedChange, VehicleState
 from tests.builders import LAG, along, boom, flying, plots, setup
@@ -43,8 +43,8 @@ def flown(
 
 def treated(own: Setup, end_m: float = 60.0, **how: float) -> Coverage:
     memory, _, _ = flown(own, end_m, **how)
-    assert memory.swath is not None
-    return memory.swath.coverage
+    assert memory.watched.swath is not None
+    return memory.watched.swath.coverage
 
 
 def along_middle(made: Coverage, north_m: float = 3.1) -> tuple[float, float]:
@@ -57,7 +57,7 @@ def along_middle(made: Coverage, north_m: float = 3.1) -> tuple[float, float]:
 
 def test_without_a_record_nothing_is_kept() -> None:
     memory, _, _ = flown(setup())
-    assert memory.swath is None
+    assert memory.watched.swath is None
 
 
 def test_a_pass_treats_from_boundary_to_boundary() -> None:
@@ -118,11 +118,11 @@ def test_a_turn_is_swept_as_it_is_flown() -> None:
             **along(course),
         )
         _, memory = step(own, state, memory, now)
-    assert memory.swath is not None
+    assert memory.watched.swath is not None
     angles = np.radians(np.arange(20.0, 70.0, 0.5))
     for aside, inside in ((-2.8, True), (0.0, True), (2.8, True), (-3.3, False), (3.3, False)):
         east, north = -(radius + aside) * np.cos(angles), (radius + aside) * np.sin(angles)
-        assert (memory.swath.coverage.covered_at(east, north) == inside).all(), aside
+        assert (memory.watched.swath.coverage.covered_at(east, north) == inside).all(), aside
 
 
 def test_a_jump_of_the_position_leaves_nothing_between() -> None:
@@ -133,8 +133,8 @@ def test_a_jump_of_the_position_leaves_nothing_between() -> None:
     for i in range(140):
         now = 10.0 + i / 20.0
         _, memory = step(own, flying(now, (300.0 if i >= 40 else 0.0) + 0.25 * i), memory, now)
-    assert memory.swath is not None
-    made = memory.swath.coverage
+    assert memory.watched.swath is not None
+    made = memory.watched.swath.coverage
     assert made.covered_at(np.array([5.0, 315.0]), np.full(2, 3.0)).all()
     assert not made.covered_at(np.arange(15.0, 300.0), np.full(285, 3.0)).any()
 
@@ -155,7 +155,13 @@ def swept(own: Setup, duty: tuple[float, ...], *findings: Finding) -> Coverage:
         now = 10.0 + i / 20.0
         order = plan(issued_s=now - 0.05, duty=duty)
         swath = follow(
-            own, swath, order, flying(now, 0.25 * i), findings=findings, drift_m=None, now_s=now
+            own.swathing,
+            swath,
+            order,
+            flying(now, 0.25 * i),
+            findings=findings,
+            drift_m=None,
+            now_s=now,
         )
     assert swath is not None
     return swath.coverage
@@ -201,7 +207,7 @@ def test_a_lease_that_ends_closes() -> None:
     for i in range(101):
         now = 10.0 + i / 20.0
         swath = follow(
-            own, swath, order, flying(now, 0.25 * i), findings=(), drift_m=None, now_s=now
+            own.swathing, swath, order, flying(now, 0.25 * i), findings=(), drift_m=None, now_s=now
         )
     assert swath is not None
     closes_s = 0.3 + LAG.off_s + LAG.output_s
@@ -221,12 +227,12 @@ def test_an_opening_of_a_moment_treats_its_moment() -> None:
         TimedChange(at_s=10.4, valve=0, duty=0.0),
     )
     order = replace(plan(issued_s=10.0, duty=SHUT, lease_s=9.0), changes=changes)
-    own: Setup = given()
+    own = given()
     swath: Swath | None = None
     for i in range(101):
         now = 10.0 + i / 20.0
         swath = follow(
-            own, swath, order, flying(now, 0.25 * i), findings=(), drift_m=None, now_s=now
+            own.swathing, swath, order, flying(now, 0.25 * i), findings=(), drift_m=None, now_s=now
         )
     assert swath is not None
     ends = along_middle(swath.coverage, 5.5)
@@ -239,8 +245,8 @@ def test_an_opening_of_a_moment_treats_its_moment() -> None:
 def test_what_is_expected_goes_on_to_the_cut_and_closes_there() -> None:
     own = given()
     memory, state, now = flown(own, 20.0)
-    at_once = expected(own, memory, state, now_s=now, cut_s=now)
-    later = expected(own, memory, state, now_s=now, cut_s=now + 0.6)
+    at_once = expected_coverage(own, memory, state, now_s=now, cut_s=now)
+    later = expected_coverage(own, memory, state, now_s=now, cut_s=now + 0.6)
     lag_m = SPEED * (LAG.off_s + LAG.output_s)
     assert along_middle(at_once)[1] == pytest.approx(20.0 + lag_m, abs=0.11)
     assert along_middle(later)[1] == pytest.approx(20.0 + 0.6 * SPEED + lag_m, abs=0.11)
@@ -250,7 +256,7 @@ def test_what_is_expected_goes_on_to_the_cut_and_closes_there() -> None:
 def test_what_is_expected_of_an_end_is_what_comes_of_it() -> None:
     own = given()
     memory, state, now = flown(own, 20.0)
-    told = expected(own, memory, state, now_s=now, cut_s=now)
+    told = expected_coverage(own, memory, state, now_s=now, cut_s=now)
     true = treated(own, enabled_until_m=20.0)
     assert told.area_m2 == pytest.approx(true.area_m2, abs=1.5)
 
@@ -258,9 +264,12 @@ def test_what_is_expected_of_an_end_is_what_comes_of_it() -> None:
 def test_where_nothing_is_open_it_is_what_it_was() -> None:
     own = given()
     memory, state, now = flown(own, 60.0)
-    assert memory.swath is not None
-    assert expected(own, memory, state, now_s=now, cut_s=now + 1.0) is memory.swath.coverage
-    assert not expected(own, Memory(), None, now_s=now, cut_s=now).tiles
+    assert memory.watched.swath is not None
+    assert (
+        expected_coverage(own, memory, state, now_s=now, cut_s=now + 1.0)
+        is memory.watched.swath.coverage
+    )
+    assert not expected_coverage(own, Memory(), None, now_s=now, cut_s=now).tiles
 
 
 @pytest.mark.parametrize("speed_m_s", [0.4, 0.7])
@@ -273,6 +282,6 @@ def test_whoever_creeps_treats_too(speed_m_s: float) -> None:
         state = flying(now, east_m, 3.0, **along(90.0, speed_m_s))
         _, memory = step(own, state, memory, now)
         now, east_m = now + 0.1, east_m + 0.1 * speed_m_s
-    assert memory.swath is not None
+    assert memory.watched.swath is not None
     # Up to two seconds are not stamped yet.
-    assert along_middle(memory.swath.coverage) == pytest.approx((0.0, 5.3), abs=0.8)
+    assert along_middle(memory.watched.swath.coverage) == pytest.approx((0.0, 5.3), abs=0.8)

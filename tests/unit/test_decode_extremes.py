@@ -13,13 +13,13 @@ from dataclasses import replace
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from companion.core.controller import expected_coverage
 from companion.core.detection import Detection
 from companion.core.drift import Drift
 from companion.core.flow_trim import FlowTrim
 from companion.core.lines import Lines
 from companion.core.liquid_law import AutopilotLiquid
 from companion.core.setup import Setup
-from companion.core.swath import expected
 from companion.core.types import SpeedReport, WindReport
 from companion.link.codec import Codec
 from companion.link.component import Component, ComponentOptions
@@ -117,7 +117,7 @@ async def test_no_extreme_of_any_field_ends_the_loop_or_opens_a_valve_under_an_i
         state = decision.state
         assert decode(encode(decision)) == decision or state is None or has_nan(state)
         if number % 10 == 0:
-            expected(setup, loop.memory, state, now_s=now_s, cut_s=now_s + 0.5)
+            expected_coverage(setup, loop.memory, state, now_s=now_s, cut_s=now_s + 0.5)
     assert loop.wrong == []
     assert loop.open_count > 0 or autopilot == 12
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core.controller import Memory, step
+from companion.core.controller import Memory, Watched, step
 from companion.core.detection import Detection, Watching, WatchMemory, follow
 from companion.core.flow_trim import FlowTrim
 from companion.core.liquid_bins import (
@@ -548,7 +548,7 @@ def test_latched_reason_alone_closes_every_valve(inhibit: Inhibit) -> None:
     watch = WatchMemory(enabled=True, latched=frozenset({inhibit}), findings=(finding,))
     watched = setup(detection=LAW)
     assert not step(watched, SPRAYING, Memory(), 10.0)[0].plan.is_off
-    decision, memory = step(watched, SPRAYING, Memory(watch=watch), 10.0)
+    decision, memory = step(watched, SPRAYING, Memory(watched=Watched(watch=watch)), 10.0)
     assert decision.inhibits == {inhibit}
     assert decision.plan.is_off
     assert decision.findings == (finding,)
@@ -564,7 +564,7 @@ def test_latched_reason_alone_closes_every_valve(inhibit: Inhibit) -> None:
 def test_decision_with_findings_comes_back_from_the_journal() -> None:
     finding = Finding(kind=FaultKind.STUCK_CLOSED, at_s=1 / 3, text="valve", valve=2)
     watch = WatchMemory(enabled=True, findings=(finding,))
-    decision = step(setup(detection=LAW), SPRAYING, Memory(watch=watch), 10.0)[0]
+    decision = step(setup(detection=LAW), SPRAYING, Memory(watched=Watched(watch=watch)), 10.0)[0]
     assert decode(encode(decision)) == decision
     assert decode(encode(setup(detection=LAW).detection)) == LAW
 

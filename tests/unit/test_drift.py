@@ -152,6 +152,8 @@ def rates(route: Route) -> list[tuple[float, float | None]]:
 
 def routes(state: VehicleState, offset_m: drift.Offset | None, **change: object) -> list[Route]:
     given = setup(**change)
+    if offset_m is not None:
+        state = drift.landed(state, offset_m)
     return list(
         find_routes(
             given.prescription, state, given.boom, back_s=0.3, ahead_s=2.0, border=given.border,
@@ -225,7 +227,7 @@ def test_a_change_of_the_wind_finds_the_routes_anew() -> None:
     ):
         state = flying(now_s, 6.0 + 5.0 * (now_s - 10.0), wind=report)
         _, memory = step(given, state, memory, now_s)
-        assert memory.drift_m == (None if place is None else pytest.approx((place, 0.0)))
+        assert memory.routes.drift_m == (None if place is None else pytest.approx((place, 0.0)))
 
 
 def test_without_a_wind_the_law_changes_nothing() -> None:

@@ -13,7 +13,7 @@ from analysis.replay import FlownCore, replay
 from companion.assembly import build_setup
 from companion.config import load
 from companion.core import flow_trim
-from companion.core.controller import Memory, duty_in_force, step
+from companion.core.controller import Memory, step
 from companion.core.flow_trim import FlowTrim
 from companion.core.flow_window import Sample, flows_over, with_order
 from companion.core.nozzle import FlowCurve, NozzleSet
@@ -367,7 +367,7 @@ class Sprayer:
         given = {"flow": report} | change
         state = flying(now_s, 10.0 + 5.0 * self.number * STEP_S, **given)
         decision, self.memory = step(self.given, state, self.memory, now_s)
-        duty = duty_in_force(decision.plan, now_s, 6)
+        duty = decision.plan.duty_at(now_s)
         self.flow_ml_s = sum(CURVE.flow_for(value) for value in duty) / 6 * 1000.0 / 60.0
         self.number += 1
         self.decisions.append(decision)
@@ -472,9 +472,9 @@ def test_the_trim_is_that_of_the_set_in_use() -> None:
     )
     given = setup(prescription=ZONE, flow_trim=FlowTrim(), nozzle_sets=(small, large))
     sprayer = Sprayer(given, gain=1.08).run(200)
-    assert sprayer.memory.trim is not None
-    assert sprayer.memory.set_index == 1
-    small_trim, large_trim = (trim.trim for trim in sprayer.memory.trim.sets)
+    assert sprayer.memory.ordering.trim is not None
+    assert sprayer.memory.ordering.set_index == 1
+    small_trim, large_trim = (trim.trim for trim in sprayer.memory.ordering.trim.sets)
     assert small_trim == 1.0
     assert sprayer.decisions[-1].flow_trim == large_trim > 1.02
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import shapely
 
-from companion.core.controller import Memory, duty_in_force, step
+from companion.core.controller import Memory, step
 from companion.core.estimator import Track, observe
 from companion.core.lines import Lines, Polyline
 from companion.core.prescription import Prescription, Zone
@@ -101,7 +101,7 @@ def test_a_skewed_boom_is_wholly_on_the_line_before_it_opens() -> None:
     lines = given.lines
     assert lines is not None
     sine = math.sin(math.radians(20.0))
-    for valve, route in zip(given.boom.valves, memory.routes, strict=True):
+    for valve, route in zip(given.boom.valves, memory.routes.routes, strict=True):
         place = 10.0 + valve.right_m * sine  # the right end is ahead
         begins = 10.0 + (12.0 + 0.5 * valve.width_m * sine - place) / 5.0
         assert route[1].at_s == pytest.approx(begins, abs=1e-6)
@@ -192,7 +192,7 @@ def test_what_is_open_closes_at_once_where_the_line_is_left() -> None:
     given = on_lines()
     _, memory = step(given, flying(10.0, 20.0), Memory(), 10.0)
     decision, _ = step(given, flying(10.05, 20.2, 3.0, **along(60.0)), memory, 10.05)
-    assert duty_in_force(decision.plan, 10.05, 6) == (0.0,) * 6
+    assert decision.plan.duty_at(10.05) == (0.0,) * 6
 
 
 # ---------------------------------------------------------------------------- the mission's leg

@@ -111,7 +111,7 @@ def test_a_set_that_can_no_longer_deliver_is_given_up() -> None:
     given = two_sets([20.0])
     slow = flying(10.0, 4.0)
     _, memory = step(given, slow, Memory(), 10.0)  # 3.6 L/min
-    assert memory.set_index == 0
+    assert memory.ordering.set_index == 0
     fast = flying(10.05, 4.3, velocity_east_m_s=7.0, checked_speed_m_s=7.0)  # 5.04 L/min
     _, memory = step(given, fast, memory, 10.05)
-    assert memory.set_index == 1
+    assert memory.ordering.set_index == 1
