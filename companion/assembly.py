@@ -8,10 +8,7 @@ named by `deliverable`, with that speed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-
-from shapely import LineString, MultiPolygon
+from collections.abc import Iterable, Sequence
 
 from companion.config import Config
 from companion.config.motors import atomisers_of, pump_of
@@ -28,15 +25,11 @@ from companion.core.liquid_law import AutopilotLiquid
 from companion.core.liquid_naming import RESTLESS_SHARE
 from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.overlap_guard import OverlapGuard
-from companion.core.prescription import FIELD, Prescription
 from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
-from companion.errors import ConfigError, MapError
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.model import MapFile, Problem
-from companion.maps.offset import offset_between
-from companion.maps.plan_lines import read_plan_lines
-from companion.maps.registry import read_area, read_map
+from companion.errors import ConfigError
+from companion.flight_map import FlightMap, difference
+from companion.problem import Problem
 
 # The autopilot tells whole millilitres ten times a second, up to a tenth of a second old: over half
 # a second that is a quarter of the flow, from one bin to the next.
@@ -46,22 +39,31 @@ AUTOPILOT_RESTLESS_SHARE = 0.25
 RATES_NAMED_MAX = 6
 
 
-def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
-    """Return the set-up of a flight; the frame is that of the map unless one is given.
+def build_setup(config: Config, flight_map: FlightMap) -> Setup:
+    """Return the set-up of a flight, over the ground of its flight map and in that frame.
 
     Raises:
-        ConfigError: where the configuration and its files do not go together.
-        MapError: where a file cannot be used.
+        ConfigError: where the configuration and the flight map do not go together.
     """
-    table = _prescription_table(config)
-    map_file = read_configured_map(config)
-    label = above_label(config, map_file)
+    table = config.prescription
+    if table is None:
+        raise ConfigError(
+            f"{config.path}: prescription.file: missing; write the path of the map under "
+            "[prescription]"
+        )
+    _refuse_other_map(config, table, flight_map)
+    label = above_label(
+        config,
+        flight_map.source,
+        rates_l_ha=flight_map.source_rates_l_ha,
+        default_rate_l_ha=flight_map.prescription.default_rate_l_ha,
+    )
     if label is not None:
         raise ConfigError(f"{config.path}: {label.text}; {label.fix}")
-    flight_frame = frame if frame is not None else frame_for(map_file)
-    prescription = _prescription(config, table, map_file, flight_frame)
+    check_mark(config, table)
+    prescription = flight_map.moved(table.offset_east_m, table.offset_north_m)
     return Setup(
-        frame=flight_frame,
+        frame=flight_map.frame,
         prescription=prescription,
         boom=config.boom(),
         nozzle_sets=config.nozzle_sets(),
@@ -84,7 +86,7 @@ def build_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
         ),
         pump=pump_of(config),
         atomisers=atomisers_of(config),
-        lines=_lines(config, flight_frame, prescription),
+        lines=_lines(config, flight_map),
         # Without an output nothing is sprayed, whatever the plans say.
         record_coverage=config.coverage.record and config.output.kind != "none",
         overlap=_overlap(config),
@@ -109,21 +111,41 @@ def _overlap(config: Config) -> OverlapGuard | None:
     return OverlapGuard(switch_off_percent=percent)
 
 
-def _lines(config: Config, frame: LocalFrame, ground: Prescription) -> Lines | None:
+def _refuse_other_map(config: Config, table: PrescriptionTable, flight_map: FlightMap) -> None:
+    """Refuse a flight map that was compiled of something else than the configuration says."""
+    if table.sha256 is not None and not any(
+        sha256.startswith(table.sha256)
+        for sha256 in (flight_map.prescription.sha256, flight_map.sha256)
+    ):
+        raise ConfigError(
+            f"{config.path}: prescription.sha256 = {show_value(table.sha256)}: "
+            f"{table.file} is another map, its hash begins with {flight_map.sha256[:8]}, that of "
+            f"its source with {flight_map.prescription.sha256[:8]}; look at it by `vrspray map "
+            "check`, then write these digits"
+        )
+    found = difference(flight_map, config)
+    if found is not None:
+        key, wanted, compiled = found
+        raise ConfigError(
+            f"{config.path}: {key} = {_shown(wanted)}, and {flight_map.path.name} was compiled "
+            f"with {_shown(compiled)}; correct the configuration, or compile the map again: "
+            f"vrspray map compile {flight_map.source} --config {config.path} "
+            f"--out {flight_map.path.name}"
+        )
+
+
+def _shown(value: object) -> str:
+    return "nothing" if value is None else show_value(value)
+
+
+def _lines(config: Config, flight_map: FlightMap) -> Lines | None:
     """Return the lines of a plan that alone are sprayed, if there are any."""
     mission = config.mission
     if mission is None or mission.lines is None:
         return None
-    with _naming(config, "mission.lines", mission.lines):
-        polylines = read_plan_lines(config.resolve(mission.lines), frame)
-    if not any(LineString(line).intersects(ground.field) for line in polylines):
-        raise ConfigError(
-            f"{config.path}: mission.lines = {show_value(mission.lines)}: no line comes over the "
-            "map; give files of the same field"
-        )
     try:
         return Lines(
-            polylines=polylines,
+            polylines=flight_map.polylines,
             aside_m=mission.lines_aside_m,
             course_deg=mission.lines_course_deg,
         )
@@ -179,90 +201,13 @@ def _detection(config: Config) -> Detection | None:
     )
 
 
-def read_configured_map(config: Config) -> MapFile:
-    """Return the map that the configuration names, read as it says."""
-    table = _prescription_table(config)
-    with _naming(config, "prescription.file", table.file):
-        found = read_map(
-            config.resolve(table.file),
-            rate_field=table.rate_field,
-            unit=table.unit,
-            crs=table.crs,
-            layer=table.layer,
-            density_kg_l=table.density_kg_l,
-            flow_width_m=table.flow_width_m,
-            flow_speed_m_s=table.flow_speed_m_s,
-            merge=table.merge,
-            origin=table.origin,
-        )
-    if table.sha256 is not None and not found.sha256.startswith(table.sha256):
-        raise ConfigError(
-            f"{config.path}: prescription.sha256 = {show_value(table.sha256)}: "
-            f"{table.file} is another map, its hash begins with {found.sha256[:8]}; look at it by "
-            "`vrspray map check`, then write these digits"
-        )
-    return found
-
-
-@contextmanager
-def _naming(config: Config, key: str, value: str) -> Iterator[None]:
-    """Have an error of a map file say which key of the configuration named it."""
-    try:
-        yield
-    except MapError as error:
-        text = f"{config.path}: {key} = {show_value(value)}: {error}"
-        raise MapError(text, code=error.code, fix=error.fix) from error
-
-
-def _area(config: Config, key: str, name: str) -> MultiPolygon:
-    """Return the ground that a file of the configuration covers."""
-    with _naming(config, key, name):
-        return read_area(config.resolve(name))
-
-
-def _prescription_table(config: Config) -> PrescriptionTable:
-    if config.prescription is None:
-        raise ConfigError(
-            f"{config.path}: prescription.file: missing; write the path of the map under "
-            "[prescription]"
-        )
-    return config.prescription
-
-
-def _prescription(
-    config: Config, table: PrescriptionTable, map_file: MapFile, frame: LocalFrame
-) -> Prescription:
-    """Return the map in the flight's frame, on the ground that may be sprayed."""
-    _check_mark(config, table)
-    boundary = None
-    if table.boundary is not None:
-        boundary = _area(config, "prescription.boundary", table.boundary)
-    built = build_prescription(
-        map_file,
-        frame,
-        overlap=table.overlap,
-        boundary=boundary,
-        exclusions=[
-            _area(config, f"prescription.exclusions[{number}]", name)
-            for number, name in enumerate(table.exclusions)
-        ],
-        offset_east_m=table.offset_east_m,
-        default_rate_l_ha=table.default_rate_l_ha,
-        offset_north_m=table.offset_north_m,
-    )
-    if not _meets(built):
-        raise ConfigError(
-            f"{config.path}: prescription.boundary and prescription.exclusions leave nothing of "
-            f"{map_file.path} to spray; give files of the same field"
-        )
-    return built
-
-
-def _check_mark(config: Config, table: PrescriptionTable) -> None:
+def check_mark(config: Config, table: PrescriptionTable) -> None:
     """Refuse an offset that does not bring a mark of the map to where the receiver finds it."""
     if table.check_map is None or table.check_surveyed is None:
         return
-    east_m, north_m = offset_between(table.check_map, table.check_surveyed)
+    latitude_deg, longitude_deg = table.check_map
+    mark = LocalFrame(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+    east_m, north_m = mark.to_local(*table.check_surveyed)
     error_m = math.hypot(east_m - table.offset_east_m, north_m - table.offset_north_m)
     if not error_m <= table.check_tolerance_m:
         raise ConfigError(
@@ -272,59 +217,25 @@ def _check_mark(config: Config, table: PrescriptionTable) -> None:
         )
 
 
-def flown_at(
-    config: Config, map_file: MapFile, points: Sequence[tuple[float, float]]
-) -> list[dict[str, object]]:
-    """Return rate and zone at each (latitude, longitude) as a flight with this configuration has.
+def above_label(
+    config: Config,
+    name: object,
+    *,
+    rates_l_ha: Sequence[float],
+    default_rate_l_ha: float | None,
+) -> Problem | None:
+    """Return what is wrong when a rate of a map is above what the product's label allows.
 
-    Boundary, exclusions, default rate and offset are applied; `inside` says whether the place may
-    be sprayed at all.
+    `rates_l_ha` are those of the map called `name`, and `default_rate_l_ha` what holds elsewhere.
     """
-    table = _prescription_table(config)
-    frame = frame_for(map_file)
-    flown = _prescription(config, table, map_file, frame)
-    latitudes, longitudes = zip(*points, strict=True)
-    east_m, north_m = frame.to_local_all(latitudes, longitudes)
-    rows: list[dict[str, object]] = []
-    for point, owners in zip(points, flown.owners_at(east_m, north_m), strict=True):
-        inside, zones = FIELD in owners, sorted(owners - {FIELD})
-        rate_l_ha = flown.rate_of(frozenset(zones)) if inside else None
-        names = [flown.zone_name(zone) for zone in zones]
-        if not names and rate_l_ha is not None:
-            names = ["default"]
-        rows.append(
-            {
-                "lat": point[0],
-                "lon": point[1],
-                "rate_l_ha": rate_l_ha,
-                "zone": ", ".join(names) or None,
-                "inside": inside,
-            }
-        )
-    return rows
-
-
-def _meets(built: Prescription) -> bool:
-    """Tell whether anything of the map lies on ground that may be sprayed."""
-    if built.cells is not None:
-        return bool(built.cells.outline.intersects(built.field))
-    return any(zone.polygon.intersects(built.field) for zone in built.zones)
-
-
-def above_label(config: Config, map_file: MapFile) -> Problem | None:
-    """Return what is wrong when a rate of the map is above what the product's label allows."""
     limit_l_ha = config.product.rate_max_l_ha
-    rates = [*map_file.rates_l_ha]
-    if config.prescription is not None and config.prescription.default_rate_l_ha is not None:
-        rates.append(config.prescription.default_rate_l_ha)
-    elif map_file.default_rate_l_ha is not None:
-        rates.append(map_file.default_rate_l_ha)
+    rates = [*rates_l_ha, *([] if default_rate_l_ha is None else [default_rate_l_ha])]
     if limit_l_ha is None or not rates or max(rates) <= limit_l_ha:
         return None
     return Problem(
         severity="error",
         code="above-label",
-        text=f"{map_file.path} asks for up to {max(rates):g} L/ha, above "
+        text=f"{name} asks for up to {max(rates):g} L/ha, above "
         f"product.rate_max_l_ha = {limit_l_ha:g}",
         fix="lower the map's rates or correct the limit to what the label says",
     )

@@ -11,11 +11,12 @@ from typing import Any
 
 from shapely import MultiPolygon
 
-from companion.assembly import above_label, flow_range, read_configured_map
+from companion.assembly import above_label, flow_range
 from companion.config import Config
 from companion.config.tables import MissionTable, PrescriptionTable, out_of_bounds
 from companion.core.frame import LocalFrame
 from companion.maps.build import build_prescription, frame_for
+from companion.maps.compiling import read_configured_map
 from companion.maps.local import Area
 from companion.maps.model import MapFile
 from companion.maps.registry import read_map
@@ -305,6 +306,13 @@ def _map(asked: Asked, config: Config | None) -> MapFile | None:
     return told(partial(read_map, path, **{**said, **asked.answers}), {"crs": asked.crs})
 
 
+def _default_rate(config: Config, map_file: MapFile) -> float | None:
+    table = config.prescription
+    if table is not None and table.default_rate_l_ha is not None:
+        return table.default_rate_l_ha
+    return map_file.default_rate_l_ha
+
+
 def _rates(
     asked: Asked,
     config: Config | None,
@@ -320,7 +328,12 @@ def _rates(
         _check_bounds("rate_l_ha", rate)
         return Uniform(rate_l_ha=rate)
     if config is not None:
-        label = above_label(config, map_file)
+        label = above_label(
+            config,
+            map_file.path,
+            rates_l_ha=map_file.rates_l_ha,
+            default_rate_l_ha=_default_rate(config, map_file),
+        )
         if label is not None:
             raise PlanError(f"{label.text}; {label.fix}")
     is_own = _is_flown(asked, config)

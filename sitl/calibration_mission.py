@@ -8,11 +8,11 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from companion.assembly import build_setup
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
 from companion.core.rate import rate_for_flow
 from companion.errors import ConfigError
+from companion.maps.compiling import compiled_setup
 from sitl.calibration_layout import RUN_OUT_M, Layout, make_layout
 from sitl.mission_writing import plan, waypoint_lines
 from sitl.stub.mission_items import MissionItem, landing, speed, waypoint
@@ -64,7 +64,7 @@ def write_calibration(
     else:
         text = "\n".join(waypoint_lines(items))
     _write(out, f"{text}\n")
-    build_setup(load(copy))  # refuses what could not be flown, such as a product's label
+    compiled_setup(load(copy))  # refuses what could not be flown, such as a product's label
     return Written(mission=out, prescription=prescription, config=copy, layout=layout)
 
 
@@ -77,7 +77,7 @@ def _place(config: Config) -> tuple[float, float]:
             f"{config.path}: neither mission.depots nor a map says where to fly; give "
             "--origin LATITUDE,LONGITUDE"
         )
-    frame = build_setup(config).frame
+    frame = compiled_setup(config).frame
     return frame.latitude_deg, frame.longitude_deg
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-from companion.assembly import build_setup
 from companion.config import Config, load
 from companion.core.prescription import Prescription
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
+from companion.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_lag, anyang_route
 from sitl.route import Route
 from sitl.trajectory import Trajectory
@@ -32,7 +32,7 @@ def example() -> Config:
 @cache
 def demo_setup(speed_m_s: float) -> Setup:
     """Return the example's set-up with its rates for one speed, and limits that allow the speed."""
-    setup = build_setup(example())
+    setup = compiled_setup(example())
     limits = replace(
         setup.limits,
         speed_min_m_s=min(setup.limits.speed_min_m_s, 0.5 * speed_m_s),

@@ -20,12 +20,13 @@ import numpy as np
 import shapely
 
 from analysis.evaluation import Evaluation, evaluate, limit_ratio
-from companion.assembly import build_setup, deliverable, refuse_mismatch
+from companion.assembly import deliverable, refuse_mismatch
 from companion.config import Config, load
 from companion.core.nozzle import allowed_duty
 from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
 from companion.errors import ConfigError
+from companion.maps.compiling import compiled_setup
 from companion.maps.model import Problem
 from sitl.board import SERVO_FRAME_S
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
@@ -170,7 +171,7 @@ def prepare(options: FlyOptions) -> Task:
         )
     config = load(options.config)
     refuse_mismatch(config)
-    setup = build_setup(config)
+    setup = compiled_setup(config)
     profile = _plant(options.plant, setup)
     faults: tuple[Fault, ...] = ()
     if options.scenario is not None:

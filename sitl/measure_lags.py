@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.evaluation import evaluate
-from companion.assembly import build_setup
 from companion.config import load
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
 from companion.core.types import SprayPlan, TimedChange
+from companion.maps.compiling import compiled_setup
 from sitl.anyang import anyang_route
 from sitl.flight import FlightOptions, fly, sprayer
 from sitl.profile import PlantProfile, load_profile
@@ -156,7 +156,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--plant", default="wang-2024")
     parser.add_argument("--output", choices=("gpio", "servo"), default="gpio")
     given = parser.parse_args(arguments)
-    setup, profile = build_setup(load(given.config)), load_profile(given.plant)
+    setup, profile = compiled_setup(load(given.config)), load_profile(given.plant)
     # The path to the valves is stated, not measured: nothing on GPIO; on a servo output the wire
     # and half a frame of 20 ms.
     path_s = 0.012 if given.output == "servo" else 0.0

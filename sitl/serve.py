@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from companion.assembly import build_setup
 from companion.config import Config, load
 from companion.core.setup import Setup
 from companion.errors import ConfigError
+from companion.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
 from sitl.flow_law import FlowLaw
@@ -119,7 +119,7 @@ class _Run:
         config = self._config = _config(options)
         scenario = load_scenario(options.scenario) if options.scenario else Scenario()
         # Read before the flight: lines or a map that cannot be used are told now, not after it.
-        self._setup = build_setup(config) if options.wait_mission or options.lines else None
+        self._setup = compiled_setup(config) if options.wait_mission or options.lines else None
         home, items = _start(options, scenario, config, self._setup)
         start_s = time.monotonic() if start_s is None else start_s
         self.sprayer = Sprayer(sprayer_options(options, config, scenario), start_s=start_s)
@@ -231,7 +231,7 @@ class _Run:
         output = self._config.output
         return judge(
             folder,
-            self._setup if self._setup is not None else build_setup(self._config),
+            self._setup if self._setup is not None else compiled_setup(self._config),
             closed_us=output.closed_us,
             full_us=output.full_us,
         )

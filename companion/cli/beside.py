@@ -24,6 +24,8 @@ NICENESS = 10
 PATIENT = frozenset(
     {"demo", "config", "map", "plan", "calibrate", "report", "flights", "replay", "export", "wsp"}
 )
+# A flight waits for it to begin.
+URGENT = frozenset({("map", "compile")})
 # Of these, what is done before a line about it could be read.
 QUICK = frozenset(
     {
@@ -66,6 +68,8 @@ def give_way(arguments: Sequence[str]) -> None:
     Where a companion runs, what computes for long says so.
     """
     is_flight = list(arguments[:2]) == ["sitl", "fly"]
+    if tuple(arguments[:2]) in URGENT:
+        return
     if not arguments or (arguments[0] not in PATIENT and not is_flight):
         return
     os.nice(max(NICENESS - os.nice(0), 0))

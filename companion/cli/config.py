@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,7 +14,8 @@ from companion.cli.answer import AsJson, Overrides, answer, problem_line, proble
 from companion.config import Config, load
 from companion.config.rules import mismatches, unbounded, without_effect
 from companion.config.wording import show_value
-from companion.maps.model import Problem
+from companion.flight_map import flight_map_of
+from companion.problem import Problem
 
 app = typer.Typer(
     add_completion=False,
@@ -31,7 +33,7 @@ def check(file: File, overrides: Overrides = None, as_json: AsJson = False) -> N
     Exit 0: it can be used; 2: it cannot.
     """
     config = load(file, overrides=overrides or ())
-    problems = [problem_object(problem) for problem in problems_of(config)]
+    problems = [problem_object(problem) for problem in problems_of(config, overrides or ())]
     ok = not any(problem["severity"] == "error" for problem in problems)
     verdict = f"{file}: ok" if ok else f"{file}: refused"
     notes = [f"{found.key}: {found.text}" for found in unbounded(config)]
@@ -43,7 +45,7 @@ def check(file: File, overrides: Overrides = None, as_json: AsJson = False) -> N
     raise typer.Exit(0 if ok else 2)
 
 
-def problems_of(config: Config) -> list[Problem]:
+def problems_of(config: Config, overrides: Sequence[str] = ()) -> list[Problem]:
     """Return what is wrong or remarkable beyond what a configuration is refused for."""
     problems = [
         Problem(severity="error", code="mismatch", text=found.text, where=found.key)
@@ -54,7 +56,7 @@ def problems_of(config: Config) -> list[Problem]:
         for found in without_effect(config)
     ]
     if config.prescription is not None:
-        setup = build_setup(config)
+        setup = build_setup(config, flight_map_of(config, overrides))
         if config.mission is not None:
             problems += deliverable(setup, config.mission.speed_m_s)
     return problems

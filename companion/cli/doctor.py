@@ -98,7 +98,7 @@ def doctor(
 def _all(config: Config, given: tuple[str, ...], *, wait_s: float | None) -> Iterator[Check]:
     yield from configuration_checks(config, today=datetime.now(tz=UTC).astimezone().date())
     yield application_check(config)
-    found, setup = map_checks(config)
+    found, setup = map_checks(config, given, now=datetime.now(tz=UTC))
     yield from found
     yield from _computer(config)
     yield from service_checks(read_service(config))

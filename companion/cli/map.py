@@ -13,8 +13,8 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.assembly import flown_at
 from companion.cli.answer import AsJson, answer
+from companion.cli.map_compile import COMPILE_EXAMPLE, compile_
 from companion.cli.map_convert import convert, show
 from companion.cli.map_grid import GRID_EXAMPLE, grid, parse_mark
 from companion.cli.map_new import NEW_EXAMPLE, new
@@ -23,6 +23,7 @@ from companion.cli.map_options import File, OverlapPolicy, Reading, reading_opti
 from companion.cli.map_plan import plan_of, sprayer_problems
 from companion.cli.map_report import report_lines
 from companion.errors import MapError
+from companion.maps.compiling import flown_at
 from companion.maps.layer import cut_off
 from companion.maps.lint import point_rates, summary
 
@@ -166,3 +167,4 @@ app.command(epilog="Example: vrspray map convert field.shp field.gpkg")(convert)
 app.command(epilog=GRID_EXAMPLE)(grid)
 app.command(epilog=NEW_EXAMPLE)(new)
 app.command(epilog=OFFSET_EXAMPLE)(offset)
+app.command("compile", epilog=COMPILE_EXAMPLE)(compile_)

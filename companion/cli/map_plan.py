@@ -90,7 +90,12 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
     rates = rates_in_force(map_file, plan)
     if config is None or not rates:
         return []
-    label = above_label(config, map_file)
+    label = above_label(
+        config,
+        map_file.path,
+        rates_l_ha=map_file.rates_l_ha,
+        default_rate_l_ha=_default(config, map_file),
+    )
     found = [] if label is None else [label]
     if config.mission is not None:
         found += undelivered(
@@ -114,6 +119,13 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
         replace(problem, where=problem.where or _where(survey, where[problem.code], plan))
         for problem in found
     ]
+
+
+def _default(config: Config, map_file: MapFile) -> float | None:
+    table = config.prescription
+    if table is not None and table.default_rate_l_ha is not None:
+        return table.default_rate_l_ha
+    return map_file.default_rate_l_ha
 
 
 def rates_in_force(map_file: MapFile, plan: Plan) -> list[float]:

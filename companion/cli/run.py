@@ -28,6 +28,7 @@ from companion.config.application_table import missing, told
 from companion.config.rules import unbounded, without_effect
 from companion.core.setup import Setup
 from companion.errors import ActuatorError, LinkError, SensorError
+from companion.flight_map import FlightMap, flight_map_of
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
@@ -79,8 +80,9 @@ def run_companion(
     config, given = load_with_kept(config_file, wanted)
     training = training_mark(config)
     refuse_mismatch(config)
+    flight_map = flight_map_of(config, given)
     setup = continued(
-        build_setup(config),
+        build_setup(config, flight_map),
         continue_from or (),
         training=training,
         takes_unmarked=takes_unmarked,
@@ -107,7 +109,7 @@ def run_companion(
     journal = Journal.create(
         folder,
         setup=setup,
-        setup_text=_about(config, given),
+        setup_text=_about(config, given, flight_map),
         training=training,
         free_min_bytes=FREE_MIN_BYTES,
         commit_every_s=commit_s,
@@ -209,13 +211,14 @@ def _warnings(config: Config) -> list[str]:
     return found
 
 
-def _about(config: Config, overrides: Sequence[str]) -> dict[str, str]:
+def _about(config: Config, overrides: Sequence[str], flight_map: FlightMap) -> dict[str, str]:
     """Return what the journal keeps of the configuration besides the set-up itself."""
     return {
         "config_path": str(config.path),
         "config_toml": config.source_text,
         "config_overrides": "\n".join(overrides),
         "application_json": json.dumps(told(config)),
+        "flight_map_json": json.dumps(flight_map.as_object()),
     }
 
 

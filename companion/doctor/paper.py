@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from datetime import date
+from collections.abc import Iterator, Sequence
+from datetime import date, datetime
 
 from companion.assembly import build_setup, deliverable
 from companion.config import Config
@@ -11,7 +11,9 @@ from companion.config.rules import mismatches, without_effect
 from companion.core.setup import Setup
 from companion.doctor.check import Check, fail, not_applicable, ok, split_advice, warn
 from companion.errors import ConfigError, LinkError, MapError
+from companion.flight_map import FlightMap, flight_map_of
 from companion.link.signing import read_key
+from companion.wording import counted
 
 # Nozzles wear, hoses age, pumps lose pressure: half a year is about one season of spraying.
 CALIBRATION_MAX_DAYS = 180
@@ -117,24 +119,48 @@ def _signing(config: Config) -> Check:
     return ok(name, "readable by its owner only")
 
 
-def map_checks(config: Config) -> tuple[list[Check], Setup | None]:
+def map_checks(
+    config: Config, overrides: Sequence[str] = (), *, now: datetime
+) -> tuple[list[Check], Setup | None]:
     """Return whether map and boundary can be flown, and what was built of them."""
     try:
-        setup = build_setup(config)
+        flight_map = flight_map_of(config, overrides)
+        setup = build_setup(config, flight_map)
     except MapError as error:
         fix = error.fix or "see vrspray map check FILE"
-        return [fail("map", str(error).removesuffix(f"; {error.fix}"), fix), _no_map()], None
+        return [fail("map", str(error).removesuffix(f"; {error.fix}"), fix), *_no_map()], None
     except ConfigError as error:
         advice = split_advice(str(error), "see vrspray config check FILE")
-        return [fail("map", *advice), _no_map()], None
+        return [fail("map", *advice), *_no_map()], None
     rates = setup.prescription.rates_l_ha
     area_ha = setup.prescription.field.area / 1e4
     span = f"{min(rates):g} to {max(rates):g} L/ha" if rates else "no rates"
-    return [ok("map", f"{area_ha:.2f} ha, {span}"), _rates(config, setup)], setup
+    found = [
+        ok("map", f"{area_ha:.2f} ha, {span}"),
+        _flight_map(flight_map, now),
+        _rates(config, setup),
+    ]
+    return found, setup
 
 
-def _no_map() -> Check:
-    return not_applicable("rates", "there is no map")
+def _no_map() -> list[Check]:
+    return [not_applicable(name, "there is no map") for name in ("flight-map", "rates")]
+
+
+def _flight_map(flight_map: FlightMap, now: datetime) -> Check:
+    """Say which flight map this is, how old it is, and what was found when it was compiled."""
+    name = "flight-map"
+    days = flight_map.age_days(now)
+    age = "on an unknown day" if days is None else f"{counted(int(days), 'day')} ago"
+    text = f"{flight_map.sha256[:8]} of {flight_map.source}, compiled {age}"
+    if not flight_map.findings:
+        return ok(name, f"{text}; nothing found wrong with the map")
+    first = flight_map.findings[0]
+    return warn(
+        name,
+        f"{text}; {counted(len(flight_map.findings), 'finding')}, the first: {first.text}",
+        first.fix or "see vrspray map check FILE",
+    )
 
 
 def _rates(config: Config, setup: Setup) -> Check:

@@ -13,6 +13,7 @@ from shapely.errors import ShapelyError
 from companion.core.dissolve import dissolved
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Overlap, Prescription, Zone, closed
+from companion.flight_map import moved
 from companion.maps.cells import bounds_deg, grid_of
 from companion.maps.local import (
     Area,
@@ -72,26 +73,29 @@ def build_prescription(
             code="null-rate",
         )
     try:
-        zones = _zones(map_file, frame, offset_m)
+        zones = _zones(map_file, frame)
         if policy == "error":
             _check_overlaps(map_file, zones)
         cells = map_file.cells
         border: Area | None
         if boundary is not None:
-            border = _projected(boundary, frame, offset_m)
+            border = _projected(boundary, frame)
         else:
             border = _outline(map_file, zones) if cells is None else None
-        return Prescription(
+        built = Prescription(
             zones,
             boundary=border,
-            exclusions=[_projected(area, frame, offset_m) for area in exclusions],
+            exclusions=[_projected(area, frame) for area in exclusions],
             overlap=policy,
             default_rate_l_ha=default_rate_l_ha,
-            cells=None
-            if cells is None
-            else grid_of(cells, frame, map_file.path, offset_m=offset_m),
+            cells=None if cells is None else grid_of(cells, frame, map_file.path),
             sha256=map_file.sha256,
         )
+        if offset_m == (0.0, 0.0):
+            return built
+        # As a flight moves what is in its flight map.
+        is_bounded = border is not None or bool(exclusions)
+        return moved(built, east_m=offset_east_m, north_m=offset_north_m, is_bounded=is_bounded)
     except ShapelyError as error:
         raise unusable_polygons(map_file.path, error) from None
 
@@ -108,13 +112,13 @@ def _policy(map_file: MapFile, overlap: str) -> Overlap:
     )
 
 
-def _zones(map_file: MapFile, frame: LocalFrame, offset_m: tuple[float, float]) -> list[Zone]:
+def _zones(map_file: MapFile, frame: LocalFrame) -> list[Zone]:
     """Return all zones that have a rate, in metres."""
     rated = [zone for zone in map_file.zones if zone.rate_l_ha is not None]
     if not rated:
         return []
     degrees = np.array([zone.geometry for zone in rated], dtype=object)
-    local = project_all(degrees, frame, offset_m=offset_m)
+    local = project_all(degrees, frame)
     zones = []
     for area, source, valid in zip(local, rated, shapely.is_valid(local), strict=True):
         polygon = area if valid else make_valid(area)
@@ -131,9 +135,9 @@ def _outline(map_file: MapFile, zones: Sequence[Zone]) -> Area:
     return as_area(polygons_of(closed(ground))) or MultiPolygon()
 
 
-def _projected(area: Area, frame: LocalFrame, offset_m: tuple[float, float]) -> Area:
+def _projected(area: Area, frame: LocalFrame) -> Area:
     """Return a boundary or exclusion in metres; rounding can make touching rings cross."""
-    local = project(area, frame, offset_m=offset_m)
+    local = project(area, frame)
     return local if local.is_valid else (make_valid(local) or MultiPolygon())
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import shapely
@@ -18,27 +17,17 @@ from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
 from companion.errors import MapError
+from companion.problem import Problem, Severity
 
-Severity = Literal["error", "warning"]
+__all__ = [
+    "Affine", "MapCells", "MapFile", "MapZone", "Problem", "Severity", "map_error",
+    "unusable_polygons",
+]  # fmt: skip
+
 Floats = NDArray[np.float64]
 
 # A rate column holds at most this, in L/ha; the core refuses the same.
 RATE_MAX_L_HA = 100_000.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
-    """One thing that is wrong or remarkable, where it is, and what the operator can do."""
-
-    severity: Severity
-    code: str
-    text: str
-    where: str = ""
-    fix: str = ""
-
-    def __post_init__(self) -> None:
-        if self.severity not in ("error", "warning"):
-            raise ValueError(f"no severity: {self.severity}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -55,8 +55,17 @@ def known_tables() -> frozenset[str]:
     return _OLDER_TABLES | own_tables().keys()
 
 
-def distrust(connection: sqlite3.Connection, size_bytes: int, *, writes: bool = False) -> None:
-    """Have a fresh connection run nothing but our own statements on a journal's own tables."""
+def distrust(
+    connection: sqlite3.Connection,
+    size_bytes: int,
+    *,
+    writes: bool = False,
+    tables: frozenset[str] | None = None,
+) -> None:
+    """Have a fresh connection run nothing but our own statements on our own tables.
+
+    Those of a journal, unless other `tables` are given.
+    """
     for name in ("trusted_schema = OFF", "cell_size_check = ON", "ignore_check_constraints = ON"):
         connection.execute(f"PRAGMA {name}")
     _configure(connection, "DEFENSIVE", value=True)
@@ -71,7 +80,7 @@ def distrust(connection: sqlite3.Connection, size_bytes: int, *, writes: bool = 
         (sqlite3.SQLITE_LIMIT_WORKER_THREADS, 0),
     ):
         connection.setlimit(limit, most)
-    tables = known_tables()
+    tables = known_tables() if tables is None else tables
     readable = tables | _LISTS
     pragmas = _PRAGMAS_READ | _PRAGMAS_WRITE if writes else _PRAGMAS_READ
 
@@ -105,12 +114,14 @@ def _configure(connection: sqlite3.Connection, name: str, *, value: bool) -> Non
         setconfig(option, value)
 
 
-def check_programs(connection: sqlite3.Connection, *, writes: bool = False) -> None:
+def check_programs(
+    connection: sqlite3.Connection, *, writes: bool = False, tables: frozenset[str] | None = None
+) -> None:
     """Refuse by a ValueError what would have to be run to be read, and with `writes` to change it.
 
     As far as the list of tables can be read: what is damaged shows where it is read.
     """
-    known = known_tables()
+    known = known_tables() if tables is None else tables
     found: set[str] = set()
     try:
         for kind, name, table, page, sql in connection.execute(_LISTED):

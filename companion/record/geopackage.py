@@ -29,9 +29,8 @@ WGS84_WKT = (
     'AXIS["Latitude",NORTH],AXIS["Longitude",EAST],AUTHORITY["EPSG","4326"]]'
 )
 
-# All tables at once: one that came in the flight would have its entry in the list of tables far
-# behind, and nothing of a file that is cut off before it could be read.
-SCHEMA = f"""
+# What every GeoPackage must have.
+REGISTERS = f"""
 PRAGMA page_size = {PAGE_BYTES};
 PRAGMA application_id = {APPLICATION_ID};
 PRAGMA user_version = {USER_VERSION};
@@ -58,17 +57,25 @@ INSERT INTO gpkg_spatial_ref_sys VALUES
     ('Undefined Cartesian', -1, 'NONE', -1, 'undefined', NULL),
     ('Undefined geographic', 0, 'NONE', 0, 'undefined', NULL),
     ('WGS 84', {WGS84_ID}, 'EPSG', {WGS84_ID}, '{WGS84_WKT}', 'longitude, latitude');
-CREATE TABLE applied (
+"""
+# The ground of a flight, in its journal and in its flight map.
+GROUND_TABLES = """CREATE TABLE zones (
+    id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY, name TEXT, rate_l_ha DOUBLE
+);
+CREATE TABLE field (id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY);
+"""
+META_TABLE = (
+    "CREATE TABLE meta (id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT);\n"
+)
+# All tables at once: one that came in the flight would have its entry in the list of tables far
+# behind, and nothing of a file that is cut off before it could be read.
+SCHEMA = f"""{REGISTERS}CREATE TABLE applied (
     sequence INTEGER PRIMARY KEY NOT NULL, geom POINT, time DATETIME, time_s DOUBLE,
     rate_l_ha DOUBLE, target_flow_l_min DOUBLE, flow_l_min DOUBLE, duty DOUBLE,
     speed_m_s DOUBLE, course_deg DOUBLE, heading_deg DOUBLE, height_m DOUBLE,
     inhibits TEXT, valve_rates_l_ha TEXT
 );
-CREATE TABLE zones (
-    id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY, name TEXT, rate_l_ha DOUBLE
-);
-CREATE TABLE field (id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY);
-CREATE TABLE blocks (
+{GROUND_TABLES}CREATE TABLE blocks (
     first_sequence INTEGER PRIMARY KEY NOT NULL, last_sequence INTEGER, row_count INTEGER,
     from_s DOUBLE, until_s DOUBLE, dictionary INTEGER, crc32 INTEGER, body BLOB,
     decisions_crc32 INTEGER, decisions BLOB
@@ -91,8 +98,7 @@ CREATE TABLE coverage_tiles (
     id INTEGER PRIMARY KEY NOT NULL, kind TEXT NOT NULL, tile_east INTEGER NOT NULL,
     tile_north INTEGER NOT NULL, cells BLOB NOT NULL, UNIQUE (kind, tile_east, tile_north)
 );
-CREATE TABLE meta (id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT);
-INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES
+{META_TABLE}INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES
     ('blocks', 'attributes', 'blocks', 'every input and decision, in order, packed'),
     ('block_dictionaries', 'attributes', 'block_dictionaries', 'for the packing of the blocks'),
     ('valve_changes', 'attributes', 'valve_changes', 'changes of the valves'),

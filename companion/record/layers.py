@@ -43,14 +43,26 @@ class Ground:
 def write_layers(
     connection: sqlite3.Connection, frame: LocalFrame, prescription: Prescription
 ) -> None:
-    """Register the layers and write the ground."""
+    """Register the layers of a journal and write the ground."""
+    register_frame(connection, frame)
+    connection.executescript(
+        layer_sql("applied", "one row a decision", geometry="POINT", srs_id=WGS84_ID)
+    )
+    write_ground(connection, prescription)
+
+
+def register_frame(connection: sqlite3.Connection, frame: LocalFrame) -> None:
+    """Define the flight's own system, in which the ground lies."""
     definition = frame.crs.to_wkt("WKT1_GDAL")
     connection.execute(
         "INSERT INTO gpkg_spatial_ref_sys VALUES ('Flight', ?, 'NONE', ?, ?, ?)",
         (LOCAL_ID, LOCAL_ID, definition, "metres east and north of the flight's origin"),
     )
+
+
+def write_ground(connection: sqlite3.Connection, prescription: Prescription) -> None:
+    """Write zones or cells, and the field."""
     for sql in (
-        layer_sql("applied", "one row a decision", geometry="POINT", srs_id=WGS84_ID),
         layer_sql("zones", "the prescription", geometry="GEOMETRY", srs_id=LOCAL_ID),
         layer_sql("field", "where spraying is allowed", geometry="GEOMETRY", srs_id=LOCAL_ID),
     ):

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.assembly import build_setup
 from companion.cli.answer import AsJson, answer, note
 from companion.config import load
+from companion.maps.compiling import compiled_setup
 from companion.wording import counted
 from missions.errors import UploadError
 from missions.upload.checks import FIRMWARES
@@ -91,7 +91,7 @@ def upload(
 
 def _refuse_elsewhere(missions: Sequence[MissionFile], path: Path) -> None:
     """Refuse missions for another field than the configuration's."""
-    setup = build_setup(load(path))
+    setup = compiled_setup(load(path))
     for mission in missions:
         reason = elsewhere(
             mission,

@@ -27,9 +27,9 @@ from analysis.calibration.flow_record import record_of
 from analysis.calibration.identify import Identified, identify
 from analysis.calibration.lag_fit import trimmed_ml
 from analysis.calibration.steps import Kind
-from companion.assembly import build_setup
 from companion.config import load
 from companion.core.types import Decision, FlowReport
+from companion.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.calibration_mission import write_calibration
 from sitl.demo_pool import do_all
@@ -72,7 +72,7 @@ def _mission(plant: str, output: Output, lags: float) -> tuple[Setup, Route]:
     with tempfile.TemporaryDirectory() as folder:
         written = write_calibration(EXAMPLE / "config.toml", Path(folder) / "calibration.plan")
         config = load(written.config)
-        setup = build_setup(config)
+        setup = compiled_setup(config)
         route = read_route(written.mission, setup.frame, speed_m_s=None, default_speed_m_s=5.0)
     if plant != PLANT:
         setup = with_sprayer(setup, load_profile(plant))

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from shapely import box
 
-from companion.assembly import build_setup
 from companion.config.load import load
 from companion.core.controller import Memory, step
 from companion.core.coverage import Coverage
@@ -35,6 +34,7 @@ from companion.core.types import (
     UtcReport,
     WindReport,
 )
+from companion.maps.compiling import compiled_setup
 from companion.record.events import LinkSample
 from companion.record.valve_rows import ValveOrder, ValveRows
 
@@ -57,7 +57,7 @@ class Turn:
 
 def example_setup() -> Setup:
     """Return the set-up of the example: six valves, forty plots."""
-    return build_setup(load(EXAMPLE))
+    return compiled_setup(load(EXAMPLE))
 
 
 def open_setup() -> Setup:

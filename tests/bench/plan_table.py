@@ -28,8 +28,8 @@ import shapely
 from shapely import box
 
 from analysis.flight_record import FlightRecord
-from companion.assembly import build_setup
 from companion.config import Config, load
+from companion.maps.compiling import compiled_setup
 from missions.coverage import measure
 from missions.demand import Demand, demands
 from missions.files.items import items_of
@@ -194,7 +194,7 @@ class Ground:
 
 def figures(plan: Plan, task: Task, config: Config, *, seed: int) -> dict[str, Any]:
     """Fly all sorties and return the table's column."""
-    setup = build_setup(config, frame=plan.frame)
+    setup = compiled_setup(config, frame=plan.frame)
     ground = Ground(plan, task)
     fence = task.field.fly.buffer(0.01)
     outside_m = 0.0

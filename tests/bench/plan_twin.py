@@ -25,9 +25,9 @@ import numpy as np
 
 from analysis.border import off_target_ml
 from analysis.strips import strips_of
-from companion.assembly import build_setup
 from companion.config import Config, load
 from companion.core.setup import Setup
+from companion.maps.compiling import compiled_setup
 from missions.files.geojson import geojson_text
 from missions.plan import Plan, Sortie
 from missions.planner import plan_mission
@@ -142,7 +142,7 @@ def main() -> int:
         plan = planned(config, boundary, speed_m_s=given.speed_m_s)
         chosen = np.linspace(0, len(plan.sorties) - 1, given.sorties).round().astype(int).tolist()
         wanted = config if given.everywhere else with_lines(plan, config)
-        setup = build_setup(wanted, frame=plan.frame)
+        setup = compiled_setup(wanted, frame=plan.frame)
         rows = []
         for at in chosen:
             rows.append(flown(plan, plan.sorties[at], setup, seed=given.seed))

@@ -20,10 +20,10 @@ from typing import Any
 
 from analysis.evaluation import Evaluation, evaluate
 from analysis.flight_record import FlightRecord
-from companion.assembly import build_setup
 from companion.config import load
 from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
+from companion.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, fly
 from sitl.motor_parts import droplet_figures, ranges_us
 from sitl.profile import PlantProfile, load_profile
@@ -52,7 +52,7 @@ def not_driven(text: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def setup_of(example: str, change: Any = None) -> tuple[Setup, FlightOptions]:
+def example_setup(example: str, change: Any = None) -> tuple[Setup, FlightOptions]:
     """Return what an example's controller knows, its text changed."""
     path = EXAMPLES / example / "config.toml"
     text = path.read_text(encoding="utf-8")
@@ -69,7 +69,7 @@ def setup_of(example: str, change: Any = None) -> tuple[Setup, FlightOptions]:
         options = FlightOptions(
             fidelity="averaged", output="servo", drive_ranges_us=ranges_us(config)
         )
-        return build_setup(config), options
+        return compiled_setup(config), options
 
 
 def joined(profile: PlantProfile) -> PlantProfile:
@@ -125,7 +125,7 @@ def main(arguments: Sequence[str]) -> int:
     """Fly all cases and print the figures as JSON, each as soon as it is known."""
     seeds = [int(text) for text in arguments] or list(SEEDS)
     for name, example, change, gust_m_s in CASES:
-        setup, options = setup_of(example, change)
+        setup, options = example_setup(example, change)
         profile = load_profile(example)
         if change is one_section:
             profile = joined(profile)

@@ -21,11 +21,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from companion.assembly import build_setup
 from companion.cli.run import build_executor, component_options
 from companion.config import load
 from companion.core.setup import Setup
 from companion.link.vehicle_link import VehicleLink
+from companion.maps.compiling import compiled_setup
 from companion.ports import PlanExecutor, Recorder
 from companion.runtime import run
 from sitl.serve import ServeOptions, _Run
@@ -164,7 +164,7 @@ async def _fly(
     await asyncio.sleep(0.1)
     companion = asyncio.create_task(
         run(
-            build_setup(config) if setup is None else setup,
+            compiled_setup(config) if setup is None else setup,
             link=link,
             executor=executor,
             recorder=recorder,

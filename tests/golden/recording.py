@@ -8,11 +8,11 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
-from companion.assembly import build_setup
 from companion.cli.record_parts import follow
 from companion.config import load
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
+from companion.maps.compiling import compiled_setup
 from companion.record.continuing import continued
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
@@ -46,7 +46,7 @@ def config_of(flight: Flight, folder: Path) -> Path:
 def setup_of(flight: Flight, config: Path, journals: Mapping[str, Path]) -> Setup:
     """Return the set-up, going on from an earlier flight where one is named."""
     after = () if flight.after is None else (journals[flight.after],)
-    return continued(build_setup(load(config)), after)
+    return continued(compiled_setup(load(config)), after)
 
 
 def record(say: Callable[[str], None], only: tuple[str, ...] = (), out: Path = FOLDER) -> None:

@@ -22,8 +22,8 @@ from typing import Any
 import pytest
 import shapely
 
-from companion.assembly import build_setup
 from companion.config import load
+from companion.maps.compiling import compiled_setup
 from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.estimator import ARDUPILOT_NOISE, PX4_NOISE
 from sitl.stub.mission_items import MissionItem
@@ -105,7 +105,7 @@ class Bench:
         """Return what truly reached the ground, in the flight's metrics and in litres."""
         summary = {"seed": 1, "speed_m_s": SPEED_M_S, **self.truth.summary()}
         self.truth.write(folder, summary)
-        setup = build_setup(load(self.config))
+        setup = compiled_setup(load(self.config))
         metrics = judge(folder, setup, closed_us=CLOSED_US, full_us=FULL_US)
         return {**metrics, "volume_l": summary["volume_l"]}
 

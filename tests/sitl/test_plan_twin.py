@@ -8,7 +8,7 @@ from pathlib import Path
 import shapely
 from shapely import Polygon, box
 
-from companion.assembly import build_setup
+from companion.maps.compiling import compiled_setup
 from tests.bench.missions import to_degrees
 from tests.bench.plan_twin import compared, config_for, flown, planned, with_lines
 
@@ -35,7 +35,7 @@ def test_litres_of_every_sortie_agree_with_the_twin_within_one_percent(tmp_path:
     config = config_for(tmp_path, map_file, boundary)
     plan = planned(config, boundary, moves=2_000, tank_l=13.0)
     assert len(plan.sorties) >= 2
-    setup = build_setup(with_lines(plan, config), frame=plan.frame)
+    setup = compiled_setup(with_lines(plan, config), frame=plan.frame)
     found = compared([flown(plan, sortie, setup, seed=1) for sortie in plan.sorties])
     assert found["worst_percent"] < 1.0, found
     # Lines that end at full speed, where bare ground begins: the noise of the position, some 3 cm.

@@ -11,13 +11,14 @@ from types import ModuleType
 import pytest
 import shapely
 
-from companion.assembly import above_label, build_setup, deliverable, read_configured_map
+from companion.assembly import deliverable
 from companion.config import load
 from companion.core.frame import LocalFrame
 from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
 from companion.core.types import Method
 from companion.errors import ConfigError, MapError
+from companion.maps.compiling import compiled_setup
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 EXAMPLE = FOLDER / "config.toml"
@@ -25,7 +26,7 @@ RATES = [14.5, 15.4, 16.6, 17.7, 19.4, 20.5, 22.7, 23.8, 25.5, 27.8]
 
 
 def setup_with(*overrides: str) -> Setup:
-    return build_setup(load(EXAMPLE, overrides=overrides))
+    return compiled_setup(load(EXAMPLE, overrides=overrides))
 
 
 def rows() -> list[tuple[int, int, int, float]]:
@@ -71,8 +72,8 @@ def test_offset_moves_the_map_and_its_boundary() -> None:
     moved = load(
         EXAMPLE, overrides=["prescription.offset_east_m=3", "prescription.offset_north_m=-4"]
     )
-    west, south, east, north = build_setup(config, frame=frame).prescription.bounds_m
-    assert build_setup(moved, frame=frame).prescription.bounds_m == pytest.approx(
+    west, south, east, north = compiled_setup(config, frame=frame).prescription.bounds_m
+    assert compiled_setup(moved, frame=frame).prescription.bounds_m == pytest.approx(
         (west + 3.0, south - 4.0, east + 3.0, north - 4.0)
     )
 
@@ -98,7 +99,7 @@ def test_half_a_mark_is_refused() -> None:
 
 def test_frame_that_is_given_is_used() -> None:
     frame = LocalFrame(latitude_deg=36.0, longitude_deg=114.5)
-    assert build_setup(load(EXAMPLE), frame=frame).frame is frame
+    assert compiled_setup(load(EXAMPLE), frame=frame).frame is frame
 
 
 def test_exclusion_is_not_sprayed(tmp_path: Path) -> None:
@@ -126,11 +127,11 @@ def test_default_rate_holds_inside_the_boundary_only() -> None:
 
 
 def test_a_map_with_another_hash_is_refused() -> None:
-    found = build_setup(load(EXAMPLE)).prescription.sha256
+    found = compiled_setup(load(EXAMPLE)).prescription.sha256
     for digits in (found, found[:8]):
-        assert build_setup(load(EXAMPLE, overrides=[f"prescription.sha256={digits}"]))
+        assert compiled_setup(load(EXAMPLE, overrides=[f"prescription.sha256={digits}"]))
     with pytest.raises(ConfigError, match=f"begins with {found[:8]}"):
-        build_setup(load(EXAMPLE, overrides=["prescription.sha256=0123456789abcdef"]))
+        compiled_setup(load(EXAMPLE, overrides=["prescription.sha256=0123456789abcdef"]))
 
 
 def test_map_above_the_label_is_refused() -> None:
@@ -144,9 +145,8 @@ def test_default_rate_above_the_label_is_refused() -> None:
         EXAMPLE,
         overrides=["product.rate_max_l_ha=30", "prescription.default_rate_l_ha=31"],
     )
-    problem = above_label(config, read_configured_map(config))
-    assert problem is not None
-    assert "31 L/ha" in problem.text
+    with pytest.raises(ConfigError, match="31 L/ha"):
+        compiled_setup(config)
 
 
 def test_configuration_without_a_map_is_refused(tmp_path: Path) -> None:
@@ -155,7 +155,7 @@ def test_configuration_without_a_map_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "config.toml"
     path.write_text(text[:start] + text[end:])
     with pytest.raises(ConfigError, match=r"prescription\.file: missing"):
-        build_setup(load(path))
+        compiled_setup(load(path))
 
 
 @pytest.mark.parametrize(
@@ -217,7 +217,7 @@ def test_range_of_several_sets_is_that_of_all_of_them(tmp_path: Path) -> None:
             ("file", "prescription.shp"), ("boundary", "boundary.geojson"),
         )],
     )  # fmt: skip
-    assert deliverable(build_setup(config), 2.0) == []
+    assert deliverable(compiled_setup(config), 2.0) == []
 
 
 def test_smallest_duty_limits_the_smallest_flow() -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import shapely
 
-from companion.assembly import build_setup
 from companion.config.load import load
 from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
@@ -18,6 +17,7 @@ from companion.core.prescription import Prescription, Zone
 from companion.core.pump import Way as PumpWay
 from companion.core.schedule import LagModel, Order, Timing, orders, schedule, shut_spans
 from companion.core.setup import Setup
+from companion.maps.compiling import compiled_setup
 from tests.border_flight import Way, flows, orders_of, pump_orders_of, spilled_by_valve, spilled_s
 from tests.builders import plots, setup
 from tests.pump_flight import PUMP_LAG, pump_setup
@@ -37,7 +37,7 @@ def rows_of(*zones: tuple[float, float]) -> Prescription:
 
 
 def pump_example(**change: object) -> Setup:
-    built = build_setup(load(PUMP))
+    built = compiled_setup(load(PUMP))
     short = rows_of((2.0, 15.0), (12.0, 20.0), (2.0, 15.0))
     return replace(built, **({"prescription": short, "border": "inside"} | change))  # type: ignore[arg-type]
 

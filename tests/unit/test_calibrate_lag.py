@@ -15,11 +15,11 @@ from analysis.calibration.identify import identify
 from analysis.calibration.interval import jackknife, mean_of
 from analysis.calibration.result import TooFewStepsError, as_json, refusal, settings
 from analysis.calibration.steps import Kind, Reject, find_steps, is_trim
-from companion.assembly import build_setup
 from companion.cli.app import execute
 from companion.config import load
 from companion.core.schedule import LagModel
 from companion.core.types import Decision, FlowReport, SprayPlan, TimedChange
+from companion.maps.compiling import compiled_setup
 from companion.record.journal import Journal
 from sitl.calibration_layout import make_layout
 from sitl.calibration_mission import write_calibration
@@ -278,7 +278,7 @@ def test_the_mission_can_be_flown_where_it_was_asked_for(tmp_path: Path, suffix:
     written = write_calibration(
         ANYANG, tmp_path / f"cal{suffix}", origin=(48.1, 11.5), heading_deg=30.0
     )
-    setup = build_setup(load(written.config))
+    setup = compiled_setup(load(written.config))
     route = read_route(written.mission, setup.frame, speed_m_s=None, default_speed_m_s=1.0)
     assert setup.frame.latitude_deg == pytest.approx(48.1, abs=0.002)
     assert {leg.speed_m_s for leg in route.legs} == {5.0}
@@ -327,7 +327,7 @@ def journals(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A calibration flight's journal on the twin, and one of its first pass only."""
     folder = tmp_path_factory.mktemp("calibration")
     written = write_calibration(ANYANG, folder / "cal.plan")
-    setup = build_setup(load(written.config))
+    setup = compiled_setup(load(written.config))
     route = read_route(written.mission, setup.frame, speed_m_s=None, default_speed_m_s=5.0)
     options = FlightOptions(fidelity="averaged", output="servo", seed=5, meter_rate_hz=50.0)
     made = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from datetime import date
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,8 @@ def paper(*overrides: str, file: Path = EXAMPLE / "config.toml") -> dict[str, Ch
 
 
 def of_map(*overrides: str) -> dict[str, Check]:
-    checks, _ = map_checks(load(EXAMPLE / "config.toml", overrides=overrides))
+    config = load(EXAMPLE / "config.toml", overrides=overrides)
+    checks, _ = map_checks(config, overrides, now=datetime.now(tz=UTC))
     return {check.name: check for check in checks}
 
 
@@ -84,6 +85,12 @@ def test_the_text_of_a_wrong_day_is_refused_by_the_configuration() -> None:
 def test_the_map(overrides: tuple[str, ...], statuses: tuple[Status, Status]) -> None:
     found = of_map(*overrides)
     assert (found["map"].status, found["rates"].status) == statuses
+
+
+def test_the_flight_map_is_named_with_its_age_and_what_was_found() -> None:
+    found = of_map()["flight-map"]
+    assert found.status is Status.WARN
+    assert "of prescription.shp, compiled 0 days ago; 1 finding, the first: 120.0 m2" in found.text
 
 
 def test_a_refused_configuration_says_what_to_write() -> None:

@@ -8,7 +8,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from companion.assembly import build_setup
 from companion.cli.servo_parts import servo_options
 from companion.config import load
 from companion.core.types import Fix
@@ -19,12 +18,13 @@ from companion.doctor.outputs import output_checks, watchdog_trouble
 from companion.doctor.serial_device import Device, read_device, serial_check
 from companion.doctor.vehicle import link_checks, no_link
 from companion.doctor.vehicle_facts import Heard, Position, Rate
+from companion.maps.compiling import compiled_setup
 from companion.output.autopilot_options import DriveOutput, ServoOptions
 from companion.output.engine.wiring import Wiring
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 CONFIG = load(EXAMPLE / "config.toml", overrides=("safety.rc_channel=7",))
-SETUP = build_setup(CONFIG)
+SETUP = compiled_setup(CONFIG)
 _FOUND = servo_options(CONFIG)
 assert _FOUND is not None
 OPTIONS: ServoOptions = _FOUND

@@ -11,7 +11,6 @@ import pytest
 import shapely
 
 from analysis.evaluation import evaluate
-from companion.assembly import build_setup
 from companion.config import load
 from companion.core import drift
 from companion.core.controller import Memory, step
@@ -21,6 +20,7 @@ from companion.core.estimator import Track, estimate, observe
 from companion.core.interlock import Limits
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import Inhibit, Input, VehicleState, WindReport
+from companion.maps.compiling import compiled_setup
 from companion.record.setup_json import field_names_of, setup_to_json
 from sitl.ballistics import Air, fall, spectrum_um
 from sitl.droplet_shift import TRUTHS, law, shift_of
@@ -267,8 +267,8 @@ def test_the_state_has_a_wind_only_with_its_direction() -> None:
 
 
 def test_it_is_off_unless_it_is_enabled() -> None:
-    assert build_setup(load(EXAMPLE)).drift is None
-    found = build_setup(load(EXAMPLE, overrides=["drift.enabled=true"])).drift
+    assert compiled_setup(load(EXAMPLE)).drift is None
+    found = compiled_setup(load(EXAMPLE, overrides=["drift.enabled=true"])).drift
     assert found is not None
     assert found.fall_s == pytest.approx(0.79, abs=0.01)
     assert (found.limit_m, found.forward_carry_m, found.wind_m_s) == (2.0, 0.2, None)

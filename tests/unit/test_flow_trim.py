@@ -10,7 +10,6 @@ import pytest
 import shapely
 
 from analysis.replay import FlownCore, replay
-from companion.assembly import build_setup
 from companion.config import load
 from companion.core import flow_trim
 from companion.core.controller import Memory, step
@@ -30,6 +29,7 @@ from companion.core.types import (
     LandedReport,
     OperatorCommand,
 )
+from companion.maps.compiling import compiled_setup
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
 from tests.builders import CURVE, flying, plots, position, setup
@@ -512,18 +512,18 @@ def test_a_trimmed_flight_is_replayed_to_the_bit(tmp_path: Path) -> None:
 
 
 def test_the_configuration_reaches_the_core() -> None:
-    assert build_setup(load(EXAMPLE)).flow_trim is None
+    assert compiled_setup(load(EXAMPLE)).flow_trim is None
     overrides = [
         "flow_trim.enabled=true", "flow_trim.tau_s=8", "flow_trim.limit=0.1",
         "flow_trim.meter_minimum_l_min=0.8", "flow_trim.settle_s=3",
     ]  # fmt: skip
     law = FlowTrim(tau_s=8.0, limit=0.1, meter_minimum_l_min=0.8, settle_s=3.0)
-    assert build_setup(load(EXAMPLE, overrides=overrides)).flow_trim == law
+    assert compiled_setup(load(EXAMPLE, overrides=overrides)).flow_trim == law
 
 
 def test_defaults_of_configuration_and_core_are_the_same() -> None:
     enabled = load(EXAMPLE, overrides=["flow_trim.enabled=true"])
-    assert build_setup(enabled).flow_trim == FlowTrim()
+    assert compiled_setup(enabled).flow_trim == FlowTrim()
 
 
 def test_a_sprayer_with_slow_lags_is_waited_for() -> None:

@@ -16,12 +16,12 @@ from analysis.border import off_target_ml
 from analysis.flight_record import FlightMeta, FlightRecord
 from analysis.planned_lines import PlannedLines
 from analysis.strips import strips_of
-from companion.assembly import build_setup
 from companion.cli.app import execute
 from companion.config import load
 from companion.core.frame import LocalFrame
 from companion.core.lines import Lines
 from companion.errors import ConfigError, MapError
+from companion.maps.compiling import compiled_setup
 from companion.maps.plan_lines import read_plan_lines
 from companion.record.layers import Ground
 from companion.record.setup_json import field_names_of, setup_from_json, setup_to_json
@@ -92,16 +92,16 @@ def test_what_is_no_line_is_refused(tmp_path: Path, coordinates: object) -> None
 def test_lines_of_another_field_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     far = written(tmp_path, line((50_000, 0), (50_000, 90)))
     with pytest.raises(ConfigError, match=r"mission\.lines.*no line comes over the map"):
-        build_setup(load(Path(EXAMPLE), overrides=[f'mission.lines="{far}"']))
+        compiled_setup(load(Path(EXAMPLE), overrides=[f'mission.lines="{far}"']))
     with pytest.raises(MapError, match=r"mission\.lines.*no such file"):
-        build_setup(load(Path(EXAMPLE), overrides=['mission.lines="none.geojson"']))
+        compiled_setup(load(Path(EXAMPLE), overrides=['mission.lines="none.geojson"']))
 
 
 def test_a_tolerance_as_wide_as_the_next_line_is_refused() -> None:
     said = r"mission\.lines_aside_m.*half a swath, 3"
     with pytest.raises(ConfigError, match=said):
         load(Path(EXAMPLE), overrides=['mission.lines="x"', "mission.lines_aside_m=3.1"])
-    assert build_setup(load(Path(EXAMPLE))).lines is None
+    assert compiled_setup(load(Path(EXAMPLE))).lines is None
 
 
 # ----------------------------------------------------------------------- plan, check, fly, replay

@@ -15,13 +15,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.assembly import build_setup
 from companion.config import load
 from companion.core import inputs as core_inputs
 from companion.core.controller import Memory, step
 from companion.core.dosing import TRIM_AGE_S
 from companion.core.types import FlowReport, Input, SprayPlan, Telemetry, TimedChange
 from companion.errors import ConfigError
+from companion.maps.compiling import compiled_setup
 from companion.output.pwm import PulseEngine
 from sitl.flight import FlightOptions, fly, sprayer
 from sitl.knowledge import lags, measured_sets, pwm_limits
@@ -271,7 +271,7 @@ def test_the_rivals_look_ahead_is_the_pumps_mean_lag_and_its_own_delays() -> Non
 
 @pytest.mark.parametrize("name", ["pinpoint", "pump"])
 def test_the_example_of_a_plant_knows_its_curve(name: str) -> None:
-    mine, profile = build_setup(load(EXAMPLES / name / "config.toml")), load_profile(name)
+    mine, profile = compiled_setup(load(EXAMPLES / name / "config.toml")), load_profile(name)
     assert mine.nozzle_sets[0].curve == measured_sets(profile)[0].curve
     assert mine.pwm == pwm_limits(profile)
     assert len(mine.boom.valves) == profile.valve_count

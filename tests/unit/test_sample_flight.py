@@ -14,10 +14,10 @@ import shapely
 from analysis.border import off_target_ml
 from analysis.flight_record import Fidelity, FlightRecord
 from analysis.strips import Strip, strips_of
-from companion.assembly import build_setup
 from companion.config import load
 from companion.core.setup import Setup
 from companion.core.types import Decision
+from companion.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.profile import PlantProfile, load_profile
 from sitl.route import Route
@@ -42,7 +42,7 @@ def real_setup(samples: Path) -> Setup:
             f'prescription.boundary="{folder / "boundary" / "Boundary.shp"}"',
         ],
     )
-    return build_setup(config)
+    return compiled_setup(config)
 
 
 def fly_route(
@@ -154,7 +154,7 @@ def test_the_bound_on_rate_0_is_broken_when_valves_close_too_late() -> None:
 
 def orchard_record(fidelity: Fidelity, off_s: float | None = None) -> FlightRecord:
     """Fly passes along and across the strip and the patch of rate 0."""
-    setup = build_setup(load(ORCHARD / "config.toml"))
+    setup = compiled_setup(load(ORCHARD / "config.toml"))
     lag = setup.lag if off_s is None else replace(setup.lag, off_s=off_s)
     lines = [
         *swaths((12.0, 12.0), azimuth_deg=113.0, length_m=100.0, count=4, spacing_m=12.0),

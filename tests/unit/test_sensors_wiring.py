@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import pytest
 
 from companion import runtime
-from companion.assembly import build_setup
 from companion.cli.sensor_parts import build_sensors
 from companion.config import load
 from companion.config.rules import without_effect
@@ -20,6 +19,7 @@ from companion.core.types import BatteryReport, Decision, FlowReport, Input, Pre
 from companion.errors import ConfigError, SensorError
 from companion.link.decode import FROM_VEHICLE
 from companion.link.streams import wanted_streams
+from companion.maps.compiling import compiled_setup
 from companion.ports import Sensor
 from companion.sensors.flow_meter import FlowMeter
 from companion.sensors.pressure import PressureSensor
@@ -48,11 +48,11 @@ def test_detection_reaches_the_core_with_what_was_measured() -> None:
         "pressure.duty=[0.5, 1.0]", "pressure.kpa=[227.0, 290.0]", "tank.source=flow",
         "tank.reserve_l=2.0",
     ]  # fmt: skip
-    law = build_setup(load(EXAMPLE, overrides=given)).detection
+    law = compiled_setup(load(EXAMPLE, overrides=given)).detection
     assert law is not None
     assert (law.spread, law.reserve_l) == (0.02, 2.0)
     assert (law.pressure_duty, law.pressure_kpa) == ((0.5, 1.0), (227.0, 290.0))
-    assert build_setup(load(EXAMPLE)).detection is None
+    assert compiled_setup(load(EXAMPLE)).detection is None
 
 
 @pytest.mark.parametrize(
@@ -166,10 +166,10 @@ def test_batteries_are_asked_for_where_one_is_a_meter() -> None:
 
     assert asked(with_battery=True) - asked(with_battery=False) == {147}
     config = load(EXAMPLE, overrides=["flow_meter.source=autopilot", "flow_meter.battery=3"])
-    wiring = build_setup(config).autopilot_liquid
+    wiring = compiled_setup(config).autopilot_liquid
     assert wiring is not None
     assert (wiring.flow_battery, wiring.tank_battery) == (3, None)
-    assert build_setup(load(EXAMPLE)).autopilot_liquid is None
+    assert compiled_setup(load(EXAMPLE)).autopilot_liquid is None
 
 
 # -------------------------------------------------------------------------------- the event loop

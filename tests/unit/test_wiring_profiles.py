@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from companion.assembly import build_setup
 from companion.cli.gpio_parts import engine_setup
 from companion.config import Config, load
 from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ConfigError
+from companion.maps.compiling import compiled_setup
 from companion.output.engine.closer import closer_arguments
 from companion.output.engine.wiring import hazards
 from companion.output.pwm import PulseEngine
@@ -38,7 +38,7 @@ def test_every_file_is_tested_here() -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_wiring_is_ready_to_fly(name: str) -> None:
     config = profile(name)
-    setup = build_setup(config)
+    setup = compiled_setup(config)
     assert len(setup.boom.valves) == NAMES[name]
     assert config.output.kind == "gpio"
     assert config.gpio.alive_line is not None

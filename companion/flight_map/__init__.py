@@ -1,0 +1,24 @@
+"""The flight map: the one file that says which rate belongs where, for the vehicle.
+
+It is compiled in the office (`vrspray map compile`) and is all that a flight opens: the ground in
+metres of the flight's frame, rates in L/ha, boundary, exclusions and planned lines, what settings
+it was made with, and what was found on the way.
+"""
+
+from companion.flight_map.child import flight_map_of
+from companion.flight_map.file import read_flight_map, write_flight_map
+from companion.flight_map.frozen import difference, frozen_settings
+from companion.flight_map.model import SUFFIX, FlightMap, SourceFile, is_flight_map, moved
+
+__all__ = [
+    "SUFFIX",
+    "FlightMap",
+    "SourceFile",
+    "difference",
+    "flight_map_of",
+    "frozen_settings",
+    "is_flight_map",
+    "moved",
+    "read_flight_map",
+    "write_flight_map",
+]

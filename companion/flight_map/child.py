@@ -1,0 +1,175 @@
+"""The flight map of a configuration: opened, or compiled first by a process of its own.
+
+Whatever else than a flight map a configuration names was made by strangers, in formats with many
+corners. It is read by a child process, `vrspray map compile`, which has ended before anything of a
+flight begins. Its result is kept: a flight that starts again in the air compiles nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from companion.config import Config
+from companion.config.tables import PrescriptionTable
+from companion.config.wording import show_value
+from companion.errors import ConfigError, MapError
+from companion.flight_map.file import VERSION, read_flight_map
+from companion.flight_map.frozen import frozen_settings
+from companion.flight_map.model import SUFFIX, FlightMap, is_flight_map
+from companion.flight_map.sources import named_files, sources_of
+
+_logger = logging.getLogger(__name__)
+
+_FOLDER = "flight-maps"
+_KEPT_MAX = 8
+# A raster of 16 million cells takes a small computer a minute.
+_TIMEOUT_S = 900.0
+_WRITTEN = (0, 1)
+
+
+def flight_map_of(config: Config, overrides: Sequence[str] = ()) -> FlightMap:
+    """Return the flight map that the configuration names, or that of the map that it names.
+
+    `overrides` are those that the configuration was read with.
+
+    Raises:
+        ConfigError: where it names none, or files that are not those of the flight map.
+        MapError: where a file cannot be used.
+    """
+    table = config.prescription
+    if table is None:
+        raise ConfigError(
+            f"{config.path}: prescription.file: missing; write the path of the map under "
+            "[prescription]"
+        )
+    path = config.resolve(table.file)
+    if not is_flight_map(path):
+        return _compiled(config, table, overrides)
+    try:
+        found = read_flight_map(path)
+    except MapError as error:
+        text = f"{config.path}: prescription.file = {show_value(table.file)}: {error}"
+        raise MapError(text, code=error.code, fix=error.fix) from error
+    _refuse_changed(config, table, found)
+    return found
+
+
+def _refuse_changed(config: Config, table: PrescriptionTable, flight_map: FlightMap) -> None:
+    """Refuse a boundary, an exclusion or a plan that lies here and is not the compiled one."""
+    for key, path in named_files(table, _lines(config), config.path.parent).items():
+        if key == "prescription.file" or not path.exists():
+            continue
+        here = {each.sha256 for each in sources_of({key: path})}
+        if not here & {each.sha256 for each in flight_map.sources if each.key == key}:
+            raise ConfigError(
+                f"{config.path}: {key}: {path.name} was changed after {flight_map.path.name} was "
+                f"compiled; compile the map again: vrspray map compile {flight_map.source} "
+                f"--config {config.path} --out {flight_map.path.name}"
+            )
+
+
+def _lines(config: Config) -> str | None:
+    return None if config.mission is None else config.mission.lines
+
+
+def _compiled(config: Config, table: PrescriptionTable, overrides: Sequence[str]) -> FlightMap:
+    """Return what was compiled of these very files with these settings, now or before."""
+    settings = frozen_settings(table, _lines(config))
+    known_by = json.dumps(
+        [VERSION, version("vrspray"), str(config.resolve(table.file)), settings], sort_keys=True
+    )
+    folder = config.resolve(config.link.state_folder) / _FOLDER
+    kept = folder / f"{hashlib.sha256(known_by.encode()).hexdigest()[:16]}{SUFFIX}"
+    found = _still_good(kept, config, table)
+    if found is not None:
+        return found
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        writable = os.access(folder, os.W_OK)
+    except OSError:
+        writable = False
+    if writable:
+        _compile(config, table, overrides, kept)
+        _forget_old(folder)
+        return read_flight_map(kept)
+    _logger.warning("%s cannot be written: the map is compiled at every start", folder)
+    with tempfile.TemporaryDirectory(prefix="vrspray-") as elsewhere:
+        path = Path(elsewhere) / kept.name
+        _compile(config, table, overrides, path)
+        return read_flight_map(path)
+
+
+def _still_good(kept: Path, config: Config, table: PrescriptionTable) -> FlightMap | None:
+    """Return what was compiled before, if it can be read and no file of the map has changed."""
+    if not kept.exists():
+        return None
+    try:
+        found = read_flight_map(kept)
+    except MapError:
+        return None
+    here = sources_of(named_files(table, _lines(config), config.path.parent))
+    return found if here == found.sources else None
+
+
+def _forget_old(folder: Path) -> None:
+    with suppress(OSError):
+        found = sorted(folder.glob(f"*{SUFFIX}"), key=lambda file: file.stat().st_mtime)
+        for file in found[:-_KEPT_MAX]:
+            file.unlink(missing_ok=True)
+
+
+def _compile(config: Config, table: PrescriptionTable, overrides: Sequence[str], out: Path) -> None:
+    """Have a child process compile the map; it has ended when this returns.
+
+    Raises:
+        ConfigError, MapError: what the child refused, in its words.
+    """
+    order = [sys.executable, "-P", "-m", "companion", "map", "compile"]
+    order += [str(config.resolve(table.file)), "--config", str(config.path), "--out", str(out)]
+    order += [part for override in overrides for part in ("--set", override)]
+    try:
+        done = subprocess.run(
+            [*order, "--json"], capture_output=True, timeout=_TIMEOUT_S, check=False,
+            stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise _failed(config, table, str(error)[:200]) from error
+    if done.returncode in _WRITTEN and out.exists():
+        return
+    said = _said(done.stdout)
+    problems = said.get("problems")
+    text = said.get("error")
+    if not isinstance(text, str):
+        raise _failed(config, table, f"the compiler ended with {done.returncode}")
+    if isinstance(problems, list) and problems:
+        raise MapError(text, code=str(problems[0]["code"]), fix=str(problems[0]["fix"]))
+    raise ConfigError(text)
+
+
+def _said(stdout: bytes) -> dict[str, Any]:
+    try:
+        found = json.loads(stdout)
+    except (ValueError, RecursionError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _failed(config: Config, table: PrescriptionTable, reason: str) -> MapError:
+    fix = "compile it in the office: vrspray map compile"
+    return MapError(
+        f"{config.path}: prescription.file = {show_value(table.file)}: cannot be compiled "
+        f"({reason}); {fix}",
+        code="not-compiled",
+        fix=fix,
+    )

@@ -1,0 +1,401 @@
+"""A flight map as a file: a GeoPackage with the tables in which a journal keeps the ground.
+
+Whoever reads one does not know who made it: a hash is no signature. So it is read as a stranger's
+database is (`record/distrust.py`), and everything in it is looked at before it is used.
+"""
+
+from __future__ import annotations
+
+import getpass
+import hashlib
+import json
+import math
+import platform
+import sqlite3
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import shapely
+from shapely import Geometry, LineString, MultiPolygon, Polygon
+
+from companion.atomic_write import write_atomically
+from companion.core.cells import CellGrid
+from companion.core.frame import LocalFrame
+from companion.core.lines import Polyline
+from companion.core.prescription import Overlap, Prescription, Zone
+from companion.errors import MapError
+from companion.flight_map.model import Area, FlightMap, SourceFile
+from companion.problem import Problem
+from companion.record.distrust import check_programs, distrust
+from companion.record.geopackage import (
+    APPLICATION_ID,
+    GROUND_TABLES,
+    LOCAL_ID,
+    META_TABLE,
+    REGISTERS,
+    geometry_blob,
+    layer_sql,
+    wkb_of,
+)
+from companion.record.layers import Ground, read_ground, register_frame, write_ground
+from companion.record.read_only import DAMAGE, one_line
+
+VERSION = "1"
+# Bounds on what a stranger may hand over; those of any map file (missions/maps/layer.py).
+FILE_BYTES_MAX = 256 * 1024 * 1024
+VERTICES_MAX = 5_000_000
+ZONES_MAX = 1_000_000
+# A field is some kilometres; beyond this the frame's scale is off by centimetres.
+EXTENT_MAX_M = 200_000.0
+_TEXT_MAX = 10_000
+_ROWS_MAX = 100_000
+_SCHEMA = f"""{REGISTERS}{GROUND_TABLES}
+CREATE TABLE exclusions (id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY);
+CREATE TABLE lines (id INTEGER PRIMARY KEY NOT NULL, geom LINESTRING);
+CREATE TABLE source_rates (id INTEGER PRIMARY KEY NOT NULL, rate_l_ha DOUBLE NOT NULL);
+CREATE TABLE sources (
+    id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL, name TEXT NOT NULL, sha256 TEXT NOT NULL
+);
+CREATE TABLE findings (
+    id INTEGER PRIMARY KEY NOT NULL, severity TEXT NOT NULL, code TEXT NOT NULL, text TEXT NOT NULL,
+    place TEXT NOT NULL, fix TEXT NOT NULL
+);
+{META_TABLE}
+INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES
+    ('source_rates', 'attributes', 'source_rates', 'all rates of the source'),
+    ('sources', 'attributes', 'sources', 'what the flight map was compiled from'),
+    ('findings', 'attributes', 'findings', 'what the check of the map found'),
+    ('meta', 'attributes', 'meta', 'settings, versions, hash');
+"""
+# What the hash is of, and in which order; `cells` is there for maps in rows and columns.
+_HASHED = (
+    "zones", "field", "exclusions", "lines", "source_rates", "sources", "findings", "cells", "meta",
+)  # fmt: skip
+_REGISTERS = ("gpkg_contents", "gpkg_geometry_columns", "gpkg_spatial_ref_sys")
+_TABLES = frozenset({*_HASHED, *_REGISTERS})
+# Who and when, and the hash itself.
+_UNHASHED = frozenset({"sha256", "compiled_utc", "compiled_by", "compiled_with"})
+
+
+def write_flight_map(path: Path, flight_map: FlightMap) -> FlightMap:
+    """Write a flight map, whole or not at all, and return it with its hash and who made it.
+
+    Raises:
+        OSError: where it cannot be written; what was there before stays.
+    """
+    stamped = replace(
+        flight_map,
+        path=path,
+        compiled_utc=datetime.now(tz=UTC).isoformat(timespec="seconds"),
+        compiled_by=_compiled_by(),
+        compiled_with=f"vrspray {version('vrspray')}",
+    )
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        _fill(connection, stamped)
+        sha256 = _content_sha256(connection)
+        _insert_meta(connection, {"sha256": sha256})
+        write_atomically(path, connection.serialize())
+    return replace(stamped, sha256=sha256)
+
+
+def _compiled_by() -> str:
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError):  # a user without a name, as in some containers
+        user = "unknown"
+    return f"{user}@{platform.node()}"
+
+
+def _fill(connection: sqlite3.Connection, flight_map: FlightMap) -> None:
+    connection.executescript(_SCHEMA)
+    register_frame(connection, flight_map.frame)
+    for table, what, kind in (
+        ("exclusions", "where nothing is sprayed; the field is without them", "GEOMETRY"),
+        ("lines", "planned lines: alone these are sprayed", "LINESTRING"),
+    ):
+        connection.executescript(layer_sql(table, what, geometry=kind, srs_id=LOCAL_ID))
+    write_ground(connection, flight_map.prescription)
+    lines = [LineString(line) for line in flight_map.polylines]
+    for table, shapes in (("exclusions", list(flight_map.exclusions)), ("lines", lines)):
+        connection.executemany(f"INSERT INTO {table} (geom) VALUES (?)", _blobs(shapes))
+    connection.executemany(
+        "INSERT INTO source_rates (rate_l_ha) VALUES (?)",
+        [(rate,) for rate in flight_map.source_rates_l_ha],
+    )
+    connection.executemany(
+        "INSERT INTO sources (key, name, sha256) VALUES (?, ?, ?)",
+        [(each.key, each.name, each.sha256) for each in flight_map.sources],
+    )
+    connection.executemany(
+        "INSERT INTO findings (severity, code, text, place, fix) VALUES (?, ?, ?, ?, ?)",
+        [
+            (found.severity, found.code, found.text, found.where, found.fix)
+            for found in flight_map.findings
+        ],
+    )
+    _insert_meta(connection, _meta_of(flight_map))
+
+
+def _meta_of(flight_map: FlightMap) -> dict[str, str]:
+    prescription = flight_map.prescription
+    return {
+        "flight_map_version": VERSION,
+        "origin_latitude_deg": repr(flight_map.frame.latitude_deg),
+        "origin_longitude_deg": repr(flight_map.frame.longitude_deg),
+        "overlap": prescription.overlap,
+        "default_rate_l_ha": json.dumps(prescription.default_rate_l_ha),
+        "is_bounded": json.dumps(flight_map.is_bounded),
+        "map_sha256": prescription.sha256,
+        "source": flight_map.source,
+        "frozen": json.dumps(dict(flight_map.frozen), sort_keys=True),
+        "compiled_utc": flight_map.compiled_utc,
+        "compiled_by": flight_map.compiled_by,
+        "compiled_with": flight_map.compiled_with,
+    }
+
+
+def _insert_meta(connection: sqlite3.Connection, meta: dict[str, str]) -> None:
+    connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", meta.items())
+
+
+def _blobs(shapes: Sequence[Geometry]) -> list[tuple[bytes]]:
+    array = np.array(shapes, dtype=object)
+    binaries = shapely.to_wkb(array, byte_order=1, flavor="iso", output_dimension=2)
+    return [
+        (geometry_blob(wkb, srs_id=LOCAL_ID, is_empty=bool(shapely.is_empty(shape))),)
+        for wkb, shape in zip(binaries, shapes, strict=True)
+    ]
+
+
+def _content_sha256(connection: sqlite3.Connection) -> str:
+    """Return the hash of all rows, each value with its kind and its length."""
+    found = hashlib.sha256()
+    there = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+    for table in _HASHED:
+        if table not in there:
+            continue
+        found.update(f"table {table}\n".encode())
+        for row in connection.execute(f"SELECT * FROM {table} ORDER BY 1"):
+            if table == "meta" and row[1] in _UNHASHED:
+                continue
+            # Numbers of rows say nothing but the order.
+            for value in row[1:]:
+                content = _bytes_of(value)
+                found.update(struct.pack("<cq", type(value).__name__[:1].encode(), len(content)))
+                found.update(content)
+    return found.hexdigest()
+
+
+def _bytes_of(value: object) -> bytes:
+    if isinstance(value, bytes):
+        return value
+    if isinstance(value, float):
+        return struct.pack("<d", value)
+    return str(value).encode("utf-8", "surrogatepass")
+
+
+def read_flight_map(path: Path) -> FlightMap:
+    """Return a flight map, with everything in it looked at.
+
+    Raises:
+        MapError: in one line, where the file is none, or is damaged.
+    """
+    try:
+        if not path.is_file():
+            raise _refused(path, "there is no such file", fix="check the path", code="no-file")
+        if path.stat().st_size > FILE_BYTES_MAX:
+            raise ValueError(f"it is larger than {FILE_BYTES_MAX // 1024**2} MB")
+        # Without locks, and without a look at the files that SQLite may find beside it.
+        uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(uri, uri=True)) as connection:
+            distrust(connection, path.stat().st_size, tables=_TABLES)
+            return _read(path, connection)
+    except (*DAMAGE, shapely.errors.ShapelyError, MemoryError) as error:
+        raise _refused(path, f"this is no sound flight map: {one_line(error)[:200]}") from error
+
+
+def _refused(
+    path: Path,
+    text: str,
+    *,
+    fix: str = "compile it again: vrspray map compile MAP --config FILE --out NAME.flightmap.gpkg",
+    code: str = "flight-map",
+) -> MapError:
+    return MapError(" ".join(f"{path}: {text}; {fix}".split()), code=code, fix=fix)
+
+
+def _read(path: Path, connection: sqlite3.Connection) -> FlightMap:
+    (application_id,) = connection.execute("PRAGMA application_id").fetchone()
+    if application_id != APPLICATION_ID:
+        raise ValueError("it is no GeoPackage")
+    check_programs(connection, tables=_TABLES)
+    meta = dict(_rows(connection, "key, value", "meta", (str, str)))
+    if meta.get("flight_map_version") != VERSION:
+        raise ValueError(
+            f"its version is {meta.get('flight_map_version', 'not told')[:20]}, not {VERSION}"
+        )
+    if _content_sha256(connection) != meta["sha256"]:
+        raise ValueError("its content is not what its hash says: it was changed or damaged")
+    frame = LocalFrame(
+        latitude_deg=float(meta["origin_latitude_deg"]),
+        longitude_deg=float(meta["origin_longitude_deg"]),
+    )
+    is_bounded = json.loads(meta["is_bounded"]) is True
+    return FlightMap(
+        path=path,
+        frame=frame,
+        prescription=_prescription(connection, meta, is_bounded=is_bounded),
+        is_bounded=is_bounded,
+        source=meta["source"],
+        source_rates_l_ha=tuple(_source_rates(connection)),
+        exclusions=tuple(_exclusions(connection)),
+        polylines=tuple(_polylines(connection)),
+        frozen=_frozen(meta["frozen"]),
+        sources=tuple(
+            SourceFile(key=key, name=name, sha256=sha256)
+            for key, name, sha256 in _rows(
+                connection, "key, name, sha256", "sources", (str, str, str)
+            )
+        ),
+        findings=tuple(_findings(connection)),
+        compiled_utc=meta["compiled_utc"],
+        compiled_by=meta["compiled_by"],
+        compiled_with=meta["compiled_with"],
+        sha256=meta["sha256"],
+    )
+
+
+def _rows(
+    connection: sqlite3.Connection, columns: str, table: str, kinds: tuple[type, ...]
+) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of a table; ValueError where they are not what a flight map has."""
+    for count, row in enumerate(connection.execute(f"SELECT {columns} FROM {table} ORDER BY id")):
+        if count >= _ROWS_MAX and table != "source_rates":
+            raise ValueError(f"its {table} have more than {_ROWS_MAX} rows")
+        for value, kind in zip(row, kinds, strict=True):
+            if type(value) is not kind:
+                raise ValueError(f"a value of its {table} is of another kind")
+            if isinstance(value, str) and len(value) > 100 * _TEXT_MAX:
+                raise ValueError(f"a text of its {table} has no end")
+        yield row
+
+
+def _prescription(
+    connection: sqlite3.Connection, meta: dict[str, str], *, is_bounded: bool
+) -> Prescription:
+    ground = read_ground(connection)
+    _check_ground(ground)
+    default = json.loads(meta["default_rate_l_ha"])
+    if default is not None and not (type(default) in (int, float) and 0.0 <= default < 100_000.0):
+        raise ValueError("its default rate is no rate")
+    if ground.cells is None and not is_bounded:
+        raise ValueError("its zones have no border")
+    return Prescription(
+        [
+            Zone(name=str(name), polygon=polygon, rate_l_ha=rate_l_ha)
+            for name, rate_l_ha, polygon in ground.zones
+        ],
+        boundary=ground.field if is_bounded else None,
+        overlap=_overlap(meta["overlap"]),
+        default_rate_l_ha=None if default is None else float(default),
+        cells=ground.cells,
+        sha256=meta["map_sha256"],
+    )
+
+
+def _overlap(text: str) -> Overlap:
+    for policy in get_args(Overlap):
+        if policy == text:
+            return policy  # type: ignore[no-any-return]
+    raise ValueError("its overlap rule is unknown")
+
+
+def _check_ground(ground: Ground) -> None:
+    if len(ground.zones) > ZONES_MAX:
+        raise ValueError(f"it has more than {ZONES_MAX} zones")
+    for name, rate_l_ha, _ in ground.zones:
+        if type(rate_l_ha) is not float or type(name) is not str:
+            raise ValueError("a zone has no name or no rate")
+    _check_shapes([*(area for _, _, area in ground.zones), ground.field])
+    if ground.field.is_empty and ground.cells is None:
+        raise ValueError("its field is empty")
+    if ground.cells is not None:
+        _check_cells(ground.cells)
+
+
+def _check_cells(cells: CellGrid) -> None:
+    """Check the polynomials: finite, of a degree, each the inverse of the other."""
+    for warp in (cells.to_frame, cells.to_cells):
+        numbers = [warp.x0, warp.y0, warp.scale, *(value for term in warp.terms for value in term)]
+        if not all(map(math.isfinite, numbers)) or not warp.scale > 0.0 or warp.degree < 1:
+            raise ValueError("its cells lie nowhere")
+    rows, columns = cells.shape
+    column, row = np.meshgrid(np.linspace(0.0, columns, 5), np.linspace(0.0, rows, 5))
+    east, north = cells.to_frame(column.ravel(), row.ravel())
+    if not bool((np.hypot(east, north) <= EXTENT_MAX_M).all()):
+        raise ValueError("its cells lie farther off than any field reaches")
+    again = np.array(cells.to_cells(east, north))
+    if not bool((np.abs(again - (column.ravel(), row.ravel())) <= 0.1).all()):
+        raise ValueError("its cells lie nowhere")
+
+
+def _check_shapes(shapes: Sequence[Geometry], *, are_areas: bool = True) -> None:
+    """Refuse what is not finite, reaches too far, is invalid, or is too much."""
+    array = np.array(shapes, dtype=object)
+    places = shapely.get_coordinates(array)
+    if len(places) > VERTICES_MAX:
+        raise ValueError(f"it has more than {VERTICES_MAX} vertices")
+    if not bool((np.abs(places) <= EXTENT_MAX_M).all()):  # NaN is not
+        raise ValueError("a place in it is no number, or farther off than any field reaches")
+    if are_areas and not bool(shapely.is_valid(array).all()):
+        raise ValueError("a polygon crosses itself")
+
+
+def _shapes(connection: sqlite3.Connection, table: str) -> list[Geometry]:
+    blobs = [row[0] for row in _rows(connection, "geom", table, (bytes,))]
+    return list(shapely.from_wkb([wkb_of(blob) for blob in blobs])) if blobs else []
+
+
+def _exclusions(connection: sqlite3.Connection) -> Iterable[Area]:
+    found = _shapes(connection, "exclusions")
+    _check_shapes(found)
+    areas = [area for area in found if isinstance(area, Polygon | MultiPolygon)]
+    if len(areas) != len(found):
+        raise ValueError("an exclusion is no polygon")
+    return areas
+
+
+def _polylines(connection: sqlite3.Connection) -> Iterator[Polyline]:
+    found = _shapes(connection, "lines")
+    _check_shapes(found, are_areas=False)
+    for line in found:
+        if not isinstance(line, LineString) or line.is_empty:
+            raise ValueError("a planned line is no line")
+        yield tuple((float(x), float(y)) for x, y in shapely.get_coordinates(line))
+
+
+def _source_rates(connection: sqlite3.Connection) -> Iterator[float]:
+    for (rate,) in _rows(connection, "rate_l_ha", "source_rates", (float,)):
+        if not 0.0 <= rate < 100_000.0:
+            raise ValueError("a rate of its source is no rate")
+        yield rate
+
+
+def _findings(connection: sqlite3.Connection) -> Iterator[Problem]:
+    columns = "severity, code, text, place, fix"
+    for severity, code, text, where, fix in _rows(connection, columns, "findings", (str,) * 5):
+        yield Problem(severity=severity, code=code, text=text, where=where, fix=fix)
+
+
+def _frozen(text: str) -> dict[str, object]:
+    found = json.loads(text)
+    if not isinstance(found, dict):
+        raise ValueError("its settings are none")
+    return found

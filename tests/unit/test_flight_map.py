@@ -1,0 +1,288 @@
+"""The flight map: what is compiled is what is flown, to the last bit, and nothing else is."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from companion.assembly import build_setup
+from companion.cli.app import execute
+from companion.config import load
+from companion.core.prescription import Prescription
+from companion.errors import ConfigError, MapError
+from companion.flight_map import (
+    FlightMap,
+    difference,
+    flight_map_of,
+    read_flight_map,
+    write_flight_map,
+)
+from companion.flight_map import child as child_module
+from companion.maps.build import build_prescription, frame_for
+from companion.maps.compiling import MapOrder, compile_map, compiled_setup, read_configured_map
+from companion.problem import Problem
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+ANYANG = EXAMPLES / "anyang" / "config.toml"
+CONFIGURATIONS = [
+    EXAMPLES / name / "config.toml" for name in ("anyang", "orchard", "pump-sections", "pinpoint")
+]
+
+
+def compiled(config_file: Path = ANYANG, *overrides: str) -> FlightMap:
+    return compile_map(MapOrder.of(load(config_file, overrides=overrides)))
+
+
+def written(folder: Path, config_file: Path = ANYANG, *overrides: str) -> FlightMap:
+    return write_flight_map(folder / "a.flightmap.gpkg", compiled(config_file, *overrides))
+
+
+def assert_same(one: Prescription, two: Prescription) -> None:
+    """Assert that two prescriptions have the same ground, edges and rates, bit for bit."""
+    assert np.array_equal(one.edges.ends, two.edges.ends)
+    assert np.array_equal(one.edges.owner, two.edges.owner)
+    assert shapely.to_wkb(one.field) == shapely.to_wkb(two.field)
+    assert (one.rates_l_ha, one.overlap, one.default_rate_l_ha, one.sha256) == (
+        two.rates_l_ha,
+        two.overlap,
+        two.default_rate_l_ha,
+        two.sha256,
+    )
+    west, south, east, north = one.bounds_m
+    places = np.random.default_rng(1).uniform((west, south), (east, north), (2000, 2))
+    assert np.array_equal(
+        one.rates_at(places[:, 0], places[:, 1]),
+        two.rates_at(places[:, 0], places[:, 1]),
+        equal_nan=True,
+    )
+    box = ((west + east) / 2 - 20, (south + north) / 2 - 20)
+    for first, second in zip(
+        one.edges_near(*box, box[0] + 40, box[1] + 40),
+        two.edges_near(*box, box[0] + 40, box[1] + 40),
+        strict=True,
+    ):
+        assert np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("config_file", CONFIGURATIONS, ids=lambda path: path.parent.name)
+def test_what_is_flown_is_what_the_source_says_to_the_last_bit(
+    config_file: Path, tmp_path: Path
+) -> None:
+    config = load(config_file)
+    map_file = read_configured_map(config)
+    again = read_flight_map(written(tmp_path, config_file).path)
+    table = config.prescription
+    assert table is not None
+    if table.boundary is None and not table.exclusions:
+        source = build_prescription(map_file, frame_for(map_file), overlap=table.overlap)
+        assert_same(again.prescription, source)
+    assert again.frame == frame_for(map_file)
+    assert again.source_rates_l_ha == map_file.rates_l_ha
+    direct = compiled_setup(config)
+    assert_same(build_setup(config, again).prescription, direct.prescription)
+
+
+def test_the_same_source_and_settings_have_the_same_hash(tmp_path: Path) -> None:
+    one = written(tmp_path)
+    two = write_flight_map(tmp_path / "b.flightmap.gpkg", compiled())
+    other = write_flight_map(
+        tmp_path / "c.flightmap.gpkg", compiled(ANYANG, "prescription.overlap=max")
+    )
+    assert one.sha256 == two.sha256 != other.sha256
+    assert read_flight_map(one.path).sha256 == one.sha256
+
+
+def test_findings_sources_and_settings_come_back(tmp_path: Path) -> None:
+    found = Problem(severity="warning", code="odd", text="a zone", where="here", fix="look")
+    one = write_flight_map(tmp_path / "a.flightmap.gpkg", replace(compiled(), findings=(found,)))
+    again = read_flight_map(one.path)
+    assert again.findings == (found,)
+    assert again.sources == one.sources
+    assert {each.key for each in again.sources} == {"prescription.file", "prescription.boundary"}
+    assert again.frozen == one.frozen
+    assert again.as_object() == one.as_object()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("prescription.overlap", "max"),
+        ("prescription.default_rate_l_ha", "12.0"),
+        ("prescription.unit", "gal/ac"),
+        ("prescription.density_kg_l", "1.1"),
+        ("prescription.boundary", "other.geojson"),
+        ("prescription.exclusions", '["pond.geojson"]'),
+        ("mission.lines", "field.lines.geojson"),
+        ("prescription.rate_field", "other"),
+    ],
+)
+def test_a_flight_map_of_other_settings_is_refused_by_the_key(
+    key: str, value: str, tmp_path: Path
+) -> None:
+    flight_map = read_flight_map(written(tmp_path).path)
+    config = load(ANYANG, overrides=[f"{key}={value}"])
+    found = difference(flight_map, config)
+    assert found is not None
+    assert found[0] == key
+    with pytest.raises(ConfigError, match=rf"{key} = .*compile the map again") as refused:
+        build_setup(config, flight_map)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "prescription.offset_east_m=1.5",
+        "prescription.border=volume",
+        "prescription.border_buffer_m=0.5",
+        "prescription.across=max",
+        "product.rate_max_l_ha=60",
+    ],
+)
+def test_what_is_live_needs_no_new_flight_map(override: str, tmp_path: Path) -> None:
+    flight_map = read_flight_map(written(tmp_path).path)
+    config = load(ANYANG, overrides=[override])
+    assert build_setup(config, flight_map) is not None
+
+
+def test_the_label_limits_the_rates_of_the_source(tmp_path: Path) -> None:
+    flight_map = read_flight_map(written(tmp_path).path)
+    with pytest.raises(ConfigError, match=r"above product\.rate_max_l_ha = 5"):
+        build_setup(load(ANYANG, overrides=["product.rate_max_l_ha=5"]), flight_map)
+
+
+def test_an_offset_moves_the_compiled_ground(tmp_path: Path) -> None:
+    flight_map = read_flight_map(written(tmp_path).path)
+    moved = flight_map.moved(10.0, -5.0)
+    here, there = flight_map.prescription, moved
+    assert np.allclose(
+        there.edges.ends, here.edges.ends + np.array([10.0, -5.0, 10.0, -5.0]), atol=1e-9
+    )
+    assert flight_map.moved(0.0, 0.0) is flight_map.prescription
+
+
+def config_naming(folder: Path, name: str) -> Path:
+    """Write a configuration that names another map, beside nothing but that."""
+    text = ANYANG.read_text().replace('file = "prescription.shp"', f'file = "{name}"')
+    path = folder / "config.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_flight_map_alone_is_enough(tmp_path: Path) -> None:
+    flight_map = written(tmp_path)
+    config = load(config_naming(tmp_path, flight_map.path.name))
+    assert_same(
+        build_setup(config, flight_map_of(config)).prescription,
+        compiled_setup(load(ANYANG)).prescription,
+    )
+
+
+def test_a_boundary_that_was_changed_since_is_refused(tmp_path: Path) -> None:
+    flight_map = written(tmp_path)
+    config = load(config_naming(tmp_path, flight_map.path.name))
+    boundary = tmp_path / "boundary.geojson"
+    boundary.write_bytes((EXAMPLES / "anyang" / "boundary.geojson").read_bytes())
+    assert flight_map_of(config).sha256 == flight_map.sha256
+    boundary.write_bytes(boundary.read_bytes() + b"\n")
+    with pytest.raises(ConfigError, match=r"prescription\.boundary: .* was changed"):
+        flight_map_of(config)
+
+
+def office_files(folder: Path) -> Path:
+    """Copy the example with its map into a folder and return its configuration."""
+    for file in (EXAMPLES / "anyang").iterdir():
+        if file.is_file() and file.suffix != ".py":
+            (folder / file.name).write_bytes(file.read_bytes())
+    return folder / "config.toml"
+
+
+def test_any_other_map_is_compiled_by_a_child_and_once_only(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = load(office_files(tmp_path))
+    first = flight_map_of(config)
+    assert (
+        first.sha256
+        == write_flight_map(
+            tmp_path / "other.flightmap.gpkg",
+            replace(compiled(config.path), findings=first.findings),
+        ).sha256
+    )
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("compiled again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(child_module.subprocess, "run", refuse)
+        assert flight_map_of(config).as_object() == first.as_object()
+        with pytest.raises(AssertionError, match="compiled again"):
+            flight_map_of(load(config.path, overrides=["prescription.overlap=max"]))
+        (tmp_path / "prescription.prj").touch()
+        assert flight_map_of(config).sha256 == first.sha256
+        (tmp_path / "boundary.geojson").write_bytes(
+            (tmp_path / "boundary.geojson").read_bytes() + b"\n"
+        )
+        with pytest.raises(AssertionError, match="compiled again"):
+            flight_map_of(config)
+
+
+def test_what_the_child_refuses_is_refused_in_its_words(tmp_path: Path) -> None:
+    config = load(office_files(tmp_path))
+    (tmp_path / "prescription.dbf").write_bytes(b"nonsense")
+    with pytest.raises(MapError) as direct:
+        compiled_setup(config)
+    with pytest.raises(MapError) as by_child:
+        flight_map_of(config)
+    assert str(by_child.value) == str(direct.value)
+    assert (by_child.value.code, by_child.value.fix) == (direct.value.code, direct.value.fix)
+
+
+def test_command_says_what_it_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "field.flightmap.gpkg"
+    source = EXAMPLES / "anyang" / "prescription.shp"
+    order = ["map", "compile", str(source), "--config", str(ANYANG), "--out", str(out)]
+    assert execute(order) == 0
+    assert read_flight_map(out).sha256[:8] in capsys.readouterr().out
+    assert execute([*order[:-1], str(tmp_path / "field.gpkg")]) == 2
+    assert execute(["map", "compile", str(out), "--out", str(out)]) == 2
+
+
+Change = Callable[[sqlite3.Connection], object]
+
+
+def changed(path: Path, change: Change) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        change(connection)
+        connection.commit()
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "UPDATE zones SET rate_l_ha = 99.0 WHERE id = 1",
+        "DELETE FROM zones",
+        "DELETE FROM meta",
+        "UPDATE meta SET value = '[' WHERE key = 'frozen'",
+        "UPDATE meta SET value = '2' WHERE key = 'flight_map_version'",
+        "DROP TABLE field",
+        "DROP TABLE zones; CREATE VIEW zones AS SELECT 1 AS id, 'a' AS name",
+        "CREATE TRIGGER t AFTER INSERT ON zones BEGIN DELETE FROM meta; END; "
+        "UPDATE zones SET name = name || 'x'",
+        "PRAGMA application_id = 1",
+    ],
+)
+def test_a_flight_map_that_was_changed_is_refused(sql: str, tmp_path: Path) -> None:
+    path = written(tmp_path).path
+    changed(path, lambda connection: connection.executescript(sql))
+    with pytest.raises(MapError, match="no sound flight map") as refused:
+        read_flight_map(path)
+    assert "\n" not in str(refused.value)
+    assert refused.value.code == "flight-map"
