@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from typing import Literal
 
@@ -38,6 +39,8 @@ PX4_DRAG_S, PX4_LEARNS_S, PX4_UNFELT_S, PX4_KEPT = 2.4, 7.0, 1.0, 0.85
 LEAST_M_S = 1e-3
 # The overlap of two legs is tried in so many steps: to 0.02 s.
 OVERLAP_STEPS = 240
+# A plan is timed more than once, most of its corners as they were.
+CORNERS_KNOWN = 1 << 15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,6 +121,7 @@ class _Leg:
     seconds: float
 
     @classmethod
+    @lru_cache(maxsize=CORNERS_KNOWN)
     def of(cls, length_m: float, course: Course) -> _Leg:
         peak = course.speed_m_s
         if peak * course.reaching(peak) > length_m:
@@ -153,6 +157,7 @@ class _Leg:
         return way, speed, jerk * (first - last)
 
 
+@lru_cache(maxsize=CORNERS_KNOWN)
 def _overlap_s(one: _Leg, other: _Leg, bend: float) -> float:
     """Return how long before the end of a leg ArduCopter begins the next one."""
     most_s = min(one.reaching_s, other.reaching_s, other.seconds / 2.0)

@@ -165,7 +165,10 @@ def _seen(closed: Floats, places: Floats, tolerance_m: float) -> Iterator[tuple[
             for at, each in zip((some - first).tolist(), possible, strict=True):
                 chunks[at].append(each)
         for at, each in zip(starts.tolist(), chunks, strict=True):
-            yield at, np.concatenate(each, axis=1)[:, : count - at]
+            possible = np.concatenate(each, axis=1)[:, : count - at]
+            ends = np.flatnonzero(possible.any(axis=(0, 2)))
+            if len(ends):
+                yield at, possible[:, : ends[-1] + 1]
 
 
 def _ahead(
@@ -185,11 +188,16 @@ def _ahead(
         least, most = _sectors(closed[ends], starts, onward, tolerance_m)
         least = np.maximum(np.maximum.accumulate(least, axis=2), low[:, :, None])
         most = np.minimum(np.minimum.accumulate(most, axis=2), high[:, :, None])
+        possible = np.zeros((*least.shape, len(DEPTHS)), dtype=np.bool_)
+        # Courses are dear: they are asked for only where there are any that an edge may have.
+        some, depth, end = np.nonzero(least - ROUNDING <= most + ROUNDING)
+        low_some, high_some = least[some, depth, end, None], most[some, depth, end, None]
         course, far_m = _courses(
-            places[ends][:, None], starts[:, :, None, None], onward[:, None, None, None]
+            places[ends[some, end]], starts[some, depth, None], onward[some, None]
         )
-        possible = (course >= least[..., None] - ROUNDING) & (course <= most[..., None] + ROUNDING)
-        possible &= far_m > SAME_M
+        possible[some, depth, end] = (
+            (course >= low_some - ROUNDING) & (course <= high_some + ROUNDING) & (far_m > SAME_M)
+        )
         yield at, possible
         low, high = least[:, :, -1], most[:, :, -1]
         on = (low <= high).any(axis=1) & (at + ahead <= count)

@@ -30,6 +30,8 @@ NEAREST = 40
 STATION_M = 1e-9
 # Rows of a table of ways are worked on together, so many: they stay in the processor's cache.
 TOGETHER = 64
+# Of so many places at once ways to corners are looked at.
+POINTS_TOGETHER = 512
 # Of a way so many corners are looked at first, those that lie least aside.
 FIRST = 24
 # Around one straight line so many corners are looked at, those that lie least aside.
@@ -100,10 +102,18 @@ class FreeSpace:
 
         With `nearest` None all corners are looked at; infinite stands for those that are not seen.
         """
+        found = np.full((len(points), len(self.corners)), math.inf)
+        if not len(self.corners):
+            return found
+        # Some at a time: what is computed on the way stays small.
+        for first in range(0, len(points), POINTS_TOGETHER):
+            some = slice(first, first + POINTS_TOGETHER)
+            found[some] = self._some_to_corners_m(points[some], nearest)
+        return found
+
+    def _some_to_corners_m(self, points: Floats, nearest: int | None) -> Floats:
         count, corners = len(points), len(self.corners)
         found = np.full((count, corners), math.inf)
-        if not corners or not count:
-            return found
         far_m = np.hypot(
             points[:, 0][:, None] - self.corners[:, 0][None, :],
             points[:, 1][:, None] - self.corners[:, 1][None, :],

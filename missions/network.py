@@ -33,17 +33,23 @@ class Network:
     """Ends 2 i and 2 i + 1 are start and end of piece i.
 
     `between_s` has a last row and column for the depot that is nearest to the other end, with
-    half of a refill: one more landing costs the search, too, not only its ferry.
+    half of a refill: one more landing costs the search, too, not only its ferry. `ring_s` has the
+    depot twice, as the two ends of a piece.
     """
 
-    between_s: Floats
+    ring_s: Floats
     near: Ints
     litres: Floats
 
     @property
+    def between_s(self) -> Floats:
+        """Return the time between ends, the depot's last."""
+        return self.ring_s[:-1, :-1]
+
+    @property
     def depot(self) -> int:
         """Return the index of the depot in `between_s`."""
-        return len(self.between_s) - 1
+        return len(self.ring_s) - 2
 
     @property
     def rows(self) -> list[Sequence[float]]:
@@ -52,7 +58,7 @@ class Network:
 
     def put_depot_anywhere(self) -> None:
         """Leave the ways from and to the depot out: it is put where the tour begins and ends."""
-        self.between_s[self.depot, :] = self.between_s[:, self.depot] = 0.0
+        self.ring_s[self.depot :, :] = self.ring_s[:, self.depot :] = 0.0
 
 
 def build_network(
@@ -70,7 +76,7 @@ def build_network(
     """
     ends = pieces.ends.reshape(-1, 2)
     count = len(ends)
-    between = np.zeros((count + 1, count + 1))
+    between = np.zeros((count + 2, count + 2))
     # Distances become times in place: of a thousand lines they fill 32 MB.
     far_m = between[:count, :count]
     near = _measured(far_m, ends)
@@ -92,8 +98,9 @@ def build_network(
     _know(near, rows, columns)
     if home_m is not None:
         home_s = motion.legs_s(home_m).min(axis=0) + refill_s / 2.0
-        between[count, :count] = between[:count, count] = home_s
-    return Network(between_s=between, near=near, litres=pieces.litres)
+        between[count:, :count] = home_s
+        between[:count, count:] = home_s[:, None]
+    return Network(ring_s=between, near=near, litres=pieces.litres)
 
 
 def rows_of(table: Floats) -> list[Sequence[float]]:

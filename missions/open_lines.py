@@ -17,11 +17,22 @@ from shapely.geometry.base import BaseGeometry
 
 from missions.boom import SLACK_M
 from missions.coverage import reachable
-from missions.strips import Floats, directions, joined, lengths_m, no_lines, rectangles, united
+from missions.strips import (
+    Floats,
+    Objects,
+    directions,
+    joined,
+    lengths_m,
+    no_lines,
+    rectangles,
+    united,
+)
 from missions.swaths import LINE_MIN_M, axes, count_across
 
 # So much of the reachable ground may be left for patches.
 LEFT_SHARE = 0.0005
+# Ground to be covered is looked at in parts of so many corners, or this wide.
+TILE_CORNERS, TILE_MIN_M = 100, 1.0
 # A pass that covers less is none.
 LEAST_M2 = 1e-3
 
@@ -115,7 +126,7 @@ def needed_passes(
     """Return the parts of passes along the border that cover what the lines leave out."""
     target = reachable(ground, width_m)
     covered = united(lines, width_m) if covered is None else covered
-    missing = shapely.get_parts(target.difference(covered))
+    missing = _in_tiles(shapely.get_parts(target.difference(covered)))
     allowed_m2 = left_share * target.area
     left_m2 = float(shapely.area(missing).sum())
     strips = rectangles(passes, width_m)
@@ -145,6 +156,31 @@ def needed_passes(
         left_m2 += float(shapely.area(left).sum() - shapely.area(own).sum())
         missing[over[at]] = left
     return joined(chosen)
+
+
+def _in_tiles(parts: Objects) -> Objects:
+    """Return the ground in parts with few corners each: those of many are cut in two.
+
+    What a strip shares with a part takes as long as the part has corners.
+    """
+    done: list[Objects] = []
+    while len(parts):
+        west, south, east, north = shapely.bounds(parts).reshape(-1, 4).T
+        is_small = shapely.get_num_coordinates(parts) <= TILE_CORNERS
+        is_small |= np.maximum(east - west, north - south) <= TILE_MIN_M
+        done.append(parts[is_small])
+        west, south, east, north = (each[~is_small] for each in (west, south, east, north))
+        x, y = (west + east) / 2.0, (south + north) / 2.0
+        is_wide = east - west > north - south
+        ones = shapely.box(west, south, np.where(is_wide, x, east), np.where(is_wide, north, y))
+        others = shapely.box(np.where(is_wide, x, west), np.where(is_wide, south, y), east, north)
+        large = parts[~is_small]
+        parts = shapely.get_parts(
+            np.concatenate([shapely.intersection(large, half) for half in (ones, others)])
+        )
+        # Edges along a cut are no ground.
+        parts = parts[shapely.get_dimensions(parts) == 2]
+    return np.concatenate([np.empty(0, dtype=object), *done])
 
 
 def _trimmed(line: Floats, points: Floats) -> Floats:

@@ -510,6 +510,11 @@ def _cheapest(
     cost_m = np.array([_cost_m(each) for each in options[0]])
     before = []
     for some, following, places in zip(options[:-1], options[1:], inner, strict=True):
+        if len(some) == len(following) == 1:
+            near = _near(some[0].last, places, following[0].first)
+            cost_m = cost_m + TOO_NEAR_M * near + _cost_m(following[0])
+            before.append(ONLY)
+            continue
         ends = np.array([one.last for one in some])
         over = cost_m[:, None] + TOO_NEAR_M * _all_near(ends, places, following)
         before.append(over.argmin(axis=0))
@@ -518,6 +523,10 @@ def _cheapest(
     for step in reversed(before):
         chain.append(int(step[chain[-1]]))
     return [some[at] for some, at in zip(options, reversed(chain), strict=True)]
+
+
+# The option before, where there is one alone.
+ONLY = np.zeros(1, dtype=np.int64)
 
 
 def _all_near(ends: Floats, inner: Sequence[Place], following: Sequence[_Option]) -> Floats:

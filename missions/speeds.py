@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from companion.core.rate import flow_for_rate
-from missions.demand import M2_PER_HA, Rates, valve_places
+from missions.demand import M2_PER_HA, Rates, Uniform, valve_places
 from missions.plan import Leg, Place, Settings
 from missions.strips import Floats
 
@@ -60,6 +60,8 @@ def speed_range(rate_l_ha: Floats, settings: Settings) -> tuple[Floats, Floats]:
 
 def stretches_of(leg: Leg, rates: Rates, settings: Settings) -> Stretches:
     """Return the stretches of a spray line along which the range of speeds is the same."""
+    if isinstance(rates, Uniform):
+        return _one_stretch(leg, rates.rate_l_ha, settings)
     start, end = np.array(leg.points[0]), np.array(leg.points[-1])
     length_m = leg.length_m
     count = max(1, math.ceil(length_m / STEP_M))
@@ -87,6 +89,21 @@ def stretches_of(leg: Leg, rates: Rates, settings: Settings) -> Stretches:
         litres=np.add.reduceat(used, first) * share,
         least_l_ha=np.where(bare, 0.0, least)[first],
         most_l_ha=most[first],
+    )
+
+
+def _one_stretch(leg: Leg, rate_l_ha: float, settings: Settings) -> Stretches:
+    """Return what one rate everywhere comes to."""
+    is_bare = not rate_l_ha > 0.0
+    rate = np.zeros(1) if is_bare else np.array([rate_l_ha])
+    low, high = speed_range(np.ones(1) if is_bare else rate, settings)
+    return Stretches(
+        ends_m=np.array([leg.length_m]),
+        low=np.zeros(1) if is_bare else low,
+        high=np.full(1, np.inf) if is_bare else high,
+        litres=np.array([0.0 if is_bare else leg.volume_l]),
+        least_l_ha=rate,
+        most_l_ha=rate,
     )
 
 

@@ -52,10 +52,7 @@ class Ring:
     def __init__(self, network: Network, order: Sortie) -> None:
         depot = network.depot
         # The depot is a piece without length, both of whose ends are the same place.
-        both = [*range(depot + 1), depot]
-        between = network.between_s[np.ix_(both, both)]
-        between[depot:, depot:] = 0.0
-        self._between = rows_of(between)
+        self._between = rows_of(network.ring_s)
         near = network.near[:, :NEAREST].tolist()
         home = np.argsort(network.between_s[depot, :depot], kind="stable")[:NEAREST].tolist()
         self._near: list[list[int]] = [*near, home, home]

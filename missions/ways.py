@@ -28,6 +28,8 @@ ON_EDGE_M = 0.05
 DEPOT_FAR_M = 20_000.0
 # Of a field that does not see all of itself so many places stand for the lines.
 SOME_POINTS = 150
+# Of so many ends at once ways around corners are looked at: the tables on the way stay small.
+ENDS_TOGETHER = 512
 # A depot farther from the field than this is worth a word: each flight is mostly ferry.
 DEPOT_FERRY_M = 500.0
 
@@ -101,8 +103,16 @@ class Ways:
         """Return how long the way is from every depot to every place, shape (depots, n)."""
         if self.high is not None:
             return self.high.home_ways_m(ends)
-        found: Floats = self._outside_m[:, None] + _inside_m(self.gates, ends, self.inside)
-        return found
+        known = ends.tobytes()
+        if known not in self._home_ways_m:
+            found: Floats = self._outside_m[:, None] + _inside_m(self.gates, ends, self.inside)
+            self._home_ways_m[known] = found
+        return self._home_ways_m[known].copy()
+
+    @cached_property
+    def _home_ways_m(self) -> dict[bytes, Floats]:
+        """Return what `home_ways_m` has found: the ends of the same lines are asked for again."""
+        return {}
 
     @property
     def are_straight(self) -> bool:
@@ -130,8 +140,10 @@ def _inside_m(depots: Floats, ends: Floats, space: FreeSpace) -> Floats:
         if not len(hidden) or not reach.size:
             continue
         to_corner_m = np.min(reach[0][:, None] + space.between_m, axis=0)
-        bent = _over_corners_m(to_corner_m, ends[hidden], space)
-        far_m[number, hidden] = np.where(np.isfinite(bent), bent, far_m[number, hidden])
+        for first in range(0, len(hidden), ENDS_TOGETHER):
+            some = hidden[first : first + ENDS_TOGETHER]
+            bent = _over_corners_m(to_corner_m, ends[some], space)
+            far_m[number, some] = np.where(np.isfinite(bent), bent, far_m[number, some])
     return far_m
 
 

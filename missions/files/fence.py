@@ -30,6 +30,7 @@ from missions.files.fence_corners import with_corners
 from missions.files.limits import NAMES
 from missions.files.plan_rules import FENCE_CORNERS_MAX
 from missions.plan import Place, Plan, Settings, Sortie
+from missions.strips import Objects
 
 # The fence lies so far outside the field, at least; drawn with fewer corners, so much farther.
 # Lines end on the field's edge: PX4 in simulation went 1.24 m beyond one, and a fence at 1.2 m
@@ -257,13 +258,12 @@ class Fences:
         self, fence: Fence, whole: BaseGeometry, obstacles: list[Shape]
     ) -> Fence:
         """Return a fence with more obstacles: its border, then they, have fewer corners."""
-        near = [each for each in obstacles if fence.border.intersects(each[0])]
+        is_near = shapely.intersects(fence.border, [part for part, _ in obstacles]).tolist()
+        near = [each for each, inside in zip(obstacles, is_near, strict=True) if inside]
         best = fence
         for simpler_m in OBSTACLE_SIMPLER_M:
             drawn = [self._simpler_obstacle(each, simpler_m) for each in obstacles]
-            wanted = sum(
-                _polygon_bytes(self._simpler_obstacle(each, simpler_m)[0]) for each in near
-            )
+            wanted = sum(_bytes_of([self._simpler_obstacle(each, simpler_m)[0] for each in near]))
             most = (self.room_bytes - wanted - POLYGON_BYTES) // CORNER_BYTES
             border, outside_m = self._with_corners(fence, whole, most)
             found = self._with_obstacles(border, outside_m, drawn)
@@ -338,18 +338,20 @@ class Fences:
         self, border: Polygon, outside_m: float, obstacles: list[Shape]
     ) -> Fence | None:
         """Return a fence of this border with as many obstacles as there is room for."""
-        left = self.room_bytes - _polygon_bytes(border)
+        left = self.room_bytes - _bytes_of([border])[0]
         if left < 0:
             return None
         polygons, circles = [], []
-        near = [part for part, _ in obstacles if border.intersects(part)]
-        have_room = sum(_polygon_bytes(part) for part in near) <= left
+        shapely.prepare(border)
+        parts = np.array([part for part, _ in obstacles], dtype=object)
+        is_near = shapely.intersects(border, parts)
+        near = [each for each, inside in zip(obstacles, is_near.tolist(), strict=True) if inside]
+        bytes_of = _bytes_of(parts[is_near])
+        have_room = sum(bytes_of) <= left
         # A circle lies within its obstacle: it stands for one only where not all have room.
-        for polygon, round_one in obstacles:
+        for (polygon, round_one), polygon_bytes in zip(near, bytes_of, strict=True):
             circle = None if have_room else round_one
-            taken = _polygon_bytes(polygon) if circle is None else CIRCLE_BYTES
-            if not border.intersects(polygon):
-                continue
+            taken = polygon_bytes if circle is None else CIRCLE_BYTES
             if taken > left:
                 continue
             left -= taken
@@ -393,7 +395,7 @@ class Fences:
     def _check(self, fence: Fence, way: BaseGeometry, sortie: Sortie) -> None:
         """Refuse a fence that the sortie itself would break."""
         kept = [*fence.polygons, *(shapely.Point(x, y).buffer(r) for x, y, r in fence.circles)]
-        if fence.border.covers(way) and not shapely.union_all(kept).intersects(way):
+        if fence.border.covers(way) and not bool(shapely.intersects(way, kept).any()):
             return
         raise PlanError(
             f"sortie {sortie.number} leads out of its fence; write .waypoints, which has none, and "
@@ -492,8 +494,11 @@ def _crowded(part: Polygon) -> tuple[float, float]:
     return east_m, north_m
 
 
-def _polygon_bytes(part: Polygon) -> int:
-    return POLYGON_BYTES + CORNER_BYTES * _corners(part)
+def _bytes_of(parts: Sequence[Polygon] | Objects) -> list[int]:
+    """Return what an autopilot keeps each polygon in."""
+    corners = shapely.get_num_points(shapely.get_exterior_ring(parts)) - 1
+    found: list[int] = (POLYGON_BYTES + CORNER_BYTES * corners).tolist()
+    return found
 
 
 def _smaller(part: Polygon) -> Polygon:

@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 from shapely import Polygon, box
 from shapely.affinity import rotate
 
+from missions import open_lines as lines_module
 from missions.coverage import measure
 from missions.fitted_lines import edges_along, fitted_lines
-from missions.open_lines import open_lines
+from missions.open_lines import needed_passes, open_lines
 from missions.strips import lengths_m
+from missions.swaths import border_passes
 from missions.turns import Motion
 from tests.bench.missions import comb
 from tests.bench.turns import model_s, twin_s
@@ -65,3 +67,17 @@ def test_columns_of_whole_swaths_are_covered_without_a_line_too_many() -> None:
 @pytest.mark.parametrize("turn", ["stop", "strafe"])
 def test_turns_of_the_model_are_those_of_the_twin(turn: str) -> None:
     assert model_s(turn) == pytest.approx(twin_s(turn), rel=0.02)  # type: ignore[arg-type]
+
+
+def test_ground_in_tiles_needs_the_passes_that_it_needs_as_a_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ground = Polygon([(0, 0), (170, 30), (200, 160), (90, 210), (-20, 120)])
+    ground = ground.difference(shapely.union_all([box(x, 80, x + 5, 90) for x in (40, 90, 140)]))
+    lines, passes = open_lines(ground, 6.0, 20.0), border_passes(ground, 6.0)
+    found = []
+    for corners in (8, 10_000):
+        monkeypatch.setattr(lines_module, "TILE_CORNERS", corners)
+        found.append(needed_passes(lines, passes, ground, 6.0))
+    assert len(found[0]) > 3
+    assert found[0] == pytest.approx(found[1], abs=1e-6)

@@ -11,10 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.core.rate import flow_for_rate
+from missions.demand import Uniform
 from missions.files.items import CHANGE_SPEED, SPRAYER, items_of
 from missions.paced import paced
 from missions.plan import Leg, Plan, Settings, Sortie
 from missions.short import short_warnings
+from missions.speeds import stretches_of
 from missions.strips import Floats
 from tests.bench.missions import FRAME
 from tests.unit.test_missions_zero import Bare, planned
@@ -145,3 +147,18 @@ def test_cells_shorter_than_the_lag_are_named_with_their_place() -> None:
     assert "sortie 3 near 48.000" in text
     assert short_warnings([sortie], fine, FRAME, settings(settle_s=0.1)) == ()
     assert short_warnings([sortie], Bands((10.0, 20.0)), FRAME, settings(settle_s=0.3)) == ()
+
+
+@pytest.mark.parametrize("rate_l_ha", [0.0, 5.0, 20.0, 200.0])
+def test_one_rate_everywhere_is_flown_as_a_map_of_one_rate(rate_l_ha: float) -> None:
+    line = Leg(
+        kind="spray", points=((0.0, 0.0), (0.0, LENGTH_M)), speed_m_s=6.0, volume_l=1.2
+    )  # fmt: skip
+    one, other = (
+        stretches_of(line, rates, settings())
+        for rates in (Uniform(rate_l_ha=rate_l_ha), Bands((rate_l_ha,)))
+    )
+    for name in ("ends_m", "low", "high", "least_l_ha", "most_l_ha"):
+        assert getattr(one, name).tolist() == pytest.approx(getattr(other, name).tolist())
+    if rate_l_ha > 0.0:
+        assert one.litres.tolist() == pytest.approx(other.litres.tolist())
