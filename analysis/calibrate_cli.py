@@ -10,16 +10,18 @@ import typer
 from typer.core import TyperGroup
 
 from companion.cli.answer import AsJson, answer, note
-from companion.cli.app import Place, load_command
+from companion.cli.app import load_command
+from companion.commands import Command
 from companion.errors import ConfigError, JournalError
 
 if TYPE_CHECKING:
-    from typer._click.core import Command, Context
+    from typer._click.core import Command as ClickCommand
+    from typer._click.core import Context
 
 # Written elsewhere; `mission` plans a flight over the twin's route, which analysis must not know.
 OTHERS = {
-    "lag-marks": Place("analysis.calibrate_marks:lag_marks", ""),
-    "flow": Place("analysis.calibrate_flow:flow", ""),
+    "lag-marks": Command(target="analysis.calibrate_marks:lag_marks", help=""),
+    "flow": Command(target="analysis.calibrate_flow:flow", help=""),
 }
 MISSION = "sitl.calibration_mission"
 
@@ -31,7 +33,7 @@ class Commands(TyperGroup):
         """Return the names of all commands."""
         return [*super().list_commands(ctx), *OTHERS]
 
-    def get_command(self, ctx: Context, cmd_name: str) -> Command | None:
+    def get_command(self, ctx: Context, cmd_name: str) -> ClickCommand | None:
         """Return one command."""
         place = OTHERS.get(cmd_name)
         if place is None:

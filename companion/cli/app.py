@@ -10,58 +10,57 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from typer.core import TyperGroup
 
 from companion.cli.beside import give_way
 from companion.cli.drawing_rules import ignore_the_folders_own
+from companion.commands import Command, Haste, all_registered, command_named, load, registered
 from companion.errors import ActuatorError, MapError, UnreadableError, VrsprayError
 
 if TYPE_CHECKING:
-    from typer._click.core import Command, Context
+    from typer._click.core import Command as ClickCommand
+    from typer._click.core import Context
     from typer._click.formatting import HelpFormatter
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
 
 
-class Place(NamedTuple):
-    """Where a command is, as `module:attribute`, and its line in the list of all commands."""
-
-    target: str
-    help: str
-
-
+# The companion's own. Those of others are found by their entry points, and cannot replace these.
 COMMANDS = {
-    "demo": Place(
-        "sitl.demo_cli:demo", "Fly the field of Wang et al. 2024 by all methods; compare them."
+    "run": Command(
+        target="companion.cli.run:run", help="Spray: the companion beside the flight controller."
     ),
-    "run": Place("companion.cli.run:run", "Spray: the companion beside the flight controller."),
-    "ground": Place(
-        "companion.cli.ground:app", "Prime, flush, rinse, catch, click: on the ground, key held."
+    "ground": Command(
+        target="companion.cli.ground:app",
+        help="Prime, flush, rinse, catch, click: on the ground, key held.",
     ),
-    "doctor": Place("companion.cli.doctor:app", "Check all that must hold before a flight."),
-    "service": Place("companion.cli.service:app", "Run as a service, with systemd's watchdog."),
-    "config": Place("companion.cli.config:app", "Check or show a configuration; print its schema."),
-    "map": Place("companion.cli.map:app", "Check, show, convert and make prescription maps."),
-    "plan": Place("missions.cli:app", "Plan the passes over a field, sortie by sortie."),
-    "upload": Place("missions.upload.cli:app", "Put a mission on the vehicle; read it back."),
-    "sitl": Place("sitl.cli:app", "Simulated flight controller and sprayer."),
-    "calibrate": Place(
-        "analysis.calibrate_cli:app", "Measure lags and flow curves; plan the flight for it."
+    "doctor": Command(
+        target="companion.cli.doctor:app", help="Check all that must hold before a flight."
     ),
-    "report": Place(
-        "analysis.report.cli:report", "Evaluate a flight: page, figures, record of application."
+    "service": Command(
+        target="companion.cli.service:app", help="Run as a service, with systemd's watchdog."
     ),
-    "flights": Place("companion.cli.flights:app", "List, show, pin, prune, recover journals."),
-    "replay": Place("analysis.cli:replay", "Feed a journal to the core and compare decisions."),
-    "export": Place(
-        "analysis.exports.cli:export", "Write a flight as CSV, KML, shapefile, ISOXML and others."
+    "config": Command(
+        target="companion.cli.config:app",
+        help="Check or show a configuration; print its schema.",
+        haste="patient",
+        hastes={"check": "quick", "show": "quick", "schema": "quick"},
     ),
-    "wsp": Place("analysis.wsp.cli:wsp", "Coverage and drop sizes on water-sensitive paper."),
+    "flights": Command(
+        target="companion.cli.flights:app",
+        help="List, show, pin, prune, recover journals.",
+        haste="patient",
+        hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
+    ),
 }
+
+
+def find_command(name: str) -> Command | None:
+    """Return a command by its name: one of ours, or one that a distribution registers."""
+    return COMMANDS.get(name) or command_named(name)
 
 
 class CommandTable(TyperGroup):
@@ -69,29 +68,24 @@ class CommandTable(TyperGroup):
 
     def list_commands(self, ctx: Context) -> list[str]:  # noqa: ARG002 - click's
         """Return the names of all commands in the order of the table."""
-        return list(COMMANDS)
+        return [*COMMANDS, *(name for name in registered() if name not in COMMANDS)]
 
-    def get_command(self, ctx: Context, cmd_name: str) -> Command | None:  # noqa: ARG002 - click's
+    def get_command(self, ctx: Context, cmd_name: str) -> ClickCommand | None:  # noqa: ARG002
         """Return one command, imported now."""
-        place = COMMANDS.get(cmd_name)
-        return None if place is None else load_command(cmd_name, place)
+        found = find_command(cmd_name)
+        return None if found is None else load_command(cmd_name, found)
 
     def format_commands(self, ctx: Context, formatter: HelpFormatter) -> None:  # noqa: ARG002 - click's
-        """Write the list of commands from the table alone."""
+        """Write the list of commands from what they announce."""
         with formatter.section("Commands"):
-            formatter.write_dl([(name, place.help) for name, place in COMMANDS.items()])
+            listed = {**all_registered(), **COMMANDS}
+            names = [*COMMANDS, *(name for name in listed if name not in COMMANDS)]
+            formatter.write_dl([(name, listed[name].help) for name in names])
 
 
-def load_command(name: str, place: Place) -> Command:
-    """Return the command at `place`: one of Typer's, a Typer application, or a plain function."""
-    module_name, _, attribute = place.target.partition(":")
-    try:
-        found = getattr(import_module(module_name), attribute)
-    except ModuleNotFoundError as error:
-        raise VrsprayError(
-            f"vrspray {name}: the module {error.name} is not part of this installation; "
-            "install all of vrspray (pip install vrspray[report,mcap,maps,mavsdk])"
-        ) from error
+def load_command(name: str, command: Command) -> ClickCommand:
+    """Return a command that is ready to run: Typer's own, or made of an application or function."""
+    found = load(name, command.target)
     if (
         callable(found)
         and not isinstance(found, typer.Typer)
@@ -140,9 +134,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     if arguments is None:
         arguments = sys.argv[1:]
-        give_way(arguments)
+        give_way(arguments, _haste(arguments))
         ignore_the_folders_own()
     sys.exit(execute(arguments))
+
+
+def _haste(arguments: Sequence[str]) -> Haste:
+    try:
+        found = find_command(arguments[0]) if arguments else None
+    except VrsprayError:  # told where it is run
+        return "at-once"
+    return "at-once" if found is None else found.haste_of(arguments[1] if arguments[1:] else "")
 
 
 def execute(arguments: Sequence[str]) -> int:

@@ -15,26 +15,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from companion.cli.answer import note
+from companion.commands import Haste
 
 _NAME = "vrspray-run-"
 _SOCKETS = Path("/proc/net/unix")
 # Against 0, the companion's: a tenth of the time where both want the same core.
 NICENESS = 10
-# What computes for long and is in no hurry. What flies, serves or tries hardware is not among them.
-PATIENT = frozenset(
-    {"demo", "config", "map", "plan", "calibrate", "report", "flights", "replay", "export", "wsp"}
-)
-# A flight waits for it to begin.
-URGENT = frozenset({("map", "compile")})
-# Of these, what is done before a line about it could be read.
-QUICK = frozenset(
-    {
-        *(("config", name) for name in ("check", "show", "schema")),
-        *(("map", name) for name in ("rate", "new", "offset")),
-        *(("flights", name) for name in ("list", "show", "pin", "unpin", "prune")),
-        ("calibrate", "mission"),
-    }
-)
 
 
 @contextlib.contextmanager
@@ -57,23 +43,15 @@ def running(sockets: Path = _SOCKETS) -> tuple[int, ...]:
     return tuple(sorted(found - {os.getpid()}))
 
 
-def is_quick(arguments: Sequence[str]) -> bool:
-    """Whether a patient command is done before a line about its priority could be read."""
-    return "--help" in arguments or tuple(arguments[:2]) in QUICK
-
-
-def give_way(arguments: Sequence[str]) -> None:
+def give_way(arguments: Sequence[str], haste: Haste) -> None:
     """Lower this process's priority, if its command can wait.
 
     Where a companion runs, what computes for long says so.
     """
-    is_flight = list(arguments[:2]) == ["sitl", "fly"]
-    if tuple(arguments[:2]) in URGENT:
-        return
-    if not arguments or (arguments[0] not in PATIENT and not is_flight):
+    if haste == "at-once":
         return
     os.nice(max(NICENESS - os.nice(0), 0))
-    flying = () if is_quick(arguments) else running()
+    flying = () if haste == "quick" or "--help" in arguments else running()
     if flying:
         numbers = ", ".join(str(number) for number in flying)
         note(f"note: vrspray run flies on this computer (process {numbers}); this gives way to it")

@@ -20,6 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from companion.commands import is_there
 from companion.config import Config
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
@@ -36,6 +37,7 @@ _KEPT_MAX = 8
 # A raster of 16 million cells takes a small computer a minute.
 _TIMEOUT_S = 900.0
 _WRITTEN = (0, 1)
+_COMPILER = ("map", "compile")
 
 
 def flight_map_of(config: Config, overrides: Sequence[str] = ()) -> FlightMap:
@@ -135,7 +137,9 @@ def _compile(config: Config, table: PrescriptionTable, overrides: Sequence[str],
     Raises:
         ConfigError, MapError: what the child refused, in its words.
     """
-    order = [sys.executable, "-P", "-m", "companion", "map", "compile"]
+    if not is_there(_COMPILER[0]):
+        raise _not_here(config, table)
+    order = [sys.executable, "-P", "-m", "companion", *_COMPILER]
     order += [str(config.resolve(table.file)), "--config", str(config.path), "--out", str(out)]
     order += [part for override in overrides for part in ("--set", override)]
     try:
@@ -155,6 +159,21 @@ def _compile(config: Config, table: PrescriptionTable, overrides: Sequence[str],
     if isinstance(problems, list) and problems:
         raise MapError(text, code=str(problems[0]["code"]), fix=str(problems[0]["fix"]))
     raise ConfigError(text)
+
+
+def _not_here(config: Config, table: PrescriptionTable) -> MapError:
+    """Return the refusal of a map on a vehicle that opens flight maps only."""
+    name = f"{Path(table.file).stem}{SUFFIX}"
+    fix = (
+        f"compile it in the office, vrspray map compile {Path(table.file).name} --config "
+        f'{config.path.name} --out {name}, and write prescription.file = "{name}"'
+    )
+    return MapError(
+        f"{config.path}: prescription.file = {show_value(table.file)}: this vehicle opens flight "
+        f"maps only ({SUFFIX}); {fix}",
+        code="not-compiled",
+        fix=fix,
+    )
 
 
 def _said(stdout: bytes) -> dict[str, Any]:

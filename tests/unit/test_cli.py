@@ -10,8 +10,9 @@ from typing import Any
 
 import pytest
 
-from companion.cli.app import COMMANDS, Place, execute, load_command, main
+from companion.cli.app import COMMANDS, execute, load_command, main
 from companion.cli.run import build_executor, component_options
+from companion.commands import Command, all_registered
 from companion.config import load
 from companion.core.types import SprayPlan
 from companion.errors import ActuatorError, LinkError, VrsprayError
@@ -48,7 +49,7 @@ def test_help_lists_every_command_without_importing_any(capsys: Captured) -> Non
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stderr.strip() == "[] 0"
-    for name, place in COMMANDS.items():
+    for name, place in {**COMMANDS, **all_registered()}.items():
         assert f"  {name} " in done.stdout
         assert place.help in done.stdout
 
@@ -117,7 +118,9 @@ def test_every_end_has_its_exit_code_and_one_line(
     function: str, code: int, text: str, capsys: Captured, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "own_commands", sys.modules[__name__])
-    monkeypatch.setitem(COMMANDS, "trial", Place(f"own_commands:{function}", "A trial."))
+    monkeypatch.setitem(
+        COMMANDS, "trial", Command(target=f"own_commands:{function}", help="A trial.")
+    )
     assert execute(["trial"]) == code
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -126,13 +129,15 @@ def test_every_end_has_its_exit_code_and_one_line(
 
 def test_number_that_a_command_returns_is_its_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "own_commands", sys.modules[__name__])
-    monkeypatch.setitem(COMMANDS, "trial", Place("own_commands:return_one", "A trial."))
+    monkeypatch.setitem(
+        COMMANDS, "trial", Command(target="own_commands:return_one", help="A trial.")
+    )
     assert execute(["trial"]) == 1
 
 
 def test_command_that_is_not_installed_says_so() -> None:
     with pytest.raises(VrsprayError, match="no_such_package is not part of this installation"):
-        load_command("fly", Place("no_such_package:fly", "Fly."))
+        load_command("fly", Command(target="no_such_package:fly", help="Fly."))
 
 
 @pytest.mark.parametrize("name", ["run", "config", "map", "replay"])

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.app import COMMANDS, main
-from companion.cli.beside import NICENESS, PATIENT, is_quick, running, shown
+from companion.cli.app import find_command, main
+from companion.cli.beside import NICENESS, running, shown
 
 # Waits for a line, so that the test says when it ends.
 RUN = "from companion.cli.beside import shown\nwith shown():\n print('up', flush=True)\n input()"
@@ -47,10 +47,19 @@ def test_a_run_is_seen_while_it_lives_and_never_after_it() -> None:
 
 
 def test_what_is_done_at_once_says_nothing() -> None:
-    assert is_quick(("report", "--help"))
-    assert is_quick(("map", "rate", "map.shp", "36.0", "114.5"))
-    assert not is_quick(("map", "check", "map.shp"))
-    assert not is_quick(("demo",))
+    expected = {
+        "map rate": "quick",
+        "map check": "patient",
+        "map compile": "at-once",
+        "demo": "patient",
+        "sitl fly": "patient",
+        "sitl serve": "at-once",
+        "run": "at-once",
+    }
+    for name, haste in expected.items():
+        command = find_command(name.partition(" ")[0])
+        assert command is not None
+        assert command.haste_of(name.partition(" ")[2]) == haste
 
 
 def test_this_process_is_not_another() -> None:
@@ -68,10 +77,6 @@ def test_a_caller_within_a_process_keeps_its_priority() -> None:
     with pytest.raises(SystemExit):
         main(["map", "--help"])
     assert os.nice(0) == before
-
-
-def test_every_patient_command_exists() -> None:
-    assert set(COMMANDS) >= PATIENT
 
 
 def test_what_cannot_be_read_is_nobody(tmp_path: Path) -> None:

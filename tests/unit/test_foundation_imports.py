@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -67,6 +68,19 @@ def test_mavutil_is_imported_nowhere() -> None:
         if any("mavutil" in name.split(".") for name in imports(path.read_text()))
     ]
     assert importing == []
+
+
+def test_the_companion_names_no_module_of_the_office_in_a_string_either() -> None:
+    named = re.compile(r"(missions|analysis|sitl)([.:]\w+)+")
+    found = [
+        f"{relative(path)}:{node.lineno}: {node.value}"
+        for path in (ROOT / "companion").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant)
+        and isinstance(node.value, str)
+        and named.fullmatch(node.value)
+    ]
+    assert found == []
 
 
 def test_simulation_never_uses_our_own_link() -> None:

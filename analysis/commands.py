@@ -1,0 +1,30 @@
+"""The commands of this package, as `vrspray` lists them; nothing else is imported for that."""
+
+from companion.commands import Command
+
+CALIBRATE = Command(
+    target="analysis.calibrate_cli:app",
+    help="Measure lags and flow curves; plan the flight for it.",
+    haste="patient",
+    hastes={"mission": "quick"},
+)
+REPORT = Command(
+    target="analysis.report.cli:report",
+    help="Evaluate a flight: page, figures, record of application.",
+    haste="patient",
+)
+REPLAY = Command(
+    target="analysis.cli:replay",
+    help="Feed a journal to the core and compare decisions.",
+    haste="patient",
+)
+EXPORT = Command(
+    target="analysis.exports.cli:export",
+    help="Write a flight as CSV, KML, shapefile, ISOXML and others.",
+    haste="patient",
+)
+WSP = Command(
+    target="analysis.wsp.cli:wsp",
+    help="Coverage and drop sizes on water-sensitive paper.",
+    haste="patient",
+)

@@ -1,0 +1,19 @@
+"""The commands of this package, as `vrspray` lists them; nothing else is imported for that."""
+
+from companion.commands import Command
+
+MAP = Command(
+    target="companion.cli.map:app",
+    help="Check, show, convert, compile and make prescription maps.",
+    haste="patient",
+    # A flight waits for a map to be compiled.
+    hastes={"rate": "quick", "new": "quick", "offset": "quick", "compile": "at-once"},
+)
+PLAN = Command(
+    target="missions.cli:app",
+    help="Plan the passes over a field, sortie by sortie.",
+    haste="patient",
+)
+UPLOAD = Command(
+    target="missions.upload.cli:app", help="Put a mission on the vehicle; read it back."
+)

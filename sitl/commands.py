@@ -1,0 +1,14 @@
+"""The commands of this package, as `vrspray` lists them; nothing else is imported for that."""
+
+from companion.commands import Command
+
+DEMO = Command(
+    target="sitl.demo_cli:demo",
+    help="Fly the field of Wang et al. 2024 by all methods; compare them.",
+    haste="patient",
+)
+SITL = Command(
+    target="sitl.cli:app",
+    help="Simulated flight controller and sprayer.",
+    hastes={"fly": "patient"},
+)
