@@ -10,24 +10,285 @@ from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from analysis.flown.read_applied import read_applied
-from analysis.overrides import override
-from analysis.replayed_ground import ReplayedGround
-from analysis.what_if import Moved, Orders, Sprayed, compared
 from companion.core.controller import Memory, step
+from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
 from companion.core.setup import Setup
+from companion.core.swath import expected
 from companion.core.types import Decision, Input
 from companion.errors import UnreadableError
 from companion.record.codec import FIELD_NAMES, FieldNames, encode
 from companion.record.coverage_table import read_coverage
 from companion.record.new_file import computing
 from companion.record.reader import Entry, JournalContent, opened, read_journal
+from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
+
+if TYPE_CHECKING:
+    from companion.core.controller import Memory, Setup
+    from companion.core.types import VehicleState
+
+
+from dataclasses import field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.dose import zone_volumes
+from analysis.evaluation import Distances, Evaluation, evaluate_strips
+from analysis.flown.applied_flight import ValveChanges
+from analysis.flown.applied_record import EvaluationError, record_of
+from analysis.strips import strips_of
+from companion.record.valve_rows import Row, ValveRows
+
+if TYPE_CHECKING:
+    from analysis.flown.applied_flight import AppliedFlight
+    from companion.core.types import Decision
+
+
+import difflib
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from types import NoneType, UnionType
+from typing import Literal, Union, get_args, get_origin, get_type_hints
+
+from companion.core.controller import Setup
+from companion.errors import ConfigError
+
+# What other decisions on a flight's inputs would have put on the ground.
+#
+# Both ways, the recorded and the other, go through one model of the sprayer: the curves and lags
+# of the recorded set-up, orders at their planned times. So an override changes what is decided,
+# and not what the sprayer is. The ground cannot react: the aircraft flies as it flew, and the
+# sensors say what they said.
+
+_MICRO = 1e-6
+ML_PER_L = 1000.0
+L_DIGITS = 6
+
+
+@dataclass(slots=True)
+class Orders:
+    """What decisions brought about, collected one by one."""
+
+    valves: ValveRows = field(default_factory=ValveRows)
+    rows: list[Row] = field(default_factory=list)
+    flow: list[tuple[float, float]] = field(default_factory=list)
+
+    def take(self, decision: Decision) -> None:
+        """Take in the next decision."""
+        self.rows += self.valves.take_plan(decision.plan)
+        self.flow.append((decision.now_s, decision.flow_l_min))
+
+    def carried_out(self, flight: AppliedFlight) -> AppliedFlight:
+        """Return the flight as if these had been its orders, each given at its planned time."""
+        table = np.array([*self.rows, *self.valves.end()], dtype=np.float64).reshape(-1, 4)
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        changes = ValveChanges(
+            planned_s=table[:, 0] * _MICRO,
+            actual_s=np.full(len(table), np.nan),
+            valve=table[:, 2].astype(np.int64),
+            duty=table[:, 3] / 1000.0,
+        )
+        at_s, flow = np.array(self.flow, dtype=np.float64).reshape(-1, 2).T
+        last = np.searchsorted(at_s, flight.time_s, "right") - 1
+        flows = np.where(last >= 0, flow[np.maximum(last, 0)], 0.0) if len(flow) else 0.0
+        return replace(flight, changes=changes, flow_l_min=flows + np.zeros(len(flight.time_s)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sprayed:
+    """What one way of deciding put on the ground, by the model; `zones` are litres by zone."""
+
+    volume_l: float
+    zones: dict[str, float]
+    lag_distance_m: Distances
+    border_margin_m: Distances
+    misapplied_percent: float | None
+    spraying_accuracy_percent: float | None
+    off_target_ml: float
+    missed: int
+    apart: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moved:
+    """By how many metres the changes lie elsewhere, + is later; the border's among them."""
+
+    mean: float | None
+    mean_abs: float | None
+    max_abs: float | None
+    count: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WhatIf:
+    """Both ways beside each other."""
+
+    recorded: Sprayed
+    what_if: Sprayed
+    moved_m: Moved
+
+
+def compared(flight: AppliedFlight, recorded: Orders, other: Orders) -> WhatIf | None:
+    """Return what both would have sprayed on this flight; None where it had no position."""
+    try:
+        was, was_found = _sprayed(recorded.carried_out(flight))
+        now, now_found = _sprayed(other.carried_out(flight))
+    except EvaluationError:
+        return None
+    places = {
+        (step.change.valve, step.change.time_s): step.lag_distance_m for step in was_found.steps
+    }
+    moves = [
+        step.lag_distance_m - before
+        for step in now_found.steps
+        if (before := places.get((step.change.valve, step.change.time_s))) is not None
+        and step.lag_distance_m is not None
+    ]
+    distances = Distances.of(moves)
+    return WhatIf(
+        recorded=was,
+        what_if=now,
+        moved_m=Moved(
+            mean=distances.mean,
+            mean_abs=distances.mean_abs,
+            max_abs=distances.max_abs,
+            count=distances.count,
+        ),
+    )
+
+
+def _sprayed(flight: AppliedFlight) -> tuple[Sprayed, Evaluation]:
+    record = record_of(flight)
+    strips = strips_of(record)
+    found = evaluate_strips(record, strips)
+    zones = zone_volumes(strips, record.prescription)
+    sprayed = Sprayed(
+        volume_l=found.applied_ml / ML_PER_L,
+        zones={
+            name or "-": round(zone.given_ml / ML_PER_L, L_DIGITS) for name, zone in zones.items()
+        },
+        lag_distance_m=found.lag_distance_m,
+        border_margin_m=found.border_margin_m,
+        misapplied_percent=found.misapplied_percent,
+        spraying_accuracy_percent=found.spraying_accuracy_percent,
+        off_target_ml=found.off_target_ml,
+        missed=found.missed,
+        apart=found.apart,
+    )
+    return sprayed, found
+
+
+# Changes of a recorded set-up for a what-if: KEY=VALUE on the fields of `Setup`.
+#
+# Keys are those of the configuration file where the set-up has them ("lag.on_s", "safety.modes",
+# "prescription.border"), or the dotted path of a field of `Setup` ("nozzle_sets.0.valves").
+
+# Where the configuration file and the set-up name the same thing differently.
+_ALIASES = {
+    "lag.method": "method",
+    "prescription.border": "border",
+    "prescription.border_buffer_m": "border_buffer_m",
+    "prescription.across": "across",
+    "output.lease_s": "lease_s",
+    "mission.lines_aside_m": "lines.aside_m",
+    "mission.lines_course_deg": "lines.course_deg",
+}
+_PREFIXES = {"safety.": "limits."}
+_FIXED = ("frame", "prescription")
+_YES, _NO = ("true", "yes", "1"), ("false", "no", "0")
+
+
+def override(setup: Setup, changes: Sequence[str]) -> Setup:
+    """Return `setup` with every KEY=VALUE carried out; ConfigError for what cannot be."""
+    for change in changes:
+        key, equals, text = change.partition("=")
+        key, text = key.strip(), text.strip()
+        if not (key and equals):
+            raise ConfigError(f"--set {change}: write KEY=VALUE, such as lag.on_s=0.12")
+        path = _path(key)
+        if path[0] in _FIXED:
+            raise ConfigError(f"--set {key}: the ground of a recorded flight cannot be changed")
+        try:
+            setup = _replaced(setup, path, text, Setup)
+        except (ValueError, TypeError) as error:
+            raise ConfigError(f"--set {change}: {error}") from error
+    return setup
+
+
+def _path(key: str) -> list[str]:
+    key = _ALIASES.get(key, key)
+    for prefix, own in _PREFIXES.items():
+        if key.startswith(prefix):
+            key = own + key.removeprefix(prefix)
+    return key.split(".")
+
+
+def _replaced(value: Any, path: Sequence[str], text: str, hint: Any) -> Any:
+    """Return `value` with the field at `path` replaced by what `text` says."""
+    if not path:
+        return _parsed(text, hint)
+    name, rest = path[0], path[1:]
+    if isinstance(value, tuple):
+        if not (name.isdigit() and int(name) < len(value)):
+            raise ValueError(f"{name} is no index of {len(value)} values, counted from 0")
+        i = int(name)
+        return (*value[:i], _replaced(value[i], rest, text, get_args(hint)[0]), *value[i + 1 :])
+    if not is_dataclass(value) or isinstance(value, type):
+        raise ValueError(f"there is nothing below it called {name}")
+    known = [field.name for field in fields(value) if field.init]
+    if name not in known:
+        near = difflib.get_close_matches(name, known, n=1)
+        raise ValueError(
+            f"{name} is unknown; " + (f"{near[0]}?" if near else f"known: {', '.join(known)}")
+        )
+    inner = get_type_hints(type(value))[name]
+    return replace(value, **{name: _replaced(getattr(value, name), rest, text, inner)})
+
+
+def _parsed(text: str, hint: Any) -> Any:
+    """Return the value of type `hint` that `text` stands for; ValueError where it is none."""
+    origin = get_origin(hint)
+    if origin in (Union, UnionType):
+        return _parsed_union(text, get_args(hint))
+    if origin is Literal:
+        return _one_of(text, {str(value): value for value in get_args(hint)})
+    if origin in (tuple, frozenset):
+        inner = get_args(hint)[0]
+        words = text.strip("[]()").replace('"', "").replace("'", "").split(",")
+        return origin(_parsed(word.strip(), inner) for word in words if word.strip())
+    if hint is bool:
+        return _one_of(text.lower(), dict.fromkeys(_YES, True) | dict.fromkeys(_NO, False))
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        # As the configuration file writes them: rtk-float, 3d, look-ahead.
+        names = {
+            member.name.lower().replace("_", "-").removeprefix("fix-"): member for member in hint
+        }
+        return _one_of(text, names)
+    if hint in (float, int, str):
+        return hint(text)
+    raise ValueError("name one of its fields")
+
+
+def _parsed_union(text: str, hints: tuple[Any, ...]) -> Any:
+    if NoneType in hints and text.lower() == "none":
+        return None
+    return _parsed(text, next(hint for hint in hints if hint is not NoneType))
+
+
+def _one_of(text: str, known: dict[str, Any]) -> Any:
+    if text not in known:
+        raise ValueError(f"{text} is none of {', '.join(known)}")
+    return known[text]
+
 
 SAY_EVERY = 5000
 
@@ -242,3 +503,72 @@ def _same(was: Any, now: Any) -> bool:
 def _short(value: Any) -> str:
     text = json.dumps(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+# Whether a replay treats the ground that its journal says was treated, cell by cell.
+#
+# A flight that ended in order wrote its ground at its very end: a few hundredths of a second
+# behind the last decision, which matters only where a valve was still open. One that was cut
+# wrote what was to be half way to its next commit, as of one of its last turns. Both are made
+# again here by the runtime's own rules.
+
+# The commit before a cut has the last told one, or the one before it.
+TOLD_KEPT = 3
+# From the last decision to the end: a turn that waited in vain, and its own time.
+END_WITHIN_S = 4.0 * STEP_MAX_S
+
+
+class ReplayedGround:
+    """Takes what each step of a replay leaves, and compares at the end."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self._told: deque[tuple[Memory, VehicleState | None, float]] = deque(maxlen=TOLD_KEPT)
+        self._last: tuple[Memory, VehicleState | None, float] | None = None
+
+    def take(self, memory: Memory, state: VehicleState | None, now_s: float) -> None:
+        """Take what the step of `now_s` has left."""
+        self._last = (memory, state, now_s)
+        if not self._told or now_s >= self._told[-1][2] + COVERAGE_EVERY_S:
+            self._told.append(self._last)
+
+    def differing(self, kept: Coverage, *, is_closed: bool) -> int | None:
+        """Return how many cells differ from the journal's; None where nothing can be compared."""
+        if not self._setup.records_coverage or self._last is None:
+            return None
+        if is_closed:
+            return self._at_the_end(kept, *self._last)
+        counts = (
+            cells_apart(kept, self._expected(*told, ahead_s=kept.ahead_s)) for told in self._told
+        )
+        return min(counts)
+
+    def _at_the_end(
+        self, kept: Coverage, memory: Memory, state: VehicleState | None, now_s: float
+    ) -> int:
+        least = Coverage() if memory.swath is None else memory.swath.coverage
+        most = self._expected(memory, state, now_s, ahead_s=END_WITHIN_S)
+        return cells_without(least, kept) + cells_without(kept, most.joined(least))
+
+    def _expected(
+        self, memory: Memory, state: VehicleState | None, now_s: float, *, ahead_s: float
+    ) -> Coverage:
+        return expected(self._setup, memory, state, now_s=now_s, cut_s=now_s + ahead_s)
+
+
+def cells_without(one: Coverage, other: Coverage) -> int:
+    """Return how many cells only the first has."""
+    return sum(_only(tile, other.tiles.get(key, b"")) for key, tile in one.tiles.items())
+
+
+def cells_apart(one: Coverage, other: Coverage) -> int:
+    """Return how many cells only one of the two has."""
+    return sum(
+        _only(a.tiles.get(key, b""), b.tiles.get(key, b""))
+        for key in set(chain(one.tiles, other.tiles))
+        for a, b in ((one, other), (other, one))
+    )
+
+
+def _only(tile: bytes, other: bytes) -> int:
+    return (int.from_bytes(tile, "little") & ~int.from_bytes(other, "little")).bit_count()

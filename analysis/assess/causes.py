@@ -14,16 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.assess.cause_marks import Marks, marks_of
-from analysis.assess.cause_rules import (
-    as_wished,
-    beside_border,
-    by_inhibit,
-    in_acceleration,
-    in_change,
-    in_edge,
-    in_saturation,
-)
-from analysis.assess.treated_ground import treated_ground
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -33,6 +23,39 @@ if TYPE_CHECKING:
     from analysis.lag import Step
     from analysis.strips import Strip
     from analysis.track import Bools
+
+
+from typing import TYPE_CHECKING
+
+from analysis.assess.cause_marks import samples_at
+from analysis.assess.rate_wishes import percent_at
+from analysis.flown.modelled_flow import ML_S_PER_L_MIN
+from analysis.holds import CLEAR_M
+from analysis.lag import Verdict
+from analysis.transitions import ML_M_PER_L_HA_M
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.assess.cause_marks import Marks
+    from analysis.flown.applied_flight import AppliedFlight
+    from analysis.lag import Step
+    from analysis.track import Bools, Floats
+    from companion.core.schedule import LagModel
+
+
+from typing import TYPE_CHECKING
+
+from analysis.assess.ground_elements import SquareGrid, slices_of, summed
+from analysis.assess.ground_rates import ground_rates
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.flight_record import FlightRecord
+    from analysis.strips import Strip
+    from analysis.track import Bools, Floats
+
 
 OFF_BY = 0.10
 # Ground that got less than this part of its rate was left out.
@@ -153,3 +176,209 @@ def _sorted(
         left &= ~where
     found.append((Cause.UNEXPLAINED, left))
     return found
+
+
+# Which marks of a strip a cause explains.
+
+# A first-order flow is within 5 % of its step after so many time constants.
+SETTLED_TIMES = 3.0
+# A speed that changes by more within a second is changing; gusts do less in most seconds.
+ACCELERATION_M_S2 = 0.5
+ACCELERATION_OVER_S = 0.5
+# Measured ranges are taken as they are, give or take 2 %, as `FlowCurve.delivers` has it.
+RANGE_SLACK = 0.02
+
+
+def as_wished(flight: AppliedFlight, marks: Marks, off_by: float) -> Bools:
+    """Return where it got the percentage that the operator asked for, give or take `off_by`."""
+    lag, setup = flight.setup.lag, marks.setup
+    percent = percent_at(flight, marks.time_s - lag.output_s - lag.up_s)
+    wished: Floats = marks.asked_ml_m * percent / 100.0
+    if setup.rate_max_l_ha is not None:
+        most = setup.rate_max_l_ha * ML_M_PER_L_HA_M * marks.strip.track.width_m
+        wished = np.minimum(wished, most)
+    near = np.abs(marks.given_ml_m - wished) <= off_by * wished
+    found: Bools = near & (percent != 100.0) & (wished > 0.0)
+    return found
+
+
+def in_edge(marks: Marks, steps: Sequence[Step]) -> Bools:
+    """Return where the border decides: the strip reaches over it, or the rule's margin is near."""
+    lag = marks.setup.lag
+    found = marks.at_border.copy()
+    margin_s = max(lag.off_end_s, lag.on_s) + marks.strip.track.period_s
+    for step in steps:
+        if step.change.border:
+            margin_m = margin_s * step.change.speed_m_s + marks.setup.border_buffer_m
+            margin_m += 0.5 * marks.strip.track.width_m  # of a border that is met at an angle
+            found |= np.abs(marks.distance_m - step.change.distance_m) <= margin_m
+    return found
+
+
+def beside_border(marks: Marks, closed: Bools) -> Bools:
+    """Return which closed marks have the border so near to the strip's end that it may be why."""
+    index = np.flatnonzero(closed)
+    found = np.zeros(len(closed), dtype=np.bool_)
+    if len(index):
+        strip = marks.strip
+        found[index] = ~strip.track.wholly_inside(
+            marks.prescription,
+            strip.track.places(marks.time_s[index]),
+            widen_m=max(CLEAR_M, marks.setup.border_buffer_m),
+        )
+    return found
+
+
+def in_change(marks: Marks, steps: Sequence[Step]) -> Bools:
+    """Return where a change of rate explains it: within its lag distance, and while it goes on."""
+    lag = marks.setup.doses.lag
+    found = np.zeros(len(marks.time_s), dtype=np.bool_)
+    starts_s = [run.start_s for run in marks.strip.stretches]
+    ends_m = {run.start_s: run.end_m for run in marks.strip.stretches}
+    takes_s = marks.strip.track.period_s + _lasts_s(lag)
+    for step in steps:
+        change = step.change
+        if change.border:
+            continue
+        reach_m = takes_s * change.speed_m_s + abs(step.lag_distance_m or 0.0)
+        until_m = change.distance_m + reach_m
+        if step.verdict is Verdict.MISSED and change.time_s in starts_s:
+            until_m = ends_m[change.time_s]
+        found |= (marks.distance_m >= change.distance_m - reach_m) & (marks.distance_m <= until_m)
+    return found
+
+
+def _lasts_s(lag: LagModel) -> float:
+    """Return how long a change of flow goes on, on either side of its volume-equivalent step."""
+    ramp_s = max(lag.on_s - lag.on_start_s, lag.off_end_s - lag.off_s)
+    return ramp_s + SETTLED_TIMES * max(lag.up_time_s, lag.down_time_s)
+
+
+def in_saturation(marks: Marks) -> Bools:
+    """Return where no nozzle set delivers what is prescribed at that speed."""
+    doses = marks.setup.doses
+    share = marks.strip.track.width_m / marks.setup.boom.width_m
+    asked_l_min = marks.asked_ml_m * marks.speed_m_s / ML_S_PER_L_MIN / share
+    delivers = np.zeros(len(asked_l_min), dtype=np.bool_)
+    for nozzles in doses.nozzle_sets:
+        low = (1.0 - RANGE_SLACK) * nozzles.curve.flow_for(max(doses.pwm.duty_min, 0.0))
+        high = (1.0 + RANGE_SLACK) * nozzles.flow_max_l_min
+        delivers |= (asked_l_min >= low) & (asked_l_min <= high)
+    saturated: Bools = ~delivers & (marks.asked_ml_m > 0.0)
+    return saturated
+
+
+def in_acceleration(marks: Marks) -> Bools:
+    """Return where the speed was changing."""
+    track = marks.strip.track
+    half_s = 0.5 * ACCELERATION_OVER_S
+    after: Floats = track.at(track.speed_m_s, marks.time_s + half_s)
+    before: Floats = track.at(track.speed_m_s, marks.time_s - half_s)
+    found: Bools = np.abs(after - before) > ACCELERATION_M_S2 * ACCELERATION_OVER_S
+    return found
+
+
+def by_inhibit(flight: AppliedFlight, marks: Marks, where: Bools) -> dict[str, float]:
+    """Return the ground by the reason that held the valves; of several, by all of them at once."""
+    names = np.array(flight.inhibits, dtype=object)
+    lead_s = flight.setup.lag.off_s + flight.setup.lag.output_s
+    found: dict[str, float] = {}
+    reasons = names[samples_at(flight, marks.time_s[where] - lead_s)]
+    later = names[samples_at(flight, marks.time_s[where])]
+    for reason, then, area in zip(
+        reasons.tolist(), later.tolist(), marks.area_m2[where].tolist(), strict=True
+    ):
+        name = reason or then or "just ended"
+        found[name] = found.get(name, 0.0) + area
+    return found
+
+
+# Which ground was treated, treated again, or left out between passes: counted on small squares.
+#
+# Squares of half a metre: what is narrower than a quarter of a metre (the noise with which an
+# aircraft holds its line) is neither a gap nor an overlap.
+
+CELL_M = 0.5
+PIECE_M = 0.125
+CELLS_MAX = 4_000_000
+# A slice was sprayed where it got this part of what was prescribed there.
+WET_FROM = 0.10
+DOUBLED_FROM = 1.5
+LEFT_OUT_BELOW = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TreatedGround:
+    """Areas in square metres; `between_m2` is the untreated ground with treated on both sides."""
+
+    treated_m2: float
+    doubled_m2: float
+    between_m2: float
+    untreated_m2: float
+
+
+def treated_ground(record: FlightRecord, strips: Sequence[Strip]) -> TreatedGround:
+    """Return how the field was covered."""
+    prescription = record.prescription
+    if prescription.field.is_empty:
+        return TreatedGround(treated_m2=0.0, doubled_m2=0.0, between_m2=0.0, untreated_m2=0.0)
+    west, south, east, north = prescription.bounds_m
+    cell_m = max(CELL_M, ((east - west) * (north - south) / CELLS_MAX) ** 0.5)
+    grid = SquareGrid.over((west, south, east, north), cell_m)
+    covered = np.zeros(grid.rows * grid.columns + 1)
+    passed = np.zeros(grid.rows * grid.columns + 1)
+    for strip in strips:
+        slices = slices_of(strip, PIECE_M)
+        active = np.flatnonzero((slices.given_ml > 1e-9) | (slices.asked_ml > 0.0))
+        wet = np.where(slices.given_ml > WET_FROM * slices.asked_ml, slices.area_m2, 0.0)
+        dry = slices.area_m2 - wet
+        for total, each in zip(
+            (covered, passed), summed(grid, slices, PIECE_M, [wet, dry], active), strict=True
+        ):
+            total += each
+    shape = (grid.rows, grid.columns)
+    area = cell_m * cell_m
+    times = covered[:-1].reshape(shape) / area
+    under = passed[:-1].reshape(shape) / area
+    open_ground = _rated(record, grid, times < LEFT_OUT_BELOW)
+    # What a strip passed with its valve closed is judged along the strip.
+    missed = open_ground & (times + under < LEFT_OUT_BELOW)
+    closed = _closed(times + under >= LEFT_OUT_BELOW, record.boom.width_m / cell_m)
+    return TreatedGround(
+        treated_m2=float((times >= LEFT_OUT_BELOW).sum()) * area,
+        doubled_m2=float((times[times > DOUBLED_FROM] - 1.0).sum()) * area,
+        between_m2=float((missed & closed).sum()) * area,
+        untreated_m2=float(open_ground.sum()) * area,
+    )
+
+
+def _rated(record: FlightRecord, grid: SquareGrid, asked: Bools) -> Bools:
+    """Return which of some squares have something prescribed in their middle."""
+    row, column = np.nonzero(asked)
+    east: Floats = grid.west_m + grid.cell_m * (column.astype(np.float64) + 0.5)
+    north: Floats = grid.south_m + grid.cell_m * (row.astype(np.float64) + 0.5)
+    found = np.zeros(asked.shape, dtype=np.bool_)
+    found[row, column] = ground_rates(record.prescription, east, north) > 0.0
+    return found
+
+
+def _closed(treated: Bools, width: float) -> Bools:
+    """Return the treated squares and what lies between them, up to `width` squares apart."""
+    reach = max(int(width / 2.0), 1)
+    padded = np.pad(treated, 2 * reach)
+    grown = _box_sum(padded.astype(np.float64), reach) > 0.5
+    shrunk = _box_sum((~grown).astype(np.float64), reach) < 0.5
+    return shrunk[2 * reach : -2 * reach, 2 * reach : -2 * reach]
+
+
+def _box_sum(values: Floats, reach: int) -> Floats:
+    """Return the sum over the square of `reach` to each side."""
+    for axis in (0, 1):
+        total = np.cumsum(values, axis=axis)
+        count = values.shape[axis]
+        high = np.minimum(np.arange(count) + reach, count - 1)
+        low = np.arange(count) - reach - 1
+        below = np.take(total, np.maximum(low, 0), axis=axis)
+        outside = np.expand_dims(low < 0, 1 - axis)
+        values = np.take(total, high, axis=axis) - np.where(outside, 0.0, below)
+    return values

@@ -8,35 +8,43 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from analysis.flown.applied_flight import AppliedFlight, Series
+from analysis.flown.applied_flight import AppliedFlight, Floats, Ints, Series, ValveChanges
 from analysis.flown.holes import (
     Hole,
+    change_holes,
     closed_over,
     doubtful_holes,
     marked,
+    sample_holes,
     within,
 )
-from analysis.flown.read_changes import read_changes
-from analysis.flown.read_samples import read_samples
 from analysis.flown.sound_rows import (
+    POINT_BYTES,
     clock_offset_s,
+    is_change,
     is_event,
+    is_sample,
+    rates_of,
     sound_rows,
 )
-from analysis.flown.table_rows import rows_of
+from analysis.flown.table_rows import Row, rows_of
 from analysis.flown.unknown import unknown_times
+from companion.core.types import Decision
 from companion.record.blocks import Entry
-from companion.record.codec import FieldNames
+from companion.record.codec import FieldNames, decode
 from companion.record.events import Event
 from companion.record.reader import OpenJournal, opened
 from companion.record.setup_json import field_names_of
+from companion.record.valve_rows import ValveRows
 from companion.record.versions import migrated, read_entries
 from companion.record.whole_file import damages
 
@@ -236,3 +244,149 @@ def _series(rows: list[tuple[float, float | None]]) -> Series | None:
     time_s, value = np.array(rows, dtype=np.float64).T
     order = np.argsort(time_s, kind="stable")
     return Series(time_s=time_s[order], value=value[order])
+
+
+# The changes of the valves in a journal, and where some of them are missing.
+
+_MICRO = 1e-6
+_COLUMNS = "planned_us, actual_us, valve, duty_permille"
+
+
+def read_changes(
+    journal: OpenJournal, valves: int, names: FieldNames, unread: list[str] | None
+) -> tuple[ValveChanges, list[Hole]]:
+    """Return the changes of all valves in the order of time in which they came about.
+
+    A journal of version 1 has no table of them: there they are worked out from its decisions.
+    """
+    what = "valve changes"
+    if journal.version == "1":
+        rows: list[Row] = list(enumerate_rows(_planned(journal, names, unread)))
+        return _in_order(_table(rows)), []
+    found = rows_of(
+        journal.connection, "valve_changes", _COLUMNS, key="id", unread=unread, what=what
+    )
+    rows = sound_rows(found.rows, partial(is_change, valves=valves), unread, what)
+    table = _table(rows)
+    changes = _changes(table)
+    holes = change_holes(
+        table[:, 0].astype(np.int64),
+        np.where(np.isnan(changes.actual_s), changes.planned_s, changes.actual_s),
+        int(journal.meta.get("rows_valve_changes") or 0),
+        reaches_end=found.reaches_end,
+    )
+    return _in_order(table), holes
+
+
+def enumerate_rows(rows: Iterator[tuple[int | None, int | None, int, int]]) -> Iterator[Row]:
+    """Yield rows with a number before each, from 1."""
+    return ((number, *row) for number, row in enumerate(rows, start=1))
+
+
+def _table(rows: list[Row]) -> np.ndarray:
+    return np.array(rows, dtype=np.float64).reshape(-1, 5)
+
+
+def _changes(table: np.ndarray) -> ValveChanges:
+    planned_s, actual_s = table[:, 1] * _MICRO, table[:, 2] * _MICRO
+    return ValveChanges(
+        # What no plan asked for (a fault that closed) has its real time only.
+        planned_s=np.where(np.isnan(planned_s), actual_s, planned_s),
+        actual_s=actual_s,
+        valve=table[:, 3].astype(np.int64),
+        duty=table[:, 4] / 1000.0,
+    )
+
+
+def _in_order(table: np.ndarray) -> ValveChanges:
+    at_us = np.where(np.isnan(table[:, 2]), table[:, 1], table[:, 2])
+    return _changes(table[np.argsort(at_us, kind="stable")])
+
+
+def _planned(
+    journal: OpenJournal, names: FieldNames, unread: list[str] | None
+) -> Iterator[tuple[int | None, int | None, int, int]]:
+    made = ValveRows()
+    entries = read_entries(
+        journal.connection, journal.version, kinds={Decision.__name__}, unread=unread
+    )
+    for entry in entries:
+        decision = decode(entry.body, names)
+        if isinstance(decision, Decision):
+            yield from made.take_plan(decision.plan)
+    yield from made.end()
+
+
+# The table `applied` of a journal in columns, and where rows of it are missing.
+
+_APPLIED = """geom, time_s, target_flow_l_min, flow_l_min, speed_m_s, course_deg, heading_deg,
+           height_m, inhibits, valve_rates_l_ha"""
+# A point as the journal writes it: 8 bytes of the GeoPackage, then WKB, little-endian.
+_POINT = np.dtype(
+    [("head", f"V{POINT_BYTES - 21}"), ("order", "u1"), ("kind", "<u4"), ("lon", "<f8"),
+     ("lat", "<f8")]
+)  # fmt: skip
+
+
+class Samples(NamedTuple):
+    """The rows of the table `applied`, in columns; `holes` are where rows are missing."""
+
+    place: NDArray[np.void]
+    columns: Floats
+    inhibits: tuple[str, ...]
+    rate_l_ha: Floats
+    holes: list[Hole]
+    missing: int
+
+
+def read_samples(journal: OpenJournal, valves: int, unread: list[str] | None) -> Samples:
+    """Return all samples with a position, in the order of their times."""
+    found = rows_of(
+        journal.connection, "applied", _APPLIED, key="sequence", unread=unread, what="samples"
+    )
+    rates: dict[object, list[float] | None] = {}
+    for row in found.rows:
+        # Rows of one rate for all valves are one text, and there are few rates.
+        if row[-1] not in rates:
+            rates[row[-1]] = rates_of(row[-1], valves)
+    rows = sound_rows(
+        found.rows, lambda row: is_sample(row) and rates[row[-1]] is not None, unread, "samples"
+    )
+    sequence: Ints = np.array([row[0] for row in rows], dtype=np.int64)
+    holes = sample_holes(
+        sequence, np.array([row[2] for row in rows], dtype=np.float64), _ends(journal)
+    )
+    count = int(journal.meta.get("rows_applied") or 0)
+    placed = [row for row in rows if row[1] is not None]
+    place = np.frombuffer(b"".join(row[1] for row in placed), dtype=_POINT)
+    columns = np.array([row[2:9] for row in placed], dtype=np.float64).reshape(-1, 7).T
+    sound = np.isfinite(place["lat"]) & np.isfinite(place["lon"])
+    order = np.flatnonzero(sound)[np.argsort(columns[0, sound], kind="stable")]
+    return Samples(
+        place=place[order],
+        columns=np.ascontiguousarray(columns[:, order]),
+        inhibits=tuple(" ".join(sorted((placed[i][9] or "").split())) for i in order.tolist()),
+        rate_l_ha=np.array(
+            [rates[placed[i][-1]] for i in order.tolist()], dtype=np.float64
+        ).reshape(-1, valves),
+        holes=holes,
+        missing=max(count - len(rows), 0),
+    )
+
+
+def _ends(journal: OpenJournal) -> Sequence[tuple[float, float]]:
+    """Return number and time of the first and the last of all entries; nothing where unknown."""
+    if journal.version == "1":
+        return ()
+    found = []
+    for sql in (
+        "SELECT first_sequence, from_s FROM blocks ORDER BY first_sequence LIMIT 1",
+        "SELECT last_sequence, until_s FROM blocks ORDER BY first_sequence DESC LIMIT 1",
+    ):
+        try:
+            row = journal.connection.execute(sql).fetchone()
+        except sqlite3.DatabaseError:
+            continue
+        if row is not None and isinstance(row[0], int) and isinstance(row[1], float):
+            found.append((float(row[0]), row[1]))
+    return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,6 @@ from analysis.report.clock import Clock, clock_of
 from analysis.report.contents import contents_of
 from analysis.report.facts import facts_of
 from analysis.report.legal import LegalRecord, legal_record
-from analysis.report.page import page_of, picture
-from analysis.report.record_files import record_csv, record_json
 from analysis.report.told import Told, told_with
 from analysis.report.treated import Treated, treated_of
 from companion.config.application_table import PROFILES, Profile
@@ -26,6 +25,23 @@ if TYPE_CHECKING:
 
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.report.figures.style import Drawn
+
+
+import base64
+import csv
+import io
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import shapely
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
+from analysis.report.clock import duration_text
+
+if TYPE_CHECKING:
+    from analysis.report.legal import LegalRecord
+
 
 Say = Callable[[str], None]
 TOO_LITTLE = "too little of the journal can be read"
@@ -185,3 +201,145 @@ def _figures(
 
             files["report.pdf"] = pdf_of(contents, drawn)
     return files, figures
+
+
+# The page: one file that opens from disk, with all figures and every number in it.
+
+EVENTS_SHOWN, RATES_SHOWN = 200, 40
+NOTHING = "-"
+
+
+def page_of(contents: Mapping[str, Any], figures: Mapping[str, Mapping[str, str]]) -> str:
+    """Return the page; `figures` has title, caption and markup (HTML) by name."""
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=False, keep_trailing_newline=True
+    )
+    environment.filters |= FILTERS
+    shown = {name: {**each, "markup": Markup(each["markup"])} for name, each in figures.items()}
+    values = {
+        **contents,
+        "setup": _with_pairs(contents["setup"]),
+        "table_5": _with_rows(contents.get("table_5")),
+        "events_shown": contents["events"][:EVENTS_SHOWN],
+        "evaluated": "breakdowns" in contents,
+        "notes": contents.get("notes", []),
+        "stylesheet": Markup(_text_of("page.css")),
+        "data": Markup(embedded(contents)),
+        "speeds_text": _speeds_text(contents),
+        "figures": _Absent(shown),
+    }
+    return environment.from_string(_text_of("page.html.j2")).render(values).lstrip()
+
+
+def _text_of(name: str) -> str:
+    return resources.files("analysis.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def embedded(contents: Mapping[str, Any]) -> str:
+    """Return JSON that may stand in a page: nothing in it can end the element it stands in."""
+    text = json.dumps(contents, allow_nan=False)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def picture(png: bytes, alt: str, width: float) -> str:
+    """Return a PNG as an element of the page; `width` is a share of the page's."""
+    data = base64.b64encode(png).decode()
+    element = '<img src="data:image/png;base64,{}" alt="{}" style="width: {}%">'
+    return str(Markup(element).format(data, alt, round(100.0 * width)))
+
+
+def _speeds_text(contents: Mapping[str, Any]) -> str:
+    """Return between which speeds the changes were flown."""
+    rows = contents.get("breakdowns", {}).get("by_speed", [])
+    low = [row["low"] for row in rows if row["lag_distance_m"]["count"]]
+    high = [row["high"] for row in rows if row["lag_distance_m"]["count"]]
+    return f"{min(low):g} to {max(high):g} m/s" if low else "no changes"
+
+
+class _Absent(dict[str, Any]):
+    """Figures by name; one that was not drawn is none."""
+
+    def __missing__(self, key: str) -> None:
+        return None
+
+
+def _with_pairs(setup: Mapping[str, Any]) -> dict[str, Any]:
+    sets = [
+        {**each, "pairs": list(zip(each["duty"], each["flow_l_min"], strict=True))}
+        for each in setup["nozzle_sets"]
+    ]
+    return {**setup, "nozzle_sets": sets}
+
+
+def _with_rows(table: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    return None if table is None else {**table, "rows_shown": table["rows"][:RATES_SHOWN]}
+
+
+def _number(value: float | None, digits: int) -> str:
+    return NOTHING if value is None else f"{value:,.{digits}f}"
+
+
+def _signed(value: float | None, digits: int) -> str:
+    return NOTHING if value is None else f"{value:+,.{digits}f}"
+
+
+def _percent(text: str) -> str:
+    return text if text == NOTHING else f"{text} %"
+
+
+def _moment(text: str | None) -> str:
+    """Return a time of ISO 8601 as it is read, without its offset: the page names the zone.
+
+    >>> _moment("2026-11-22T03:22:39+00:00")
+    '2026-11-22 03:22:39'
+    """
+    return NOTHING if text is None else text[:19].replace("T", " ")
+
+
+def _span(interval: Mapping[str, Any], digits: int) -> str:
+    """Return an interval as it is read; too few independent measurements have none."""
+    low, high = interval["low"], interval["high"]
+    return NOTHING if low is None or high is None else f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+FILTERS: dict[str, Callable[..., str]] = {
+    "f": _number,
+    "signed": _signed,
+    "percent": _percent,
+    "moment": _moment,
+    "span": _span,
+    "duration": duration_text,
+}
+
+
+# A legal record as files: JSON with the treated area as GeoJSON, CSV of one row.
+
+
+def record_json(record: LegalRecord) -> bytes:
+    """Return the record as JSON."""
+    return (json.dumps(record.as_json(), indent=1, allow_nan=False) + "\n").encode()
+
+
+def record_csv(record: LegalRecord) -> bytes:
+    """Return the record as one row under its heading, so that a register grows by appending rows.
+
+    A column is named as the field in the JSON, with the unit where there is one; the area is WKT.
+    """
+    row: dict[str, object] = {
+        "profile": record.profile,
+        "complete": "yes" if record.is_complete else "no",
+        "missing": "; ".join(record.missing),
+    }
+    for entry in record.entries:
+        row[entry.name] = "" if entry.value is None else entry.value
+        if entry.unit and not entry.name.endswith(entry.unit.lower().replace("/", "_")):
+            row[f"{entry.name}_unit"] = entry.unit
+    row["added_after_flight"] = "; ".join(record.added_after_flight)
+    row["remarks"] = "; ".join(record.remarks)
+    area = shapely.from_geojson(json.dumps(record.treated_area))
+    row["treated_area_wkt"] = shapely.to_wkt(area, rounding_precision=7)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, fieldnames=list(row))
+    writer.writeheader()
+    writer.writerow(row)
+    return text.getvalue().encode()

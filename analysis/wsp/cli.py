@@ -13,9 +13,7 @@ import typer
 from analysis.report.folder import check_folder
 from analysis.wsp.card import INSET_MM, Method
 from analysis.wsp.figure import draw_distributions
-from analysis.wsp.flown_journal import Flown, read_flown
 from analysis.wsp.image import LEAST_DPI, MOST_DPI, ImageError, sheets_of
-from analysis.wsp.picture import draw_sheet
 from analysis.wsp.positions import Position, placed, read_positions
 from analysis.wsp.results import (
     Numbered,
@@ -37,6 +35,23 @@ from companion.errors import ConfigError
 
 if TYPE_CHECKING:
     from analysis.wsp.flight_ties import Ties
+
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from companion.errors import JournalError
+
+if TYPE_CHECKING:
+    from analysis.flown.applied_flight import AppliedFlight
+
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from analysis.wsp.card import Card
+from analysis.wsp.image import Sheet
 
 FIGURE = "distributions.png"
 
@@ -247,3 +262,99 @@ def _write(text: str, path: Path) -> None:
 
 # What the program's own command line takes in: one command of the kind that Typer makes.
 wsp = typer.main.get_command(app)
+
+
+# The journal behind the cards: read before the scans are, and as far as it can be read.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flown:
+    """A flight, None without one, and what of its journal is missing."""
+
+    flight: AppliedFlight | None = None
+    warnings: tuple[str, ...] = ()
+
+
+def read_flown(journal: Path) -> Flown:
+    """Return the flight of a journal; one that is damaged is a warning, a missing file an error.
+
+    Cards are measured whatever became of the journal: scans do not depend on it.
+    """
+    from analysis.flown.read_applied import read_applied
+
+    if not journal.is_file():
+        raise ConfigError(f"--journal {journal}: there is no such file")
+    unread: list[str] = []
+    try:
+        flight = read_applied(journal, unread=unread)
+    except JournalError as error:
+        return Flown(warnings=(str(error),))
+    found = []
+    if not flight.is_closed:
+        found.append("the flight was cut off: its last second may be missing")
+    if flight.lost:
+        found.append(f"{flight.lost} rows are missing in the journal")
+    if not len(flight.time_s):
+        found.append("the flight never had a position: no card can be tied to it")
+        return Flown(warnings=(*found, *unread))
+    return Flown(flight=flight, warnings=(*found, *(f"not read: {each}" for each in unread)))
+
+
+# The picture of a sheet: cards outlined and numbered, counted stains tinted.
+
+Bytes = NDArray[np.uint8]
+
+# Longest side of a sheet's picture: a stain of 0.2 mm on A4 is still two pixels.
+_LONGEST = 3600
+_TINT = np.array([228, 26, 28], dtype=np.float32)
+_OUTLINE = (0, 90, 255)
+_TINT_SHARE = 0.75
+
+
+def draw_sheet(sheet: Sheet, cards: Sequence[tuple[int, Card]], path: Path) -> None:
+    """Write the sheet with what was found on it: outline blue, counted stains red."""
+    factor = -(-max(sheet.pixels.shape[:2]) // _LONGEST)
+    small = np.array(sheet.reduced(factor))
+    for _, card in cards:
+        _tint(small, card, factor)
+    image = Image.fromarray(small)
+    drawing = ImageDraw.Draw(image)
+    line = max(2, round(max(small.shape[:2]) / 800))
+    font = ImageFont.load_default(size=max(16.0, max(small.shape[:2]) / 60))
+    for number, card in cards:
+        corners = [(float(x) / factor, float(y) / factor) for x, y in card.outline.corners]
+        drawing.line([*corners, corners[0]], fill=_OUTLINE, width=line)
+        _label(drawing, f"{number}", corners, font)
+    image.save(path, quality=88)
+
+
+def _label(
+    drawing: ImageDraw.ImageDraw,
+    text: str,
+    corners: Sequence[tuple[float, float]],
+    font: ImageFont.ImageFont | ImageFont.FreeTypeFont,
+) -> None:
+    """Write a card's number on a white ground into its upper left corner."""
+    x, y = min(corners, key=lambda corner: corner[0] + corner[1])
+    place = (max(x, 0.0) + 6.0, max(y, 0.0) + 6.0)
+    left, top, right, bottom = drawing.textbbox(place, text, font=font)
+    drawing.rectangle((left - 5, top - 5, right + 5, bottom + 5), fill=(255, 255, 255))
+    drawing.text(place, text, fill=_OUTLINE, font=font)
+
+
+def _tint(small: Bytes, card: Card, factor: int) -> None:
+    """Colour the counted stains, mixed by how much of each small pixel they cover."""
+    left, top, right, bottom = card.box
+    x, y = left // factor, top // factor
+    columns, rows = -(-right // factor) - x, -(-bottom // factor) - y
+    whole = np.zeros((rows * factor, columns * factor), dtype=np.bool_)
+    dx, dy = left - x * factor, top - y * factor
+    whole[dy : dy + bottom - top, dx : dx + right - left] = card.stained
+    share = np.zeros((rows, columns), dtype=np.uint8)
+    for down in range(factor):
+        for across in range(factor):
+            share += whole[down::factor, across::factor]
+    view = small[y : y + rows, x : x + columns]
+    stained = np.nonzero(share[: view.shape[0], : view.shape[1]])
+    part = share[stained][:, None] * np.float32(_TINT_SHARE / factor**2)
+    view[stained] = np.round(view[stained] * (1.0 - part) + _TINT * part).astype(np.uint8)

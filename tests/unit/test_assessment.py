@@ -13,12 +13,11 @@ import shapely.affinity
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.assess.assessment import Assessment, assess
+from analysis.assess.assessment import Assessment, assess, balance_of
 from analysis.assess.breakdowns import speed_bin
 from analysis.assess.causes import Cause
 from analysis.assess.cell_maps import cell_maps
 from analysis.assess.intervals import crossings_of, mean_interval, ratio_interval
-from analysis.assess.volume_balance import balance_of
 from analysis.flown.applied_flight import Series
 from analysis.flown.applied_record import record_of
 from analysis.strips import strips_of

@@ -13,10 +13,9 @@ from hypothesis import given as drawn
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from analysis.exports.outlines import outlines
 from analysis.exports.registry import FORMATS
 from analysis.exports.source import Source
-from analysis.exports.swaths import LENGTH_M, swaths_of
+from analysis.exports.swaths import LENGTH_M, outlines, swaths_of
 from analysis.flight_record import FlightRecord
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.read_applied import read_applied

@@ -14,8 +14,8 @@ import shapely
 
 from analysis.border import off_target_ml
 from analysis.flight_record import FlightMeta, FlightRecord
-from analysis.planned_lines import PlannedLines
 from analysis.strips import strips_of
+from analysis.track import PlannedLines
 from companion.cli.app import execute
 from companion.config import load
 from companion.core.frame import LocalFrame

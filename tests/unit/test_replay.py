@@ -17,8 +17,7 @@ from pathlib import Path
 import pytest
 from numpy._core import _multiarray_umath
 
-from analysis.overrides import override
-from analysis.replay import FlownCore, first_difference, replay
+from analysis.replay import FlownCore, first_difference, override, replay
 from companion.cli.app import execute
 from companion.core.setup import Setup
 from companion.core.types import (

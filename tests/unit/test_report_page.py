@@ -17,14 +17,12 @@ from analysis.assess.assessment import assess
 from analysis.assess.causes import Cause
 from analysis.assess.histogram import Histogram
 from analysis.flown.read_applied import read_applied
-from analysis.report.build import Report, ReportOptions, build_report
+from analysis.report.build import Report, ReportOptions, build_report, embedded, page_of
 from analysis.report.clock import clock_of
-from analysis.report.contents import METRICS, contents_of
-from analysis.report.figures.spread import histogram
-from analysis.report.page import embedded, page_of
+from analysis.report.contents import METRICS, contents_of, held_between, held_ground
+from analysis.report.drawing import histogram
 from analysis.report.told import told_with
 from analysis.report.treated import treated_of
-from analysis.report.words import held_between, held_ground
 from companion.record.writer import Event
 from tests.unit.report_flight import EU_TOLD, fly
 

@@ -12,7 +12,7 @@ import pytest
 from analysis.evaluation import evaluate
 from analysis.flown.read_applied import read_applied
 from analysis.replay import replay
-from analysis.report import words
+from analysis.report import contents
 from companion.cli.app import execute
 from companion.cli.run import component_options, training_mark
 from companion.config import load
@@ -152,7 +152,7 @@ def test_a_filling_that_the_sensor_refuses_is_denied_and_not_shown() -> None:
 def test_a_simulated_flight_is_marked_and_its_report_says_so(tmp_path: Path) -> None:
     path = report_flight.fly(tmp_path, training="simulated")
     flight = read_applied(path)
-    assert [each.code for each in words._training(flight)] == ["training"]
+    assert [each.code for each in contents._training(flight)] == ["training"]
 
 
 def test_run_refuses_widths_that_config_check_refuses(

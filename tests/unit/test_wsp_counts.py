@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from analysis.wsp.counts import Counted, at_edge, drops_on
-from analysis.wsp.notches import crossings, notches, seen_share
+from analysis.wsp.corrected import Counted, at_edge, crossings, drops_on, notches, seen_share
 from analysis.wsp.outlines import Outlines, outlines_of
 from analysis.wsp.overlap import drops_px
 from analysis.wsp.stains import segment

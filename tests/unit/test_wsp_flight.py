@@ -9,8 +9,14 @@ import numpy as np
 import pytest
 
 from analysis.flown.applied_flight import AppliedFlight, ValveChanges
-from analysis.wsp.boundaries import CardAtChange, NearestChange, nearest_change, tables
-from analysis.wsp.passing import duty_at, passing
+from analysis.wsp.flight_ties import (
+    CardAtChange,
+    NearestChange,
+    duty_at,
+    nearest_change,
+    passing,
+    tables,
+)
 from tests import builders
 from tests.pump_flight import pump, pump_setup
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from analysis.wsp.counts import without_holes
+from analysis.wsp.corrected import without_holes
 from analysis.wsp.overlap import drops_px
 
 SIDE = 900
