@@ -59,7 +59,7 @@ from enum import Enum
 from types import NoneType, UnionType
 from typing import Literal, Union, get_args, get_origin, get_type_hints
 
-from companion.core.controller import Setup
+from companion.core.setup import Setup
 from companion.errors import ConfigError
 
 # What other decisions on a flight's inputs would have put on the ground.

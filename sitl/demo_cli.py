@@ -26,10 +26,10 @@ from companion.cli.answer import AsJson, answer, note
 from companion.cli.progress import progress
 from companion.errors import ConfigError
 from sitl.cli import FlowLaw
-from sitl.demo_report import can_report, write_report
 
 if TYPE_CHECKING:
     from sitl.demo import DemoOptions, DemoResult
+
 
 JOURNAL = "flight-0001.gpkg"
 PICTURES = ("map.png", "lags.png", "flow.png")
@@ -222,3 +222,22 @@ def _table(result: DemoResult, *, padding: int) -> Table:
 
 # What the program's own command line takes in: one command of the kind that Typer makes.
 demo = typer.main.get_command(app)
+
+
+# The report of the demo's flight, as `vrspray report` makes it of any journal.
+
+# What a report needs besides the program itself: the extra `report`.
+NEEDED = ("jinja2", "matplotlib")
+
+
+def can_report() -> bool:
+    """Return whether all is installed that a report needs."""
+    return all(importlib.util.find_spec(name) is not None for name in NEEDED)
+
+
+def write_report(journal: Path, folder: Path) -> None:
+    """Evaluate the flight in `journal` and write its report into `folder`."""
+    from analysis.report.build import ReportOptions, build_report
+    from analysis.report.folder import write_files
+
+    write_files(folder, build_report(journal, ReportOptions()).files)

@@ -9,10 +9,13 @@ flight's liquid lands is moved by wind x fall time and judged again.
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import shlex
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -35,7 +38,6 @@ from sitl.disturbances import (
 )
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
-from sitl.sensitivity_page import COMMAND, table_lines, write_page, write_plot
 
 SPEED_M_S = 5.0
 PROFILE = "wang-2024"
@@ -240,3 +242,166 @@ def main() -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+# How the costs of errors are shown: lines for a terminal, a page, a picture.
+
+COMMAND = "python -m sitl.sensitivity"
+HEAD = (
+    "Disturbance", "Lag mean [m]", "Abs [m]", "Cost [m]", "Worst [m]", "Cost [m]",
+    "Misapplied [%]", "Cost [points]", "Outside [mL]",
+)  # fmt: skip
+
+INTRODUCTION = """\
+# Sensitivity
+
+What an error costs that nobody knows of. Each row is a flight over the field of Wang et al. 2024
+(four passes, 216 changes of rate) with one disturbance and the method `scheduled`. *Cost* is
+disturbed minus undisturbed, seed by seed, and then the mean of the seeds. The figures are those of
+[metrics](metrics.md): + is too late; *Abs* is the mean of absolute lag distances, *Worst* the
+largest of all seeds, *Outside* what fell outside the border.
+"""
+
+READING = """\
+## How to read it
+
+- **Time costs speed times time**: an error of 20 ms is 0.10 m at 5 m/s and 0.20 m at 10 m/s, the
+  same for every change of its kind. *Lag mean* shows the whole shift; *Abs* rises by less, because
+  noise and the scatter between valves are in it already.
+- **A position 10 cm behind is the same as 20 ms at 5 m/s**, but does not grow with speed. It is an
+  offset of the body (the place of the antenna, `forward_m` of the valves).
+- **A constant ground offset along the passes** (datum, base station, map) changes its sign with the
+  direction of flight: the mean stays, the mean of absolute values does not. `vrspray calibrate
+  lag-marks` tells the three apart ([calibration](calibration.md)).
+- **Across the passes** nothing moves along the track. The metrics, and the controller by default,
+  take the rate under the *centre* of a strip, here 1 m wide and 0.5 m from the next plot: what is
+  less than 0.5 m across costs nothing in these figures, and what is more counts as a whole strip.
+  Only *Outside* is exact to 0.1 m. An autopilot with the same offset also flies beside its line;
+  here the vehicle holds its path, and only what the controller is told is wrong.
+- **Up and down alone**: the changes of that kind only. On and off are at this field's border only,
+  where no lag distance is measured: their cost is in *Misapplied* and *Outside*.
+- **The rate of positions**: between two messages the controller predicts, so fewer of them cost the
+  mean little on a straight pass at a steady speed, and single changes (*Worst*) more. Braking and
+  turning are not in this. Each rate draws other errors of position: differences of millimetres
+  between two rates are noise.
+- **Wind** blows on droplets only; the vehicle holds its path. Model: shift = wind x time of fall,
+  from 3.5 m. 0.80 s are droplets of 250 um in a downwash of 8 m/s that fades to the ground, from
+  a ballistic calculation with Schiller and Naumann's drag; 0.45 s is 3.5 m at the downwash's full
+  speed, about the least that is to expect. Droplets of 100 um take 1.45 s, and several times that
+  where no downwash reaches. The undisturbed flight's liquid is moved by the shift as one piece,
+  and the ground under it judged again; spreading is left out. The wind comes from one side of the
+  field, so a shift along the passes is late one way and early the other. What is blown over the
+  border is in *Outside* and no longer in *Misapplied*; beside the passes the field ends 0.5 m
+  beyond the plots.
+
+A light wind costs more than any of the other errors here, and it is the one that the controller
+does not measure. Lags and the places of antenna and map are worth calibrating to 20 ms and 10 cm;
+beyond that, the weather decides where the drops fall.
+"""
+
+
+def table_lines(result: Result) -> list[str]:
+    """Return the table for a terminal."""
+    rows = _rows(result)
+    widths = [max(len(row[i]) for row in (HEAD, *rows)) for i in range(len(HEAD))]
+    lines = [
+        "  ".join(
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
+        for row in (HEAD, *rows)
+    ]
+    return [*lines, _basis(result)]
+
+
+def write_page(result: Result, path: Path, *, plot: Path | None, command: str = COMMAND) -> None:
+    """Write the page.
+
+    Raises:
+        ConfigError: when it cannot be written.
+    """
+    rows = [HEAD, ("---", *("---:" for _ in HEAD[1:])), *_rows(result)]
+    table = "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    today = datetime.now(tz=UTC).date().isoformat()
+    parts = [INTRODUCTION, f"Made by `{command}` on {today}: {_basis(result)}\n"]
+    if plot is not None:
+        link = Path(os.path.relpath(plot, path.parent)).as_posix()
+        parts.append(f"![What each disturbance costs]({link})\n")
+    try:
+        path.write_text("\n".join([*parts, table + "\n", READING]), encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def write_plot(result: Result, path: Path) -> None:
+    """Draw what each disturbance costs.
+
+    Raises:
+        ConfigError: without matplotlib, or when the picture cannot be written.
+    """
+    if importlib.util.find_spec("matplotlib") is None:
+        raise ConfigError("no picture without matplotlib; pip install vrspray[plot]")
+    from matplotlib import rc_context
+
+    from sitl.demo_style import COLOURS, DPI, INK, STYLE, new_figure
+
+    height_in = 1.3 + 0.28 * len(result.rows)
+    with rc_context(STYLE):
+        figure = new_figure(
+            (9.0, height_in),
+            "What an unknown error costs",
+            f"Disturbed minus undisturbed: {_basis(result)}",
+        )
+        left, right = figure.subplots(1, 2, sharey=True)
+        figure.subplots_adjust(
+            left=0.32, right=0.95, top=1.0 - 0.75 / height_in, bottom=0.5 / height_in, wspace=0.1
+        )
+        places = range(len(result.rows))
+        lag_m = [row.lag_mean_abs_cost_m.mean for row in result.rows]
+        points = [row.misapplied_cost_points.mean for row in result.rows]
+        for axes, costs, colour, name, form in (
+            (left, lag_m, COLOURS["scheduled"], "mean absolute lag distance [m]", "{:+.3f}"),
+            (right, points, COLOURS["none"], "misapplied volume [points]", "{:+.2f}"),
+        ):
+            bars = axes.barh(places, costs, color=colour, height=0.65)
+            axes.bar_label(bars, [form.format(cost) for cost in costs], padding=3, size=8)
+            axes.set_xlabel(name)
+            axes.margins(x=0.25)
+            axes.axvline(0.0, lw=0.8, color=INK)
+            axes.spines["left"].set_visible(False)
+            axes.tick_params(axis="y", length=0)
+        left.set_yticks(places, [row.label for row in result.rows])
+        left.invert_yaxis()
+        try:
+            figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": None})
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"{path}: cannot be written ({error})") from None
+
+
+def _basis(result: Result) -> str:
+    """Return what the figures rest on."""
+    return (
+        f"{result.flights} flights, seeds {result.seeds[0]} to {result.seeds[-1]}, "
+        f"{result.fidelity} twin, {result.speed_m_s:g} m/s."
+    )
+
+
+def _rows(result: Result) -> list[tuple[str, ...]]:
+    plain = result.undisturbed
+    return [_row("undisturbed, positions at 20 Hz", plain, None)] + [
+        _row(row.label, row.figures, row) for row in result.rows
+    ]
+
+
+def _row(label: str, figures: Figures, row: Row | None) -> tuple[str, ...]:
+    return (
+        label,
+        f"{figures.lag_mean_m:+.3f}",
+        f"{figures.lag_mean_abs_m:.3f}",
+        "" if row is None else f"{row.lag_mean_abs_cost_m.mean:+.3f}",
+        f"{figures.lag_worst_m:.3f}",
+        "" if row is None else f"{row.lag_worst_cost_m.mean:+.3f}",
+        f"{figures.misapplied_percent:.2f}",
+        "" if row is None else f"{row.misapplied_cost_points.mean:+.2f}",
+        f"{figures.off_target_ml:.0f}",
+    )

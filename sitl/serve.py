@@ -10,17 +10,22 @@ import asyncio
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from analysis.evaluation import Evaluation, FlightMeta, FlightRecord, evaluate
 from companion.config import Config, load
 from companion.core.setup import Setup
+from companion.core.types import TimedChange
 from companion.errors import ConfigError
 from companion.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
 from sitl.flow_law import FlowLaw
+from sitl.profile import load_profile
 from sitl.serve_mission import (
     MissionWatch,
     first_course_deg,
@@ -28,19 +33,23 @@ from sitl.serve_mission import (
     mission_items,
     waiting_place,
 )
-from sitl.serve_sprayer import sprayer_options
 from sitl.stub.build import StubOptions, build_autopilot, firmware_of
 from sitl.stub.firmware import Firmware
-from sitl.stub.liquid import words_of
+from sitl.stub.liquid import LiquidOptions, words_of
 from sitl.stub.liquid_entries import TAKE_OFF
 from sitl.stub.mission_items import MissionItem
 from sitl.stub.operator import Operator, Step
+from sitl.stub.parameters import OUTPUT_COUNT
+from sitl.stub.px4 import px4_parameters
 from sitl.stub.scenario import Scenario, load_scenario
 from sitl.stub.server import StubServer
-from sitl.stub.sprayer import BoardKind, Sprayer
+from sitl.stub.sprayer import BoardKind, Sprayer, SprayerOptions
 from sitl.stub.truth import TruthLog
 from sitl.vehicle import Corners
-from sitl.wire_truth import judge
+
+if TYPE_CHECKING:
+    from companion.core.setup import Setup
+
 
 DEFAULT_LINK = "udpout:127.0.0.1:14550"
 _SAY_EVERY_S = 5.0
@@ -305,3 +314,134 @@ def _start(
         return waiting_place(options.place_deg, config, setup, is_example=is_example), ()
     items = mission_items(options.mission, options.speed_m_s, firmware)
     return home_of(items), items
+
+
+# The sprayer behind a simulated autopilot, as configuration and scenario wire it.
+
+
+def _drive_channels(config: Config) -> tuple[int, ...]:
+    """Return the channels of the motors, as the configuration has them."""
+    pump = () if config.pump is None else (config.pump,)
+    motors = (*pump, *config.atomiser)
+    if any(motor.output != "autopilot" for motor in motors):
+        raise ConfigError(
+            f'{config.path}: a motor with output = "pwm" hangs on this computer, where the '
+            "simulated autopilot does not see it; fly it with `vrspray sitl fly`"
+        )
+    return tuple(motor.channel for motor in motors)
+
+
+def _pins(options: ServeOptions, scenario: Scenario, channels: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the output of each channel; PX4's are actuators, which parameters place."""
+    if options.autopilot != "px4":
+        return channels
+    parameters = px4_parameters()
+    for name, value in scenario.parameters.items():
+        if name in parameters:
+            parameters.put(name, value)
+    actuators = {
+        int(parameters[f"PWM_MAIN_FUNC{pin}"]) - 300: pin for pin in range(OUTPUT_COUNT, 0, -1)
+    }
+    # An actuator that no output shows is a valve that nobody opens.
+    return tuple(actuators.get(channel, -channel) for channel in channels)
+
+
+def _liquid(options: ServeOptions, scenario: Scenario) -> LiquidOptions | None:
+    """Return what goes wrong with the liquid and who sees it; None where nothing is asked for."""
+    batteries = (scenario.meter_battery, scenario.tank_battery)
+    if options.autopilot == "px4" and batteries != (None, None):
+        raise ConfigError(
+            f"{scenario.source}: sensors: PX4 has no fuel flow meter; leave meter_battery and "
+            "tank_battery out, or give --autopilot ardupilot"
+        )
+    found = LiquidOptions(
+        entries=scenario.liquid,
+        meter_battery=scenario.meter_battery,
+        tank_battery=scenario.tank_battery,
+        tank_l=scenario.tank_l,
+        pressure_folder=options.sensors,
+    )
+    return None if found == LiquidOptions() else found
+
+
+def sprayer_options(options: ServeOptions, config: Config, scenario: Scenario) -> SprayerOptions:
+    """Return the sprayer as the configuration wires it."""
+    return SprayerOptions(
+        profile=options.profile,
+        board=options.board,
+        channels=_pins(options, scenario, tuple(valve.channel for valve in config.boom().valves)),
+        closed_us=config.output.closed_us,
+        full_us=config.output.full_us,
+        box_closed_s=scenario.box_closed_s,
+        liquid=_liquid(options, scenario),
+        seed=options.seed,
+        drive_channels=_pins(options, scenario, _drive_channels(config)),
+        flow_law=options.flow_law,
+    )
+
+
+# The stub's truth judged as any flight: from `truth.npz` to the metrics of the demo.
+
+
+def evaluate_truth(folder: Path, setup: Setup, *, closed_us: float, full_us: float) -> Evaluation:
+    """Return every metric of a flight of the stub, from what it wrote into `folder`."""
+    summary: dict[str, Any] = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
+    profile = load_profile(summary["profile"])
+    with np.load(folder / "truth.npz") as arrays:
+        flat = Earth(setup.frame.latitude_deg, setup.frame.longitude_deg)
+        east_m, north_m = _in_frame(arrays, summary["origin"], flat)
+        record = FlightRecord(
+            time_s=arrays["time_s"],
+            east_m=east_m,
+            north_m=north_m,
+            heading_deg=arrays["heading_deg"],
+            volume_ml=arrays["volume_ml"],
+            boom=setup.boom,
+            prescription=setup.prescription,
+            lines=setup.lines,
+            pwm_period_s=profile.pwm.period_s,
+            duty_limits=(profile.pwm.duty_min, profile.pwm.duty_max),
+            nozzle_sets=setup.nozzle_sets,
+            orders=_orders(arrays, closed_us, full_us),
+            meta=FlightMeta(
+                speed_m_s=summary["speed_m_s"],
+                method=setup.method.value,
+                fidelity="pulsed",
+                output="servo",
+                seed=summary["seed"],
+            ),
+        )
+    return evaluate(record)
+
+
+def _in_frame(
+    arrays: Any, origin: dict[str, float], frame: Earth
+) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Return the path in the frame of the map; the stub's own begins at its home."""
+    home = Earth(origin["latitude_deg"], origin["longitude_deg"])
+    latitudes, longitudes = home.to_geographic_all(arrays["east_m"], arrays["north_m"])
+    return frame.to_local_all(latitudes, longitudes)
+
+
+def _orders(arrays: Any, closed_us: float, full_us: float) -> tuple[TimedChange, ...]:
+    """Return the orders that changed a valve, as duties."""
+    times, valves = arrays["order_time_s"].tolist(), arrays["order_valve"].tolist()
+    duties = np.clip((arrays["order_pulse_us"] - closed_us) / (full_us - closed_us), 0.0, 1.0)
+    changed: list[TimedChange] = []
+    last: dict[int, float] = {}
+    for at_s, valve, duty in zip(times, valves, duties.tolist(), strict=True):
+        if last.get(valve, 0.0) != duty:
+            changed.append(TimedChange(at_s=at_s, valve=valve, duty=duty))
+            last[valve] = duty
+    return tuple(sorted(changed, key=lambda change: change.at_s))
+
+
+def judge(folder: Path, setup: Setup, *, closed_us: float, full_us: float) -> dict[str, object]:
+    """Add the flight's metrics to its `truth.json`, and return them."""
+    found = evaluate_truth(folder, setup, closed_us=closed_us, full_us=full_us)
+    found = replace(found, zone_volume_error_percent={})
+    metrics = found.as_json()
+    path = folder / "truth.json"
+    summary = json.loads(path.read_text(encoding="utf-8")) | {"metrics": metrics}
+    path.write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    return metrics

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from sitl.anyang import anyang_items
-from sitl.mission_writing import write_mission
+from sitl.calibration_mission import write_mission
 
 SPEED_M_S = 5.0
 

@@ -20,7 +20,7 @@ import shapely
 from pyproj import CRS
 
 from companion.core.frame import LocalFrame
-from sitl.mission_writing import write_mission
+from sitl.calibration_mission import write_mission
 from sitl.stub.mission_items import MissionItem, speed, waypoint
 from sitl.stub.protocol import dialect
 

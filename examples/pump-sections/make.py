@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.core.frame import LocalFrame
-from sitl.mission_writing import write_mission
+from sitl.calibration_mission import write_mission
 from sitl.stub.mission_items import MissionItem, speed, waypoint
 from sitl.stub.protocol import dialect
 

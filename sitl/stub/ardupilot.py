@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
 from sitl.stub import commands, mission, parameters, services
 from sitl.stub.ardupilot_commands import COMMANDS, handle_data_stream, handle_set_mode
-from sitl.stub.ardupilot_streams import (
-    BUILDERS,
-    GROUPS,
-    SILENT,
-    heartbeat,
-    second_servo_output,
-    withholds,
-)
-from sitl.stub.firmware import Firmware, MessageHandler, Version
+from sitl.stub.firmware import Builder, Firmware, MessageHandler, Version
+from sitl.stub.mission import current
 from sitl.stub.mission_items import refused_by_ardupilot
-from sitl.stub.protocol import dialect
+from sitl.stub.protocol import Message, dialect
+from sitl.stub.streams import COMMON, HEALTHY, LOST, estimated, version_word
+
+if TYPE_CHECKING:
+    from sitl.stub.autopilot import Autopilot
+
 
 NAME = "ardupilot"
 VERSION: Version = (4, 6, 0)
@@ -67,3 +69,129 @@ def ardupilot(version: Version = VERSION) -> Firmware:
         system_in_timesync=True,
         carries_out_for_unheard=True,
     )
+
+
+# What ArduCopter sends beside what both firmwares do, and how it groups its streams.
+#
+# A default ArduCopter streams nothing of this unasked; only HEARTBEAT comes by itself.
+
+
+def ekf_status(autopilot: Autopilot, now_s: float) -> Message:
+    """Return EKF_STATUS_REPORT; without a position it holds a constant one and says so."""
+    lost = autopilot.estimator_lost(now_s)
+    variance = 1.2 if lost else 0.05
+    flags = LOST if lost else HEALTHY
+    return dialect.MAVLink_ekf_status_report_message(flags, variance, variance, 0.05, 0.05, 0.0)
+
+
+def autopilot_version(autopilot: Autopilot, _now_s: float) -> Message:
+    """Return AUTOPILOT_VERSION: a Copter, without file transfer."""
+    capabilities = (
+        dialect.MAV_PROTOCOL_CAPABILITY_MISSION_INT
+        | dialect.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+        | dialect.MAV_PROTOCOL_CAPABILITY_PARAM_FLOAT
+        | dialect.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    )
+    zeros = [0] * 8
+    version = version_word(autopilot.firmware.version)
+    return dialect.MAVLink_autopilot_version_message(
+        capabilities, version, 0, 0, 0, zeros, zeros, zeros, 0, 0, 1
+    )
+
+
+def wind(autopilot: Autopilot, now_s: float) -> Message:
+    """Return WIND: the direction it comes from; exactly 0 where none is estimated."""
+    if not autopilot.parameters["EK3_DRAG_BCOEF_X"] > 0.0:
+        return dialect.MAVLink_wind_message(0.0, 0.0, 0.0)
+    east_m_s, north_m_s = estimated(autopilot.wind_towards_m_s, now_s)
+    from_deg = math.degrees(math.atan2(-east_m_s, -north_m_s)) % 360.0
+    return dialect.MAVLink_wind_message(from_deg, math.hypot(east_m_s, north_m_s), 0.0)
+
+
+def heartbeat(autopilot: Autopilot, _now_s: float) -> Message:
+    """Return HEARTBEAT of an ArduCopter."""
+    flight = autopilot.flight
+    mode = (
+        dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        | dialect.MAV_MODE_FLAG_STABILIZE_ENABLED
+        | dialect.MAV_MODE_FLAG_MANUAL_INPUT_ENABLED
+        | dialect.MAV_MODE_FLAG_GUIDED_ENABLED
+        | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if flight.armed else 0)
+    )
+    status = dialect.MAV_STATE_ACTIVE if flight.in_air else dialect.MAV_STATE_STANDBY
+    return dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_QUADROTOR,
+        dialect.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        mode,
+        flight.mode,
+        status,
+        3,
+    )
+
+
+def battery_status(autopilot: Autopilot, now_s: float) -> Message:
+    """Return BATTERY_STATUS of one monitor; they take turns (GCS_Common.cpp)."""
+    monitors = autopilot.batteries(now_s)
+    autopilot.battery_turn = (autopilot.battery_turn + 1) % len(monitors)
+    found = monitors[autopilot.battery_turn]
+    percent = -1 if found.remaining_percent is None else found.remaining_percent
+    consumed = -1 if found.consumed is None else found.consumed
+    return dialect.MAVLink_battery_status_message(
+        found.number, 0, 0, 32767, [65535] * 10, -1, consumed, -1, percent
+    )
+
+
+BUILDERS: Mapping[int, Builder] = {
+    **COMMON,
+    dialect.MAVLINK_MSG_ID_HEARTBEAT: heartbeat,
+    dialect.MAVLINK_MSG_ID_MISSION_CURRENT: lambda autopilot, _now_s: current(autopilot),
+    dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
+    dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT: ekf_status,
+    dialect.MAVLINK_MSG_ID_WIND: wind,
+    dialect.MAVLINK_MSG_ID_BATTERY_STATUS: battery_status,
+}
+
+
+def withholds(autopilot: Autopilot, message_id: int, now_s: float) -> bool:
+    """Return whether a message is not sent now: BATTERY_STATUS, without a monitor."""
+    return message_id == dialect.MAVLINK_MSG_ID_BATTERY_STATUS and not autopilot.batteries(now_s)
+
+
+def second_servo_output(autopilot: Autopilot, now_s: float) -> Message | None:
+    """Return SERVO_OUTPUT_RAW of the outputs 17 to 32, where they are switched on."""
+    pulses = autopilot.outputs.pulses_us(now_s)[16:]
+    if not pulses:
+        return None
+    boot_us = (autopilot.boot_ms(now_s) * 1000) & 0xFFFFFFFF
+    return dialect.MAVLink_servo_output_raw_message(boot_us, 1, *pulses)
+
+
+# Known to an ArduCopter and granted, but never sent by one with these sensors.
+SILENT = frozenset(
+    {
+        dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR,
+        dialect.MAVLINK_MSG_ID_RANGEFINDER,
+        dialect.MAVLINK_MSG_ID_RPM,
+        dialect.MAVLINK_MSG_ID_TERRAIN_REPORT,
+    }
+)
+
+# What REQUEST_DATA_STREAM switches together, of what there is here.
+GROUPS: dict[int, tuple[int, ...]] = {
+    dialect.MAV_DATA_STREAM_EXTENDED_STATUS: (
+        dialect.MAVLINK_MSG_ID_SYS_STATUS,
+        dialect.MAVLINK_MSG_ID_GPS_RAW_INT,
+        dialect.MAVLINK_MSG_ID_MISSION_CURRENT,
+    ),
+    dialect.MAV_DATA_STREAM_RC_CHANNELS: (
+        dialect.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,
+        dialect.MAVLINK_MSG_ID_RC_CHANNELS,
+    ),
+    dialect.MAV_DATA_STREAM_POSITION: (dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,),
+    dialect.MAV_DATA_STREAM_EXTRA1: (dialect.MAVLINK_MSG_ID_ATTITUDE,),
+    dialect.MAV_DATA_STREAM_EXTRA2: (dialect.MAVLINK_MSG_ID_VFR_HUD,),
+    dialect.MAV_DATA_STREAM_EXTRA3: (
+        dialect.MAVLINK_MSG_ID_SYSTEM_TIME,
+        dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
+    ),
+}

@@ -7,14 +7,11 @@ the other stands in its `Firmware`.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
-from sitl.stub import actions, mission, parameters, routing
-from sitl.stub.acknowledgements import Acknowledgements
-from sitl.stub.beats import Beats
+from sitl.stub import actions, mission, parameters, services
 from sitl.stub.channel import Channel
 from sitl.stub.faults import Fault, FaultKind
-from sitl.stub.impairment import Impairment
-from sitl.stub.incidents import Incidents
 from sitl.stub.liquid import Battery
 from sitl.stub.mission_items import MissionItem
 from sitl.stub.modes import INFO
@@ -29,9 +26,33 @@ from sitl.stub.protocol import (
     sender,
 )
 from sitl.stub.rc import rc_pulses_us
-from sitl.stub.script import SCRIPT_PERIOD_S, Script
 from sitl.stub.strangers import Strangers
 from sitl.stub.world import Pose
+
+if TYPE_CHECKING:
+    from sitl.stub.strangers import Strangers
+
+
+import heapq
+from itertools import count
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sitl.stub.channel import Channel
+
+
+import random
+from typing import TYPE_CHECKING
+
+from sitl.stub.faults import FaultClock
+from sitl.stub.modes import AUTO
+from sitl.stub.protocol import target
+
+if TYPE_CHECKING:
+    from sitl.stub.channel import Channel
+
+
+from typing import Protocol
 
 UTC_START_S = 1_774_080_000.0  # 2026-03-21 08:00
 
@@ -102,9 +123,9 @@ class Autopilot:
             if self.script is not None:
                 self.script.on_message(bytes(message.get_msgbuf()), now_s)
             if self.firmware.forwards:
-                routing.forward(self, channel, message)
+                forward(self, channel, message)
             handler = self.firmware.messages.get(message.get_type())
-            if handler is not None and routing.is_for_us(self, message):
+            if handler is not None and is_for_us(self, message):
                 handler(self, channel, message, now_s)
         actions.tell(self, now_s)
 
@@ -287,3 +308,277 @@ class Autopilot:
         if self.script is not None and self._script_due_s <= now_s:
             self._script_due_s = max(self._script_due_s + SCRIPT_PERIOD_S, now_s)
             self.script.update(now_s)
+
+
+# What comes by itself: heartbeats, requests of the clock, MISSION_CURRENT, strangers.
+
+_HEARTBEAT_S = 1.0
+_CURRENT_S = 10.0
+
+
+class Beats:
+    """Keeps what is due when."""
+
+    def __init__(self, strangers: Strangers, *, timesync_s: float, start_s: float) -> None:
+        self.heartbeat_due_s = start_s
+        self._strangers = strangers
+        self._timesync_s = timesync_s
+        self._timesync_due_s = start_s + timesync_s
+        # The last MISSION_CURRENT: of how many items which one, and when.
+        self._current: tuple[int, int, float] = (0, -1, start_s)
+
+    def tick(self, autopilot: Autopilot, now_s: float) -> None:
+        """Send what is due."""
+        if self.heartbeat_due_s <= now_s:
+            self.heartbeat_due_s = max(self.heartbeat_due_s + _HEARTBEAT_S, now_s)
+            autopilot.broadcast(autopilot.firmware.heartbeat(autopilot, now_s))
+            for frame in self._strangers.heartbeats(now_s):
+                autopilot.relay(frame)
+        for frame in self._strangers.positions(now_s):
+            autopilot.relay(frame)
+        if self._timesync_due_s <= now_s:
+            self._timesync_due_s = max(self._timesync_due_s + self._timesync_s, now_s)
+            autopilot.broadcast(services.timesync_request(autopilot, now_s))
+        if dialect.MAVLINK_MSG_ID_MISSION_CURRENT not in autopilot.firmware.builders:
+            self._tell_current(autopilot, now_s)
+
+    def _tell_current(self, autopilot: Autopilot, now_s: float) -> None:
+        """Send MISSION_CURRENT on a change and every ten seconds: here it is no stream."""
+        count, sequence = len(autopilot.flight.items), autopilot.flight.sequence
+        if (count, sequence) != self._current[:2] or now_s - self._current[2] >= _CURRENT_S:
+            self._current = (count, sequence, now_s)
+            autopilot.broadcast(mission.current(autopilot))
+
+
+# COMMAND_ACK: once, late, twice, in two steps or not at all, as the faults will have it.
+
+
+class Acknowledgements:
+    """Sends them, and keeps those that come late."""
+
+    def __init__(self) -> None:
+        self._late: list[tuple[float, int, Channel, Message]] = []
+        self._number = count()
+
+    def send(
+        self,
+        autopilot: Autopilot,
+        channel: Channel,
+        answer: tuple[int, int],
+        *,
+        to: tuple[int, int],
+        now_s: float,
+    ) -> None:
+        """Answer a command; `answer` is its number and the result."""
+        command, result = answer
+        message = dialect.MAVLink_command_ack_message(command, result, 0, 0, *to)
+        if autopilot.strikes(FaultKind.ACK_LOST, now_s, command=command):
+            return
+        late = autopilot.strikes(FaultKind.ACK_LATE, now_s, command=command)
+        if late is None:
+            late = autopilot.strikes(FaultKind.ACK_IN_PROGRESS, now_s, command=command)
+            if late is not None:
+                begun = (command, dialect.MAV_RESULT_IN_PROGRESS, 0, 0, *to)
+                autopilot.send(channel, dialect.MAVLink_command_ack_message(*begun))
+        if late is not None:
+            due_s = now_s + late.delay_s
+            heapq.heappush(self._late, (due_s, next(self._number), channel, message))
+            return
+        autopilot.send(channel, message)
+        if autopilot.strikes(FaultKind.ACK_DOUBLED, now_s, command=command):
+            autopilot.send(channel, message)
+
+    def tick(self, autopilot: Autopilot, now_s: float) -> None:
+        """Send the late ones that are due."""
+        while self._late and self._late[0][0] <= now_s:
+            _, _, channel, message = heapq.heappop(self._late)
+            autopilot.send(channel, message)
+
+    def next_due_s(self) -> float:
+        """Return when the next late one is due; infinite without one."""
+        return self._late[0][0] if self._late else float("inf")
+
+
+# What faults do to bytes, acknowledgements and the clock, with a seeded hand.
+
+_WRAP_MS = 2**32
+
+# The start bytes of MAVLink 2 and 1, so that garbage looks like frames that begin.
+_STARTS = b"\xfd\xfe"
+_UNKNOWN_IDS = (60_000, 2**24)
+
+
+class Impairment:
+    """Damages what the autopilot sends, as far as a fault is in force."""
+
+    def __init__(self, faults: FaultClock, *, seed: int) -> None:
+        self._faults = faults
+        # Not for secrets: the same seed must give the same damage.
+        self._random = random.Random(seed)
+
+    def strikes(self, kind: FaultKind, now_s: float, *, command: int = 0) -> Fault | None:
+        """Return the fault of a kind that is in force and strikes this time."""
+        fault = self._faults.active(kind, now_s, command=command)
+        if fault is None or self._random.random() >= fault.fraction:
+            return None
+        return fault
+
+    def apply(self, frame: bytes, now_s: float) -> bytes:
+        """Return what goes out in place of a frame; nothing while the link is silent."""
+        if self._faults.active(FaultKind.SILENCE, now_s):
+            return b""
+        if self.strikes(FaultKind.CORRUPT, now_s):
+            place = self._random.randrange(len(frame))
+            changed = frame[place] ^ self._random.randrange(1, 256)
+            frame = frame[:place] + bytes((changed,)) + frame[place + 1 :]
+        if self.strikes(FaultKind.TRUNCATED, now_s):
+            frame = frame[: self._random.randrange(1, len(frame))]
+        if self.strikes(FaultKind.UNKNOWN_ID, now_s):
+            frame = self._unknown() + frame
+        if self.strikes(FaultKind.GARBAGE, now_s):
+            burst = bytearray(self._random.randbytes(self._random.randrange(1, 280)))
+            burst[self._random.randrange(len(burst))] = self._random.choice(_STARTS)
+            frame = bytes(burst) + frame
+        return frame
+
+    def clock_s(self, uptime_s: float, now_s: float) -> float:
+        """Return the time since boot, about to wrap or set back by a fault; TIMESYNC tells it."""
+        wrap = self._faults.active(FaultKind.CLOCK_WRAP, now_s)
+        if wrap is not None:
+            uptime_s = _WRAP_MS / 1000.0 + self._faults.elapsed_s(wrap, now_s) - wrap.delay_s
+        back = self._faults.active(FaultKind.CLOCK_BACKWARDS, now_s)
+        return uptime_s if back is None else max(uptime_s - back.delay_s, 0.0)
+
+    def boot_ms(self, uptime_s: float, now_s: float) -> int:
+        """Return the 32 bits of milliseconds since boot that messages have."""
+        return round(self.clock_s(uptime_s, now_s) * 1000.0) % _WRAP_MS
+
+    def _unknown(self) -> bytes:
+        """Return a frame with an id that no dialect has; nobody can check it."""
+        payload = self._random.randbytes(self._random.randrange(1, 60))
+        identifier = self._random.randrange(_UNKNOWN_IDS[0], _UNKNOWN_IDS[1]).to_bytes(3, "little")
+        head = bytes((_STARTS[0], len(payload), 0, 0, self._random.randrange(256), 1, 1))
+        return head + identifier + payload + self._random.randbytes(2)
+
+
+# What happens once when a fault begins or ends, and what another ground station does meanwhile.
+
+
+class Incidents:
+    """Looks at each tick what has begun and what is over."""
+
+    def __init__(self) -> None:
+        self._in_force: set[FaultKind] = set()
+        self._station_due_s = 0.0
+
+    def tick(self, autopilot: Autopilot, now_s: float) -> None:
+        """Do what is due."""
+        if self._begins(autopilot, FaultKind.REBOOT, now_s):
+            autopilot.reboot(now_s)
+        if self._begins(autopilot, FaultKind.MODE, now_s):
+            mode = autopilot.faults.active(FaultKind.MODE, now_s)
+            if mode is not None:
+                autopilot.flight.set_mode(mode.mode, now_s)
+        if self._ends(autopilot, FaultKind.MODE, now_s):
+            autopilot.flight.set_mode(AUTO, now_s)
+        self._overwrite_rates(autopilot, now_s)
+
+    def _begins(self, autopilot: Autopilot, kind: FaultKind, now_s: float) -> bool:
+        if kind in self._in_force or autopilot.faults.active(kind, now_s) is None:
+            return False
+        self._in_force.add(kind)
+        return True
+
+    def _ends(self, autopilot: Autopilot, kind: FaultKind, now_s: float) -> bool:
+        if kind not in self._in_force or autopilot.faults.active(kind, now_s) is not None:
+            return False
+        self._in_force.discard(kind)
+        return True
+
+    def _overwrite_rates(self, autopilot: Autopilot, now_s: float) -> None:
+        """Set all rates again and again, as ground stations do on a link they share.
+
+        On ArduPilot by REQUEST_DATA_STREAM for all groups; on PX4, which has none, message by
+        message.
+        """
+        fault = autopilot.faults.active(FaultKind.STATION_RATES, now_s)
+        if fault is None or now_s < self._station_due_s:
+            return
+        self._station_due_s = now_s + max(fault.delay_s, 0.1)
+        grouped = {number for group in autopilot.firmware.groups.values() for number in group}
+        interval_s = 1.0 / fault.rate_hz if fault.rate_hz > 0.0 else None
+        for channel in autopilot.channels:
+            for message_id in grouped | set(channel.streams):
+                channel.ask(message_id, interval_s, now_s=now_s)
+
+
+# Which messages are for the autopilot, and which it passes on to other peers.
+
+
+def is_for_us(autopilot: Autopilot, message: Message) -> bool:
+    """Return whether to act.
+
+    ArduPilot carries out what is for a component that it never heard (MAVLink_routing.cpp, rule
+    1e); PX4 takes no command for every system (`evaluate_target_ok`).
+    """
+    system, component = target(message)
+    for_unheard = autopilot.firmware.carries_out_for_unheard
+    if message.get_type().startswith("COMMAND_") and not for_unheard:
+        return system == AUTOPILOT_SYSTEM and component in (0, AUTOPILOT_COMPONENT)
+    if system not in (0, AUTOPILOT_SYSTEM):
+        return False
+    if component in (0, AUTOPILOT_COMPONENT):
+        return True
+    known = any((system, component) in channel.heard for channel in autopilot.channels)
+    return for_unheard and not known
+
+
+def forward(autopilot: Autopilot, origin: Channel, message: Message) -> None:
+    """Pass on what is for everybody, or for a component that was heard elsewhere."""
+    system, component = target(message)
+    if (system, component) == (AUTOPILOT_SYSTEM, AUTOPILOT_COMPONENT):
+        return
+    for channel in autopilot.channels:
+        if channel is not origin and (
+            system == 0
+            or any(system == heard[0] and component in (0, heard[1]) for heard in channel.heard)
+        ):
+            autopilot.emit(channel, bytes(message.get_msgbuf()))
+
+
+# A script that runs in the flight controller, such as a watchdog of the valves in Lua.
+#
+# The stub calls it as ArduPilot's scheduler would; what the script orders goes to the outputs past
+# every rule of DO_SET_SERVO, as `SRV_Channels:set_output_pwm_chan` does.
+
+SCRIPT_PERIOD_S = 0.02
+
+_MAVLINK2 = 0xFD
+_PAYLOAD_SIZE = 264  # payload64[33] of mavlink_message_t
+_TAIL_SIZE = 2 + 13  # checksum as received, signature
+
+
+class Script(Protocol):
+    """What a script has to offer; it gets `Autopilot.set_output` from whoever makes it."""
+
+    def on_message(self, raw: bytes, now_s: float) -> None:
+        """Take a frame in that arrived from a peer, as it was on the wire."""
+
+    def update(self, now_s: float) -> None:
+        """Do what is due; called every 20 ms."""
+
+
+def as_message_struct(frame: bytes) -> bytes:
+    """Return a frame as `mavlink_message_t`, which is what `mavlink:receive_chan` gives to Lua.
+
+    checksum (2), start, length, two flags, sequence, system, component, id (3), payload filled
+    with zeros, checksum, signature: counted from 1, the component is byte 9.
+    """
+    if frame[0] == _MAVLINK2:
+        head, payload = frame[:10], frame[10 : 10 + frame[1]]
+    else:
+        head = bytes((frame[0], frame[1], 0, 0, *frame[2:6], 0, 0))
+        payload = frame[6 : 6 + frame[1]]
+    end = (10 if frame[0] == _MAVLINK2 else 6) + frame[1]
+    checksum = frame[end : end + 2]
+    return checksum + head + payload.ljust(_PAYLOAD_SIZE, b"\0") + checksum.ljust(_TAIL_SIZE, b"\0")

@@ -14,7 +14,6 @@ from sitl.drives import Motors
 from sitl.flow_law import FlowLaw
 from sitl.plants import edge_plant
 from sitl.profile import load_profile
-from sitl.stub.box import ArmingBox
 from sitl.stub.liquid import Battery, Liquid, LiquidOptions
 from sitl.stub.liquid_entries import SPRAYING
 from sitl.stub.outputs import ServoOrder
@@ -158,3 +157,40 @@ class Sprayer:
         """Return what all valves have delivered; asked for in order of time."""
         self._recent.forget(now_s - _MEMORY_S)
         return float(self._recent.volume_ml(np.array([now_s])).sum()) / 1000.0
+
+
+# A driver box that has to be armed, as speed controllers of motors do.
+#
+# It passes nothing on until it has seen the closed pulse for a while without a break; when the
+# pulses end it has to be armed again. An order that opens before that makes it begin anew. Some
+# boxes on the market are built that way; the board of this project is not.
+
+_PULSE_MIN_US = 800.0
+# Of the span: a width this near to closed is closed, as at the driver board.
+_CLOSED_DUTY = 0.01
+
+
+class ArmingBox:
+    """One input a channel; says of each order whether it is passed on."""
+
+    def __init__(self, *, closed_s: float, closed_us: float, full_us: float) -> None:
+        self._closed_s = closed_s
+        self._closed_max_us = closed_us + _CLOSED_DUTY * (full_us - closed_us)
+        self._closed_since_s: dict[int, float] = {}
+        self._armed: set[int] = set()
+
+    def passes(self, order: ServoOrder) -> bool:
+        """Take an order in and return whether it reaches the valve."""
+        channel = order.channel
+        if order.pulse_us < _PULSE_MIN_US:
+            self._armed.discard(channel)
+            self._closed_since_s.pop(channel, None)
+            return True
+        since_s = self._closed_since_s.get(channel)
+        if since_s is not None and order.at_s - since_s >= self._closed_s:
+            self._armed.add(channel)
+        if order.pulse_us <= self._closed_max_us:
+            self._closed_since_s.setdefault(channel, order.at_s)
+            return True
+        self._closed_since_s.pop(channel, None)
+        return channel in self._armed or self._closed_s == 0.0

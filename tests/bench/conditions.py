@@ -7,8 +7,17 @@ from dataclasses import dataclass, replace
 
 from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
-from sitl.hard_fields import bands, deliverable_rates, drawn_rates, edges_of, plots
-from sitl.hard_paths import CentreLine, Pace, hard_trajectory, laid_on
+from sitl.hard_fields import (
+    CentreLine,
+    Pace,
+    bands,
+    deliverable_rates,
+    drawn_rates,
+    edges_of,
+    hard_trajectory,
+    laid_on,
+    plots,
+)
 from sitl.trajectory import Floats, Trajectory
 from tests.bench.fields import RATES_L_HA
 

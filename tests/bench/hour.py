@@ -1,7 +1,7 @@
 """An hour of simulated flight with random faults: `python -m tests.bench.hour [hours] [seed]`.
 
 The closed loop over the demo's field, flight after flight, each with faults of its own drawn at
-random: those of `sitl/input_faults.py` and, beside them, fields that are no number, reports that
+random: those of `sitl/fly.py` and, beside them, fields that are no number, reports that
 stop, a link that delays and repeats. The operator enables again every few seconds, so that there
 is something to close.
 """
@@ -37,7 +37,7 @@ from companion.core.types import (
 )
 from sitl.demo_field import START_S, demo_route
 from sitl.flight import FlightOptions, fly
-from sitl.input_faults import ON_INPUTS, with_faults
+from sitl.fly import ON_INPUTS, with_faults
 from sitl.message_way import Way, sent_over
 from sitl.outputs import PlanFollower
 from sitl.profile import load_profile

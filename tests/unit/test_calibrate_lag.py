@@ -21,8 +21,7 @@ from companion.core.schedule import LagModel
 from companion.core.types import Decision, FlowReport, SprayPlan, TimedChange
 from companion.maps.compiling import compiled_setup
 from companion.record.journal import Journal
-from sitl.calibration_layout import make_layout
-from sitl.calibration_mission import write_calibration
+from sitl.calibration_mission import make_layout, write_calibration
 from sitl.demo_field import demo_setup
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile

@@ -22,7 +22,7 @@ from companion.runtime import run
 from sitl.demo_cli import _termination_as_interrupt
 from sitl.demo_pool import _interrupt_held_back, _pool
 from sitl.serve import ServeOptions, _Run
-from sitl.stub.transport import _TcpServer
+from sitl.stub.server import _TcpServer
 from tests.builders import setup
 
 

@@ -23,8 +23,7 @@ from companion.core.types import Inhibit, Input, VehicleState, WindReport
 from companion.maps.compiling import compiled_setup
 from companion.record.setup_json import field_names_of, setup_to_json
 from sitl.ballistics import Air, fall, spectrum_um
-from sitl.droplet_shift import TRUTHS, law, shift_of
-from sitl.droplets import landed, with_wind
+from sitl.droplets import TRUTHS, landed, law, shift_of, with_wind
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import lags as true_lags
 from sitl.profile import load_profile

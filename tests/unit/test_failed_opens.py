@@ -15,7 +15,7 @@ from companion.output.engine.lines import FileLines
 from companion.output.engine.spi595 import SpiDevice
 from companion.record.new_file import open_for_flight
 from sitl.stub.channel import Channel
-from sitl.stub.transport import open_link
+from sitl.stub.server import open_link
 
 
 def open_files() -> list[str]:

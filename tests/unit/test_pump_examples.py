@@ -11,8 +11,8 @@ import pytest
 from companion.cli.app import execute
 from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
+from sitl.calibration_mission import write_mission
 from sitl.fly import FlyOptions, prepare
-from sitl.mission_writing import write_mission
 from sitl.stub.mission_items import speed, waypoint
 from sitl.stub.protocol import dialect
 

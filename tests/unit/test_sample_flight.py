@@ -19,10 +19,10 @@ from companion.core.setup import Setup
 from companion.core.types import Decision
 from companion.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, FlightResult, fly
+from sitl.fly import zero_rate_ml
 from sitl.profile import PlantProfile, load_profile
 from sitl.route import Route
 from sitl.vehicle import Vehicle
-from sitl.zero_rate import zero_rate_ml
 from tests.unit.sample_route import SPEED_M_S, Line, along_edge, route_of, swaths
 
 ORCHARD = Path(__file__).resolve().parents[2] / "examples" / "orchard"

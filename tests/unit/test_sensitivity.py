@@ -22,8 +22,17 @@ from sitl.disturbances import (
     on_ground,
     shortened,
 )
-from sitl.sensitivity import SPEED_M_S, Cost, Figures, Result, app, measure
-from sitl.sensitivity_page import table_lines, write_page, write_plot
+from sitl.sensitivity import (
+    SPEED_M_S,
+    Cost,
+    Figures,
+    Result,
+    app,
+    measure,
+    table_lines,
+    write_page,
+    write_plot,
+)
 
 FRAME = demo_setup(SPEED_M_S).frame
 

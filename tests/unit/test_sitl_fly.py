@@ -13,9 +13,9 @@ from companion.cli.app import execute
 from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
 from sitl.anyang import anyang_items, anyang_route
+from sitl.calibration_mission import write_mission
 from sitl.fly import FlyOptions, fly_mission, prepare
 from sitl.fly_files import fly_lines
-from sitl.mission_writing import write_mission
 from sitl.routes import read_route
 from sitl.stub.mission_file import read_mission
 from sitl.stub.mission_items import landing

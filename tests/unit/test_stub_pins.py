@@ -7,13 +7,12 @@ from typing import Any
 
 import pytest
 
-from sitl.stub.box import ArmingBox
+from sitl.stub.autopilot import as_message_struct
 from sitl.stub.faults import Fault, FaultKind
 from sitl.stub.outputs import ServoOrder
 from sitl.stub.protocol import Speaker, dialect
 from sitl.stub.scenario import Scenario
-from sitl.stub.script import as_message_struct
-from sitl.stub.sprayer import Sprayer, SprayerOptions
+from sitl.stub.sprayer import ArmingBox, Sprayer, SprayerOptions
 from tests.unit.stub_bench import Bench
 
 SET_SERVO = dialect.MAV_CMD_DO_SET_SERVO

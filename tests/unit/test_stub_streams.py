@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from sitl.stub.ardupilot_streams import BUILDERS
+from sitl.stub.ardupilot import BUILDERS
 from sitl.stub.protocol import dialect
 from sitl.stub.scenario import Scenario
 from tests.unit.stub_bench import HOME, Bench, mission
