@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from analysis.flown.read_applied import read_applied
-from companion.core.controller import Memory, step
+from companion.core.controller import Memory, expected_coverage, step
 from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
 from companion.core.setup import Setup
-from companion.core.swath import expected
 from companion.core.types import Decision, Input
 from companion.errors import UnreadableError
 from companion.record.codec import FIELD_NAMES, FieldNames, encode
@@ -546,14 +545,14 @@ class ReplayedGround:
     def _at_the_end(
         self, kept: Coverage, memory: Memory, state: VehicleState | None, now_s: float
     ) -> int:
-        least = Coverage() if memory.swath is None else memory.swath.coverage
+        least = Coverage() if memory.watched.swath is None else memory.watched.swath.coverage
         most = self._expected(memory, state, now_s, ahead_s=END_WITHIN_S)
         return cells_without(least, kept) + cells_without(kept, most.joined(least))
 
     def _expected(
         self, memory: Memory, state: VehicleState | None, now_s: float, *, ahead_s: float
     ) -> Coverage:
-        return expected(self._setup, memory, state, now_s=now_s, cut_s=now_s + ahead_s)
+        return expected_coverage(self._setup, memory, state, now_s=now_s, cut_s=now_s + ahead_s)
 
 
 def cells_without(one: Coverage, other: Coverage) -> int:

@@ -11,9 +11,8 @@ import math
 from collections.abc import Iterable, Sequence
 
 from companion.config import Config
-from companion.config.motors import atomisers_of, pump_of
-from companion.config.rules import mismatches
-from companion.config.sensor_rules import tank_capacity_l
+from companion.config.motor_rules import atomisers_of, pump_of
+from companion.config.rules import mismatches, tank_capacity_l
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
 from companion.core.detection import Detection

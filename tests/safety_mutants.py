@@ -23,7 +23,7 @@ SOURCES = (
     "companion/core/interlock.py",
     "companion/core/sprayer_state.py",
     "companion/output/engine/engine.py",
-    "companion/output/engine/schedule.py",
+    "companion/output/engine/engine.py",
     "companion/output/pulse_train.py",
     "companion/output/pwm.py",
     "companion/output/timed.py",

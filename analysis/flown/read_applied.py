@@ -41,12 +41,12 @@ from analysis.flown.unknown import unknown_times
 from companion.core.types import Decision
 from companion.record.blocks import Entry
 from companion.record.codec import FieldNames, decode
-from companion.record.events import Event
 from companion.record.reader import OpenJournal, opened
 from companion.record.setup_json import field_names_of
 from companion.record.valve_rows import ValveRows
 from companion.record.versions import migrated, read_entries
 from companion.record.whole_file import damages
+from companion.record.writer import Event
 
 _NAN = float("nan")
 PARSED_AT_ONCE = 1000

@@ -15,29 +15,24 @@ import typer
 from companion.cli.answer import AsJson, Overrides, answer
 from companion.cli.doctor_click import guided_click
 from companion.cli.doctor_watchdogs import watchdog_checks
-from companion.cli.gpio_parts import engine_setup
 from companion.cli.link_parts import build_link, load_with_kept
+from companion.cli.output_parts import engine_setup, servo_options
 from companion.cli.run import component_options
 from companion.cli.sensor_parts import build_sensors
-from companion.cli.service_unit import is_ours, quoted, watchdog_is_on
-from companion.cli.servo_parts import servo_options
+from companion.cli.service import is_ours, quoted, watchdog_is_on
 from companion.cli.systemd import properties, read_unit, unit_path
 from companion.config import Config
 from companion.core.setup import Setup
-from companion.doctor.application import application_check
-from companion.doctor.check import Check, Status, fail, is_ready, split_advice
-from companion.doctor.computer import computer_checks
-from companion.doctor.computer_facts import read_computer
-from companion.doctor.engine import engine_checks, read_engine
+from companion.doctor.check import Check, Status, application_check, fail, is_ready, split_advice
+from companion.doctor.computer import computer_checks, read_computer, read_device, serial_check
+from companion.doctor.engine_trial import engine_checks, read_engine
 from companion.doctor.gpio import gpio_checks, read_chip, read_register
 from companion.doctor.listen import listen
 from companion.doctor.outputs import output_checks
 from companion.doctor.paper import configuration_checks, map_checks, refused_configuration
 from companion.doctor.sensors import Read, read_sensors, sensor_check
-from companion.doctor.serial_device import read_device, serial_check
 from companion.doctor.service import Service, service_checks
-from companion.doctor.vehicle import link_checks, no_link
-from companion.doctor.vehicle_facts import Heard
+from companion.doctor.vehicle import Heard, link_checks, no_link
 from companion.errors import ConfigError, LinkError
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)

@@ -10,8 +10,8 @@ from statistics import fmean
 
 from companion import ground, runtime
 from companion.cli.answer import note
+from companion.cli.ground_doing import in_words
 from companion.cli.ground_tasks import ground_setup
-from companion.cli.ground_words import in_words
 from companion.cli.hand import INTERRUPTED, Hand, read_line
 from companion.cli.link_parts import build_link
 from companion.cli.run import build_executor, component_options
@@ -21,12 +21,15 @@ from companion.core.ground_task import CLICK_TIMES, GroundTask, clicks, flow_of
 from companion.core.liquid_clicks import ClickFlow, ClickLaw, judge_clicks
 from companion.core.liquid_law import AutopilotLiquid
 from companion.doctor.check import Check, fail
-from companion.doctor.click_bench import HeardLink, HeardSensor, Readings, ShortHand
-from companion.doctor.clicks import (
+from companion.doctor.click_bench import (
     AGAIN,
     END,
     WET_OPEN_S,
     WET_TIMES,
+    HeardLink,
+    HeardSensor,
+    Readings,
+    ShortHand,
     answer_of,
     dry_check,
     name_of,

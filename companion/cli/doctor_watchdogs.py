@@ -9,18 +9,16 @@ import time
 from collections.abc import Iterator
 
 from companion.cli.answer import note
-from companion.cli.gpio_parts import engine_setup
+from companion.cli.ground_doing import in_words
 from companion.cli.ground_tasks import ground_setup
-from companion.cli.ground_words import in_words
 from companion.cli.hand import read_line
 from companion.cli.link_parts import build_link
+from companion.cli.output_parts import engine_setup, servo_options
 from companion.cli.run import component_options
-from companion.cli.servo_parts import servo_options
 from companion.cli.systemd import read_unit, systemctl, unit_path
 from companion.config import Config
 from companion.doctor.check import Check
-from companion.doctor.computer import hardware_watchdog_check
-from companion.doctor.computer_facts import read_computer
+from companion.doctor.computer import hardware_watchdog_check, read_computer
 from companion.doctor.engine_trial import EngineTrial, try_engine
 from companion.doctor.script_trial import try_script
 from companion.doctor.watchdogs import (

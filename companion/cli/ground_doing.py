@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import sys
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from companion import ground, runtime
-from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.answer import REQUIRED, AsJson, Option, Overrides, answer, note, with_options
 from companion.cli.beside import shown
 from companion.cli.ground_tasks import (
     GroundOptionError,
@@ -25,18 +27,15 @@ from companion.cli.ground_tasks import (
     piece_of,
     plan_line,
 )
-from companion.cli.ground_words import in_words
-from companion.cli.hand import INTERRUPTED, KEY, Hand, read_line
+from companion.cli.hand import ENDED, INTERRUPTED, KEY, Hand, read_line
 from companion.cli.link_parts import build_link, load_with_kept
-from companion.cli.options import REQUIRED, Option, with_options
 from companion.cli.run import build_executor, component_options, training_mark
 from companion.cli.sensor_parts import build_sensors
 from companion.config import Config
 from companion.core.ground_task import GroundKind
 from companion.core.ground_work import GroundReason
-from companion.errors import ActuatorError
+from companion.errors import ActuatorError, JournalError
 from companion.ground import GroundOutcome
-from companion.record import ground_log
 from companion.sensors.estop import EstopSwitch
 
 _ConfigFile = Annotated[
@@ -92,14 +91,14 @@ def do(asked: Asked, wish: Wish, *, is_water: bool = False) -> None:
     wanted = (*asked.overrides, *(["journal.training=true"] if is_water else []))
     config, given = load_with_kept(asked.config_file, wanted)
     piece = piece_of(config, wish)
-    log = ground_log.ready_log(config.resolve(config.journal.folder))
+    log = ready_log(config.resolve(config.journal.folder))
     descriptor = _stdin(asked.is_lines)
     _ask(piece, config, descriptor)
     hand = Hand(descriptor, is_lines=asked.is_lines)
     outcome = _perform(config, given, piece, hand)
     result = _result(config, piece, outcome)
     if outcome.has_begun:
-        trouble = ground_log.append(log, {"ended_utc": datetime.now(UTC).isoformat(), **result})
+        trouble = append(log, {"ended_utc": datetime.now(UTC).isoformat(), **result})
         if trouble is not None:
             note(f"warning: {trouble}")
     if INTERRUPTED in outcome.reasons:
@@ -204,3 +203,71 @@ def _lines(piece: Piece, result: dict[str, Any]) -> list[str]:
     elif piece.task.is_whole:
         lines.append("a catch that was broken off is worth nothing: empty the cups, do it again")
     return lines
+
+
+# The record of ground work: one line of JSON for each piece, beside the journals.
+
+NAME = "ground-work.jsonl"
+
+
+def ready_log(folder: Path) -> Path:
+    """Return the file in `folder`; a `JournalError` where it cannot be written."""
+    path = folder / NAME
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with path.open("a"):
+            pass
+    except OSError as error:
+        raise JournalError(
+            f"journal folder {folder}: cannot be written ({error}); "
+            "set journal.folder to a folder that can"
+        ) from error
+    return path
+
+
+def append(path: Path, entry: Mapping[str, Any]) -> str | None:
+    """Write one piece down for good; return why it could not be, None where it could."""
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry, allow_nan=False) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+    except (OSError, ValueError) as error:
+        return f"{path}: not written: {error}"
+    return None
+
+
+# What is said of the reasons for which ground work was not done, or ended.
+
+_WORDS: dict[str, str] = {
+    GroundReason.NO_HEARTBEAT: "no vehicle is heard; check link.url and power",
+    GroundReason.STALE_HEARTBEAT: "the vehicle is heard no more",
+    GroundReason.ARMED: "the vehicle is armed; disarm it",
+    GroundReason.MISSION_MODE: "the vehicle is in a mode that flies missions or may spray; choose "
+    "another, such as LOITER",
+    GroundReason.MISSION_ACTIVE: "the vehicle's mission is active; end it",
+    GroundReason.LANDED_UNKNOWN: "the vehicle does not say whether it stands (EXTENDED_SYS_STATE)",
+    GroundReason.NOT_LANDED: "the vehicle does not say that it stands on the ground",
+    GroundReason.OUTPUT_FAULT: "the outputs are not sound",
+    GroundReason.OUTPUTS_NEED_ARMING: "servo outputs of this autopilot follow orders only while it "
+    'is armed (PX4), and ground work needs it disarmed; use valves on GPIO (output.kind = "gpio")',
+    GroundReason.STOPPED: "stopped by MAVLink or by the emergency stop",
+    GroundReason.ESTOP_UNKNOWN: "the emergency stop is pressed or cannot be read",
+    GroundReason.NOT_HELD: "the key was let go",
+    GroundReason.STALLED: "this computer stood still for a moment",
+    GroundReason.TIME_OVER: "the time of one piece is over; start anew",
+    GroundReason.DONE: "done",
+    KEY: "another key was pressed",
+    ENDED: "stdin ended",
+    INTERRUPTED: "interrupted",
+}
+
+
+def in_words(reasons: Iterable[str], fault: str = "") -> str:
+    """Return the reasons in one line; `fault` is what outputs or link said."""
+    named = [str(reason) for reason in GroundReason if reason in set(reasons)]
+    named += sorted(reason for reason in set(reasons) if reason not in named)
+    words = [_WORDS.get(reason, reason) for reason in named]
+    if GroundReason.OUTPUT_FAULT in named and fault:
+        words[named.index(GroundReason.OUTPUT_FAULT)] += f" ({fault})"
+    return "; ".join(words)

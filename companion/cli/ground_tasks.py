@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from companion.config import Config
-from companion.config.motors import atomisers_of, makes_flow, pump_of
+from companion.config.motor_rules import atomisers_of, makes_flow, pump_of
 from companion.core.ground_task import (
     PIECE_MAX_S,
     GroundKind,

@@ -7,12 +7,11 @@ from pathlib import Path
 
 from companion.cli.answer import note
 from companion.config import Config, load
-from companion.config.sensor_rules import tank_capacity_l
+from companion.config.rules import tank_capacity_l
 from companion.errors import ConfigError
 from companion.link.component import ComponentOptions
 from companion.link.parameters import SETTINGS, Parameters, known_parameters
-from companion.link.signing import Signing, read_key
-from companion.link.state_file import read_state, write_state
+from companion.link.signing import Signing, read_key, read_state, write_state
 from companion.link.vehicle_link import VehicleLink
 
 PARAMETERS_NAME = "parameters.json"

@@ -8,8 +8,8 @@ from typing import Annotated, Any, get_args
 
 import typer
 
+from companion.cli.answer import Option, with_options
 from companion.cli.map_grid import parse_place
-from companion.cli.options import Option, with_options
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.core.prescription import Overlap

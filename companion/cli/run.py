@@ -6,20 +6,25 @@ import json
 import logging
 import os
 import re
+import socket
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, MutableMapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
 import typer
+from shapely.errors import ShapelyError
 
 from companion import runtime
 from companion.assembly import build_setup, deliverable, refuse_mismatch
 from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.beside import shown
 from companion.cli.link_parts import build_link, load_with_kept
-from companion.cli.notify import Notifier
 from companion.cli.output_parts import build_outputs
 from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
 from companion.cli.sensor_parts import build_sensors, follow_refills
@@ -27,7 +32,7 @@ from companion.config import Config
 from companion.config.application_table import missing, told
 from companion.config.rules import unbounded, without_effect
 from companion.core.setup import Setup
-from companion.errors import ActuatorError, LinkError, SensorError
+from companion.errors import ActuatorError, LinkError, SensorError, VrsprayError
 from companion.flight_map import FlightMap, flight_map_of
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
@@ -36,10 +41,11 @@ from companion.output.autopilot_budget import dither_too_much
 from companion.output.servo import DITHER_S
 from companion.ports import PlanExecutor
 from companion.record.commit_pace import commit_every_s
-from companion.record.continuing import continued
+from companion.record.continuing import Treated, continued, read_treated_ground, rest_of
+from companion.record.folder import journals
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
-from companion.record.unfinished import unfinished
+from companion.record.read_only import DAMAGE
+from companion.record.reader import opened, read_journal
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -237,3 +243,138 @@ def _application_notes(config: Config, training: str) -> list[str]:
 
 
 run = typer.main.get_command(app)
+
+
+# Tells systemd that the control loop makes its steps; without systemd it does nothing.
+#
+# The protocol is a datagram of `KEY=VALUE` lines to the socket in NOTIFY_SOCKET (sd_notify(3)).
+
+# A journal takes up to 30 s to close; the valves are closed by then, and no step follows.
+CLOSING_MAX_S = 35.0
+
+
+class Notifier:
+    """Sends READY=1 at the first step, and WATCHDOG=1 at most twice in the watchdog's time.
+
+    It has no timer: a loop that stands still is silent, and systemd ends it.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[bytes], None] | None = None,
+        *,
+        watchdog_s: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._send = send
+        self._pause_s = None if watchdog_s is None else 0.5 * watchdog_s
+        self._clock = clock
+        self._fed_s: float | None = None
+
+    @classmethod
+    def from_environment(cls, environment: MutableMapping[str, str], *, pid: int) -> Notifier:
+        """Return what the environment asks for, and take it out: it is not for our children."""
+        address = environment.pop("NOTIFY_SOCKET", "")
+        watchdog_us = environment.pop("WATCHDOG_USEC", "")
+        meant = environment.pop("WATCHDOG_PID", str(pid))
+        if not address.startswith(("/", "@")):
+            return cls()
+        is_watched = watchdog_us.isdecimal() and int(watchdog_us) > 0 and meant == str(pid)
+        return cls(
+            _sender(address.replace("@", "\0", 1) if address[0] == "@" else address),
+            watchdog_s=int(watchdog_us) / 1e6 if is_watched else None,
+        )
+
+    def stepped(self) -> None:
+        """Take that the control loop has made a step."""
+        if self._send is None:
+            return
+        now_s = self._clock()
+        if self._fed_s is None:
+            self._fed_s = now_s
+            self._send(b"READY=1\nWATCHDOG=1")
+        elif self._pause_s is not None and now_s - self._fed_s >= self._pause_s:
+            self._fed_s = now_s
+            self._send(b"WATCHDOG=1")
+
+    def __enter__(self) -> Self:
+        """Begin; nothing is sent before the first step."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Take that the loop has ended and all is closed: the journal may take its time."""
+        if self._send is not None:
+            self._send(f"STOPPING=1\nWATCHDOG_USEC={round(CLOSING_MAX_S * 1e6)}".encode())
+
+
+def _sender(address: str) -> Callable[[bytes], None]:
+    def send(message: bytes) -> None:
+        # What cannot be sent now is missed by systemd, which is what it is for.
+        with (
+            suppress(OSError),
+            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel,
+        ):
+            channel.setblocking(False)
+            channel.sendto(message, address)
+
+    return send
+
+
+# Which earlier flight left ground of this map untreated: for whoever forgets to go on with it.
+
+# As far back as a day of flights goes; each costs a look at its `meta`.
+FLIGHTS_LOOKED_AT = 20
+# Less than this of a field is its edge.
+LEFT_MIN_SHARE = 0.01
+# A raster of more tiles (80 ha) takes too long to outline before a flight: nothing is said then.
+TILES_MAX = 5000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unfinished:
+    """A journal, and how much of the field it leaves."""
+
+    path: Path
+    left_share: float
+    left_ha: float
+
+
+def unfinished(folder: Path, setup: Setup, *, training: str = "no") -> Unfinished | None:
+    """Return the newest flight over the same map that treated some of it, if it left the rest.
+
+    It says something or nothing, and never hinders a start.
+    """
+    try:
+        for path in islice(reversed(journals(folder)), FLIGHTS_LOOKED_AT):
+            if not _is_of(path, setup, training):
+                continue
+            found = read_treated_ground(path)
+            if found.coverage.tiles:
+                return _left(found)
+    except (VrsprayError, ShapelyError, *DAMAGE):
+        return None
+    return None
+
+
+def _is_of(path: Path, setup: Setup, training: str) -> bool:
+    """Return whether a flight that has ended sprayed the same over the same map."""
+    try:
+        with opened(path, is_lenient=True) as journal:
+            meta = journal.meta
+    except VrsprayError:
+        return False
+    return (
+        meta.get("closed") in ("yes", "recovered")
+        and meta.get("training") == training
+        and meta.get("map_sha256") == setup.prescription.sha256 != ""
+    )
+
+
+def _left(found: Treated) -> Unfinished | None:
+    if len(found.coverage.tiles) > TILES_MAX:
+        return None
+    field = found.setup.prescription.field
+    left_m2 = rest_of(field, found.coverage, found.strip_m).area
+    if not left_m2 > LEFT_MIN_SHARE * field.area:
+        return None
+    return Unfinished(path=found.path, left_share=left_m2 / field.area, left_ha=left_m2 / 10_000.0)

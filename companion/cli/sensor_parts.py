@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+from typing import Any
 
 from companion.config import Config
-from companion.config.sensor_rules import tank_capacity_l
+from companion.config.rules import tank_capacity_l
 from companion.config.sensor_tables import ConverterTable
+from companion.core.types import Input, PressureReport
+from companion.errors import SensorError
+from companion.gpio_chip import find_chip, load_gpiod
 from companion.link.vehicle_link import VehicleLink
 from companion.ports import Sensor
 from companion.sensors.current_loop import CurrentLoop
 from companion.sensors.estop import EstopSwitch
 from companion.sensors.flow_meter import FlowMeter
 from companion.sensors.gauge import Gauge
-from companion.sensors.gpiod_edges import GpiodEdges
-from companion.sensors.gpiod_level import GpiodLevel
-from companion.sensors.pressure import PressureSensor
-from companion.sensors.pulses import Meter
+from companion.sensors.pulses import Edge, Meter
 from companion.sensors.tank import TankSensor
 from companion.sensors.voltage import I2cVoltage, IioVoltage, VoltageSource
 
@@ -106,3 +108,146 @@ def _tank(config: Config, meter: FlowMeter | None) -> TankSensor | None:
         filled_l=table.filled_l,
         tolerance_l=table.tolerance_l,
     )
+
+
+# Edges of a GPIO line by libgpiod 2, each with the kernel's own time.
+
+# A second of pulses at 1 kHz; the kernel drops and numbers what does not fit.
+BUFFER_SIZE = 1024
+NANOSECONDS = 1e9
+
+
+class GpiodEdges:
+    """The rising edges of one line; the module is only needed where a line is."""
+
+    def __init__(self, chip: str, line: int, *, pull: str = "as-is") -> None:
+        self._chip = chip
+        self._line = line
+        self._pull = pull
+        self._request: Any = None
+
+    def open(self) -> None:
+        """Take the line: SensorError where the module, the chip or the line is not to be had."""
+        gpiod = load_gpiod(SensorError)
+        bias = {
+            "up": gpiod.line.Bias.PULL_UP,
+            "down": gpiod.line.Bias.PULL_DOWN,
+            "as-is": gpiod.line.Bias.AS_IS,
+        }[self._pull]
+        settings = gpiod.LineSettings(
+            direction=gpiod.line.Direction.INPUT,
+            edge_detection=gpiod.line.Edge.RISING,
+            event_clock=gpiod.line.Clock.MONOTONIC,
+            bias=bias,
+        )
+        try:
+            self._request = gpiod.request_lines(
+                find_chip(gpiod, self._chip, SensorError),
+                consumer="vrspray flow meter",
+                config={self._line: settings},
+                event_buffer_size=BUFFER_SIZE,
+            )
+        except (OSError, ValueError) as error:
+            raise SensorError(
+                f"flow_meter.line = {self._line} on {self._chip}: {error}; see `gpioinfo` for "
+                "the chip, and for who holds the line"
+            ) from error
+
+    def read(self) -> Sequence[Edge]:
+        """Return the edges that the kernel has kept."""
+        edges: list[Edge] = []
+        while self._request is not None and self._request.wait_edge_events(timedelta(0)):
+            edges += [
+                Edge(event.timestamp_ns / NANOSECONDS, event.line_seqno)
+                for event in self._request.read_edge_events()
+            ]
+        return edges
+
+    def close(self) -> None:
+        """Release the line."""
+        request, self._request = self._request, None
+        if request is not None:
+            request.release()
+
+
+# The level of one GPIO line by libgpiod 2, with its own pull-up.
+
+_NO_WAIT = timedelta(0)
+
+
+class GpiodLevel:
+    """An input line; the module is only needed where a line is."""
+
+    def __init__(self, chip: str, line: int, *, key: str) -> None:
+        self._chip, self._line, self._key = chip, line, key
+        self._request: Any = None
+        self._high: Any = None
+        self._rising: Any = None
+
+    def open(self) -> None:
+        """Take the line: SensorError where the module, the chip or the line is not to be had."""
+        gpiod = load_gpiod(SensorError)
+        settings = gpiod.LineSettings(
+            direction=gpiod.line.Direction.INPUT,
+            edge_detection=gpiod.line.Edge.BOTH,
+            bias=gpiod.line.Bias.PULL_UP,
+        )
+        self._high = gpiod.line.Value.ACTIVE
+        self._rising = gpiod.EdgeEvent.Type.RISING_EDGE
+        try:
+            self._request = gpiod.request_lines(
+                find_chip(gpiod, self._chip, SensorError),
+                consumer="vrspray",
+                config={self._line: settings},
+            )
+        except (OSError, ValueError) as error:
+            raise SensorError(
+                f"{self._key} = {self._line} on {self._chip}: {error}; see `gpioinfo` for the "
+                "chip, and for who holds the line"
+            ) from error
+
+    def is_high(self) -> bool:
+        """Return whether the level is high or has been since the last look; OSError if unknown."""
+        if self._request is None:
+            raise OSError("the line is not open")
+        has_risen = False
+        while self._request.wait_edge_events(_NO_WAIT):
+            events = self._request.read_edge_events()
+            has_risen = has_risen or any(event.event_type == self._rising for event in events)
+        return has_risen or bool(self._request.get_value(self._line) == self._high)
+
+    def fileno(self) -> int | None:
+        """Return the request's file, readable when the level has changed."""
+        return None if self._request is None else int(self._request.fd)
+
+    def close(self) -> None:
+        """Release the line."""
+        request, self._request = self._request, None
+        if request is not None:
+            request.release()
+
+
+# Pressure before the valves, from a 4 to 20 mA transmitter.
+
+
+class PressureSensor:
+    """The mean pressure of the last whole PWM periods, at every step."""
+
+    def __init__(self, gauge: Gauge) -> None:
+        self._gauge = gauge
+
+    async def open(self, wake: Callable[[], None]) -> None:  # noqa: ARG002 - steps come anyway
+        """Find the converter: SensorError where there is none."""
+        await self._gauge.open()
+
+    def read(self, now_s: float) -> Sequence[Input]:
+        """Return the pressure, or the fault of the sensor."""
+        found = self._gauge.value(now_s)
+        if found is None:
+            return []
+        kpa, fault = found
+        return [PressureReport(received_s=now_s, pressure_kpa=kpa, fault=fault)]
+
+    async def close(self) -> None:
+        """Let go of the converter."""
+        await self._gauge.close()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.atomic_write import write_atomically
-from companion.cli.service_unit import is_ours
+from companion.cli.service import is_ours
 from companion.errors import VrsprayError
 
 NAME = "vrspray.service"

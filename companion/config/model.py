@@ -10,10 +10,8 @@ from pydantic_core import PydanticCustomError
 
 from companion.config import (
     application_table,
-    correction_tables,
-    coverage_table,
+    motor_rules,
     motor_tables,
-    motors,
     sensor_tables,
     sprayer_tables,
     tables,
@@ -64,14 +62,14 @@ class Config(tables.Table):
     mission: tables.MissionTable | None = None
     product: tables.ProductTable = tables.ProductTable()
     application: application_table.ApplicationTable = application_table.ApplicationTable()
-    flow_trim: correction_tables.FlowTrimTable = correction_tables.FlowTrimTable()
+    flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
     flow_meter: sensor_tables.FlowMeterTable = sensor_tables.FlowMeterTable()
     pressure: sensor_tables.PressureTable = sensor_tables.PressureTable()
     tank: sensor_tables.TankTable = sensor_tables.TankTable()
     detection: sensor_tables.DetectionTable = sensor_tables.DetectionTable()
-    drift: correction_tables.DriftTable = correction_tables.DriftTable()
-    prediction: correction_tables.PredictionTable = correction_tables.PredictionTable()
-    coverage: coverage_table.CoverageTable = coverage_table.CoverageTable()
+    drift: tables.DriftTable = tables.DriftTable()
+    prediction: tables.PredictionTable = tables.PredictionTable()
+    coverage: tables.CoverageTable = tables.CoverageTable()
     journal: tables.JournalTable = tables.JournalTable()
     web: tables.WebTable = tables.WebTable()
 
@@ -137,7 +135,7 @@ class Config(tables.Table):
 
     def nozzle_sets(self) -> tuple[NozzleSet, ...]:
         """Return the sets, from the smallest to the largest flow."""
-        of_pump = motors.pump_set(self)
+        of_pump = motor_rules.pump_set(self)
         if of_pump is not None:
             return (of_pump,)
         index = {valve.name: number for number, valve in enumerate(self.valve)}
@@ -154,7 +152,7 @@ class Config(tables.Table):
 
     def pwm_limits(self) -> PwmLimits:
         """Return what the valves can follow, or the pump that makes their flow."""
-        least = motors.fraction_min(self)
+        least = motor_rules.fraction_min(self)
         if least is not None:
             return PwmLimits(
                 frequency_hz=self.pwm.frequency_hz,

@@ -18,7 +18,7 @@ from companion.core.types import (
     Telemetry,
     WindReport,
 )
-from companion.doctor.vehicle_facts import Heard, Position, Rate
+from companion.doctor.vehicle import Heard, Position, Rate
 from companion.errors import LinkError
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_check import ardupilot_places

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 from companion.doctor.check import Check, fail, not_applicable, ok, warn
 from companion.doctor.listen import rest_pulses
-from companion.doctor.vehicle_facts import Heard
+from companion.doctor.vehicle import Heard
 from companion.output.autopilot_check import TOLERANCE_US
 from companion.output.autopilot_findings import Finding, findings, px4_wiring
 from companion.output.autopilot_guard import REFUSALS

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.core.types import Decision, EstopReport, Input, OperatorCommand, RateOverride
-from companion.link.messages import CommandReceived, Sender
+from companion.link.messages import CommandReceived, Sender, Tank
 from companion.link.parameters import RATE_PERCENT, VALUES_HZ, Parameters
-from companion.link.tank import Tank
 
 DO_SPRAYER = 216
 PREFLIGHT_REBOOT_SHUTDOWN = 246

@@ -5,15 +5,25 @@ No I/O: bytes and times come in, bytes go out through `send`, which says whether
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeGuard, get_args
 
 from companion.core.lines import MISSION_MODES
-from companion.core.order import Order, Place, noted, sorted_in
-from companion.core.types import Decision, HeartbeatReport, Input, Telemetry
+from companion.core.order import AHEAD_MAX_S, BOOT_WRAP_S, Order, Place, noted, sorted_in
+from companion.core.types import (
+    ClockReport,
+    Decision,
+    HeartbeatReport,
+    Input,
+    LandedReport,
+    RcReport,
+    Telemetry,
+    WindReport,
+)
 from companion.link.announcer import Announcer
-from companion.link.clock import ClockExchanges
 from companion.link.codec import Codec
 from companion.link.commands import REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, Desk
 from companion.link.encode import Encoder
@@ -26,19 +36,17 @@ from companion.link.messages import (
     ParamValue,
     PingReceived,
     ServoOutput,
+    Tank,
     TimesyncReceived,
 )
 from companion.link.mission_messages import MissionCurrent, MissionTransfer
 from companion.link.mission_reader import MissionReader
-from companion.link.news import News
 from companion.link.outputs import ORDERS, Outputs
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent, Service
 from companion.link.signing import Signing
 from companion.link.statistics import Meter
 from companion.link.streams import Stream, StreamRequest, StreamSupervisor, wanted_streams
-from companion.link.tank import Tank
-from companion.link.wind import WindWatch
 
 _POSITION = 33
 # How often the time is asked for, in seconds; where answers are slow, bytes are dear.
@@ -339,3 +347,135 @@ class Component:
 
 def _is_input(message: Message) -> TypeGuard[Input]:
     return isinstance(message, _INPUTS)
+
+
+# What the vehicle says of its switches and outputs, if it is no older than what it said before.
+#
+# Where the autopilot's messages come twice or late (two radios, a router's loop), an old pulse of
+# the pilot's switch would enable again after he has stopped, and an old output would look like a
+# fault. Both carry the autopilot's time since boot; the positions tell what that is by now.
+
+# SERVO_OUTPUT_RAW counts microseconds in 32 bits, which begin anew after 72 minutes.
+_MICROS_WRAP_S = 2**32 / 1e6
+# For so long after a restart something of before it may still come.
+_LATE_MAX_S = 30.0
+
+
+class News:
+    """Remembers how new the last message of each kind was."""
+
+    def __init__(self) -> None:
+        self._newest: dict[str, float] = {}
+        self._wary_until_s = -math.inf
+
+    def begin_anew(self, now_s: float) -> None:
+        """Forget it: the autopilot's clock has begun anew."""
+        self._newest.clear()
+        self._wary_until_s = now_s + _LATE_MAX_S
+
+    def is_old(self, message: Message, order: Order) -> bool:
+        """Return whether something newer is known; what has no time is as new as it comes.
+
+        After a restart what is ahead of the positions is of the clock before it.
+        """
+        if not isinstance(message, RcReport | ServoOutput) or message.boot_s is None:
+            return False
+        boot_s = message.boot_s
+        kind, wrap_s = "rc", BOOT_WRAP_S
+        if isinstance(message, ServoOutput):
+            kind, wrap_s = f"port {message.port}", _MICROS_WRAP_S
+        if order.boot_s is not None and message.received_s < self._wary_until_s:
+            now_s = order.boot_s + message.received_s - order.received_s
+            if math.remainder(boot_s - now_s, wrap_s) > AHEAD_MAX_S:
+                return True
+        newest_s = self._newest.get(kind)
+        if newest_s is not None and math.remainder(boot_s - newest_s, wrap_s) < 0.0:
+            return True
+        self._newest[kind] = boot_s
+        return False
+
+
+# Whether a wind that the autopilot tells is an estimate; one that never moves is none.
+#
+# ArduCopter sends WIND with exactly 0 while it estimates no wind, whatever blows, and an estimator
+# that has stopped goes on telling its last number. A real estimate changes with every message.
+
+# Asked for twice a second; a link that is slowed to a quarter still shows five reports in this.
+STILL_MAX_S = 10.0
+
+
+class WindWatch:
+    """Looks at all inputs; hands on each wind, as not known where it cannot be an estimate."""
+
+    def __init__(self) -> None:
+        self._in_air = False
+        self._last: tuple[float | None, float | None, float | None] | None = None
+        self._moved_s = -math.inf
+
+    def take(self, item: Input) -> Input:
+        """Return the input; a wind that is no estimate without its numbers."""
+        if isinstance(item, LandedReport):
+            self._in_air = item.in_air is True
+        if not isinstance(item, WindReport) or item.speed_m_s is None:
+            return item
+        told = (item.speed_m_s, item.east_m_s, item.north_m_s)
+        if told != self._last:
+            self._last, self._moved_s = told, item.received_s
+        stands_still = self._in_air and not item.received_s - self._moved_s <= STILL_MAX_S
+        if item.speed_m_s == 0.0 or stands_still:
+            return replace(item, speed_m_s=None, east_m_s=None, north_m_s=None)
+        return item
+
+
+# Questions of the time and their answers: how far the autopilot's clock is from ours.
+#
+# TIMESYNC (mavlink.io/en/services/timesync.html): we send our time, the answer brings it back with
+# the autopilot's. An exchange is wrong by at most half of its round trip, where one direction takes
+# all of the time. What follows from many of them is the core's to say (`companion/core/clock.py`).
+
+_KEPT = 60
+
+
+class ClockExchanges:
+    """Matches answers with questions, and keeps how quick the last ones were."""
+
+    def __init__(self) -> None:
+        self._asked_ns: deque[int] = deque(maxlen=8)
+        self._round_trips_s: deque[float] = deque(maxlen=_KEPT)
+        self._news: list[ClockReport] = []
+
+    def ask(self, now_s: float) -> int:
+        """Return the number to send, which the answer will bring back."""
+        asked_ns = round(now_s * 1e9)
+        self._asked_ns.append(asked_ns)
+        return asked_ns
+
+    def answer(self, tc1_ns: int, ts1_ns: int, received_s: float) -> None:
+        """Take an answer; one to somebody else's question is ignored."""
+        if ts1_ns not in self._asked_ns:
+            return
+        self._asked_ns.remove(ts1_ns)
+        asked_s = ts1_ns * 1e-9
+        round_trip_s = received_s - asked_s
+        if not round_trip_s >= 0.0:
+            return
+        offset_s = 0.5 * (asked_s + received_s) - tc1_ns * 1e-9
+        self._round_trips_s.append(round_trip_s)
+        self._news.append(
+            ClockReport(received_s=received_s, offset_s=offset_s, round_trip_s=round_trip_s)
+        )
+
+    def take_reports(self) -> list[ClockReport]:
+        """Return every exchange once: inputs of the core."""
+        news, self._news = self._news, []
+        return news
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the autopilot has answered at all."""
+        return bool(self._round_trips_s)
+
+    @property
+    def round_trip_s(self) -> float | None:
+        """Return the quickest round trip of late."""
+        return min(self._round_trips_s, default=None)

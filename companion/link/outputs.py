@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
-from companion.link import ardupilot, px4
+from companion.link import px4
 from companion.link.census import Vehicle
 from companion.link.encode import Encoder
 from companion.link.messages import ParamValue, ServoOutput
-from companion.link.parameter_reader import ParameterReader
 
-ORDERS = frozenset({ardupilot.DO_SET_SERVO, px4.DO_SET_ACTUATOR})
+# What ArduPilot wants of an order and means by a parameter; PX4's side is in `px4.py`.
+
+DO_SET_SERVO = 183
+
+
+class ServoOrders:
+    """One DO_SET_SERVO an output, sent at once; the pulse goes out as ordered, unclamped."""
+
+    def __init__(self, encoder: Encoder, send: Callable[[bytes], bool]) -> None:
+        self._encoder = encoder
+        self._send = send
+
+    def order(self, channel: int, pulse_us: int) -> bool:
+        """Order one output; False where the order could not leave."""
+        return self._send(self._encoder.set_servo(channel, pulse_us))
+
+    def flush(self) -> bool:
+        """Return that nothing waits to be sent."""
+        return True
+
+
+def parameter_value(value: float, _kind: int) -> float:
+    """Return the value of a parameter: ArduPilot casts every type to a float."""
+    return value
+
+
+ORDERS = frozenset({DO_SET_SERVO, px4.DO_SET_ACTUATOR})
 
 
 class OutputListener(Protocol):
@@ -39,7 +65,7 @@ class Outputs:
         self._encoder = encoder
         self._send = send
         self._ends = {"closed_us": closed_us, "full_us": full_us}
-        self._orders: ardupilot.ServoOrders | px4.ActuatorOrders | None = None
+        self._orders: ServoOrders | px4.ActuatorOrders | None = None
         self._reader = ParameterReader()
         self._is_px4 = False
         self._is_armed: bool | None = None
@@ -51,7 +77,7 @@ class Outputs:
         if vehicle.is_px4:
             self._orders = px4.ActuatorOrders(self._encoder, self._send, **self._ends)
         else:
-            self._orders = ardupilot.ServoOrders(self._encoder, self._send)
+            self._orders = ServoOrders(self._encoder, self._send)
         self._reader.clear()
         if self.listener is not None:
             self._reader.want(self.listener.met(vehicle.is_px4))
@@ -78,7 +104,7 @@ class Outputs:
 
     def parameter(self, found: ParamValue) -> None:
         """Take a parameter of the autopilot."""
-        meant = px4.parameter_value if self._is_px4 else ardupilot.parameter_value
+        meant = px4.parameter_value if self._is_px4 else parameter_value
         self._reader.take(found.name, meant(found.value, found.kind))
 
     def tick(self, now_s: float) -> None:
@@ -89,3 +115,70 @@ class Outputs:
         known = self._reader.finished()
         if known is not None and self.listener is not None:
             self._reader.want(self.listener.learned(known))
+
+
+# Reads parameters of the autopilot one by one: paced, asked again, given up in the end.
+#
+# Pure but for what it remembers; time is an argument. Single reads and no list: a list slows all
+# streams of ArduPilot down to a quarter while it runs.
+
+_PAUSE_S = 0.04
+_AGAIN_S = 0.7
+# An unknown parameter gets no answer, so the number of questions decides.
+_TRIES = 4
+
+
+@dataclass(slots=True)
+class _Asked:
+    """A parameter that is not known yet."""
+
+    tries: int = 0
+    at_s: float = float("-inf")
+
+
+class ParameterReader:
+    """Says which parameter to ask for next, and gives all once the last has come or is given up."""
+
+    def __init__(self) -> None:
+        self._open: dict[str, _Asked] = {}
+        self._known: dict[str, float | None] = {}
+        self._asked_s = float("-inf")
+
+    def want(self, names: Iterable[str]) -> None:
+        """Begin to read parameters; what was being read before is read to its end."""
+        for name in names:
+            self._known.pop(name, None)
+            self._open.setdefault(name, _Asked())
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._open.clear()
+        self._known.clear()
+
+    def next_name(self, now_s: float) -> str | None:
+        """Return the parameter to ask for now; None while none is due."""
+        if now_s - self._asked_s < _PAUSE_S:
+            return None
+        for name, asked in list(self._open.items()):
+            if now_s - asked.at_s < _AGAIN_S:
+                continue
+            if asked.tries >= _TRIES:
+                del self._open[name]
+                self._known[name] = None
+                continue
+            asked.tries += 1
+            asked.at_s = self._asked_s = now_s
+            return name
+        return None
+
+    def take(self, name: str, value: float) -> None:
+        """Take the value of a parameter; those that nobody asked for are ignored."""
+        if self._open.pop(name, None) is not None:
+            self._known[name] = value
+
+    def finished(self) -> dict[str, float | None] | None:
+        """Return once what is known of all that was wanted; None where that did not answer."""
+        if self._open or not self._known:
+            return None
+        known, self._known = self._known, {}
+        return known

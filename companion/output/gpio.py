@@ -10,19 +10,23 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
+import socket
+import subprocess
+import sys
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import Any
 
 from companion.core.types import SprayPlan
 from companion.errors import ActuatorError
-from companion.output.engine.child import COMMAND, EngineChild
-from companion.output.engine.held import HeldLines
+from companion.output.engine.lines import Lines, open_lines
 from companion.output.engine.selftest import SelfTest
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import (
+    PACKET_MAX,
     Issued,
     Kind,
     RefusedError,
@@ -34,6 +38,78 @@ from companion.output.engine.wire import (
     unpack,
 )
 from companion.output.timed import Lateness, OnOrder
+
+# The engine's process as the companion has it: start, packets to it, its end.
+
+# -P: a module of the working directory is none of ours, whatever its name. Not -I, which would
+# also leave out a user's own site-packages, where this program may be installed.
+COMMAND = (sys.executable, "-P", "-m", "companion.output.engine")
+KILL_MAX_S = 0.1
+
+
+class EngineChild:
+    """A child process and the socket to it. No threads and no shell; `reap` must be called."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with ExitStack() as on_failure, theirs:
+            on_failure.enter_context(ours)
+            file = theirs.fileno()
+            self._process = subprocess.Popen(
+                [*command, str(file), str(os.getpid())],
+                pass_fds=(file,),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                # Linux shares the processor among sessions first: in ours, a busy companion would
+                # leave the engine's wake-ups a twentieth of a processor that others want as well.
+                start_new_session=True,
+            )
+            on_failure.pop_all()
+        ours.setblocking(False)
+        self.socket = ours
+        self.is_connected = True
+
+    @property
+    def pid(self) -> int:
+        """Return the process id."""
+        return self._process.pid
+
+    def send(self, packet: bytes) -> bool:
+        """Hand over a packet; False if its socket is full, or it is gone."""
+        try:
+            self.socket.send(packet, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
+        except OSError:
+            return False
+        return True
+
+    def packets(self) -> Iterator[bytes]:
+        """Yield what it sent; an empty packet is its end."""
+        while self.is_connected:
+            try:
+                packet = self.socket.recv(PACKET_MAX)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            yield packet
+            if not packet:
+                return
+
+    def disconnect(self) -> None:
+        """Close the socket, which ends an engine that is well."""
+        self.is_connected = False
+        self.socket.close()
+
+    def kill(self) -> None:
+        """End it whatever it does; the kernel releases its lines."""
+        self._process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(KILL_MAX_S)
+
+    def reap(self) -> None:
+        """Wait for an end that is under way."""
+        self._process.wait()
+
 
 _logger = logging.getLogger(__name__)
 
@@ -277,3 +353,38 @@ class GpioExecutor:
         if self._fault is None:
             self._fault = text
         self._ready.set()
+
+
+# Lines of an engine that is gone: driven to their safe levels from here, and held there.
+
+# Somebody else may still hold them: tried soon, and later not more often than this.
+FIRST_S, MOST_S = 0.05, 1.0
+
+
+class HeldLines:
+    """Takes the lines as soon as they can be had; `take` is called again and again."""
+
+    def __init__(self, setup: EngineSetup) -> None:
+        self._setup = setup
+        self._lines: Lines | None = None
+        self._next_s, self._wait_s = float("-inf"), FIRST_S
+        self._told = ""
+
+    def take(self, now_s: float) -> None:
+        """Have them at their safe levels; what prevents it is logged once."""
+        if self._lines is not None or now_s < self._next_s:
+            return
+        try:
+            self._lines = open_lines(self._setup)
+        except ActuatorError as error:
+            if self._told != str(error):
+                self._told = str(error)
+                _logger.error("lines cannot be taken over: %s", error)
+            self._next_s, self._wait_s = now_s + self._wait_s, min(2.0 * self._wait_s, MOST_S)
+
+    def release(self) -> None:
+        """Let go of them."""
+        if self._lines is not None:
+            with suppress(OSError):
+                self._lines.release()
+            self._lines = None

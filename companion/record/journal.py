@@ -24,10 +24,9 @@ from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import JournalError
 from companion.ports import COMMIT_EVERY_S
-from companion.record.events import Event, LinkSample
 from companion.record.new_file import about, new_file, open_for_flight
 from companion.record.valve_rows import ValveOrder
-from companion.record.writer import Item, Writer
+from companion.record.writer import Event, Item, LinkSample, Writer
 
 if TYPE_CHECKING:
     from companion.core.coverage import Coverage

@@ -6,17 +6,18 @@ prescription beside what was applied, and replay needs no map file.
 
 from __future__ import annotations
 
+import json
 import sqlite3
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
 import shapely
 from shapely import MultiPolygon, Polygon
 
-from companion.core.cells import CellGrid
+from companion.core.cells import CellGrid, Warp
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
-from companion.record.cell_table import read_cells, write_cells
 from companion.record.geopackage import (
     LOCAL_ID,
     WGS84_ID,
@@ -152,3 +153,77 @@ def _box(areas: list[Area]) -> tuple[float, float, float, float] | None:
         return None
     west, south, east, north = (float(value) for value in shapely.total_bounds(areas))
     return (west, south, east, north) if abs(west) < float("inf") else None
+
+
+# Rows and columns of rates in the journal, exact to the last bit: one row of packed arrays.
+
+# A damaged length must not take the reader's memory.
+CELLS_MAX = 64_000_000
+_SQL = """
+CREATE TABLE cells (
+    id INTEGER PRIMARY KEY NOT NULL, row_count INTEGER, column_count INTEGER, classes BLOB,
+    rates_l_ha BLOB, warps TEXT
+);
+INSERT INTO gpkg_contents (table_name, data_type, identifier, description) VALUES
+    ('cells', 'attributes', 'cells', 'the prescription in rows and columns');
+"""
+
+
+def write_cells(connection: sqlite3.Connection, cells: CellGrid) -> None:
+    """Write the cells: classes as int32 and rates as float64, little-endian, deflated."""
+    connection.executescript(_SQL)
+    connection.execute(
+        "INSERT INTO cells (row_count, column_count, classes, rates_l_ha, warps) "
+        "VALUES (?, ?, ?, ?, ?)",
+        (
+            *cells.shape,
+            zlib.compress(cells.classes.astype("<i4").tobytes(), level=1),
+            zlib.compress(cells.rates_l_ha.astype("<f8").tobytes(), level=1),
+            json.dumps(
+                [
+                    {"x0": warp.x0, "y0": warp.y0, "scale": warp.scale, "terms": warp.terms}
+                    for warp in (cells.to_frame, cells.to_cells)
+                ]
+            ),
+        ),
+    )
+
+
+def read_cells(connection: sqlite3.Connection) -> CellGrid | None:
+    """Return the cells, None where the flight had zones; ValueError where they are damaged."""
+    there = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'cells'").fetchone()
+    if there is None:
+        return None
+    found = connection.execute(
+        "SELECT row_count, column_count, classes, rates_l_ha, warps FROM cells"
+    ).fetchall()
+    if len(found) != 1:
+        raise ValueError(f"one set of cells expected, got {len(found)}")
+    rows, columns, classes, rates, warps = found[0]
+    try:
+        to_frame, to_cells = (
+            Warp(
+                x0=float(warp["x0"]),
+                y0=float(warp["y0"]),
+                scale=float(warp["scale"]),
+                terms=tuple((float(u), float(v)) for u, v in warp["terms"]),
+            )
+            for warp in json.loads(warps)
+        )
+        return CellGrid(
+            np.frombuffer(_unpacked(classes), dtype="<i4").reshape(rows, columns),
+            np.frombuffer(_unpacked(rates), dtype="<f8"),
+            to_frame,
+            to_cells,
+        )
+    except (KeyError, TypeError, zlib.error) as error:
+        raise ValueError(f"the cells are damaged: {error!r}") from error
+
+
+def _unpacked(packed: bytes) -> bytes:
+    """Return deflated bytes in full, or refuse more than a grid can have."""
+    worker = zlib.decompressobj()
+    content = worker.decompress(packed, 8 * CELLS_MAX)
+    if worker.unconsumed_tail or not worker.eof:
+        raise ValueError("the cells are cut off, or more than a grid can have")
+    return content

@@ -16,7 +16,6 @@ from companion.record.blocks import Entry
 from companion.record.codec import FieldNames, decode
 from companion.record.coverage_table import read_treated
 from companion.record.distrust import check_programs
-from companion.record.events import Event
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import read_ground
 from companion.record.read_only import DAMAGE, one_line, read_only, tolerate_damage
@@ -32,6 +31,7 @@ from companion.record.versions import (
     read_entries,
 )
 from companion.record.whole_file import damaged_pages
+from companion.record.writer import Event
 
 __all__ = ["Entry", "JournalContent", "OpenJournal", "opened", "read_journal"]
 

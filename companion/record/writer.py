@@ -15,12 +15,9 @@ from typing import TYPE_CHECKING
 
 from companion.core.frame import LocalFrame
 from companion.core.types import Decision, Input, UtcReport
-from companion.record.applied_rows import AppliedRows
 from companion.record.blocks import Block
 from companion.record.codec import encode
 from companion.record.coverage_table import write_coverage
-from companion.record.events import Event, LinkSample
-from companion.record.flight_clock import FlightClock
 from companion.record.layers import set_box
 from companion.record.totals import totals_of
 from companion.record.valve_rows import Row, ValveOrder, ValveRows
@@ -28,7 +25,37 @@ from companion.record.valve_rows import Row, ValveOrder, ValveRows
 if TYPE_CHECKING:
     from companion.core.coverage import Coverage
 
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from companion.core.frame import course_deg
+from companion.core.types import Inhibit, SprayerState, VehicleState
+from companion.record.geopackage import point_blob, time_text
+
 __all__ = ["Event", "Item", "Writer"]
+
+
+# What is written down besides inputs and decisions.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Event:
+    """What happened besides inputs and decisions."""
+
+    at_s: float
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LinkSample:
+    """How the link does at one moment: a value for each column of `link_stats`, as far as known."""
+
+    at_s: float
+    values: Mapping[str, float | None]
+
 
 _logger = logging.getLogger(__name__)
 
@@ -266,3 +293,118 @@ def tell_times_again(connection: sqlite3.Connection, offset_s: float, known_s: f
     """Give what was written before the autopilot told the time of day that time."""
     for table in ("applied", "events"):
         connection.execute(_TIME_AGAIN.format(table), (offset_s, known_s))
+
+
+# Rows of the layer `applied`: where the vehicle was and what was to be applied there.
+#
+# For map viewers and reports: ten a second, and one more whenever the reasons not to spray or the
+# state of the sprayer change. Every decision itself is in the blocks.
+
+EVERY_S = 0.1
+# Decisions come when something arrives, not on the tick.
+_EARLY_S = 0.005
+Box = tuple[float, float, float, float]
+
+
+class AppliedRows:
+    """Makes rows of some decisions, and keeps the box around their places."""
+
+    def __init__(self, frame: LocalFrame, time_text: Callable[[float], str | None]) -> None:
+        # A projection of its own: pyproj's are not to be shared between threads.
+        self._frame = LocalFrame(frame.latitude_deg, frame.longitude_deg)
+        self._time_text = time_text
+        self._last_s = -math.inf
+        self._told: tuple[frozenset[Inhibit], SprayerState] | None = None
+        self.box: Box | None = None
+
+    def take(self, sequence: int, decision: Decision) -> tuple[object, ...] | None:
+        """Return the row of a decision; None where none is due."""
+        told = (decision.inhibits, decision.sprayer)
+        since_s = decision.now_s - self._last_s
+        if told == self._told and 0.0 <= since_s < EVERY_S - _EARLY_S:
+            return None
+        self._told, self._last_s = told, decision.now_s
+        return self._row(sequence, decision)
+
+    def _row(self, sequence: int, decision: Decision) -> tuple[object, ...]:
+        state, duty = decision.state, decision.plan.duty
+        rates = [rate for rate in decision.rate_l_ha if rate is not None]
+        motion: tuple[float | None, ...] = (None, None, None, None)
+        if state is not None:
+            east, north = state.velocity_east_m_s, state.velocity_north_m_s
+            speed_m_s = math.hypot(east, north)
+            motion = (speed_m_s, course_deg(east, north), state.heading_deg, state.height_m)
+        return (
+            sequence,
+            None if state is None else self._point(state),
+            self._time_text(decision.now_s),
+            decision.now_s,
+            sum(rates) / len(rates) if rates else None,
+            decision.target_flow_l_min,
+            decision.flow_l_min,
+            sum(duty) / len(duty) if duty else 0.0,
+            *motion,
+            " ".join(sorted(decision.inhibits)),
+            _short(decision.rate_l_ha),
+        )
+
+    def _point(self, state: VehicleState) -> bytes | None:
+        latitude, longitude = self._frame.to_geographic(state.east_m, state.north_m)
+        if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+            return None
+        west, south, east, north = self.box or (longitude, latitude, longitude, latitude)
+        self.box = (
+            min(west, longitude),
+            min(south, latitude),
+            max(east, longitude),
+            max(north, latitude),
+        )
+        return point_blob(longitude, latitude)
+
+
+def _short(values: Sequence[float | None]) -> str:
+    """Return one value a valve; one alone where all are the same, as they mostly are."""
+    rounded = [None if value is None else round(value, 4) for value in values]
+    return json.dumps(rounded[:1] if len(set(rounded)) == 1 else rounded, separators=(",", ":"))
+
+
+# Which time of day it is: by this computer at first, by the autopilot as soon as it says so.
+#
+# A board without a clock of its own wakes in 1970 or where it was switched off; the autopilot has
+# the time of the satellites. Pure: times are arguments.
+
+# What differs by more is another time, and not the way of a message.
+JUMP_S = 1.0
+
+
+class FlightClock:
+    """Makes a time since 1970 of the companion's monotonic one.
+
+    Of the autopilot's reports the one counts that was shortest on its way: delays only ever make
+    its clock look slow.
+    """
+
+    def __init__(self, offset_s: float) -> None:
+        self.offset_s = offset_s
+        self.source = "computer"
+        self.known_s: float | None = None
+
+    def take(self, report: UtcReport) -> str | None:
+        """Take a report; return what is to be said of it, None where it only agrees."""
+        offset_s = report.utc_s - report.received_s
+        if not abs(offset_s) < float("inf"):
+            return None
+        apart_s = offset_s - self.offset_s
+        if self.known_s is None:
+            self.offset_s, self.source, self.known_s = offset_s, "autopilot", report.received_s
+            text = time_text(report.utc_s)
+            return f"the autopilot says {text}; this computer's clock was {-apart_s:+.1f} s off"
+        if abs(apart_s) > JUMP_S:
+            self.offset_s = offset_s
+            return f"the autopilot's time of day jumped by {apart_s:+.1f} s"
+        self.offset_s = max(self.offset_s, offset_s)
+        return None
+
+    def text(self, at_s: float) -> str | None:
+        """Return a monotonic time as UTC; None for what is no time."""
+        return time_text(at_s + self.offset_s)

@@ -35,8 +35,8 @@ from companion.core.types import (
     WindReport,
 )
 from companion.maps.compiling import compiled_setup
-from companion.record.events import LinkSample
 from companion.record.valve_rows import ValveOrder, ValveRows
+from companion.record.writer import LinkSample
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/anyang/config.toml"
 DECISIONS_HZ = 50

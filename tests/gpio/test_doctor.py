@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from companion.cli.sensor_parts import GpiodEdges
 from companion.doctor.check import Check
 from companion.doctor.gpio import gpio_checks, read_chip
 from companion.output.engine.gpiod_lines import GpiodLines, load_gpiod
 from companion.output.engine.wiring import Wiring
-from companion.sensors.gpiod_edges import GpiodEdges
 from tests.gpio.sim import SimChip
 
 pytestmark = pytest.mark.needs_gpiosim

@@ -9,12 +9,11 @@ from collections.abc import Iterator
 
 import pytest
 
+from companion.cli import sensor_parts
+from companion.cli.sensor_parts import GpiodEdges, GpiodLevel
 from companion.errors import SensorError
 from companion.output.engine.gpiod_lines import GpiodLines, load_gpiod
-from companion.sensors import gpiod_edges
 from companion.sensors.flow_meter import FlowMeter
-from companion.sensors.gpiod_edges import GpiodEdges
-from companion.sensors.gpiod_level import GpiodLevel
 from companion.sensors.pulses import Meter
 from tests.gpio.sim import SimChip
 
@@ -29,7 +28,7 @@ METER = Meter(pulses_per_l=1000.0, flow_max_l_min=1e9, pwm_period_s=1.0 / 11.0)
 @pytest.fixture
 def edges(chip: SimChip, monkeypatch: pytest.MonkeyPatch) -> Iterator[GpiodEdges]:
     """The edges of a line, with a buffer that is soon full."""
-    monkeypatch.setattr(gpiod_edges, "BUFFER_SIZE", BUFFER)
+    monkeypatch.setattr(sensor_parts, "BUFFER_SIZE", BUFFER)
     edges = GpiodEdges(chip.name, LINE)
     yield edges
     edges.close()

@@ -17,8 +17,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
-from companion.output.engine.engine import GAP_S, Engine
-from companion.output.engine.late import KEPT
+from companion.output.engine.engine import GAP_S, KEPT, Engine
 from companion.output.engine.lines import MemoryLines
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import CHANGES_MAX, Kind, edges_from, pack_plan, unpack

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.ground_words import in_words
+from companion.cli.ground_doing import in_words
 from companion.core.ground_hold import Hold
 from companion.core.ground_task import GroundKind, clicks, together
 from companion.core.ground_work import GroundSetup

@@ -11,8 +11,7 @@ from analysis.report.legal_fields import LABELS
 from companion.cli.run import _about, _application_notes
 from companion.config import application_table, load
 from companion.config.application_table import ASKED, PROFILES, missing, told
-from companion.doctor.application import application_check
-from companion.doctor.check import Status
+from companion.doctor.check import Status, application_check
 from companion.errors import ConfigError
 from tests.unit.report_flight import EU_TOLD
 

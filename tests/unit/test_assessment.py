@@ -25,7 +25,7 @@ from analysis.student import t_factor
 from companion.core.cells import CellGrid, Warp
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
-from companion.record.events import Event
+from companion.record.writer import Event
 from tests.builders import plots, setup
 from tests.unit.applied_flights import SPEED_M_S, changes_of, eastwards
 

@@ -20,6 +20,7 @@ import shapely
 from analysis.flown.read_applied import read_applied
 from analysis.replay import replay
 from companion.cli.app import execute
+from companion.cli.run import unfinished
 from companion.core.controller import Memory, expected_coverage, step
 from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
@@ -54,7 +55,6 @@ from companion.record.coverage_table import (
 )
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
-from companion.record.unfinished import unfinished
 from companion.runtime import coverage_ahead_s
 from tests.builders import setup
 

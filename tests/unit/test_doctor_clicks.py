@@ -11,8 +11,14 @@ from companion.core.liquid_clicks import ClickFinding, ClickJudgement
 from companion.core.liquid_law import AutopilotLiquid
 from companion.core.types import BatteryReport, FaultKind, FlowReport
 from companion.doctor.check import Check, Status
-from companion.doctor.click_bench import Readings, ShortHand
-from companion.doctor.clicks import answer_of, dry_check, wet_checks, wet_click
+from companion.doctor.click_bench import (
+    Readings,
+    ShortHand,
+    answer_of,
+    dry_check,
+    wet_checks,
+    wet_click,
+)
 
 NAMES = ("left", "right")
 

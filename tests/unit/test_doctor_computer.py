@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from companion.doctor.check import Check, Status, is_ready, warn
-from companion.doctor.computer import computer_checks
-from companion.doctor.computer_facts import (
+from companion.doctor.computer import (
     Computer,
     Folder,
     HardwareWatchdog,
+    computer_checks,
     read_computer,
     try_folder,
 )

@@ -6,7 +6,7 @@ import pytest
 
 from companion.core.nozzle import PwmLimits
 from companion.doctor.check import Status
-from companion.doctor.engine import engine_checks, read_engine
+from companion.doctor.engine_trial import engine_checks, read_engine
 from companion.output.engine.selftest import SelfTest
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wiring import Wiring

@@ -7,15 +7,15 @@ from pathlib import Path
 import pytest
 
 from companion.cli.link_parts import build_link
+from companion.cli.output_parts import servo_options
 from companion.cli.run import component_options
-from companion.cli.servo_parts import servo_options
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
 from companion.core.types import Fix
 from companion.doctor import listen as listening
 from companion.doctor.listen import listen
-from companion.doctor.vehicle_facts import Heard
-from companion.link import parameter_reader
+from companion.doctor.vehicle import Heard
+from companion.link import outputs
 from companion.link.vehicle_link import VehicleLink
 from tests.sitl.wire_peer import WirePeer, free_port, over_udp
 
@@ -30,7 +30,7 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(listening, "_SETTLE_S", 0.3)
     monkeypatch.setattr(listening, "_MEASURE_S", 1.0)
     monkeypatch.setattr(listening, "_CLOSE_EVERY_S", 0.3)
-    monkeypatch.setattr(parameter_reader, "_AGAIN_S", 0.2)
+    monkeypatch.setattr(outputs, "_AGAIN_S", 0.2)
 
 
 def parts(port: int) -> tuple[Config, VehicleLink]:

@@ -8,16 +8,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from companion.cli.servo_parts import servo_options
+from companion.cli.output_parts import servo_options
 from companion.config import load
 from companion.core.types import Fix
 from companion.doctor import gpio
 from companion.doctor.check import Check, Status
+from companion.doctor.computer import Device, read_device, serial_check
 from companion.doctor.gpio import Chip, Line, gpio_checks, read_chip, read_register
 from companion.doctor.outputs import output_checks, watchdog_trouble
-from companion.doctor.serial_device import Device, read_device, serial_check
-from companion.doctor.vehicle import link_checks, no_link
-from companion.doctor.vehicle_facts import Heard, Position, Rate
+from companion.doctor.vehicle import Heard, Position, Rate, link_checks, no_link
 from companion.maps.compiling import compiled_setup
 from companion.output.autopilot_options import DriveOutput, ServoOptions
 from companion.output.engine.wiring import Wiring

@@ -10,11 +10,10 @@ from typing import Any
 
 import pytest
 
-from companion.cli.sensor_parts import build_sensors
+from companion.cli.sensor_parts import GpiodLevel, build_sensors
 from companion.core.types import EstopReport
 from companion.errors import SensorError
 from companion.sensors.estop import EstopSwitch
-from companion.sensors.gpiod_level import GpiodLevel
 from tests.unit.test_sensors_wiring import EXAMPLE, load
 
 

@@ -14,11 +14,11 @@ from companion.link.decode import FROM_VEHICLE
 from companion.output.engine.wire import Issued
 from companion.output.gpio import GpioExecutor
 from companion.output.none import DryRunExecutor
-from companion.record.flight_clock import FlightClock
 from companion.record.folder import look_at
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
 from companion.record.valve_rows import ValveOrder, ValveRows
+from companion.record.writer import FlightClock
 from tests.builders import setup
 from tests.unit.test_journal import decisions, query
 from tests.unit.test_replay import fly

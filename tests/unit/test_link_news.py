@@ -10,9 +10,8 @@ import pytest
 from companion.core.estimator import Track, observe
 from companion.core.order import Order
 from companion.core.types import Input, RcReport
-from companion.link.component import Component, ComponentOptions
+from companion.link.component import Component, ComponentOptions, News
 from companion.link.messages import ServoOutput
-from companion.link.news import News
 from tests import builders
 from tests.unit.test_component import Peer
 

@@ -7,8 +7,7 @@ import math
 import pytest
 
 from companion.core.types import Inhibit, Input, LandedReport, WindReport
-from companion.link.component import Component, ComponentOptions
-from companion.link.wind import STILL_MAX_S, WindWatch
+from companion.link.component import STILL_MAX_S, Component, ComponentOptions, WindWatch
 from tests.bench.gate_frames import STEP_S, Loop, Vehicle, long_setup
 from tests.unit.test_component import Peer
 

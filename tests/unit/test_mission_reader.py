@@ -12,14 +12,13 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.core.types import LegReport
 from companion.link.component import Component, ComponentOptions
 from companion.link.encode import Encoder
-from companion.link.mission_legs import leg_report
 from companion.link.mission_messages import (
     MissionCurrent,
     MissionItem,
     MissionStep,
     MissionTransfer,
 )
-from companion.link.mission_reader import ITEMS_MAX, MissionReader
+from companion.link.mission_reader import ITEMS_MAX, MissionReader, leg_report
 from companion.link.streams import wanted_streams
 from tests.unit import stub_bench
 

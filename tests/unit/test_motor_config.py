@@ -7,17 +7,20 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.motor_parts import motor_closer_arguments
-from companion.cli.output_parts import build_outputs, parts_of
+from companion.cli.output_parts import (
+    CompositeExecutor,
+    build_outputs,
+    motor_closer_arguments,
+    parts_of,
+    servo_options,
+)
 from companion.cli.run import component_options
 from companion.cli.service import build_unit
-from companion.cli.servo_parts import servo_options
 from companion.config import Config, load
-from companion.config.motors import atomisers_of, pump_of
+from companion.config.motor_rules import atomisers_of, pump_of
 from companion.config.rules import without_effect
 from companion.errors import ConfigError
 from companion.link.vehicle_link import VehicleLink
-from companion.output.composite import CompositeExecutor
 from companion.output.hardware_pwm import HardwarePwmExecutor
 from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor

@@ -18,7 +18,7 @@ from companion.core.types import RateOverride
 from companion.errors import ConfigError, LinkError
 from companion.link.component import Component, ComponentOptions
 from companion.link.parameters import Parameters, known_parameters
-from companion.link.state_file import read_state, write_state
+from companion.link.signing import read_state, write_state
 from tests.unit.test_component import OPEN, VEHICLE, Peer
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"

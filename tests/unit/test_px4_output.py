@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.core.types import TimedChange
-from companion.link import ardupilot, px4
+from companion.link import outputs, px4
 from companion.link.component import Component, ComponentOptions
 from companion.link.encode import Encoder
-from companion.link.parameter_reader import ParameterReader
+from companion.link.outputs import ParameterReader
 from companion.output.autopilot_findings import px4_wiring, wanted_parameters
 from companion.output.autopilot_guard import OutputGuard
 from companion.output.servo import ServoExecutor, ServoOptions
@@ -113,7 +113,7 @@ def test_a_whole_number_survives_where_px4_puts_it(number: int) -> None:
     (value,) = struct.unpack("<f", struct.pack("<i", number))
     assert px4.parameter_value(value, 6) == number
     assert px4.parameter_value(float(number), 9) == float(number)
-    assert ardupilot.parameter_value(float(number), 6) == float(number)
+    assert outputs.parameter_value(float(number), 6) == float(number)
 
 
 def _is_signalling(number: int) -> bool:

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion import gpio_chip
+from companion.cli.sensor_parts import GpiodEdges
 from companion.core.types import FlowReport
 from companion.errors import SensorError
 from companion.sensors.flow_meter import FlowMeter, VirtualEdges
-from companion.sensors.gpiod_edges import GpiodEdges
 from companion.sensors.pulses import Edge, Meter, PulseCounter
 
 PERIOD_S = 1.0 / 11.0

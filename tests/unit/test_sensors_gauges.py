@@ -11,11 +11,11 @@ from types import ModuleType
 
 import pytest
 
+from companion.cli.sensor_parts import PressureSensor
 from companion.core.types import PressureReport, TankReport
 from companion.errors import SensorError
 from companion.sensors.current_loop import CurrentLoop
 from companion.sensors.gauge import Gauge
-from companion.sensors.pressure import PressureSensor
 from companion.sensors.tank import TankSensor
 from companion.sensors.voltage import I2cVoltage, IioVoltage
 

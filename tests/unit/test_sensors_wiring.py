@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from companion import runtime
-from companion.cli.sensor_parts import build_sensors
+from companion.cli.sensor_parts import PressureSensor, build_sensors
 from companion.config import load
 from companion.config.rules import without_effect
 from companion.core.estimator import Track, observe
@@ -22,7 +22,6 @@ from companion.link.streams import wanted_streams
 from companion.maps.compiling import compiled_setup
 from companion.ports import Sensor
 from companion.sensors.flow_meter import FlowMeter
-from companion.sensors.pressure import PressureSensor
 from companion.sensors.tank import TankSensor
 from tests.builders import position, setup
 

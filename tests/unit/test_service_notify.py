@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from companion.cli.notify import CLOSING_MAX_S, Notifier
+from companion.cli.run import CLOSING_MAX_S, Notifier
 from companion.core.types import Decision, Input, SprayPlan
 from companion.runtime import run
 from tests.builders import setup

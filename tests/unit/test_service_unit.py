@@ -12,8 +12,7 @@ from typing import Any
 
 import pytest
 
-from companion.cli.service import build_unit
-from companion.cli.service_unit import Unit, command, is_ours, quoted, watchdog_is_on
+from companion.cli.service import Unit, build_unit, command, is_ours, quoted, watchdog_is_on
 from companion.config import load
 
 ROOT = Path(__file__).resolve().parents[2]

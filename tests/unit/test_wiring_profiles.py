@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.gpio_parts import engine_setup
+from companion.cli.output_parts import engine_setup
 from companion.config import Config, load
 from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ConfigError

@@ -50,17 +50,16 @@ def main(arguments: Sequence[str]) -> int:
         from companion.output.engine import process
 
         return process.main(rest)
-    # Not needed by the engine, which is to start as quickly as the real one.
-    from companion.cli import gpio_parts
+    from companion.cli import output_parts
     from companion.cli.app import execute
     from companion.config import Config
     from companion.output.gpio import GpioExecutor
 
     def build_gpio(config: Config) -> GpioExecutor:
-        return GpioExecutor(gpio_parts.engine_setup(config), command=engine_command(Path(folder)))
+        return GpioExecutor(output_parts.engine_setup(config), command=engine_command(Path(folder)))
 
     # The command that puts a companion together is imported when it is run.
-    gpio_parts.build_gpio = build_gpio
+    output_parts.build_gpio = build_gpio
     return execute(rest)
 
 
