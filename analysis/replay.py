@@ -31,7 +31,7 @@ from companion.record.reader import Entry, JournalContent, opened, read_journal
 from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
 
 if TYPE_CHECKING:
-    from companion.core.controller import Memory, Setup
+    from companion.core.controller import Memory
     from companion.core.types import VehicleState
 
 
@@ -58,7 +58,6 @@ from enum import Enum
 from types import NoneType, UnionType
 from typing import Literal, Union, get_args, get_origin, get_type_hints
 
-from companion.core.setup import Setup
 from companion.errors import ConfigError
 
 # What other decisions on a flight's inputs would have put on the ground.

@@ -284,7 +284,7 @@ class MissionAsker:
         """Return a request, where one is due."""
         if self._is_over or now_s - max(self._heard_s, self._asked_s) < _EVERY_S:
             return None
-        if self._tries >= _MISSION_TRIES and now_s - self._asked_s < _mission_asker_AGAIN_S:
+        if self._tries >= _MISSION_TRIES and now_s - self._asked_s < _MISSION_AGAIN_S:
             return None
         self._tries = self._tries % _MISSION_TRIES + 1
         self._asked_s = now_s
