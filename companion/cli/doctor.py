@@ -19,8 +19,7 @@ from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.output_parts import engine_setup, servo_options
 from companion.cli.run import component_options
 from companion.cli.sensor_parts import build_sensors
-from companion.cli.service import is_ours, quoted, watchdog_is_on
-from companion.cli.systemd import properties, read_unit, unit_path
+from companion.cli.systemd import is_ours, properties, quoted, read_unit, unit_path, watchdog_is_on
 from companion.config import Config
 from companion.core.setup import Setup
 from companion.doctor.check import Check, Status, application_check, fail, is_ready, split_advice

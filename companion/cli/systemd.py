@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 
 from companion.atomic_write import write_atomically
-from companion.cli.service import is_ours
 from companion.errors import VrsprayError
 
 NAME = "vrspray.service"
@@ -100,3 +102,134 @@ def _advice(error: Exception) -> str:
     if isinstance(error, PermissionError):
         return "use sudo, or --user for a service of your own"
     return str(getattr(error, "strerror", None) or error).lower()
+
+
+# The text of the systemd unit, from a template and what is particular to this computer. Pure.
+
+MARK = "# Written by `vrspray service install`"
+# Below the valve engine (50), above everything that is not real time.
+PRIORITY = 20
+_PLAIN = re.compile(r"[A-Za-z0-9_./:=@+,-]+")
+
+_SANDBOX = """\
+ProtectSystem=strict
+ProtectHome=read-only
+ReadWritePaths={writable}
+PrivateTmp=yes
+ProtectKernelTunables=yes
+ProtectKernelModules=yes
+ProtectKernelLogs=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectProc=invisible
+RestrictNamespaces=yes
+RestrictSUIDSGID=yes
+RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK
+LockPersonality=yes
+SystemCallArchitectures=native
+{capabilities}
+UMask=0027
+# Devices stay open: a serial adapter that is plugged in later has to be found."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unit:
+    """What the template leaves open; paths are absolute.
+
+    `closer` are the arguments of the independent closer, empty where no valve hangs on this
+    computer's lines. `account` and `groups` are for a system's unit only.
+    """
+
+    python: str
+    config: str
+    writable: tuple[str, ...]
+    closer: tuple[str, ...] = ()
+    is_user: bool = False
+    account: str = ""
+    groups: tuple[str, ...] = ()
+    is_realtime: bool = False
+    writes_sysfs: bool = False
+
+    def text(self) -> str:
+        """Return the unit's file."""
+        template = resources.files("companion.cli").joinpath("vrspray.service").read_text()
+        filled = template.format(
+            start=command(self.python, "-P", "-m", "companion", "run", "--config", self.config),
+            closer=self._closer(),
+            account="" if self.is_user else self._account(),
+            realtime=self._realtime(),
+            sandbox="" if self.is_user else self._sandbox(),
+            target="default.target" if self.is_user else "multi-user.target",
+        )
+        return re.sub(r"\n{2,}(?!\[)", "\n", filled)
+
+    def _closer(self) -> str:
+        if not self.closer:
+            return "# No valve hangs on this computer's lines: there is nothing to close after it."
+        close = command(self.python, "-P", "-m", "companion.output.engine.closer", *self.closer)
+        return (
+            "# After every end, crash and watchdog included: lines to their safe levels.\n"
+            f"ExecStopPost={close}"
+        )
+
+    def _account(self) -> str:
+        lines = [f"User={self.account}"] if self.account else []
+        if self.groups:
+            lines.append(f"SupplementaryGroups={' '.join(self.groups)}")
+        return "\n".join(lines)
+
+    def _realtime(self) -> str:
+        if self.is_user or not self.is_realtime:
+            return ""
+        return f"CPUSchedulingPolicy=fifo\nCPUSchedulingPriority={PRIORITY}"
+
+    def _sandbox(self) -> str:
+        # Root without its capabilities could not write to a folder of another user.
+        is_root = self.account in ("", "root")
+        # Hardware PWM is written in /sys, which this would make read-only.
+        sandbox = (
+            _SANDBOX.replace("ProtectKernelTunables=yes\n", "") if self.writes_sysfs else _SANDBOX
+        )
+        return sandbox.format(
+            writable=" ".join(quoted(path) for path in self.writable),
+            capabilities="# Better run as a user: --run-as USER"
+            if is_root
+            else "CapabilityBoundingSet=",
+        )
+
+
+def command(*words: str) -> str:
+    """Return a command line as systemd takes it apart again.
+
+    >>> command("/opt/my python", "-c", "100 %")
+    '"/opt/my python" -c "100 %%"'
+    """
+    return " ".join(quoted(word).replace("$", "$$") for word in words)
+
+
+def quoted(word: str) -> str:
+    """Return a word that systemd reads as one, with nothing in it replaced.
+
+    >>> quoted("/srv/a field"), quoted("/etc/vrspray")
+    ('"/srv/a field"', '/etc/vrspray')
+    """
+    if any(not letter.isprintable() for letter in word):
+        raise ValueError(f"a control character in {word!r}")
+    if _PLAIN.fullmatch(word):
+        return word
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
+    return f'"{escaped}"'
+
+
+def is_ours(text: str) -> bool:
+    """Return whether a unit was written by this program, so that it may be replaced."""
+    return text.startswith(MARK)
+
+
+def watchdog_is_on(lines: Sequence[str]) -> bool:
+    """Return whether a unit has a watchdog.
+
+    >>> watchdog_is_on(["Type=notify", "WatchdogSec=2"])
+    True
+    """
+    return any(re.fullmatch(r"WatchdogSec=\s*(?!0*\s*$)\S.*", line) for line in lines)

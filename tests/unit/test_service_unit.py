@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from companion.cli.service import Unit, build_unit, command, is_ours, quoted, watchdog_is_on
+from companion.cli.service import build_unit
+from companion.cli.systemd import Unit, command, is_ours, quoted, watchdog_is_on
 from companion.config import load
 
 ROOT = Path(__file__).resolve().parents[2]
