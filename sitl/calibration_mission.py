@@ -16,7 +16,6 @@ from companion.core.nozzle import SET_UP_FRACTION, set_change_l_min
 from companion.core.rate import rate_for_flow
 from companion.errors import ConfigError
 from companion.maps.compiling import compiled_setup
-from sitl.calibration_mission import RUN_OUT_M, Layout, make_layout, plan, waypoint_lines
 from sitl.stub.mission_items import MissionItem, landing, speed, waypoint
 from sitl.stub.protocol import dialect
 

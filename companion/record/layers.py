@@ -201,6 +201,8 @@ def read_cells(connection: sqlite3.Connection) -> CellGrid | None:
         raise ValueError(f"one set of cells expected, got {len(found)}")
     rows, columns, classes, rates, warps = found[0]
     try:
+        if not (rows > 0 and columns > 0 and rows * columns <= CELLS_MAX):
+            raise ValueError(f"{rows} rows of {columns} cells")
         to_frame, to_cells = (
             Warp(
                 x0=float(warp["x0"]),
@@ -211,8 +213,10 @@ def read_cells(connection: sqlite3.Connection) -> CellGrid | None:
             for warp in json.loads(warps)
         )
         return CellGrid(
-            np.frombuffer(_unpacked(classes), dtype="<i4").reshape(rows, columns),
-            np.frombuffer(_unpacked(rates), dtype="<f8"),
+            np.frombuffer(_unpacked(classes, 4 * rows * columns), dtype="<i4").reshape(
+                rows, columns
+            ),
+            np.frombuffer(_unpacked(rates, 8 * rows * columns), dtype="<f8"),
             to_frame,
             to_cells,
         )
@@ -220,10 +224,10 @@ def read_cells(connection: sqlite3.Connection) -> CellGrid | None:
         raise ValueError(f"the cells are damaged: {error!r}") from error
 
 
-def _unpacked(packed: bytes) -> bytes:
-    """Return deflated bytes in full, or refuse more than a grid can have."""
+def _unpacked(packed: bytes, most_bytes: int) -> bytes:
+    """Return deflated bytes in full, or refuse more than such a grid can have."""
     worker = zlib.decompressobj()
-    content = worker.decompress(packed, 8 * CELLS_MAX)
-    if worker.unconsumed_tail or not worker.eof:
+    content = worker.decompress(packed, most_bytes + 1)
+    if len(content) > most_bytes or not worker.eof:
         raise ValueError("the cells are cut off, or more than a grid can have")
     return content
