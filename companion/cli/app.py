@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from typer.core import TyperGroup
 
-from companion.cli.app import ignore_the_folders_own
 from companion.cli.beside import give_way
 from companion.commands import Command, Haste, all_registered, command_named, load, registered
 from companion.errors import ActuatorError, MapError, UnreadableError, VrsprayError
