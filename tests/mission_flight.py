@@ -130,24 +130,31 @@ def _leg(length_m: float, speed_m_s: float) -> tuple[_SpeedingUp, float]:
 
 def flown_s(way: Way) -> float:
     """Return the time of a way whose last leg is the return, which begins at rest."""
+    return float(legs_s(way).sum())
+
+
+def legs_s(way: Way) -> Floats:
+    """Return the time of each leg of a way, what it has together with the one before left out."""
     lengths_m = way.lengths_m
     steps = np.diff(way.places, axis=0)
+    found = np.zeros(len(lengths_m))
     # Two waypoints at one place are one.
     apart = lengths_m > 0.01
     lengths_m, steps, speeds = lengths_m[apart], steps[apart], way.speeds_m_s[apart]
     if not len(lengths_m):
-        return 0.0
+        return found
     along = steps / lengths_m[:, None]
     legs = [
         _leg(round(length, 3), round(speed, 3))
         for length, speed in zip(lengths_m.tolist(), speeds.tolist(), strict=True)
     ]
-    taken_s = sum(whole_s for _, whole_s in legs)
+    taken_s = np.array([whole_s for _, whole_s in legs])
     for number in range(len(legs) - 2):
         cosine = float(np.clip(along[number] @ along[number + 1], -1.0, 1.0))
         slower = float(min(speeds[number], speeds[number + 1]))
-        taken_s -= _together_s(legs[number], legs[number + 1], cosine, slower)
-    return taken_s
+        taken_s[number + 1] -= _together_s(legs[number], legs[number + 1], cosine, slower)
+    found[apart] = taken_s
+    return found
 
 
 def _together_s(

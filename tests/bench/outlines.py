@@ -45,6 +45,7 @@ from tests.mission_flight import (
     flown_s,
     items_of_plan,
     items_of_waypoints,
+    legs_s,
     length_m,
     near,
     way_of,
@@ -205,7 +206,7 @@ def _judged(drawn: Drawn, planned: Planned) -> dict[str, Any]:
     drawn_wh = [
         POWER.wh(
             ground_s=ground_s, way_m=length_m(way), speed_m_s=SPEED_M_S,
-            litres=_on_board_l(planned.plan, row["number"], row["volume_l"]),
+            litres=on_board_l(planned.plan, row["number"], row["volume_l"], way),
         )
         for way, row, ground_s in zip(ways, rows, flown, strict=True)
     ]  # fmt: skip
@@ -229,20 +230,31 @@ def _judged(drawn: Drawn, planned: Planned) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _on_board_l(plan: dict[str, Any], number: int, volume_l: float) -> float:
-    """Return the mean of the litres on board along the way of a sortie."""
-    left_l, sum_l_m, sum_m = volume_l + RESERVE_L, 0.0, 0.0
+def on_board_l(plan: dict[str, Any], number: int, volume_l: float, way: Way) -> float:
+    """Return the mean of the litres on board over the time of a sortie's way.
+
+    What a load takes of a battery is its power times the time for which it is carried: the tank
+    empties in the short lines of a flight, which take far more time a metre than its ferries. By
+    metres a load counts for longer than it is on board where the first ferry is long.
+    """
+    flown_m = np.concatenate([[0.0], np.cumsum(way.lengths_m)])
+    flown = np.concatenate([[0.0], np.cumsum(legs_s(way))])
+    legs_m, sprayed_l = [], []
     for each in plan["features"]:
         properties = each["properties"]
         if each["geometry"]["type"] != "LineString" or properties["sortie"] != number:
             continue
         points = np.array(each["geometry"]["coordinates"])
         scale = np.array([np.cos(np.radians(points[0, 1])), 1.0])
-        long = float(np.hypot(*(np.diff(points, axis=0) * scale).T).sum())
-        sum_l_m += long * (left_l - properties["volume_l"] / 2.0)
-        sum_m += long
-        left_l -= properties["volume_l"]
-    return sum_l_m / sum_m if sum_m else left_l
+        legs_m.append(float(np.hypot(*(np.diff(points, axis=0) * scale).T).sum()))
+        sprayed_l.append(properties["volume_l"])
+    # Degrees become metres by the way itself, which is as long.
+    ends_m = np.concatenate([[0.0], np.cumsum(legs_m)])
+    ends_m *= flown_m[-1] / max(ends_m[-1], 1e-12)
+    taken_s = np.diff(np.interp(ends_m, flown_m, flown))
+    before_l = volume_l + RESERVE_L - np.cumsum([0.0, *sprayed_l])
+    carried = taken_s * (before_l[:-1] + before_l[1:]) / 2.0
+    return float(carried.sum() / flown[-1]) if flown[-1] > 0.0 else float(before_l[-1])
 
 
 # --- beside it ----------------------------------------------------------------------------------

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+from typing import Any
+
 import numpy as np
 import pytest
 import shapely
 
-from tests.bench.outlines import CRITERIA, failed
+from tests.bench.outlines import CRITERIA, RESERVE_L, failed, on_board_l
 from tests.bench.parcels import KINDS, parcel
 from tests.bench.peers import PEERS, lines_of, tanks
 from tests.mission_fields import degrees
-from tests.mission_flight import Way, flown_s, items_of_plan, items_of_waypoints
+from tests.mission_flight import Way, flown_s, items_of_plan, items_of_waypoints, legs_s
 from tests.mission_judge import Drawn, judge_legs
 from tests.unit.test_missions_times import FLOWN
 
@@ -136,3 +139,37 @@ def test_every_criterion_can_fail() -> None:
     }  # fmt: skip
     assert {failed(good | {key: value})[0] for key, value in bad.items()} == set(CRITERIA)
     assert failed({"no answer": "", "cpu_s": 120.0}) == ["no answer"]
+
+
+def sortie_of(
+    places_m: list[tuple[float, float]], litres: list[float]
+) -> tuple[dict[str, Any], Way]:
+    """Return the legs of a sortie as a plan's file has them, and its way at 6 m/s."""
+    metre_deg = 1.0 / 111_320.0
+    rows = [[east * metre_deg, north * metre_deg] for east, north in places_m]
+    legs = [
+        {
+            "geometry": {"type": "LineString", "coordinates": [one, other]},
+            "properties": {"sortie": 1, "volume_l": volume_l},
+        }
+        for (one, other), volume_l in zip(pairwise(rows), litres, strict=True)
+    ]
+    places = np.array(places_m, dtype=np.float64)
+    return {"features": legs}, Way(places=places, speeds_m_s=np.full(len(places) - 1, 6.0))
+
+
+def test_a_load_counts_for_the_time_for_which_it_is_on_board() -> None:
+    # Far out with all of it, then short passes that empty the tank, and far back.
+    short = [(600.0 + 6.0 * (n // 2 % 2), 6.0 * (n // 2 + n % 2)) for n in range(40)]
+    plan, way = sortie_of([(0.0, 0.0), *short, (0.0, 0.0)], [0.0, *[1.0] * 39, 0.0])
+    seconds, left_l, carried = legs_s(way), 39.0 + RESERVE_L, 0.0
+    for taken_s, used_l in zip(seconds, [0.0, *[1.0] * 39, 0.0], strict=True):
+        carried += taken_s * (left_l - used_l / 2.0)
+        left_l -= used_l
+    assert seconds.sum() == pytest.approx(flown_s(way))
+    assert on_board_l(plan, 1, 39.0, way) == pytest.approx(carried / seconds.sum(), rel=1e-3)
+
+
+def test_a_tank_that_empties_evenly_is_half_full_on_the_whole() -> None:
+    plan, way = sortie_of([(0.0, 0.0), (500.0, 0.0)], [39.0])
+    assert on_board_l(plan, 1, 39.0, way) == pytest.approx(39.0 / 2.0 + RESERVE_L)
