@@ -7,6 +7,7 @@ the comments of the task, a line each.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
@@ -14,12 +15,11 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely import MultiPolygon
+from shapely import MultiPolygon, Polygon
 
 from analysis.exports.ground import geographic
 from analysis.exports.isoxml_log import BOOM, LOG_NAME, Logged, logged, records, template
 from analysis.exports.output import zipped
-from companion.maps.isoxml.elements import add_polygons, printable
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content
@@ -54,6 +54,15 @@ _COMMENT_MAX = 32
 _HASH_DIGITS = 20
 
 
+# As long as a designator may be (ISO 11783-10).
+_NAME_MAX = 32
+
+
+def _printable(name: str) -> str:
+    """Return a name without what XML cannot hold, as long as a designator may be."""
+    return " ".join("".join(one for one in name if one.isprintable()).split())[:_NAME_MAX]
+
+
 def make(source: Source, out: Path) -> Content:
     """Return the files of the folder, or one zip with the folder in it."""
     values = logged(source.samples)
@@ -70,7 +79,7 @@ def make(source: Source, out: Path) -> Content:
 
 def _task_data(source: Source, log_bytes: int, values: list[Logged]) -> bytes:
     about, boom = source.about, source.flight.setup.boom
-    maker = printable(about.exported_by)
+    maker = _printable(about.exported_by)
     root = Element(
         "ISO11783_TaskData",
         VersionMajor="4",
@@ -78,16 +87,16 @@ def _task_data(source: Source, log_bytes: int, values: list[Logged]) -> bytes:
         ManagementSoftwareManufacturer="vrspray",
         ManagementSoftwareVersion=maker,
         TaskControllerManufacturer="vrspray",
-        TaskControllerVersion=printable(about.recorded_by),
+        TaskControllerVersion=_printable(about.recorded_by),
         DataTransferOrigin="2",
     )
     totals = _totals(source.samples)
     add_device(root, boom, about, values=values, totals=list(totals))
     _add_field(root, source)
-    SubElement(root, "PDT", A="PDT-1", B=printable(_product(source)))
-    task = SubElement(root, "TSK", A="TSK-1", B=printable(about.title), E="PFD-1", G=_COMPLETED)
+    SubElement(root, "PDT", A="PDT-1", B=_printable(_product(source)))
+    task = SubElement(root, "TSK", A="TSK-1", B=_printable(about.title), E="PFD-1", G=_COMPLETED)
     if about.operator is not None:
-        worker = Element("WKR", A="WKR-1", B=printable(about.operator))
+        worker = Element("WKR", A="WKR-1", B=_printable(about.operator))
         root.insert(list(root).index(task), worker)
     time = SubElement(
         task, "TIM", A=about.started_utc, B=about.ended_utc,
@@ -149,10 +158,10 @@ def _add_field(root: Element, source: Source) -> None:
     setup = source.flight.setup
     ground = setup.prescription.field
     name = source.about.field_name or "Field"
-    field = SubElement(root, "PFD", A="PFD-1", C=printable(name), D=str(round(ground.area)))
+    field = SubElement(root, "PFD", A="PFD-1", C=_printable(name), D=str(round(ground.area)))
     if not ground.is_empty:
         (outline,) = geographic([MultiPolygon(shapely.get_parts(ground).tolist())], setup.frame)
-        add_polygons(field, shapely.get_parts(outline).tolist(), kind=_FIELD)
+        _add_outline(field, shapely.get_parts(outline).tolist())
 
 
 # The sprayer as ISO 11783-10 describes a device: its elements, where they sit, what they tell.
@@ -197,7 +206,7 @@ def add_device(
 ) -> None:
     """Add the device with an element for the boom, one for each valve and one for the antenna."""
     device = SubElement(
-        root, "DVC", A=DEVICE, B="vrspray", C=printable(about.recorded_by),
+        root, "DVC", A=DEVICE, B="vrspray", C=_printable(about.recorded_by),
         D=client_name(about), F=_label(boom), G=_LOCALIZATION,
     )  # fmt: skip
     objects = _Objects(device)
@@ -242,7 +251,7 @@ class _Objects:
         """Add an element and return the number of its object."""
         self._last += 1
         self._elements[self._last] = SubElement(
-            self._device, "DET", A=id_, B=str(self._last), C=kind, D=printable(name),
+            self._device, "DET", A=id_, B=str(self._last), C=kind, D=_printable(name),
             E=str(number), F=str(parent),
         )  # fmt: skip
         return self._last
@@ -281,3 +290,14 @@ def _label(boom: Boom) -> str:
     """Return seven bytes that change with the structure of the device."""
     told = repr([(valve.right_m, valve.forward_m, valve.width_m) for valve in boom.valves])
     return f"{zlib.crc32(told.encode()):014X}"
+
+
+def _add_outline(field: Element, polygons: Iterable[Polygon]) -> None:
+    """Add the outline of a field: polygons with their rings."""
+    for polygon in polygons:
+        element = SubElement(field, "PLN", A=_FIELD)
+        for kind, ring in (("1", polygon.exterior), *(("2", hole) for hole in polygon.interiors)):
+            line = SubElement(element, "LSG", A=kind)
+            for east, north in ring.coords:
+                # Nine decimals of a degree are 0.1 mm.
+                SubElement(line, "PNT", A="2", C=f"{north:.9f}", D=f"{east:.9f}")

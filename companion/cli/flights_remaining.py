@@ -19,8 +19,7 @@ from companion.core.coverage import Coverage
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
 from companion.errors import VrsprayError
-from companion.maps.build import build_prescription
-from companion.maps.registry import read_map
+from companion.flight_map import flight_map_of_file
 from companion.record.continuing import Treated, read_treated_ground, rest_of
 from companion.record.coverage_area import moved
 
@@ -57,16 +56,17 @@ def remaining(
     last = flights[-1]
     for line in _training(flights):
         note(line)
-    ground = last.setup.prescription
+    ground, frame = last.setup.prescription, last.frame
     if map_file is not None:
-        ground = build_prescription(read_map(map_file), last.frame, overlap="max")
+        flight_map = flight_map_of_file(map_file, overlap="max")
+        ground, frame = flight_map.prescription, flight_map.frame
     treated = Coverage()
     for flight in flights:
-        treated = treated.joined(moved(flight.coverage, flight.frame, last.frame))
+        treated = treated.joined(moved(flight.coverage, flight.frame, frame))
     rest = rest_of(ground.field, treated, last.strip_m)
     result = _result(flights, ground, treated, rest)
     if out is not None:
-        _write(out, rest, last.frame, result)
+        _write(out, rest, frame, result)
         result["file"] = str(out)
     answer(result, _lines(result), as_json=as_json)
     for text in result["unread"]:

@@ -5,7 +5,7 @@ metres of the flight's frame, rates in L/ha, boundary, exclusions and planned li
 it was made with, and what was found on the way.
 """
 
-from companion.flight_map.child import flight_map_of
+from companion.flight_map.child import flight_map_of, flight_map_of_file
 from companion.flight_map.file import read_flight_map, write_flight_map
 from companion.flight_map.frozen import difference, frozen_settings
 from companion.flight_map.model import SUFFIX, FlightMap, SourceFile, is_flight_map, moved
@@ -16,6 +16,7 @@ __all__ = [
     "SourceFile",
     "difference",
     "flight_map_of",
+    "flight_map_of_file",
     "frozen_settings",
     "is_flight_map",
     "moved",

@@ -131,46 +131,68 @@ def _forget_old(folder: Path) -> None:
             file.unlink(missing_ok=True)
 
 
-def _compile(config: Config, table: PrescriptionTable, overrides: Sequence[str], out: Path) -> None:
-    """Have a child process compile the map; it has ended when this returns.
+def flight_map_of_file(path: Path, *, overlap: str) -> FlightMap:
+    """Return a flight map, or that of any other map without a configuration.
 
     Raises:
-        ConfigError, MapError: what the child refused, in its words.
+        ConfigError, MapError: where it cannot be compiled.
     """
+    if is_flight_map(path):
+        return read_flight_map(path)
+    with tempfile.TemporaryDirectory(prefix="vrspray-") as folder:
+        out = Path(folder) / f"map{SUFFIX}"
+        if not is_there(_COMPILER[0]):
+            raise _not_here(str(path), path, None)
+        _run(str(path), [str(path), "--overlap", overlap, "--out", str(out)], out)
+        return read_flight_map(out)
+
+
+def _compile(config: Config, table: PrescriptionTable, overrides: Sequence[str], out: Path) -> None:
+    """Have a child process compile the map of a configuration."""
+    named = f"{config.path}: prescription.file = {show_value(table.file)}"
+    path = config.resolve(table.file)
     if not is_there(_COMPILER[0]):
-        raise _not_here(config, table)
-    order = [sys.executable, "-P", "-m", "companion", *_COMPILER]
-    order += [str(config.resolve(table.file)), "--config", str(config.path), "--out", str(out)]
-    order += [part for override in overrides for part in ("--set", override)]
+        raise _not_here(named, path, config.path)
+    order = [str(path), "--config", str(config.path), "--out", str(out)]
+    _run(named, order + [part for each in overrides for part in ("--set", each)], out)
+
+
+def _run(named: str, order: Sequence[str], out: Path) -> None:
+    """Run the compiler; it has ended when this returns.
+
+    Raises:
+        ConfigError, MapError: what it refused, in its words.
+    """
     try:
         done = subprocess.run(
-            [*order, "--json"], capture_output=True, timeout=_TIMEOUT_S, check=False,
+            [sys.executable, "-P", "-m", "companion", *_COMPILER, *order, "--json"],
+            capture_output=True,
+            timeout=_TIMEOUT_S,
+            check=False,
             stdin=subprocess.DEVNULL,
-        )  # fmt: skip
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise _failed(config, table, str(error)[:200]) from error
+        raise _failed(named, str(error)[:200]) from error
     if done.returncode in _WRITTEN and out.exists():
         return
     said = _said(done.stdout)
     problems = said.get("problems")
     text = said.get("error")
     if not isinstance(text, str):
-        raise _failed(config, table, f"the compiler ended with {done.returncode}")
+        raise _failed(named, f"the compiler ended with {done.returncode}")
     if isinstance(problems, list) and problems:
         raise MapError(text, code=str(problems[0]["code"]), fix=str(problems[0]["fix"]))
     raise ConfigError(text)
 
 
-def _not_here(config: Config, table: PrescriptionTable) -> MapError:
+def _not_here(named: str, path: Path, config: Path | None) -> MapError:
     """Return the refusal of a map on a vehicle that opens flight maps only."""
-    name = f"{Path(table.file).stem}{SUFFIX}"
-    fix = (
-        f"compile it in the office, vrspray map compile {Path(table.file).name} --config "
-        f'{config.path.name} --out {name}, and write prescription.file = "{name}"'
-    )
+    name = f"{path.stem}{SUFFIX}"
+    fix = f"compile it in the office: vrspray map compile {path.name} --out {name}"
+    if config is not None:
+        fix = f'{fix} --config {config.name}; then write prescription.file = "{name}"'
     return MapError(
-        f"{config.path}: prescription.file = {show_value(table.file)}: this vehicle opens flight "
-        f"maps only ({SUFFIX}); {fix}",
+        f"{named}: this vehicle opens flight maps only ({SUFFIX}); {fix}",
         code="not-compiled",
         fix=fix,
     )
@@ -184,11 +206,6 @@ def _said(stdout: bytes) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def _failed(config: Config, table: PrescriptionTable, reason: str) -> MapError:
+def _failed(named: str, reason: str) -> MapError:
     fix = "compile it in the office: vrspray map compile"
-    return MapError(
-        f"{config.path}: prescription.file = {show_value(table.file)}: cannot be compiled "
-        f"({reason}); {fix}",
-        code="not-compiled",
-        fix=fix,
-    )
+    return MapError(f"{named}: cannot be compiled ({reason}); {fix}", code="not-compiled", fix=fix)

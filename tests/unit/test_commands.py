@@ -160,8 +160,8 @@ def test_a_vehicle_without_the_office_says_what_to_do_with_any_other_map(
     assert done.stderr.count("\n") == 1
     assert "this vehicle opens flight maps only" in done.stderr
     assert (
-        "vrspray map compile prescription.shp --config config.toml --out "
-        "prescription.flightmap.gpkg" in done.stderr
+        "vrspray map compile prescription.shp --out prescription.flightmap.gpkg --config "
+        "config.toml" in done.stderr
     )
 
 
