@@ -12,7 +12,7 @@ import shapely
 from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from companion.maps.local import polygons_of
+from missions.maps.local import polygons_of
 from missions.strips import Floats, lengths_m
 from missions.swaths import inner_lines
 from missions.turns import Motion

@@ -15,15 +15,15 @@ from typing import Annotated, Any, Literal
 import typer
 
 from companion.cli.answer import AsJson, answer, note
-from companion.cli.map_grid import parse_mark
-from companion.cli.map_options import Reading, reading_options
 from companion.cli.progress import Tell, progress
-from companion.maps.whole_file import check_folder
 from companion.wording import counted
 from missions.files.fence import Fences, fence_warnings
 from missions.files.fleet import write_fleet
 from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
 from missions.files.write import check_suffix, older_sorties
+from missions.maps.cli.grid import parse_mark
+from missions.maps.cli.options import Reading, reading_options
+from missions.maps.whole_file import check_folder
 from missions.obstacles import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan

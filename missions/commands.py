@@ -3,7 +3,7 @@
 from companion.commands import Command
 
 MAP = Command(
-    target="companion.cli.map:app",
+    target="missions.maps.cli.app:app",
     help="Check, show, convert, compile and make prescription maps.",
     haste="patient",
     # A flight waits for a map to be compiled.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
-from companion.maps.local import Area, as_area, polygons_of
+from missions.maps.local import Area, as_area, polygons_of
 from missions.strips import Floats
 
 Ints = NDArray[np.int64]

@@ -14,11 +14,11 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
 from companion.core.prescription import SLIVER_M
-from companion.maps.local import Area, as_area, make_valid, polygons_of, project
-from companion.maps.local import places as places_of
 from missions.coverage import reachable
 from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
+from missions.maps.local import Area, as_area, make_valid, polygons_of, project
+from missions.maps.local import places as places_of
 from missions.obstacles import Obstacle
 from missions.strips import Floats
 from missions.wind import WindBuffer

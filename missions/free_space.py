@@ -12,8 +12,8 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from companion.maps.local import as_area, polygons_of
 from missions.fewer_corners import inside_with_fewer_corners
+from missions.maps.local import as_area, polygons_of
 from missions.strips import Floats
 
 # Ways bend this far from a corner, so that rounding does not put them behind it.

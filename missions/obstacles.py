@@ -18,10 +18,10 @@ from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
-from companion.maps.layer import Value, as_number
-from companion.maps.local import make_valid, project_all
-from companion.maps.registry import Record, read_records
 from missions.errors import PlanError
+from missions.maps.layer import Value, as_number
+from missions.maps.local import make_valid, project_all
+from missions.maps.registry import Record, read_records
 from missions.nearness import check_near
 from missions.reading_outline import NOTHING_TOLD, told
 

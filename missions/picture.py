@@ -15,11 +15,11 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from companion.maps.local import polygons_of
-from companion.maps.picture.draw import Sheet, sheet_for
-from companion.maps.whole_file import write_whole
 from missions.boom import boom_of
 from missions.errors import PlanError
+from missions.maps.local import polygons_of
+from missions.maps.picture.draw import Sheet, sheet_for
+from missions.maps.whole_file import write_whole
 from missions.picture_legend import (
     ABOVE_IN,
     BELOW_IN,
@@ -126,7 +126,7 @@ def _bounds_m(plan: Plan) -> tuple[float, float, float, float]:
 def _fill(axes: Axes, areas: Iterable[BaseGeometry], **style: Any) -> None:
     from matplotlib.collections import PathCollection
 
-    from companion.maps.picture.ground import outline_of
+    from missions.maps.picture.ground import outline_of
 
     paths = [outline_of(part) for area in areas for part in polygons_of(area)]
     if paths:

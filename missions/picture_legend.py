@@ -6,8 +6,8 @@ import colorsys
 import math
 from typing import TYPE_CHECKING, Any
 
-from companion.maps.picture.draw import Sheet, printable, scale_length_m
 from companion.wording import counted
+from missions.maps.picture.draw import Sheet, printable, scale_length_m
 from missions.plan import Plan
 
 if TYPE_CHECKING:

@@ -15,15 +15,15 @@ from companion.assembly import above_label, flow_range
 from companion.config import Config
 from companion.config.tables import MissionTable, PrescriptionTable, out_of_bounds
 from companion.core.frame import LocalFrame
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.compiling import read_configured_map
-from companion.maps.local import Area
-from companion.maps.model import MapFile
-from companion.maps.registry import read_map
 from missions.demand import Rates, Uniform
 from missions.errors import PlanError
 from missions.field import OUTLINE_TOLERANCE_M, Field, build_field, frame_of
 from missions.map_rates import MapRates
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.compiling import read_configured_map
+from missions.maps.local import Area
+from missions.maps.model import MapFile
+from missions.maps.registry import read_map
 from missions.nearness import check_near
 from missions.obstacles import Obstacle, read_obstacles
 from missions.plan import Settings

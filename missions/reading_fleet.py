@@ -16,13 +16,13 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.config.tables import MissionTable
 from companion.core.frame import LocalFrame
-from companion.maps.local import as_area, polygons_of
-from companion.maps.registry import read_area
 from companion.record.continuing import is_journal, read_treated_ground, rest_of
 from companion.record.coverage_area import carried, carried_places
 from missions.energy import Battery
 from missions.errors import PlanError
 from missions.field import MARGIN_M, Field, local_area
+from missions.maps.local import as_area, polygons_of
+from missions.maps.registry import read_area
 from missions.reading_outline import told
 from missions.remaining import Break, Remaining, read_lines, remaining
 from missions.strips import Floats

@@ -13,9 +13,9 @@ import shapely
 from companion.config import Config
 from companion.config.tables import MissionTable
 from companion.core.frame import LocalFrame
-from companion.maps.registry import read_area
 from missions.errors import PlanError
 from missions.field import Field, local_area
+from missions.maps.registry import read_area
 from missions.reading_outline import told
 from missions.run_in import RunIn
 from missions.swath_table import SwathPoint, swath_width_m

@@ -14,12 +14,12 @@ from shapely import MultiPolygon
 
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
-from companion.maps.build import frame_for
-from companion.maps.cells import grid_of
-from companion.maps.local import Area, as_area, polygons_of
-from companion.maps.model import MapFile
-from companion.maps.registry import read_area, read_map
 from missions.errors import PlanError
+from missions.maps.build import frame_for
+from missions.maps.cells import grid_of
+from missions.maps.local import Area, as_area, polygons_of
+from missions.maps.model import MapFile
+from missions.maps.registry import read_area, read_map
 from missions.nearness import check_near
 from missions.strips import Floats
 

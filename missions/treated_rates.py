@@ -14,11 +14,11 @@ from shapely.affinity import translate
 from shapely.geometry.base import BaseGeometry
 
 from companion.core.coverage import Coverage
-from companion.maps.registry import read_area
 from companion.record.continuing import is_journal, read_treated_ground
 from companion.record.coverage_area import moved
 from missions.demand import Demand, Rates, demands
 from missions.field import Field, local_area
+from missions.maps.registry import read_area
 from missions.reading_outline import told
 from missions.strips import Floats, rectangles
 

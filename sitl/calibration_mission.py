@@ -15,7 +15,7 @@ from companion.core.frame import LocalFrame
 from companion.core.nozzle import SET_UP_FRACTION, set_change_l_min
 from companion.core.rate import rate_for_flow
 from companion.errors import ConfigError
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from sitl.stub.mission_items import MissionItem, landing, speed, waypoint
 from sitl.stub.protocol import dialect
 

@@ -124,8 +124,8 @@ def serve(
     """
     from dataclasses import replace
 
-    from companion.cli.map_grid import parse_mark
     from companion.errors import VrsprayError
+    from missions.maps.cli.grid import parse_mark
     from sitl.serve import ServeOptions
     from sitl.serve_mission import home_of_file
 

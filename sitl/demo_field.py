@@ -9,7 +9,7 @@ from companion.config import Config, load
 from companion.core.prescription import Prescription
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_lag, anyang_route
 from sitl.route import Route
 from sitl.trajectory import Trajectory

@@ -26,8 +26,8 @@ from companion.core.nozzle import allowed_duty
 from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
 from companion.errors import ConfigError
-from companion.maps.compiling import compiled_setup
-from companion.maps.model import Problem
+from missions.maps.compiling import compiled_setup
+from missions.maps.model import Problem
 from sitl.board import SERVO_FRAME_S
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.knowledge import perfect_setup

@@ -26,7 +26,7 @@ from companion.config import load
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
 from companion.core.types import SprayPlan, TimedChange
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from sitl.anyang import anyang_route
 from sitl.flight import FlightOptions, fly, sprayer
 from sitl.profile import PlantProfile, load_profile

@@ -21,7 +21,7 @@ from companion.config import Config, load
 from companion.core.setup import Setup
 from companion.core.types import TimedChange
 from companion.errors import ConfigError
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
 from sitl.flow_law import FlowLaw

@@ -21,7 +21,6 @@ from shapely import LineString, Polygon, STRtree
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
-from companion.maps.local import polygons_of
 from companion.wording import counted
 from missions.errors import FenceError, PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
@@ -29,6 +28,7 @@ from missions.field import Field
 from missions.files.fence_corners import with_corners
 from missions.files.limits import NAMES
 from missions.files.plan_rules import FENCE_CORNERS_MAX
+from missions.maps.local import polygons_of
 from missions.plan import Place, Plan, Settings, Sortie
 from missions.strips import Objects
 

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from companion.config import Config
-from companion.maps.whole_file import write_whole
 from missions.errors import PlanError
+from missions.maps.whole_file import write_whole
 from missions.plan import Plan
 from missions.sheet import ground_text
 

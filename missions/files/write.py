@@ -6,13 +6,13 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from companion.maps.whole_file import write_whole
 from missions.errors import PlanError
 from missions.files.fence import Fences
 from missions.files.geojson import geojson_text
 from missions.files.kml import kml_text
 from missions.files.plan_file import plan_text
 from missions.files.waypoints import waypoints_text
+from missions.maps.whole_file import write_whole
 from missions.plan import Plan
 
 ONE_SORTIE = (".plan", ".waypoints")

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.maps.geotiff.file import read_raster
-from companion.maps.layer import read_bytes
 from missions.errors import PlanError
+from missions.maps.geotiff.file import read_raster
+from missions.maps.layer import read_bytes
 from missions.strips import Floats
 from missions.terrain.dem import HIGHEST_M, LOWEST_M, WGS84_CRS, Dem
 

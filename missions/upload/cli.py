@@ -12,9 +12,9 @@ import typer
 
 from companion.cli.answer import AsJson, answer, note
 from companion.config import load
-from companion.maps.compiling import compiled_setup
 from companion.wording import counted
 from missions.errors import UploadError
+from missions.maps.compiling import compiled_setup
 from missions.upload.checks import FIRMWARES
 from missions.upload.following import each_when_flown, sorties_from
 from missions.upload.items import MissionFile

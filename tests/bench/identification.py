@@ -29,7 +29,7 @@ from analysis.calibration.lag_fit import trimmed_ml
 from analysis.calibration.steps import Kind
 from companion.config import load
 from companion.core.types import Decision, FlowReport
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.calibration_mission import write_calibration
 from sitl.demo_pool import do_all

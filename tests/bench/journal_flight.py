@@ -34,9 +34,9 @@ from companion.core.types import (
     UtcReport,
     WindReport,
 )
-from companion.maps.compiling import compiled_setup
 from companion.record.valve_rows import ValveOrder, ValveRows
 from companion.record.writer import LinkSample
+from missions.maps.compiling import compiled_setup
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/anyang/config.toml"
 DECISIONS_HZ = 50

@@ -16,8 +16,8 @@ import shapely
 from pyproj import CRS
 
 from companion.core.frame import LocalFrame
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.registry import read_map
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.registry import read_map
 from tests.bench.fields import grid_zones
 from tests.bench.figures import Figure
 
@@ -58,8 +58,8 @@ _RASTER = """
 import json, sys
 from pathlib import Path
 from time import perf_counter
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.registry import read_map
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.registry import read_map
 begin = perf_counter()
 found = read_map(Path(sys.argv[1]), unit="L/ha")
 prescription = build_prescription(found, frame_for(found))

@@ -10,8 +10,8 @@ from pyproj import CRS
 from shapely import Point
 
 from companion.core.prescription import Prescription
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.model import MapCells, MapFile
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.model import MapCells, MapFile
 from tests.bench.fields import example, grid_zones
 from tests.bench.figures import Figure, collector_as_in_flight, spread
 

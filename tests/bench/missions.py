@@ -27,10 +27,10 @@ from shapely.affinity import rotate, translate
 
 from companion.core.frame import LocalFrame
 from companion.errors import VrsprayError
-from companion.maps.local import Area, as_area, polygons_of
-from companion.maps.registry import read_area
 from missions.demand import Uniform
 from missions.field import Field, build_field
+from missions.maps.local import Area, as_area, polygons_of
+from missions.maps.registry import read_area
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.strips import Floats, lengths_m, united

@@ -29,10 +29,10 @@ from shapely import box
 
 from analysis.flight_record import FlightRecord
 from companion.config import Config, load
-from companion.maps.compiling import compiled_setup
 from missions.coverage import measure
 from missions.demand import Demand, demands
 from missions.files.items import items_of
+from missions.maps.compiling import compiled_setup
 from missions.plan import Leg, Place, Plan, Sortie
 from missions.planner import plan_mission
 from missions.reading import Asked, Task, read_task

@@ -27,8 +27,8 @@ from analysis.border import off_target_ml
 from analysis.strips import strips_of
 from companion.config import Config, load
 from companion.core.setup import Setup
-from companion.maps.compiling import compiled_setup
 from missions.files.geojson import geojson_text
+from missions.maps.compiling import compiled_setup
 from missions.plan import Plan, Sortie
 from missions.planner import plan_mission
 from missions.reading import Asked, read_task

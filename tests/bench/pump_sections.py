@@ -23,7 +23,7 @@ from analysis.flight_record import FlightRecord
 from companion.config import load
 from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, fly
 from sitl.motor_parts import droplet_figures, ranges_us
 from sitl.profile import PlantProfile, load_profile

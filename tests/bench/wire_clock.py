@@ -25,9 +25,9 @@ from companion.cli.run import build_executor, component_options
 from companion.config import load
 from companion.core.setup import Setup
 from companion.link.vehicle_link import VehicleLink
-from companion.maps.compiling import compiled_setup
 from companion.ports import PlanExecutor, Recorder
 from companion.runtime import run
+from missions.maps.compiling import compiled_setup
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.channel import Channel
 from tests.bench.wire import MEAN_ABS_MAX_M, RTK, WORST_MAX_M, example

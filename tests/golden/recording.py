@@ -12,10 +12,10 @@ from companion.cli.record_parts import follow
 from companion.config import load
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
-from companion.maps.compiling import compiled_setup
 from companion.record.continuing import continued
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
+from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions
 from sitl.flight import fly as fly_twin
 from sitl.fly import _plant

@@ -16,15 +16,15 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.assemble import map_of
-from companion.maps.declared import Given
-from companion.maps.geopackage.reader import read_geopackage
-from companion.maps.geopackage.wkb import CurvedError, areas_of, polygons_in
-from companion.maps.geopackage.writer import write_geopackage
-from companion.maps.kml.reader import read_kml
-from companion.maps.kml.writer import write_kml
-from companion.maps.layer import Layer
-from companion.maps.model import MapFile, MapZone
+from missions.maps.assemble import map_of
+from missions.maps.declared import Given
+from missions.maps.geopackage.reader import read_geopackage
+from missions.maps.geopackage.wkb import CurvedError, areas_of, polygons_in
+from missions.maps.geopackage.writer import write_geopackage
+from missions.maps.kml.reader import read_kml
+from missions.maps.kml.writer import write_kml
+from missions.maps.layer import Layer
+from missions.maps.model import MapFile, MapZone
 
 WEST, SOUTH, CELL = 114.543, 35.996, 0.0005
 READERS: dict[str, Callable[[Path], Layer]] = {

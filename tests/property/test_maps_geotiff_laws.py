@@ -21,15 +21,15 @@ from pyproj import CRS
 from shapely import MultiPolygon, box
 
 from companion.errors import MapError
-from companion.maps.adapt.geoparquet import read_geoparquet
-from companion.maps.adapt.reader import read_adapt
-from companion.maps.assemble import map_of
-from companion.maps.declared import Given
-from companion.maps.geotiff.dji import read_dji
-from companion.maps.geotiff.reader import read_geotiff
-from companion.maps.geotiff.writer import write_dji, write_geotiff
-from companion.maps.layer import Grid, Layer
-from companion.maps.model import MapCells
+from missions.maps.adapt.geoparquet import read_geoparquet
+from missions.maps.adapt.reader import read_adapt
+from missions.maps.assemble import map_of
+from missions.maps.declared import Given
+from missions.maps.geotiff.dji import read_dji
+from missions.maps.geotiff.reader import read_geotiff
+from missions.maps.geotiff.writer import write_dji, write_geotiff
+from missions.maps.layer import Grid, Layer
+from missions.maps.model import MapCells
 
 WEST, NORTH, CELL = 114.5, 36.0, 1e-4
 RATES = np.linspace(0.0, 50.0, 600, dtype="float32").reshape(20, 30)

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.lint import point_rates, summary
-from companion.maps.model import MapFile, MapZone
-from companion.maps.registry import read_area, read_map
-from companion.maps.rings import area_of_rings
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.lint import point_rates, summary
+from missions.maps.model import MapFile, MapZone
+from missions.maps.registry import read_area, read_map
+from missions.maps.rings import area_of_rings
 
 WEST, SOUTH, CELL = 114.543, 35.996, 0.0005
 SUFFIXES = (".shp", ".shx", ".dbf", ".prj", ".cpg")

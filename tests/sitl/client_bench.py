@@ -23,7 +23,7 @@ import pytest
 import shapely
 
 from companion.config import load
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from sitl.serve import judge
 from sitl.stub.build import StubOptions, build_autopilot
 from sitl.stub.estimator import ARDUPILOT_NOISE, PX4_NOISE

@@ -8,7 +8,7 @@ from pathlib import Path
 import shapely
 from shapely import Polygon, box
 
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from tests.bench.missions import to_degrees
 from tests.bench.plan_twin import compared, config_for, flown, planned, with_lines
 

@@ -9,8 +9,8 @@ import numpy as np
 from pyproj import CRS
 from shapely import MultiPolygon, Polygon, box
 
-from companion.maps.lint import Plan, Sprayer
-from companion.maps.model import MapCells, MapFile, MapZone, Problem
+from missions.maps.lint import Plan, Sprayer
+from missions.maps.model import MapCells, MapFile, MapZone, Problem
 
 WEST, SOUTH, CELL = 114.543, 35.996, 0.0001
 WIDTH_M, HEIGHT_M = 9.017, 11.096

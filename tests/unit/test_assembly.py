@@ -18,7 +18,7 @@ from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
 from companion.core.types import Method
 from companion.errors import ConfigError, MapError
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 EXAMPLE = FOLDER / "config.toml"

@@ -17,7 +17,7 @@ from companion.core.prescription import Prescription, Zone
 from companion.core.pump import Way as PumpWay
 from companion.core.schedule import LagModel, Order, Timing, orders, schedule, shut_spans
 from companion.core.setup import Setup
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from tests.border_flight import Way, flows, orders_of, pump_orders_of, spilled_by_valve, spilled_s
 from tests.builders import plots, setup
 from tests.pump_flight import PUMP_LAG, pump_setup

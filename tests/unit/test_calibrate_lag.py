@@ -19,8 +19,8 @@ from companion.cli.app import execute
 from companion.config import load
 from companion.core.schedule import LagModel
 from companion.core.types import Decision, FlowReport, SprayPlan, TimedChange
-from companion.maps.compiling import compiled_setup
 from companion.record.journal import Journal
+from missions.maps.compiling import compiled_setup
 from sitl.calibration_mission import make_layout, write_calibration
 from sitl.demo_field import demo_setup
 from sitl.flight import FlightOptions, fly

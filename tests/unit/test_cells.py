@@ -19,11 +19,11 @@ from companion.core.cells import NO_RATE, CellGrid, Warp, exponents, rectangles
 from companion.core.crossings import find_routes
 from companion.core.prescription import FIELD, Prescription, Zone
 from companion.errors import MapError
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.cells import cell_areas_m2, cell_size_m
-from companion.maps.model import Affine, MapCells, MapFile
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.cells import cell_areas_m2, cell_size_m
+from missions.maps.model import Affine, MapCells, MapFile
 from tests import builders
 
 WGS84 = CRS.from_epsg(4326)

@@ -11,10 +11,10 @@ import shapely
 from shapely import Polygon
 
 from companion.cli.app import execute, refusal
-from companion.cli.map_report import ALIKE_SHOWN_MAX, KINDS_SHOWN_MAX, LINE_MAX, report_lines
 from companion.errors import MapError
-from companion.maps.lint import summary
-from companion.maps.model import MapFile, Problem
+from missions.maps.cli.report import ALIKE_SHOWN_MAX, KINDS_SHOWN_MAX, LINE_MAX, report_lines
+from missions.maps.lint import summary
+from missions.maps.model import MapFile, Problem
 from tests.unit.lint_maps import CELL, SOUTH, WEST, a_map, cell, cells_map
 
 CONFIG = Path(__file__).resolve().parents[2] / "examples" / "anyang" / "config.toml"
@@ -236,7 +236,7 @@ def test_many_problems_fit_on_a_screen_with_the_worst_first() -> None:
 
 def test_places_are_answered_in_words(capsys: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
     given = a_map((cell(0), 10.0), (cell(1), None), (cell(2), 20.0), boundary=cell(0, width=2))
-    monkeypatch.setattr("companion.cli.map_options.read_map", lambda *_, **__: given)
+    monkeypatch.setattr("missions.maps.cli.options.read_map", lambda *_, **__: given)
 
     def said(column: float) -> str:
         longitude = WEST + column * CELL
@@ -253,7 +253,7 @@ def test_cells_are_answered_for_a_file_of_points(
     capsys: Captured, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     given = cells_map([[10.0, 20.0], [float("nan"), 0.0]])
-    monkeypatch.setattr("companion.cli.map_options.read_map", lambda *_, **__: given)
+    monkeypatch.setattr("missions.maps.cli.options.read_map", lambda *_, **__: given)
     rows = [(SOUTH + up * CELL, WEST + right * CELL) for up in (1.5, 0.5) for right in (0.5, 1.5)]
     points = tmp_path / "points.csv"
     points.write_text("lat,lon\n" + "".join(f"{lat},{lon}\n" for lat, lon in rows))

@@ -16,12 +16,12 @@ import typer
 from pyproj import CRS, Geod
 from shapely import MultiPolygon, Polygon, box
 
-from companion.cli import map_convert
 from companion.errors import MapError
-from companion.maps.convert.formats import WRITERS, Writer
-from companion.maps.convert.writers import write_map
-from companion.maps.model import MapCells, MapFile
-from companion.maps.registry import read_map
+from missions.maps.cli import convert as convert_cli
+from missions.maps.convert.formats import WRITERS, Writer
+from missions.maps.convert.writers import write_map
+from missions.maps.model import MapCells, MapFile
+from missions.maps.registry import read_map
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 PLOTS = EXAMPLES / "anyang" / "prescription.shp"
@@ -31,8 +31,8 @@ FLOW = ("--flow-width-m", "6", "--flow-speed-m-s", "5")
 Captured = pytest.CaptureFixture[str]
 
 app = typer.Typer(add_completion=False)
-app.command()(map_convert.convert)
-app.command()(map_convert.show)
+app.command()(convert_cli.convert)
+app.command()(convert_cli.show)
 
 
 def run(*arguments: object) -> int:

@@ -10,12 +10,12 @@ import shapely
 import typer
 from typer.testing import CliRunner
 
-from companion.cli.map_grid import GRID_EXAMPLE
-from companion.cli.map_new import NEW_EXAMPLE, grid, new
 from companion.errors import MapError
-from companion.maps.csvfile.reader import read_csv
-from companion.maps.layer import Grid
-from companion.maps.text.reader import read_text_map
+from missions.maps.cli.grid import GRID_EXAMPLE
+from missions.maps.cli.new import NEW_EXAMPLE, grid, new
+from missions.maps.csvfile.reader import read_csv
+from missions.maps.layer import Grid
+from missions.maps.text.reader import read_text_map
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 app.command(epilog=NEW_EXAMPLE)(new)

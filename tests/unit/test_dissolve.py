@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from shapely import Polygon, box
 
 from companion.core.dissolve import Objects, dissolved, without_overlay
-from companion.maps.overlaps import overlaps
+from missions.maps.overlaps import overlaps
 
 
 def ragged(seed: int, *, side: int = 12, decimals: int = 7, kinds: int = 3) -> Objects:

@@ -20,8 +20,8 @@ from companion.core.estimator import Track, estimate, observe
 from companion.core.interlock import Limits
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import Inhibit, Input, VehicleState, WindReport
-from companion.maps.compiling import compiled_setup
 from companion.record.setup_json import field_names_of, setup_to_json
+from missions.maps.compiling import compiled_setup
 from sitl.ballistics import Air, fall, spectrum_um
 from sitl.droplets import TRUTHS, landed, law, shift_of, with_wind
 from sitl.flight import FlightOptions, fly

@@ -25,9 +25,9 @@ from companion.flight_map import (
     write_flight_map,
 )
 from companion.flight_map import child as child_module
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.compiling import MapOrder, compile_map, compiled_setup, read_configured_map
 from companion.problem import Problem
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.compiling import MapOrder, compile_map, compiled_setup, read_configured_map
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 ANYANG = EXAMPLES / "anyang" / "config.toml"

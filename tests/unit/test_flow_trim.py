@@ -29,9 +29,9 @@ from companion.core.types import (
     LandedReport,
     OperatorCommand,
 )
-from companion.maps.compiling import compiled_setup
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
+from missions.maps.compiling import compiled_setup
 from tests.builders import CURVE, flying, plots, position, setup
 from tests.unit.trim_bench import STEP_S, TrimBench, tracking
 

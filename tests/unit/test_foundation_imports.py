@@ -19,7 +19,7 @@ ALLOWED = {
     "mavsdk": ("missions/upload/",),
     "serial": ("companion/link", "sitl/stub"),
     "pydantic": ("companion/config",),
-    "shapefile": ("companion/maps", "analysis/exports/"),
+    "shapefile": ("missions/maps", "analysis/exports/"),
 }
 CORE_ALLOWED = {
     "numpy": None,

@@ -20,8 +20,8 @@ import pytest
 import rasterio
 import shapely
 
-from companion.maps.lint import point_rates
-from companion.maps.registry import read_map
+from missions.maps.lint import point_rates
+from missions.maps.registry import read_map
 from tests.random_places import places_in
 
 POINTS = 1_000

@@ -17,13 +17,13 @@ import pytest
 
 from companion.cli.app import execute
 from companion.errors import MapError
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.csvfile.reader import read_csv
-from companion.maps.geotiff.world_file import parse_world_file
-from companion.maps.layer import Grid, Layer
-from companion.maps.lint import summary
-from companion.maps.registry import read_map
-from companion.maps.text.reader import read_text_map
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.csvfile.reader import read_csv
+from missions.maps.geotiff.world_file import parse_world_file
+from missions.maps.layer import Grid, Layer
+from missions.maps.lint import summary
+from missions.maps.registry import read_map
+from missions.maps.text.reader import read_text_map
 
 MORE_BYTES = 512 * 1024**2
 # Reads, checks and builds every map that it is given, within so much memory beyond its own.
@@ -31,9 +31,9 @@ CHILD = """
 import json, resource, sys
 from pathlib import Path
 from companion.errors import MapError
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.lint import summary
-from companion.maps.registry import read_map
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.lint import summary
+from missions.maps.registry import read_map
 
 lines = Path("/proc/self/status").read_text().splitlines()
 status = dict(line.split(":", 1) for line in lines)
@@ -225,6 +225,6 @@ def test_running_out_of_memory_is_one_line(
     def no_memory(*_: object, **__: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("companion.cli.map_options.read_map", no_memory)
+    monkeypatch.setattr("missions.maps.cli.options.read_map", no_memory)
     assert execute(["map", "check", str(folder / "any.csv")]) == 2
     assert capsys.readouterr().err.startswith("error: there is not enough memory")

@@ -9,9 +9,9 @@ from pyproj import Geod
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.build import build_prescription, frame_for, project
-from companion.maps.lint import check_map, point_rates, summary
-from companion.maps.model import MapFile
+from missions.maps.build import build_prescription, frame_for, project
+from missions.maps.lint import check_map, point_rates, summary
+from missions.maps.model import MapFile
 from tests.unit.lint_maps import a_map
 
 WEST, SOUTH, CELL = 114.543, 35.996, 0.001

@@ -16,9 +16,9 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from companion.errors import MapError
-from companion.maps import bundle, xmltree
-from companion.maps.bundle import files_beside, open_bundle
-from companion.maps.xmltree import parse_xml
+from missions.maps import bundle, xmltree
+from missions.maps.bundle import files_beside, open_bundle
+from missions.maps.xmltree import parse_xml
 
 
 def zipped(path: Path, members: dict[str, bytes], method: int = zipfile.ZIP_DEFLATED) -> Path:

@@ -17,12 +17,12 @@ from pyproj import CRS, Transformer
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.convert import cell_zones, scan
-from companion.maps.convert.cell_zones import zones_of
-from companion.maps.convert.plain_zones import outline_of_rates, plain_zones
-from companion.maps.convert.rasterise import cell_rates, cells_of, metres_per_degree, north_up
-from companion.maps.model import Affine, MapCells, MapFile, MapZone
-from companion.maps.totals import as_sprayed, totals
+from missions.maps.convert import cell_zones, scan
+from missions.maps.convert.cell_zones import zones_of
+from missions.maps.convert.plain_zones import outline_of_rates, plain_zones
+from missions.maps.convert.rasterise import cell_rates, cells_of, metres_per_degree, north_up
+from missions.maps.model import Affine, MapCells, MapFile, MapZone
+from missions.maps.totals import as_sprayed, totals
 
 Floats = NDArray[np.float64]
 

@@ -15,11 +15,11 @@ from pyproj import CRS, Transformer
 from shapely import box
 
 from companion.errors import MapError
-from companion.maps.assemble import map_of
-from companion.maps.csvfile.lattice import find_lattice
-from companion.maps.csvfile.reader import read_csv
-from companion.maps.declared import Given
-from companion.maps.layer import Grid, Layer
+from missions.maps.assemble import map_of
+from missions.maps.csvfile.lattice import find_lattice
+from missions.maps.csvfile.reader import read_csv
+from missions.maps.declared import Given
+from missions.maps.layer import Grid, Layer
 
 WEST, SOUTH = 114.543, 35.996
 

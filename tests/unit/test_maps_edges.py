@@ -13,9 +13,9 @@ from pyproj import CRS
 
 from companion.cli.app import execute
 from companion.errors import MapError
-from companion.maps.cells import check_place
-from companion.maps.model import MapCells
-from companion.maps.registry import read_map
+from missions.maps.cells import check_place
+from missions.maps.model import MapCells
+from missions.maps.registry import read_map
 
 Captured = pytest.CaptureFixture[str]
 

@@ -13,10 +13,10 @@ import shapely
 from shapely import box
 
 from companion.errors import MapError
-from companion.maps import layer
-from companion.maps.geojson import reader as geojson
-from companion.maps.geojson.reader import read_geojson
-from companion.maps.registry import read_area, read_map
+from missions.maps import layer
+from missions.maps.geojson import reader as geojson
+from missions.maps.geojson.reader import read_geojson
+from missions.maps.registry import read_area, read_map
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001
 SQUARE = [[WEST, SOUTH], [WEST + CELL, SOUTH], [WEST + CELL, SOUTH + CELL], [WEST, SOUTH]]

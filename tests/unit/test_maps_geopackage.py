@@ -18,12 +18,12 @@ from pyproj import CRS, Transformer
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.assemble import map_of
-from companion.maps.declared import Given
-from companion.maps.geopackage.reader import read_geopackage
-from companion.maps.geopackage.writer import write_geopackage
-from companion.maps.layer import Layer
-from companion.maps.model import MapFile, MapZone
+from missions.maps.assemble import map_of
+from missions.maps.declared import Given
+from missions.maps.geopackage.reader import read_geopackage
+from missions.maps.geopackage.writer import write_geopackage
+from missions.maps.layer import Layer
+from missions.maps.model import MapFile, MapZone
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001
 SQUARE = box(WEST, SOUTH, WEST + CELL, SOUTH + CELL)
@@ -408,8 +408,8 @@ def test_a_virtual_table_is_no_layer(tmp_path: Path) -> None:
 def test_work_without_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = by_gdal(tmp_path / "rx.gpkg", grounds=[SQUARE] * 2000, rates=[1.0] * 2000)
     assert len(read_geopackage(path).geometries) == 2000
-    monkeypatch.setattr("companion.maps.geopackage.sqlite._STEPS_MAX", 1000)
-    monkeypatch.setattr("companion.maps.geopackage.sqlite._STEPS_PER_CALL", 500)
+    monkeypatch.setattr("missions.maps.geopackage.sqlite._STEPS_MAX", 1000)
+    monkeypatch.setattr("missions.maps.geopackage.sqlite._STEPS_PER_CALL", 500)
     assert refused(path).code == "too-large"
 
 
@@ -428,7 +428,7 @@ def test_what_is_too_large_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: int
 ) -> None:
     path = by_gdal(tmp_path / "rx.gpkg")
-    monkeypatch.setattr(f"companion.maps.{limit}", value)
+    monkeypatch.setattr(f"missions.maps.{limit}", value)
     with pytest.raises(MapError, match=r"more than|too many"):
         read_geopackage(path)
 

@@ -16,12 +16,12 @@ from pyproj import CRS, Geod
 from shapely import MultiPolygon, Point, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.adapt.geoparquet import read_geoparquet
-from companion.maps.adapt.parquet_file import read_table
-from companion.maps.adapt.reader import read_adapt
-from companion.maps.assemble import map_of
-from companion.maps.declared import Given
-from companion.maps.layer import Layer
+from missions.maps.adapt.geoparquet import read_geoparquet
+from missions.maps.adapt.parquet_file import read_table
+from missions.maps.adapt.reader import read_adapt
+from missions.maps.assemble import map_of
+from missions.maps.declared import Given
+from missions.maps.layer import Layer
 
 WEST, SOUTH, CELL = 114.5, 36.0, 1e-3
 SQUARES = [box(WEST + i * CELL, SOUTH, WEST + (i + 1) * CELL, SOUTH + CELL) for i in range(3)]

@@ -22,14 +22,14 @@ from rasterio.transform import Affine
 from shapely import MultiPolygon, box
 
 from companion.errors import MapError
-from companion.maps.adapt.reader import read_adapt
-from companion.maps.assemble import map_of
-from companion.maps.cells import bounds_deg
-from companion.maps.declared import Given
-from companion.maps.geotiff.dji import read_dji
-from companion.maps.geotiff.reader import read_geotiff
-from companion.maps.geotiff.world_file import parse_world_file
-from companion.maps.layer import Grid
+from missions.maps.adapt.reader import read_adapt
+from missions.maps.assemble import map_of
+from missions.maps.cells import bounds_deg
+from missions.maps.declared import Given
+from missions.maps.geotiff.dji import read_dji
+from missions.maps.geotiff.reader import read_geotiff
+from missions.maps.geotiff.world_file import parse_world_file
+from missions.maps.layer import Grid
 
 WEST, NORTH, CELL = 114.5, 36.0, 1e-4
 PLACE = Affine(CELL, 0.0, WEST, 0.0, -CELL, NORTH)

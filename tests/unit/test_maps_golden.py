@@ -10,9 +10,9 @@ import shapely
 from pyproj import Geod
 
 from companion.errors import MapError
-from companion.maps.build import build_prescription, frame_for
-from companion.maps.lint import point_rates, summary
-from companion.maps.registry import read_area, read_map
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.lint import point_rates, summary
+from missions.maps.registry import read_area, read_map
 
 
 def seen_by_gdal(path: Path) -> list[shapely.Geometry]:

@@ -15,9 +15,9 @@ import shapely
 from shapely import Polygon, box
 
 from companion.errors import MapError
-from companion.maps.isoxml.reader import read_isoxml
-from companion.maps.layer import Grid, Layer
-from companion.maps.registry import read_map
+from missions.maps.isoxml.reader import read_isoxml
+from missions.maps.layer import Grid, Layer
+from missions.maps.registry import read_map
 
 WEST, SOUTH = 15.0, 48.0
 HEAD = '<?xml version="1.0" encoding="UTF-8"?>'
@@ -445,8 +445,8 @@ def test_dictionary_says_unit_and_resolution(
 def test_dictionary_agrees_with_an_independent_one() -> None:
     from isoxml.models.ddi_entities import DDEntity
 
-    from companion.maps.isoxml.ddi import FAMILIES
-    from companion.maps.units import rate_unit
+    from missions.maps.isoxml.ddi import FAMILIES
+    from missions.maps.units import rate_unit
 
     roles = ("setpoint", "actual", "default", "minimum", "maximum")
     for family in FAMILIES:

@@ -15,12 +15,12 @@ import shapely
 from shapely import LinearRing, MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.assemble import map_of
-from companion.maps.declared import Given
-from companion.maps.kml.reader import read_kml
-from companion.maps.kml.writer import write_kml
-from companion.maps.layer import Layer
-from companion.maps.model import MapFile, MapZone
+from missions.maps.assemble import map_of
+from missions.maps.declared import Given
+from missions.maps.kml.reader import read_kml
+from missions.maps.kml.writer import write_kml
+from missions.maps.layer import Layer
+from missions.maps.model import MapFile, MapZone
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001
 SQUARE = box(WEST, SOUTH, WEST + CELL, SOUTH + CELL)
@@ -431,7 +431,7 @@ def test_links_in_a_circle_or_out_of_the_archive_end(tmp_path: Path) -> None:
 def test_linked_files_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = zipped(tmp_path, {"doc.kml": kml(links("a.kml")), "a.kml": MAY})
     assert len(read_kml(path).geometries) == 1
-    monkeypatch.setattr("companion.maps.kml.files.MAX_ELEMENTS", 15)
+    monkeypatch.setattr("missions.maps.kml.files.MAX_ELEMENTS", 15)
     assert refused(path).code == "too-large"
 
 
@@ -471,7 +471,7 @@ def test_what_is_too_large_is_refused(
 ) -> None:
     path = saved(tmp_path, kml(*[placemark(data(rate=1), polygon())] * 2))
     assert len(read_kml(path).geometries) == 2
-    monkeypatch.setattr(f"companion.maps.{limit}", value)
+    monkeypatch.setattr(f"missions.maps.{limit}", value)
     with pytest.raises(MapError, match=r"more than|too many"):
         read_kml(path)
 

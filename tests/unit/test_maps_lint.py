@@ -15,11 +15,11 @@ from shapely import MultiPolygon, Point, Polygon, box
 from shapely.affinity import translate
 
 from companion.errors import MapError
-from companion.maps import overlaps as overlaps_module
-from companion.maps.lint import Plan, check_map, summary
-from companion.maps.lint import survey as survey_module
-from companion.maps.model import MapFile, Problem
-from companion.maps.overlaps import overlaps
+from missions.maps import overlaps as overlaps_module
+from missions.maps.lint import Plan, check_map, summary
+from missions.maps.lint import survey as survey_module
+from missions.maps.model import MapFile, Problem
+from missions.maps.overlaps import overlaps
 from tests.unit.lint_maps import (
     CELL,
     HEIGHT_M,
@@ -574,7 +574,7 @@ def test_pairs_that_are_not_all_counted_are_said_to_be_at_least_so_many(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(overlaps_module, "PAIRS_MAX", 3)
-    monkeypatch.setattr("companion.maps.lint.shapes.PAIRS_MAX", 3)
+    monkeypatch.setattr("missions.maps.lint.shapes.PAIRS_MAX", 3)
     stack = a_map(*((cell(0), float(rate)) for rate in range(2, 7)))
     (problem,) = (one for one in check_map(stack) if one.code == "overlap")
     assert problem.text.startswith("at least 10 pairs of zones overlap, by at least ")

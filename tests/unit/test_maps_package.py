@@ -19,7 +19,7 @@ from rasterio.transform import Affine
 from shapely import box
 
 from companion.errors import MapError
-from companion.maps.registry import read_area, read_map
+from missions.maps.registry import read_area, read_map
 
 WEST, SOUTH, CELL = 114.5, 36.0, 1e-3
 TASK = (

@@ -17,12 +17,12 @@ from pyproj import CRS
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.build import frame_for
-from companion.maps.convert.rasterise import metres_per_degree
-from companion.maps.model import MapCells, MapFile, MapZone
-from companion.maps.picture.draw import DPI, _bounds_m, draw, printable, scale_length_m, sheet_for
-from companion.maps.picture.ground import Colours
-from companion.maps.totals import as_sprayed
+from missions.maps.build import frame_for
+from missions.maps.convert.rasterise import metres_per_degree
+from missions.maps.model import MapCells, MapFile, MapZone
+from missions.maps.picture.draw import DPI, _bounds_m, draw, printable, scale_length_m, sheet_for
+from missions.maps.picture.ground import Colours
+from missions.maps.totals import as_sprayed
 
 LON, LAT = 8.73, 47.42
 ACROSS_M, ALONG_M = metres_per_degree(LAT)

@@ -15,19 +15,19 @@ from shapely import MultiPolygon, box
 
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
-from companion.maps.assemble import map_of
-from companion.maps.convert.make_map import Plots, Points, make_plots, make_points, plot_rates
-from companion.maps.declared import Given
-from companion.maps.layer import Grid
-from companion.maps.model import MapCells, MapFile, MapZone
-from companion.maps.text.point_grid import MERGES, cell_numbers, cell_size, layout_for, merged
-from companion.maps.text.reader import (
+from missions.maps.assemble import map_of
+from missions.maps.convert.make_map import Plots, Points, make_plots, make_points, plot_rates
+from missions.maps.declared import Given
+from missions.maps.layer import Grid
+from missions.maps.model import MapCells, MapFile, MapZone
+from missions.maps.text.point_grid import MERGES, cell_numbers, cell_size, layout_for, merged
+from missions.maps.text.reader import (
     grid_of_points,
     read_text_map,
     text_map_of,
     write_text_map,
 )
-from companion.maps.text.text_points import MAX_POINTS, TextMap, parse_text_map, text_of
+from missions.maps.text.text_points import MAX_POINTS, TextMap, parse_text_map, text_of
 
 ORIGIN = (39.5, -0.4, 50.0)
 WIDTH_M, SPEED_M_S = 5.0, 4.0

@@ -21,11 +21,11 @@ from shapely import MultiPolygon, Polygon, box
 from shapely.affinity import rotate
 
 from companion.cli.app import execute
-from companion.maps.cells import shares_inside
-from companion.maps.convert.writers import write_map
-from companion.maps.lint import Plan, summary
-from companion.maps.model import MapCells, MapFile, MapZone
-from companion.maps.totals import Totals, totals
+from missions.maps.cells import shares_inside
+from missions.maps.convert.writers import write_map
+from missions.maps.lint import Plan, summary
+from missions.maps.model import MapCells, MapFile, MapZone
+from missions.maps.totals import Totals, totals
 
 GEOD = Geod(ellps="WGS84")
 WEST, SOUTH = -93.8257, 41.8487

@@ -15,13 +15,13 @@ from pyproj import CRS
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.assemble import map_of
-from companion.maps.declared import Given
-from companion.maps.geotiff.dji import read_dji
-from companion.maps.geotiff.reader import read_geotiff
-from companion.maps.geotiff.writer import write_dji, write_geotiff
-from companion.maps.layer import Grid
-from companion.maps.model import Affine, MapCells
+from missions.maps.assemble import map_of
+from missions.maps.declared import Given
+from missions.maps.geotiff.dji import read_dji
+from missions.maps.geotiff.reader import read_geotiff
+from missions.maps.geotiff.writer import write_dji, write_geotiff
+from missions.maps.layer import Grid
+from missions.maps.model import Affine, MapCells
 
 WEST, NORTH, WIDTH, HEIGHT = 114.5, 36.0, 1.1e-5, 0.9e-5
 NORTH_UP: Affine = (WIDTH, 0.0, WEST, 0.0, -HEIGHT, NORTH)

@@ -19,11 +19,11 @@ from pyproj import CRS
 from shapely import MultiPolygon, box
 
 from companion.errors import MapError
-from companion.maps.crs import WGS84
-from companion.maps.isoxml.reader import read_isoxml
-from companion.maps.isoxml.writer import write_isoxml
-from companion.maps.layer import Grid, Layer
-from companion.maps.model import Affine, MapCells, MapFile, MapZone
+from missions.maps.crs import WGS84
+from missions.maps.isoxml.reader import read_isoxml
+from missions.maps.isoxml.writer import write_isoxml
+from missions.maps.layer import Grid, Layer
+from missions.maps.model import Affine, MapCells, MapFile, MapZone
 
 WEST, SOUTH, STEP = 114.543, 35.996, 0.0005
 PLACES = ["TASKDATA.XML", "map.zip", "field"]

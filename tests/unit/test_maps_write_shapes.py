@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from companion.maps.geojson.writer import write_geojson
-from companion.maps.model import MapZone
-from companion.maps.registry import read_map
-from companion.maps.shapefile import writer as module
-from companion.maps.shapefile.reader import read_shapefile
-from companion.maps.shapefile.writer import write_shapefile
+from missions.maps.geojson.writer import write_geojson
+from missions.maps.model import MapZone
+from missions.maps.registry import read_map
+from missions.maps.shapefile import writer as module
+from missions.maps.shapefile.reader import read_shapefile
+from missions.maps.shapefile.writer import write_shapefile
 
 WEST, SOUTH, CELL = 114.543_123_456_789, 35.996_987_654_321, 0.001
 Writer = Callable[..., None]

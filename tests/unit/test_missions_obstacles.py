@@ -16,8 +16,8 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.cli.app import execute
 from companion.errors import MapError
-from companion.maps.registry import read_area
 from missions.field import frame_of
+from missions.maps.registry import read_area
 from missions.obstacles import read_obstacles
 from tests.bench.missions import to_degrees
 from tests.unit.test_missions_cli import written

@@ -17,7 +17,6 @@ from shapely.affinity import rotate, translate
 
 from companion.cli.app import execute
 from companion.errors import MapError
-from companion.maps.local import make_valid
 from missions.demand import Uniform
 from missions.errors import PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
@@ -28,6 +27,7 @@ from missions.files.geojson import geojson_text
 from missions.files.plan_file import plan_text
 from missions.files.plan_rules import FENCE_CORNERS_MAX
 from missions.free_space import CORNERS_MAX, free_space
+from missions.maps.local import make_valid
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.reading_outline import outline_of

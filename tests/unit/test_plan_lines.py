@@ -21,10 +21,10 @@ from companion.config import load
 from companion.core.frame import LocalFrame
 from companion.core.lines import Lines
 from companion.errors import ConfigError, MapError
-from companion.maps.compiling import compiled_setup
-from companion.maps.plan_lines import read_plan_lines
 from companion.record.layers import Ground
 from companion.record.setup_json import field_names_of, setup_from_json, setup_to_json
+from missions.maps.compiling import compiled_setup
+from missions.maps.plan_lines import read_plan_lines
 from tests.builders import setup
 
 EXAMPLE = "examples/anyang/config.toml"

@@ -21,8 +21,8 @@ from companion.core.controller import Memory, step
 from companion.core.dosing import TRIM_AGE_S
 from companion.core.types import FlowReport, Input, SprayPlan, Telemetry, TimedChange
 from companion.errors import ConfigError
-from companion.maps.compiling import compiled_setup
 from companion.output.pwm import PulseEngine
+from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, fly, sprayer
 from sitl.knowledge import lags, measured_sets, pwm_limits
 from sitl.measure_pump import measure

@@ -13,7 +13,7 @@ import pytest
 from companion.atomic_write import write_atomically
 from companion.cli.systemd import write_unit
 from companion.link.signing import STATE_NAME, Signing, read_state, write_state
-from companion.maps.whole_file import write_whole
+from missions.maps.whole_file import write_whole
 
 KEY = bytes(range(32))
 NOW_S = 1_800_000_000.0

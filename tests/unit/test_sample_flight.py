@@ -17,7 +17,7 @@ from analysis.strips import Strip, strips_of
 from companion.config import load
 from companion.core.setup import Setup
 from companion.core.types import Decision
-from companion.maps.compiling import compiled_setup
+from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.fly import zero_rate_ml
 from sitl.profile import PlantProfile, load_profile

@@ -19,10 +19,10 @@ from companion.core.types import BatteryReport, Decision, FlowReport, Input, Pre
 from companion.errors import ConfigError, SensorError
 from companion.link.decode import FROM_VEHICLE
 from companion.link.streams import wanted_streams
-from companion.maps.compiling import compiled_setup
 from companion.ports import Sensor
 from companion.sensors.flow_meter import FlowMeter
 from companion.sensors.tank import TankSensor
+from missions.maps.compiling import compiled_setup
 from tests.builders import position, setup
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang" / "config.toml"

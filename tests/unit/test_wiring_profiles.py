@@ -11,10 +11,10 @@ from companion.cli.output_parts import engine_setup
 from companion.config import Config, load
 from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ConfigError
-from companion.maps.compiling import compiled_setup
 from companion.output.engine.closer import closer_arguments
 from companion.output.engine.wiring import hazards
 from companion.output.pwm import PulseEngine
+from missions.maps.compiling import compiled_setup
 
 PROFILES = Path(__file__).resolve().parents[2] / "examples" / "profiles"
 NAMES = {

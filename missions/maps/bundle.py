@@ -1,0 +1,262 @@
+"""A set of files that belong together: a folder, or a zip that nobody vouches for.
+
+Readers of formats that come as several files ask a bundle and need not know which of the two it
+is. Nothing is ever unpacked to disk, so that a name in an archive can lead nowhere. An archive
+within an archive is one more file, and stays shut.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path, PurePosixPath
+
+from companion.errors import MapError
+from missions.maps.layer import MAX_FILE_BYTES, read_bytes
+from missions.maps.model import map_error
+
+# A prescription with boundary and task data has a few files; a data carrier some hundred.
+MAX_MEMBERS = 2_000
+# `TASKDATA/`, or `Rx/grower/farm/field/`, in a folder or two around it.
+MAX_DEPTH = 8
+# Deflate gains a thousandfold at the very most, on zeros; up to 16 MB of them, a grid of four
+# million cells, are no harm. Beyond, a map gains some two hundredfold.
+MAX_RATIO = 400
+_RATIO_FREE_BYTES = 16 * 1024**2
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_ENTRY_MARK = b"PK\1\2"
+_LOCAL_HEADER_BYTES = 30
+_MAKE_AGAIN = "make the archive again"
+# What `zipfile` raises on bytes that are not what they claim (found by mutating archives).
+_BROKEN = (
+    zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, RuntimeError, ValueError,
+    IndexError, OverflowError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """Files by their names inside `path`, with `/` between folders."""
+
+    path: Path
+    files: dict[str, Path | zipfile.ZipInfo]
+    _archive: zipfile.ZipFile | None = field(default=None, repr=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return all names, sorted."""
+        return tuple(sorted(self.files))
+
+    def with_suffix(self, *suffixes: str) -> list[str]:
+        """Return the names that end in one of the suffixes, in any case: `.shp`, `.tif`."""
+        return [name for name in self.names if PurePosixPath(name).suffix.casefold() in suffixes]
+
+    def called(self, basename: str) -> list[str]:
+        """Return the names whose last part is `basename`, in any case."""
+        wanted = basename.casefold()
+        return [name for name in self.names if PurePosixPath(name).name.casefold() == wanted]
+
+    def read(self, name: str) -> bytes:
+        """Return one file's bytes."""
+        entry = self.files[name]
+        if isinstance(entry, Path):
+            return read_bytes(entry)
+        if self._archive is None:
+            raise ValueError("a member of an archive needs its archive")
+        try:
+            with self._archive.open(entry) as member:
+                content = member.read(entry.file_size + 1)
+        except _BROKEN as error:
+            raise map_error(
+                self.path,
+                f"its member {name} cannot be unpacked ({str(error)[:120]})",
+                fix=f"copy it again, or {_MAKE_AGAIN}",
+                code="truncated",
+            ) from None
+        if len(content) != entry.file_size:
+            raise _unsafe(self.path, f"its member {name} is not as long as the archive says")
+        return content
+
+
+def open_bundle(path: Path) -> Bundle:
+    """Return the files of a folder or of a zip archive."""
+    return _folder(path) if path.is_dir() else _archive(path)
+
+
+def files_beside(path: Path) -> Bundle:
+    """Return a file and those beside it whose names begin alike: `rx.prj`, `rx-Metadata.json`.
+
+    Unlike in a whole folder, a link is followed: the operator named this very file.
+    """
+    start = path.stem.casefold()
+    try:
+        there = sorted(path.parent.iterdir())
+        files: dict[str, Path | zipfile.ZipInfo] = {
+            file.name: file
+            for file in there
+            if file.name.casefold().startswith(start) and file.is_file()
+        }
+    except (OSError, ValueError) as error:
+        raise map_error(
+            path, f"cannot be read ({error})", fix="check path and rights", code="no-file"
+        ) from None
+    return Bundle(path.parent, files | {path.name: path})
+
+
+def is_litter(name: str) -> bool:
+    """Tell what a computer leaves behind in folders and archives from what people put there.
+
+    >>> is_litter("__MACOSX/._rx.shp"), is_litter("Rx/.DS_Store"), is_litter("Rx/rx.shp")
+    (True, True, False)
+    """
+    parts = PurePosixPath(name).parts
+    return "__MACOSX" in parts or any(part.startswith(".") for part in parts)
+
+
+def _folder(path: Path) -> Bundle:
+    files: dict[str, Path | zipfile.ZipInfo] = {}
+    for name, file in _walk(path):
+        files[name] = file
+        if len(files) > MAX_MEMBERS:
+            raise map_error(
+                path,
+                f"the folder holds more than {MAX_MEMBERS} files",
+                fix="name the map's own folder",
+                code="too-large",
+            )
+    return Bundle(path, files)
+
+
+def _walk(path: Path) -> Iterator[tuple[str, Path]]:
+    """Yield the files in a folder and its folders; links are not followed."""
+
+    def refuse(error: OSError) -> None:
+        raise map_error(
+            path, f"cannot be read ({error})", fix="check path and rights", code="no-file"
+        )
+
+    for place, folders, names in os.walk(path, onerror=refuse):
+        here = Path(place).relative_to(path)
+        folders[:] = sorted(name for name in folders if not is_litter(name))
+        if folders and len(here.parts) >= MAX_DEPTH:
+            raise map_error(
+                path,
+                f"its folders lie more than {MAX_DEPTH} deep in each other",
+                fix="name the map's own folder",
+                code="too-large",
+            )
+        for name in sorted(names):
+            file = Path(place) / name
+            if not is_litter(name) and file.is_file() and not file.is_symlink():
+                yield (here / name).as_posix(), file
+
+
+def _archive(path: Path) -> Bundle:
+    content = read_bytes(path)
+    # Counted before the list is made, and not believed to the number that the archive states.
+    entries = content.count(_ENTRY_MARK)
+    if entries > 4 * MAX_MEMBERS:
+        raise _too_large(path, f"some {entries} files are more than {MAX_MEMBERS}")
+    try:
+        archive = zipfile.ZipFile(BytesIO(content))
+        members = archive.infolist()
+        _check_members(path, members)
+        _check_apart(path, members, archive.start_dir)
+        return Bundle(path, _named(path, members), archive)
+    except MapError:
+        raise
+    except _BROKEN as error:
+        raise map_error(
+            path,
+            f"this is no whole zip archive ({str(error)[:120]})",
+            fix=f"copy it again, or {_MAKE_AGAIN}",
+            code="truncated",
+        ) from None
+
+
+def _check_members(path: Path, members: Sequence[zipfile.ZipInfo]) -> None:
+    """Refuse what is too much, hidden, or packed in a way whose gain has no bound."""
+    if len(members) > MAX_MEMBERS:
+        raise _too_large(path, f"{len(members)} files are more than {MAX_MEMBERS}")
+    if sum(member.file_size for member in members) > MAX_FILE_BYTES:
+        raise _too_large(path, f"unpacked it would be more than {MAX_FILE_BYTES // 1024**2} MB")
+    for member in members:
+        shown = repr(member.filename[:80])
+        if member.flag_bits & 0x1:
+            raise _unsafe(path, f"its member {shown} is encrypted", fix="pack it unencrypted")
+        if member.compress_type not in _METHODS:
+            raise _unsafe(
+                path,
+                f"its member {shown} is packed in an unusual way",
+                fix="pack it as a plain zip (deflate)",
+            )
+        if member.file_size > max(MAX_RATIO * member.compress_size, _RATIO_FREE_BYTES):
+            raise _unsafe(path, f"its member {shown} unpacks without measure")
+        if stat.S_ISLNK(member.external_attr >> 16):
+            raise _unsafe(path, f"its member {shown} is a link", fix="pack the file itself")
+
+
+def _check_apart(path: Path, members: Sequence[zipfile.ZipInfo], start_dir: int) -> None:
+    """Refuse members that share bytes: a small archive could unpack to any size that way."""
+    ordered = sorted(members, key=lambda member: member.header_offset)
+    starts = [*(member.header_offset for member in ordered), start_dir]
+    for member, (start, following) in zip(ordered, pairwise(starts), strict=True):
+        if start < 0 or start + _LOCAL_HEADER_BYTES + member.compress_size > following:
+            raise _unsafe(path, f"its member {member.filename[:80]!r} overlaps another")
+
+
+def _named(path: Path, members: Sequence[zipfile.ZipInfo]) -> dict[str, Path | zipfile.ZipInfo]:
+    """Return the files by name, with the folders and the litter left out."""
+    files: dict[str, Path | zipfile.ZipInfo] = {}
+    for member in members:
+        text = _text_of(member).replace("\\", "/")
+        name = PurePosixPath(text)
+        shown = repr(text[:80])
+        if name.is_absolute() or ".." in name.parts or ":" in (name.parts or ("",))[0]:
+            raise _unsafe(path, f"its member {shown} leads out of it")
+        if any(ord(character) < 32 for character in text):
+            raise _unsafe(path, f"its member {shown} has a control character in its name")
+        if text.endswith("/") or is_litter(text):
+            continue
+        if not name.name or len(name.parts) > MAX_DEPTH + 1:
+            raise _unsafe(path, f"its member {shown} has no name, or lies too deep in folders")
+        if str(name) in files:
+            raise _unsafe(path, f"it holds {shown} twice")
+        files[str(name)] = member
+    return files
+
+
+def _text_of(member: zipfile.ZipInfo) -> str:
+    """Return a name as it was meant, as well as that can be known.
+
+    Without its flag for UTF-8, the name is in the code page of the computer that packed it, which
+    the archive does not state; Chinese names show by their pairs of high bytes. What is at stake
+    is how the name looks: files that belong together are read alike.
+    """
+    if member.flag_bits & 0x800 or member.filename.isascii():
+        return member.filename
+    try:
+        raw = member.filename.encode("cp437")
+    except UnicodeError:
+        return member.filename
+    for encoding in ("utf-8", "gb2312"):
+        try:
+            return raw.decode(encoding)
+        except UnicodeError:
+            continue
+    return member.filename
+
+
+def _unsafe(path: Path, text: str, *, fix: str = _MAKE_AGAIN) -> Exception:
+    return map_error(path, text, fix=fix, code="archive-unsafe")
+
+
+def _too_large(path: Path, text: str) -> Exception:
+    return map_error(path, text, fix="pack the map of one field alone", code="too-large")

@@ -1,0 +1,151 @@
+"""From a configuration to what the linter wants to know of the flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from shapely import MultiPolygon
+
+from companion.assembly import above_label, undelivered
+from companion.cli.answer import note
+from companion.config import Config
+from companion.errors import MapError
+from missions.maps.lint import Plan, Sprayer
+from missions.maps.lint.survey import Survey
+from missions.maps.model import MapFile, Problem
+from missions.maps.registry import read_area
+
+# The rates between the least and the largest say nothing more of a sprayer's range.
+RATES_MAX = 1_000
+
+
+def plan_of(config: Config | None, home: tuple[float, float] | None) -> tuple[Plan, list[Problem]]:
+    """Return the flight that the configuration describes, and what is wrong with its boundary."""
+    homes: tuple[tuple[float, float], ...] = () if home is None else (home,)
+    if config is None:
+        return Plan(homes=homes), []
+    table, mission = config.prescription, config.mission
+    if home is None and mission is not None:
+        homes = mission.depots
+    problems: list[Problem] = []
+    boundary, exclusions = None, []
+    if table is not None:
+        if table.boundary is not None:
+            boundary = _area(config, table.boundary, "prescription.boundary", problems)
+        for number, name in enumerate(table.exclusions):
+            area = _area(config, name, f"prescription.exclusions[{number}]", problems)
+            exclusions += [] if area is None else [area]
+    plan = Plan(
+        boundary=boundary,
+        exclusions=tuple(exclusions),
+        default_rate_l_ha=None if table is None else table.default_rate_l_ha,
+        homes=homes,
+        sprayer=_sprayer(config),
+    )
+    return plan, problems
+
+
+def _area(config: Config, name: str, key: str, problems: list[Problem]) -> MultiPolygon | None:
+    """Return a boundary or an exclusion, or None with what is wrong with it."""
+    path = config.resolve(name)
+    try:
+        return read_area(path)
+    except MapError as error:
+        if error.code == "no-file":
+            note(f"{key}: {path} is not there; the map is checked without it")
+        else:
+            problems.append(_refused_area(error, key))
+    return None
+
+
+def _refused_area(error: MapError, key: str) -> Problem:
+    what = "the boundary" if key == "prescription.boundary" else "an exclusion"
+    return Problem(
+        severity="error",
+        code=error.code,
+        text=f"{what} cannot be used: {str(error).removesuffix('; ' + error.fix)}",
+        where=key,
+        fix=error.fix,
+    )
+
+
+def _sprayer(config: Config) -> Sprayer | None:
+    mission, table, lag = config.mission, config.prescription, config.lag
+    if mission is None:
+        return None
+    return Sprayer(
+        speed_m_s=mission.speed_m_s,
+        lag_s=max(lag.on_s, lag.off_s, lag.up_s, lag.down_s) + lag.output_s,
+        period_s=config.pwm_limits().period_s,
+        strip_m=min(valve.width_m for valve in config.boom().valves),
+        across="centre" if table is None else table.across,
+        angle_deg=None if mission.angle_deg == "auto" else mission.angle_deg,
+        speed_min_m_s=config.safety.speed_min_m_s,
+    )
+
+
+def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> list[Problem]:
+    """Return what this sprayer and this product have against the rates of the map."""
+    rates = rates_in_force(map_file, plan)
+    if config is None or not rates:
+        return []
+    label = above_label(
+        config,
+        map_file.path,
+        rates_l_ha=map_file.rates_l_ha,
+        default_rate_l_ha=_default(config, map_file),
+    )
+    found = [] if label is None else [label]
+    if config.mission is not None:
+        found += undelivered(
+            _fewer(rates),
+            sets=config.nozzle_sets(),
+            pwm=config.pwm_limits(),
+            width_m=config.boom_table.width_m,
+            speed_m_s=config.mission.speed_m_s,
+            speeds_m_s=(config.safety.speed_min_m_s, config.safety.speed_max_m_s),
+        )
+    if not found:
+        return []
+    survey = Survey(map_file)
+    positive = [rate for rate in rates if rate > 0.0]
+    where = {
+        "above-label": max(positive, default=0.0),
+        "rate-too-high": max(positive, default=0.0),
+        "rate-too-low": min(positive, default=0.0),
+    }
+    return [
+        replace(problem, where=problem.where or _where(survey, where[problem.code], plan))
+        for problem in found
+    ]
+
+
+def _default(config: Config, map_file: MapFile) -> float | None:
+    table = config.prescription
+    if table is not None and table.default_rate_l_ha is not None:
+        return table.default_rate_l_ha
+    return map_file.default_rate_l_ha
+
+
+def rates_in_force(map_file: MapFile, plan: Plan) -> list[float]:
+    """Return all different rates that would be sprayed, the default among them."""
+    default = plan.default_rate_l_ha
+    if default is None and map_file.boundary is not None:
+        default = map_file.default_rate_l_ha
+    return sorted({*map_file.rates_l_ha, *([] if default is None else [default])})
+
+
+def _fewer(rates: Sequence[float]) -> Sequence[float]:
+    """Return a map's rates thinned out, with both ends, where each cell has one of its own."""
+    if len(rates) <= RATES_MAX:
+        return rates
+    step = len(rates) // RATES_MAX + 1
+    return [*rates[::step], rates[-1]]
+
+
+def _where(survey: Survey, rate_l_ha: float, plan: Plan) -> str:
+    place = survey.rate_spots(rate_l_ha)
+    if not place and rate_l_ha in (plan.default_rate_l_ha, survey.map_file.default_rate_l_ha):
+        place = "the default rate"
+    return f"{rate_l_ha:g} L/ha: {place}" if place else f"{rate_l_ha:g} L/ha"

@@ -1,0 +1,238 @@
+"""From a configuration and its files to the flight map: all that a flight needs of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from shapely import LineString, MultiPolygon
+
+from companion.assembly import build_setup, check_mark
+from companion.config import Config
+from companion.config.tables import PrescriptionTable
+from companion.config.wording import show_value
+from companion.core.frame import LocalFrame
+from companion.core.lines import Polyline
+from companion.core.prescription import FIELD, Prescription
+from companion.core.setup import Setup
+from companion.errors import ConfigError, MapError
+from companion.flight_map import FlightMap, frozen_settings, is_flight_map, read_flight_map
+from companion.flight_map.sources import named_files, sources_of
+from companion.problem import Problem
+from missions.maps.build import build_prescription, frame_for
+from missions.maps.local import make_valid, project
+from missions.maps.model import MapFile
+from missions.maps.plan_lines import read_plan_lines
+from missions.maps.registry import read_area, read_map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapOrder:
+    """What is to be compiled: the settings of the map, and where their files are.
+
+    `config` is the file that says so; None where nobody wrote one.
+    """
+
+    table: PrescriptionTable
+    lines: str | None = None
+    folder: Path = Path()
+    config: Path | None = None
+
+    @classmethod
+    def of(cls, config: Config) -> MapOrder:
+        """Return what a configuration wants to be compiled."""
+        if config.prescription is None:
+            raise ConfigError(
+                f"{config.path}: prescription.file: missing; write the path of the map under "
+                "[prescription]"
+            )
+        return cls(
+            table=config.prescription,
+            lines=None if config.mission is None else config.mission.lines,
+            folder=config.path.parent,
+            config=config.path,
+        )
+
+    def resolve(self, name: str) -> Path:
+        """Return the path of a file that a setting names."""
+        return self.folder / name
+
+    def files(self) -> dict[str, Path]:
+        """Return every file, by the setting that names it."""
+        return named_files(self.table, self.lines, self.folder)
+
+    def refused(self, text: str) -> ConfigError:
+        """Return the refusal of a setting."""
+        return ConfigError(text if self.config is None else f"{self.config}: {text}")
+
+    @contextmanager
+    def naming(self, key: str, value: str) -> Iterator[None]:
+        """Have an error of a map file say which key of the configuration named it."""
+        try:
+            yield
+        except MapError as error:
+            if self.config is None:
+                raise
+            text = f"{self.config}: {key} = {show_value(value)}: {error}"
+            raise MapError(text, code=error.code, fix=error.fix) from error
+
+
+def compiled_setup(config: Config, *, frame: LocalFrame | None = None) -> Setup:
+    """Return the set-up of a flight as `vrspray run` has it, compiled in this very process.
+
+    For the office, where reading maps is no risk to anybody's valves.
+    """
+    order = MapOrder.of(config)
+    path = order.resolve(order.table.file)
+    if is_flight_map(path):
+        return build_setup(config, read_flight_map(path))
+    return build_setup(config, compile_map(order, frame=frame))
+
+
+def read_configured_map(config: Config) -> MapFile:
+    """Return the map that the configuration names, read as it says."""
+    return read_ordered_map(MapOrder.of(config))
+
+
+def read_ordered_map(order: MapOrder) -> MapFile:
+    """Return the map, read as its settings say."""
+    table = order.table
+    with order.naming("prescription.file", table.file):
+        found = read_map(
+            order.resolve(table.file),
+            rate_field=table.rate_field,
+            unit=table.unit,
+            crs=table.crs,
+            layer=table.layer,
+            density_kg_l=table.density_kg_l,
+            flow_width_m=table.flow_width_m,
+            flow_speed_m_s=table.flow_speed_m_s,
+            merge=table.merge,
+            origin=table.origin,
+        )
+    if table.sha256 is not None and not found.sha256.startswith(table.sha256):
+        raise order.refused(
+            f"prescription.sha256 = {show_value(table.sha256)}: {table.file} is another map, its "
+            f"hash begins with {found.sha256[:8]}; look at it by `vrspray map check`, then write "
+            "these digits"
+        )
+    return found
+
+
+def compile_map(
+    order: MapOrder,
+    *,
+    map_file: MapFile | None = None,
+    frame: LocalFrame | None = None,
+    findings: Sequence[Problem] = (),
+) -> FlightMap:
+    """Return the flight map; its frame is that of the map unless one is given.
+
+    Raises:
+        ConfigError: where settings and files do not go together.
+        MapError: where a file cannot be used.
+    """
+    map_file = read_ordered_map(order) if map_file is None else map_file
+    frame = frame_for(map_file) if frame is None else frame
+    table = order.table
+    boundary = None
+    if table.boundary is not None:
+        boundary = _area(order, "prescription.boundary", table.boundary)
+    exclusions = [
+        _area(order, f"prescription.exclusions[{number}]", name)
+        for number, name in enumerate(table.exclusions)
+    ]
+    prescription = build_prescription(
+        map_file,
+        frame,
+        overlap=table.overlap,
+        boundary=boundary,
+        exclusions=exclusions,
+        default_rate_l_ha=table.default_rate_l_ha,
+    )
+    if not _meets(prescription):
+        raise order.refused(
+            f"prescription.boundary and prescription.exclusions leave nothing of {map_file.path} "
+            "to spray; give files of the same field"
+        )
+    local = [project(area, frame) for area in exclusions]
+    return FlightMap(
+        path=map_file.path,
+        frame=frame,
+        prescription=prescription,
+        is_bounded=map_file.cells is None
+        or boundary is not None
+        or map_file.boundary is not None
+        or bool(exclusions),
+        source=map_file.path.name,
+        source_rates_l_ha=map_file.rates_l_ha,
+        exclusions=tuple(
+            area if area.is_valid else (make_valid(area) or MultiPolygon()) for area in local
+        ),
+        polylines=_polylines(order, frame, prescription),
+        frozen=frozen_settings(table, order.lines),
+        sources=sources_of(order.files()),
+        findings=tuple(findings),
+    )
+
+
+def flown_at(
+    config: Config, map_file: MapFile, points: Sequence[tuple[float, float]]
+) -> list[dict[str, object]]:
+    """Return rate and zone at each (latitude, longitude) as a flight with this configuration has.
+
+    Boundary, exclusions, default rate and offset are applied; `inside` says whether the place may
+    be sprayed at all.
+    """
+    compiled = compile_map(replace(MapOrder.of(config), lines=None), map_file=map_file)
+    table = config.prescription or PrescriptionTable(file=str(map_file.path))
+    check_mark(config, table)
+    flown = compiled.moved(table.offset_east_m, table.offset_north_m)
+    latitudes, longitudes = zip(*points, strict=True)
+    east_m, north_m = compiled.frame.to_local_all(latitudes, longitudes)
+    rows: list[dict[str, object]] = []
+    for point, owners in zip(points, flown.owners_at(east_m, north_m), strict=True):
+        inside, zones = FIELD in owners, sorted(owners - {FIELD})
+        rate_l_ha = flown.rate_of(frozenset(zones)) if inside else None
+        names = [flown.zone_name(zone) for zone in zones]
+        if not names and rate_l_ha is not None:
+            names = ["default"]
+        rows.append(
+            {
+                "lat": point[0],
+                "lon": point[1],
+                "rate_l_ha": rate_l_ha,
+                "zone": ", ".join(names) or None,
+                "inside": inside,
+            }
+        )
+    return rows
+
+
+def _area(order: MapOrder, key: str, name: str) -> MultiPolygon:
+    """Return the ground that a file of the configuration covers."""
+    with order.naming(key, name):
+        return read_area(order.resolve(name))
+
+
+def _polylines(order: MapOrder, frame: LocalFrame, ground: Prescription) -> tuple[Polyline, ...]:
+    """Return the lines of a plan that alone are sprayed, if there are any."""
+    if order.lines is None:
+        return ()
+    with order.naming("mission.lines", order.lines):
+        polylines = read_plan_lines(order.resolve(order.lines), frame)
+    if not any(LineString(line).intersects(ground.field) for line in polylines):
+        raise order.refused(
+            f"mission.lines = {show_value(order.lines)}: no line comes over the map; give files of "
+            "the same field"
+        )
+    return polylines
+
+
+def _meets(built: Prescription) -> bool:
+    """Tell whether anything of the map lies on ground that may be sprayed."""
+    if built.cells is not None:
+        return bool(built.cells.outline.intersects(built.field))
+    return any(zone.polygon.intersects(built.field) for zone in built.zones)

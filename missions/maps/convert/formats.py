@@ -1,0 +1,185 @@
+"""The formats in which maps are written; a new one is a function and an entry here.
+
+Each writer gets what its format can hold: zones or cells, the outline of the field and the
+default rate where there is room for them, and otherwise zones and cells that say the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import shapely
+from shapely import MultiPolygon
+
+from companion.errors import MapError
+from missions.maps.convert.plain_zones import outline_of_rates, plain_zones
+from missions.maps.convert.rasterise import cells_of, in_field, north_up
+from missions.maps.crs import is_wgs84
+from missions.maps.local import polygons_of
+from missions.maps.model import MapCells, MapFile, map_error
+
+# Where the operator does not say: narrower than any section of a boom.
+CELL_M = 1.0
+# To which all formats round at most: a tenth of a millimetre on the ground.
+DEGREE_STEP = 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wish:
+    """What the operator says about a file to be written, where its format leaves a choice."""
+
+    cell_m: float | None = None
+    flow_width_m: float | None = None
+    flow_speed_m_s: float | None = None
+    overlap: str = "error"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Writer:
+    """One format: its name, the suffixes of its files ("" is a folder), and how it is written."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    write: Callable[[MapFile, Path, Wish], None]
+
+
+def keeps_cells(map_file: MapFile, wish: Wish) -> bool:
+    """Tell whether a format of cells along meridians and parallels takes those of the map."""
+    if map_file.cells is None or wish.cell_m is not None:
+        return False
+    a, b, _, d, _, _ = map_file.cells.transform
+    return is_wgs84(map_file.cells.crs) and a > 0.0 and b == d == 0.0
+
+
+def _shapefile(map_file: MapFile, path: Path, _: Wish) -> None:
+    from missions.maps.shapefile.writer import write_shapefile
+
+    # Beside the zones a zip has the boundary too, but few programs heed it.
+    write_shapefile(plain_zones(map_file, clip=True), path, boundary=_boundary(map_file))
+
+
+def _geojson(map_file: MapFile, path: Path, _: Wish) -> None:
+    from missions.maps.geojson.writer import write_geojson
+
+    write_geojson(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
+
+
+def _geopackage(map_file: MapFile, path: Path, _: Wish) -> None:
+    from missions.maps.geopackage.writer import write_geopackage
+
+    write_geopackage(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
+
+
+def _kml(map_file: MapFile, path: Path, _: Wish) -> None:
+    from missions.maps.kml.writer import write_kml
+
+    write_kml(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
+
+
+def _isoxml(map_file: MapFile, path: Path, wish: Wish) -> None:
+    from missions.maps.isoxml.writer import write_isoxml
+
+    written = map_file
+    if wish.cell_m is not None:
+        written = replace(map_file, zones=(), cells=_cells(map_file, wish, clip=False))
+    elif map_file.cells is not None and not keeps_cells(map_file, wish):
+        # The field and its default stay what they are, so no zone need stand for them.
+        bare = replace(map_file, boundary=None)
+        written = replace(map_file, zones=tuple(plain_zones(bare, clip=False)), cells=None)
+    write_isoxml(replace(written, boundary=_field(map_file)), path)
+
+
+def _boundary(map_file: MapFile) -> MultiPolygon | None:
+    return None if map_file.boundary is None else _sound(map_file.boundary)
+
+
+def _field(map_file: MapFile) -> MultiPolygon | None:
+    """Return the outline of the field, or where the map has none, of all that has a rate."""
+    if map_file.boundary is not None:
+        return _sound(map_file.boundary)
+    try:
+        return _sound(outline_of_rates(map_file))
+    except MapError:  # cells too speckled for an outline; the format does without
+        return None
+
+
+def _sound(boundary: MultiPolygon) -> MultiPolygon:
+    """Return a boundary whose rings still do not cross when its degrees are rounded in a file."""
+    snapped = shapely.set_precision(boundary, DEGREE_STEP)
+    return MultiPolygon(polygons_of(snapped)) if polygons_of(snapped) else boundary
+
+
+def keeps_raster(map_file: MapFile, wish: Wish) -> bool:
+    """Tell whether a GeoTIFF takes the cells of the map as they are, in whatever CRS they lie."""
+    return map_file.cells is not None and wish.cell_m is None
+
+
+def _geotiff(map_file: MapFile, path: Path, wish: Wish) -> None:
+    from missions.maps.geotiff.writer import write_geotiff
+
+    cells = map_file.cells
+    if cells is None or not keeps_raster(map_file, wish):
+        made = _cells(map_file, wish, clip=True)
+    else:
+        made = in_field(cells, map_file, clip=True)
+    write_geotiff(made, path)
+
+
+def _dji(map_file: MapFile, path: Path, wish: Wish) -> None:
+    from missions.maps.geotiff.writer import write_dji
+
+    cells = _cells(map_file, wish, clip=False)
+    write_dji(cells, path, _field(map_file))
+
+
+def _cells(map_file: MapFile, wish: Wish, *, clip: bool) -> MapCells:
+    if map_file.cells is not None:
+        return north_up(map_file, wish.cell_m, clip=clip)
+    return cells_of(map_file, wish.cell_m or CELL_M, overlap=wish.overlap, clip=clip)
+
+
+def _text_map(map_file: MapFile, path: Path, wish: Wish) -> None:
+    from missions.maps.text.text_lattice import text_map_of
+    from missions.maps.text.text_points import write_text_map
+
+    width_m, speed_m_s = wish.flow_width_m, wish.flow_speed_m_s
+    if width_m is None or speed_m_s is None or not (width_m > 0.0 and speed_m_s > 0.0):
+        raise map_error(
+            path,
+            "rates in this format are L/min, for one width and speed",
+            fix="give both with --flow-width-m and --flow-speed-m-s",
+            code="no-flow-basis",
+        )
+    spacing_m = wish.cell_m
+    if spacing_m is not None and not (spacing_m >= 1.0 and spacing_m == int(spacing_m)):
+        raise map_error(
+            path,
+            f"cells of {spacing_m:g} m are not whole metres, as this format has them",
+            fix="take --cell-m 1, 2, 3, …",
+            code="cell-size",
+        )
+    points = text_map_of(
+        map_file,
+        width_m=width_m,
+        speed_m_s=speed_m_s,
+        spacing_m=None if spacing_m is None else int(spacing_m),
+        overlap=wish.overlap,
+    )
+    write_text_map(points, path)
+
+
+WRITERS = {
+    writer.name: writer
+    for writer in (
+        Writer(name="shapefile", suffixes=(".shp", ".zip"), write=_shapefile),
+        Writer(name="geojson", suffixes=(".geojson", ".json"), write=_geojson),
+        Writer(name="geopackage", suffixes=(".gpkg",), write=_geopackage),
+        Writer(name="kml", suffixes=(".kml", ".kmz"), write=_kml),
+        Writer(name="isoxml", suffixes=(".xml", ".zip", ""), write=_isoxml),
+        Writer(name="geotiff", suffixes=(".tif", ".tiff"), write=_geotiff),
+        Writer(name="dji", suffixes=(".zip", ""), write=_dji),
+        Writer(name="text-map", suffixes=(".txt",), write=_text_map),
+    )
+}

@@ -1,0 +1,197 @@
+"""GeoPackage (OGC 12-128r19): one layer of polygons out of an SQLite database.
+
+Coordinates are always x (or longitude) before y, whatever the CRS says (section 2.1.3.1.1).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from shapely.geometry.base import BaseGeometry
+
+from missions.maps.attributes import column_of, stated_unit
+from missions.maps.bundle import open_bundle
+from missions.maps.geopackage.geopackage_crs import UNDEFINED_SRS, layer_crs
+from missions.maps.geopackage.layers import (
+    LayerTable,
+    check_size,
+    chosen_layer,
+    is_numeric,
+    is_outline,
+    layers_of,
+    value_of,
+)
+from missions.maps.geopackage.sqlite import Cell, Database, check_closed, open_database, quoted
+from missions.maps.geopackage.wkb import CurvedError, Found, Rings, areas_of, polygons_in
+from missions.maps.layer import Column, Layer, Value, check_counts, digest, read_bytes
+from missions.maps.local import Area
+from missions.maps.model import map_error
+from missions.maps.one_of import one_of
+from missions.maps.outline import outline_of
+
+# Bytes of the envelope by its code in the header's flags (section 2.1.3.1.1).
+_ENVELOPE_BYTES = (0, 32, 48, 48, 64)
+_EXPORT_AGAIN = "export the map again"
+
+
+@dataclass(slots=True)
+class _Content:
+    columns: tuple[Column, ...]
+    polygons: list[list[Rings]] = field(default_factory=list)
+    skipped: dict[int, str] = field(default_factory=dict)
+    marks: dict[int, BaseGeometry] = field(default_factory=dict)
+
+    @property
+    def areas(self) -> list[Area | None]:
+        return areas_of(self.polygons)
+
+
+def read_geopackage(path: Path, layer: str | None = None) -> Layer:
+    """Return one layer of a GeoPackage: the one that `layer` names, or the only one with numbers.
+
+    A layer called "boundary" that holds no numbers is the outline of the field.
+    """
+    content, layer = _content_of(path, layer)
+    with open_database(content, path) as database:
+        tables = layers_of(database)
+        chosen = chosen_layer(database, tables, layer)
+        records = _content(database, chosen)
+        crs = layer_crs(database, chosen)
+        outline = next((one for one in tables if is_outline(database, one, chosen)), None)
+        boundary = None
+        if outline is not None:
+            outline_crs = layer_crs(database, outline)
+            if outline_crs is not None:
+                boundary = outline_of(_content(database, outline).areas, outline_crs, path)
+    return Layer(
+        format="geopackage",
+        crs=crs,
+        columns=records.columns,
+        geometries=tuple(records.areas),
+        sha256=digest([content]),
+        boundary=boundary,
+        skipped=records.skipped,
+        marks=records.marks,
+    )
+
+
+def _content_of(path: Path, layer: str | None) -> tuple[bytes, str | None]:
+    """Return the database, the file itself or one in a folder or an archive, and the layer in it.
+
+    What names a file of several is no layer any more.
+    """
+    if not path.is_dir() and path.suffix.casefold() != ".zip":
+        check_closed(path)
+        return read_bytes(path), layer
+    bundle = open_bundle(path)
+    names = bundle.with_suffix(".gpkg")
+    is_file = any(layer in (name, PurePosixPath(name).name) for name in names)
+    name = one_of(bundle, names, layer if is_file or len(names) > 1 else None, kind="GeoPackage")
+    if path.is_dir():
+        check_closed(path / name)
+    elif f"{name}-wal" in bundle.names:
+        raise map_error(
+            path,
+            f"{name} was copied while a program had it open",
+            fix="close the program, and make the archive again",
+            code="file-in-use",
+        )
+    return bundle.read(name), None if is_file or len(names) > 1 else layer
+
+
+def _content(database: Database, table: LayerTable) -> _Content:
+    """Return attributes and ground, in one query: two could list the records in two orders."""
+    check_size(database, table)
+    names = [table.geometry, *(name for name, _, _ in table.columns)]
+    sql = f"SELECT {', '.join(map(quoted, names))} FROM {quoted(table.name)}"
+    values: list[list[Value]] = [[] for _ in table.columns]
+    content = _Content(columns=())
+    vertices = 0
+    for index, (blob, *cells) in enumerate(database.rows(sql)):
+        found = _found(database, table, index, blob)
+        content.polygons.append(found.polygons if found is not None else [])
+        reason = "null-geometry" if found is None else found.reason
+        if reason:
+            content.skipped[index] = reason
+        if found is not None:
+            if found.mark is not None:
+                content.marks[index] = found.mark
+            vertices += found.vertex_count
+            check_counts(database.path, records=index, vertices=vertices)
+        for column, cell, (_, kind, _) in zip(values, cells, table.columns, strict=True):
+            column.append(value_of(cell, kind))
+    content.columns = tuple(_columns(database, table, values))
+    return content
+
+
+def _columns(
+    database: Database, table: LayerTable, values: Sequence[Sequence[Value]]
+) -> Iterator[Column]:
+    titles = _titles(database, table)
+    for (name, kind, _), cells in zip(table.columns, values, strict=True):
+        unit = stated_unit(titles.get(name.casefold(), ()), column=name, path=database.path)
+        yield column_of(name, cells, declared=is_numeric(kind), unit=unit)
+
+
+def _titles(database: Database, table: LayerTable) -> dict[str, list[str]]:
+    """Return what the optional table of titles and descriptions says of each column."""
+    if "gpkg_data_columns" not in database.tables:
+        return {}
+    database.check("gpkg_data_columns")
+    sql = "SELECT table_name, column_name, name, title, description FROM gpkg_data_columns"
+    return {
+        str(column).casefold(): [str(text) for text in texts if text]
+        for name, column, *texts in database.rows(sql)
+        if str(name).casefold() == table.name.casefold()
+    }
+
+
+def _found(database: Database, table: LayerTable, index: int, blob: Cell) -> Found | None:
+    """Return the polygons of one record, None where it has no geometry."""
+    if blob is None:
+        return None
+    try:
+        if not isinstance(blob, bytes):
+            raise ValueError("it is no geometry")
+        srs_id, start = _header(blob)
+        found = polygons_in(blob, start)
+    except CurvedError as error:
+        raise map_error(
+            database.path,
+            f"record {index + 1} of the layer {table.name} has round edges ({error})",
+            fix="turn curves into straight edges (in QGIS: Convert to straight segments)",
+            code="curved-geometry",
+        ) from None
+    except (ValueError, struct.error) as error:
+        raise map_error(
+            database.path,
+            f"the geometry of record {index + 1} of the layer {table.name} is broken ({error})",
+            fix=_EXPORT_AGAIN,
+            code="broken-geometry",
+        ) from None
+    if srs_id not in (table.srs_id, *UNDEFINED_SRS):
+        raise map_error(
+            database.path,
+            f"record {index + 1} of the layer {table.name} is in the coordinate reference system "
+            f"{srs_id}, its layer in {table.srs_id}",
+            fix=_EXPORT_AGAIN,
+            code="wrong-crs",
+        )
+    return found
+
+
+def _header(blob: bytes) -> tuple[int, int]:
+    """Return the CRS's number, and where the well-known binary begins (section 2.1.3)."""
+    if blob[:2] != b"GP" or len(blob) < 8:
+        raise ValueError("it has no GeoPackage header")
+    flags = blob[3]
+    if flags & 0x20:
+        raise ValueError("it is in a private encoding")
+    envelope = flags >> 1 & 0x07
+    if envelope >= len(_ENVELOPE_BYTES):
+        raise ValueError(f"its envelope has the code {envelope}")
+    srs_id = struct.unpack_from("<i" if flags & 1 else ">i", blob, 4)[0]
+    return srs_id, 8 + _ENVELOPE_BYTES[envelope]

@@ -1,0 +1,176 @@
+"""Cells of a raster as rates: what is no data, what is zero, and what is neither.
+
+No data and 0 L/ha are two things: over both the valves close, but one is outside the map. Nobody
+but the file can say which number means no data, so a raster with -9999 in it and no word of that
+is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.errors import MapError
+from missions.maps.layer import Band
+from missions.maps.model import Problem, map_error
+
+Cells = NDArray[Any]
+Bools = NDArray[np.bool_]
+
+# More are no zone numbers any more.
+_CLASSES_MAX = 9
+# No rate of anything, in any unit; programs fill with the largest number of a type.
+_FILL_MIN = 1e30
+# Types whose largest number is a fill. That of a byte, 255, may be a rate.
+_FILLED = ("int16", "uint16", "int32", "uint32", "int64", "uint64")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawBand:
+    """One band as the file has it; `hidden` are cells that a mask in the file leaves out."""
+
+    name: str
+    values: Cells
+    nodata: float | None
+    hidden: Bools | None = None
+    scale: float = 1.0
+    offset: float = 0.0
+    unit: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadBand:
+    """One band understood: what to say of it, and why it can be no rate, if so."""
+
+    band: Band
+    problems: tuple[Problem, ...] = ()
+    fault: MapError | None = None
+
+
+def read_band(raw: RawBand, path: Path) -> ReadBand:
+    """Return a band with NaN for no data."""
+    # What a damaged file makes of numbers may overflow, and its NaN may "signal".
+    with np.errstate(all="ignore"):
+        return _read_band(raw, path)
+
+
+def _read_band(raw: RawBand, path: Path) -> ReadBand:
+    values = raw.values.astype(np.float64)
+    missing = np.isnan(values)
+    if raw.hidden is not None:
+        missing |= raw.hidden
+    problems = []
+    if raw.nodata is not None and not np.isnan(raw.nodata):
+        empty = values == _as_stored(raw.nodata, raw.values.dtype)
+        count = int((empty & ~missing).sum())
+        if raw.nodata == 0.0 and count:
+            problems.append(_nodata_zero(raw.name, count))
+        missing |= empty
+    filled = _filled(raw, missing)
+    if (raw.scale, raw.offset) != (1.0, 0.0):
+        if not (0.0 < abs(raw.scale) < 1e9 and abs(raw.offset) < 1e9):
+            text = f"{raw.name} is to be multiplied by {raw.scale:g} with {raw.offset:g} added"
+            raise map_error(path, text, fix="export the map again", code="bad-rate")
+        values = values * raw.scale + raw.offset
+    values[missing] = np.nan
+    return ReadBand(
+        band=Band(name=raw.name, values=values, unit=raw.unit),
+        problems=tuple(problems),
+        fault=filled_fault(raw, filled, path) if filled else _fault(raw, values, path),
+    )
+
+
+def usable(bands: Sequence[ReadBand]) -> tuple[Band, ...]:
+    """Return the bands, or refuse when none of them can be a rate.
+
+    One among several that can is not in the way: NDVI is below zero, and nobody sprays by it.
+    """
+    faults = [one.fault for one in bands if one.fault is not None]
+    if faults and len(faults) == len(bands):
+        raise faults[0]
+    return tuple(one.band for one in bands)
+
+
+def class_problem(band: Band) -> Problem | None:
+    """Return the warning that a band looks like zone numbers 1, 2, 3, …, and not like rates."""
+    values = band.values[~np.isnan(band.values)]
+    if not values.size or not (values.min() >= 0.0 and values.max() <= _CLASSES_MAX):
+        return None
+    if not bool((values == np.rint(values)).all()):
+        return None
+    classes = np.flatnonzero(np.bincount(values.astype(np.int64))[1:]) + 1
+    if len(classes) < 2 or len(classes) != classes[-1]:
+        return None
+    return Problem(
+        severity="warning",
+        code="class-raster",
+        text=f"its values are {', '.join(map(str, classes.tolist()))}: these look like numbers of "
+        "zones and not like rates",
+        where=band.name,
+        fix="make sure that they are rates, or export the map with the rate of each zone",
+    )
+
+
+def _as_stored(nodata: float, dtype: np.dtype[Any]) -> float:
+    """Return the declared value as the cells' type holds it: -3.4e38 is cut to 32 bits."""
+    if dtype.kind != "f":
+        return nodata
+    return float(dtype.type(nodata))
+
+
+def _nodata_zero(name: str, count: int) -> Problem:
+    return Problem(
+        severity="warning",
+        code="nodata-zero",
+        text=f"the file declares 0 as no data: {count} cells count as outside the map, not as "
+        "0 L/ha (the valves close over both)",
+        where=name,
+        fix="export the map with -9999 for no data if 0 is meant as a rate",
+    )
+
+
+def _filled(raw: RawBand, missing: Bools) -> float | None:
+    """Return the number that a program left where there is nothing, or None."""
+    dtype = raw.values.dtype
+    if dtype.name in _FILLED:
+        largest = np.iinfo(dtype).max
+        found = bool(((raw.values == largest) & ~missing).any())
+        return float(largest) if found else None
+    if dtype.kind == "f":
+        found_cells = (raw.values >= _FILL_MIN) & ~missing & np.isfinite(raw.values)
+        return float(raw.values[found_cells][0]) if found_cells.any() else None
+    return None
+
+
+def filled_fault(raw: RawBand, value: float, path: Path) -> MapError:
+    """Return the refusal of a number that stands for no data, which the file does not say."""
+    beside = "" if raw.nodata is None else f" beside its no-data value {raw.nodata:.6g}"
+    return map_error(
+        path,
+        f"{raw.name} holds {value:.6g}{beside}, which is no rate and not declared as no data",
+        fix=f"export the map again with {value:.6g} declared as its no-data value",
+        code="nodata-undeclared",
+    )
+
+
+def _fault(raw: RawBand, values: NDArray[np.float64], path: Path) -> MapError | None:
+    """Return why a band can be no rate: infinite or negative numbers."""
+    wrong = np.isinf(values) | (values < 0.0)
+    if not wrong.any():
+        return None
+    found = values[wrong]
+    if bool((found == found[0]).all()) and np.isfinite(found[0]):
+        return filled_fault(raw, float(found[0]), path)
+    row, column = np.argwhere(wrong)[0].tolist()
+    return map_error(
+        path,
+        f"{raw.name} holds {float(found[0]):.6g} in row {row + 1}, column {column + 1}, and "
+        f"{len(found)} such numbers in all, which are no rates",
+        fix="correct the values, or export the map again",
+        code="bad-rate",
+    )

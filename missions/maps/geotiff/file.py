@@ -1,0 +1,245 @@
+"""The bytes of a GeoTIFF, taken apart by GDAL (rasterio) within bounds.
+
+GDAL is given the bytes and nothing else: it opens no other file, format or address, and what it
+would allocate is known from the head of the file before any cell is read.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pyproj import CRS
+
+from companion.errors import MapError
+from missions.maps.crs import parse_crs
+from missions.maps.geotiff.bands import RawBand, ReadBand, read_band
+from missions.maps.geotiff.tags import check_tags
+from missions.maps.model import Affine, map_error
+from missions.maps.xmltree import parse_xml
+
+MAX_CELLS = 16_000_000
+MAX_BANDS = 64
+MAX_VALUES = 64_000_000
+_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_MAX_PAGES = 1_000
+# No file beside the map is looked for, and no world file: ours is read by other rules.
+_OPTIONS = {
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    "GDAL_PAM_ENABLED": False,
+    "GDAL_GEOREF_SOURCES": "INTERNAL",
+    "GDAL_CACHEMAX": 64,
+    "GDAL_NUM_THREADS": "1",
+}
+_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+_UNIT_TAGS = ("unit", "units", "uom")
+# The name of the copy in memory, which means nothing to anybody.
+_COPY = re.compile(
+    r"'?(?:GTIFF_DIR:\d+:)?(?:/vsimem/)?[0-9a-f-]{36}(?:/[^\s:']*)?(?:\.tif)?'?:?\s*"
+)
+
+_NO_PIXELS = re.compile(r"IReadBlock|Read failed")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Raster:
+    """What a file says: `transform` from corners of cells, None where it does not say."""
+
+    crs: CRS | None
+    transform: Affine | None
+    bands: tuple[ReadBand, ...]
+    unit: str | None
+
+
+def gdal(path: Path) -> Any:
+    """Return rasterio, or say how to get it."""
+    try:
+        import rasterio
+        import rasterio.io
+    except ImportError:
+        raise map_error(
+            path,
+            "reading and writing GeoTIFF takes the library rasterio, which is not installed",
+            fix="install it with: pip install 'vrspray[maps]'",
+            code="missing-library",
+        ) from None
+    return rasterio
+
+
+def read_raster(content: bytes, path: Path, *, layer: str | None, described: bool) -> Raster:
+    """Return all bands of a GeoTIFF; `described`: another file says what each of them is."""
+    if not content.startswith(_MAGIC):
+        raise map_error(
+            path, "this is no TIFF file", fix="export the map again as GeoTIFF",
+            code="unknown-format",
+        )  # fmt: skip
+    with _opened(content, path, layer) as source:
+        _check_size(source, path)
+        _check_numbers(source, path)
+        if not described:
+            _check_no_picture(source, path)
+        crs, transform = _crs(source, path), _transform(source, path)
+        tags = {name.casefold(): text for name, text in source.tags().items()}
+        alpha = set() if described else _alpha(source)
+        bands = tuple(
+            read_band(_raw_band(source, index, described=described), path)
+            for index in source.indexes
+            if index not in alpha
+        )
+    unit = next((tags[name] for name in _UNIT_TAGS if tags.get(name)), None)
+    return Raster(crs=crs, transform=transform, bands=bands, unit=unit)
+
+
+@contextmanager
+def _opened(content: bytes, path: Path, layer: str | None) -> Iterator[Any]:
+    rasterio = gdal(path)
+    from rasterio._err import CPLE_BaseError
+
+    broken = (
+        rasterio.errors.RasterioError, CPLE_BaseError, OSError, ValueError, OverflowError,
+         MemoryError, KeyError, AttributeError,
+    )  # fmt: skip
+    try:
+        for description in check_tags(content):
+            # GDAL does without one that it cannot read, and so without the scale of the rates.
+            parse_xml(description, path, name="its description of the bands")
+        with warnings.catch_warnings(), rasterio.Env(**_OPTIONS):
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.io.MemoryFile(content) as memory, memory.open(driver="GTiff") as source:
+                page = _page(source.subdatasets, path, layer)
+                if page is None:
+                    yield source
+                else:
+                    with rasterio.open(page, driver="GTiff") as one:
+                        yield one
+    except MapError:
+        raise
+    except broken as error:
+        reason = _COPY.sub("", f"{error.__cause__ or error}")[:120]
+        if _NO_PIXELS.search(reason):
+            reason = "its pixels cannot be read"
+        raise map_error(
+            path,
+            f"the GeoTIFF is cut short or damaged ({reason})",
+            fix="copy it again, or export the map again",
+            code="truncated",
+        ) from None
+
+
+def _page(pages: list[str], path: Path, layer: str | None) -> str | None:
+    """Return the picture that is meant in a file of several, None in a file of one."""
+    count = len(pages)
+    if count <= 1:
+        if layer not in (None, "1", path.stem):
+            raise map_error(
+                path, f"it is not the layer {layer!r}", fix="leave out --layer", code="no-layer"
+            )
+        return None
+    numbers = [str(number) for number in range(1, min(count, _MAX_PAGES) + 1)]
+    if layer not in numbers:
+        raise map_error(
+            path,
+            f"the file holds {count} pictures"
+            + (f", and none called {layer!r}" if layer is not None else ""),
+            fix=f"name one of them with --layer, 1 to {count}",
+            code="several-layers" if layer is None else "no-layer",
+        )
+    return pages[int(layer) - 1]
+
+
+def _check_size(source: Any, path: Path) -> None:
+    """Refuse what would take the vehicle's memory; the head of the file says it all."""
+    cells, bands = source.width * source.height, source.count
+    block = max(rows * columns for rows, columns in source.block_shapes)
+    for count, limit, of in (
+        (cells, MAX_CELLS, "cells"),
+        (bands, MAX_BANDS, "bands"),
+        (cells * bands, MAX_VALUES, "values"),
+        (block * bands, MAX_VALUES, "values in one block"),
+    ):
+        if not 0 < count <= limit:
+            raise map_error(
+                path,
+                f"its {count} {of} are more than {limit}",
+                fix="cut the map to one field, or make its cells larger",
+                code="too-large",
+            )
+
+
+def _check_no_picture(source: Any, path: Path) -> None:
+    """Refuse colours."""
+    colours = {interpretation.name for interpretation in source.colorinterp}
+    bytes_only = set(source.dtypes) == {"uint8"}
+    if "palette" in colours or (bytes_only and {"red", "green", "blue"} <= colours):
+        raise map_error(
+            path,
+            "this is a picture: its numbers are colours, not rates",
+            fix="export the rates themselves as GeoTIFF (raw values, not a rendered image)",
+            code="picture",
+        )
+
+
+def _check_numbers(source: Any, path: Path) -> None:
+    if any("complex" in dtype for dtype in source.dtypes):
+        raise map_error(
+            path, "its values are complex numbers", fix="export the rates", code="bad-rate"
+        )
+
+
+def _alpha(source: Any) -> set[int]:
+    """Return the bands that only say which cells are there."""
+    return {
+        index
+        for index, kind in zip(source.indexes, source.colorinterp, strict=True)
+        if kind.name == "alpha"
+    }
+
+
+def _crs(source: Any, path: Path) -> CRS | None:
+    text = source.crs.to_wkt() if source.crs else ""
+    return parse_crs(text, path=path, source="what it says of its coordinates") if text else None
+
+
+def _transform(source: Any, path: Path) -> Affine | None:
+    """Return where the cells lie; GDAL turns the centres of `PixelIsPoint` into corners."""
+    transform = source.transform
+    found = (transform.a, transform.b, transform.c, transform.d, transform.e, transform.f)
+    if found == _IDENTITY:
+        if source.gcps[0] or source.rpcs:
+            raise map_error(
+                path,
+                "it has control points, but no rows and columns of a map",
+                fix="warp it to a map projection (in QGIS: Georeferencer), and export it again",
+                code="not-georeferenced",
+            )
+        return None
+    a, b, c, d, e, f = found
+    if not (a * e - b * d != 0.0 and all(abs(value) <= 1e9 for value in (a, b, c, d, e, f))):
+        raise map_error(
+            path,
+            "its cells have no size, or are no place on earth",
+            fix="export the map again",
+            code="not-georeferenced",
+        )
+    return found
+
+
+def _raw_band(source: Any, index: int, *, described: bool) -> RawBand:
+    at = index - 1
+    flags = {flag.name for flag in source.mask_flag_enums[at]}
+    hides = "per_dataset" in flags and not (described and "alpha" in flags)
+    tags = {name.casefold(): text for name, text in source.tags(index).items()}
+    return RawBand(
+        name=" ".join((source.descriptions[at] or "").split())[:60] or f"band {index}",
+        values=source.read(index),
+        nodata=source.nodatavals[at],
+        hidden=source.read_masks(index) == 0 if hides else None,
+        scale=source.scales[at],
+        offset=source.offsets[at],
+        unit=source.units[at] or next((tags[name] for name in _UNIT_TAGS if tags.get(name)), None),
+    )

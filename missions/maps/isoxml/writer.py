@@ -1,0 +1,154 @@
+"""Writing ISOXML 4 task data: zones as polygons, cells as a grid of type 2, rates by DDI 0001.
+
+A raw value of DDI 0001 is 0.0001 L/ha. The treatment zones for default, position lost and out of
+field are always there, the latter two with rate 0. A grid of type 2 has a value in every cell: a
+cell without a rate gets the default inside the field where the map has one, else 0, which both
+close the nozzles as before.
+"""
+
+from __future__ import annotations
+
+import shutil
+import zipfile
+from io import BytesIO
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+import numpy as np
+
+from missions.maps.isoxml.elements import (
+    DEFAULT_CODE,
+    add_field,
+    add_polygons,
+    add_treatment_zone,
+    decimal,
+    new_task_data,
+    printable,
+    raw_rate,
+)
+from missions.maps.isoxml.grouping import grouped, outline
+from missions.maps.model import MapCells, MapFile, map_error
+from missions.maps.whole_file import not_written, write_whole
+
+GRID_NAME = "GRD00001"
+_TASK_DATA = "TASKDATA.XML"
+# A zip has times of its members; the earliest it can hold makes the same bytes every time.
+_NO_TIME = (1980, 1, 1, 0, 0, 0)
+
+
+def write_isoxml(map_file: MapFile, path: Path) -> None:
+    """Write a map as `….xml` with its grid beside, as a `.zip`, or as a folder (no suffix)."""
+    suffix = "" if path.is_dir() else path.suffix.casefold()
+    if suffix not in (".xml", ".zip", ""):
+        raise map_error(
+            path,
+            f"ISOXML is not written as {suffix}",
+            fix="name a TASKDATA.XML, a .zip, or a folder",
+            code="unknown-format",
+        )
+    task_data, grid = _content(map_file, path)
+    if suffix == ".zip":
+        write_whole(path, _zipped(task_data, grid))
+    elif suffix == ".xml":
+        _write_files(path, task_data, grid)
+    else:
+        _write_folder(path, task_data, grid)
+
+
+def _content(map_file: MapFile, path: Path) -> tuple[bytes, bytes | None]:
+    """Return the bytes of TASKDATA.XML, and of the grid where there is one."""
+    root, task = new_task_data(printable(map_file.path.stem))
+    boundary = map_file.boundary
+    default_l_ha = map_file.default_rate_l_ha if boundary is not None else None
+    default_raw = raw_rate(default_l_ha or 0.0)
+    if boundary is None:
+        boundary = outline(map_file.zones, path)
+    if boundary is not None:
+        add_field(root, task, boundary)
+    for code, (name, raw) in enumerate(
+        (("Default", default_raw), ("PositionLost", 0), ("OutOfField", 0)), DEFAULT_CODE
+    ):
+        add_treatment_zone(task, code, name, raw)
+    grid = None
+    if map_file.cells is None:
+        for code, zone in enumerate(grouped(map_file.zones, path), DEFAULT_CODE + 3):
+            add_polygons(add_treatment_zone(task, code, zone.name, zone.raw), zone.polygons)
+    else:
+        grid = _add_grid(task, map_file.cells, default_raw, path)
+    indent(root)
+    return tostring(root, encoding="UTF-8", xml_declaration=True) + b"\n", grid
+
+
+def _add_grid(task: Element, cells: MapCells, default_raw: int, path: Path) -> bytes:
+    """Add the GRD to a task and return its bytes, rows from south to north."""
+    a, b, west, d, e, south = cells.transform
+    if cells.crs.to_epsg() != 4326 or b != 0.0 or d != 0.0:
+        raise map_error(
+            path,
+            "an ISOXML grid has its rows and columns along latitude and longitude, which this "
+            "map has not",
+            fix="convert it to zones or to cells in EPSG:4326 first",
+            code="grid-crs",
+        )
+    rates = cells.rates_l_ha
+    rows, columns = rates.shape
+    if a < 0.0:
+        rates, west, a = rates[:, ::-1], west + columns * a, -a
+    if e < 0.0:
+        rates, south, e = rates[::-1], south + rows * e, -e
+    raw = np.where(np.isnan(rates), default_raw, np.rint(rates * 1e4)).astype("<i4")
+    SubElement(
+        task,
+        "GRD",
+        A=decimal(south), B=decimal(west), C=decimal(e), D=decimal(a), E=str(columns), F=str(rows),
+        G=GRID_NAME, H=str(4 * raw.size), I="2", J=str(DEFAULT_CODE),
+    )  # fmt: skip
+    return raw.tobytes()
+
+
+def _zipped(task_data: bytes, grid: bytes | None) -> bytes:
+    """Return a zip with a folder TASKDATA, as terminals look for on a stick."""
+    members = [(_TASK_DATA, task_data), *([(f"{GRID_NAME}.BIN", grid)] if grid else [])]
+    buffer = BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in members:
+            member = zipfile.ZipInfo(f"TASKDATA/{name}", _NO_TIME)
+            member.external_attr = 0o644 << 16
+            # A grid of a few rates would shrink so much that it looks like a zip bomb.
+            packed = name == _TASK_DATA
+            member.compress_type = zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED
+            archive.writestr(member, content)
+    return buffer.getvalue()
+
+
+def _write_files(path: Path, task_data: bytes, grid: bytes | None) -> None:
+    """Write the XML, after its grid; the grid of another task beside it is left alone."""
+    if grid is not None:
+        beside = {file.name.casefold(): file for file in path.parent.glob("*") if file.is_file()}
+        there = beside.get(f"{GRID_NAME}.bin".casefold())
+        if there is not None and not path.exists():
+            raise map_error(
+                path,
+                f"there is a {there.name} of another task beside it",
+                fix="write into a folder of its own",
+                code="file-exists",
+            )
+        write_whole(there or path.with_name(f"{GRID_NAME}.BIN"), grid)
+    write_whole(path, task_data)
+
+
+def _write_folder(path: Path, task_data: bytes, grid: bytes | None) -> None:
+    """Write into a folder; a new one appears with both files or not at all."""
+    if path.is_dir():
+        _write_files(path / _TASK_DATA, task_data, grid)
+        return
+    part = path.with_name(f".{path.name}.part")
+    try:
+        try:
+            part.mkdir()
+            _write_files(part / _TASK_DATA, task_data, grid)
+            part.rename(path)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+    except OSError as error:
+        raise not_written(path, error) from None

@@ -1,0 +1,11 @@
+"""What is wrong or remarkable about a map that can be read.
+
+`read_map` refuses what cannot be used; here is what the operator should look at before a flight.
+docs/map-check.md lists every code.
+"""
+
+from missions.maps.lint.check import check_map, summary
+from missions.maps.lint.plan import Plan, Sprayer
+from missions.maps.points import point_rates
+
+__all__ = ["Plan", "Sprayer", "check_map", "point_rates", "summary"]

@@ -1,0 +1,195 @@
+"""Zones that are over before the sprayer has settled on their rate, and narrower than a strip."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from shapely import STRtree
+
+from companion.wording import counted
+from missions.maps.lint.plan import Sprayer
+from missions.maps.lint.runs import cell_steps, runs_along
+from missions.maps.lint.shapes import SLIVER_WIDTH_M, SMALL_M2
+from missions.maps.lint.survey import (
+    PLACES_MAX,
+    Floats,
+    Ints,
+    Objects,
+    Survey,
+    area_text,
+    some,
+)
+from missions.maps.model import Problem
+
+# A zone as wide as a strip is not narrower because of a rounding in its coordinates.
+STRIP_SHARE = 0.999
+_ACROSS = {
+    "centre": "the rate under its own centre",
+    "mean": "the mean of the rates under it",
+    "max": "the largest rate under it",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pieces:
+    """Connected ground of one rate: whose, mean extent along and across the passes, and area."""
+
+    ground: Objects
+    owner: Ints
+    along_m: Floats
+    across_m: Floats
+    area_m2: Floats
+
+
+def short_problems(survey: Survey, sprayer: Sprayer | None) -> list[Problem]:
+    """Return what is too short along the passes, or too narrow across them, for this sprayer."""
+    if sprayer is None or not survey.rated.any() or not survey.is_simple:
+        return []
+    direction = _direction(survey, sprayer.angle_deg)
+    if survey.cells is not None:
+        return _cell_problems(survey, sprayer, direction)
+    pieces = _pieces(survey, sprayer, direction)
+    problems = []
+    short = pieces.along_m < sprayer.length_min_m
+    if short.any():
+        where = _where(survey, pieces, pieces.along_m, np.flatnonzero(short))
+        least_m, area_m2 = float(pieces.along_m[short].min()), float(pieces.area_m2[short].sum())
+        problems.append(_short(sprayer, int(short.sum()), area_m2, least_m, where))
+    narrow = ~short & (pieces.across_m < sprayer.strip_m * STRIP_SHARE)
+    if narrow.any():
+        where = _where(survey, pieces, pieces.across_m, np.flatnonzero(narrow))
+        count, area_m2 = int(narrow.sum()), float(pieces.area_m2[narrow].sum())
+        text = f"{counted(count, 'place')} of one rate, {area_text(area_m2)} in all,"
+        problems.append(_narrow(sprayer, text, where))
+    return problems
+
+
+def _short(sprayer: Sprayer, count: int, area_m2: float, least_m: float, where: str) -> Problem:
+    # Cut down, so that the speed named is one that does.
+    speed_m_s = math.floor(10.0 * least_m / sprayer.settle_s) / 10.0
+    slower = f"fly at {speed_m_s:g} m/s or slower, or "
+    return Problem(
+        severity="warning",
+        code="short-zone",
+        text=f"{counted(count, 'place')} of one rate, {area_text(area_m2)} in all, shorter "
+        f"along the passes than the {sprayer.length_min_m:.2f} m that a change of rate takes at "
+        f"{sprayer.speed_m_s:g} m/s (lag {sprayer.lag_s:.3f} s and one PWM period of "
+        f"{sprayer.period_s:.3f} s); the shortest is {least_m:.2f} m",
+        where=where,
+        fix=(slower if speed_m_s >= max(sprayer.speed_min_m_s, 0.1) else "")
+        + "make them longer or merge them with their neighbours",
+    )
+
+
+def _narrow(sprayer: Sprayer, text: str, where: str) -> Problem:
+    return Problem(
+        severity="warning",
+        code="narrow-zone",
+        text=f"{text} narrower than the strip of one valve ({sprayer.strip_m:.2f} m); each valve "
+        f"sprays {_ACROSS.get(sprayer.across, sprayer.across)} (prescription.across)",
+        where=where,
+        fix="make the map no finer than the strips, or choose prescription.across",
+    )
+
+
+def _direction(survey: Survey, angle_deg: float | None) -> Floats:
+    """Return the direction (east, north) of the passes: as planned, else along the longer side."""
+    if angle_deg is not None:
+        angle = math.radians(angle_deg)
+        return np.array([math.sin(angle), math.cos(angle)])
+    if survey.cells is not None:
+        rows, columns = survey.rates.shape
+        along_row, along_column = cell_steps(survey.cells, survey.frame)
+        row_m = columns * np.hypot(*along_row)
+        return _unit(along_row if row_m >= rows * np.hypot(*along_column) else along_column)
+    hull = shapely.convex_hull(shapely.multipoints(shapely.get_coordinates(survey.local)))
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(hull))
+    sides = np.diff(corners[:3], axis=0) if len(corners) >= 3 else np.array([[0.0, 1.0]])
+    return _unit(sides[int(np.argmax(np.hypot(*sides.T)))])
+
+
+def _unit(vector: Floats) -> Floats:
+    length = float(np.hypot(*vector))
+    return vector / length if length > 0.0 else np.array([0.0, 1.0])
+
+
+def _pieces(survey: Survey, sprayer: Sprayer, direction: Floats) -> Pieces:
+    """Return the ground of every rate that has anything small, joined where its zones touch.
+
+    Ground joined of parts that are all long enough is never shorter than the shortest of them,
+    so the other rates need not be joined. Slivers have a problem of their own.
+    """
+    alone = _measured(survey.local, direction)
+    small = (alone.along_m < sprayer.length_min_m) | (
+        alone.across_m < sprayer.strip_m * STRIP_SHARE
+    )
+    rates = np.unique(survey.rates[alone.owner[small]])
+    chosen = np.flatnonzero(np.isin(survey.rates, rates))
+    order = chosen[np.argsort(survey.rates[chosen], kind="stable")]
+    starts = np.flatnonzero(np.diff(survey.rates[order], prepend=-1.0))
+    groups = np.split(survey.local[order], starts[1:])
+    united = [group[0] if len(group) == 1 else shapely.union_all(group) for group in groups]
+    return _measured(np.array(united, dtype=object), direction)
+
+
+def _measured(areas: Objects, direction: Floats) -> Pieces:
+    """Return all parts of some size, with their mean length along the passes and across them.
+
+    Mean length is area over the extent across; a strip that lies across the passes is as short
+    as they find it, however long it is itself.
+    """
+    parts, owner = shapely.get_parts(areas, return_index=True)
+    area_m2 = shapely.area(parts)
+    kept = (area_m2 >= SMALL_M2) & (2.0 * area_m2 >= SLIVER_WIDTH_M * shapely.length(parts))
+    parts, owner, area_m2 = parts[kept], owner[kept], area_m2[kept]
+    points, part = shapely.get_coordinates(parts, return_index=True)
+    first = np.flatnonzero(np.diff(part, prepend=-1))
+
+    def extent_m(axis: Floats) -> Floats:
+        if not len(first):
+            return np.empty(0)
+        along = points @ axis
+        result: Floats = np.maximum.reduceat(along, first) - np.minimum.reduceat(along, first)
+        return result
+
+    return Pieces(
+        ground=parts,
+        owner=owner,
+        along_m=area_m2 / extent_m(np.array([direction[1], -direction[0]])),
+        across_m=area_m2 / extent_m(direction),
+        area_m2=area_m2,
+    )
+
+
+def _where(survey: Survey, pieces: Pieces, size_m: Floats, which: Ints) -> str:
+    """Return the smallest pieces: of which zone, where and how large."""
+    ordered = which[np.argsort(size_m[which], kind="stable")]
+    tree = STRtree(survey.local)
+    named = []
+    for index in ordered[:PLACES_MAX].tolist():
+        inside = shapely.point_on_surface(pieces.ground[index])
+        zones = [zone for zone in tree.query(inside, "intersects").tolist() if survey.rated[zone]]
+        name = survey.zone_name(zones[0]) if zones else "a zone"
+        named.append(f"{name} at {survey.spot(pieces.ground[index])} ({size_m[index]:.2f} m)")
+    return some(named, len(ordered))
+
+
+def _cell_problems(survey: Survey, sprayer: Sprayer, direction: Floats) -> list[Problem]:
+    """Return the same for cells: runs of one rate along the axis that is nearer to the passes."""
+    runs = runs_along(survey, direction)
+    problems = []
+    least = math.ceil(sprayer.length_min_m / runs.step_m * (1.0 - 1e-6))
+    short = survey.rated & (runs.length < least)
+    if short.any():
+        shortest = int(runs.length[short].min())
+        count = int(np.rint((1.0 / runs.length[short]).sum()))
+        where = survey.cell_spots(short & (runs.length == shortest))
+        area_m2 = float(survey.area_m2[short].sum())
+        problems.append(_short(sprayer, count, area_m2, shortest * runs.step_m, where))
+    if runs.width_m < sprayer.strip_m * STRIP_SHARE:
+        text = f"the cells are {runs.width_m:.2f} m wide across the passes,"
+        problems.append(_narrow(sprayer, text, survey.cell_spots(survey.rated)))
+    return problems

@@ -1,0 +1,255 @@
+"""A map as a picture: rates in colours, with legend, north and a scale.
+
+With `picture_ground` and `picture_legend` all that needs matplotlib here (extra `plot`). Drawn is
+what would be sprayed: the default rate as ground of its own, nothing beyond the map's boundary.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import shapely
+from shapely.errors import ShapelyError
+
+from companion.core.frame import LocalFrame
+from missions.maps.build import frame_for
+from missions.maps.cells import bounds_deg
+from missions.maps.local import project_all
+from missions.maps.model import MapFile, map_error, unusable_polygons
+from missions.maps.totals import Totals, as_sprayed, totals
+from missions.maps.whole_file import write_whole
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+SUFFIXES = (".png", ".svg", ".pdf")
+# 1600 by 1200 pixels at most; the map's own part of them, and what legend and title take.
+DPI = 100
+_MAP_MAX_IN, _MAP_MIN_IN = (11.6, 10.0), (5.0, 4.0)
+_LEFT_IN, _RIGHT_IN, _BELOW_IN, _ABOVE_IN = 0.4, 4.0, 0.9, 1.1
+_FONT = "DejaVu Sans"  # comes with matplotlib
+# No date and no version in the file: the same map makes the same bytes.
+_METADATA: dict[str, dict[str, str | None]] = {
+    ".png": {"Software": None},
+    ".svg": {"Date": None},
+    ".pdf": {"CreationDate": None},
+}
+
+
+class Sheet(NamedTuple):
+    """The paper: its size, the map's place on it in inches, and the ground in that place [m]."""
+
+    size_in: tuple[float, float]
+    map_in: tuple[float, float]
+    ground_m: tuple[float, float, float, float]
+
+    @property
+    def metres_per_inch(self) -> float:
+        """Return the scale."""
+        return (self.ground_m[2] - self.ground_m[0]) / self.map_in[0]
+
+
+def draw(map_file: MapFile, out: Path, *, title: str) -> Totals:
+    """Draw a map into a PNG, SVG or PDF file and return the ground of each rate."""
+    suffix = out.suffix.casefold()
+    if suffix not in SUFFIXES:
+        raise map_error(
+            out,
+            f"pictures are not written as {suffix or 'a folder'}",
+            fix=f"take one of {', '.join(SUFFIXES)}",
+            code="unknown-format",
+        )
+    if importlib.util.find_spec("matplotlib") is None:
+        raise map_error(
+            out,
+            "no picture without matplotlib",
+            fix="install it with: pip install 'vrspray[plot]'",
+            code="missing-library",
+        )
+    if not map_file.zones and map_file.cells is None:
+        raise map_error(
+            map_file.path, "there is nothing to draw", fix="name another file", code="no-polygon"
+        )
+    try:
+        content, found = _drawn(map_file, title, suffix)
+    except ShapelyError as error:
+        raise unusable_polygons(map_file.path, error) from None
+    write_whole(out, content)
+    return found
+
+
+def _drawn(map_file: MapFile, title: str, suffix: str) -> tuple[bytes, Totals]:
+    """Return the picture's bytes, and the ground of each rate."""
+    from matplotlib import rc_context
+
+    sprayed = as_sprayed(map_file)
+    frame = frame_for(sprayed)
+    found = totals(map_file, frame=frame)
+    with rc_context({"font.family": _FONT, "svg.hashsalt": "vrspray", "hatch.linewidth": 0.6}):
+        figure = _figure(sprayed, frame, found, title)
+        content = BytesIO()
+        figure.savefig(content, format=suffix[1:], dpi=DPI, metadata=_METADATA[suffix])
+    return content.getvalue(), found
+
+
+def _figure(map_file: MapFile, frame: LocalFrame, found: Totals, title: str) -> Figure:
+    from matplotlib.figure import Figure
+
+    from missions.maps.picture.ground import Colours, draw_ground
+    from missions.maps.picture.legend import draw_legend
+
+    sheet = sheet_for(_bounds_m(map_file, frame))
+    wide, high = sheet.size_in
+    figure = Figure(figsize=sheet.size_in, facecolor="white")
+    axes = figure.add_axes(
+        (
+            _LEFT_IN / wide, _BELOW_IN / high, sheet.map_in[0] / wide, sheet.map_in[1] / high,
+        )
+    )  # fmt: skip
+    west, south, east, north = sheet.ground_m
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set_color("0.75")
+    colours = Colours.of(found.rates_l_ha)
+    bare = draw_ground(
+        axes, map_file, frame, colours,
+        metres_per_inch=sheet.metres_per_inch, rated_ha=found.area_ha,
+    )  # fmt: skip
+    axes.set_xlim(west, east)
+    axes.set_ylim(south, north)
+    _scale(axes, sheet)
+    _north(axes, sheet)
+    _title(figure, sheet, frame, found, title)
+    draw_legend(
+        figure,
+        colours,
+        found,
+        left=(_LEFT_IN + sheet.map_in[0] + 0.3) / wide,
+        top=1.0 - _ABOVE_IN / high,
+        bare=bare,
+        boundary=map_file.boundary is not None,
+    )
+    return figure
+
+
+def sheet_for(bounds_m: tuple[float, float, float, float]) -> Sheet:
+    """Return a sheet for ground of this size; a narrow field gets more of its surroundings.
+
+    >>> sheet = sheet_for((0.0, 0.0, 1000.0, 500.0))
+    >>> sheet.map_in[0], round(sheet.map_in[1], 2)
+    (11.6, 5.8)
+    """
+    west, south, east, north = bounds_m
+    wide_m, high_m = max(east - west, 1.0) * 1.08, max(north - south, 1.0) * 1.08
+    scale = max(wide_m / _MAP_MAX_IN[0], high_m / _MAP_MAX_IN[1])
+    wide_in = max(wide_m / scale, _MAP_MIN_IN[0])
+    high_in = max(high_m / scale, _MAP_MIN_IN[1])
+    middle = (west + east) / 2, (south + north) / 2
+    half = wide_in * scale / 2, high_in * scale / 2
+    return Sheet(
+        size_in=(wide_in + _LEFT_IN + _RIGHT_IN, high_in + _BELOW_IN + _ABOVE_IN),
+        map_in=(wide_in, high_in),
+        ground_m=(
+            middle[0] - half[0], middle[1] - half[1], middle[0] + half[0], middle[1] + half[1],
+        ),
+    )  # fmt: skip
+
+
+def _bounds_m(map_file: MapFile, frame: LocalFrame) -> tuple[float, float, float, float]:
+    areas = [zone.geometry for zone in map_file.zones]
+    if map_file.cells is not None:
+        areas.append(shapely.box(*bounds_deg(map_file.cells)))
+    if map_file.boundary is not None:
+        areas.append(map_file.boundary)
+    local = project_all(np.array(areas, dtype=object), frame)
+    west, south, east, north = shapely.total_bounds(local).tolist()
+    return west, south, east, north
+
+
+def scale_length_m(width_m: float) -> float:
+    """Return a round length of at most a quarter of the picture's width.
+
+    >>> scale_length_m(950.0), scale_length_m(72.0)
+    (200.0, 10.0)
+    """
+    most = width_m / 4.0
+    power = 10.0 ** math.floor(math.log10(most))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most)
+
+
+def _scale(axes: Axes, sheet: Sheet) -> None:
+    west, _, east, _ = sheet.ground_m
+    length = scale_length_m(east - west)
+    across = axes.get_xaxis_transform()  # x in metres, y as a share of the map's height
+    down = 0.28 / sheet.map_in[1]
+    for start, end, colour in ((0.0, 0.5, "black"), (0.5, 1.0, "white")):
+        axes.fill_between(
+            [west + start * length, west + end * length], -down, -down - 0.09 / sheet.map_in[1],
+            transform=across, facecolor=colour, edgecolor="black", linewidth=0.8, clip_on=False,
+        )  # fmt: skip
+    text = f"{length / 1000:g} km" if length >= 1000.0 else f"{length:g} m"
+    for share, label, align in ((0.0, "0", "left"), (1.0, text, "center")):
+        axes.text(
+            west + share * length, -down - 0.14 / sheet.map_in[1], label,
+            transform=across, ha=align, va="top", fontsize=11,
+        )  # fmt: skip
+
+
+def _north(axes: Axes, sheet: Sheet) -> None:
+    high_in = sheet.map_in[1]
+    axes.annotate(
+        "N",
+        xy=(0.97, -0.1 / high_in),
+        xytext=(0.97, -0.72 / high_in),
+        xycoords="axes fraction",
+        ha="center",
+        fontsize=13,
+        fontweight="bold",
+        arrowprops={"facecolor": "black", "width": 3.0, "headwidth": 10.0, "headlength": 10.0},
+        annotation_clip=False,
+    )
+
+
+def _title(figure: Figure, sheet: Sheet, frame: LocalFrame, found: Totals, title: str) -> None:
+    from missions.maps.picture.legend import amount
+
+    wide, high = sheet.size_in
+    fits = int(wide * 72.0 / (0.66 * 17.0))
+    shown = printable(title)
+    shown = shown if len(shown) <= fits else f"{shown[: fits - 3]}..."
+    lines = (
+        (shown, 17, "bold", 0.28),
+        (
+            f"application rate [L/ha]    {amount(found.area_ha)} ha    "
+            f"{amount(found.all_litres)} L    "
+            f"centre {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}",
+            11, "normal", 0.66,
+        ),
+    )  # fmt: skip
+    for text, size, weight, below_in in lines:
+        figure.text(
+            _LEFT_IN / wide, 1.0 - below_in / high, text,
+            fontsize=size, fontweight=weight, va="top", parse_math=False,
+        )  # fmt: skip
+
+
+def printable(text: str) -> str:
+    r"""Return text that the font has; what it lacks, such as Chinese, by its numbers.
+
+    >>> printable("map \u5904")
+    'map \\u5904'
+    """
+    from matplotlib.font_manager import FontProperties, findfont, get_font
+
+    known = get_font(findfont(FontProperties(family=_FONT))).get_charmap()
+    return "".join(
+        one if ord(one) in known and one.isprintable() else one.encode("unicode_escape").decode()
+        for one in text
+    )
