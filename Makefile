@@ -61,6 +61,7 @@ mypy: $(INSTALLED)
 
 imports: $(INSTALLED)
 	$(BIN)/lint-imports
+	$(BIN)/python -m tests.import_circles
 
 bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 	$(BIN)/python -m tests.bench $(SEED)
