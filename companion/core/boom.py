@@ -10,9 +10,8 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from companion.core.frame import Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,8 @@ import numpy as np
 
 from companion.core.boom import Boom
 from companion.core.drift import Contact
-from companion.core.paths import Floats, Paths, time_on_chord
+from companion.core.frame import Floats
+from companion.core.paths import Paths, time_on_chord
 
 # Contacts of a strip with the sides of what an edge sweeps, to those with the edge (`drift.py`).
 Merge = Callable[[list[Contact]], list[Contact]]

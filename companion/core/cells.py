@@ -20,8 +20,8 @@ import shapely
 from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from companion.core.frame import Floats, Ints
+
 Classes = NDArray[np.int32]
 
 # The class of a cell to which the map gives no rate, and of all ground beyond the cells.

@@ -11,14 +11,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
+from companion.core.frame import Bools, Floats, Ints, Place
+
 # Number of a tile eastwards and northwards.
 TileKey = tuple[int, int]
-Place = tuple[float, float]
 # Corners in turn, either way round.
 Quad = tuple[Place, Place, Place, Place]
 

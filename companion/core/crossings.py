@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from companion.core.boom import Boom
 from companion.core.border import Intervals, add_contacts
 from companion.core.drift import Offset, joined, swept
-from companion.core.paths import Floats, Paths, predict
+from companion.core.frame import Floats
+from companion.core.paths import Paths, predict
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
 from companion.core.types import VehicleState
 

@@ -12,9 +12,9 @@ import shapely
 from numpy.typing import NDArray
 from shapely import Geometry, STRtree
 
+from companion.core.frame import Floats, Ints
+
 Objects = NDArray[np.object_]
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # A corner this near to a neighbour's edge stands on it: maps are written with so many decimals.
 CORNER_OFF_M = 0.001

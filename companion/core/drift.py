@@ -15,11 +15,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from companion.core.frame import Floats
 from companion.core.types import VehicleState
 
-Floats = NDArray[np.float64]
 # East and north [m], from the nozzle to where its droplets land.
 Offset = tuple[float, float]
 

@@ -14,6 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import CRS, Geod, Transformer
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+# Metres east and north.
+Place = tuple[float, float]
+
 WGS84 = Geod(ellps="WGS84")
 
 

@@ -19,10 +19,10 @@ import numpy as np
 
 from companion.core.boom import Boom
 from companion.core.border import Intervals
-from companion.core.paths import Floats, Paths, time_on_chord
+from companion.core.frame import Floats, Place
+from companion.core.paths import Paths, time_on_chord
 from companion.core.types import VehicleState, Way
 
-Place = tuple[float, float]
 Polyline = tuple[Place, ...]
 
 # Lines are looked up in squares of this size: a few swaths and the way of a second or two.

@@ -13,16 +13,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.core.boom import Boom
 from companion.core.coverage import CELL_M, Coverage
 from companion.core.crossings import Crossing, Route
-from companion.core.paths import Floats, Paths, predict
+from companion.core.frame import Bools, Floats
+from companion.core.paths import Paths, predict
 from companion.core.swath import Swath, wake_m
 from companion.core.types import VehicleState
 
-Bools = NDArray[np.bool_]
 # From when until when a strip is over treated ground.
 Spans = list[tuple[float, float]]
 

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from companion.core.frame import Floats
 from companion.core.leg import CREEP_M_S, braking_begins_s
 from companion.core.motion import carried_s2, gained_s
 from companion.core.types import VehicleState
-
-Floats = NDArray[np.float64]
 
 # Below these, the estimate of a turn is mostly noise. What it leaves out: in the 0.3 s that an
 # order looks ahead at most, a valve 2.5 m from the middle gains or loses up to 0.04 m.

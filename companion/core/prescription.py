@@ -20,10 +20,9 @@ from shapely import Geometry, MultiPolygon, Polygon, STRtree
 
 from companion.core.cells import NO_RATE, CellGrid
 from companion.core.dissolve import dissolved
+from companion.core.frame import Floats, Ints
 
 Overlap = Literal["error", "max", "min", "mean", "last"]
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # Gaps between neighbouring zones up to this width are digitising errors, not borders: they are
 # closed when the outline of the zones is the border.

@@ -16,8 +16,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from companion.core.boom import Boom
-from companion.core.coverage import Coverage, Place
+from companion.core.coverage import Coverage
 from companion.core.drift import Offset
+from companion.core.frame import Place
 from companion.core.swath_liquid import Lags, Toggle, open_at, ordered_until
 from companion.core.swath_way import Front, swept
 from companion.core.types import Finding, SprayPlan, VehicleState

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.core.boom import Boom
-from companion.core.coverage import Place, Quad
+from companion.core.coverage import Quad
+from companion.core.frame import Place
 from companion.core.swath_liquid import Toggle
 
 # So far a tip of the boom may be off a straight piece: below the noise of an RTK position.
