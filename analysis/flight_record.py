@@ -16,8 +16,8 @@ from companion.core.boom import Boom, Valve
 
 if TYPE_CHECKING:
     from analysis.spans import Spans
-    from companion.core.lines import Lines
     from companion.core.nozzle import NozzleSet
+    from companion.core.options.lines import Lines
     from companion.core.prescription import Prescription
     from companion.core.types import TimedChange
 

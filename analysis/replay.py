@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from analysis.flown.read_applied import read_applied
 from companion.core.controller import Memory, expected_coverage, step
-from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import UnreadableError

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 from typing import TYPE_CHECKING
 
-from companion.core.lines import MOVING_M_S
+from companion.core.options.lines import MOVING_M_S
 
 if TYPE_CHECKING:
     from analysis.flight_record import FlightRecord
-    from companion.core.lines import Lines
+    from companion.core.options.lines import Lines
 
 
 # When a true path flew a planned line: from one of its ends to the other, or to a stop.

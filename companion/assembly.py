@@ -15,16 +15,13 @@ from companion.config.motor_rules import atomisers_of, pump_of
 from companion.config.rules import mismatches, tank_capacity_l
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
-from companion.core.detection import Detection
-from companion.core.flow_trim import FlowTrim
 from companion.core.frame import LocalFrame
-from companion.core.lines import Lines
-from companion.core.liquid_bins import BIN_S
-from companion.core.liquid_law import AutopilotLiquid
-from companion.core.liquid_naming import RESTLESS_SHARE
-from companion.core.nozzle import NozzleSet, PwmLimits
-from companion.core.overlap_guard import OverlapGuard
-from companion.core.rate import flow_for_rate
+from companion.core.inputs import AutopilotLiquid
+from companion.core.nozzle import NozzleSet, PwmLimits, flow_for_rate
+from companion.core.options.flow_trim import FlowTrim
+from companion.core.options.lines import Lines
+from companion.core.options.liquid_evidence import BIN_S, RESTLESS_SHARE, Detection
+from companion.core.options.overlap import OverlapGuard
 from companion.core.setup import Setup
 from companion.errors import ConfigError
 from companion.flight_map import FlightMap, difference

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from companion.core.coverage import Coverage
+from companion.core.options.coverage import Coverage
 from companion.core.types import Decision, Input, SprayPlan
 
 # How often a recorder commits, unless it is told otherwise.

@@ -21,8 +21,8 @@ from collections.abc import Callable, Coroutine, Iterator, Sequence
 from typing import Any, TypeVar
 
 from companion.core.controller import Memory, expected_coverage, step
-from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.core.types import (
     Decision,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from missions.demand import M2_PER_HA, Rates, Uniform, valve_places
 from missions.plan import Leg, Place, Settings
 from missions.strips import Floats

@@ -13,7 +13,7 @@ import shapely
 from shapely.affinity import translate
 from shapely.geometry.base import BaseGeometry
 
-from companion.core.coverage import Coverage
+from companion.core.options.coverage import Coverage
 from companion.record.continuing import is_journal, read_treated_ground
 from companion.record.coverage_area import moved
 from missions.demand import Demand, Rates, demands

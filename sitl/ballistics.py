@@ -1,7 +1,7 @@
 """Droplets as the twin has them: points with drag, from a moving nozzle through moving air.
 
-Independent of the controller's model (`companion/core/drift.py`): three dimensions instead of
-one, a spectrum instead of one size, slip of small droplets, wind that may fade to the ground.
+Independent of the controller's model (`companion/core/options/drift.py`): three dimensions instead
+of one, a spectrum instead of one size, slip of small droplets, wind that may fade to the ground.
 Evaporation, turbulence and the vortices beside the rotors are left out.
 """
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING
 from analysis.calibration.steps import settle_s
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
-from companion.core.nozzle import SET_UP_FRACTION, set_change_l_min
-from companion.core.rate import rate_for_flow
+from companion.core.nozzle import SET_UP_FRACTION, rate_for_flow, set_change_l_min
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
 from sitl.stub.mission_items import MissionItem, landing, speed, waypoint

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from analysis.settled import ordered_ml_s
 from analysis.smoothing import boxed, rise_over
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from sitl.anyang import anyang_passes
 from sitl.deposit import L_HA_PER_ML_M2
 

@@ -24,7 +24,7 @@ from analysis.evaluation import evaluate
 from analysis.flight_record import Fidelity, FlightRecord
 from analysis.strips import strips_of
 from companion.cli.answer import AsJson, answer
-from companion.core.drift import Drift, fall_s
+from companion.core.options.drift import Drift, fall_s
 from companion.core.types import Input, WindReport
 from sitl.ballistics import Air, Landing, fall, spectrum_um
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory

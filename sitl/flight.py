@@ -16,8 +16,8 @@ import numpy as np
 
 from analysis.flight_record import Fidelity, FlightMeta, FlightRecord, Floats
 from companion.core.controller import Memory, expected_coverage, step
-from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.core.types import (
     Decision,

@@ -22,8 +22,7 @@ import shapely
 from analysis.evaluation import Evaluation, evaluate, limit_ratio
 from companion.assembly import deliverable, refuse_mismatch
 from companion.config import Config, load
-from companion.core.nozzle import allowed_duty
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import allowed_duty, flow_for_rate
 from companion.core.setup import Setup
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
@@ -43,7 +42,7 @@ if TYPE_CHECKING:
     from shapely import LineString
 
     from analysis.flight_record import Fidelity
-    from companion.core.drift import Drift
+    from companion.core.options.drift import Drift
     from companion.core.types import Decision, Input
     from sitl.flow_law import FlowLaw
     from sitl.vehicle import Leg

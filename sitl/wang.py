@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 
 from analysis.published_flow import SETS
 from companion.core.frame import course_deg, look_ahead_point
-from companion.core.nozzle import FLOW_LAWS, FlowCurve, NozzleSet, allowed_duty
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import FLOW_LAWS, FlowCurve, NozzleSet, allowed_duty, flow_for_rate
 from companion.core.types import SprayPlan, Telemetry, TimedChange
 
 if TYPE_CHECKING:

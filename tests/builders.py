@@ -11,9 +11,9 @@ import shapely
 
 from companion.core.boom import Boom, Valve
 from companion.core.frame import LocalFrame
-from companion.core.interlock import Limits
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
 from companion.core.prescription import Prescription, Zone
+from companion.core.safety import Limits
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
 from companion.core.types import Fix, Method, SprayPlan, Telemetry, TimedChange, VehicleState

@@ -27,7 +27,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 LIST = Path(__file__).with_name("mutants.toml")
-INTERLOCK = "companion/core/interlock.py"
+INTERLOCK = "companion/core/safety.py"
 PACKAGES = ("companion", "sitl", "analysis", "missions")
 LEFT_OUT = (".venv*", ".git", ".*_cache", ".hypothesis", "*.egg-info", "demo-out", "flights")
 # Of the processor's time, so that a busy computer proves nothing by itself; on the clock there is

@@ -14,8 +14,8 @@ import shapely
 
 from companion.core.controller import Memory, step
 from companion.core.nozzle import FlowCurve, NozzleSet
+from companion.core.options.pump import Pump, Way
 from companion.core.prescription import Prescription
-from companion.core.pump import Pump, Way
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
 from companion.core.types import Decision, SprayPlan

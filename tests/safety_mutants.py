@@ -20,8 +20,7 @@ from tests.mutations import LEFT_OUT, PACKAGES, ROOT
 
 TOOL = ROOT / ".venv" / "mutmut"
 SOURCES = (
-    "companion/core/interlock.py",
-    "companion/core/sprayer_state.py",
+    "companion/core/safety.py",
     "companion/output/engine/engine.py",
     "companion/output/engine/engine.py",
     "companion/output/pulse_train.py",

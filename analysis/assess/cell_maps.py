@@ -17,7 +17,7 @@ import numpy as np
 from analysis.assess.ground_elements import Grid, Slices, SquareGrid, slices_of, summed
 from analysis.assess.ground_rates import rates_of_squares
 from analysis.assess.histogram import Histogram
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from companion.core.rate import is_override
+from companion.core.nozzle import is_override
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight

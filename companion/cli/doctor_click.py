@@ -18,8 +18,8 @@ from companion.cli.run import build_executor, component_options
 from companion.cli.sensor_parts import build_sensors
 from companion.config import Config
 from companion.core.ground_task import CLICK_TIMES, GroundTask, clicks, flow_of
+from companion.core.inputs import AutopilotLiquid
 from companion.core.liquid_clicks import ClickFlow, ClickLaw, judge_clicks
-from companion.core.liquid_law import AutopilotLiquid
 from companion.doctor.check import Check, fail
 from companion.doctor.click_bench import (
     AGAIN,

@@ -15,8 +15,8 @@ from shapely import MultiPolygon
 
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note
-from companion.core.coverage import Coverage
 from companion.core.frame import LocalFrame
+from companion.core.options.coverage import Coverage
 from companion.core.prescription import Prescription
 from companion.errors import VrsprayError
 from companion.flight_map import flight_map_of_file

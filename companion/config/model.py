@@ -18,9 +18,9 @@ from companion.config import (
 )
 from companion.config.rules import contradictions
 from companion.core.boom import Boom, Valve
-from companion.core.drift import Drift, blowing, fall_s
-from companion.core.interlock import Limits
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.options.drift import Drift, blowing, fall_s
+from companion.core.safety import Limits
 from companion.core.schedule import LagModel
 from companion.core.types import Fix, Method
 

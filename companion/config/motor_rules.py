@@ -14,9 +14,9 @@ if TYPE_CHECKING:
 
 from typing import TYPE_CHECKING
 
-from companion.core.atomiser import Atomiser, DropletLaw
 from companion.core.nozzle import FlowCurve, NozzleSet
-from companion.core.pump import Pump, Way
+from companion.core.options.atomisers import Atomiser, DropletLaw
+from companion.core.options.pump import Pump, Way
 from companion.core.schedule import LagModel
 
 if TYPE_CHECKING:

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
+from companion.core.braking import CREEP_M_S, braking_begins_s
 from companion.core.frame import Floats
+from companion.core.motion import carried_s2, gained_s
+from companion.core.types import VehicleState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,3 +84,227 @@ def width_across_course_m(width_m: float, *, heading_deg: float, course_deg: flo
     3.0
     """
     return width_m * abs(math.cos(math.radians(heading_deg - course_deg)))
+
+
+# Where each point of the boom will be: the predicted motion as chords, one on a straight pass.
+
+# Below these, the estimate of a turn is mostly noise. What it leaves out: in the 0.3 s that an
+# order looks ahead at most, a valve 2.5 m from the middle gains or loses up to 0.04 m.
+STRAIGHT_YAW_RATE_DEG_S = 3.0
+STRAIGHT_LATERAL_M_S2 = 1.0
+CURVE_CHORDS = 6
+# Knots of a path nearer than this are one.
+KNOTS_APART_S = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Paths:
+    """Predicted paths of points of the boom: (points, knots) arrays, knots at `time_s`."""
+
+    time_s: tuple[float, ...]
+    east_m: Floats
+    north_m: Floats
+    speed_m_s: Floats
+    middle: tuple[tuple[float, float], ...]
+    right: tuple[tuple[float, float], ...]
+    step_east_m: Floats
+    step_north_m: Floats
+    length_m: Floats
+
+    def box(self, reach_m: float) -> tuple[float, float, float, float]:
+        """Return west, south, east, north of all within `reach_m` of the middle's path."""
+        east, north = zip(*self.middle, strict=True)
+        return (
+            min(east) - reach_m,
+            min(north) - reach_m,
+            max(east) + reach_m,
+            max(north) + reach_m,
+        )
+
+
+def predict(
+    state: VehicleState, right_m: Floats, forward_m: Floats, *, back_s: float, ahead_s: float
+) -> Paths:
+    """Return the paths of points of the boom from `back_s` ago to `ahead_s` from now.
+
+    The same motion as `estimator.estimate`: constant velocity plus a fading acceleration, and a
+    constant yaw rate; on a straight path that ends in a stop, the braking before it.
+    """
+    heading_deg = state.heading_deg if state.heading_deg is not None else 0.0
+    speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+    lateral = 0.0
+    if speed > 0.0:
+        lateral = (
+            state.velocity_east_m_s * state.acceleration_north_m_s2
+            - state.velocity_north_m_s * state.acceleration_east_m_s2
+        ) / speed
+    turning = not (
+        abs(state.yaw_rate_deg_s) < STRAIGHT_YAW_RATE_DEG_S and abs(lateral) < STRAIGHT_LATERAL_M_S2
+    )
+    chords = CURVE_CHORDS if turning else 1
+    knots = [-back_s + (back_s + ahead_s) * i / chords for i in range(chords + 1)]
+    if turning:
+        shape = (len(right_m), chords + 1)
+        east, north, pace = np.empty(shape), np.empty(shape), np.empty(shape)
+        middle = [
+            _knot(state, dt_s, heading_deg, right_m, forward_m, (east, north, pace), i)
+            for i, dt_s in enumerate(knots)
+        ]
+    else:
+        motions = _braked(state, back_s, ahead_s)
+        if motions is None:
+            motions = [(dt_s, *_carried(state, dt_s, *_along(state))) for dt_s in knots]
+        knots = [motion[0] for motion in motions]
+        east, north, pace, middle = _straight(motions, heading_deg, right_m, forward_m)
+    rights = []
+    for a, b in pairwise(knots):
+        turned_deg = state.yaw_rate_deg_s * (a + b) / 2 if turning else 0.0
+        angle = math.radians(heading_deg + turned_deg)
+        rights.append((math.cos(angle), -math.sin(angle)))
+    dx = east[:, 1:] - east[:, :-1]
+    dy = north[:, 1:] - north[:, :-1]
+    return Paths(
+        time_s=tuple([state.time_s + dt_s for dt_s in knots]),
+        east_m=east,
+        north_m=north,
+        speed_m_s=pace,
+        middle=tuple(middle),
+        right=tuple(rights),
+        step_east_m=dx,
+        step_north_m=dy,
+        length_m=np.hypot(dx, dy),
+    )
+
+
+def place_velocity(state: VehicleState) -> tuple[float, float]:
+    """Return how fast the place goes, east and north: where it is told, not how it is dosed."""
+    return (
+        state.velocity_east_m_s + state.outrun_east_m_s,
+        state.velocity_north_m_s + state.outrun_north_m_s,
+    )
+
+
+def _carried(
+    state: VehicleState, dt_s: float, ae: float, an: float
+) -> tuple[float, float, float, float]:
+    """Return velocity (east, north) and place (east, north) of the reference at `dt_s` from now.
+
+    The place outruns the velocity where an autopilot tells two motions.
+    """
+    ahead_s, fade_s = max(dt_s, 0.0), state.acceleration_fade_s
+    goes_east, goes_north = place_velocity(state)
+    gained, carried = gained_s(ahead_s, fade_s), carried_s2(ahead_s, fade_s)
+    return (
+        state.velocity_east_m_s + ae * gained,
+        state.velocity_north_m_s + an * gained,
+        state.east_m + goes_east * dt_s + ae * carried,
+        state.north_m + goes_north * dt_s + an * carried,
+    )
+
+
+# dt_s, velocity (east, north) and place (east, north) of the reference then.
+_Motion = tuple[float, float, float, float, float]
+
+
+def _along(state: VehicleState) -> tuple[float, float]:
+    """Return the acceleration along the course, all that counts on a straight path.
+
+    One chord to where the other leads would miss the near end of the path by more than leaving it
+    out.
+    """
+    ve, vn = state.velocity_east_m_s, state.velocity_north_m_s
+    gain = ve * state.acceleration_east_m_s2 + vn * state.acceleration_north_m_s2
+    gain /= max(ve * ve + vn * vn, 1e-9)
+    return gain * ve, gain * vn
+
+
+def _braked(state: VehicleState, back_s: float, ahead_s: float) -> list[_Motion] | None:
+    """Return the motion at the knots of a path that brakes for a stop; None if none does.
+
+    Its chords are those before the braking, of the braking and, at the stop, a creeping on.
+    """
+    stop = state.stop_ahead
+    speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
+    if stop is None or not speed > CREEP_M_S:
+        return None
+    ae, an = _along(state)
+    along = (ae * state.velocity_east_m_s + an * state.velocity_north_m_s) / speed
+    begins_s = braking_begins_s(stop, speed, along, state.acceleration_fade_s, ahead_s)
+    if begins_s is None:
+        return None
+    motions = [(dt_s, *_carried(state, dt_s, ae, an)) for dt_s in (-back_s, begins_s)]
+    _, ve, vn, east_m, north_m = motions[-1]
+    pace = math.hypot(ve, vn)
+    unit_east, unit_north = ve / pace, vn / pace
+    creeps_s = max(pace - CREEP_M_S, 0.0) / stop.braking_m_s2
+    for dt_s in (min(begins_s + creeps_s, ahead_s), ahead_s):
+        braked_s = dt_s - motions[-1][0]
+        if braked_s < KNOTS_APART_S:
+            continue
+        after = max(pace - stop.braking_m_s2 * braked_s, min(pace, CREEP_M_S))
+        way_m = 0.5 * (pace + after) * braked_s
+        east_m, north_m, pace = east_m + unit_east * way_m, north_m + unit_north * way_m, after
+        motions.append((dt_s, unit_east * after, unit_north * after, east_m, north_m))
+    return motions
+
+
+def _straight(
+    motions: list[_Motion], heading_deg: float, right_m: Floats, forward_m: Floats
+) -> tuple[Floats, Floats, Floats, list[tuple[float, float]]]:
+    """Return east, north and speed of all points at all knots, and the reference's places."""
+    angle = math.radians(heading_deg)
+    sin, cos = math.sin(angle), math.cos(angle)
+    middle_east, middle_north = [m[3] for m in motions], [m[4] for m in motions]
+    east = (right_m * cos + forward_m * sin)[:, None] + np.array(middle_east)
+    north = (forward_m * cos - right_m * sin)[:, None] + np.array(middle_north)
+    pace = np.empty(east.shape)
+    pace[:] = [math.hypot(m[1], m[2]) for m in motions]
+    return east, north, pace, list(zip(middle_east, middle_north, strict=True))
+
+
+def _knot(
+    state: VehicleState,
+    dt_s: float,
+    heading_deg: float,
+    right_m: Floats,
+    forward_m: Floats,
+    into: tuple[Floats, Floats, Floats],
+    column: int,
+) -> tuple[float, float]:
+    """Write east, north and speed of all points at `dt_s` from now into a column, in a turn.
+
+    Returns the position reference itself.
+    """
+    ae, an = state.acceleration_east_m_s2, state.acceleration_north_m_s2
+    velocity_east, velocity_north, middle_east, middle_north = _carried(state, dt_s, ae, an)
+    angle = math.radians(heading_deg + state.yaw_rate_deg_s * dt_s)
+    sin, cos = math.sin(angle), math.cos(angle)
+    offset_east = right_m * cos + forward_m * sin
+    offset_north = forward_m * cos - right_m * sin
+    east, north, pace = into
+    east[:, column] = middle_east + offset_east
+    north[:, column] = middle_north + offset_north
+    yaw_rate = math.radians(state.yaw_rate_deg_s)
+    pace[:, column] = np.hypot(
+        velocity_east + yaw_rate * offset_north, velocity_north - yaw_rate * offset_east
+    )
+    return middle_east, middle_north
+
+
+def time_on_chord(
+    paths: Paths, chord: int, point: int, s: float, reach: float
+) -> tuple[float, float]:
+    """Return when the path is `s` metres along the chord, and its speed there.
+
+    Speed changes evenly along a chord: s = v0 t + (v1 - v0) t^2 / 2T, scaled to the chord's end
+    (as in `crossings._cuts`, where it is solved for all cuts at once).
+    """
+    t0, t1 = paths.time_s[chord], paths.time_s[chord + 1]
+    v0, v1 = paths.speed_m_s.item(point, chord), paths.speed_m_s.item(point, chord + 1)
+    if not v0 + v1 > 1e-9:
+        return t0, 0.0
+    share = s / reach
+    spread = (v1 * v1 - v0 * v0) * share + v0 * v0
+    speed = math.sqrt(max(spread, 0.0))
+    tau = share * (v0 + v1) / (v0 + speed) if v0 + speed > 0.0 else 0.0
+    return t0 + tau * (t1 - t0), speed

@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from companion.core.boom import Boom
-from companion.core.drift import Contact
-from companion.core.frame import Floats
-from companion.core.paths import Paths, time_on_chord
+from companion.core.boom import Boom, Paths, time_on_chord
+from companion.core.frame import Floats, Offset
 
+# Which strip meets which edge, and the least and greatest way along the path where it does.
+Contact = tuple[int, int, tuple[float, float]]
 # Contacts of a strip with the sides of what an edge sweeps, to those with the edge (`drift.py`).
 Merge = Callable[[list[Contact]], list[Contact]]
 # From when until when a strip is closed.
@@ -95,3 +95,42 @@ def _clip(a: tuple[float, float], b: tuple[float, float], half_m: float) -> tupl
         held = min(max(u, -half_m), half_m)
         ends.append(s if held == u else s0 + (s1 - s0) * (held - u0) / (u1 - u0))
     return min(ends), max(ends)
+
+
+# ---------------------------------------------- liquid that lands beside its nozzle (`drift.py`)
+
+SIDES = 4
+
+
+def swept(ends: Floats, offset_m: Offset) -> Floats:
+    """Return the four sides of what each edge sweeps when it is moved by the offset, in turn.
+
+    A strip where liquid lands meets what an edge sweeps exactly while ground between it and its
+    nozzle lies on that edge.
+    """
+    first, last = ends[:, :2], ends[:, 2:]
+    moved = np.array(offset_m)
+    sides = np.stack(
+        [
+            ends,
+            np.hstack([first + moved, last + moved]),
+            np.hstack([first, first + moved]),
+            np.hstack([last, last + moved]),
+        ],
+        axis=1,
+    )
+    return sides.reshape(-1, 4)
+
+
+def joined(contacts: list[Contact]) -> list[Contact]:
+    """Return, of contacts with the sides of `swept`, one for each edge that it was made of.
+
+    What an edge sweeps is convex: a strip that moves along touches it from the first contact with
+    any of its sides to the last, and lies within it between.
+    """
+    found: dict[tuple[int, int], tuple[float, float]] = {}
+    for valve, side, (low, high) in contacts:
+        key = (valve, side // SIDES)
+        before = found.get(key, (low, high))
+        found[key] = (min(low, before[0]), max(high, before[1]))
+    return [(valve, edge, limits) for (valve, edge), limits in found.items()]

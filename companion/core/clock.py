@@ -25,7 +25,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from companion.core.order import BOOT_WRAP_S, ROUND_TRIP_MAX_S
+from companion.core.positions import BOOT_WRAP_S, ROUND_TRIP_MAX_S
 from companion.core.types import ClockReport, Telemetry
 
 # Arrivals later than this against the mean are late messages; the mean is not moved by more. One

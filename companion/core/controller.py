@@ -13,29 +13,33 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
-from companion.core import detection, flow_trim, swath
-from companion.core.atomiser import spinning
+from companion.core.boom import Paths
 from companion.core.border import Intervals
-from companion.core.coverage import Coverage
-from companion.core.crossings import Route, find_routes
-from companion.core.detection import WatchMemory
-from companion.core.dosing import dosing_of, overdrive_of, skew_of, speed_soon
-from companion.core.drift import Offset, is_same, landed, offset
-from companion.core.drive_plans import constant_drive
-from companion.core.drives import flows_ahead, liquid_of, modulated
-from companion.core.flow_trim import TrimMemory
-from companion.core.interlock import closed_plan, guard
-from companion.core.lines import add_off_lines
-from companion.core.overlap_guard import guarded, treated_before
-from companion.core.paths import Paths
-from companion.core.pump import on_off, sections
-from companion.core.rate import flow_for_rate, overridden
-from companion.core.routes import NO_ROUTES, KnownRoutes, carried_on
+from companion.core.crossings import NO_ROUTES, KnownRoutes, Route, carried_on, find_routes
+from companion.core.dose import (
+    SetOfRate,
+    dosing_by_valve,
+    dosing_of,
+    overdrive_of,
+    sets_ahead,
+    skew_of,
+    speed_soon,
+)
+from companion.core.frame import Offset
+from companion.core.nozzle import flow_for_rate, overridden
+from companion.core.options import flow_trim, liquid_faults, treated_area
+from companion.core.options.atomisers import flows_ahead, spinning
+from companion.core.options.coverage import Coverage
+from companion.core.options.drift import is_same, landed, offset
+from companion.core.options.flow_trim import TrimMemory
+from companion.core.options.lines import add_off_lines
+from companion.core.options.liquid_faults import WatchMemory
+from companion.core.options.overlap import guarded, treated_before
+from companion.core.options.pump import constant_drive, liquid_of, modulated, on_off, sections
+from companion.core.options.treated_area import Swath
+from companion.core.safety import UNASKED, Permission, closed_plan, guard, permit, shown
 from companion.core.schedule import Dosing, ValveSchedule, rate_at, schedule, sticky_border_s
-from companion.core.sets import SetOfRate, dosing_by_valve, sets_ahead
 from companion.core.setup import Setup
-from companion.core.sprayer_state import UNASKED, Permission, permit, shown
-from companion.core.swath import Swath
 from companion.core.types import (
     Decision,
     DrivePlan,
@@ -105,7 +109,7 @@ def step(
         memory.permission,
         state,
         setup.limits,
-        faults=detection.inhibits_of(watched.watch),
+        faults=liquid_faults.inhibits_of(watched.watch),
         field_bounds_m=setup.prescription.bounds_m,
         now_s=now_s,
     )
@@ -152,11 +156,11 @@ def _watch(
     """Return what flow, pressure and tank say of the plan until now, and what it treated."""
     watch, area, ran_s = before
     if setup.watching is not None:
-        watch = detection.follow(
+        watch = liquid_faults.follow(
             setup.watching, watch or WatchMemory(), liquid, state, index=set_index, now_s=now_s
         )
     if setup.swathing is not None:
-        area = swath.follow(
+        area = treated_area.follow(
             setup.swathing, area, plan, state,
             pumped=liquid if setup.pumping is not None else None,
             findings=_findings(setup, watch), drift_m=drift_m, now_s=now_s,
@@ -187,7 +191,7 @@ def expected_coverage(
     if setup.swathing is None:
         return Coverage()
     pumped = None if setup.pumping is None else liquid_of(setup.pumping, memory.plan)
-    return swath.expected(
+    return treated_area.expected(
         setup.swathing, memory.watched.swath, memory.plan, state,
         pumped=pumped, findings=_findings(setup, memory.watched.watch),
         drift_m=memory.routes.drift_m, now_s=now_s, cut_s=cut_s,

@@ -13,16 +13,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.core.boom import Boom
-from companion.core.border import Intervals, add_contacts
-from companion.core.drift import Offset, joined, swept
-from companion.core.frame import Floats
-from companion.core.paths import Paths, predict
+from companion.core.boom import STRAIGHT_YAW_RATE_DEG_S, Boom, Paths, place_velocity, predict
+from companion.core.border import Intervals, add_contacts, joined, swept
+from companion.core.frame import Floats, Offset
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
 from companion.core.types import VehicleState
 
@@ -323,3 +322,199 @@ def _combine(
             speed = pace.get(at_s, speeds[0] + share * (speeds[1] - speeds[0]))
             route.append(Crossing(at_s, rate, outside, speed))
     return tuple(route)
+
+
+# The routes of all valves as one: what the boom as a whole is prescribed along its way.
+#
+# A pump makes the flow of all sections together, and an atomiser's speed follows that flow. The
+# rate of the whole is the mean of the strips' rates by their widths; closed strips count as 0.
+
+
+def boom_route(
+    routes: tuple[Route, ...], boom: Boom, *, merge_s: float = 0.0, shuts_outside: bool = False
+) -> Route:
+    """Return the mean rate over the boom; None where every strip is closed.
+
+    Sections cross a slanting boundary one after the other. Steps between two flows that are nearer
+    to each other than `merge_s` become one, at the moment at which it carries the same volume.
+    Where every strip is closed, the boom is outside as soon as one of them is; with
+    `shuts_outside` it is closed there.
+
+    >>> from companion.core.boom import Valve
+    >>> boom = Boom(width_m=4.0, valves=tuple(
+    ...     Valve(name=name, right_m=0.0, forward_m=0.0, width_m=w) for name, w in (("1", 1.0),
+    ...                                                                             ("2", 3.0))))
+    >>> left = (Crossing(0.0, None, True, 5.0), Crossing(1.0, 20.0, False, 5.0))
+    >>> right = (Crossing(0.0, None, True, 5.0), Crossing(1.5, 20.0, False, 5.0))
+    >>> [(step.at_s, step.rate_l_ha) for step in boom_route((left, right), boom)]
+    [(0.0, None), (1.0, 5.0), (1.5, 20.0)]
+    """
+    widths = (2.0 * boom.half_width_m).tolist()
+    whole_m = sum(widths)
+    crossings: dict[float, list[tuple[int, Crossing]]] = {}
+    for valve, route in enumerate(routes):
+        for crossing in route[1:]:
+            crossings.setdefault(crossing.at_s, []).append((valve, crossing))
+    rates = [route[0].rate_l_ha or 0.0 for route in routes]
+    is_outside = [route[0].outside for route in routes]
+
+    def whole(at_s: float, speed_m_s: float) -> Crossing:
+        rate = sum(rate * width for rate, width in zip(rates, widths, strict=True)) / whole_m
+        outside = any(is_outside)
+        if rate > 0.0 and not (outside and shuts_outside):
+            return Crossing(at_s, rate, False, speed_m_s)
+        return Crossing(at_s, None, outside, speed_m_s)
+
+    first = routes[len(routes) // 2][0]
+    made = [whole(first.at_s, first.speed_m_s)]
+    for at_s in sorted(crossings):
+        here = crossings[at_s]
+        for valve, crossing in here:
+            rates[valve] = crossing.rate_l_ha or 0.0
+            is_outside[valve] = crossing.outside
+        now = whole(at_s, sum(crossing.speed_m_s for _, crossing in here) / len(here))
+        if not now.is_as(made[-1]):
+            made.append(now)
+    return _merged(tuple(made), merge_s) if merge_s > 0.0 else tuple(made)
+
+
+def _merged(route: Route, merge_s: float) -> Route:
+    made = [route[0]]
+    i = 1
+    while i < len(route):
+        last = i
+        while (
+            last + 1 < len(route)
+            and route[last + 1].at_s - route[i].at_s < merge_s
+            and all(step.rate_l_ha is not None for step in route[i - 1 : last + 2])
+        ):
+            last += 1
+        made.append(_as_one(route[i - 1 : last + 1]))
+        i = last + 1
+    return tuple(made)
+
+
+def _as_one(steps: Route) -> Crossing:
+    """Return the steps behind the first as one, where a sharp one would carry their volume."""
+    end = steps[-1]
+    if len(steps) == 2:
+        return end
+    rises = [(step.at_s, (step.rate_l_ha or 0.0) - (ahead.rate_l_ha or 0.0))
+             for ahead, step in pairwise(steps)]  # fmt: skip
+    rise = sum(each for _, each in rises)
+    if rise == 0.0:
+        return end
+    at_s = sum(at_s * each for at_s, each in rises) / rise
+    return end._replace(at_s=min(max(at_s, steps[1].at_s), end.at_s))
+
+
+def bridged(route: Route, gap_s: float) -> Route:
+    """Return the route with closed stretches shorter than `gap_s` at the rate before them.
+
+    What cannot stop and start again in the time goes on; whether anything comes out is the
+    valves' affair.
+    """
+    made: list[Crossing] = [route[0]]
+    for i in range(1, len(route)):
+        step = route[i]
+        if step.rate_l_ha is None and made[-1].rate_l_ha is not None:
+            again = (each.at_s for each in route[i:] if each.rate_l_ha is not None)
+            follows_s = next(again, float("inf"))
+            if follows_s - step.at_s < gap_s:
+                continue
+        if not step.is_as(made[-1]):
+            made.append(step)
+    return tuple(made)
+
+
+# Routes found in one step serve the next ones too, as long as the prediction holds.
+
+# Crossings found in one step are carried on for this long, if the path does not leave its
+# prediction by more than these and none of them is to be ordered within this time.
+ROUTES_KEPT_S = 0.21
+ROUTES_ASIDE_M = 0.05
+ROUTES_ALONG_M = 0.2
+ROUTES_EXACT_S = 0.15
+
+
+class KnownRoutes(NamedTuple):
+    """The routes in view, the state that they were found from, and the wind's offset then."""
+
+    routes: tuple[Route, ...] = ()
+    found_from: VehicleState | None = None
+    drift_m: Offset | None = None
+
+
+NO_ROUTES = KnownRoutes()
+
+
+def carried_on(
+    known: KnownRoutes, state: VehicleState, *, longest_s: float, reach_m: float, now_s: float
+) -> KnownRoutes | None:
+    """Return the routes of before at the times that the new position gives; None if they are over.
+
+    On a straight pass the same edges are crossed at every step: as long as the prediction holds
+    and no crossing is due within `longest_s`, the longest lead, the last ones are carried on.
+    """
+    if known.found_from is None:
+        return None
+    exact_s = longest_s + ROUTES_EXACT_S
+    shift = _shift(known.found_from, state, exact_s=exact_s, reach_m=reach_m, now_s=now_s)
+    if shift is None:
+        return None
+    routes = _shifted(known.routes, shift, now_s)
+    soon_s = now_s + exact_s
+    if not all(len(route) == 1 or route[1].at_s > soon_s for route in routes):
+        return None
+    return known._replace(routes=routes)
+
+
+def _shift(
+    before: VehicleState, state: VehicleState, *, exact_s: float, reach_m: float, now_s: float
+) -> tuple[float, float, float] | None:
+    """Return how far along, how fast then and how fast now; None where the prediction fails."""
+    age_s = now_s - before.time_s
+    turning = max(abs(before.yaw_rate_deg_s), abs(state.yaw_rate_deg_s))
+    if not (0.0 <= age_s <= ROUTES_KEPT_S and turning < STRAIGHT_YAW_RATE_DEG_S):
+        return None
+    went_east, went_north = place_velocity(before)
+    then_east = went_east + before.acceleration_east_m_s2 * age_s
+    then_north = went_north + before.acceleration_north_m_s2 * age_s
+    east, north = place_velocity(state)
+    speed, then = math.hypot(east, north), math.hypot(then_east, then_north)
+    if not (speed > 0.5 and then > 0.5):
+        return None
+    half = 0.5 * age_s * age_s
+    off_east = state.east_m - before.east_m - went_east * age_s
+    off_east -= before.acceleration_east_m_s2 * half
+    off_north = state.north_m - before.north_m - went_north * age_s
+    off_north -= before.acceleration_north_m_s2 * half
+    aside = abs(off_north * east - off_east * north) / speed
+    bend = abs(then_east * north - then_north * east) / (speed * then)
+    turned_deg = ((state.heading_deg or 0.0) - (before.heading_deg or 0.0) + 180.0) % 360.0 - 180.0
+    aside += bend * speed * exact_s
+    aside += math.radians(abs(turned_deg)) * reach_m
+    along = (off_east * east + off_north * north) / speed
+    if not (aside <= ROUTES_ASIDE_M and abs(along) <= ROUTES_ALONG_M):
+        return None
+    return along, then, speed
+
+
+def _shifted(
+    routes: tuple[Route, ...], shift: tuple[float, float, float], now_s: float
+) -> tuple[Route, ...]:
+    """Return the routes with their crossings at the times that the new position gives."""
+    along_m, then, speed = shift
+    moved: list[Route] = []
+    for route in routes:
+        if len(route) == 1:
+            moved.append(route)
+            continue
+        moved.append(
+            route[:1]
+            + tuple(
+                crossing._replace(at_s=now_s + ((crossing.at_s - now_s) * then - along_m) / speed)
+                for crossing in route[1:]
+            )
+        )
+    return tuple(moved)

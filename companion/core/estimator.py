@@ -13,12 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from companion.core.braking import Approach, Leg, approach, learned, leg_of, stop_ahead, way_of
 from companion.core.clock import Clock, on_time_s, tick
-from companion.core.frozen import Stand, look
-from companion.core.leg import Approach, Leg, approach, learned, leg_of, stop_ahead, way_of
 from companion.core.motion import BRIDGED_MAX_S, Told
-from companion.core.order import Order, Place, noted, sorted_in
-from companion.core.rate import is_override
+from companion.core.nozzle import is_override
+from companion.core.positions import Order, Place, Stand, look, noted, sorted_in
 from companion.core.setup import Setup
 from companion.core.types import (
     BatteryReport,

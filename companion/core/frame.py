@@ -19,6 +19,8 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 # Metres east and north.
 Place = tuple[float, float]
+# East and north [m], from a nozzle to where its droplets land.
+Offset = tuple[float, float]
 
 WGS84 = Geod(ellps="WGS84")
 

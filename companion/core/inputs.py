@@ -6,6 +6,7 @@ the autopilot's clock). Missing is `None`, never 0.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -254,6 +255,35 @@ class LegReport:
     stops: bool
     speed_m_s: float | None = None
     longer: tuple[tuple[float, float], tuple[float, float]] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AutopilotLiquid:
+    """Which of the autopilot's battery monitors are flow meter and tank; None: neither."""
+
+    flow_battery: int | None = None
+    tank_battery: int | None = None
+    tank_l: float = 0.0
+
+    def flow(self, item: BatteryReport) -> FlowReport | None:
+        """Return the count of the flow meter; no number where the autopilot knows none."""
+        if item.battery != self.flow_battery:
+            return None
+        consumed_ml = item.consumed
+        if consumed_ml is None:
+            text = "flow meter: the autopilot has no count of it"
+            return FlowReport(received_s=item.received_s, volume_ml=math.nan, fault=text)
+        return FlowReport(received_s=item.received_s, volume_ml=consumed_ml)
+
+    def tank(self, item: BatteryReport) -> TankReport | None:
+        """Return what is left in the tank."""
+        if item.battery != self.tank_battery:
+            return None
+        percent = item.remaining_percent
+        if percent is None:
+            text = "tank: the autopilot has no level of it"
+            return TankReport(received_s=item.received_s, level_l=None, fault=text)
+        return TankReport(received_s=item.received_s, level_l=percent / 100.0 * self.tank_l)
 
 
 Input = (

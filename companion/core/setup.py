@@ -4,26 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from companion.core.atomiser import Atomiser
 from companion.core.boom import Boom
-from companion.core.coverage import Coverage
-from companion.core.crossings import Across, Border
-from companion.core.detection import Detection, Watching
-from companion.core.dosing import Sprayer
-from companion.core.drift import Drift
-from companion.core.flow_trim import FlowTrim, Trimming
+from companion.core.crossings import ROUTES_KEPT_S, Across, Border
+from companion.core.dose import Sprayer
 from companion.core.frame import LocalFrame
-from companion.core.interlock import Limits
-from companion.core.lines import Lines
-from companion.core.liquid_law import AutopilotLiquid
+from companion.core.inputs import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits
-from companion.core.overlap_guard import OverlapGuard
+from companion.core.options.atomisers import Atomiser
+from companion.core.options.coverage import Coverage
+from companion.core.options.drift import Drift
+from companion.core.options.flow_trim import FlowTrim, Trimming
+from companion.core.options.lines import Lines
+from companion.core.options.liquid_evidence import Detection, Watching
+from companion.core.options.overlap import OverlapGuard
+from companion.core.options.pump import Pump, Pumping
+from companion.core.options.treated_area import Lags, SwathSettings
 from companion.core.prescription import Prescription
-from companion.core.pump import Pump, Pumping
-from companion.core.routes import ROUTES_KEPT_S
+from companion.core.safety import Limits
 from companion.core.schedule import LagModel, Timing
-from companion.core.swath import SwathSettings
-from companion.core.swath_liquid import Lags
 from companion.core.types import Method
 
 

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.core import drawn
+from companion.core import motion
 from companion.core.arithmetic import exp
-from companion.core.drawn import NOT_DRAWN, Drawn
 from companion.core.motion import (
     BELIEVING,
     BRIDGED_MAX_S,
     CRUISE,
     DOUBTING,
     MANOEUVRE,
+    NOT_DRAWN,
     SHARE_MIN,
     Axis,
     Belief,
+    Drawn,
     Pair,
     Seen,
     Told,
@@ -155,7 +156,7 @@ def _drawn_after(by: Drawn, dt_s: float, before: Seen, now: Seen) -> Drawn:
     if before.velocity_m_s is None or now.velocity_m_s is None:
         return NOT_DRAWN
     told_m_s = 0.5 * (before.velocity_m_s + now.velocity_m_s)
-    return drawn.followed(by, dt_s, now.position_m - before.position_m, told_m_s)
+    return motion.followed(by, dt_s, now.position_m - before.position_m, told_m_s)
 
 
 def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:

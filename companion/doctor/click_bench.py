@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 from companion.core.ground_hold import STROKES_OVER_S, Hold
 from companion.core.ground_task import GroundKind, GroundTask, Phase
+from companion.core.inputs import AutopilotLiquid
 from companion.core.liquid_clicks import ClickFinding, ClickFlow, ClickJudgement
-from companion.core.liquid_law import AutopilotLiquid
 from companion.core.types import BatteryReport, Decision, FaultKind, FlowReport, Input
 from companion.doctor.check import Check, fail, not_applicable, ok, warn
 from companion.ground import GroundLink, HandHold

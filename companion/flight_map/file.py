@@ -28,7 +28,7 @@ from shapely import Geometry, LineString, MultiPolygon, Polygon
 from companion.atomic_write import write_atomically
 from companion.core.cells import CellGrid
 from companion.core.frame import LocalFrame
-from companion.core.lines import Polyline
+from companion.core.options.lines import Polyline
 from companion.core.prescription import Overlap, Prescription, Zone
 from companion.errors import MapError
 from companion.flight_map.model import Area, FlightMap, SourceFile

@@ -13,7 +13,7 @@ from shapely import Geometry, MultiPolygon, Polygon
 
 from companion.core.cells import CellGrid, Warp
 from companion.core.frame import LocalFrame
-from companion.core.lines import Polyline
+from companion.core.options.lines import Polyline
 from companion.core.prescription import Prescription, Zone
 from companion.problem import Problem
 

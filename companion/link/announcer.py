@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 
-from companion.core.sprayer_state import ENVELOPE
+from companion.core.safety import ENVELOPE
 from companion.core.types import Decision, Inhibit, SprayerState
 from companion.link.encode import (
     STATE_ACTIVE,

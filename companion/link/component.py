@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TypeGuard, get_args
 
-from companion.core.lines import MISSION_MODES
-from companion.core.order import AHEAD_MAX_S, BOOT_WRAP_S, Order, Place, noted, sorted_in
+from companion.core.options.lines import MISSION_MODES
+from companion.core.positions import AHEAD_MAX_S, BOOT_WRAP_S, Order, Place, noted, sorted_in
 from companion.core.types import (
     ClockReport,
     Decision,

@@ -17,19 +17,10 @@ from types import ModuleType
 
 import numpy as np
 
-from companion.core import (
-    atomiser,
-    boom,
-    frame,
-    interlock,
-    nozzle,
-    pump,
-    schedule,
-    setup,
-    types,
-)
+from companion.core import boom, frame, nozzle, safety, schedule, setup, types
+from companion.core.options import atomisers, pump
 
-_MODULES = (types, boom, nozzle, schedule, interlock, frame, pump, atomiser, setup)
+_MODULES = (types, boom, nozzle, schedule, safety, frame, pump, atomisers, setup)
 _SCALARS = frozenset({float, int, str, bool, type(None)})
 _SET = "frozenset"
 

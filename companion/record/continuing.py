@@ -12,9 +12,9 @@ import shapely
 from shapely import MultiPolygon
 from shapely.geometry.base import BaseGeometry
 
-from companion.core.coverage import CELL_M, Coverage
 from companion.core.frame import LocalFrame
-from companion.core.overlap_guard import OverlapGuard
+from companion.core.options.coverage import CELL_M, Coverage
+from companion.core.options.overlap import OverlapGuard
 from companion.core.setup import Setup
 from companion.errors import JournalError, UnreadableError
 from companion.record.coverage_area import as_polygons, moved, polygons

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from companion.core.coverage import CELL_M, TILE_CELLS, Coverage, TileKey
 from companion.core.frame import LocalFrame
+from companion.core.options.coverage import CELL_M, TILE_CELLS, Coverage, TileKey
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -11,7 +11,14 @@ import sqlite3
 import zlib
 from typing import Literal
 
-from companion.core.coverage import CELL_M, TILE_BYTES, TILE_CELLS, TILES_MAX, Coverage, TileKey
+from companion.core.options.coverage import (
+    CELL_M,
+    TILE_BYTES,
+    TILE_CELLS,
+    TILES_MAX,
+    Coverage,
+    TileKey,
+)
 
 _Kind = Literal["before", "flight"]
 _TABLE = (

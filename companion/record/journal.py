@@ -29,7 +29,7 @@ from companion.record.valve_rows import ValveOrder
 from companion.record.writer import Event, Item, LinkSample, Writer
 
 if TYPE_CHECKING:
-    from companion.core.coverage import Coverage
+    from companion.core.options.coverage import Coverage
 
 _logger = logging.getLogger(__name__)
 

@@ -23,7 +23,7 @@ from companion.record.totals import totals_of
 from companion.record.valve_rows import Row, ValveOrder, ValveRows
 
 if TYPE_CHECKING:
-    from companion.core.coverage import Coverage
+    from companion.core.options.coverage import Coverage
 
 
 import json

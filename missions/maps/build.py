@@ -10,9 +10,8 @@ import shapely
 from shapely import MultiPolygon
 from shapely.errors import ShapelyError
 
-from companion.core.dissolve import dissolved
 from companion.core.frame import LocalFrame
-from companion.core.prescription import Overlap, Prescription, Zone, closed
+from companion.core.prescription import Overlap, Prescription, Zone, closed, dissolved
 from companion.flight_map import moved
 from missions.maps.cells import bounds_deg, grid_of
 from missions.maps.local import (

@@ -14,7 +14,7 @@ from companion.config import Config
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
 from companion.core.frame import LocalFrame
-from companion.core.lines import Polyline
+from companion.core.options.lines import Polyline
 from companion.core.prescription import FIELD, Prescription
 from companion.core.setup import Setup
 from companion.errors import ConfigError, MapError

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from companion.core.frame import LocalFrame, Place
-from companion.core.lines import Polyline
+from companion.core.options.lines import Polyline
 from companion.errors import MapError
 from missions.maps.layer import read_bytes
 from missions.maps.model import map_error

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from companion.core.rate import rate_for_flow
+from companion.core.nozzle import rate_for_flow
 
 Kind = Literal["volume", "mass", "flow"]
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from companion.core.coverage import Coverage
+from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input, OperatorCommand, Telemetry
 from companion.link.component import ComponentOptions

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from companion.core.setup import Setup
 from sitl.hard_fields import (
     CentreLine,

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from analysis.evaluation import evaluate
-from companion.core.flow_trim import FlowTrim
+from companion.core.options.flow_trim import FlowTrim
 from companion.core.types import Decision
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly

@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.core.controller import Memory, step
 from companion.core.estimator import Track, estimate, observe
-from companion.core.interlock import Limits
 from companion.core.prescription import Prescription, Zone
+from companion.core.safety import Limits
 from companion.core.setup import Setup
 from companion.core.types import Decision
 from companion.link.component import Component, ComponentOptions

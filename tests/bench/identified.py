@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from analysis.calibration.result import settings
 from analysis.evaluation import Evaluation, evaluate
-from companion.core.flow_trim import FlowTrim
+from companion.core.options.flow_trim import FlowTrim
 from sitl.flight import fly
 from sitl.profile import load_profile
 from tests.bench import identification

@@ -28,7 +28,7 @@ from typing import Any
 import pyogrio
 
 from analysis.flown.read_applied import read_applied
-from companion.core.coverage import Coverage
+from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.record.codec import encode
 from companion.record.journal import Journal

@@ -12,8 +12,8 @@ from shapely import box
 
 from companion.config.load import load
 from companion.core.controller import Memory, step
-from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
+from companion.core.options.coverage import Coverage
 from companion.core.prescription import Prescription
 from companion.core.setup import Setup
 from companion.core.types import (

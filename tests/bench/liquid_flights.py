@@ -10,8 +10,9 @@ from typing import Literal
 
 import numpy as np
 
-from companion.core.detection import Detection, Watching, WatchMemory, follow
-from companion.core.flow_trim import FlowTrim
+from companion.core.options.flow_trim import FlowTrim
+from companion.core.options.liquid_evidence import Detection, Watching
+from companion.core.options.liquid_faults import WatchMemory, follow
 from companion.core.setup import Setup
 from companion.core.types import Decision, FlowReport, PressureReport, SprayPlan, VehicleState
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory

@@ -18,8 +18,8 @@ import shapely
 
 from analysis.evaluation import Evaluation, evaluate
 from companion.core.frame import LocalFrame
-from companion.core.interlock import Limits
 from companion.core.prescription import Prescription, Zone
+from companion.core.safety import Limits
 from companion.core.setup import Setup
 from companion.core.types import Method
 from sitl.flight import FlightOptions, fly

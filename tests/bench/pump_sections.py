@@ -21,7 +21,7 @@ from typing import Any
 from analysis.evaluation import Evaluation, evaluate
 from analysis.flight_record import FlightRecord
 from companion.config import load
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from companion.core.setup import Setup
 from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, fly

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.core.controller import Memory, expected_coverage
-from companion.core.coverage import Coverage
-from companion.core.overlap_guard import OverlapGuard
+from companion.core.options.coverage import Coverage
+from companion.core.options.overlap import OverlapGuard
 from companion.core.setup import Setup
 from companion.core.types import Input, OperatorCommand, VehicleState
 from companion.ports import COMMIT_EVERY_S

@@ -14,9 +14,8 @@ from shapely import Polygon
 
 from companion.core.crossings import Crossing, Route
 from companion.core.nozzle import FlowCurve, NozzleSet
-from companion.core.overdrive import Overdrive
 from companion.core.prescription import Prescription, Zone
-from companion.core.schedule import LagModel, Timing, orders
+from companion.core.schedule import LagModel, Overdrive, Timing, orders
 from companion.core.setup import Setup
 from tests.border_flight import Ground, Way, flows, spilled_by_valve
 from tests.builders import CURVE, boom, setup

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from companion.core.controller import Memory, step
 from companion.core.crossings import find_routes
 from companion.core.frame import LocalFrame, look_ahead_point
-from companion.core.nozzle import FlowCurve, PwmLimits, allowed_duty
+from companion.core.nozzle import FlowCurve, PwmLimits, allowed_duty, flow_for_rate
 from companion.core.prescription import Prescription, Zone
-from companion.core.rate import flow_for_rate
 from companion.core.types import Fix, VehicleState
 from tests.builders import CURVE, SPRAYING, along, boom, flying, setup
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.crossings import Route, find_routes
-from companion.core.drift import Drift, Offset, landed, offset
+from companion.core.frame import Offset
+from companion.core.options.drift import Drift, landed, offset
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import VehicleState, WindReport
 from tests.builders import SPRAYING, along, boom, flying

@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.core import flow_trim
-from companion.core.flow_trim import FlowTrim
+from companion.core.options import flow_trim
+from companion.core.options.flow_trim import FlowTrim
 from companion.core.types import FlowReport
 from tests.unit.trim_bench import TrimBench
 

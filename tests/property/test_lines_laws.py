@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.crossings import Route, find_routes
-from companion.core.lines import Lines, Piece, Polyline, add_off_lines
+from companion.core.options.lines import Lines, Piece, Polyline, add_off_lines
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import VehicleState, Way
 from tests.builders import along, boom, flying

@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.core.atomiser import Atomiser, DropletLaw
 from companion.core.controller import Memory, step
-from companion.core.drive_plans import behind_path
 from companion.core.nozzle import FlowCurve
-from companion.core.pump import Pump, Way
+from companion.core.options.atomisers import Atomiser, DropletLaw
+from companion.core.options.pump import Pump, Way, behind_path
 from companion.core.setup import Setup
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from tests.builders import SPRAYING, flying

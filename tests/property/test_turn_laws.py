@@ -10,9 +10,9 @@ import shapely
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from companion.core.boom import STRAIGHT_LATERAL_M_S2, STRAIGHT_YAW_RATE_DEG_S
 from companion.core.crossings import find_routes
 from companion.core.motion import CRUISE
-from companion.core.paths import STRAIGHT_LATERAL_M_S2, STRAIGHT_YAW_RATE_DEG_S
 from companion.core.prescription import Prescription, Zone
 from tests.builders import boom, flying
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.core.coverage import Coverage
+from companion.core.options.coverage import Coverage
 from companion.core.types import Decision, Input
 from companion.record.reader import read_journal
 from sitl.serve import ServeOptions

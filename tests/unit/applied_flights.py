@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from analysis.flown.applied_flight import AppliedFlight, Series, ValveChanges
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from companion.core.setup import Setup
 from tests.builders import setup
 

@@ -14,7 +14,7 @@ import shapely
 from companion.assembly import deliverable
 from companion.config import load
 from companion.core.frame import LocalFrame
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from companion.core.setup import Setup
 from companion.core.types import Method
 from companion.errors import ConfigError, MapError

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from sitl.demo_field import demo_trajectory
 from tests.bench import __main__ as bench
 from tests.bench.accuracy import accuracy

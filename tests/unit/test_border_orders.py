@@ -11,11 +11,10 @@ import shapely
 from companion.config.load import load
 from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
-from companion.core.lines import Lines
-from companion.core.overdrive import Overdrive
+from companion.core.options.lines import Lines
+from companion.core.options.pump import Way as PumpWay
 from companion.core.prescription import Prescription, Zone
-from companion.core.pump import Way as PumpWay
-from companion.core.schedule import LagModel, Order, Timing, orders, schedule, shut_spans
+from companion.core.schedule import LagModel, Order, Overdrive, Timing, orders, schedule, shut_spans
 from companion.core.setup import Setup
 from missions.maps.compiling import compiled_setup
 from tests.border_flight import Way, flows, orders_of, pump_orders_of, spilled_by_valve, spilled_s

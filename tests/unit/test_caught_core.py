@@ -13,8 +13,8 @@ import pytest
 
 from companion.core.crossings import Crossing, Route
 from companion.core.estimator import Track, estimate, observe
-from companion.core.interlock import Limits, closed_plan, guard, inhibits
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
+from companion.core.safety import Limits, closed_plan, guard, inhibits
 from companion.core.schedule import Timing, orders, resolve, schedule
 from companion.core.types import (
     ClockReport,

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 import shapely
 
-from companion.core.boom import Boom, Valve
+from companion.core.boom import Boom, Valve, predict
 from companion.core.controller import Memory, step
 from companion.core.crossings import Route, find_routes
 from companion.core.motion import CRUISE
 from companion.core.nozzle import FlowCurve
-from companion.core.paths import predict
 from companion.core.prescription import Prescription, Zone
 from companion.core.types import VehicleState
 from tests.builders import flying, setup

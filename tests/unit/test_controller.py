@@ -12,9 +12,8 @@ import shapely
 
 from companion.core.controller import Memory, step
 from companion.core.crossings import Across, find_routes
-from companion.core.nozzle import FlowCurve, NozzleSet
+from companion.core.nozzle import FlowCurve, NozzleSet, flow_for_rate
 from companion.core.prescription import Prescription, Zone
-from companion.core.rate import flow_for_rate
 from companion.core.setup import Setup
 from companion.core.types import Method, SprayPlan, TimedChange, VehicleState
 from tests.builders import CURVE, LAG, along, boom, flying, plots, setup

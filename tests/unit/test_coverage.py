@@ -10,8 +10,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core import coverage as raster
-from companion.core.coverage import CELL_M, TILE_CELLS, Coverage, Quad
+from companion.core.options import coverage as raster
+from companion.core.options.coverage import CELL_M, TILE_CELLS, Coverage, Quad
 
 HALF = CELL_M / 2
 

@@ -22,10 +22,10 @@ from analysis.replay import replay
 from companion.cli.app import execute
 from companion.cli.run import unfinished
 from companion.core.controller import Memory, expected_coverage, step
-from companion.core.coverage import Coverage
 from companion.core.estimator import Track, estimate, observe
 from companion.core.frame import LocalFrame
-from companion.core.overlap_guard import OverlapGuard
+from companion.core.options.coverage import Coverage
+from companion.core.options.overlap import OverlapGuard
 from companion.core.setup import Setup
 from companion.core.types import (
     Decision,

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 import shapely
 
-from companion.core import swath_liquid as law
 from companion.core.controller import Memory, expected_coverage, step
-from companion.core.coverage import Coverage
+from companion.core.options import treated_area
+from companion.core.options.coverage import Coverage
+from companion.core.options.treated_area import Swath, Toggle, follow
 from companion.core.prescription import Prescription
 from companion.core.setup import Setup
-from companion.core.swath import Swath, follow
-from companion.core.swath_liquid import Toggle
 from companion.core.types import FaultKind, Finding, SprayPlan, TimedChange, VehicleState
 from tests.builders import LAG, along, boom, flying, plots, setup
 
@@ -180,7 +179,7 @@ def strips(made: Coverage) -> list[bool]:
     return made.covered_at(np.full(6, 10.0), MIDDLES).tolist()
 
 
-@pytest.mark.parametrize("kind", sorted(law.NO_LIQUID))
+@pytest.mark.parametrize("kind", sorted(treated_area.NO_LIQUID))
 def test_nothing_is_treated_where_no_liquid_comes(kind: FaultKind) -> None:
     assert strips(swept(given(), OPEN)) == [True] * 6
     assert not swept(given(), OPEN, found(kind)).tiles
@@ -216,9 +215,9 @@ def test_a_lease_that_ends_closes() -> None:
 
 def test_a_change_that_overtakes_the_one_before_undoes_it() -> None:
     off = Toggle(10.2, 1, opens=False)
-    assert law.toggled((off,), Toggle(10.1, 1, opens=True)) == ()
+    assert treated_area.toggled((off,), Toggle(10.1, 1, opens=True)) == ()
     other = Toggle(10.1, 0, opens=True)
-    assert law.toggled((off,), other) == (off, other)
+    assert treated_area.toggled((off,), other) == (off, other)
 
 
 def test_an_opening_of_a_moment_treats_its_moment() -> None:

@@ -14,11 +14,11 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.core.controller import expected_coverage
-from companion.core.detection import Detection
-from companion.core.drift import Drift
-from companion.core.flow_trim import FlowTrim
-from companion.core.lines import Lines
-from companion.core.liquid_law import AutopilotLiquid
+from companion.core.inputs import AutopilotLiquid
+from companion.core.options.drift import Drift
+from companion.core.options.flow_trim import FlowTrim
+from companion.core.options.lines import Lines
+from companion.core.options.liquid_evidence import Detection
 from companion.core.setup import Setup
 from companion.core.types import SpeedReport, WindReport
 from companion.link.codec import Codec

@@ -11,18 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.core.controller import Memory, Watched, step
-from companion.core.detection import Detection, Watching, WatchMemory, follow
-from companion.core.flow_trim import FlowTrim
-from companion.core.liquid_bins import (
+from companion.core.options.flow_trim import FlowTrim
+from companion.core.options.liquid_evidence import (
     Bin,
     Collecting,
+    Detection,
     Order,
+    Watching,
     bin_length_s,
     collected,
     duties_of,
     expected_ml,
+    valve_of,
 )
-from companion.core.liquid_naming import valve_of
+from companion.core.options.liquid_faults import WatchMemory, follow
 from companion.core.types import (
     Decision,
     FaultKind,

@@ -7,8 +7,8 @@ import math
 import pytest
 
 from companion.core.ground_hold import Hold
+from companion.core.inputs import AutopilotLiquid
 from companion.core.liquid_clicks import ClickFinding, ClickJudgement
-from companion.core.liquid_law import AutopilotLiquid
 from companion.core.types import BatteryReport, FaultKind, FlowReport
 from companion.doctor.check import Check, Status
 from companion.doctor.click_bench import (

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.core.drawn import (
+from companion.core.frame import LocalFrame
+from companion.core.motion import (
     AGREES_M_S,
     DRAWN_MAX_M_S,
     MEMORY_S,
@@ -20,7 +21,6 @@ from companion.core.drawn import (
     Drawn,
     followed,
 )
-from companion.core.frame import LocalFrame
 from companion.core.types import Telemetry
 from companion.core.vehicle_motion import Motion, begun
 from companion.core.vehicle_motion import followed as moved_on

@@ -12,13 +12,13 @@ import shapely
 
 from analysis.evaluation import evaluate
 from companion.config import load
-from companion.core import drift
 from companion.core.controller import Memory, step
 from companion.core.crossings import Route, find_routes
-from companion.core.drift import Drift, fall_s
 from companion.core.estimator import Track, estimate, observe
-from companion.core.interlock import Limits
+from companion.core.options import drift
+from companion.core.options.drift import Drift, fall_s
 from companion.core.prescription import Prescription, Zone
+from companion.core.safety import Limits
 from companion.core.types import Inhibit, Input, VehicleState, WindReport
 from companion.record.setup_json import field_names_of, setup_to_json
 from missions.maps.compiling import compiled_setup

@@ -11,11 +11,11 @@ import shapely
 
 from analysis.replay import FlownCore, replay
 from companion.config import load
-from companion.core import flow_trim
 from companion.core.controller import Memory, step
-from companion.core.flow_trim import FlowTrim
-from companion.core.flow_window import Sample, flows_over, with_order
 from companion.core.nozzle import FlowCurve, NozzleSet
+from companion.core.options import flow_trim
+from companion.core.options.flow_meter import Sample, flows_over, with_order
+from companion.core.options.flow_trim import FlowTrim
 from companion.core.prescription import Prescription
 from companion.core.setup import Setup
 from companion.core.types import (

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
 from companion.core.estimator import Track, estimate, observe
-from companion.core.frozen import Stand, look
+from companion.core.positions import Stand, look
 from companion.core.types import (
     Decision,
     EstimatorReport,

@@ -10,7 +10,7 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
-from companion.core.interlock import (
+from companion.core.safety import (
     HEIGHT_MARGIN_M,
     HOLD_S,
     MARGIN_SHARE_MAX,

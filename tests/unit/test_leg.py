@@ -11,9 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core.controller import Memory, step
-from companion.core.estimator import Track, estimate, observe
-from companion.core.leg import (
+from companion.core.boom import predict
+from companion.core.braking import (
     Approach,
     Leg,
     approach,
@@ -23,7 +22,8 @@ from companion.core.leg import (
     speed_after,
     stop_ahead,
 )
-from companion.core.paths import predict
+from companion.core.controller import Memory, step
+from companion.core.estimator import Track, estimate, observe
 from companion.core.setup import Setup
 from companion.core.types import (
     HeartbeatReport,

@@ -10,7 +10,7 @@ import shapely
 
 from companion.core.controller import Memory, step
 from companion.core.estimator import Track, observe
-from companion.core.lines import Lines, Polyline
+from companion.core.options.lines import Lines, Polyline
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
 from companion.core.types import LegReport, TimedChange, VehicleState, Way

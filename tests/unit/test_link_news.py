@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from companion.core.estimator import Track, observe
-from companion.core.order import Order
+from companion.core.positions import Order
 from companion.core.types import Input, RcReport
 from companion.link.component import Component, ComponentOptions, News
 from companion.link.messages import ServoOutput

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from missions.demand import Uniform
 from missions.files.items import CHANGE_SPEED, SPRAYER, items_of
 from missions.paced import paced

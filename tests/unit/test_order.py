@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.estimator import Track, estimate, observe
-from companion.core.order import Order, Place, noted, sorted_in
+from companion.core.positions import Order, Place, noted, sorted_in
 from companion.core.types import ClockReport, HeartbeatReport, Input, Telemetry, UtcReport
 from tests import builders
 from tests.builders import setup

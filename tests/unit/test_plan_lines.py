@@ -19,7 +19,7 @@ from analysis.track import PlannedLines
 from companion.cli.app import execute
 from companion.config import load
 from companion.core.frame import LocalFrame
-from companion.core.lines import Lines
+from companion.core.options.lines import Lines
 from companion.errors import ConfigError, MapError
 from companion.record.layers import Ground
 from companion.record.setup_json import field_names_of, setup_from_json, setup_to_json

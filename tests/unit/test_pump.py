@@ -9,15 +9,13 @@ from itertools import pairwise
 
 import pytest
 
-from companion.core.atomiser import Atomiser, DropletLaw, Flow, spinning
-from companion.core.boom_route import boom_route, bridged
 from companion.core.controller import Memory, step
-from companion.core.crossings import Crossing
-from companion.core.detection import Detection
-from companion.core.drive_plans import liquid_plan
-from companion.core.flow_trim import FlowTrim
+from companion.core.crossings import Crossing, boom_route, bridged
 from companion.core.nozzle import FlowCurve
-from companion.core.pump import Pump
+from companion.core.options.atomisers import Atomiser, DropletLaw, Flow, spinning
+from companion.core.options.flow_trim import FlowTrim
+from companion.core.options.liquid_evidence import Detection
+from companion.core.options.pump import Pump, liquid_plan
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from companion.record.codec import FIELD_NAMES, decode, encode
 from tests.builders import boom, flying, setup

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
 from companion.core.estimator import Track, observe
-from companion.core.rate import overridden
+from companion.core.nozzle import overridden
 from companion.core.setup import Setup
 from companion.core.types import Decision, RateOverride
 from tests import builders

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.core.crossings import Crossing
-from companion.core.overdrive import Overdrive
-from companion.core.schedule import LagModel, Timing, orders, schedule
+from companion.core.schedule import LagModel, Overdrive, Timing, orders, schedule
 from sitl.knowledge import measured_sets
 from sitl.profile import load_profile
 from sitl.pump_plant import PumpPlant

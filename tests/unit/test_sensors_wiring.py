@@ -14,7 +14,7 @@ from companion.cli.sensor_parts import PressureSensor, build_sensors
 from companion.config import load
 from companion.config.rules import without_effect
 from companion.core.estimator import Track, observe
-from companion.core.liquid_law import AutopilotLiquid
+from companion.core.inputs import AutopilotLiquid
 from companion.core.types import BatteryReport, Decision, FlowReport, Input, PressureReport
 from companion.errors import ConfigError, SensorError
 from companion.link.decode import FROM_VEHICLE

@@ -12,9 +12,18 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from companion.core.controller import Memory, step
 from companion.core.estimator import Track, estimate, observe
-from companion.core.interlock import HOLD_S, Limits, settled
+from companion.core.safety import (
+    BOOT,
+    ENVELOPE,
+    FAULTS,
+    HOLD_S,
+    LATCHED,
+    Limits,
+    Machine,
+    follow,
+    settled,
+)
 from companion.core.setup import Setup
-from companion.core.sprayer_state import BOOT, ENVELOPE, FAULTS, LATCHED, Machine, follow
 from companion.core.types import (
     Decision,
     EstimatorReport,

@@ -6,8 +6,8 @@ import math
 import random
 from dataclasses import dataclass, field
 
-from companion.core import flow_trim
-from companion.core.flow_trim import FlowTrim, TrimMemory, Trimming
+from companion.core.options import flow_trim
+from companion.core.options.flow_trim import FlowTrim, TrimMemory, Trimming
 from companion.core.types import FlowReport, FlowTrimState
 from tests.builders import LAG, setup
 

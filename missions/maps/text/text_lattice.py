@@ -20,7 +20,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.core.rate import flow_for_rate
+from companion.core.nozzle import flow_for_rate
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.cells import to_degrees
 from missions.maps.model import Floats, MapCells, MapFile, map_error

@@ -8,15 +8,23 @@ there are any, are on-off sections then. Whatever the laws say, the last word ha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from companion.core.boom import Boom
-from companion.core.boom_route import boom_route, bridged
-from companion.core.crossings import Crossing, Route
+from companion.core.crossings import Crossing, Route, boom_route, bridged
+from companion.core.dose import dosing_of, overdrive_of, speed_soon
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
-from companion.core.schedule import LagModel, Timing, rate_at, resolve
-from companion.core.types import Method
+from companion.core.schedule import LagModel, Timing, rate_at, resolve, schedule, sticky_border_s
+from companion.core.types import (
+    DriveChange,
+    DrivePlan,
+    Method,
+    SprayPlan,
+    TimedChange,
+    VehicleState,
+)
 
 Control = Literal["modulates", "constant"]
 # What lets out what is pumped: the valves alone, a return valve beside them, or nozzles that
@@ -235,3 +243,109 @@ def _where_open(route: Route, on: Route) -> Route:
         if not (made and here.is_as(made[-1])):
             made.append(here)
     return tuple(made)
+
+
+# Plans of motors: what is in force, where a pump may run, what of it comes out of the nozzles.
+
+# A move of the motor by less is a trim, as on a valve's driver board.
+RESTART_FRACTION = 0.02
+
+
+def as_drive(fraction: float, changes: Sequence[TimedChange]) -> DrivePlan:
+    """Return a motor's plan from the changes of duty that the schedule made for it."""
+    return DrivePlan(
+        fraction=fraction,
+        changes=tuple(DriveChange(at_s=each.at_s, fraction=each.duty) for each in changes),
+    )
+
+
+def behind_path(plan: SprayPlan, drive: DrivePlan) -> DrivePlan:
+    """Return the drive stopped wherever no valve of the plan is open: no way out, no pump.
+
+    >>> off = TimedChange(at_s=0.2, valve=0, duty=0.0)
+    >>> plan = SprayPlan(sequence=1, issued_s=0.0, duty=(1.0,), changes=(off,), lease_until_s=0.3)
+    >>> [change.at_s for change in behind_path(plan, DrivePlan(fraction=0.5)).changes]
+    [0.2]
+    """
+    duty = list(plan.duty)
+    # At one moment the valves go first: an opening one is open for the pump that starts with it.
+    times = {change.at_s for change in plan.changes} | {change.at_s for change in drive.changes}
+    start = drive.fraction if any(duty) else 0.0
+    made: list[DriveChange] = []
+    stands = start
+    valves = iter(plan.changes)
+    ahead = next(valves, None)
+    for at_s in sorted(times):
+        while ahead is not None and ahead.at_s <= at_s:
+            duty[ahead.valve] = ahead.duty
+            ahead = next(valves, None)
+        wanted = drive.at(at_s) if any(duty) else 0.0
+        if wanted != stands:
+            made.append(DriveChange(at_s=at_s, fraction=wanted))
+            stands = wanted
+    return DrivePlan(fraction=start, changes=tuple(made))
+
+
+def constant_drive(pump: Pump, plan: SprayPlan) -> DrivePlan:
+    """Return the plan of a pump that supplies valves: it runs wherever it may."""
+    drive = DrivePlan(fraction=pump.run_fraction)
+    return drive if pump.way == "return" else behind_path(plan, drive)
+
+
+def liquid_plan(plan: SprayPlan | None, way: Way) -> SprayPlan | None:
+    """Return the plan of one valve that is the pump: what of its flow comes out of the nozzles."""
+    if plan is None:
+        return None
+    drive = plan.drives[0] if plan.drives else DrivePlan(fraction=0.0)
+    if way == "return":
+        drive = behind_path(plan, drive)
+    changes = []
+    before = drive.fraction
+    for change in drive.changes:
+        moved = abs(change.fraction - before)
+        is_new = (before == 0.0) != (change.fraction == 0.0) or moved >= RESTART_FRACTION
+        changes.append(TimedChange(at_s=change.at_s, valve=0, duty=change.fraction, restart=is_new))
+        before = change.fraction
+    return SprayPlan(
+        sequence=plan.sequence,
+        issued_s=plan.issued_s,
+        duty=(drive.fraction,),
+        changes=tuple(changes),
+        lease_until_s=plan.lease_until_s,
+    )
+
+
+# What the motors do: the pump by the laws of the valves, the atomisers by the flow to come.
+
+
+def modulated(
+    pumping: Pumping,
+    state: VehicleState,
+    plan: SprayPlan,
+    routes: tuple[Route, ...],
+    *,
+    in_force: float,
+    speed_m_s: float,
+    skew: float,
+    border_buffer_m: float,
+) -> DrivePlan:
+    """Return the plan of a pump that makes the flow, behind the valves' `plan`."""
+    found = schedule(
+        pump_route(pumping, routes),
+        valve=0,
+        timing=pumping.timing,
+        dosing=dosing_of(pumping, 0, skew, state.rate_percent),
+        in_force=in_force,
+        speed_soon_m_s=speed_soon(pumping, state, speed_m_s),
+        now_s=plan.issued_s,
+        until_s=plan.lease_until_s,
+        overdrive=overdrive_of(pumping, 0),
+        sticky_border_s=sticky_border_s(border_buffer_m, speed_m_s),
+    )
+    drive = as_drive(in_force, found.changes)
+    return behind_path(plan, drive) if pumping.pump.way == "valves" else drive
+
+
+def liquid_of(pumping: Pumping | None, plan: SprayPlan | None) -> SprayPlan | None:
+    """Return the plan that the meter's flow follows: the valves', or that of the pump."""
+    return plan if pumping is None else liquid_plan(plan, pumping.pump.way)

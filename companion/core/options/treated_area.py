@@ -11,17 +11,283 @@ long as they are straight: a step stays cheap.
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+
 from companion.core.boom import Boom
-from companion.core.coverage import Coverage
-from companion.core.drift import Offset
-from companion.core.frame import Place
-from companion.core.swath_liquid import Lags, Toggle, open_at, ordered_until
-from companion.core.swath_way import Front, swept
-from companion.core.types import Finding, SprayPlan, VehicleState
+from companion.core.frame import Offset, Place
+from companion.core.options.coverage import Coverage, Quad
+from companion.core.schedule import LagModel
+from companion.core.types import FaultKind, Finding, SprayPlan, VehicleState
+
+# What the boom sweeps over the ground while its valves are open: few and straight pieces.
+
+# So far a tip of the boom may be off a straight piece: below the noise of an RTK position.
+STRAIGHT_M = 0.03
+NEAR_M = 1e-6
+# Strips of neighbours that touch to this are one.
+TOUCH_M = 0.01
+
+
+class Front(NamedTuple):
+    """Where the boom was, the liquid's offset by the wind in it."""
+
+    time_s: float
+    east_m: float
+    north_m: float
+    heading_deg: float
+
+
+def swept(
+    boom: Boom,
+    fronts: tuple[Front, ...],
+    is_open: tuple[bool, ...],
+    toggles: tuple[Toggle, ...],
+) -> list[Quad]:
+    """Return the quadrilaterals swept on the way through `fronts`; `is_open` holds at the first."""
+    way = _Way(boom, fronts)
+    stays = _stays(is_open, toggles, fronts[0].time_s, fronts[-1].time_s)
+    return [quad for strip in _strips(boom, stays) for quad in way.quads(*strip)]
+
+
+# From when until when liquid comes out of one valve.
+_Stays = tuple[tuple[float, float], ...]
+
+
+def _stays(
+    is_open: tuple[bool, ...], toggles: tuple[Toggle, ...], start_s: float, end_s: float
+) -> list[_Stays]:
+    """Return when each valve is open between two times."""
+    found: list[_Stays] = []
+    for valve, opens in enumerate(is_open):
+        stays = []
+        since_s = start_s
+        for toggle in toggles:
+            if toggle.valve != valve or toggle.at_s > end_s or toggle.opens is opens:
+                continue
+            if opens:
+                stays.append((since_s, toggle.at_s))
+            opens, since_s = toggle.opens, max(toggle.at_s, start_s)
+        if opens:
+            stays.append((since_s, end_s))
+        found.append(tuple(stay for stay in stays if stay[1] > stay[0]))
+    return found
+
+
+# Left and right end, place ahead, and when it is open: of valves side by side that are so together.
+_Strip = tuple[float, float, float, _Stays]
+
+
+def _strips(boom: Boom, stays: list[_Stays]) -> list[_Strip]:
+    found: list[_Strip] = []
+    for right_m, forward_m, half_m, own in zip(
+        boom.right_m.tolist(),
+        boom.forward_m.tolist(),
+        boom.half_width_m.tolist(),
+        stays,
+        strict=True,
+    ):
+        left_m = right_m - half_m
+        if found and found[-1][2:] == (forward_m, own) and abs(found[-1][1] - left_m) <= TOUCH_M:
+            left_m = found.pop()[0]
+        found.append((left_m, right_m + half_m, forward_m, own))
+    return found
+
+
+class _Way:
+    """The way of the boom through its fronts, in as few straight pieces as it allows.
+
+    Plain numbers: for some ten fronts that is several times as fast as arrays are.
+    """
+
+    def __init__(self, boom: Boom, fronts: tuple[Front, ...]) -> None:
+        self._fronts = fronts
+        reach_m = float((np.abs(boom.right_m) + boom.half_width_m).max())
+        tips = []
+        for _, east_m, north_m, heading_deg in fronts:
+            angle = math.radians(heading_deg)
+            sin, cos = reach_m * math.sin(angle), reach_m * math.cos(angle)
+            tips.append((east_m - cos, north_m + sin, east_m + cos, north_m - sin))
+        self._knots_s = [fronts[bend].time_s for bend in _bends(tips, 0, len(tips) - 1)]
+
+    def quads(self, left_m: float, right_m: float, forward_m: float, stays: _Stays) -> list[Quad]:
+        """Return the quadrilaterals that a strip sweeps while it is open."""
+        found: list[Quad] = []
+        for begin_s, end_s in stays:
+            inner = [knot_s for knot_s in self._knots_s if begin_s < knot_s < end_s]
+            ends = [
+                self._ends(at_s, left_m, right_m, forward_m) for at_s in (begin_s, *inner, end_s)
+            ]
+            found.extend(
+                (left, right, next_right, next_left)
+                for (left, right), (next_left, next_right) in pairwise(ends)
+            )
+        return found
+
+    def _ends(
+        self, at_s: float, left_m: float, right_m: float, forward_m: float
+    ) -> tuple[Place, Place]:
+        """Return where the ends of a strip are at a time."""
+        number = bisect_right(self._fronts, at_s, key=_time) - 1
+        number = min(max(number, 0), len(self._fronts) - 2)
+        first, last = self._fronts[number : number + 2]
+        share = min(max((at_s - first.time_s) / (last.time_s - first.time_s), 0.0), 1.0)
+        turned_deg = (last.heading_deg - first.heading_deg + 180.0) % 360.0 - 180.0
+        angle = math.radians(first.heading_deg + share * turned_deg)
+        sin, cos = math.sin(angle), math.cos(angle)
+        east_m = first.east_m + share * (last.east_m - first.east_m) + forward_m * sin
+        north_m = first.north_m + share * (last.north_m - first.north_m) + forward_m * cos
+        return (
+            (east_m + left_m * cos, north_m - left_m * sin),
+            (east_m + right_m * cos, north_m - right_m * sin),
+        )
+
+
+def _time(front: Front) -> float:
+    return front.time_s
+
+
+def _bends(tips: list[tuple[float, float, float, float]], first: int, last: int) -> list[int]:
+    """Return the indices between which both tips go straight (as Douglas and Peucker have it)."""
+    x0, y0, x1, y1 = tips[first]
+    x2, y2, x3, y3 = tips[last]
+    dx, dy, ex, ey = x2 - x0, y2 - y0, x3 - x1, y3 - y1
+    left, right = math.hypot(dx, dy), math.hypot(ex, ey)
+    worst, worst_m = 0, STRAIGHT_M
+    for number in range(first + 1, last):
+        xa, ya, xb, yb = tips[number]
+        xa, ya, xb, yb = xa - x0, ya - y0, xb - x1, yb - y1
+        off_m = max(
+            abs(xa * dy - ya * dx) / left if left > NEAR_M else math.hypot(xa, ya),
+            abs(xb * ey - yb * ex) / right if right > NEAR_M else math.hypot(xb, yb),
+        )
+        if off_m > worst_m:
+            worst, worst_m = number, off_m
+    if not worst:
+        return []
+    return [*_bends(tips, first, worst), worst, *_bends(tips, worst, last)]
+
+
+# When liquid comes out of a valve, or stops: from the plan in force and what was found.
+#
+# A valve is open by the changes that a plan has brought about in its time; an inhibit has made a
+# plan without any. What flow, pressure and tank say of the liquid goes before it. An order takes
+# effect on the liquid after its lag, the volume-equivalent one: a sharp edge there carries the
+# same volume as the rise or fall.
+
+# Found in the liquid: nothing, or not what was ordered, comes out.
+NO_LIQUID = frozenset({FaultKind.NO_FLOW, FaultKind.PUMP_OFF, FaultKind.TANK_EMPTY, FaultKind.AIR})
+
+
+class Lags(NamedTuple):
+    """The lag of the valves, and that of what makes the flow: the same, or a pump's."""
+
+    valve: LagModel
+    flow: LagModel
+
+
+class Toggle(NamedTuple):
+    """From `at_s` on liquid comes out of a valve, or none does."""
+
+    at_s: float
+    valve: int
+    opens: bool
+
+
+def ordered_until(
+    plan: SprayPlan | None,
+    pumped: SprayPlan | None,
+    findings: tuple[Finding, ...],
+    *,
+    now_s: float,
+    lags: Lags,
+    ordered: tuple[bool, ...],
+    toggles: tuple[Toggle, ...],
+    lapses: bool,
+) -> tuple[tuple[bool, ...], tuple[Toggle, ...]]:
+    """Return what is ordered by `now_s` and what becomes of it, after what was until then.
+
+    `pumped` is the flow of a pump that makes it, where there is one. With `lapses` a plan ends with
+    its lease, as an executor has it.
+    """
+    for at_s, opened, lag in _openings(plan, pumped, lags, now_s, lapses=lapses):
+        wanted = _real(opened, findings) if findings else opened
+        if wanted == ordered:
+            continue
+        for valve, (was, opens) in enumerate(zip(ordered, wanted, strict=True)):
+            if was != opens:
+                lag_s = (lag.on_s if opens else lag.off_s) + lags.valve.output_s
+                toggles = toggled(toggles, Toggle(at_s + lag_s, valve, opens))
+        ordered = wanted
+    return ordered, toggles
+
+
+def _openings(
+    plan: SprayPlan | None, pumped: SprayPlan | None, lags: Lags, now_s: float, *, lapses: bool
+) -> list[tuple[float, tuple[bool, ...], LagModel]]:
+    """Return which valves let liquid out, from when on, and by the lag of what."""
+    if plan is None:
+        return []
+    duty = [each > 0.0 for each in plan.duty]
+    until_s = min(now_s, plan.lease_until_s) if lapses else now_s
+    runs = pumped is None or pumped.duty[0] > 0.0
+    lag = lags.valve
+    found = [(plan.issued_s, tuple(each and runs for each in duty), lag)]
+    changes = [(change.at_s, change.valve, change.duty > 0.0) for change in plan.changes]
+    if pumped is not None:
+        changes += [(change.at_s, -1, change.duty > 0.0) for change in pumped.changes]
+        changes.sort()
+    for at_s, valve, opens in changes:
+        if not at_s <= until_s:
+            break
+        if valve < 0:
+            runs = opens
+        else:
+            duty[valve] = opens
+        lag = lags.flow if valve < 0 else lags.valve
+        found.append((at_s, tuple(each and runs for each in duty), lag))
+    if lapses and not now_s < plan.lease_until_s:
+        found.append((plan.lease_until_s, (False,) * len(duty), lags.valve))
+    return found
+
+
+def _real(opened: tuple[bool, ...], findings: tuple[Finding, ...]) -> tuple[bool, ...]:
+    """Return which valves let liquid out, after all that was found."""
+    kinds = {finding.kind for finding in findings}
+    shut = {each.valve for each in findings if each.kind is FaultKind.STUCK_CLOSED}
+    stuck = {each.valve for each in findings if each.kind is FaultKind.STUCK_OPEN}
+    flows = not kinds & NO_LIQUID
+    return tuple(
+        flows and ((is_open and valve not in shut) or valve in stuck)
+        for valve, is_open in enumerate(opened)
+    )
+
+
+def toggled(toggles: tuple[Toggle, ...], new: Toggle) -> tuple[Toggle, ...]:
+    """Return the toggles with one more; one that comes before the last of its valve undoes it."""
+    for number in range(len(toggles) - 1, -1, -1):
+        if toggles[number].valve == new.valve:
+            if toggles[number].at_s >= new.at_s:
+                return toggles[:number] + toggles[number + 1 :]
+            break
+    return (*toggles, new)
+
+
+def open_at(
+    is_open: tuple[bool, ...], toggles: tuple[Toggle, ...], at_s: float
+) -> tuple[tuple[bool, ...], tuple[Toggle, ...]]:
+    """Return which valves are open at a time, and what follows later."""
+    now = list(is_open)
+    for toggle in toggles:
+        if toggle.at_s <= at_s:
+            now[toggle.valve] = toggle.opens
+    return tuple(now), tuple(toggle for toggle in toggles if toggle.at_s > at_s)
+
 
 # The way is stamped after this time: a swath of 10 m at 5 m/s is one look at some 2000 cells.
 STAMP_EVERY_S = 2.0

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from companion.core.nozzle import FlowCurve
+from companion.core.boom import Boom
+from companion.core.crossings import Route, boom_route
+from companion.core.nozzle import FlowCurve, flow_for_rate, overridden
 from companion.core.types import DriveChange, DrivePlan
 
 # As of a valve's trims: smaller moves are noise of the speed.
@@ -97,6 +99,24 @@ class Flow(NamedTuple):
 
     at_s: float
     flow_l_min: float
+
+
+def flows_ahead(
+    boom: Boom, routes: tuple[Route, ...], *, skew: float, percent: float, limit_l_ha: float | None
+) -> list[Flow]:
+    """Return the boom's flow along its way, as it comes out of the nozzles."""
+    width_m = boom.width_m * skew
+    return [
+        Flow(
+            step.at_s,
+            flow_for_rate(
+                overridden(step.rate_l_ha or 0.0, percent, limit_l_ha),
+                step.speed_m_s,
+                width_m,
+            ),
+        )
+        for step in boom_route(routes, boom)
+    ]
 
 
 def spinning(

@@ -17,10 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.core.boom import Boom
+from companion.core.boom import Boom, Paths, time_on_chord
 from companion.core.border import Intervals
 from companion.core.frame import Floats, Place
-from companion.core.paths import Paths, time_on_chord
 from companion.core.types import VehicleState, Way
 
 Polyline = tuple[Place, ...]

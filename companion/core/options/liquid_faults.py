@@ -11,29 +11,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from companion.core.flow_window import ML_S_PER_L_MIN, STALE_S
-from companion.core.liquid_bins import (
+from companion.core.options.flow_meter import ML_S_PER_L_MIN, STALE_S
+from companion.core.options.liquid_evidence import (
     LONGEST_BINS,
     Bin,
     Collecting,
+    Evidence,
+    Watching,
     collected,
     duties_of,
     heard,
+    name_of,
+    name_of_nothing,
     pressed,
+    valve_of,
     with_orders,
 )
-from companion.core.liquid_law import Detection, Watching
-from companion.core.liquid_naming import Evidence, name_of, name_of_nothing, valve_of
 from companion.core.types import FaultKind, Finding, FlowReport, Inhibit, SprayPlan, VehicleState
-
-if TYPE_CHECKING:
-    from companion.core.liquid_law import Watching
-
-
-__all__ = ["Detection", "WatchMemory", "Watching", "follow", "inhibits_of"]
-
 
 # From evidence to findings: which fault, of which valve, and whether it closes the valves.
 

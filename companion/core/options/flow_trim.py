@@ -13,7 +13,8 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from companion.core.flow_window import (
+from companion.core.nozzle import PwmLimits
+from companion.core.options.flow_meter import (
     ML_S_PER_L_MIN,
     STALE_S,
     Flows,
@@ -24,7 +25,6 @@ from companion.core.flow_window import (
     with_count,
     with_order,
 )
-from companion.core.nozzle import PwmLimits
 from companion.core.schedule import LagModel
 from companion.core.types import FlowReport, FlowTrimState
 

@@ -14,12 +14,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.core.boom import Boom
-from companion.core.coverage import CELL_M, Coverage
+from companion.core.boom import Boom, Paths, predict
 from companion.core.crossings import Crossing, Route
 from companion.core.frame import Bools, Floats
-from companion.core.paths import Paths, predict
-from companion.core.swath import Swath, wake_m
+from companion.core.options.coverage import CELL_M, Coverage
+from companion.core.options.treated_area import Swath, wake_m
 from companion.core.types import VehicleState
 
 # From when until when a strip is over treated ground.

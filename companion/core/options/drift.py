@@ -14,13 +14,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from companion.core.frame import Floats
+from companion.core.frame import Offset
 from companion.core.types import VehicleState
-
-# East and north [m], from the nozzle to where its droplets land.
-Offset = tuple[float, float]
 
 # Routes are found anew when the offset has moved by more than this since they were.
 SAME_OFFSET_M = 0.02
@@ -118,49 +113,6 @@ def is_same(one: Offset | None, other: Offset | None) -> bool:
     if one is None or other is None:
         return one is other
     return math.hypot(one[0] - other[0], one[1] - other[1]) <= SAME_OFFSET_M
-
-
-# ------------------------------------------------------------------------------- at the border
-
-SIDES = 4
-
-
-def swept(ends: Floats, offset_m: Offset) -> Floats:
-    """Return the four sides of what each edge sweeps when it is moved by the offset, in turn.
-
-    A strip where liquid lands meets what an edge sweeps exactly while ground between it and its
-    nozzle lies on that edge.
-    """
-    first, last = ends[:, :2], ends[:, 2:]
-    moved = np.array(offset_m)
-    sides = np.stack(
-        [
-            ends,
-            np.hstack([first + moved, last + moved]),
-            np.hstack([first, first + moved]),
-            np.hstack([last, last + moved]),
-        ],
-        axis=1,
-    )
-    return sides.reshape(-1, 4)
-
-
-# Which strip meets which edge, and the least and greatest way along the path where it does.
-Contact = tuple[int, int, tuple[float, float]]
-
-
-def joined(contacts: list[Contact]) -> list[Contact]:
-    """Return, of contacts with the sides of `swept`, one for each edge that it was made of.
-
-    What an edge sweeps is convex: a strip that moves along touches it from the first contact with
-    any of its sides to the last, and lies within it between.
-    """
-    found: dict[tuple[int, int], tuple[float, float]] = {}
-    for valve, side, (low, high) in contacts:
-        key = (valve, side // SIDES)
-        before = found.get(key, (low, high))
-        found[key] = (min(low, before[0]), max(high, before[1]))
-    return [(valve, edge, limits) for (valve, edge), limits in found.items()]
 
 
 # ------------------------------------------------------------------------------------ the fall

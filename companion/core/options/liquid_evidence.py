@@ -1,0 +1,539 @@
+"""Evidence of what flows: what the meter counted beside what was ordered, in whole PWM periods.
+
+The table's volume of each valve is taken as late as the sprayer is, at the exact times of the
+changes, so that an order whose flow is still on its way is no difference. A bin is a few PWM
+periods long: the pulses cancel in it, and a fault shows within a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.options.flow_meter import ML_S_PER_L_MIN, STALE_S, is_usable
+from companion.core.schedule import LagModel
+from companion.core.types import FaultKind, FlowReport, PressureReport, SprayPlan
+
+# Whole periods of about this time: short enough to see a fault within a second, long enough that
+# 1 % of noise a period and the meter's pulses leave about 1 %.
+BIN_S = 0.25
+# The ramp of a valve is over within this: a bin that begins later is not bent by it.
+EDGE_S = 0.05
+# Positions further apart than so many times the usual, and than this: the link, the vehicle or this
+# computer stood still. At 20 Hz one may be lost, not two. A count of that time is as old as it may
+# be, so no bin ends there: it goes on, for so many times its length. An order of that time was
+# carried out as late as the end of the silence: a bin to which that is more than this is none.
+SILENT_TIMES = 2.4
+SILENT_MIN_S = 0.12
+LONGEST_BINS = 4
+LATE_SHARE = 0.03
+_USUAL_SHARE = 0.1
+
+
+class Order(NamedTuple):
+    """From `at_s` on: what the table says of each valve, and the pressure that goes with it."""
+
+    at_s: float
+    flows_ml_s: tuple[float, ...]
+    pressure_kpa: float | None
+
+
+class Bin(NamedTuple):
+    """Some whole periods: expected volume of each valve, metered volume, pressure over expected.
+
+    `is_whole` says that the same valves were open all the time, from the count before its begin to
+    the one after its end, and that no order of weight was held back: what the lags leave at the
+    ends of a pass is no evidence, nor what somebody did too late.
+    """
+
+    begin_s: float
+    end_s: float
+    expected_ml: tuple[float, ...]
+    metered_ml: float
+    pressure: float | None
+    is_whole: bool = True
+
+    @property
+    def all_ml(self) -> float:
+        """Return the expected volume of all valves."""
+        return math.fsum(self.expected_ml)
+
+
+class Collecting(NamedTuple):
+    """The bin that is being filled; `from_s` is None where none is.
+
+    `from_ml` lies between two counts, of which `counted_s` is the time of the first. Of the
+    positions it is known of what time the newest is and when it came, how far apart they usually
+    come, and when none came for longer than that.
+    """
+
+    orders: tuple[Order, ...] = ()
+    last: FlowReport | None = None
+    from_s: float | None = None
+    from_ml: float = 0.0
+    counted_s: float = -math.inf
+    position_s: float = -math.inf
+    heard_s: float = -math.inf
+    usual_s: float | None = None
+    silences: tuple[tuple[float, float], ...] = ()
+    pressure_s: float = -math.inf
+    pressure_sum: float = 0.0
+    pressure_count: int = 0
+
+
+def bin_length_s(period_s: float, wanted_s: float = BIN_S) -> float:
+    """Return the length of a bin: the whole periods nearest to what is wanted.
+
+    >>> round(bin_length_s(1.0 / 11.0) * 11.0, 6)
+    3.0
+    """
+    return max(round(wanted_s / period_s), 1) * period_s
+
+
+def duties_of(plan: SprayPlan, until_s: float) -> Iterable[tuple[float, tuple[float, ...]]]:
+    """Yield (time, duty of each valve) of what `plan` has brought about by `until_s`."""
+    duty = list(plan.duty)
+    yield plan.issued_s, tuple(duty)
+    for change in plan.changes:
+        if change.at_s > until_s or change.at_s >= plan.lease_until_s:
+            break
+        duty[change.valve] = change.duty
+        yield max(change.at_s, plan.issued_s), tuple(duty)
+    if plan.lease_until_s <= until_s:
+        yield plan.lease_until_s, (0.0,) * len(duty)
+
+
+def with_orders(
+    orders: tuple[Order, ...], new: Iterable[Order], *, keep_from_s: float
+) -> tuple[Order, ...]:
+    """Return the orders with newer ones, without those over before `keep_from_s`."""
+    grown = list(orders)
+    for order in new:
+        if grown and order.at_s <= grown[-1].at_s:
+            order = order._replace(at_s=grown[-1].at_s)
+        if not grown or order[1:] != grown[-1][1:]:
+            grown.append(order)
+    kept = 0
+    while kept + 1 < len(grown) and grown[kept + 1].at_s <= keep_from_s:
+        kept += 1
+    return tuple(grown[kept:])
+
+
+def expected_ml(orders: tuple[Order, ...], begin_s: float, end_s: float) -> tuple[float, ...]:
+    """Return the table's volume of each valve between two times."""
+    sums = [0.0] * (len(orders[0].flows_ml_s) if orders else 0)
+    for number, order in enumerate(orders):
+        until_s = orders[number + 1].at_s if number + 1 < len(orders) else end_s
+        length_s = min(until_s, end_s) - max(order.at_s, begin_s)
+        if length_s > 0.0:
+            for valve, flow_ml_s in enumerate(order.flows_ml_s):
+                sums[valve] += flow_ml_s * length_s
+    return tuple(sums)
+
+
+def _is_whole(orders: tuple[Order, ...], begin_s: float, end_s: float) -> bool:
+    """Whether the same valves were open from `begin_s` to `end_s`, and a little before."""
+    open_now: set[tuple[bool, ...]] = set()
+    for number, order in enumerate(orders):
+        until_s = orders[number + 1].at_s if number + 1 < len(orders) else end_s
+        if order.at_s < end_s and until_s > begin_s - EDGE_S:
+            open_now.add(tuple(flow > 0.0 for flow in order.flows_ml_s))
+    return len(open_now) <= 1
+
+
+def heard(state: Collecting, position_s: float, *, keep_from_s: float, now_s: float) -> Collecting:
+    """Return the bin in progress after a look at `now_s` for a position that is newer."""
+    if not position_s > state.position_s:
+        return state
+    gap_s = now_s - state.heard_s
+    if not math.isfinite(gap_s):
+        return state._replace(position_s=position_s, heard_s=now_s)
+    usual_s = gap_s if state.usual_s is None else state.usual_s
+    silences = tuple(each for each in state.silences if each[1] >= keep_from_s)
+    if gap_s > max(SILENT_TIMES * usual_s, SILENT_MIN_S):
+        silences = (*silences, (state.heard_s, now_s))
+    usual_s += _USUAL_SHARE * (min(gap_s, 2.0 * usual_s) - usual_s)
+    return state._replace(position_s=position_s, heard_s=now_s, usual_s=usual_s, silences=silences)
+
+
+def _is_silent(state: Collecting, begin_s: float, end_s: float) -> bool:
+    """Whether nothing was heard for some of this time."""
+    return any(from_s < end_s and begin_s < until_s for from_s, until_s in state.silences)
+
+
+def _late_ml(state: Collecting, begin_s: float, end_s: float) -> float:
+    """Return the volume that orders of this time may have missed the table by, by coming late."""
+    missed_ml = 0.0
+    for from_s, until_s in state.silences:
+        for before, order in pairwise(state.orders):
+            if max(from_s, begin_s) <= order.at_s < min(until_s, end_s):
+                moved_ml_s = math.fsum(order.flows_ml_s) - math.fsum(before.flows_ml_s)
+                missed_ml += abs(moved_ml_s) * (until_s - order.at_s)
+    return missed_ml
+
+
+def pressed(
+    state: Collecting, report: PressureReport | None, *, delay_s: float, now_s: float
+) -> Collecting:
+    """Return the bin with a pressure more, over that which goes with the orders of its time."""
+    if report is None or report.pressure_kpa is None or not report.received_s > state.pressure_s:
+        return state
+    if not (0.0 <= now_s - report.received_s <= STALE_S and abs(report.pressure_kpa) < 1e6):
+        return state
+    state = state._replace(pressure_s=report.received_s)
+    then_s = report.received_s - delay_s
+    for order in reversed(state.orders):
+        if order.at_s <= then_s:
+            if order.pressure_kpa is None:
+                return state
+            return state._replace(
+                pressure_sum=state.pressure_sum + report.pressure_kpa / order.pressure_kpa,
+                pressure_count=state.pressure_count + 1,
+            )
+    return state
+
+
+def collected(
+    state: Collecting, report: FlowReport | None, *, bin_s: float, delay_s: float, now_s: float
+) -> tuple[Collecting, Bin | None]:
+    """Return the bin in progress after a count, and the one that it filled.
+
+    A count that is stale, no number or does not go on from the last one begins anew.
+    """
+    last = state.last
+    if not is_usable(report, last, now_s):
+        sound = report is not None and math.isfinite(report.volume_ml)
+        return _begun(state, None)._replace(last=report if sound else None), None
+    assert report is not None  # is_usable
+    if last is None or state.from_s is None:
+        is_dated = not _is_silent(state, report.received_s, report.received_s)
+        return _begun(state, report if is_dated else None)._replace(last=report), None
+    if report.received_s == last.received_s:
+        return state, None
+    bins = int((report.received_s - state.from_s) / bin_s)
+    edge_s = state.from_s + bins * bin_s
+    is_dated = bins >= LONGEST_BINS or not _is_silent(state, last.received_s, report.received_s)
+    if not (edge_s > last.received_s and bins > 0 and is_dated):
+        return state._replace(last=report), None
+    if not state.orders or state.orders[0].at_s > state.counted_s - delay_s:
+        return _begun(state, report), None  # what was ordered then is not known
+    share = _share_by(state.orders, last.received_s, edge_s, report.received_s, delay_s=delay_s)
+    edge_ml = last.volume_ml + share * (report.volume_ml - last.volume_ml)
+    expected = expected_ml(state.orders, state.from_s - delay_s, edge_s - delay_s)
+    count = state.pressure_count
+    late_ml = _late_ml(state, state.from_s - delay_s, edge_s - delay_s)
+    filled = Bin(
+        begin_s=state.from_s,
+        end_s=edge_s,
+        expected_ml=expected,
+        metered_ml=edge_ml - state.from_ml,
+        pressure=state.pressure_sum / count if count else None,
+        is_whole=_is_whole(state.orders, state.counted_s - delay_s, report.received_s - delay_s)
+        and not _is_silent(state, last.received_s, report.received_s)
+        and late_ml <= LATE_SHARE * math.fsum(expected),
+    )
+    begun = _begun(state, report)
+    return begun._replace(from_s=edge_s, from_ml=edge_ml, counted_s=last.received_s), filled
+
+
+def _share_by(
+    orders: tuple[Order, ...], last_s: float, edge_s: float, next_s: float, *, delay_s: float
+) -> float:
+    """Return the share of what came between two counts that had come by `edge_s`.
+
+    As the orders have it, not by the time alone: a rate that changes between two counts of an
+    autopilot's meter, 0.2 s apart and more, would else leave a tenth of a bin in its neighbour.
+    """
+    edge_s = min(max(edge_s, last_s), next_s)
+    before_ml = math.fsum(expected_ml(orders, last_s - delay_s, edge_s - delay_s))
+    after_ml = math.fsum(expected_ml(orders, edge_s - delay_s, next_s - delay_s))
+    if before_ml + after_ml > 0.0:
+        return before_ml / (before_ml + after_ml)
+    return (edge_s - last_s) / (next_s - last_s)
+
+
+def _begun(state: Collecting, report: FlowReport | None) -> Collecting:
+    return state._replace(
+        last=report,
+        from_s=None if report is None else report.received_s,
+        from_ml=0.0 if report is None else report.volume_ml,
+        counted_s=-math.inf if report is None else report.received_s,
+        pressure_sum=0.0,
+        pressure_count=0,
+    )
+
+
+# What a wrong flow is, and of which valve: names for what `liquid_faults.py` has noticed.
+#
+# Nozzles and valves obey flow = conductance x sqrt(pressure). What is wrong behind the pressure
+# sensor moves flow and pressure in opposite directions and changes the conductance; what is wrong
+# before it moves both the same way and leaves the conductance as it was.
+
+# A conductance that moves by less than this share of the flow's move is healthy.
+SUPPLY_SHARE = 0.5
+# A loss of this much of one valve's flow is that valve shut; the pressure that rises for the
+# others hides an eighth of it (14.6 of 16.7 % on the twin of wang-2024).
+SHUT_SHARE = (0.70, 1.20)
+OPEN_SHARE = (0.75, 1.25)
+# Bins that differ by more than this from one to the next are no liquid: healthy ones differ by 1 %.
+RESTLESS_SHARE = 0.06
+# One valve is told from the next best by this many squared standard deviations: 1 in 2 000.
+TOLD_APART = 12.0
+# Of a bin: meter, its pulses, and what the lags leave at a change.
+NOISE_SHARE = 0.02
+NOISE_ML = 0.5
+# Pressures over expected: shut nozzles raise it by a third, a stopped pump leaves little.
+PRESSURE_SHUT = 1.15
+PRESSURE_LOST = 0.75
+
+
+class Evidence(NamedTuple):
+    """The bins since a fault began, means of flow and pressure over expected; and the sprayer."""
+
+    bins: tuple[Bin, ...]
+    gain: float
+    flow: float
+    pressure: float | None
+    open_ml_s: float
+    restless_share: float = RESTLESS_SHARE
+
+    @classmethod
+    def of(
+        cls,
+        bins: Sequence[Bin],
+        *,
+        gain: float,
+        pressure_gain: float,
+        open_ml_s: float,
+        restless_share: float = RESTLESS_SHARE,
+    ) -> Evidence:
+        """Return the evidence of some bins; the first of them may lie before the fault."""
+        sure = tuple(bins[1:]) or tuple(bins)
+        expected_ml = gain * math.fsum(each.all_ml for each in sure)
+        pressures = [each.pressure for each in sure if each.pressure is not None]
+        return cls(
+            bins=sure,
+            gain=gain,
+            flow=math.fsum(each.metered_ml for each in sure) / expected_ml,
+            pressure=_mean(pressures) / pressure_gain if pressures else None,
+            open_ml_s=open_ml_s,
+            restless_share=restless_share,
+        )
+
+    @property
+    def is_restless(self) -> bool:
+        """Whether the flow jumps from bin to bin, as no liquid does."""
+        flows = [each.metered_ml / (self.gain * each.all_ml) for each in self.bins]
+        moves = [abs(b - a) for a, b in pairwise(flows)]
+        return len(moves) >= 2 and _mean(moves) > self.restless_share
+
+    @property
+    def is_supply(self) -> bool:
+        """Whether flow and pressure agree with each other: the nozzles are as they were."""
+        if self.pressure is None or not self.pressure > 0.0:
+            return False
+        conductance = self.flow / math.sqrt(self.pressure)
+        return abs(conductance - 1.0) < SUPPLY_SHARE * abs(self.flow - 1.0)
+
+
+def _mean(values: Sequence[float]) -> float:
+    return math.fsum(values) / len(values)
+
+
+def name_of_nothing(evidence: Evidence, *, is_air_before: bool, is_tank_low: bool) -> FaultKind:
+    """Return why nothing of what is ordered is metered."""
+    pressure = evidence.pressure
+    if pressure is None:
+        return FaultKind.TANK_EMPTY if is_tank_low or is_air_before else FaultKind.NO_FLOW
+    if pressure < PRESSURE_LOST:
+        return FaultKind.TANK_EMPTY if is_tank_low or is_air_before else FaultKind.PUMP_OFF
+    return FaultKind.NO_FLOW if pressure > PRESSURE_SHUT else FaultKind.DEAD_METER
+
+
+def name_of(evidence: Evidence) -> FaultKind:
+    """Return what is wrong with a flow that is too small or too large."""
+    if evidence.is_restless:
+        return FaultKind.AIR
+    if evidence.is_supply:
+        return FaultKind.SUPPLY
+    if evidence.flow < 1.0:
+        share = _share(evidence, is_open=False)
+        return FaultKind.STUCK_CLOSED if _within(share, SHUT_SHARE) else FaultKind.CLOG
+    share = _share(evidence, is_open=True)
+    return FaultKind.STUCK_OPEN if _within(share, OPEN_SHARE) else FaultKind.LEAK
+
+
+def _within(share: float, bounds: tuple[float, float]) -> bool:
+    return bounds[0] <= share <= bounds[1]
+
+
+def _share(evidence: Evidence, *, is_open: bool) -> float:
+    """Return the wrong flow over that of one whole valve, the mean one of those in use."""
+    wrong_ml = valve_ml = 0.0
+    for each in evidence.bins:
+        used = [volume for volume in each.expected_ml if volume > 0.0]
+        if not used:
+            continue
+        mean_ml = evidence.gain * _mean(used)
+        wrong_ml += each.metered_ml - evidence.gain * each.all_ml
+        open_ml = evidence.gain * evidence.open_ml_s * (each.end_s - each.begin_s)
+        valve_ml += open_ml - mean_ml if is_open else mean_ml
+    return abs(wrong_ml) / valve_ml if valve_ml > 0.0 else 0.0
+
+
+def valve_of(bins: Sequence[Bin], *, gain: float, open_ml_s: float, is_open: bool) -> int | None:
+    """Return the valve whose orders explain the wrong flow; None where several do as well.
+
+    Valves that always have the same duty cannot be told apart; the border, sets of nozzles,
+    plots beside each other and clicks of single valves tell.
+    """
+    if not bins or len(bins[0].expected_ml) < 2:
+        return None
+    misfits = []
+    for valve in range(len(bins[0].expected_ml)):
+        shapes = []
+        for each in bins:
+            ordered_ml = gain * each.expected_ml[valve]
+            open_ml = gain * open_ml_s * (each.end_s - each.begin_s)
+            shapes.append(open_ml - ordered_ml if is_open else -ordered_ml)
+        misfits.append((_misfit(bins, shapes, gain), valve))
+    misfits.sort()
+    return misfits[0][1] if misfits[1][0] - misfits[0][0] > TOLD_APART else None
+
+
+def _misfit(bins: Sequence[Bin], shapes: Sequence[float], gain: float) -> float:
+    """Return the weighted squares that the best share, 0 to 1.2, of `shapes` leaves over."""
+    weights, wrong = [], []
+    for each in bins:
+        wrong.append(each.metered_ml - gain * each.all_ml)
+        weights.append(1.0 / (NOISE_ML + NOISE_SHARE * gain * each.all_ml) ** 2)
+    rows = list(zip(weights, shapes, wrong, strict=True))
+    square = math.fsum(w * s * s for w, s, _ in rows)
+    share = math.fsum(w * s * r for w, s, r in rows) / square if square > 0.0 else 0.0
+    share = min(max(share, 0.0), 1.2)
+    return math.fsum(w * (r - share * s) ** 2 for w, s, r in rows)
+
+
+# What a healthy sprayer does, for `liquid_faults.py`: its spread, its pressure, its tables by duty.
+
+# A sprayer that follows more slowly than this is judged only when it has settled.
+SLOW_S = 0.5
+CURVE_STEPS = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Detection:
+    """What is known of the healthy sprayer; `pressure_kpa` at `pressure_duty`, increasing.
+
+    `spread` is one standard deviation of metered over expected flow, `closed_share` of the full
+    flow may be metered while all is closed; without `closed_check` that is not looked at, for a
+    meter that also counts what returns to the tank. A flow is compared over `bin_s`; one that
+    moves by more than `restless_share` from bin to bin is no liquid.
+    """
+
+    spread: float = 0.0125
+    closed_share: float = 0.02
+    meter_minimum_l_min: float = 0.5
+    pressure_duty: tuple[float, ...] = ()
+    pressure_kpa: tuple[float, ...] = ()
+    reserve_l: float | None = None
+    meter_required: bool = False
+    closed_check: bool = True
+    bin_s: float = BIN_S
+    restless_share: float = RESTLESS_SHARE
+
+    def __post_init__(self) -> None:
+        if not 0.001 <= self.spread <= 0.05:
+            raise ValueError(f"spread must lie in [0.001, 0.05], got {self.spread}")
+        if not 0.001 <= self.closed_share <= 0.5:
+            raise ValueError(f"closed_share must lie in [0.001, 0.5], got {self.closed_share}")
+        if not 0.05 <= self.bin_s <= 5.0:
+            raise ValueError(f"bin_s must lie in [0.05, 5], got {self.bin_s}")
+        if not 0.01 <= self.restless_share <= 1.0:
+            raise ValueError(f"restless_share must lie in [0.01, 1], got {self.restless_share}")
+        if not 0.0 <= self.meter_minimum_l_min <= 1e4:
+            raise ValueError("meter_minimum_l_min must lie in [0, 1e4]")
+        if len(self.pressure_duty) != len(self.pressure_kpa) or len(self.pressure_duty) == 1:
+            raise ValueError("pressure_duty and pressure_kpa need as many points, 2 or more")
+        duties = self.pressure_duty
+        if not all(a < b for a, b in pairwise(duties)):
+            raise ValueError(f"pressure_duty must increase, got {duties}")
+        if not all(0.0 < kpa < 1e5 for kpa in self.pressure_kpa):
+            raise ValueError("pressure_kpa must be positive")
+
+    def pressure_at(self, duty: float) -> float | None:
+        """Return the healthy pressure at a duty, a straight line between the points."""
+        duties, kpa = self.pressure_duty, self.pressure_kpa
+        if not duties:
+            return None
+        for i in range(1, len(duties) - 1):
+            if duty < duties[i]:
+                break
+        else:
+            i = len(duties) - 1
+        share = min(max((duty - duties[i - 1]) / (duties[i] - duties[i - 1]), 0.0), 1.0)
+        return kpa[i - 1] + share * (kpa[i] - kpa[i - 1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Watching:
+    """The law with what a sprayer makes of it: times, and the table of each set by duty."""
+
+    law: Detection
+    delay_s: float
+    bin_s: float
+    closed_after_s: float
+    settle_s: float
+    full_ml_s: float
+    open_ml_s: float
+    valves: tuple[tuple[int, ...], ...]
+    tables: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(
+        cls, law: Detection, sets: tuple[NozzleSet, ...], lag: LagModel, pwm: PwmLimits
+    ) -> Watching:
+        """Return the watching of a sprayer."""
+        lags = (lag.on_s, lag.off_s, lag.up_s, lag.down_s)
+        largest = sets[-1]
+        full_ml_s = largest.flow_max_l_min * ML_S_PER_L_MIN
+        steps = [step / CURVE_STEPS for step in range(CURVE_STEPS + 1)]
+        return cls(
+            law=law,
+            delay_s=sum(lags) / len(lags) + lag.output_s,
+            bin_s=bin_length_s(pwm.period_s, law.bin_s),
+            closed_after_s=max(lag.off_end_s, *lags) + lag.output_s + 0.5,
+            settle_s=3.0 * max(lags) if max(lags) > SLOW_S else 0.0,
+            full_ml_s=full_ml_s,
+            open_ml_s=full_ml_s / len(largest.valves),
+            valves=tuple(nozzles.valves for nozzles in sets),
+            tables=tuple(
+                tuple(
+                    nozzles.curve.flow_for(duty) * ML_S_PER_L_MIN / len(nozzles.valves)
+                    for duty in steps
+                )
+                for nozzles in sets
+            ),
+        )
+
+    def order(self, at_s: float, duties: tuple[float, ...], index: int) -> Order:
+        """Return what duties stand for, by the table of a nozzle set."""
+        table, flows, known = self.tables[index], [0.0] * len(duties), dict[float, float]()
+        total = 0.0
+        for valve in self.valves[index]:
+            duty = duties[valve]
+            if duty > 0.0:
+                flow = known.get(duty)
+                if flow is None:
+                    i = min(int(duty * CURVE_STEPS), CURVE_STEPS - 1)
+                    part = duty * CURVE_STEPS - i
+                    flow = known[duty] = table[i] + (table[i + 1] - table[i]) * part
+                flows[valve] = flow
+                total += duty
+        used = sum(1 for flow in flows if flow > 0.0)
+        pressure = self.law.pressure_at(total / used) if used else None
+        return Order(at_s, tuple(flows), pressure)
