@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from statistics import fmean
 
-from companion import ground, runtime
+from companion import runtime
 from companion.cli.answer import note
 from companion.cli.ground_doing import in_words
 from companion.cli.ground_tasks import ground_setup
@@ -17,9 +17,7 @@ from companion.cli.link_parts import build_link
 from companion.cli.run import build_executor, component_options
 from companion.cli.sensor_parts import build_sensors
 from companion.config import Config
-from companion.core.ground_task import CLICK_TIMES, GroundTask, clicks, flow_of
 from companion.core.inputs import AutopilotLiquid
-from companion.core.liquid_clicks import ClickFlow, ClickLaw, judge_clicks
 from companion.doctor.check import Check, fail
 from companion.doctor.click_bench import (
     AGAIN,
@@ -38,7 +36,10 @@ from companion.doctor.click_bench import (
     wet_click,
 )
 from companion.errors import VrsprayError
-from companion.ground import GroundOutcome
+from companion.ground import shell
+from companion.ground.clicks import ClickFlow, ClickLaw, judge_clicks
+from companion.ground.shell import GroundOutcome
+from companion.ground.work import CLICK_TIMES, GroundTask, clicks, flow_of
 from companion.ports import Sensor
 from companion.sensors.estop import EstopSwitch
 from companion.sensors.flow_meter import FlowMeter
@@ -164,7 +165,7 @@ class _Bench:
     # ----------------------------------------------------------------------------- inside
 
     def _perform(
-        self, task: GroundTask, hand: Hand, hold: ground.HandHold, readings: Readings
+        self, task: GroundTask, hand: Hand, hold: shell.HandHold, readings: Readings
     ) -> GroundOutcome:
         config = self._config
         options = component_options(config, training="ground", watch_mission=True)
@@ -173,7 +174,7 @@ class _Bench:
 
         async def main() -> GroundOutcome:
             with hand.attending():
-                return await ground.perform(
+                return await shell.perform(
                     task,
                     ground_setup(config),
                     link=HeardLink(link, readings, self._liquid()),

@@ -8,7 +8,7 @@ import typer
 
 from companion.cli.ground_doing import Asked, asked_options, do
 from companion.cli.ground_tasks import Wish
-from companion.core.ground_task import GroundKind
+from companion.ground.work import GroundKind
 
 app = typer.Typer(
     add_completion=False,

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from companion import ground, runtime
+from companion import runtime
 from companion.cli.answer import REQUIRED, AsJson, Option, Overrides, answer, note, with_options
 from companion.cli.beside import shown
 from companion.cli.ground_tasks import (
@@ -32,10 +32,10 @@ from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.run import build_executor, component_options, training_mark
 from companion.cli.sensor_parts import build_sensors
 from companion.config import Config
-from companion.core.ground_task import GroundKind
-from companion.core.ground_work import GroundReason
 from companion.errors import ActuatorError, JournalError
-from companion.ground import GroundOutcome
+from companion.ground import shell
+from companion.ground.shell import GroundOutcome
+from companion.ground.work import GroundKind, GroundReason
 from companion.sensors.estop import EstopSwitch
 
 _ConfigFile = Annotated[
@@ -152,7 +152,7 @@ def _perform(config: Config, given: tuple[str, ...], piece: Piece, hand: Hand) -
 
     async def main() -> GroundOutcome:
         with hand.attending():
-            return await ground.perform(
+            return await shell.perform(
                 piece.task,
                 ground_setup(config),
                 link=link,

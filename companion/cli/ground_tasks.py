@@ -7,9 +7,12 @@ from dataclasses import dataclass, replace
 
 from companion.config import Config
 from companion.config.motor_rules import atomisers_of, makes_flow, pump_of
-from companion.core.ground_task import (
+from companion.core.nozzle import allowed_duty
+from companion.errors import VrsprayError
+from companion.ground.work import (
     PIECE_MAX_S,
     GroundKind,
+    GroundSetup,
     GroundTask,
     clicks,
     expected_ml,
@@ -17,9 +20,6 @@ from companion.core.ground_task import (
     in_turn,
     together,
 )
-from companion.core.ground_work import GroundSetup
-from companion.core.nozzle import allowed_duty
-from companion.errors import VrsprayError
 
 # Where no pump says how long its hoses take.
 PRIME_S = 10.0

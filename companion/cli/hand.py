@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from companion.core.ground_hold import HOLD_S, Hold
+from companion.ground.work import HOLD_S, Hold
 
 KEY, ENDED, INTERRUPTED = "another-key", "stdin-ended", "interrupted"
 # Ctrl-Z and Ctrl-\\ too: a process that stands still or dies orders nothing closed. SIGHUP is a

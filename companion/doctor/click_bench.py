@@ -7,13 +7,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
-from companion.core.ground_hold import STROKES_OVER_S, Hold
-from companion.core.ground_task import GroundKind, GroundTask, Phase
 from companion.core.inputs import AutopilotLiquid
-from companion.core.liquid_clicks import ClickFinding, ClickFlow, ClickJudgement
 from companion.core.types import BatteryReport, Decision, FaultKind, FlowReport, Input
 from companion.doctor.check import Check, fail, not_applicable, ok, warn
-from companion.ground import GroundLink, HandHold
+from companion.ground.clicks import ClickFinding, ClickFlow, ClickJudgement
+from companion.ground.shell import GroundLink, HandHold
+from companion.ground.work import STROKES_OVER_S, GroundKind, GroundTask, Hold, Phase
 from companion.ports import Sensor
 
 # A step comes every 0.05 s, and a hold begins with strokes over some time.

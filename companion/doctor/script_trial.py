@@ -13,10 +13,15 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from companion.core.ground_state import GroundState, observe_ground
-from companion.core.ground_work import GroundReason, GroundSetup, ground_reasons
 from companion.core.types import Decision, Inhibit, SprayPlan
 from companion.errors import LinkError
+from companion.ground.work import (
+    GroundReason,
+    GroundSetup,
+    GroundState,
+    ground_reasons,
+    observe_ground,
+)
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_check import TOLERANCE_US, ardupilot_places
 from companion.output.autopilot_options import ServoOptions

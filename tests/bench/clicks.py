@@ -20,7 +20,7 @@ from functools import cache
 
 import numpy as np
 
-from companion.core.liquid_clicks import ClickFlow, ClickJudgement, ClickLaw, judge_clicks
+from companion.ground.clicks import ClickFlow, ClickJudgement, ClickLaw, judge_clicks
 from companion.output.pulse_train import Edge
 from sitl.plant import PulsedPlant
 from sitl.profile import ML_S_PER_L_MIN, PlantProfile, load_profile

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from companion.core.liquid_clicks import (
+from companion.core.types import FaultKind
+from companion.ground.clicks import (
     NOTHING_SHARE,
     SUPPLY_SHARE,
     ClickFlow,
@@ -17,7 +18,6 @@ from companion.core.liquid_clicks import (
     judge_clicks,
     limit_of,
 )
-from companion.core.types import FaultKind
 
 FLOW_ML_S, OPEN_S, WINDOW_S = 17.0, 2.0, 4.0
 LAW = ClickLaw(valve_ml_s=(FLOW_ML_S,) * 6, step_ml=0.2)

@@ -8,11 +8,20 @@ from dataclasses import dataclass, field
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core.ground_hold import Hold
-from companion.core.ground_state import GroundState
-from companion.core.ground_task import GroundKind, GroundTask, clicks, in_turn, together
-from companion.core.ground_work import GroundMemory, GroundOrder, GroundSetup, ground_step
 from companion.core.types import HeartbeatReport, LandedReport, OutputReport, SprayPlan
+from companion.ground.work import (
+    GroundKind,
+    GroundMemory,
+    GroundOrder,
+    GroundSetup,
+    GroundState,
+    GroundTask,
+    Hold,
+    clicks,
+    ground_step,
+    in_turn,
+    together,
+)
 
 COUNT = 4
 TASKS = (

@@ -12,10 +12,8 @@ from pathlib import Path
 import pytest
 
 from companion.cli.ground_doing import in_words
-from companion.core.ground_hold import Hold
-from companion.core.ground_task import GroundKind, clicks, together
-from companion.core.ground_work import GroundSetup
-from companion.ground import GroundOutcome, perform
+from companion.ground.shell import GroundOutcome, perform
+from companion.ground.work import GroundKind, GroundSetup, Hold, clicks, together
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
 from companion.output.engine.setup import EngineSetup

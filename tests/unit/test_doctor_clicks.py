@@ -6,9 +6,7 @@ import math
 
 import pytest
 
-from companion.core.ground_hold import Hold
 from companion.core.inputs import AutopilotLiquid
-from companion.core.liquid_clicks import ClickFinding, ClickJudgement
 from companion.core.types import BatteryReport, FaultKind, FlowReport
 from companion.doctor.check import Check, Status
 from companion.doctor.click_bench import (
@@ -19,6 +17,8 @@ from companion.doctor.click_bench import (
     wet_checks,
     wet_click,
 )
+from companion.ground.clicks import ClickFinding, ClickJudgement
+from companion.ground.work import Hold
 
 NAMES = ("left", "right")
 

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import pytest
 
-from companion.core.ground_work import GroundSetup
 from companion.core.nozzle import PwmLimits
 from companion.core.types import HeartbeatReport, Input, LandedReport, SprayPlan
 from companion.doctor import engine_trial
@@ -26,6 +25,7 @@ from companion.doctor.watchdogs import (
     seconds_of,
     systemd_checks,
 )
+from companion.ground.work import GroundSetup
 from companion.output.autopilot_options import ServoOptions
 from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wiring import Wiring

@@ -93,7 +93,13 @@ def test_simulation_never_uses_our_own_link() -> None:
 
 
 @pytest.mark.parametrize(
-    "path", sorted((ROOT / "companion/core").rglob("*.py")), ids=lambda path: path.name
+    "path",
+    [
+        *sorted((ROOT / "companion/core").rglob("*.py")),
+        ROOT / "companion/ground/work.py",
+        ROOT / "companion/ground/clicks.py",
+    ],
+    ids=lambda path: path.name,
 )
 def test_core_imports_nothing_that_is_not_pure(path: Path) -> None:
     for name in imports(path.read_text()):

@@ -14,7 +14,7 @@ import pytest
 from companion.cli.app import execute
 from companion.cli.ground_tasks import Wish, csv_line, ground_setup, piece_of, plan_line
 from companion.config import load
-from companion.core.ground_task import GroundKind
+from companion.ground.work import GroundKind
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang"
 

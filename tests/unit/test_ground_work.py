@@ -7,26 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from companion.core.ground_hold import Hold
-from companion.core.ground_state import GroundState, observe_ground
-from companion.core.ground_task import (
-    GroundKind,
-    GroundTask,
-    Phase,
-    clicks,
-    expected_ml,
-    flow_of,
-    in_turn,
-    together,
-)
-from companion.core.ground_work import (
-    GroundDecision,
-    GroundMemory,
-    GroundOrder,
-    GroundReason,
-    GroundSetup,
-    ground_step,
-)
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.types import (
     EstopReport,
@@ -35,6 +15,25 @@ from companion.core.types import (
     OperatorCommand,
     OutputReport,
     SpeedReport,
+)
+from companion.ground.work import (
+    GroundDecision,
+    GroundKind,
+    GroundMemory,
+    GroundOrder,
+    GroundReason,
+    GroundSetup,
+    GroundState,
+    GroundTask,
+    Hold,
+    Phase,
+    clicks,
+    expected_ml,
+    flow_of,
+    ground_step,
+    in_turn,
+    observe_ground,
+    together,
 )
 from tests import builders
 

@@ -9,13 +9,198 @@ leads from here into a flight: arming ends the work for good, and enabling is no
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from itertools import pairwise
+from typing import Any
 
-from companion.core.ground_hold import EARLY_S, HOLD_S, Hold
-from companion.core.ground_state import GroundState
-from companion.core.ground_task import PIECE_MAX_S, GroundTask
-from companion.core.types import DrivePlan, SprayPlan, TimedChange
+from companion.core.nozzle import NozzleSet
+from companion.core.schedule import LagModel
+from companion.core.types import (
+    DrivePlan,
+    EstopReport,
+    HeartbeatReport,
+    Input,
+    LandedReport,
+    OperatorCommand,
+    OutputReport,
+    SprayPlan,
+    TimedChange,
+)
+
+# Pieces of ground work as a course of duties over time: prime, flush, rinse, catch, click.
+#
+# A piece is at most `PIECE_MAX_S` long: what takes longer is done in several, each begun anew.
+
+PIECE_MAX_S = 30.0
+# Long enough to be heard and felt, and for the slowest valve to open; twice, to be sure of it.
+CLICK_S = 0.2
+CLICK_TIMES = 2
+
+
+class GroundKind(StrEnum):
+    """What is done on the ground with valves open."""
+
+    PRIME = "prime"  # fill the lines: all valves, fully open
+    FLUSH = "flush"  # push out what is in the lines
+    RINSE = "rinse"  # the same with so much clean water
+    CATCH = "catch"  # an exact time at one duty, over cups
+    CLICK = "click"  # dry: each valve in turn, to be heard
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Phase:
+    """From `at_s` of the work on, each valve has its duty."""
+
+    at_s: float
+    duty: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundTask:
+    """One piece of ground work; `is_whole` where an interruption makes it worthless.
+
+    `drives` are what pump and atomisers do meanwhile, as in a plan.
+    """
+
+    kind: GroundKind
+    phases: tuple[Phase, ...]
+    seconds: float
+    is_whole: bool = False
+    drives: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.seconds <= PIECE_MAX_S:
+            raise ValueError(f"takes {self.seconds:.3g} s; one piece lasts {PIECE_MAX_S:g} s")
+        times = [phase.at_s for phase in self.phases]
+        rising = all(a < b for a, b in pairwise(times))
+        if not times or times[0] != 0.0 or not rising or not times[-1] < self.seconds:
+            raise ValueError(f"phases must rise from 0 to below {self.seconds}, got {times}")
+        counts = {len(phase.duty) for phase in self.phases}
+        if len(counts) != 1 or counts == {0}:
+            raise ValueError("every phase needs one duty for each valve")
+        if not all(0.0 <= duty <= 1.0 for phase in self.phases for duty in phase.duty):
+            raise ValueError("duties must lie in [0, 1]")
+        if not all(0.0 <= fraction <= 1.0 for fraction in self.drives):
+            raise ValueError("drives must lie in [0, 1]")
+
+    @property
+    def valve_count(self) -> int:
+        """Return how many valves the sprayer has."""
+        return len(self.phases[0].duty)
+
+
+def _duties(count: int, valves: Sequence[int], duty: float) -> tuple[float, ...]:
+    return tuple(duty if valve in valves else 0.0 for valve in range(count))
+
+
+def together(
+    kind: GroundKind, count: int, valves: Sequence[int], *, duty: float, seconds: float
+) -> GroundTask:
+    """Return the work that has some of `count` valves open at the same time."""
+    return GroundTask(
+        kind=kind,
+        phases=(Phase(at_s=0.0, duty=_duties(count, valves, duty)),),
+        seconds=seconds,
+        is_whole=kind is GroundKind.CATCH,
+    )
+
+
+def in_turn(
+    kind: GroundKind, count: int, valves: Sequence[int], *, duty: float, seconds: float
+) -> GroundTask:
+    """Return the work that has one valve open after the other, all for the same time.
+
+    >>> task = in_turn(GroundKind.FLUSH, 3, (0, 2), duty=1.0, seconds=8.0)
+    >>> [(phase.at_s, phase.duty) for phase in task.phases]
+    [(0.0, (1.0, 0.0, 0.0)), (4.0, (0.0, 0.0, 1.0))]
+    """
+    each_s = seconds / max(len(valves), 1)
+    phases = tuple(
+        Phase(at_s=number * each_s, duty=_duties(count, (valve,), duty))
+        for number, valve in enumerate(valves)
+    )
+    return GroundTask(kind=kind, phases=phases, seconds=seconds)
+
+
+def clicks(count: int, valves: Sequence[int]) -> GroundTask:
+    """Return the dry click: each valve in turn opens twice for a fifth of a second.
+
+    >>> round(clicks(6, range(6)).seconds, 9)
+    4.8
+    """
+    closed = (0.0,) * count
+    phases = []
+    for number, valve in enumerate(v for v in valves for _ in range(CLICK_TIMES)):
+        phases.append(Phase(at_s=2 * number * CLICK_S, duty=_duties(count, (valve,), 1.0)))
+        phases.append(Phase(at_s=(2 * number + 1) * CLICK_S, duty=closed))
+    seconds = 2 * CLICK_TIMES * len(valves) * CLICK_S
+    return GroundTask(kind=GroundKind.CLICK, phases=tuple(phases), seconds=seconds)
+
+
+def flow_of(sets: Sequence[NozzleSet], valves: Sequence[int], duty: float) -> float:
+    """Return what the measured curves say of these valves at one duty [L/min].
+
+    By the set of just these valves, else by their share of the smallest set that has them all, else
+    of the largest one.
+    """
+    wanted = frozenset(valves)
+    if not wanted or not sets:
+        return 0.0
+    holding = [nozzles for nozzles in sets if wanted <= frozenset(nozzles.valves)]
+    nozzles = min(holding or [sets[-1]], key=lambda each: len(each.valves))
+    return nozzles.curve.flow_for(duty) * len(wanted) / len(nozzles.valves)
+
+
+def expected_ml(flow_l_min: float, *, open_s: float, lag: LagModel) -> float:
+    """Return what falls into the cups: the flow begins `on_s` late and ends `off_s` late."""
+    flowing_s = max(open_s - lag.on_s + lag.off_s, 0.0) if open_s > 0.0 else 0.0
+    return flow_l_min * flowing_s / 60.0 * 1000.0
+
+
+# The dead-man of ground work: when strokes of a key, or lines of a script, are a held key.
+#
+# Nothing says when a stroke was made, only when it was heard: a connection that stood still hands
+# over at once what was pressed in the meantime, though the key was let go long ago.
+
+# A key that is held repeats 10 to 40 times a second; this is what may lie between two repeats.
+HOLD_S = 0.5
+# What a connection has held back comes in a burst. Strokes so close are one, and so many over so
+# long are more than a burst is.
+STROKE_GAP_S = 0.01
+STROKES_MIN = 4
+STROKES_OVER_S = 0.3
+# Between clocks of two processes; what is further in the future is no time at all.
+EARLY_S = -0.1
+# Sums of times are right to far better than this, and no key repeats faster.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Hold:
+    """The dead-man: a key that repeats. A few strokes, or many in a burst, are no hold.
+
+    `strokes` are those since `first_s`, as they were heard: when they were made nobody knows.
+    """
+
+    first_s: float = -math.inf
+    last_s: float = -math.inf
+    strokes: int = 0
+
+    def renewed(self, now_s: float) -> Hold:
+        """Return the hold after one more stroke; after a gap it begins anew."""
+        if not self.last_s + STROKE_GAP_S <= now_s < math.inf:
+            return self
+        if now_s < self.last_s + HOLD_S:
+            return Hold(first_s=self.first_s, last_s=now_s, strokes=self.strokes + 1)
+        return Hold(first_s=now_s, last_s=now_s, strokes=1)
+
+    def is_held(self, now_s: float) -> bool:
+        """Whether the key is down now."""
+        young = now_s < self.last_s + HOLD_S and now_s - self.last_s >= EARLY_S
+        long = self.last_s - self.first_s >= STROKES_OVER_S - _BIT_S
+        return young and long and self.strokes >= STROKES_MIN
+
 
 # EXTENDED_SYS_STATE is asked for at 2 Hz.
 LANDED_AGE_MAX_S = 2.5
@@ -281,3 +466,47 @@ def _closed(
         now_s=now_s, reasons=reasons, plan=plan, done_s=done_s, is_over=is_over
     )
     return decision, memory
+
+
+# What ground work has to know of the vehicle; neither place nor map is in it.
+#
+# Everything is as the vehicle said it last, with the time at which it was heard: whoever asks
+# judges the age. What was never heard is `None`, and never counts as good.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundState:
+    """What has been heard so far.
+
+    `mission_active` is what MISSION_CURRENT says, `None` where it does not say. `estop_line` is
+    whether the switch on a line is pressed. `was_stopped` stays: whoever presses it, or enables,
+    disables or stops by MAVLink, wants something else than ground work.
+    """
+
+    heartbeat: HeartbeatReport | None = None
+    landed: LandedReport | None = None
+    output: OutputReport | None = None
+    mission_active: bool | None = None
+    estop_line: bool | None = None
+    was_stopped: bool = False
+
+
+def _estop(state: GroundState, item: EstopReport) -> GroundState:
+    if item.pressed is not False:
+        state = replace(state, was_stopped=True)
+    return replace(state, estop_line=item.pressed) if item.source == "line" else state
+
+
+_OBSERVED: dict[type, Callable[[GroundState, Any], GroundState]] = {
+    HeartbeatReport: lambda state, item: replace(state, heartbeat=item),
+    LandedReport: lambda state, item: replace(state, landed=item),
+    OutputReport: lambda state, item: replace(state, output=item),
+    EstopReport: _estop,
+    OperatorCommand: lambda state, _: replace(state, was_stopped=True),
+}
+
+
+def observe_ground(state: GroundState, item: Input) -> GroundState:
+    """Return `state` with one more input; what ground work does not need changes nothing."""
+    take = _OBSERVED.get(type(item))
+    return state if take is None else take(state, item)

@@ -14,19 +14,20 @@ from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
 from typing import Protocol
 
-from companion.core.ground_hold import Hold
-from companion.core.ground_state import GroundState, observe_ground
-from companion.core.ground_task import GroundTask
-from companion.core.ground_work import (
+from companion.core.types import Decision, Inhibit, OutputReport, SprayerState
+from companion.ground.work import (
     GroundDecision,
     GroundMemory,
     GroundOrder,
     GroundReason,
     GroundSetup,
+    GroundState,
+    GroundTask,
+    Hold,
     ground_reasons,
     ground_step,
+    observe_ground,
 )
-from companion.core.types import Decision, Inhibit, OutputReport, SprayerState
 from companion.ports import PlanExecutor, Sensor, VehicleLink
 
 _logger = logging.getLogger(__name__)
