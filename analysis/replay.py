@@ -8,35 +8,26 @@ put on the ground is in `what_if.py`; whether the same ground is treated, `repla
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from enum import Enum
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
-
-from analysis.flown.read_applied import read_applied
-from companion.core.controller import Memory, expected_coverage, step
-from companion.core.estimator import Track, estimate, observe
-from companion.core.options.coverage import Coverage
-from companion.core.setup import Setup
-from companion.core.types import Decision, Input
-from companion.errors import UnreadableError
-from companion.record.codec import FIELD_NAMES, FieldNames, encode
-from companion.record.coverage_table import read_coverage
-from companion.record.new_file import computing
-from companion.record.reader import Entry, JournalContent, opened, read_journal
-from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
-
-if TYPE_CHECKING:
-    from companion.core.controller import Memory
-    from companion.core.types import VehicleState
-
-
-from dataclasses import field, replace
-from typing import TYPE_CHECKING
+from types import NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    Protocol,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 
@@ -44,21 +35,26 @@ from analysis.dose import zone_volumes
 from analysis.evaluation import Distances, Evaluation, evaluate_strips
 from analysis.flown.applied_flight import ValveChanges
 from analysis.flown.applied_record import EvaluationError, record_of
+from analysis.flown.read_applied import read_applied
 from analysis.strips import strips_of
+from companion.core.controller import Memory, expected_coverage, step
+from companion.core.estimator import Track, estimate, observe
+from companion.core.options.coverage import Coverage
+from companion.core.setup import Setup
+from companion.core.types import Decision, Input
+from companion.errors import ConfigError, UnreadableError
+from companion.record.codec import FIELD_NAMES, FieldNames, encode
+from companion.record.coverage_table import read_coverage
+from companion.record.new_file import computing
+from companion.record.reader import Entry, JournalContent, opened, read_journal
 from companion.record.valve_rows import Row, ValveRows
+from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
-    from companion.core.types import Decision
+    from companion.core.controller import Memory
+    from companion.core.types import Decision, VehicleState
 
-
-import difflib
-from dataclasses import fields, is_dataclass
-from enum import Enum
-from types import NoneType, UnionType
-from typing import Literal, Union, get_args, get_origin, get_type_hints
-
-from companion.errors import ConfigError
 
 # What other decisions on a flight's inputs would have put on the ground.
 #

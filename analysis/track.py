@@ -11,19 +11,12 @@ import shapely
 from numpy.typing import NDArray
 
 from analysis.smoothing import rise_over
-
-if TYPE_CHECKING:
-    from analysis.flight_record import FlightRecord
-    from companion.core.prescription import Prescription
-
-
-from typing import TYPE_CHECKING
-
 from companion.core.options.lines import MOVING_M_S
 
 if TYPE_CHECKING:
     from analysis.flight_record import FlightRecord
     from companion.core.options.lines import Lines
+    from companion.core.prescription import Prescription
 
 
 # When a true path flew a planned line: from one of its ends to the other, or to a stop.

@@ -3,16 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import TYPE_CHECKING
-
-from missions.turns import Turn
-
-if TYPE_CHECKING:
-    from missions.plan import Leg, Sortie
-    from missions.verticals import Vertical
 
 # Spray liquid is water, but for a few per cent.
 KG_L = 1.0
@@ -60,50 +51,3 @@ class Battery:
         """
         drawn = cruise_s * self.cruise_w + other_s * self.hover_w
         return (drawn + (cruise_s + other_s) * litres * KG_L * self.per_kg_w) / J_WH
-
-
-def nose_s(legs: Sequence[Leg], *, turn: Turn, rate_deg_s: float | None) -> float:
-    """Return how long the aircraft stands and turns its nose, at every corner of its way.
-
-    Only one that stops and flies nose first does so, and only where the rate is given.
-    """
-    if rate_deg_s is None or turn != "stop":
-        return 0.0
-    points = [point for leg in legs for point in leg.points]
-    courses = [
-        math.degrees(math.atan2(b[0] - a[0], b[1] - a[1]))
-        for a, b in pairwise(points)
-        if math.dist(a, b) > 1e-3
-    ]
-    bends = [abs((b - a + 180.0) % 360.0 - 180.0) for a, b in pairwise(courses)]
-    return sum(bend for bend in bends if bend >= STRAIGHT_DEG) / rate_deg_s
-
-
-def sortie_wh(
-    sortie: Sortie,
-    battery: Battery,
-    *,
-    vertical: Vertical,
-    height_m: float,
-    reserve_l: float,
-    nose_turn_s: float,
-) -> float:
-    """Return the use of a sortie: the tank empties line by line, down to its reserve.
-
-    Turning the nose is counted with half of the sortie's litres on board.
-    """
-    left_l = sortie.volume_l + reserve_l
-    first_m, last_m = sortie.end_heights_m(height_m)
-    used = battery.wh(cruise_s=0.0, other_s=vertical.climb_s(first_m), litres=left_l)
-    used += battery.wh(
-        cruise_s=0.0, other_s=vertical.return_s(last_m, sortie.home_m), litres=reserve_l
-    )
-    middle_l = reserve_l + sortie.volume_l / 2.0
-    used += battery.wh(cruise_s=0.0, other_s=nose_turn_s, litres=middle_l)
-    for leg in sortie.legs:
-        cruise_s = min(leg.length_m / leg.speed_m_s, leg.seconds)
-        used += battery.wh(
-            cruise_s=cruise_s, other_s=leg.seconds - cruise_s, litres=left_l - leg.volume_l / 2.0
-        )
-        left_l -= leg.volume_l
-    return used

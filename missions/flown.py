@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from missions.demand import Demand, Rates
-from missions.energy import nose_s, sortie_wh
 from missions.errors import PlanError
 from missions.paced import Paced
-from missions.plan import Leg, Settings, Sortie
+from missions.plan import Leg, Settings, Sortie, nose_s, sortie_wh
 from missions.sorties import Flying, SortieSearch
 from missions.speeds import choices, chosen, stretches_of
 from missions.strips import Floats

@@ -12,7 +12,7 @@ import shapely
 
 from missions.budget import Budget, build_budget
 from missions.demand import Demand, Pieces, cut
-from missions.energy import J_WH, KG_L, nose_s
+from missions.energy import J_WH, KG_L
 from missions.errors import OutOfReachError, PlanError
 from missions.network import (
     ACROSS_M,
@@ -22,7 +22,7 @@ from missions.network import (
     Network,
     build_network,
 )
-from missions.plan import Kind, Leg, Place, Settings, Sortie
+from missions.plan import Kind, Leg, Place, Settings, Sortie, nose_s
 from missions.refill_search import beside, build_limits, build_passes, several
 from missions.refills import Limits, Part, Passes, flown_by
 from missions.savings import Sortie as Order

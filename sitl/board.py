@@ -11,16 +11,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from sitl.edges import BoardEdge
-    from sitl.profile import Pulsing
-
-
-from typing import TYPE_CHECKING
-
 from sitl.edges import BoardEdge
 
 if TYPE_CHECKING:
+    from sitl.edges import BoardEdge
     from sitl.profile import Pulsing
 
 

@@ -5,39 +5,28 @@ With `demo_map` and `demo_style` the only files of the demo that need matplotlib
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import matplotlib
 import numpy as np
+import shapely
 from matplotlib import rc_context
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from analysis.published import p1_lag_distance_m
 from sitl.demo import METHODS, SCHEDULED, DemoResult, Flown
 from sitl.demo_field import demo_setup
-from sitl.demo_style import COLOURS, DPI, FAINT, INK, STYLE, TITLES, new_figure, shown
-from sitl.demo_traces import field_axes
+from sitl.demo_style import COLOURS, DPI, FAINT, INK, QUIET, STYLE, TITLES, new_figure, shown
+from sitl.demo_traces import CELL_M, MARGIN_X_M, MARGIN_Y_M, FieldAxes, field_axes
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-import matplotlib
-import shapely
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import PolyCollection
-from matplotlib.colors import Colormap, Normalize
-
-from sitl.demo_style import QUIET
-from sitl.demo_traces import CELL_M, MARGIN_X_M, MARGIN_Y_M, FieldAxes
-
-if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 

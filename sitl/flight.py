@@ -10,13 +10,16 @@ import heapq
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import shapely
 
 from analysis.flight_record import Fidelity, FlightMeta, FlightRecord, Floats
 from companion.core.controller import Memory, expected_coverage, step
 from companion.core.estimator import Track, estimate, observe
+from companion.core.frame import LocalFrame
 from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.core.types import (
@@ -28,6 +31,7 @@ from companion.core.types import (
     Inhibit,
     Input,
     LandedReport,
+    LegReport,
     OperatorCommand,
     SprayPlan,
     Telemetry,
@@ -41,15 +45,10 @@ from sitl.earth import Earth
 from sitl.knowledge import KnowingOutput, WaitingForDuties, WaitingForEdges, pwm_limits
 from sitl.liquid_faults import LiquidFault, LiquidSensors
 from sitl.navigation import Navigation
-from sitl.outputs import (
-    WIRE_S,
-    AveragedOutput,
-    Output,
-    PlanFollower,
-    ServoOutput,
-    TakesEdges,
-)
+from sitl.outputs import WIRE_S, AveragedOutput, Output, PlanFollower, ServoOutput, TakesEdges
 from sitl.plants import duty_plant, edge_plant
+from sitl.route import Route
+from sitl.vehicle import STRAIGHT_DEG
 from sitl.wang import POLL_S, WangController
 
 if TYPE_CHECKING:
@@ -57,20 +56,6 @@ if TYPE_CHECKING:
     from sitl.plant import Plant
     from sitl.profile import PlantProfile
     from sitl.route import Route
-    from sitl.trajectory import Trajectory
-
-
-from itertools import pairwise
-from typing import TYPE_CHECKING
-
-import shapely
-
-from companion.core.frame import LocalFrame
-from companion.core.types import LegReport
-from sitl.route import Route
-from sitl.vehicle import STRAIGHT_DEG
-
-if TYPE_CHECKING:
     from sitl.trajectory import Trajectory
 
 

@@ -18,12 +18,25 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import shapely
+from shapely import LineString
 
+from analysis.border import off_target_ml
 from analysis.evaluation import Evaluation, evaluate, limit_ratio
+from analysis.strips import strips_of
 from companion.assembly import deliverable, refuse_mismatch
 from companion.config import Config, load
 from companion.core.nozzle import allowed_duty, flow_for_rate
+from companion.core.prescription import Prescription
 from companion.core.setup import Setup
+from companion.core.types import (
+    EstimatorReport,
+    Fix,
+    GnssReport,
+    HeartbeatReport,
+    Input,
+    SpeedReport,
+    Telemetry,
+)
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
 from missions.maps.model import Problem
@@ -34,49 +47,19 @@ from sitl.motor_parts import check_motors, droplet_figures, fits, ranges_us
 from sitl.outputs import WIRE_S
 from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
-from sitl.stub.faults import Fault, read_scenario
+from sitl.stub.faults import Fault, FaultClock, FaultKind, read_scenario
+from sitl.stub.modes import MODE_NAMES
 from sitl.stub.scenario import check_scenario
-from sitl.vehicle import Corners, Route, Trajectory, Vehicle
+from sitl.vehicle import Corners, Leg, Route, Trajectory, Vehicle
 
 if TYPE_CHECKING:
     from shapely import LineString
 
-    from analysis.flight_record import Fidelity
+    from analysis.flight_record import Fidelity, FlightRecord
     from companion.core.options.drift import Drift
     from companion.core.types import Decision, Input
     from sitl.flow_law import FlowLaw
     from sitl.vehicle import Leg
-
-
-from typing import TYPE_CHECKING
-
-from shapely import LineString
-
-from companion.core.types import (
-    EstimatorReport,
-    Fix,
-    GnssReport,
-    HeartbeatReport,
-    Input,
-    SpeedReport,
-    Telemetry,
-)
-from sitl.stub.faults import FaultClock, FaultKind
-from sitl.stub.modes import MODE_NAMES
-from sitl.vehicle import Leg
-
-if TYPE_CHECKING:
-    pass
-
-
-from typing import TYPE_CHECKING
-
-from analysis.border import off_target_ml
-from analysis.strips import strips_of
-from companion.core.prescription import Prescription
-
-if TYPE_CHECKING:
-    from analysis.flight_record import FlightRecord
 
 
 DEFAULT_SPEED_M_S = 5.0

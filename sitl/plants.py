@@ -4,21 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sitl.plant import AveragedPlant, PulsedPlant
-from sitl.pump_plant import PumpPlant
-from sitl.section_plant import SectionPlant
-
-if TYPE_CHECKING:
-    from sitl.profile import PlantProfile
-
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from sitl.approach import Approach
 from sitl.meter import Metering, MeterStream
-from sitl.plant import Floats, Plant
+from sitl.plant import AveragedPlant, Floats, Plant, PulsedPlant
+from sitl.pump_plant import PumpPlant
+from sitl.section_plant import SectionPlant
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from analysis.dose import misapplied_parts
 from analysis.evaluation import Evaluation, evaluate_strips
 from analysis.flow_accuracy import flow_samples
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
+from analysis.flown.metered import counted
 from analysis.flown.modelled_flow import ordered_s
 from analysis.flown.unknown import GAP_S
 from analysis.strips import Strip, strips_of
@@ -23,17 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from analysis.flight_record import FlightRecord
-    from analysis.flown.applied_flight import AppliedFlight, Floats
-
-
-from dataclasses import asdict
-from typing import TYPE_CHECKING
-
-from analysis.flown.metered import counted
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from analysis.flown.applied_flight import AppliedFlight, Floats
     from analysis.strips import Strip
 

@@ -13,21 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.assess.cause_marks import Marks, marks_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from analysis.flight_record import FlightRecord
-    from analysis.flown.applied_flight import AppliedFlight
-    from analysis.lag import Step
-    from analysis.strips import Strip
-    from analysis.track import Bools
-
-
-from typing import TYPE_CHECKING
-
-from analysis.assess.cause_marks import samples_at
+from analysis.assess.cause_marks import Marks, marks_of, samples_at
+from analysis.assess.ground_elements import SquareGrid, slices_of, summed
+from analysis.assess.ground_rates import ground_rates
 from analysis.assess.rate_wishes import percent_at
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.holds import CLEAR_M
@@ -35,26 +23,15 @@ from analysis.lag import Verdict
 from analysis.transitions import ML_M_PER_L_HA_M
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from analysis.assess.cause_marks import Marks
+    from analysis.flight_record import FlightRecord
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.lag import Step
-    from analysis.track import Bools, Floats
-    from companion.core.schedule import LagModel
-
-
-from typing import TYPE_CHECKING
-
-from analysis.assess.ground_elements import SquareGrid, slices_of, summed
-from analysis.assess.ground_rates import ground_rates
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from analysis.flight_record import FlightRecord
     from analysis.strips import Strip
     from analysis.track import Bools, Floats
+    from companion.core.schedule import LagModel
 
 
 OFF_BY = 0.10

@@ -24,15 +24,9 @@ if TYPE_CHECKING:
 
     from analysis.flight_record import FlightRecord
     from analysis.strips import Strip
-    from analysis.track import Bools, Floats
-    from companion.core.prescription import Prescription
-
-
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from analysis.track import Floats, Ints
+    from analysis.track import Bools, Floats, Ints
     from companion.core.cells import CellGrid
+    from companion.core.prescription import Prescription
 
 
 # P2 leaves cells blank whose commanded flow is below this part of the highest.

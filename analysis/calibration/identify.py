@@ -9,24 +9,14 @@ from dataclasses import dataclass, replace
 from statistics import fmean, median, variance
 from typing import TYPE_CHECKING
 
-from analysis.calibration.interval import Estimate, mean_of
-from analysis.calibration.lag_fit import MAD_TO_SD, Fit, Meter, fit_step
-from analysis.calibration.steps import Kind, Reject, Step, find_steps
-
-if TYPE_CHECKING:
-    from analysis.calibration.flow_record import FlowRecord
-
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from analysis.calibration.interval import jackknife
-from analysis.calibration.lag_fit import trimmed_ml
-from analysis.calibration.steps import settle_s
+from analysis.calibration.interval import Estimate, jackknife, mean_of
+from analysis.calibration.lag_fit import MAD_TO_SD, Fit, Meter, fit_step, trimmed_ml
+from analysis.calibration.steps import Kind, Reject, Step, find_steps, settle_s
 
 if TYPE_CHECKING:
-    from analysis.calibration.flow_record import Floats
+    from analysis.calibration.flow_record import Floats, FlowRecord
     from analysis.calibration.lag_fit import Fit, Line, Meter
     from companion.core.schedule import LagModel
 

@@ -7,7 +7,8 @@ the comments of the task, a line each.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import zlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
@@ -18,28 +19,25 @@ from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
 from analysis.exports.ground import geographic
-from analysis.exports.isoxml_log import BOOM, LOG_NAME, Logged, logged, records, template
-from analysis.exports.output import zipped
-
-if TYPE_CHECKING:
-    from analysis.exports.output import Content
-    from analysis.exports.samples import Samples
-    from analysis.exports.source import Source
-
-
-import zlib
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 from analysis.exports.isoxml_log import (
     ACTUAL_RATE,
     ACTUAL_WIDTH,
+    BOOM,
+    LOG_NAME,
     SETPOINT_RATE,
+    Logged,
+    logged,
+    records,
     section,
+    template,
 )
+from analysis.exports.output import zipped
 
 if TYPE_CHECKING:
     from analysis.exports.about import About
+    from analysis.exports.output import Content
+    from analysis.exports.samples import Samples
+    from analysis.exports.source import Source
     from companion.core.boom import Boom
 
 

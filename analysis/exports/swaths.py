@@ -8,10 +8,12 @@ are those of the strip along the path, at the times that the model of the flow g
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely import MultiPoint, MultiPolygon, Polygon
 
 from analysis.exports.ground import geographic
 from analysis.exports.samples import FLOW_MIN_L_MIN, duty_at
@@ -20,17 +22,9 @@ from analysis.strips import Strip, strips_of
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
 
+    from analysis.exports.ground import Ground
     from analysis.flight_record import FlightRecord
     from analysis.flown.applied_flight import AppliedFlight
-
-
-from typing import TYPE_CHECKING, cast
-
-import shapely
-from shapely import MultiPoint, MultiPolygon, Polygon
-
-if TYPE_CHECKING:
-    from analysis.exports.ground import Ground
     from analysis.track import Track
 
 

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import base64
+import csv
+import io
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import shapely
+from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup
+
 from analysis.assess.assessment import Assessment, assess
 from analysis.flown.applied_record import EvaluationError
 from analysis.flown.read_applied import read_applied
-from analysis.report.clock import Clock, clock_of
+from analysis.report.clock import Clock, clock_of, duration_text
 from analysis.report.contents import contents_of
 from analysis.report.facts import facts_of
 from analysis.report.legal import LegalRecord, legal_record
@@ -25,21 +32,6 @@ if TYPE_CHECKING:
 
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.report.figures.style import Drawn
-
-
-import base64
-import csv
-import io
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
-
-import shapely
-from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup
-
-from analysis.report.clock import duration_text
-
-if TYPE_CHECKING:
     from analysis.report.legal import LegalRecord
 
 

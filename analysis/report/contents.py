@@ -4,44 +4,31 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
+from analysis.assess.causes import Cause
+from analysis.assess.rate_wishes import rate_wishes
+from analysis.flown.holes import UNREAD
+from analysis.flown.unknown import GAP_S
 from analysis.published import P1_RESULTS
+from analysis.report.clock import duration_text
 from analysis.report.definitions import DEFINITIONS
+from analysis.report.facts import wind_note
+from companion.core.types import Inhibit
 from companion.record.content_hash import content_sha256
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from analysis.assess.assessment import Assessment
     from analysis.assess.breakdowns import AccuracyGroup
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.report.clock import Clock
     from analysis.report.legal import LegalRecord
     from analysis.report.told import Told
-    from analysis.report.treated import Treated
-
-
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
-
-from analysis.assess.causes import Cause
-from analysis.assess.rate_wishes import rate_wishes
-from analysis.flown.holes import UNREAD
-from analysis.flown.unknown import GAP_S
-from analysis.report.clock import duration_text
-from analysis.report.facts import wind_note
-from companion.core.types import Inhibit
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from analysis.assess.assessment import Assessment
-    from analysis.flown.applied_flight import AppliedFlight
-    from analysis.report.clock import Clock
-    from analysis.report.legal import LegalRecord
     from analysis.report.treated import Treated
 
 

@@ -2,78 +2,51 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from analysis.report.definitions import CAUSES
-from analysis.report.figures import over_time
-from analysis.report.figures.sheet import sheet_of
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from analysis.assess.assessment import Assessment
-    from analysis.report.clock import Clock
-    from analysis.report.figures.style import Drawn
-    from analysis.report.treated import Treated
-
-
 import math
 from typing import TYPE_CHECKING
 
 import numpy as np
+import shapely
 from matplotlib import colormaps
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
+from matplotlib.ticker import NullLocator
 
-from analysis.report.figures.sheet import NOTHING_COLOUR, Sheet, dress
-from analysis.report.figures.style import DEVIATION_MAP, RATES_MAP, Drawn
+from analysis.report.definitions import CAUSES
+from analysis.report.figures import over_time
+from analysis.report.figures.sheet import NOTHING_COLOUR, Sheet, dress, sheet_of
+from analysis.report.figures.style import (
+    BLUE,
+    DEVIATION_MAP,
+    FAINT,
+    GRID,
+    INK,
+    RATES_MAP,
+    RED,
+    SKY,
+    Drawn,
+    new_figure,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
     from matplotlib.axes import Axes
     from matplotlib.collections import QuadMesh
     from matplotlib.colors import Colormap
 
-    from analysis.assess.cell_maps import CellMaps
-    from analysis.track import Floats
-
-
-from typing import TYPE_CHECKING
-
-from analysis.report.figures.style import BLUE, FAINT, GRID, INK, RED, new_figure
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from matplotlib.axes import Axes
-
+    from analysis.assess.assessment import Assessment
     from analysis.assess.breakdowns import Group
+    from analysis.assess.cell_maps import CellMaps
+    from analysis.assess.histogram import Histogram
     from analysis.assess.intervals import Interval
     from analysis.evaluation import Evaluation
     from analysis.lag import Step
-
-
-from typing import TYPE_CHECKING
-
-from matplotlib.ticker import NullLocator
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from matplotlib.axes import Axes
-
-    from analysis.assess.histogram import Histogram
-    from analysis.track import Ints
-
-
-from typing import TYPE_CHECKING
-
-import shapely
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path
-
-from analysis.report.figures.style import SKY
-
-if TYPE_CHECKING:
+    from analysis.report.clock import Clock
     from analysis.report.figures.sheet import Sheet
+    from analysis.report.figures.style import Drawn
     from analysis.report.treated import Treated
+    from analysis.track import Floats, Ints
 
 
 def drawn_of(assessment: Assessment, clock: Clock, treated: Treated) -> Iterator[Drawn]:

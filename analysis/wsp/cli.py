@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 
 from analysis.report.folder import check_folder
-from analysis.wsp.card import INSET_MM, Method
+from analysis.wsp.card import INSET_MM, Card, Method
 from analysis.wsp.figure import draw_distributions
-from analysis.wsp.image import LEAST_DPI, MOST_DPI, ImageError, sheets_of
+from analysis.wsp.image import LEAST_DPI, MOST_DPI, ImageError, Sheet, sheets_of
 from analysis.wsp.positions import Position, placed, read_positions
 from analysis.wsp.results import (
     Numbered,
@@ -31,27 +35,11 @@ from analysis.wsp.spread import SPREADS, spread_of
 from analysis.wsp.stains import THRESHOLD, Threshold
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note
-from companion.errors import ConfigError
-
-if TYPE_CHECKING:
-    from analysis.wsp.flight_ties import Ties
-
-
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-from companion.errors import JournalError
+from companion.errors import ConfigError, JournalError
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
-
-
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
-
-from analysis.wsp.card import Card
-from analysis.wsp.image import Sheet
+    from analysis.wsp.flight_ties import Ties
 
 FIGURE = "distributions.png"
 

@@ -223,7 +223,7 @@ def _about(config: Config, overrides: Sequence[str], flight_map: FlightMap) -> d
         "config_path": str(config.path),
         "config_toml": config.source_text,
         "config_overrides": "\n".join(overrides),
-        "application_json": json.dumps(told(config)),
+        "application_json": json.dumps(told(config.application, config.product)),
         "flight_map_json": json.dumps(flight_map.as_object()),
     }
 
@@ -233,7 +233,7 @@ def _application_notes(config: Config, training: str) -> list[str]:
     profile = config.application.profile
     if profile is None or training != "no":
         return []
-    absent = missing(profile, told(config))
+    absent = missing(profile, told(config.application, config.product))
     if not absent:
         return []
     return [

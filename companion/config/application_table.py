@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from datetime import date, datetime
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 from pydantic import AfterValidator, Field, FiniteFloat, ValidationError
@@ -18,9 +18,6 @@ from pydantic_core import PydanticCustomError
 from companion.config.tables import ProductTable, Table, Text
 from companion.config.wording import say
 from companion.errors import ConfigError
-
-if TYPE_CHECKING:
-    from companion.config.model import Config
 
 Profile = Literal["eu", "us", "generic"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
@@ -207,9 +204,9 @@ def check(values: Mapping[str, Any]) -> None:
         raise ConfigError(f"entry of the record: {say(error.errors(), nested, _Tables)}") from error
 
 
-def told(config: Config) -> dict[str, Any]:
+def told(application: ApplicationTable, product: ProductTable) -> dict[str, Any]:
     """Return what the configuration says for the record, by dotted key; what it does not, not."""
-    tables = {"application": config.application, "product": config.product}
+    tables: dict[str, Table] = {"application": application, "product": product}
     return {
         f"{name}.{key}": value
         for name, table in tables.items()

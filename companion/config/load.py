@@ -10,7 +10,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from companion.config.model import Config, Origin, leaves
+from companion.config.document import Origin, leaves
+from companion.config.model import Config
 from companion.config.wording import say, say_syntax, show_value
 from companion.errors import ConfigError
 

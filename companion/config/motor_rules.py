@@ -7,20 +7,13 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from companion.config.model import Config
-    from companion.config.motor_tables import AtomiserTable, PumpTable
-
-
-from typing import TYPE_CHECKING
-
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.options.atomisers import Atomiser, DropletLaw
 from companion.core.options.pump import Pump, Way
 from companion.core.schedule import LagModel
 
 if TYPE_CHECKING:
-    from companion.config.model import Config
+    from companion.config.document import Document
     from companion.config.motor_tables import AtomiserTable, PumpTable
 
 
@@ -28,7 +21,7 @@ Found = Iterator[tuple[str, str]]
 SPAN_MIN_US = 100
 
 
-def motor_contradictions(config: Config) -> Found:
+def motor_contradictions(config: Document) -> Found:
     """Yield (key, what is wrong and what to write instead)."""
     if config.pump is not None:
         yield from _pulses(config.pump)
@@ -42,7 +35,7 @@ def motor_contradictions(config: Config) -> Found:
     yield from _closed_pulse(config)
 
 
-def motor_warnings(config: Config) -> Found:
+def motor_warnings(config: Document) -> Found:
     """Yield what works, and is unwise."""
     pump = config.pump
     if pump is not None and pump.control == "constant" and config.output.return_channel is None:
@@ -89,7 +82,7 @@ def _constant(pump: PumpTable) -> Found:
         yield "pump.run_us", 'missing; with control = "constant" write the pulse at which it runs'
 
 
-def _modulating(config: Config, pump: PumpTable) -> Found:
+def _modulating(config: Document, pump: PumpTable) -> Found:
     for key in ("us", "flow_l_min"):
         if not getattr(pump, key):
             yield f"pump.{key}", "missing; write the measured curve of the pump"
@@ -117,7 +110,7 @@ def _modulating(config: Config, pump: PumpTable) -> Found:
     yield from _sections(config)
 
 
-def _sections(config: Config) -> Found:
+def _sections(config: Document) -> Found:
     """Yield what does not go with valves that are on-off sections behind the pump."""
     if len(config.nozzle_set) > 1:
         yield "nozzle_set", "a pump that makes the flow has one set; name all valves in one"
@@ -167,7 +160,7 @@ def _increasing(key: str, curve: dict[str, tuple[float, ...]]) -> Found:
             )
 
 
-def _atomiser(config: Config, table: AtomiserTable, key: str) -> Found:
+def _atomiser(config: Document, table: AtomiserTable, key: str) -> Found:
     broken = [*_increasing(key, {"us": table.us, "rpm": table.rpm})]
     if broken:
         yield from broken
@@ -195,7 +188,7 @@ def _atomiser(config: Config, table: AtomiserTable, key: str) -> Found:
         )
 
 
-def _flows(config: Config) -> tuple[float, float]:
+def _flows(config: Document) -> tuple[float, float]:
     """Return the least and the largest flow of the boom; 0 where no curve says it."""
     pump = config.pump
     if pump is not None and makes_flow(config):
@@ -208,13 +201,13 @@ def _flows(config: Config) -> tuple[float, float]:
     return min(each[0] for each in flows), max(each[-1] for each in flows)
 
 
-def _rpm(config: Config, table: AtomiserTable, boom_flow_l_min: float) -> float:
+def _rpm(config: Document, table: AtomiserTable, boom_flow_l_min: float) -> float:
     atomiser = atomiser_of(config, table)
     flow_l_min = atomiser.share * boom_flow_l_min
     return atomiser.law.rpm_for(atomiser.droplet_um, flow_l_min) if flow_l_min > 0.0 else 0.0
 
 
-def _every(config: Config) -> dict[str, PumpTable | AtomiserTable]:
+def _every(config: Document) -> dict[str, PumpTable | AtomiserTable]:
     """Return all motors by their keys, the pump first."""
     every: dict[str, PumpTable | AtomiserTable] = {}
     if config.pump is not None:
@@ -223,7 +216,7 @@ def _every(config: Config) -> dict[str, PumpTable | AtomiserTable]:
     return every
 
 
-def _closed_pulse(config: Config) -> Found:
+def _closed_pulse(config: Document) -> Found:
     """Yield a closed pulse at which a motor runs.
 
     The watchdog script has one pulse for all outputs that it guards. When this computer is dead,
@@ -248,7 +241,7 @@ def _closed_pulse(config: Config) -> Found:
             )
 
 
-def _outputs(config: Config) -> Found:
+def _outputs(config: Document) -> Found:
     """Yield outputs that are none, or that two share."""
     every = _every(config)
     found: dict[str, tuple[str, int, int]] = {}
@@ -284,17 +277,17 @@ DROPLET_UM = {
 }
 
 
-def makes_flow(config: Config) -> bool:
+def makes_flow(config: Document) -> bool:
     """Return whether a pump's speed makes the flow, and valves are on-off sections."""
     return config.pump is not None and config.pump.control == "modulates"
 
 
-def has_valve_outputs(config: Config) -> bool:
+def has_valve_outputs(config: Document) -> bool:
     """Return whether valves hang on outputs; without any the nozzles are always open."""
     return any(valve.channel is not None for valve in config.valve)
 
 
-def way_of(config: Config) -> Way:
+def way_of(config: Document) -> Way:
     """Return what lets out what is pumped."""
     if makes_flow(config) and not has_valve_outputs(config):
         return "always"
@@ -309,7 +302,7 @@ def pump_curve(table: PumpTable) -> FlowCurve:
     )
 
 
-def pump_of(config: Config) -> Pump | None:
+def pump_of(config: Document) -> Pump | None:
     """Return the pump as the core knows it."""
     table = config.pump
     if table is None:
@@ -331,7 +324,7 @@ def pump_of(config: Config) -> Pump | None:
     )
 
 
-def fraction_min(config: Config) -> float | None:
+def fraction_min(config: Document) -> float | None:
     """Return the least fraction at which a pump that makes the flow runs; None without one."""
     table = config.pump
     if table is None or not makes_flow(config):
@@ -340,7 +333,7 @@ def fraction_min(config: Config) -> float | None:
     return (least_us - table.stop_us) / (table.max_us - table.stop_us)
 
 
-def _lag(config: Config, table: PumpTable) -> LagModel:
+def _lag(config: Document, table: PumpTable) -> LagModel:
     """Return a pump's lags: from standing still its rise comes after its spin-up.
 
     The rule on the tables has made sure that all of them are there.
@@ -367,14 +360,14 @@ def _no_lag() -> LagModel:
     )
 
 
-def droplet_um(config: Config, table: AtomiserTable) -> float | None:
+def droplet_um(config: Document, table: AtomiserTable) -> float | None:
     """Return the wanted median diameter; None where nothing says it."""
     if table.droplet_um is not None:
         return table.droplet_um
     return DROPLET_UM.get((config.product.droplet_class or "").strip().lower())
 
 
-def atomiser_of(config: Config, table: AtomiserTable) -> Atomiser:
+def atomiser_of(config: Document, table: AtomiserTable) -> Atomiser:
     """Return an atomiser as the core knows it; all of them share the flow alike."""
     span_us = table.us[-1] - table.stop_us
     return Atomiser(
@@ -396,12 +389,12 @@ def atomiser_of(config: Config, table: AtomiserTable) -> Atomiser:
     )
 
 
-def atomisers_of(config: Config) -> tuple[Atomiser, ...]:
+def atomisers_of(config: Document) -> tuple[Atomiser, ...]:
     """Return all atomisers, in the order of their tables."""
     return tuple(atomiser_of(config, table) for table in config.atomiser)
 
 
-def pump_set(config: Config) -> NozzleSet | None:
+def pump_set(config: Document) -> NozzleSet | None:
     """Return all valves with the pump's curve; None where the valves' own curves count."""
     if config.pump is None or not makes_flow(config):
         return None

@@ -8,28 +8,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import chain, combinations, pairwise
 from typing import TYPE_CHECKING
 
 from companion.config.motor_rules import makes_flow, motor_contradictions, motor_warnings
 from companion.core.nozzle import FLOW_LAWS, FlowCurve
 
 if TYPE_CHECKING:
-    from companion.config.model import Config
+    from companion.config.document import Document
     from companion.config.sprayer_tables import NozzleSetTable
-
-
-from itertools import combinations
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from companion.config.model import Config
-
-
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from companion.config.model import Config
 
 
 # MAV_CMD_DO_SET_SERVO: ArduPilot has at most 32 outputs (SERVO1 to SERVO32).
@@ -54,9 +41,9 @@ class Contradiction:
 Rule = Iterator[Contradiction]
 
 
-def contradictions(config: Config) -> Rule:
+def contradictions(config: Document) -> Rule:
     """Yield what makes the configuration unusable."""
-    rules: tuple[Callable[[Config], Rule], ...] = (
+    rules: tuple[Callable[[Document], Rule], ...] = (
         _link, _prescription, _valves, _channels, _nozzle_sets, _pwm, _lags, _output, _safety,
         _mission,
     )  # fmt: skip
@@ -68,7 +55,7 @@ def contradictions(config: Config) -> Rule:
         yield Contradiction(key=key, text=text)
 
 
-def _prescription(config: Config) -> Rule:
+def _prescription(config: Document) -> Rule:
     table = config.prescription
     if table is not None and (table.check_map is None) != (table.check_surveyed is None):
         here, missing = ("check_map", "check_surveyed")
@@ -80,7 +67,7 @@ def _prescription(config: Config) -> Rule:
         )
 
 
-def mismatches(config: Config) -> Rule:
+def mismatches(config: Document) -> Rule:
     """Yield what `config check` refuses though the parts would run: widths that do not agree."""
     width_m = config.boom_table.width_m
     mission = config.mission
@@ -99,7 +86,7 @@ def mismatches(config: Config) -> Rule:
         )
 
 
-def without_effect(config: Config) -> Rule:
+def without_effect(config: Document) -> Rule:
     """Yield settings that are not acted on, or work and are unwise: silence would deceive."""
     if config.flow_trim.enabled and config.flow_meter.source == "none":
         yield Contradiction(
@@ -123,7 +110,7 @@ def without_effect(config: Config) -> Rule:
             yield Contradiction(key=key, text="not part of this version, without effect")
 
 
-def unbounded(config: Config) -> Rule:
+def unbounded(config: Document) -> Rule:
     """Yield that no lines are named: then the map alone says where is sprayed."""
     if config.mission is None or config.mission.lines is None:
         yield Contradiction(
@@ -137,7 +124,7 @@ def _near(value_m: float, reference_m: float) -> bool:
     return abs(value_m - reference_m) <= SWATH_TOLERANCE * reference_m + 1e-9
 
 
-def _link(config: Config) -> Rule:
+def _link(config: Document) -> Rule:
     kind, _, rest = config.link.url.partition(":")
     port = int(rest.rpartition(":")[2])
     least = 0 if kind == "udpin" else 1  # 0 lets the system choose the port to listen on
@@ -145,7 +132,7 @@ def _link(config: Config) -> Rule:
         yield Contradiction(key="link.url", text="no port; write one from 1 to 65535 at the end")
 
 
-def _valves(config: Config) -> Rule:
+def _valves(config: Document) -> Rule:
     seen: set[str] = set()
     for number, valve in enumerate(config.valve):
         if valve.name in seen:
@@ -163,7 +150,7 @@ def _valves(config: Config) -> Rule:
             )
 
 
-def _channels(config: Config) -> Rule:
+def _channels(config: Document) -> Rule:
     kind = config.output.kind
     if kind == "none":
         return
@@ -188,12 +175,12 @@ def _channels(config: Config) -> Rule:
             yield Contradiction(key=key, text=f"used twice; give each valve its own {what}")
 
 
-def _alive(config: Config) -> dict[str, int | None]:
+def _alive(config: Document) -> dict[str, int | None]:
     line = config.gpio.alive_line
     return {} if line is None else {"gpio.alive_line": line}
 
 
-def _nozzle_sets(config: Config) -> Rule:
+def _nozzle_sets(config: Document) -> Rule:
     names = [valve.name for valve in config.valve]
     used: set[str] = set()
     for number, table in enumerate(config.nozzle_set):
@@ -220,7 +207,7 @@ def _nozzle_sets(config: Config) -> Rule:
             )
 
 
-def _preset(config: Config, table: NozzleSetTable, key: str) -> Rule:
+def _preset(config: Document, table: NozzleSetTable, key: str) -> Rule:
     if table.duty or table.flow_l_min or makes_flow(config):
         other = "the curve of the pump" if makes_flow(config) else "a row of measured points"
         yield Contradiction(
@@ -263,7 +250,7 @@ def _curve(duty: tuple[float, ...], flow_l_min: tuple[float, ...], key: str) -> 
         )
 
 
-def _pwm(config: Config) -> Rule:
+def _pwm(config: Document) -> Rule:
     pwm = config.pwm
     if not pwm.duty_min < pwm.duty_max:
         yield Contradiction(
@@ -283,7 +270,7 @@ def _pwm(config: Config) -> Rule:
         )
 
 
-def _lags(config: Config) -> Rule:
+def _lags(config: Document) -> Rule:
     lag = config.lag
     if not lag.on_start_s <= lag.on_s:
         yield Contradiction(
@@ -306,7 +293,7 @@ def _lags(config: Config) -> Rule:
             )
 
 
-def _output(config: Config) -> Rule:
+def _output(config: Document) -> Rule:
     output = config.output
     if not abs(output.full_us - output.closed_us) >= SPAN_MIN_US:
         yield Contradiction(
@@ -323,7 +310,7 @@ def _output(config: Config) -> Rule:
         )
 
 
-def _safety(config: Config) -> Rule:
+def _safety(config: Document) -> Rule:
     safety = config.safety
     for what in ("speed", "height"):
         unit = "m_s" if what == "speed" else "m"
@@ -348,7 +335,7 @@ def _safety(config: Config) -> Rule:
         )
 
 
-def _mission(config: Config) -> Rule:
+def _mission(config: Document) -> Rule:
     mission = config.mission
     if mission is not None and not mission.reserve_l < mission.tank_l:
         yield Contradiction(
@@ -388,14 +375,14 @@ class Claim:
     chip: str
 
 
-def line_contradictions(config: Config) -> Found:
+def line_contradictions(config: Document) -> Found:
     """Yield (key, what is wrong) of a line that is claimed a second time on one chip."""
     for first, second in _shared(config):
         if first.chip == second.chip:
             yield second.key, f"{first.key} has this line; give each its own"
 
 
-def line_warnings(config: Config) -> Found:
+def line_warnings(config: Document) -> Found:
     """Yield lines of one number on chips of two names: these may be one chip.
 
     A chip is found by its name or by its label, and which labels there are only the computer knows.
@@ -409,7 +396,7 @@ def line_warnings(config: Config) -> Found:
             )
 
 
-def claims(config: Config) -> tuple[Claim, ...]:
+def claims(config: Document) -> tuple[Claim, ...]:
     """Return what claims lines, the valves first."""
     output = config.output
     found: dict[str, int | None] = {}
@@ -429,7 +416,7 @@ def claims(config: Config) -> tuple[Claim, ...]:
     )
 
 
-def _shared(config: Config) -> Iterator[tuple[Claim, Claim]]:
+def _shared(config: Document) -> Iterator[tuple[Claim, Claim]]:
     """Yield each two that name the same number."""
     return (pair for pair in combinations(claims(config), 2) if pair[0].line == pair[1].line)
 
@@ -437,7 +424,7 @@ def _shared(config: Config) -> Iterator[tuple[Claim, Claim]]:
 # What the tables of the sensors must say together with the others.
 
 
-def sensor_contradictions(config: Config) -> Found:
+def sensor_contradictions(config: Document) -> Found:
     """Yield (key, what is wrong and what to write instead)."""
     yield from _meter(config)
     yield from _pressure(config)
@@ -449,7 +436,7 @@ def sensor_contradictions(config: Config) -> Found:
         )
 
 
-def _meter(config: Config) -> Found:
+def _meter(config: Document) -> Found:
     table = config.flow_meter
     if table.source != "gpio":
         return
@@ -462,7 +449,7 @@ def _meter(config: Config) -> Found:
         )
 
 
-def _pressure(config: Config) -> Found:
+def _pressure(config: Document) -> Found:
     table = config.pressure
     if not table.at_4_ma_kpa < table.at_20_ma_kpa:
         yield (
@@ -479,7 +466,7 @@ def _pressure(config: Config) -> Found:
         yield "pressure.duty", "must increase; write the measured points in order of duty"
 
 
-def _tank(config: Config) -> Found:
+def _tank(config: Document) -> Found:
     table = config.tank
     if table.source == "none":
         return
@@ -497,7 +484,7 @@ def _tank(config: Config) -> Found:
         )
 
 
-def tank_capacity_l(config: Config) -> float | None:
+def tank_capacity_l(config: Document) -> float | None:
     """Return what a full tank holds."""
     if config.tank.capacity_l is not None:
         return config.tank.capacity_l

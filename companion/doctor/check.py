@@ -125,7 +125,7 @@ def application_check(config: Config) -> Check:
             "application.profile is not set: no legal record is asked for",
             'write profile = "eu", "us" or "generic" under [application]',
         )
-    absent = missing(table.profile, told(config))
+    absent = missing(table.profile, told(config.application, config.product))
     if absent:
         return warn(
             NAME,

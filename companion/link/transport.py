@@ -81,34 +81,6 @@ def serial_baud(url: str) -> int | None:
     return parse_url(url).number if url.startswith("serial:") else None
 
 
-async def open_transport(
-    url: str, on_bytes: OnBytes, on_change: OnChange, on_trouble: OnTrouble | None = None
-) -> Transport:
-    """Open `url`; raises a `LinkError` of one line that says what it sees and what to change.
-
-    `on_change` is told of every loss and return after that; TCP and serial links come back by
-    themselves, UDP has nothing to lose. With `on_trouble` a link for which waiting can help is
-    not refused: its one line goes there, and it is tried until it opens.
-    """
-    # The kinds are imported where they are needed: pyserial is of no use to a UDP link.
-    parts = parse_url(url)
-    if parts.kind in ("udpin", "udpout"):
-        from companion.link.udp import open_udp
-
-        return await open_udp(parts, on_bytes)
-    link: Reconnecting
-    if parts.kind == "tcp":
-        from companion.link.tcp import TcpTransport
-
-        link = TcpTransport(parts, on_bytes, on_change, on_trouble)
-    else:
-        from companion.link.serial_port import SerialTransport
-
-        link = SerialTransport(parts, on_bytes, on_change, on_trouble)
-    await link.open()
-    return link
-
-
 class Reconnecting:
     """What links that can be lost have in common: they try again with growing pauses."""
 

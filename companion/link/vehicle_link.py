@@ -18,7 +18,15 @@ from companion.link.parameters import Parameters
 from companion.link.service import OnEvent
 from companion.link.signing import Signing
 from companion.link.statistics import LinkStatistics
-from companion.link.transport import LinkUrl, Transport, open_transport, parse_url
+from companion.link.transport import (
+    LinkUrl,
+    OnBytes,
+    OnChange,
+    OnTrouble,
+    Reconnecting,
+    Transport,
+    parse_url,
+)
 
 OnStatistics = Callable[[float, Mapping[str, float | None]], None]
 
@@ -331,3 +339,31 @@ class Watch:
         _logger.warning("%s: set link.component_id to a number that nobody has", text)
         self._component.warn(f"{system_id}/{component_id} twice: set link.component_id")
         self._tell(now_s, "link", text)
+
+
+async def open_transport(
+    url: str, on_bytes: OnBytes, on_change: OnChange, on_trouble: OnTrouble | None = None
+) -> Transport:
+    """Open `url`; raises a `LinkError` of one line that says what it sees and what to change.
+
+    `on_change` is told of every loss and return after that; TCP and serial links come back by
+    themselves, UDP has nothing to lose. With `on_trouble` a link for which waiting can help is
+    not refused: its one line goes there, and it is tried until it opens.
+    """
+    # The kinds are imported where they are needed: pyserial is of no use to a UDP link.
+    parts = parse_url(url)
+    if parts.kind in ("udpin", "udpout"):
+        from companion.link.udp import open_udp
+
+        return await open_udp(parts, on_bytes)
+    link: Reconnecting
+    if parts.kind == "tcp":
+        from companion.link.tcp import TcpTransport
+
+        link = TcpTransport(parts, on_bytes, on_change, on_trouble)
+    else:
+        from companion.link.serial_port import SerialTransport
+
+        link = SerialTransport(parts, on_bytes, on_change, on_trouble)
+    await link.open()
+    return link

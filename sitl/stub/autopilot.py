@@ -6,15 +6,18 @@ the other stands in its `Firmware`.
 
 from __future__ import annotations
 
+import heapq
+import random
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from itertools import count
+from typing import TYPE_CHECKING, Protocol
 
 from sitl.stub import actions, mission, parameters, services
 from sitl.stub.channel import Channel
-from sitl.stub.faults import Fault, FaultKind
+from sitl.stub.faults import Fault, FaultClock, FaultKind
 from sitl.stub.liquid import Battery
 from sitl.stub.mission_items import MissionItem
-from sitl.stub.modes import INFO
+from sitl.stub.modes import AUTO, INFO
 from sitl.stub.outputs import OutputState
 from sitl.stub.parts import Parts
 from sitl.stub.protocol import (
@@ -24,35 +27,15 @@ from sitl.stub.protocol import (
     Speaker,
     dialect,
     sender,
+    target,
 )
 from sitl.stub.rc import rc_pulses_us
 from sitl.stub.strangers import Strangers
 from sitl.stub.world import Pose
 
 if TYPE_CHECKING:
+    from sitl.stub.channel import Channel
     from sitl.stub.strangers import Strangers
-
-
-import heapq
-from itertools import count
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from sitl.stub.channel import Channel
-
-
-import random
-from typing import TYPE_CHECKING
-
-from sitl.stub.faults import FaultClock
-from sitl.stub.modes import AUTO
-from sitl.stub.protocol import target
-
-if TYPE_CHECKING:
-    from sitl.stub.channel import Channel
-
-
-from typing import Protocol
 
 UTC_START_S = 1_774_080_000.0  # 2026-03-21 08:00
 

@@ -13,8 +13,8 @@ import json
 import sys
 from typing import Literal
 
-from missions.energy import nose_s
 from missions.plan import Leg as Planned
+from missions.plan import nose_s
 from missions.turns import Motion
 from sitl.vehicle import TURN_RATE_DEG_S, Leg, Route, Vehicle
 

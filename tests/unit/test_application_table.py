@@ -27,14 +27,14 @@ def test_what_a_law_asks_for_is_a_key_of_the_configuration_and_has_a_label() -> 
 
 def test_example_says_nothing_for_the_record() -> None:
     config = load(EXAMPLE)
-    assert told(config) == {}
-    assert missing("us", told(config)) == ASKED["us"]
+    assert told(config.application, config.product) == {}
+    assert missing("us", told(config.application, config.product)) == ASKED["us"]
 
 
 def test_whatever_is_said_is_kept_and_no_longer_missing() -> None:
     config = load(EXAMPLE, overrides=EU)
-    assert told(config) == EU_TOLD
-    assert missing("eu", told(config)) == ()
+    assert told(config.application, config.product) == EU_TOLD
+    assert missing("eu", told(config.application, config.product)) == ()
     assert json.loads(_about(config, ())["application_json"]) == EU_TOLD
 
 

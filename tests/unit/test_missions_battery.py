@@ -13,9 +13,9 @@ from shapely import Polygon, box
 
 from companion.config.tables import MissionTable
 from missions.demand import Uniform
-from missions.energy import Battery, sortie_wh
+from missions.energy import Battery
 from missions.errors import PlanError
-from missions.plan import Leg, Plan, Settings, Sortie
+from missions.plan import Leg, Plan, Settings, Sortie, sortie_wh
 from missions.planner import plan_mission
 from missions.reading_fleet import battery_of
 from missions.verticals import Vertical

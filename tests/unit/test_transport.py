@@ -13,7 +13,8 @@ import pytest
 
 import companion.link.transport as transport_module
 from companion.errors import LinkError
-from companion.link.transport import Transport, open_transport
+from companion.link.transport import Transport
+from companion.link.vehicle_link import open_transport
 from tests.sitl.wire_peer import free_port
 
 

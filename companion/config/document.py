@@ -1,0 +1,126 @@
+"""What a configuration file holds, table by table, before it is asked whether it makes sense."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, PrivateAttr
+
+from companion.config import application_table, motor_tables, sensor_tables, sprayer_tables, tables
+from companion.core.boom import Boom, Valve
+
+Origin = Literal["file", "override", "default"]
+
+
+class Document(tables.Table):
+    """The tables of a file, each with its own rules; `rules.py` has those that join tables."""
+
+    version: int = Field(ge=1, le=1, description="of this format")
+    link: tables.LinkTable = tables.LinkTable()
+    prescription: tables.PrescriptionTable | None = None
+    # The method `boom` returns the core's type, so that the table cannot have the name.
+    boom_table: sprayer_tables.BoomTable = Field(alias="boom")
+    valve: Annotated[
+        tuple[sprayer_tables.ValveTable, ...], Field(strict=False, min_length=1, max_length=256)
+    ]
+    pwm: sprayer_tables.PwmTable = sprayer_tables.PwmTable()
+    nozzle_set: Annotated[
+        tuple[sprayer_tables.NozzleSetTable, ...], Field(strict=False, min_length=1, max_length=32)
+    ]
+    lag: sprayer_tables.LagTable
+    output: sprayer_tables.OutputTable = sprayer_tables.OutputTable()
+    gpio: sprayer_tables.GpioTable = sprayer_tables.GpioTable()
+    pump: motor_tables.PumpTable | None = None
+    atomiser: Annotated[
+        tuple[motor_tables.AtomiserTable, ...], Field(strict=False, max_length=32)
+    ] = ()
+    safety: tables.SafetyTable = tables.SafetyTable()
+    mission: tables.MissionTable | None = None
+    product: tables.ProductTable = tables.ProductTable()
+    application: application_table.ApplicationTable = application_table.ApplicationTable()
+    flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
+    flow_meter: sensor_tables.FlowMeterTable = sensor_tables.FlowMeterTable()
+    pressure: sensor_tables.PressureTable = sensor_tables.PressureTable()
+    tank: sensor_tables.TankTable = sensor_tables.TankTable()
+    detection: sensor_tables.DetectionTable = sensor_tables.DetectionTable()
+    drift: tables.DriftTable = tables.DriftTable()
+    prediction: tables.PredictionTable = tables.PredictionTable()
+    coverage: tables.CoverageTable = tables.CoverageTable()
+    journal: tables.JournalTable = tables.JournalTable()
+    web: tables.WebTable = tables.WebTable()
+
+    _path: Path = PrivateAttr(default=Path("config.toml"))
+    _source_text: str = PrivateAttr(default="")
+    _origins: dict[str, Origin] = PrivateAttr(default_factory=dict)
+
+    def came_from(self, path: Path, *, source_text: str, origins: dict[str, Origin]) -> Self:
+        """Note the file that this was read from and which of its keys are whose; return self."""
+        self._path, self._source_text, self._origins = path, source_text, origins
+        return self
+
+    @property
+    def path(self) -> Path:
+        """Return the file that this was read from."""
+        return self._path
+
+    @property
+    def source_text(self) -> str:
+        """Return the text of that file, for the record of a flight."""
+        return self._source_text
+
+    def resolve(self, name: str) -> Path:
+        """Return the path of a file that the configuration names, relative to its own folder."""
+        return self._path.parent / name
+
+    def settings(self) -> dict[str, tuple[Any, Origin]]:
+        """Return every effective setting by its dotted key, and where it came from."""
+        found: dict[str, tuple[Any, Origin]] = {}
+        for key, value in leaves(self.model_dump(mode="json", by_alias=True)):
+            found[key] = (value, self._origins.get(key, "default"))
+        return found
+
+    def boom(self) -> Boom:
+        """Return the geometry; strips share the effective width but for a `width_m` of their own.
+
+        With several sets it is the largest whose valves share it: the smaller sets widen it.
+        """
+        largest = max(len(nozzle_set.valves) for nozzle_set in self.nozzle_set)
+        shared_m = self.boom_table.width_m / largest
+        return Boom(
+            width_m=self.boom_table.width_m,
+            height_m=self.boom_table.height_m,
+            valves=tuple(
+                Valve(
+                    name=valve.name,
+                    right_m=valve.right_m,
+                    forward_m=_or(valve.forward_m, self.boom_table.forward_m),
+                    width_m=_or(valve.width_m, shared_m),
+                    channel=valve.channel or 0,
+                )
+                for valve in self.valve
+            ),
+        )
+
+
+def _or(value: float | None, otherwise: float) -> float:
+    return otherwise if value is None else value
+
+
+def leaves(node: Any, key: str = "") -> list[tuple[str, Any]]:
+    """Return (dotted key, value) of all settings below `node`; lists of tables get an index.
+
+    >>> leaves({"lag": {"on_s": 0.1}, "valve": [{"name": "1"}]})
+    [('lag.on_s', 0.1), ('valve[0].name', '1')]
+    """
+    if isinstance(node, dict):
+        return [
+            leaf
+            for name, value in node.items()
+            for leaf in leaves(value, f"{key}.{name}" if key else str(name))
+        ]
+    if isinstance(node, list) and any(isinstance(item, dict) for item in node):
+        return [
+            leaf for number, item in enumerate(node) for leaf in leaves(item, f"{key}[{number}]")
+        ]
+    return [(key, node)]
