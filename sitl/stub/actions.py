@@ -9,7 +9,7 @@ from sitl.stub.protocol import dialect
 from sitl.stub.px4_commands import set_actuators
 
 if TYPE_CHECKING:
-    from sitl.stub.autopilot import Autopilot
+    from sitl.stub.firmware import Autopilot
     from sitl.stub.mission_items import MissionItem
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from sitl.stub import commands, mission, parameters, services
+from sitl.stub import commands, mission, services
 from sitl.stub.ardupilot_commands import COMMANDS, handle_data_stream, handle_set_mode
 from sitl.stub.firmware import Builder, Firmware, MessageHandler, Version
 from sitl.stub.mission import current
@@ -15,7 +15,7 @@ from sitl.stub.protocol import Message, dialect
 from sitl.stub.streams import COMMON, HEALTHY, LOST, estimated, version_word
 
 if TYPE_CHECKING:
-    from sitl.stub.autopilot import Autopilot
+    from sitl.stub.firmware import Autopilot
 
 
 NAME = "ardupilot"
@@ -33,9 +33,9 @@ MESSAGES: dict[str, MessageHandler] = {
     "MISSION_REQUEST": mission.handle_request,
     "MISSION_CLEAR_ALL": mission.handle_clear,
     "MISSION_SET_CURRENT": mission.handle_set_current,
-    "PARAM_REQUEST_LIST": parameters.handle_list,
-    "PARAM_REQUEST_READ": parameters.handle_read,
-    "PARAM_SET": parameters.handle_set,
+    "PARAM_REQUEST_LIST": services.handle_parameter_list,
+    "PARAM_REQUEST_READ": services.handle_parameter_read,
+    "PARAM_SET": services.handle_parameter_set,
     "TIMESYNC": services.handle_timesync,
     "PING": services.handle_ping,
     "FILE_TRANSFER_PROTOCOL": services.handle_file_transfer,

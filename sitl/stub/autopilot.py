@@ -10,11 +10,12 @@ import heapq
 import random
 from collections.abc import Callable, Sequence
 from itertools import count
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from sitl.stub import actions, mission, parameters, services
+from sitl.stub import actions, mission, services
 from sitl.stub.channel import Channel
 from sitl.stub.faults import Fault, FaultClock, FaultKind
+from sitl.stub.firmware import Upload
 from sitl.stub.liquid import Battery
 from sitl.stub.mission_items import MissionItem
 from sitl.stub.modes import AUTO, INFO
@@ -33,10 +34,6 @@ from sitl.stub.rc import rc_pulses_us
 from sitl.stub.strangers import Strangers
 from sitl.stub.world import Pose
 
-if TYPE_CHECKING:
-    from sitl.stub.channel import Channel
-    from sitl.stub.strangers import Strangers
-
 UTC_START_S = 1_774_080_000.0  # 2026-03-21 08:00
 
 
@@ -51,7 +48,7 @@ class Autopilot:
         self.faults = parts.faults
         self.wind_towards_m_s = parts.wind_towards_m_s
         self.channels: list[Channel] = []
-        self.upload: mission.Upload | None = None
+        self.upload: Upload | None = None
         self.fence: tuple[MissionItem, ...] = ()
         self.script: Script | None = None
         # The battery monitors: those of flow meter and tank too, where the sprayer has them.
@@ -242,7 +239,7 @@ class Autopilot:
         self._beats.tick(self, now_s)
         self._acknowledgements.tick(self, now_s)
         for channel in list(self.channels):
-            parameters.send_list(self, channel, now_s)
+            services.send_parameters(self, channel, now_s)
             self._stream(channel, now_s)
 
     def next_due_s(self) -> float:

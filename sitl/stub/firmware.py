@@ -6,15 +6,22 @@ firmware's source or measured on its SITL.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import random
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-from sitl.stub.protocol import Message
-
-if TYPE_CHECKING:
-    from sitl.stub.autopilot import Autopilot
-    from sitl.stub.channel import Channel
+from sitl.stub.channel import Channel
+from sitl.stub.faults import Fault, FaultClock, FaultKind
+from sitl.stub.flight import Flight
+from sitl.stub.liquid import Battery
+from sitl.stub.mission_items import MissionItem
+from sitl.stub.modes import INFO
+from sitl.stub.outputs import Outputs
+from sitl.stub.parameters import Parameters
+from sitl.stub.protocol import Message, dialect
+from sitl.stub.world import Pose
 
 Params = tuple[float, ...]
 Builder = Callable[["Autopilot", float], Message]
@@ -66,3 +73,136 @@ class Firmware:
     forwards: bool = True
     tells_of_actions: bool = True
     position_step_s: float = 0.0
+
+
+@dataclass(slots=True, kw_only=True)
+class Upload:
+    """A mission or a fence on its way in."""
+
+    channel: Channel
+    peer: tuple[int, int]
+    count: int
+    asked_s: float
+    heard_s: float
+    kind: int = dialect.MAV_MISSION_TYPE_MISSION
+    items: list[MissionItem] = field(default_factory=list)
+
+
+class Autopilot(Protocol):
+    """The stub as the handlers of its messages and commands see it."""
+
+    firmware: Firmware
+    flight: Flight
+    outputs: Outputs
+    parameters: Parameters
+    faults: FaultClock
+    wind_towards_m_s: tuple[float, float]
+    channels: list[Channel]
+    upload: Upload | None
+    fence: tuple[MissionItem, ...]
+    batteries: Callable[[float], Sequence[Battery]]
+    battery_turn: int
+    queue: CommandQueue | None
+    says: Callable[[str], None]
+    utc_offset_s: float
+
+    def send(self, channel: Channel, message: Message) -> None:
+        """Send a message of the autopilot to one peer."""
+
+    def broadcast(self, message: Message) -> None:
+        """Send a message of the autopilot to all peers."""
+
+    def tell(self, text: str, *, severity: int = INFO) -> None:
+        """Send a STATUSTEXT to all peers."""
+
+    def strikes(self, kind: FaultKind, now_s: float, *, command: int = 0) -> Fault | None:
+        """Return the fault of a kind that is in force and strikes this time."""
+
+    def acknowledge(
+        self, channel: Channel, command: int, result: int, *, to: tuple[int, int], now_s: float
+    ) -> None:
+        """Answer a command, as far as the faults let the answer through."""
+
+    def has(self, message_id: int, now_s: float) -> bool:
+        """Return whether a message can be sent now."""
+
+    def build(self, message_id: int, now_s: float) -> Message:
+        """Return a message that can be asked for."""
+
+    def boot_ms(self, now_s: float) -> int:
+        """Return milliseconds since boot, 32 bits."""
+
+    def boot_ns(self, now_s: float) -> int:
+        """Return nanoseconds since boot, the time of TIMESYNC."""
+
+    def sample_s(self, now_s: float) -> float:
+        """Return when the estimate was made that is sent now."""
+
+    def believed(self, now_s: float) -> Pose:
+        """Return the estimated pose; frozen and at rest while the estimator is lost."""
+
+    def estimator_lost(self, now_s: float) -> bool:
+        """Return whether the estimator says that it has no position."""
+
+    def wire_sequence(self, sequence: int) -> int:
+        """Return the number that an item of the flight has on the wire."""
+
+    def home_item(self) -> MissionItem:
+        """Return home as item 0 of the mission."""
+
+    def reboot(self, now_s: float) -> None:
+        """Start the clock again and forget streams and outputs; the twin flies on."""
+
+
+# PX4's way of a command from the receiver to the Commander: a short queue that loses.
+#
+# The Commander takes one command per loop of about 10 ms; the queue holds eight, and more than 20
+# to 30 commands a second in total are not safe (vehicle_command lost; PX4 #16630, #16635, #20430).
+# Modelled as eight commands at once and `per_s` of them a second in the long run; what is beyond is
+# lost, with its acknowledgement. Those that get through are answered 4 to 12 ms later, as measured
+# on a PX4 1.16 SITL; DO_SET_ACTUATOR is at the outputs by then, which hear it themselves.
+
+Job = Callable[[float], None]
+_DELAY_S = (0.004, 0.012)
+
+
+class CommandQueue:
+    """Keeps jobs until they are due."""
+
+    def __init__(self, *, depth: int, per_s: float, seed: int) -> None:
+        self.lost_count = 0
+        self._depth, self._per_s = float(depth), per_s
+        self._room = float(depth)
+        self._room_at_s: float | None = None
+        self._jobs: deque[tuple[float, Job]] = deque()
+        # Not for secrets: the same seed must give the same delays.
+        self._random = random.Random(seed)
+
+    def put(self, job: Job, now_s: float) -> bool:
+        """Take a job; false if it is lost."""
+        since_s = now_s - (now_s if self._room_at_s is None else self._room_at_s)
+        self._room = min(self._room + max(since_s, 0.0) * self._per_s, self._depth)
+        self._room_at_s = now_s
+        if self._room < 1.0:
+            self.lost_count += 1
+            return False
+        self._room -= 1.0
+        due_s = now_s + self._random.uniform(*_DELAY_S)
+        if self._jobs:
+            due_s = max(due_s, self._jobs[-1][0])
+        self._jobs.append((due_s, job))
+        return True
+
+    def run(self, now_s: float) -> None:
+        """Do the jobs that are due."""
+        while self._jobs and self._jobs[0][0] <= now_s:
+            _, job = self._jobs.popleft()
+            job(now_s)
+
+    def clear(self) -> None:
+        """Forget all jobs."""
+        self._jobs.clear()
+
+    def next_due_s(self) -> float:
+        """Return when the next job is due; infinite without one."""
+        return self._jobs[0][0] if self._jobs else float("inf")

@@ -7,7 +7,6 @@ back, and flown through; rally points are not kept.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from sitl.stub.mission_items import MissionItem, item_message, item_of
@@ -15,8 +14,8 @@ from sitl.stub.modes import AUTO, Phase
 from sitl.stub.protocol import Message, dialect, sender
 
 if TYPE_CHECKING:
-    from sitl.stub.autopilot import Autopilot
     from sitl.stub.channel import Channel
+    from sitl.stub.firmware import Autopilot, Upload
 
 _ACCEPTED = dialect.MAV_MISSION_ACCEPTED
 _SLOW_S = 1.0
@@ -29,19 +28,6 @@ _MISSION, _FENCE = dialect.MAV_MISSION_TYPE_MISSION, dialect.MAV_MISSION_TYPE_FE
 _FENCE_COMMANDS = frozenset(
     range(dialect.MAV_CMD_NAV_FENCE_RETURN_POINT, dialect.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION + 1)
 )
-
-
-@dataclass(slots=True, kw_only=True)
-class Upload:
-    """A mission or a fence on its way in."""
-
-    channel: Channel
-    peer: tuple[int, int]
-    count: int
-    asked_s: float
-    heard_s: float
-    kind: int = _MISSION
-    items: list[MissionItem] = field(default_factory=list)
 
 
 def _acknowledge(

@@ -8,15 +8,8 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
-from sitl.stub.faults import FaultKind
-from sitl.stub.modes import WARNING
 from sitl.stub.protocol import Message, dialect
-
-if TYPE_CHECKING:
-    from sitl.stub.autopilot import Autopilot
-    from sitl.stub.channel import Channel
 
 INT8: int = dialect.MAV_PARAM_TYPE_INT8
 INT16: int = dialect.MAV_PARAM_TYPE_INT16
@@ -34,10 +27,6 @@ MOTOR_FUNCTIONS = (33, 34, 35, 36)
 # ArduCopter has 0 here, and its AUTO waits for the pilot's throttle.
 AUTO_ARMING = 1
 AUTO_TAKE_OFF = 2
-
-# A link carries so many PARAM_VALUE in one go; the rest of a list follows.
-LIST_BURST = 10
-LIST_EVERY_S = 0.02
 
 
 def ardupilot_table() -> dict[str, tuple[float, int]]:
@@ -145,55 +134,3 @@ class Parameters:
         if message.param_type != self.kind(name):
             return None
         return float(struct.unpack("<i", struct.pack("<f", value))[0])
-
-
-def handle_list(autopilot: Autopilot, channel: Channel, _message: Message, now_s: float) -> None:
-    """Begin to send the whole table; the other streams of that peer are slowed meanwhile."""
-    channel.busy_until_s = now_s + 1.0
-    channel.parameters_left = list(range(len(autopilot.parameters)))
-    send_list(autopilot, channel, now_s)
-
-
-def send_list(autopilot: Autopilot, channel: Channel, now_s: float) -> None:
-    """Send what the link takes of a list in one go."""
-    left = channel.parameters_left
-    if not left or now_s < channel.parameters_due_s:
-        return
-    channel.busy_until_s = now_s + 1.0
-    channel.parameters_due_s = now_s + LIST_EVERY_S
-    for index in left[:LIST_BURST]:
-        name = autopilot.parameters.name_at(index)
-        if name is not None:
-            _send(autopilot, channel, name, now_s)
-    del left[:LIST_BURST]
-
-
-def _send(autopilot: Autopilot, channel: Channel, name: str, now_s: float) -> None:
-    if autopilot.strikes(FaultKind.PARAM_LOST, now_s) is None:
-        autopilot.send(channel, autopilot.parameters.message(name))
-
-
-def handle_read(autopilot: Autopilot, channel: Channel, message: Message, now_s: float) -> None:
-    """Send one parameter by index or name; an unknown one gets no answer."""
-    name: str | None = message.param_id
-    if message.param_index >= 0:
-        name = autopilot.parameters.name_at(message.param_index)
-    if name is not None and name in autopilot.parameters:
-        _send(autopilot, channel, name, now_s)
-
-
-def handle_set(autopilot: Autopilot, _channel: Channel, message: Message, now_s: float) -> None:
-    """Set one parameter and tell everybody its new value."""
-    name = message.param_id
-    if name not in autopilot.parameters:
-        return
-    if autopilot.strikes(FaultKind.PARAM_LOST, now_s) is not None:
-        return
-    value = autopilot.parameters.decoded(name, message)
-    if value is None:
-        if autopilot.parameters.bytewise:
-            autopilot.tell(f"param types mismatch param: {name}", severity=WARNING)
-        return
-    autopilot.parameters.put(name, value)
-    for channel in autopilot.channels:
-        _send(autopilot, channel, name, now_s)

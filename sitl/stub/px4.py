@@ -23,7 +23,7 @@ from sitl.stub.px4_modes import base_mode, custom_mode
 from sitl.stub.streams import COMMON, HEALTHY, LOST, estimated, version_word
 
 if TYPE_CHECKING:
-    from sitl.stub.autopilot import Autopilot
+    from sitl.stub.firmware import Autopilot
 
 
 NAME = "px4"

@@ -18,8 +18,8 @@ from sitl.stub.px4_modes import mode_of
 from sitl.stub.px4_outputs import ActuatorOutputs
 
 if TYPE_CHECKING:
-    from sitl.stub.autopilot import Autopilot
     from sitl.stub.channel import Channel
+    from sitl.stub.firmware import Autopilot
 
 # Until this version nobody acknowledged DO_SET_ACTUATOR, and a NaN overwrote (PR #22711).
 ACKNOWLEDGED_SINCE = (1, 14, 2)

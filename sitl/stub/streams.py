@@ -16,7 +16,7 @@ from sitl.stub.rc import RC_COUNT, rc_pulses_us
 from sitl.stub.world import Pose
 
 if TYPE_CHECKING:
-    from sitl.stub.autopilot import Autopilot
+    from sitl.stub.firmware import Autopilot
 
 _HEADING_UNKNOWN = 65535
 # MAVLink gives EKF_STATUS_REPORT and ESTIMATOR_STATUS the same flags.
