@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sitl.stub.firmware import Upload
 from sitl.stub.mission_items import MissionItem, item_message, item_of
 from sitl.stub.modes import AUTO, Phase
 from sitl.stub.protocol import Message, dialect, sender
 
 if TYPE_CHECKING:
     from sitl.stub.channel import Channel
-    from sitl.stub.firmware import Autopilot, Upload
+    from sitl.stub.firmware import Autopilot
 
 _ACCEPTED = dialect.MAV_MISSION_ACCEPTED
 _SLOW_S = 1.0

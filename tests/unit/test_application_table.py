@@ -35,7 +35,7 @@ def test_whatever_is_said_is_kept_and_no_longer_missing() -> None:
     config = load(EXAMPLE, overrides=EU)
     assert told(config.application, config.product) == EU_TOLD
     assert missing("eu", told(config.application, config.product)) == ()
-    assert json.loads(_about(config, ())["application_json"]) == EU_TOLD
+    assert json.loads(_about(config, (), None)["application_json"]) == EU_TOLD
 
 
 @pytest.mark.parametrize("key", ASKED["eu"])
