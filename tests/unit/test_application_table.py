@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -35,7 +36,10 @@ def test_whatever_is_said_is_kept_and_no_longer_missing() -> None:
     config = load(EXAMPLE, overrides=EU)
     assert told(config.application, config.product) == EU_TOLD
     assert missing("eu", told(config.application, config.product)) == ()
-    assert json.loads(_about(config, (), None)["application_json"]) == EU_TOLD
+    assert (
+        json.loads(_about(config, (), SimpleNamespace(as_object=dict))["application_json"])
+        == EU_TOLD
+    )
 
 
 @pytest.mark.parametrize("key", ASKED["eu"])
