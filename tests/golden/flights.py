@@ -48,7 +48,7 @@ class Flight:
     `twin` is the core in the closed loop without sockets, with pulses to the edge where it has
     valves. `extra` are inputs of a twin flight at their times, `held_s` is for how long vehicle
     and wire stand still at a time. `after` names the flight whose journal it goes on from, and
-    `until_s` cuts one short.
+    `until_s` cuts one short. `small_set` is a nozzle set before that of the configuration.
     """
 
     over: str = "wire"
@@ -65,7 +65,7 @@ class Flight:
     twin: Mapping[str, Any] = field(default_factory=dict)
     extra: tuple[Input, ...] = ()
     speed_m_s: float = 5.0
-    plant: str | None = None
+    small_set: str = ""
 
 
 def fault(kind: str, at_s: float, duration_s: float | None = None, **keys: object) -> str:
@@ -107,6 +107,12 @@ PRESSURE = {
 }
 TANK = {"tank.source": '"flow"', "tank.capacity_l": "10.0"}
 LIQUID = PULSES | PRESSURE | DETECTION | GPIO
+# P1's eight of twelve nozzles.
+EIGHT = """[[nozzle_set]]
+valves = ["1", "2", "3", "4"]
+duty = [0.2, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0]
+flow_l_min = [1.024, 1.872, 2.216, 3.144, 3.48, 4.168, 4.272]
+"""
 _RC_ON = (1500, 1500, 1000, 1500, 1000, 1000, 1000, 2000)
 _RC_OFF = (1500, 1500, 1000, 1500, 1000, 1000, 1000, 1000)
 
@@ -187,6 +193,12 @@ FLIGHTS: dict[str, Flight] = {
     "px4-turn": Flight(autopilot="px4", settings=MISSION, places=BOTH),
     "px4-lines": Flight(
         autopilot="px4", scenario=RTK, settings={"mission.lines": '"lines.geojson"'}
+    ),
+    "ardupilot-clock": Flight(
+        scenario=fault("clock-backwards", 4.0, 3.0, delay_s=0.3)
+        + fault("clock-wrap", 9.0, 2.0, delay_s=1.0)
+        + fault("slow-streams", 11.0, 2.0, factor=4.0),
+        held_s=lambda at_s: max(0.3 - (at_s - 16.0) % 2.0, 0.0) if at_s > 16.0 else 0.0,
     ),
     "px4-wind": Flight(
         autopilot="px4",
@@ -270,6 +282,17 @@ FLIGHTS: dict[str, Flight] = {
             OutputReport(received_s=16.2, healthy=True),
             LandedReport(received_s=17.0, in_air=False, on_ground=True),
         ),
+    ),
+    "gpio-two-sets": Flight(
+        over="twin",
+        settings=GPIO | COVERED | PULSES | TRIM,
+        small_set=EIGHT,
+        places=BOTH,
+        twin={"meter_rate_hz": 20.0},
+    ),
+    "gpio-constant-pump": Flight(
+        over="twin",
+        settings=GPIO | {"pump.control": '"constant"', "pump.channel": "15", "pump.run_us": "1700"},
     ),
     "gpio-many": Flight(
         over="twin", settings={"pwm.min_on_s": "0.02"}, base="orchard", places=PASS

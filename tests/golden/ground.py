@@ -140,7 +140,13 @@ MAPS = {
 
 
 def write_config(
-    folder: Path, *, base: str, map_name: str, autopilot: str, settings: Mapping[str, str]
+    folder: Path,
+    *,
+    base: str,
+    map_name: str,
+    autopilot: str,
+    settings: Mapping[str, str],
+    small_set: str = "",
 ) -> Path:
     """Write an example's configuration with other settings and one of the maps above."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -159,6 +165,8 @@ def write_config(
     given["prescription.unit"] = '"L/ha"'
     for key, value in (given | dict(settings)).items():
         text = with_setting(text, key, value)
+    if small_set:
+        text = text.replace("[[nozzle_set]]\n", f"{small_set}\n[[nozzle_set]]\n", 1)
     path = folder / "config.toml"
     path.write_text(text, encoding="utf-8")
     return path

@@ -38,6 +38,7 @@ def config_of(flight: Flight, folder: Path) -> Path:
         map_name=flight.map,
         autopilot=flight.autopilot,
         settings=flight.settings,
+        small_set=flight.small_set,
     )
     write_mission(folder / "golden.waypoints", flight.places)
     return path
@@ -135,7 +136,7 @@ def _in_the_twin(flight: Flight, config_file: Path, setup: Setup, journal: Journ
     result = fly_twin(
         setup,
         trajectory,
-        _plant(flight.plant, setup),
+        _plant(None, setup),
         FlightOptions(**(given | dict(flight.twin))),  # type: ignore[arg-type]
         speed_m_s=flight.speed_m_s,
         observer=journal.record_decision,
