@@ -9,13 +9,16 @@ import os
 import signal
 import tempfile
 import threading
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+from tests.virtual_time import JumpingLoop
+
+LoopFactory = Callable[[], asyncio.AbstractEventLoop]
 SAMPLES_VARIABLE = "VRSPRAY_SAMPLES"
 GRACE_S = 2.0
 
@@ -48,6 +51,13 @@ def pytest_configure() -> None:
 def pytest_unconfigure() -> None:
     """Remove the place where children tell."""
     _LEFT_OPEN.cleanup()
+
+
+def pytest_asyncio_loop_factories(item: pytest.Item) -> Mapping[str, LoopFactory]:
+    """Have tests that are marked so run on virtual time, all others on that of the computer."""
+    if item.get_closest_marker("virtual_time") is not None:
+        return {"virtual": JumpingLoop}
+    return {"real": asyncio.new_event_loop}
 
 
 # Modules that take longest begin first: the other processes have enough to do meanwhile.

@@ -14,7 +14,6 @@ import argparse
 import asyncio
 import contextlib
 import json
-import selectors
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -31,74 +30,11 @@ from missions.maps.compiling import compiled_setup
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.channel import Channel
 from tests.bench.wire import MEAN_ABS_MAX_M, RTK, WORST_MAX_M, example
+from tests.virtual_time import START_S, WIRE_S, Delivery, JumpingLoop, WireLink
 
-WIRE_S = 0.0005
 _TICK_S = 0.02
-# Not that of the computer, which rounds otherwise after some hours: flights are the same again.
-START_S = 5000.0
 # The clock moves at each wait by this at least.
 _LEAST_S = 1e-4
-
-
-class _Jump(selectors.SelectSelector):
-    """Waits for nothing: what would be waited for becomes the time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.now_s = 0.0
-
-    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        if timeout is not None and timeout > 0.0:
-            self.now_s += timeout
-        return super().select(0.0)
-
-
-class JumpingLoop(asyncio.SelectorEventLoop):
-    """An event loop whose time is what its timers say."""
-
-    def __init__(self, start_s: float) -> None:
-        self._jump = _Jump()
-        self._jump.now_s = start_s
-        super().__init__(self._jump)
-
-    def time(self) -> float:
-        return self._jump.now_s
-
-
-class _Wire:
-    """The companion's end: a transport that delivers after a moment."""
-
-    is_up = True
-    speaker = None
-
-    def adopt(self, speaker: object, now_s: float, *, is_vehicle: bool) -> None:
-        """Do nothing: there is one other end."""
-
-    def __init__(self, deliver: Callable[[bytes], None]) -> None:
-        self._deliver = deliver
-
-    def send(self, data: bytes) -> bool:
-        asyncio.get_running_loop().call_later(WIRE_S, self._deliver, data)
-        return True
-
-    async def close(self) -> None:
-        await asyncio.sleep(2.0 * WIRE_S)
-
-
-class WireLink(VehicleLink):
-    """A link whose other end is in this process."""
-
-    deliver: Callable[[bytes], None] = staticmethod(lambda _: None)
-
-    async def open(self, wake: Callable[[], None]) -> None:
-        """Open at once."""
-        self._wake = wake
-        self._transport = _Wire(self.deliver)
-        self._watch.link_up(self._clock())
-
-    def arrive(self, data: bytes) -> None:
-        """Take what the vehicle has sent."""
-        self._on_bytes(data)
 
 
 # Gets the link and the outputs of a flight before it begins.
@@ -115,15 +51,11 @@ def _never(_at_s: float) -> float:
 async def _vehicle(stub: _Run, link: WireLink, held_s: Holds) -> None:
     """Be the vehicle until its mission is flown."""
     loop = asyncio.get_running_loop()
-    last_s = 0.0
+    # By name at each arrival: a test may have put something in its place.
+    delivery = Delivery(lambda data: link.arrive(data))
 
     def send(data: bytes) -> None:
-        nonlocal last_s
-        at_s = loop.time() + WIRE_S
-        if (wait_s := held_s(at_s)) > 0.0:
-            # What was held back comes in its order.
-            at_s = last_s = max(at_s + wait_s, last_s + 1e-6)
-        loop.call_at(at_s, link.arrive, data)
+        delivery.send(data, wait_s=held_s(loop.time() + WIRE_S))
 
     channel: Channel = stub.autopilot.attach("wire", send)
 

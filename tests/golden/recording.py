@@ -23,11 +23,11 @@ from sitl.motor_parts import ranges_us
 from sitl.routes import read_route
 from sitl.serve import ServeOptions
 from sitl.vehicle import Vehicle
-from tests.bench.wire_clock import START_S
 from tests.bench.wire_clock import fly as fly_wire
 from tests.golden.checking import FOLDER
 from tests.golden.flights import FLIGHTS, Flight
 from tests.golden.ground import write_config, write_mission
+from tests.virtual_time import START_S
 
 
 def config_of(flight: Flight, folder: Path) -> Path:

@@ -12,15 +12,15 @@ from companion.cli.sensor_parts import follow_refills
 from companion.core.options.liquid_evidence import Detection
 from companion.core.types import FaultKind, Inhibit, TankReport
 from companion.link.component import ComponentOptions
-from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.runtime import run
 from companion.sensors.tank import TankSensor
 from tests import builders
 from tests.sitl.test_run_flight import CHANNELS, Notes
-from tests.sitl.wire_peer import WirePeer, free_port, over_udp
+from tests.sitl.wire_peer import WirePeer, over_wire
+from tests.virtual_time import WireLink, now_s
 
-pytestmark = pytest.mark.sitl
+pytestmark = [pytest.mark.sitl, pytest.mark.virtual_time]
 
 REFILLED = 31011
 SETUP = builders.setup(
@@ -47,16 +47,23 @@ class Flight:
 
 @pytest.fixture
 async def flight() -> AsyncIterator[Flight]:
-    port = free_port()
-    link = VehicleLink(f"udpin:127.0.0.1:{port}", ComponentOptions())
+    link = WireLink("udpin:127.0.0.1:14550", ComponentOptions(), clock=now_s)
     executor = ServoExecutor(ServoOptions(channels=CHANNELS), link.order)
     tank = TankSensor(Counter(), None, capacity_l=40.0, filled_l=0.9)
     follow_refills([tank], link)
     notes = Notes()
     task = asyncio.create_task(
-        run(SETUP, link=link, executor=executor, recorder=notes, sensors=[tank])
+        run(
+            SETUP,
+            link=link,
+            executor=executor,
+            recorder=notes,
+            sensors=[tank],
+            clock=now_s,
+            boot_clock=now_s,
+        )
     )
-    async with over_udp(WirePeer(SETUP.frame, east_m=2.0), port) as peer:
+    async with over_wire(WirePeer(SETUP.frame, east_m=2.0), link) as peer:
         yield Flight(peer, notes)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)

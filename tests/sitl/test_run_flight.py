@@ -1,30 +1,31 @@
-"""`run` against an autopilot on the wire: it sprays when it may, and closes however it ends."""
+"""`run` against an autopilot on the wire: it sprays when it may, and closes however it ends.
+
+On virtual time, byte by byte; over sockets in `test_run_socket.py`.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import os
 import signal
-import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from statistics import median
 
 import pytest
 
 from companion.core.setup import Setup
 from companion.core.types import Decision, Inhibit, Input, SprayPlan
-from companion.errors import LinkError
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import ServoExecutor, ServoOptions
-from companion.runtime import STEP_MAX_S, execute, run
+from companion.runtime import STEP_MAX_S, run
 from tests import builders
 from tests.quickest import quickest
-from tests.sitl.wire_peer import TcpHost, WirePeer, free_port, over_udp
+from tests.sitl.wire_peer import WirePeer, over_wire
+from tests.virtual_time import WireLink, now_s
 
-pytestmark = pytest.mark.sitl
+pytestmark = [pytest.mark.sitl, pytest.mark.virtual_time]
 
 SETUP = builders.setup()
 CHANNELS = tuple(range(9, 15))
@@ -57,10 +58,14 @@ class Notes:
 
 
 class Companion:
-    """`run` as a task, wired as the command line wires it."""
+    """`run` as a task, wired as the command line wires it; without a URL in this process alone."""
 
-    def __init__(self, url: str, setup: Setup = SETUP) -> None:
-        self.link = VehicleLink(url, ComponentOptions())
+    def __init__(self, url: str | None = None, setup: Setup = SETUP) -> None:
+        self.link = (
+            WireLink("udpin:127.0.0.1:14550", ComponentOptions(), clock=now_s)
+            if url is None
+            else VehicleLink(url, ComponentOptions())
+        )
         self.executor = ServoExecutor(ServoOptions(channels=CHANNELS), self.link.order)
         self.link.on_order_ack(self.executor.acknowledge)
         self.notes = Notes()
@@ -75,6 +80,8 @@ class Companion:
                 executor=self.executor,
                 recorder=self.notes,
                 duration_s=duration_s,
+                clock=now_s,
+                boot_clock=now_s,
             )
         )
         return self.task
@@ -101,10 +108,10 @@ class Flight:
 @pytest.fixture
 async def flight() -> AsyncIterator[Flight]:
     """Yield a companion that has just begun, beside a vehicle that flies over the field."""
-    port = free_port()
-    companion = Companion(f"udpin:127.0.0.1:{port}")
+    companion = Companion()
+    assert isinstance(companion.link, WireLink)
     companion.start()
-    async with over_udp(WirePeer(SETUP.frame, east_m=2.0), port) as peer:
+    async with over_wire(WirePeer(SETUP.frame, east_m=2.0), companion.link) as peer:
         yield Flight(companion, peer)
         if companion.task is not None and not companion.task.done():
             companion.task.cancel()
@@ -119,39 +126,19 @@ async def test_it_begins_closed_and_stays_so_until_it_is_enabled(flight: Flight)
     await flight.peer.until(lambda: len(flight.peer.open_channels) == 6)
 
 
-async def test_the_heartbeat_is_heard_before_the_vehicle_says_anything() -> None:
-    port = free_port()
-    loop = asyncio.get_running_loop()
-    heard: asyncio.Future[bytes] = loop.create_future()
-
-    class Ear(asyncio.DatagramProtocol):
-        def datagram_received(self, data: bytes, addr: object) -> None:
-            if not heard.done():
-                heard.set_result(data)
-
-    ear, _ = await loop.create_datagram_endpoint(Ear, local_addr=("127.0.0.1", port))
-    companion = Companion(f"udpout:127.0.0.1:{port}")
-    companion.start(duration_s=0.3)
-    async with asyncio.timeout(1.0):
-        frame = await heard
-    ear.close()
-    assert (frame[5], frame[6]) == (1, 191)
-    assert await companion.result() == 0
-
-
 async def test_it_asks_for_positions_at_twenty_hertz_and_gets_them(flight: Flight) -> None:
     await flight.until_spraying()
     begin = len(flight.companion.notes.decisions)
-    before_s = time.monotonic()
+    before_s = now_s()
     await asyncio.sleep(1.0)
-    rate_hz = (len(flight.companion.notes.decisions) - begin) / (time.monotonic() - before_s)
+    rate_hz = (len(flight.companion.notes.decisions) - begin) / (now_s() - before_s)
     assert rate_hz >= 20.0
 
 
 async def test_disabling_closes_within_five_hundredths_of_a_second(flight: Flight) -> None:
     async def closing_s() -> float:
         await flight.until_spraying()
-        sent_s = time.monotonic()
+        sent_s = now_s()
         flight.peer.enable(False)
         await flight.peer.until(lambda: flight.peer.is_all_closed)
         return flight.peer.orders[-1].at_s - sent_s
@@ -165,7 +152,7 @@ async def test_a_change_of_mode_closes_at_once(flight: Flight) -> None:
         flight.peer.send(0)
         await flight.until_spraying()
         flight.peer.mode = 6
-        sent_s = time.monotonic()
+        sent_s = now_s()
         flight.peer.send(0)
         await flight.peer.until(lambda: flight.peer.is_all_closed)
         return flight.peer.orders[-1].at_s - sent_s
@@ -180,7 +167,7 @@ async def test_silence_of_the_vehicle_closes_within_the_age_of_a_position(flight
         flight.peer.is_silent = False
         await flight.until_spraying()
         flight.peer.is_silent = True
-        silent_s = time.monotonic()
+        silent_s = now_s()
         await flight.peer.until(lambda: flight.peer.is_all_closed)
         return flight.peer.orders[-1].at_s - silent_s
 
@@ -214,7 +201,7 @@ async def test_a_refused_order_closes_for_good_and_is_told_once(flight: Flight) 
 async def test_an_autopilot_that_rebooted_is_asked_for_its_streams_again(flight: Flight) -> None:
     await flight.until_spraying()
     flight.peer.forget_streams()
-    flight.peer.started_s = time.monotonic() + 55.0
+    flight.peer.started_s = now_s() + 55.0
     flight.peer.start_east_m = 20.0 + 55.0 * 5.0
     asked = len([m for m in flight.peer.of("COMMAND_LONG") if m.command == 511])
     flight.peer.send(33)
@@ -306,7 +293,7 @@ async def test_however_it_ends_every_valve_is_ordered_closed(
 
 
 async def test_it_ends_by_itself_after_its_duration() -> None:
-    companion = Companion(f"udpin:127.0.0.1:{free_port()}")
+    companion = Companion()
     companion.start(duration_s=0.1)
     assert await companion.result() == 0
     assert companion.notes.events == [("start", ""), ("stop", "duration")]
@@ -316,48 +303,16 @@ async def test_a_restart_is_disabled(flight: Flight) -> None:
     await flight.until_spraying()
     os.kill(os.getpid(), signal.SIGTERM)
     await flight.companion.result()
-    again = Companion(flight.companion.link._url)
+    again = Companion()
+    assert isinstance(again.link, WireLink)
     again.start()
     flight.peer.outputs.clear()
     flight.peer.messages.clear()
-    await flight.peer.until(lambda: "Spray off: not enabled" in flight.peer.texts())
-    assert not flight.peer.is_spraying
-    os.kill(os.getpid(), signal.SIGTERM)
-    await again.result()
-
-
-async def test_a_port_in_use_is_refused_before_anything_is_ordered(flight: Flight) -> None:
-    await flight.peer.until(lambda: bool(flight.peer.messages))
-    second = Companion(flight.companion.link._url)
-    second.start()
-    with pytest.raises(LinkError, match="in use"):
-        await second.result()
-    assert second.executor.order_count == 0
-
-
-async def test_a_lost_tcp_link_closes_and_comes_back_closed_first() -> None:
-    peer = WirePeer(SETUP.frame, east_m=2.0)
-    host = TcpHost(peer)
-    await host.listen()
-    companion = Companion(f"tcp:127.0.0.1:{host.port}")
-    companion.start()
-    await host.connected.wait()
-    peer.begin()
-    flight = Flight(companion, peer)
-    await flight.until_spraying()
-    await host.hang_up()
-    await companion.notes.until(lambda d: Inhibit.LINK_LOST in d.inhibits)
-    assert companion.notes.decisions[-1].plan.is_off
-    count = len(peer.orders)
-    await host.connected.wait()
-    await peer.until(lambda: len(peer.orders) >= count + 6)
-    assert [order.pulse_us for order in peer.orders[count : count + 6]] == [1000] * 6
-    await peer.until(lambda: peer.is_spraying)
-    os.kill(os.getpid(), signal.SIGTERM)
-    assert await companion.result() == 0
-    assert peer.is_all_closed
-    await peer.end()
-    await host.close()
+    async with over_wire(flight.peer, again.link):
+        await flight.peer.until(lambda: "Spray off: not enabled" in flight.peer.texts())
+        assert not flight.peer.is_spraying
+        os.kill(os.getpid(), signal.SIGTERM)
+        await again.result()
 
 
 # ----------------------------------------------------------------- the order of closing down
@@ -437,15 +392,11 @@ async def test_no_timer_is_left_behind(fail_on: str) -> None:
     assert [timer for timer in loop._scheduled if not timer.cancelled()] == []  # type: ignore[attr-defined]
 
 
-def test_the_precise_loop_runs_it_and_gives_the_result_back() -> None:
-    scribe = Scribe()
-    assert execute(lambda: run(SETUP, link=scribe, executor=scribe, duration_s=0.01)) == 0
-    assert scribe.calls[-2:] == ["stop", "close"]
-
-
 async def test_without_news_a_step_follows_after_the_longest_wait() -> None:
     scribe, notes = Scribe(), Notes()
-    await run(SETUP, link=scribe, executor=scribe, recorder=notes, duration_s=1.0)
+    await run(
+        SETUP, link=scribe, executor=scribe, recorder=notes, duration_s=1.0,
+        clock=now_s, boot_clock=now_s,
+    )  # fmt: skip
     gaps_s = [b.now_s - a.now_s for a, b in pairwise(notes.decisions)]
-    # A busy computer makes some of them late; what was asked for shows in most.
-    assert median(gaps_s) == pytest.approx(STEP_MAX_S, abs=0.005)
+    assert gaps_s == pytest.approx([STEP_MAX_S] * len(gaps_s), abs=1e-6)

@@ -10,8 +10,9 @@ import pytest
 
 from sitl.serve import ServeOptions
 from tests.bench.wire import RTK, example
-from tests.bench.wire_clock import WireLink, fly
+from tests.bench.wire_clock import fly
 from tests.sitl.test_wire_flight import HOME, write_field, write_mission
+from tests.virtual_time import WireLink
 
 pytestmark = pytest.mark.sitl
 

@@ -17,6 +17,7 @@ from typing import Any
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.core.frame import LocalFrame
+from tests.virtual_time import Delivery, WireLink, now_s
 
 HEALTHY_EKF = 1 | 2 | 4 | 8 | 16 | 32
 ACCEPTED, UNSUPPORTED = 0, 3
@@ -37,13 +38,20 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
         return int(probe.getsockname()[1])
 
 
+def _begin_s() -> float:
+    try:
+        return now_s()
+    except RuntimeError:  # made before the loop that it is to fly on: that of the computer
+        return time.monotonic()
+
+
 class WirePeer:
     """Autopilot 1/1 on any byte transport: give it `write`, and feed it by `feed`."""
 
     def __init__(self, frame: LocalFrame, *, east_m: float, speed_m_s: float = 5.0) -> None:
         self.frame = frame
         self.start_east_m, self.speed_m_s = east_m, speed_m_s
-        self.started_s = time.monotonic()
+        self.started_s = _begin_s()
         self.mode, self.armed, self.landed_state = 3, True, 2
         self.autopilot = 3
         self.twin = False  # somebody else speaks as component 191
@@ -87,12 +95,12 @@ class WirePeer:
         )
 
     async def _repeat(self, message_id: int, interval_s: float) -> None:
-        next_s = time.monotonic()
+        next_s = now_s()
         while True:
             if not self.is_silent:
                 self.send(message_id)
             next_s += interval_s
-            await asyncio.sleep(max(0.0, next_s - time.monotonic()))
+            await asyncio.sleep(max(0.0, next_s - now_s()))
 
     # ----------------------------------------------------------------------------- out
 
@@ -101,7 +109,7 @@ class WirePeer:
 
     def place(self, *, east_m: float) -> None:
         """Put the vehicle somewhere; it flies on from there."""
-        self.start_east_m += east_m - self.east_m(time.monotonic())
+        self.start_east_m += east_m - self.east_m(now_s())
 
     def send(self, message_id: int) -> None:
         message = self._compose(message_id)
@@ -113,10 +121,10 @@ class WirePeer:
             self.write(bytes(beat.pack(self._twin)))
 
     def _compose(self, message_id: int) -> Any:
-        now_s = time.monotonic()
-        mav, boot_ms = self._mav, round((now_s - self.started_s) * 1000) + 60_000
+        at_s = now_s()
+        mav, boot_ms = self._mav, round((at_s - self.started_s) * 1000) + 60_000
         speed_cm_s = round(self.speed_m_s * 100)
-        latitude, longitude = self.frame.to_geographic(self.east_m(now_s), 3.0)
+        latitude, longitude = self.frame.to_geographic(self.east_m(at_s), 3.0)
         pulses = [self.outputs.get(channel, 0) for channel in range(1, 17)]
         return {
             0: lambda: mav.heartbeat_encode(
@@ -159,13 +167,13 @@ class WirePeer:
     # ------------------------------------------------------------------------------ in
 
     def feed(self, data: bytes) -> None:
-        now_s = time.monotonic()
+        at_s = now_s()
         for message in self._parser.parse_buffer(data) or []:
             if message.get_srcComponent() != 191:
                 continue
             self.messages.append(message)
             if message.get_type() == "COMMAND_LONG" and message.target_component == 1:
-                self._obey(message, now_s)
+                self._obey(message, at_s)
         self._news.set()
 
     def _obey(self, command: Any, now_s: float) -> None:
@@ -235,6 +243,18 @@ async def over_udp(peer: WirePeer, port: int) -> Any:
     finally:
         await peer.end()
         transport.close()
+
+
+@contextlib.asynccontextmanager
+async def over_wire(peer: WirePeer, link: WireLink) -> Any:
+    """Have the peer speak to a companion in this process, on virtual time."""
+    peer.write = Delivery(link.arrive).send
+    link.deliver = peer.feed  # type: ignore[method-assign]
+    peer.begin()
+    try:
+        yield peer
+    finally:
+        await peer.end()
 
 
 class TcpHost:
