@@ -1,18 +1,26 @@
-"""PX4 over a real socket: the companion orders its actuators and hits the boundaries."""
+"""PX4, byte by byte on virtual time: the companion orders its actuators and hits the boundaries.
+
+Over real sockets `test_mission_chain.py` and `test_clients_mavsdk.py` fly beside it.
+"""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from companion.cli.record_parts import follow
+from companion.config import load
+from companion.record.journal import Journal
 from companion.record.reader import read_journal
+from missions.maps.compiling import compiled_setup
 from sitl.serve import ServeOptions
-from tests.bench.wire import RTK, example, fly
+from tests.bench.wire import RTK, example
 from tests.bench.wire_clock import fly as fly_by_clock
 from tests.sitl.test_wire_flight import check_pass, write_field, write_mission
-from tests.sitl.wire_peer import free_port
+from tests.virtual_time import START_S
 
 pytestmark = pytest.mark.sitl
 
@@ -49,40 +57,56 @@ def test_each_change_falls_on_its_boundary_under_px4(tmp_path: Path) -> None:
     check_pass(result)
 
 
-async def test_px4_is_found_out_and_sprays_over_a_real_socket(tmp_path: Path) -> None:
-    port = free_port()
-    config = short_field(tmp_path / "field", port)
-    result, said = await fly(
-        config,
-        port,
-        *("--autopilot", "px4", "--seed", "5"),
-        *("--mission", str(config.parent / "short.waypoints")),
-        within_s=100.0,
-    )
+def kept_flight(
+    config: Path, scenario: str = ""
+) -> tuple[dict[str, Any], list[tuple[str, str]], list[str]]:
+    """Fly with a journal; return what the stub says, the journal's events, and the faults."""
+    setup, options = compiled_setup(load(config)), {}
+    if scenario:
+        options["scenario"] = config.parent / "scenario.toml"
+        options["scenario"].write_text(scenario, encoding="utf-8")
+    with Journal.create(
+        config.parent / "flights", setup=setup, started_s=START_S, waits=True, training="no"
+    ) as journal:
+        result, fault = fly_by_clock(
+            config,
+            ServeOptions(
+                autopilot="px4",
+                field_config=config,
+                mission=config.parent / "short.waypoints",
+                seed=5,
+                out=config.parent / "truth",
+                **options,
+            ),
+            recorder=journal,
+            setup=setup,
+            wired=lambda link, executor: follow(journal, link, executor),
+        )
+    events = [(event.kind, event.text) for event in read_journal(journal.path).events]
+    return result, events, [] if fault is None else [fault]
+
+
+def test_px4_is_found_out_and_sprays(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    result, events, faults = kept_flight(short_field(tmp_path / "field", 14550))
     assert result["state"] == "landed"
     # A third of it at least: how exactly it falls is the other test's matter.
     assert result["volume_l"] > 0.2
+    assert faults == []
     # The stub's disarmed values are PX4's own: named, and no reason to stay closed.
     warning = "PWM_MAIN_DIS9 is 900: set it to 1000 (and 5 more)"
-    assert warning in said
-    (journal,) = (config.parent / "flights").glob("*.gpkg")
-    events = [(event.kind, event.text) for event in read_journal(journal).events]
+    assert warning in caplog.text
     assert ("outputs", warning) in events
 
 
-async def test_an_actuator_that_no_output_shows_keeps_all_closed(tmp_path: Path) -> None:
-    port = free_port()
-    config = short_field(tmp_path / "field", port)
-    scenario = tmp_path / "wrong.toml"
-    scenario.write_text("[parameters]\nPWM_MAIN_FUNC11 = 0\n", encoding="utf-8")
-    result, said = await fly(
-        config,
-        port,
-        *("--autopilot", "px4", "--scenario", str(scenario)),
-        *("--mission", str(config.parent / "short.waypoints")),
-        within_s=100.0,
-    )
-    assert "no output for channel 3: set its PWM_MAIN_FUNCn or PWM_AUX_FUNCn to 303" in said
+def test_an_actuator_that_no_output_shows_keeps_all_closed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = short_field(tmp_path / "field", 14550)
+    result, events, faults = kept_flight(config, "[parameters]\nPWM_MAIN_FUNC11 = 0\n")
+    said = "no output for channel 3: set its PWM_MAIN_FUNCn or PWM_AUX_FUNCn to 303"
+    assert said in caplog.text
+    assert any(said in text for _, text in events)
+    assert said in " ".join(faults)
     truth = json.loads((config.parent / "truth" / "truth.json").read_text(encoding="utf-8"))
     assert truth["state"] == result["state"] == "landed"
     assert truth["volume_l"] == 0.0
