@@ -100,16 +100,19 @@ def replayed(
     )
 
 
-def difference(was: Any, now: Any, name: str = "", *, is_tolerant: bool = False) -> str | None:
+def difference(
+    was: Any, now: Any, name: str = "", *, is_tolerant: bool = False, within: float = WITHIN
+) -> str | None:
     """Return the first field in which two values of the core differ; None where none does.
 
-    NaN equals NaN and 0.0 is not -0.0, but for a tolerant comparison.
+    NaN equals NaN and 0.0 is not -0.0, but for a tolerant comparison: numbers that are no times
+    may differ by `within` there.
 
     >>> difference((1.0, 2.0), (1.0, 2.5), "duty")
     'duty[1] was 2.0, is 2.5'
     """
     if isinstance(was, float) and isinstance(now, float):
-        is_same = _near(was, now, name) if is_tolerant else _to_the_bit(was, now)
+        is_same = _near(was, now, name, within) if is_tolerant else _to_the_bit(was, now)
         return None if is_same else f"{name} was {was!r}, is {now!r}"
     if type(was) is not type(now):
         return f"{name} was {was!r}, is {now!r}"
@@ -124,9 +127,8 @@ def difference(was: Any, now: Any, name: str = "", *, is_tolerant: bool = False)
         is_known = isinstance(was, Enum | str | int | frozenset | tuple) or was is None
         assert is_known, f"{name}: {type(was).__name__} is no value of the core"
         return None if was == now else f"{name} was {was!r}, is {now!r}"
-    return next(
-        (found for one in pairs if (found := difference(*one, is_tolerant=is_tolerant))), None
-    )
+    each = (difference(*one, is_tolerant=is_tolerant, within=within) for one in pairs)
+    return next((found for found in each if found), None)
 
 
 def _to_the_bit(was: float, now: float) -> bool:
@@ -135,10 +137,10 @@ def _to_the_bit(was: float, now: float) -> bool:
     return was == now and math.copysign(1.0, was) == math.copysign(1.0, now)
 
 
-def _near(was: float, now: float, name: str) -> bool:
+def _near(was: float, now: float, name: str, within: float) -> bool:
     if math.isnan(was) or math.isnan(now) or math.isinf(was):
         return was == now or (math.isnan(was) and math.isnan(now))
     is_time = name.endswith("_s") and not name.endswith(("m_s", "deg_s"))
     if is_time:
         return abs(was - now) <= TIME_WITHIN_S
-    return abs(was - now) <= WITHIN * max(1.0, abs(was))
+    return abs(was - now) <= within * max(1.0, abs(was))

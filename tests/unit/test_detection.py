@@ -16,12 +16,14 @@ from companion.core.options.liquid_evidence import (
     Bin,
     Collecting,
     Detection,
+    Evidence,
     Order,
     Watching,
     bin_length_s,
     collected,
     duties_of,
     expected_ml,
+    name_of,
     valve_of,
 )
 from companion.core.options.liquid_faults import WatchMemory, follow
@@ -647,3 +649,56 @@ def test_a_leak_in_flight_closes_the_valves_and_the_trim_does_not_hide_it() -> N
     assert after
     assert all(decision.plan.is_off for decision in after)
     assert {Inhibit.LEAK, Inhibit.VALVE_STUCK_OPEN} & after[-1].inhibits
+
+
+# -------------------------------------------------------------------------- the size of a fault
+
+
+def some_bins(flows: list[tuple[float, float]], *, gain: float = 1.0) -> tuple[Bin, ...]:
+    """Return bins of a second of six valves: what is ordered of each, and metered besides."""
+    return tuple(
+        Bin(
+            begin_s=float(number),
+            end_s=number + 1.0,
+            expected_ml=(each_ml,) * 6,
+            metered_ml=gain * (6.0 * each_ml + more_ml),
+            pressure=None,
+        )
+        for number, (each_ml, more_ml) in enumerate(flows)
+    )
+
+
+def named(bins: tuple[Bin, ...], count: int, *, learnt: float, likely: float = 1.0) -> FaultKind:
+    evidence = Evidence.of(
+        bins, count, gain=learnt, likely_gain=likely, pressure_gain=1.0, open_ml_s=OPEN_ML_S
+    )
+    return name_of(evidence)
+
+
+@pytest.mark.parametrize("gain", [0.97, 1.0, 1.03])
+@pytest.mark.parametrize("learnt", [-0.02, 0.0, 0.02])
+def test_a_stuck_valve_is_told_from_a_leak_though_the_gain_was_learnt_wrong(
+    gain: float, learnt: float
+) -> None:
+    healthy = [(12.0, 0.0), (13.0, 0.0), (12.0, 0.0)]
+    stuck = [(each, OPEN_ML_S - each) for each in (11.0, 12.0, 10.0, 9.0)]
+    bins = some_bins(healthy + stuck, gain=gain)
+    assert named(bins, 5, learnt=gain + learnt) is FaultKind.STUCK_OPEN
+    leak = some_bins(healthy + [(each, 0.4 * more) for each, more in stuck], gain=gain)
+    assert named(leak, 5, learnt=gain + learnt) is FaultKind.LEAK
+
+
+def test_a_fault_since_the_first_bin_is_measured_by_the_likely_gain() -> None:
+    stuck = some_bins([(each, OPEN_ML_S - each) for each in (11.0, 11.0, 11.0)], gain=1.02)
+    assert named(stuck, 3, learnt=1.0, likely=1.02) is FaultKind.STUCK_OPEN
+    half = some_bins([(each, 0.5 * (OPEN_ML_S - each)) for each in (11.0, 11.0, 11.0)], gain=1.02)
+    assert named(half, 3, learnt=1.0, likely=1.02) is FaultKind.LEAK
+
+
+@pytest.mark.parametrize("gain", [0.97, 1.03])
+def test_a_shut_valve_is_told_from_a_smaller_clog_though_the_gain_is_not_known(gain: float) -> None:
+    healthy = [(12.0, 0.0), (13.0, 0.0), (12.0, 0.0)]
+    shut = some_bins(healthy + [(each, -each) for each in (11.0, 12.0, 10.0, 12.0)], gain=gain)
+    assert named(shut, 6, learnt=gain) is FaultKind.STUCK_CLOSED
+    clog = some_bins(healthy + [(each, -0.5 * each) for each in (11.0, 12.0, 10.0)], gain=gain)
+    assert named(clog, 5, learnt=gain) is FaultKind.CLOG

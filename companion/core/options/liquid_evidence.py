@@ -286,16 +286,24 @@ TOLD_APART = 12.0
 # Of a bin: meter, its pulses, and what the lags leave at a change.
 NOISE_SHARE = 0.02
 NOISE_ML = 0.5
+# One standard deviation of a meter's own gain, before anything is learnt of it.
+GAIN_SPREAD = 0.03
 # Pressures over expected: shut nozzles raise it by a third, a stopped pump leaves little.
 PRESSURE_SHUT = 1.15
 PRESSURE_LOST = 0.75
 
 
 class Evidence(NamedTuple):
-    """The bins since a fault began, means of flow and pressure over expected; and the sprayer."""
+    """The bins since a fault began, means of flow and pressure over expected; and the sprayer.
+
+    `known` are all bins that are kept, those from before the fault too; `likely_gain` is what the
+    meter's gain would be taken for without them.
+    """
 
     bins: tuple[Bin, ...]
+    known: tuple[Bin, ...]
     gain: float
+    likely_gain: float
     flow: float
     pressure: float | None
     open_ml_s: float
@@ -304,20 +312,25 @@ class Evidence(NamedTuple):
     @classmethod
     def of(
         cls,
-        bins: Sequence[Bin],
+        known: Sequence[Bin],
+        count: int,
         *,
         gain: float,
+        likely_gain: float,
         pressure_gain: float,
         open_ml_s: float,
         restless_share: float = RESTLESS_SHARE,
     ) -> Evidence:
-        """Return the evidence of some bins; the first of them may lie before the fault."""
-        sure = tuple(bins[1:]) or tuple(bins)
+        """Return the evidence of the last `count` bins; the first may lie before the fault."""
+        bins = tuple(known[-count:])
+        sure = bins[1:] or bins
         expected_ml = gain * math.fsum(each.all_ml for each in sure)
         pressures = [each.pressure for each in sure if each.pressure is not None]
         return cls(
             bins=sure,
+            known=tuple(known),
             gain=gain,
+            likely_gain=likely_gain,
             flow=math.fsum(each.metered_ml for each in sure) / expected_ml,
             pressure=_mean(pressures) / pressure_gain if pressures else None,
             open_ml_s=open_ml_s,
@@ -372,17 +385,48 @@ def _within(share: float, bounds: tuple[float, float]) -> bool:
 
 
 def _share(evidence: Evidence, *, is_open: bool) -> float:
-    """Return the wrong flow over that of one whole valve, the mean one of those in use."""
-    wrong_ml = valve_ml = 0.0
-    for each in evidence.bins:
-        used = [volume for volume in each.expected_ml if volume > 0.0]
-        if not used:
+    """Return the wrong flow over that of one whole valve, the mean one of those in use.
+
+    The meter's gain, the share and the bin with which the fault began are those that fit all bins
+    best, by least squares. The sums of evidence may have begun before the fault, and the gain that
+    is learnt may hold a part of it: both would make a stuck valve look like a smaller leak.
+    """
+    certain = 1.0 / GAIN_SPREAD**2
+    gain_gain, gain_metered = certain, certain * evidence.likely_gain
+    rows = []
+    for each in evidence.known:
+        weight = _weight(each, evidence.gain)
+        rows.append((weight, each, _of_one_valve(each, evidence.open_ml_s, is_open=is_open)))
+        gain_gain += weight * each.all_ml**2
+        gain_metered += weight * each.all_ml * each.metered_ml
+    best, found = -math.inf, 0.0
+    gain_wrong = wrong_wrong = wrong_metered = 0.0
+    for weight, each, wrong_ml in reversed(rows):
+        gain_wrong += weight * each.all_ml * wrong_ml
+        wrong_wrong += weight * wrong_ml**2
+        wrong_metered += weight * wrong_ml * each.metered_ml
+        determinant = gain_gain * wrong_wrong - gain_wrong**2
+        if not determinant > 0.0:
             continue
-        mean_ml = evidence.gain * _mean(used)
-        wrong_ml += each.metered_ml - evidence.gain * each.all_ml
-        open_ml = evidence.gain * evidence.open_ml_s * (each.end_s - each.begin_s)
-        valve_ml += open_ml - mean_ml if is_open else mean_ml
-    return abs(wrong_ml) / valve_ml if valve_ml > 0.0 else 0.0
+        gain = (wrong_wrong * gain_metered - gain_wrong * wrong_metered) / determinant
+        wrong = (gain_gain * wrong_metered - gain_wrong * gain_metered) / determinant
+        # What the squares fall by: the more, the better the fit.
+        fitted = gain * gain_metered + wrong * wrong_metered
+        if fitted > best and gain > 0.0:
+            best, found = fitted, wrong / gain
+    return max(found, 0.0)
+
+
+def _of_one_valve(each: Bin, open_ml_s: float, *, is_open: bool) -> float:
+    """Return what one valve, the mean one in use, adds when it is stuck open or takes away shut."""
+    used = [volume for volume in each.expected_ml if volume > 0.0]
+    if not used:
+        return 0.0
+    return open_ml_s * (each.end_s - each.begin_s) - _mean(used) if is_open else -_mean(used)
+
+
+def _weight(each: Bin, gain: float) -> float:
+    return 1.0 / (NOISE_ML + NOISE_SHARE * gain * each.all_ml) ** 2
 
 
 def valve_of(bins: Sequence[Bin], *, gain: float, open_ml_s: float, is_open: bool) -> int | None:
@@ -410,7 +454,7 @@ def _misfit(bins: Sequence[Bin], shapes: Sequence[float], gain: float) -> float:
     weights, wrong = [], []
     for each in bins:
         wrong.append(each.metered_ml - gain * each.all_ml)
-        weights.append(1.0 / (NOISE_ML + NOISE_SHARE * gain * each.all_ml) ** 2)
+        weights.append(_weight(each, gain))
     rows = list(zip(weights, shapes, wrong, strict=True))
     square = math.fsum(w * s * s for w, s, _ in rows)
     share = math.fsum(w * s * r for w, s, r in rows) / square if square > 0.0 else 0.0

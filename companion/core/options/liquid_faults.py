@@ -194,8 +194,11 @@ def _is_tank_low(watching: Watching, state: VehicleState) -> bool:
 
 def _evidence(watching: Watching, memory: WatchMemory, count: int) -> Evidence:
     return Evidence.of(
-        memory.bins[-count:],
+        memory.bins,
+        count,
         gain=memory.gain,
+        # What was learnt in a few seconds may be the fault's.
+        likely_gain=1.0 + (memory.gain - 1.0) * memory.learnt_s / LEARN_S,
         pressure_gain=memory.pressure_gain,
         open_ml_s=watching.open_ml_s,
         restless_share=watching.law.restless_share,
