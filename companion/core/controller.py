@@ -226,7 +226,7 @@ def _closed(
         flow_trim=None if trim is None else trim.sets[trim.set_index].trim,
         flow_trim_state=None if trim is None else trim.state,
         findings=_findings(setup, watched.watch),
-        sprayer=shown(permission.machine, is_open=False),
+        sprayer=shown(permission.sprayer, is_open=False),
     )
     return decision, Memory(
         plan=plan, watched=watched, permission=permission, ordering=Ordering(trim=trim)
@@ -493,7 +493,7 @@ def _decision(
         flow_trim=None if trim is None else trim.sets[index].trim,
         flow_trim_state=None if trim is None else trim.state,
         findings=_findings(setup, watched.watch),
-        sprayer=shown(permission.machine, is_open=plan.opens),
+        sprayer=shown(permission.sprayer, is_open=plan.opens),
         out_of_range_count=sum(not nozzles.curve.delivers(flow) for flow in flows),
     )
     return decision, ordering._replace(trim=trim)

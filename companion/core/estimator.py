@@ -13,11 +13,36 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from companion.core import motion
+from companion.core.arithmetic import exp
 from companion.core.braking import Approach, Leg, approach, learned, leg_of, stop_ahead, way_of
 from companion.core.clock import Clock, on_time_s, tick
-from companion.core.motion import BRIDGED_MAX_S, Told
+from companion.core.inputs import MISSION_MODES
+from companion.core.motion import (
+    BELIEVING,
+    BRIDGED_MAX_S,
+    CRUISE,
+    DOUBTING,
+    MANOEUVRE,
+    NOT_DRAWN,
+    SHARE_MIN,
+    Axis,
+    Belief,
+    Drawn,
+    Pair,
+    Seen,
+    Told,
+    agreed,
+    doubted,
+    follow_pair,
+    mixed,
+    moved,
+    stretch,
+    told,
+)
 from companion.core.nozzle import is_override
 from companion.core.positions import Order, Place, Stand, look, noted, sorted_in
+from companion.core.safety import NO_CONSENT, Consent, consented
 from companion.core.setup import Setup
 from companion.core.types import (
     BatteryReport,
@@ -46,21 +71,153 @@ from companion.core.types import (
     Way,
     WindReport,
 )
-from companion.core.vehicle_motion import CONFIRM_COUNT, Motion, begun, followed
+
+# The vehicle's motion as its positions tell it: the filters of `motion.py`, course and height.
+
+YAW_RATE_TIME_S = 0.25
+# After a jump the filters start anew, and nothing is sprayed until so many positions confirm it.
+CONFIRM_COUNT = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """What the filters make of the positions, true at `time_s` on our clock.
+
+    `agreed` is what all of them say together; `seen` is the last message, to the east and to the
+    north, and `drawn` how the place is drawn beside the velocities of these.
+    """
+
+    time_s: float
+    boot_s: float
+    received_s: float
+    believing: Pair
+    doubting: Pair
+    doubt_share: float
+    agreed: Pair
+    seen: tuple[Seen, Seen]
+    drawn: tuple[Drawn, Drawn]
+    heading_deg: float | None
+    yaw_rate_deg_s: float
+    height_m: float
+    velocity_known: bool
+    confirm_left: int
+
+    def after(self, dt_s: float) -> tuple[Told, Told]:
+        """Return the motion to the east and to the north `dt_s` later: the place as it is told.
+
+        The velocity is the told one too, not that of the place, but for what has begun to draw the
+        place just now, as far as the velocity is doubted at all (`drawn.py`).
+        """
+        cruise, manoeuvre, share = self.agreed.cruise, self.agreed.manoeuvre, self.agreed.share
+        calm, nimble = stretch(CRUISE.fade_s, dt_s), stretch(MANOEUVRE.fade_s, dt_s)
+        east = told(mixed(moved(cruise.east, calm), moved(manoeuvre.east, nimble), share))
+        north = told(mixed(moved(cruise.north, calm), moved(manoeuvre.north, nimble), share))
+        return self._drawn(east, self.drawn[0], dt_s), self._drawn(north, self.drawn[1], dt_s)
+
+    def _drawn(self, axis: Told, by: Drawn, dt_s: float) -> Told:
+        velocity_m_s = axis.velocity_m_s + self.doubt_share * by.after(dt_s)
+        return axis._replace(velocity_m_s=velocity_m_s)
+
+    @property
+    def acceleration_fade_s(self) -> float:
+        """Return the time constant with which the acceleration is expected to fade."""
+        return CRUISE.fade_s + self.agreed.share * (MANOEUVRE.fade_s - CRUISE.fade_s)
+
+
+def begun(item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
+    """Return what a first position says."""
+    east, north = _seen(item, place)
+    belief = Belief(
+        Axis(place[0], east.velocity_m_s or 0.0, 0.0),
+        Axis(place[1], north.velocity_m_s or 0.0, 0.0),
+    )
+    pair = Pair(belief, belief, 0.5)
+    return Motion(
+        time_s=time_s,
+        boot_s=item.boot_s,
+        received_s=item.received_s,
+        believing=pair,
+        doubting=pair,
+        doubt_share=SHARE_MIN,
+        agreed=pair,
+        seen=(east, north),
+        drawn=(NOT_DRAWN, NOT_DRAWN),
+        heading_deg=item.heading_deg,
+        yaw_rate_deg_s=0.0,
+        height_m=item.relative_altitude_m,
+        velocity_known=east.velocity_m_s is not None,
+        confirm_left=CONFIRM_COUNT,
+    )
+
+
+def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
+    """Return the motion after one more position; it begins anew after a gap and after a jump."""
+    dt_s = time_s - before.time_s
+    if not 0.0 < dt_s < BRIDGED_MAX_S:
+        return begun(item, place, time_s)
+    east, north = _seen(item, place)
+    believing = follow_pair(BELIEVING, before.believing, dt_s, east, north)
+    if believing is None:
+        return begun(item, place, time_s)
+    doubting = follow_pair(DOUBTING, before.doubting, dt_s, east, north)
+    known = east.velocity_m_s is not None
+    share = before.doubt_share
+    if doubting is None:
+        # No jump to those that believe: the doubters were led astray, and begin anew.
+        doubting, share = believing, SHARE_MIN
+    elif known:
+        share = doubted(share, dt_s, believing[1], doubting[1])
+    return Motion(
+        time_s=time_s,
+        boot_s=item.boot_s,
+        received_s=item.received_s,
+        believing=believing[0],
+        doubting=doubting[0],
+        doubt_share=share,
+        agreed=agreed(believing[0], doubting[0], share),
+        seen=(east, north),
+        drawn=(
+            _drawn_after(before.drawn[0], dt_s, before.seen[0], east),
+            _drawn_after(before.drawn[1], dt_s, before.seen[1], north),
+        ),
+        heading_deg=item.heading_deg,
+        yaw_rate_deg_s=_yaw_rate(before, item.heading_deg, dt_s),
+        height_m=item.relative_altitude_m,
+        velocity_known=known,
+        confirm_left=max(before.confirm_left - 1, 0),
+    )
+
+
+def _seen(item: Telemetry, place: tuple[float, float]) -> tuple[Seen, Seen]:
+    """Return what a message says to the east and to the north; half a velocity is none."""
+    east_m_s, north_m_s = item.velocity_east_m_s, item.velocity_north_m_s
+    if east_m_s is None or north_m_s is None:
+        return Seen(place[0], None), Seen(place[1], None)
+    return Seen(place[0], east_m_s), Seen(place[1], north_m_s)
+
+
+def _drawn_after(by: Drawn, dt_s: float, before: Seen, now: Seen) -> Drawn:
+    if before.velocity_m_s is None or now.velocity_m_s is None:
+        return NOT_DRAWN
+    told_m_s = 0.5 * (before.velocity_m_s + now.velocity_m_s)
+    return motion.followed(by, dt_s, now.position_m - before.position_m, told_m_s)
+
+
+def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:
+    if heading_deg is None or before.heading_deg is None:
+        return 0.0
+    if not abs(heading_deg - before.heading_deg) <= 720.0:
+        return 0.0  # one of them is no number; the rate would never be one again
+    turned_deg = (heading_deg - before.heading_deg + 180.0) % 360.0 - 180.0
+    share = 1.0 - exp(-dt_s / YAW_RATE_TIME_S)
+    return before.yaw_rate_deg_s + share * (turned_deg / dt_s - before.yaw_rate_deg_s)
+
 
 SPEED_REPORT_AGE_MAX_S = 1.0
 # Fix, estimator and landed state come at 1 to 5 Hz; older than this they count as not known.
 STATUS_AGE_MAX_S = 5.0
-# Both are asked for at 5 to 10 Hz, of which a slowed-down link leaves a quarter.
-RC_AGE_MAX_S = 2.0
+# Asked for at 5 to 10 Hz, of which a slowed-down link leaves a quarter.
 RANGE_AGE_MAX_S = 1.0
-# A companion that stood still for longer asks the operator again.
-CONSENT_STANDSTILL_S = 2.0
-# ArduPilot's and PX4's names of the mode that flies the mission.
-MISSION_MODES = frozenset({"AUTO", "MISSION"})
-RC_HIGH_US = 1700
-RC_LOW_US = 1300
-RC_SIGNAL_MAX_US = 2300
 _NOTHING_HEARD = Order()
 
 
@@ -82,8 +239,6 @@ class Track:
     heartbeat: HeartbeatReport | None = None
     landed: LandedReport | None = None
     wind: WindReport | None = None
-    rc: RcReport | None = None
-    switch_us: int = 0  # of the operator's channel in `rc`; 0 is no signal
     range: RangeReport | None = None
     output: OutputReport | None = None
     flow: FlowReport | None = None
@@ -95,9 +250,7 @@ class Track:
     way_before: Way | None = None
     braking_m_s2: float | None = None  # as seen at the ends of legs so far
     rate_percent: float = 100.0
-    enabled: bool = False
-    operator_wishes: int = 0  # how often somebody has enabled anew, or disabled
-    estops: frozenset[str] | None = None  # which are pressed; None: none was heard of
+    consent: Consent = NO_CONSENT
 
 
 def observe(track: Track, item: Input, setup: Setup) -> Track:
@@ -165,38 +318,12 @@ def _dated(track: Track, clock: Clock) -> FlowReport | None:
     return replace(counted, received_s=on_time_s(counted.received_s, track.clock, clock))
 
 
-def _observe_heartbeat(track: Track, item: HeartbeatReport, setup: Setup) -> Track:
-    """Disarming, and leaving the modes that may spray, take the operator's consent back."""
-    before = track.heartbeat
-    enabled = track.enabled
-    if before is not None:
-        if before.armed and not item.armed:
-            enabled = False
-        if setup.limits.allows(before.mode) and not setup.limits.allows(item.mode):
-            enabled = False
-        if not item.received_s - before.received_s <= setup.limits.consent_gap_max_s:
-            enabled = False
-    return replace(track, heartbeat=item, enabled=enabled)
-
-
-def _observe_operator(track: Track, item: OperatorCommand, setup: Setup) -> Track:
-    """Take the operator's wish; to disable also ends a stop that was commanded.
-
-    Who may not enable changes nothing by trying; everyone may disable.
-    """
-    if item.enable and item.source not in setup.limits.enable_by:
-        return track
-    if not item.enable and track.estops:
-        track = replace(track, estops=track.estops - {"command"})
-    return _wished(track, item.enable)
-
-
-def _observe_estop(track: Track, item: EstopReport, _setup: Setup) -> Track:
-    """Take the consent back at a stop; while it is pressed nobody can give it."""
-    pressed = track.estops or frozenset()
-    if item.pressed is not False:
-        return replace(track, estops=pressed | {item.source}, enabled=False)
-    return replace(track, estops=pressed - {item.source})
+def _observe_consent(track: Track, item: Any, setup: Setup) -> Track:
+    """Take what gives or takes back the operator's consent; of a heartbeat, the rest too."""
+    consent = consented(track.consent, item, setup.limits, heartbeat=track.heartbeat)
+    if isinstance(item, HeartbeatReport):
+        return replace(track, heartbeat=item, consent=consent)
+    return replace(track, consent=consent)
 
 
 def _observe_wind(track: Track, item: WindReport, setup: Setup) -> Track:
@@ -211,9 +338,9 @@ def _observe_standstill(track: Track, item: StandstillReport, _setup: Setup) -> 
 
     What the sprayer itself says stays, and the consent over a short standstill.
     """
-    enabled = track.enabled and item.gap_s <= CONSENT_STANDSTILL_S
+    consent = track.consent.after_standstill(item.gap_s)
     return Track(
-        heartbeat=track.heartbeat if enabled else None,
+        heartbeat=track.heartbeat if consent.enabled else None,
         wind=track.wind,
         output=track.output,
         flow=track.flow,
@@ -221,47 +348,16 @@ def _observe_standstill(track: Track, item: StandstillReport, _setup: Setup) -> 
         tank=track.tank,
         braking_m_s2=track.braking_m_s2,
         rate_percent=track.rate_percent,
-        enabled=enabled,
-        operator_wishes=track.operator_wishes,
-        estops=track.estops,
+        consent=consent,
     )
-
-
-def _wished(track: Track, enabled: bool) -> Track:
-    """Return the track after a wish; to repeat that one may spray is no new wish."""
-    is_new = not (enabled and track.enabled)
-    return replace(
-        track,
-        enabled=enabled and not track.estops,
-        operator_wishes=track.operator_wishes + is_new,
-    )
-
-
-def _observe_rc(track: Track, item: RcReport, setup: Setup) -> Track:
-    """Only the edges of the switch count: up enables, down disables, a lost signal disables."""
-    channel, wish = setup.limits.rc_channel, None
-    if channel is not None and "rc" in setup.limits.enable_by and track.rc is not None:
-        before, now = _pulse(track.rc, channel), _pulse(item, channel)
-        if before <= RC_HIGH_US < now:
-            wish = before >= RC_LOW_US // 2  # an edge out of a lost signal is no wish
-        elif now < RC_LOW_US <= before:
-            wish = False
-    if wish is not None:
-        track = _wished(track, wish)
-    switch_us = 0 if channel is None else _pulse(item, channel)
-    return replace(track, rc=item, switch_us=switch_us)
-
-
-def _pulse(report: RcReport, channel: int) -> int:
-    return report.pulse_us[channel - 1] if 0 < channel <= len(report.pulse_us) else 0
 
 
 _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
-    HeartbeatReport: _observe_heartbeat,
-    OperatorCommand: _observe_operator,
-    EstopReport: _observe_estop,
+    HeartbeatReport: _observe_consent,
+    OperatorCommand: _observe_consent,
+    EstopReport: _observe_consent,
+    RcReport: _observe_consent,
     StandstillReport: _observe_standstill,
-    RcReport: _observe_rc,
     WindReport: _observe_wind,
     BatteryReport: _observe_battery,
 }
@@ -283,7 +379,7 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         # It is kept out of the filters, and what comes after it has to be confirmed.
         still = replace(before, boot_s=item.boot_s, confirm_left=CONFIRM_COUNT)
         return replace(track, motion=still, stand=stand)
-    at_once = not track.enabled or before is None
+    at_once = not track.consent.enabled or before is None
     ticked = tick(track.clock, item, track.clock_report, at_once=at_once)
     clock = ticked.clock
     # Its age counts from its sending, for the limit on it too.
@@ -391,12 +487,12 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         in_air=track.landed.in_air if track.landed and _young(track.landed, now_s) else None,
         wind_m_s=track.wind.speed_m_s if track.wind else None,
         wind_received_s=track.wind.received_s if track.wind else None,
-        rc_switch_on=_switch_on(track, now_s),
+        rc_switch_on=track.consent.switch_on(now_s),
         output_healthy=track.output is None or track.output.healthy,
         link_up=track.output is None or track.output.link_up,
-        enabled=track.enabled,
-        operator_wishes=track.operator_wishes,
-        estop=None if track.estops is None else bool(track.estops),
+        enabled=track.consent.enabled,
+        operator_wishes=track.consent.wishes,
+        estop=track.consent.is_stopped,
         flow=track.flow,
         pressure=track.pressure,
         tank=track.tank,
@@ -447,19 +543,12 @@ def _approach(track: Track, leg: Leg, east: Told, north: Told, now_s: float) -> 
 
 
 def _young(
-    report: GnssReport | EstimatorReport | LandedReport | RcReport | RangeReport | SpeedReport,
+    report: GnssReport | EstimatorReport | LandedReport | RangeReport | SpeedReport,
     now_s: float,
     limit_s: float = STATUS_AGE_MAX_S,
 ) -> bool:
     """Whether a report may be believed: no older than the limit, and not of the future."""
     return -0.1 <= now_s - report.received_s <= limit_s
-
-
-def _switch_on(track: Track, now_s: float) -> bool | None:
-    """Whether the operator's switch is not off; None where nothing young is known of it."""
-    if track.rc is None or not _young(track.rc, now_s, RC_AGE_MAX_S):
-        return None
-    return RC_LOW_US <= track.switch_us <= RC_SIGNAL_MAX_US
 
 
 def _height(track: Track, motion: Motion, now_s: float) -> float:

@@ -10,6 +10,9 @@ import math
 from dataclasses import dataclass
 from enum import IntEnum
 
+# The modes that fly the mission, as ArduPilot and PX4 call them.
+MISSION_MODES = frozenset({"AUTO", "MISSION"})
+
 
 class Fix(IntEnum):
     """Quality of the GNSS fix, in the order of trust (MAVLink GPS_FIX_TYPE 0 to 6)."""

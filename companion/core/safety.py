@@ -1,7 +1,12 @@
-"""The last word of the core: any reason not to spray makes the all-closed plan.
+"""All that permits spraying: limits, the operator's consent, stops, faults and their latch.
 
-It knows nothing of rates. Every check is written positively (`if not age <= limit`), so that NaN,
+`permit` answers whether anything may be sprayed now: only where there is no reason against it.
+Nothing here knows of rates or routes, and nothing here opens a valve; any reason makes the
+all-closed plan (`guard`). Every check is written positively (`if not age <= limit`), so that NaN,
 a missing value and a stale one close the valves.
+
+In this order: limits and the reasons that follow from a state; the operator's consent; the
+sprayer's state, which latches faults and emergency stops; `permit`, which puts them together.
 """
 
 from __future__ import annotations
@@ -10,7 +15,10 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+from companion.core.inputs import EstopReport, HeartbeatReport, OperatorCommand, RcReport
 from companion.core.types import Fix, Inhibit, SprayerState, SprayPlan, VehicleState
+
+# -------------------------------------------------------------- limits, and the reasons that follow
 
 # What closed at a limit opens again this far inside it, so that noise does not make it chatter:
 # three standard deviations and more of the filtered speed (0.03 m/s), of the height, and of the
@@ -231,31 +239,126 @@ def settled(
     return reasons.union(reason for reason, _ in still), anew + still
 
 
-def closed_plan(*, sequence: int, valve_count: int, now_s: float, lease_s: float) -> SprayPlan:
-    """Return the plan that closes every valve at once."""
-    return SprayPlan(
-        sequence=sequence,
-        issued_s=now_s,
-        duty=(0.0,) * valve_count,
-        changes=(),
-        lease_until_s=now_s + lease_s,
-    )
+# --------------------------------------------------------------------------- the operator's consent
+
+# A companion that stood still for longer asks the operator again.
+CONSENT_STANDSTILL_S = 2.0
+# The switch is asked for at 5 to 10 Hz, of which a slowed-down link leaves a quarter.
+RC_AGE_MAX_S = 2.0
+CLOCK_SLACK_S = 0.1
+RC_HIGH_US = 1700
+RC_LOW_US = 1300
+RC_SIGNAL_MAX_US = 2300
 
 
-def guard(plan: SprayPlan, reasons: frozenset[Inhibit], *, lease_s: float) -> SprayPlan:
-    """Return `plan`, or the all-closed plan if there is any reason."""
-    if not reasons:
-        return plan
-    return closed_plan(
-        sequence=plan.sequence,
-        valve_count=len(plan.duty),
-        now_s=plan.issued_s,
-        lease_s=lease_s,
-    )
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Consent:
+    """Whether the operator allows spraying, by whichever way, and which stops are pressed.
+
+    `wishes` is how often somebody has enabled anew, or disabled. `estops` is None where none was
+    heard of; `switch_us` is of the operator's channel in `rc`, and 0 is no signal.
+    """
+
+    enabled: bool = False
+    wishes: int = 0
+    estops: frozenset[str] | None = None
+    rc: RcReport | None = None
+    switch_us: int = 0
+
+    @property
+    def is_stopped(self) -> bool | None:
+        """Whether an emergency stop is pressed; None where none was heard of."""
+        return None if self.estops is None else bool(self.estops)
+
+    def switch_on(self, now_s: float) -> bool | None:
+        """Whether the operator's switch is not off; None where nothing young is known of it."""
+        if self.rc is None or not -CLOCK_SLACK_S <= now_s - self.rc.received_s <= RC_AGE_MAX_S:
+            return None
+        return RC_LOW_US <= self.switch_us <= RC_SIGNAL_MAX_US
+
+    def wished(self, enabled: bool) -> Consent:
+        """Return the consent after a wish; to repeat that one may spray is no new wish."""
+        is_new = not (enabled and self.enabled)
+        return replace(self, enabled=enabled and not self.estops, wishes=self.wishes + is_new)
+
+    def after_standstill(self, gap_s: float) -> Consent:
+        """Return what is left of the consent after the companion itself stood still."""
+        enabled = self.enabled and gap_s <= CONSENT_STANDSTILL_S
+        return Consent(enabled=enabled, wishes=self.wishes, estops=self.estops)
 
 
-# What the sprayer may do, as one state, and the latch of faults and emergency stops.
-#
+NO_CONSENT = Consent()
+
+
+def consented(
+    consent: Consent,
+    item: HeartbeatReport | OperatorCommand | EstopReport | RcReport,
+    limits: Limits,
+    *,
+    heartbeat: HeartbeatReport | None,
+) -> Consent:
+    """Return the consent after one more input; `heartbeat` is the last one before it."""
+    if isinstance(item, HeartbeatReport):
+        return _after_heartbeat(consent, item, limits, heartbeat)
+    if isinstance(item, OperatorCommand):
+        return _after_command(consent, item, limits)
+    if isinstance(item, EstopReport):
+        return _after_estop(consent, item)
+    return _after_rc(consent, item, limits)
+
+
+def _after_heartbeat(
+    consent: Consent, item: HeartbeatReport, limits: Limits, before: HeartbeatReport | None
+) -> Consent:
+    """Disarming, and leaving the modes that may spray, take the operator's consent back."""
+    if before is None or not consent.enabled:
+        return consent
+    disarms = before.armed and not item.armed
+    leaves = limits.allows(before.mode) and not limits.allows(item.mode)
+    stays = item.received_s - before.received_s <= limits.consent_gap_max_s
+    return replace(consent, enabled=False) if disarms or leaves or not stays else consent
+
+
+def _after_command(consent: Consent, item: OperatorCommand, limits: Limits) -> Consent:
+    """Take the operator's wish; to disable also ends a stop that was commanded.
+
+    Who may not enable changes nothing by trying; everyone may disable.
+    """
+    if item.enable and item.source not in limits.enable_by:
+        return consent
+    if not item.enable and consent.estops:
+        consent = replace(consent, estops=consent.estops - {"command"})
+    return consent.wished(item.enable)
+
+
+def _after_estop(consent: Consent, item: EstopReport) -> Consent:
+    """Take the consent back at a stop; while it is pressed nobody can give it."""
+    pressed = consent.estops or frozenset()
+    if item.pressed is not False:
+        return replace(consent, estops=pressed | {item.source}, enabled=False)
+    return replace(consent, estops=pressed - {item.source})
+
+
+def _after_rc(consent: Consent, item: RcReport, limits: Limits) -> Consent:
+    """Only the edges of the switch count: up enables, down disables, a lost signal disables."""
+    channel, wish = limits.rc_channel, None
+    if channel is not None and "rc" in limits.enable_by and consent.rc is not None:
+        before, now = _pulse(consent.rc, channel), _pulse(item, channel)
+        if before <= RC_HIGH_US < now:
+            wish = before >= RC_LOW_US // 2  # an edge out of a lost signal is no wish
+        elif now < RC_LOW_US <= before:
+            wish = False
+    if wish is not None:
+        consent = consent.wished(wish)
+    return replace(consent, rc=item, switch_us=0 if channel is None else _pulse(item, channel))
+
+
+def _pulse(report: RcReport, channel: int) -> int:
+    return report.pulse_us[channel - 1] if 0 < channel <= len(report.pulse_us) else 0
+
+
+# --------------------------------------------------------------- the sprayer's state, and its latch
+
 #     BOOT -> SAFE -> READY -> ARMED <-> SPRAYING        any -> FAULT, ESTOP -> SAFE
 #
 # A state follows from the reasons not to spray, so several arrows may be one step. FAULT and ESTOP
@@ -296,7 +399,7 @@ _BEFORE_FLIGHT = ENVELOPE | {
 LATCHED = frozenset({SprayerState.FAULT, SprayerState.ESTOP})
 
 
-class Machine(NamedTuple):
+class SprayerMemory(NamedTuple):
     """The state (never SPRAYING, which is an ARMED one that is open), and of a latch the answer.
 
     `wishes` is how many the operator had had when the cause of a latch was last there: the answer
@@ -307,21 +410,22 @@ class Machine(NamedTuple):
     wishes: int = 0
 
 
-BOOT = Machine()
+BOOT = SprayerMemory()
 
 
 def follow(
-    before: Machine, reasons: frozenset[Inhibit], state: VehicleState | None
-) -> tuple[Machine, frozenset[Inhibit]]:
+    before: SprayerMemory, reasons: frozenset[Inhibit], state: VehicleState | None
+) -> tuple[SprayerMemory, frozenset[Inhibit]]:
     """Return the state after `reasons`, and these with the reason that a latch adds."""
     cause = _cause(reasons)
     if cause is not None:
         is_stop = SprayerState.ESTOP in (cause, before.state)
         latched = SprayerState.ESTOP if is_stop else SprayerState.FAULT
-        return Machine(latched, before.wishes if state is None else state.operator_wishes), reasons
+        wishes = before.wishes if state is None else state.operator_wishes
+        return SprayerMemory(latched, wishes), reasons
     if before.state in LATCHED and not _is_answered(before, state):
         return before, reasons | {Inhibit.REARM_NEEDED}
-    return Machine(_unlatched(before.state, reasons)), reasons
+    return SprayerMemory(_unlatched(before.state, reasons)), reasons
 
 
 def _cause(reasons: frozenset[Inhibit]) -> SprayerState | None:
@@ -330,7 +434,7 @@ def _cause(reasons: frozenset[Inhibit]) -> SprayerState | None:
     return SprayerState.FAULT if reasons & FAULTS else None
 
 
-def _is_answered(latch: Machine, state: VehicleState | None) -> bool:
+def _is_answered(latch: SprayerMemory, state: VehicleState | None) -> bool:
     """Return whether the operator has disabled, or enabled anew, since the cause was there."""
     return state is not None and state.operator_wishes > latch.wishes
 
@@ -345,9 +449,12 @@ def _unlatched(before: SprayerState, reasons: frozenset[Inhibit]) -> SprayerStat
     return SprayerState.SAFE
 
 
-def shown(machine: Machine, *, is_open: bool) -> SprayerState:
+def shown(sprayer: SprayerMemory, *, is_open: bool) -> SprayerState:
     """Return the state to be told: SPRAYING where a valve is open or about to be."""
-    return SprayerState.SPRAYING if is_open else machine.state
+    return SprayerState.SPRAYING if is_open else sprayer.state
+
+
+# ---------------------------------------------------------- permission, and what is done without it
 
 
 class Permission(NamedTuple):
@@ -355,7 +462,7 @@ class Permission(NamedTuple):
 
     reasons: frozenset[Inhibit] = frozenset()
     held: Held = ()
-    machine: Machine = BOOT
+    sprayer: SprayerMemory = BOOT
 
 
 UNASKED = Permission()
@@ -378,5 +485,28 @@ def permit(
         state, limits, field_bounds_m=field_bounds_m, now_s=now_s, before=before.reasons
     )
     reasons, held = settled(reasons | faults, before.held, now_s)
-    machine, reasons = follow(before.machine, reasons, state)
-    return Permission(reasons, held, machine)
+    sprayer, reasons = follow(before.sprayer, reasons, state)
+    return Permission(reasons, held, sprayer)
+
+
+def closed_plan(*, sequence: int, valve_count: int, now_s: float, lease_s: float) -> SprayPlan:
+    """Return the plan that closes every valve at once."""
+    return SprayPlan(
+        sequence=sequence,
+        issued_s=now_s,
+        duty=(0.0,) * valve_count,
+        changes=(),
+        lease_until_s=now_s + lease_s,
+    )
+
+
+def guard(plan: SprayPlan, reasons: frozenset[Inhibit], *, lease_s: float) -> SprayPlan:
+    """Return `plan`, or the all-closed plan if there is any reason."""
+    if not reasons:
+        return plan
+    return closed_plan(
+        sequence=plan.sequence,
+        valve_count=len(plan.duty),
+        now_s=plan.issued_s,
+        lease_s=lease_s,
+    )

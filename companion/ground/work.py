@@ -15,6 +15,7 @@ from enum import StrEnum
 from itertools import pairwise
 from typing import Any
 
+from companion.core.inputs import MISSION_MODES
 from companion.core.nozzle import NozzleSet
 from companion.core.schedule import LagModel
 from companion.core.types import (
@@ -206,7 +207,6 @@ class Hold:
 LANDED_AGE_MAX_S = 2.5
 # Whoever has started has this long to begin holding; then it needs a new start.
 START_MAX_S = 30.0
-MISSION_MODES = frozenset({"AUTO", "MISSION"})
 # Sums of times are right to far better than this, and no valve is faster.
 _BIT_S = 1e-6
 

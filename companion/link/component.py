@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TypeGuard, get_args
 
-from companion.core.options.lines import MISSION_MODES
+from companion.core.inputs import MISSION_MODES
 from companion.core.positions import AHEAD_MAX_S, BOOT_WRAP_S, Order, Place, noted, sorted_in
 from companion.core.types import (
     ClockReport,

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.core.estimator import Track, estimate, observe
+from companion.core.safety import Consent
 from companion.core.types import ClockReport, VehicleState
 from tests import builders
 from tests.bench.figures import Figure
@@ -53,7 +54,7 @@ class Vehicle:
     def flown(self, end_s: float, *, enabled: bool = True) -> Iterator[tuple[float, VehicleState]]:
         """Yield our time and the state at every position."""
         rng = np.random.default_rng(self.seed)
-        track, ask_s = Track(enabled=enabled), 0.5
+        track, ask_s = Track(consent=Consent(enabled=enabled)), 0.5
         for i in range(round(end_s * self.hz)):
             sent_s = i / self.hz
             late_s, there_s, back_s = (self.way_s + self.jitter_s * rng.random(3)).tolist()

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from companion.core.estimator import Track, estimate, observe
+from companion.core.safety import Consent
 from companion.core.types import ClockReport
 from tests.bench.clocks import (
     ONE,
@@ -71,7 +72,7 @@ def test_what_runs_like_no_clock_closes(rate: float) -> None:
 
 @pytest.mark.parametrize("ahead_s", [-0.45, -0.2, 0.2, 0.45, 100.0, -1.7e9])
 def test_answers_that_do_not_go_with_the_positions_close(ahead_s: float) -> None:
-    track = Track(enabled=True)
+    track = Track(consent=Consent(enabled=True))
     for i in range(100):
         now_s = i / 10
         latitude, longitude = SETUP.frame.to_geographic(SPEED_M_S * now_s, 3.0)
@@ -162,7 +163,7 @@ def test_a_clock_that_is_set_is_known_again_within_a_second(by_s: float) -> None
 
 def test_answers_that_go_on_to_be_impossible_close() -> None:
     # 40 ms behind the positions for good: neither of the two can be believed.
-    track, agrees = Track(enabled=True), []
+    track, agrees = Track(consent=Consent(enabled=True)), []
     for i in range(200):
         now_s = i / 20
         item = replace(ONE, received_s=now_s + 0.005, boot_s=now_s + UP_S)

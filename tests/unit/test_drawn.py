@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from companion.core.estimator import Motion, begun
+from companion.core.estimator import followed as moved_on
 from companion.core.frame import LocalFrame
 from companion.core.motion import (
     AGREES_M_S,
@@ -22,8 +24,6 @@ from companion.core.motion import (
     followed,
 )
 from companion.core.types import Telemetry
-from companion.core.vehicle_motion import Motion, begun
-from companion.core.vehicle_motion import followed as moved_on
 from tests.builders import position
 
 Floats = NDArray[np.float64]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.core.estimator import Track, estimate, observe
+from companion.core.estimator import CONFIRM_COUNT, Track, estimate, observe
 from companion.core.motion import CRUISE, MANOEUVRE, Belief, Pair, carried
 from companion.core.types import (
     ClockReport,
@@ -25,7 +25,6 @@ from companion.core.types import (
     Telemetry,
     WindReport,
 )
-from companion.core.vehicle_motion import CONFIRM_COUNT
 from tests import builders
 from tests.builders import LAG, setup
 
@@ -239,7 +238,7 @@ ENABLE = OperatorCommand(received_s=11.0, enable=True, source="command")
 
 
 def enabled(track: Track) -> bool:
-    return track.enabled
+    return track.consent.enabled
 
 
 def test_the_operator_enables_and_disables() -> None:
@@ -290,7 +289,7 @@ def test_the_switch_enables_by_its_edge_only(pulses: tuple[int, ...], wanted: bo
     track = Track()
     for i, pulse in enumerate(pulses):
         track = observe(track, rc(10.0 + i, pulse), given)
-    assert track.enabled is wanted
+    assert track.consent.enabled is wanted
 
 
 def test_reports_are_kept_and_grow_old() -> None:

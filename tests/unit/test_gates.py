@@ -12,7 +12,7 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
-from companion.core.estimator import Track, estimate, observe
+from companion.core.estimator import CONFIRM_COUNT, Track, estimate, observe
 from companion.core.positions import Stand, look
 from companion.core.types import (
     Decision,
@@ -31,7 +31,6 @@ from companion.core.types import (
     Telemetry,
     WindReport,
 )
-from companion.core.vehicle_motion import CONFIRM_COUNT
 from companion.link.component import Component, ComponentOptions
 from companion.link.parameters import Parameters, known_parameters
 from tests.bench.fuzz import fuzz

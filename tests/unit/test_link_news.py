@@ -61,7 +61,7 @@ def test_an_old_pulse_of_the_switch_does_not_enable_after_the_pilot_has_stopped(
         if round(at_s * 10) % 2 == 0:
             component.receive(peer.position(UP_S + at_s), at_s)
         track = enabled(component.receive(frame, at_s), track)
-        assert track.enabled is (2.0 <= at_s < 14.99), at_s
+        assert track.consent.enabled is (2.0 <= at_s < 14.99), at_s
 
 
 def test_after_a_restart_the_switch_counts_again_whatever_comes_late_of_before(

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.core.estimator import Motion, begun, followed
 from companion.core.motion import (
     CHANGE_TIME_S,
     CRUISE,
@@ -29,7 +30,6 @@ from companion.core.motion import (
     judged,
     mixed,
 )
-from companion.core.vehicle_motion import Motion, begun, followed
 from tests.builders import position
 
 DT_S = 0.05

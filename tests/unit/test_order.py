@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from companion.core.estimator import Track, estimate, observe
 from companion.core.positions import Order, Place, noted, sorted_in
+from companion.core.safety import Consent
 from companion.core.types import ClockReport, HeartbeatReport, Input, Telemetry, UtcReport
 from tests import builders
 from tests.builders import setup
@@ -99,7 +100,7 @@ def test_the_slow_radio_alone_is_no_restart_and_its_positions_are_old() -> None:
     # The quick one falls silent at 10 s; the slow one goes on, three seconds late.
     _, places = sort([*stream(0.0, 10.0), *stream(0.0, 40.0, late_s=3.0)])
     assert Place.ANEW not in places
-    track = Track(enabled=True)
+    track = Track(consent=Consent(enabled=True))
     for item in arrived([*stream(0.0, 10.0), *stream(0.0, 40.0, late_s=3.0)]):
         track = observe(track, item, SETUP)
         state = estimate(track, item.received_s)
@@ -216,7 +217,7 @@ def test_whatever_comes_late_the_place_is_right_or_nothing_opens(
         for item, (lates_s, itself_s) in zip(clean, delays, strict=True)
         for late_s in (*lates_s, itself_s)
     ]
-    track = Track(enabled=True)
+    track = Track(consent=Consent(enabled=True))
     for item in arrived(items):
         now_s = item.received_s
         track = observe(track, item, SETUP)
@@ -257,7 +258,7 @@ def set_back(back_s: float, lates_s: Sequence[float], *, gap_s: float, by_utc: b
 
 def far_off_m(items: Iterable[Input]) -> tuple[float, float]:
     """Return how far the place is off at worst where a valve may open, and when one last may."""
-    track, worst_m, may_s = Track(enabled=True), 0.0, 0.0
+    track, worst_m, may_s = Track(consent=Consent(enabled=True)), 0.0, 0.0
     for item in items:
         now_s = item.received_s
         track = observe(track, item, SETUP)

@@ -19,7 +19,7 @@ from companion.core.safety import (
     HOLD_S,
     LATCHED,
     Limits,
-    Machine,
+    SprayerMemory,
     follow,
     settled,
 )
@@ -47,9 +47,9 @@ from tests.builders import SPRAYING, position, setup
 REASONS = st.frozensets(st.sampled_from([r for r in Inhibit if r is not Inhibit.REARM_NEEDED]))
 
 
-def after(*reasons: Inhibit, before: Machine | None = None, **change: object) -> SprayerState:
+def after(*reasons: Inhibit, before: SprayerMemory | None = None, **change: object) -> SprayerState:
     state: VehicleState = replace(SPRAYING, **change)  # type: ignore[arg-type]
-    return follow(before or Machine(SprayerState.SAFE), frozenset(reasons), state)[0].state
+    return follow(before or SprayerMemory(SprayerState.SAFE), frozenset(reasons), state)[0].state
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_armed_is_only_where_nothing_but_the_envelope_is_missing(
     before: SprayerState, reasons: frozenset[Inhibit], answered: bool
 ) -> None:
     state = replace(SPRAYING, operator_wishes=int(answered))
-    machine, found = follow(Machine(before), reasons, state)
+    machine, found = follow(SprayerMemory(before), reasons, state)
     assert reasons <= found
     assert (machine.state is SprayerState.ARMED) <= (found <= ENVELOPE)
     assert (machine.state in LATCHED) == (
@@ -291,7 +291,7 @@ def test_the_switch_is_a_wish_too() -> None:
         sprayer.hear(RcReport(received_s=sprayer.now_s, pulse_us=(0,) * 6 + (pulse_us,)))
         sprayer.fly(1.0)
     assert sprayer.step().sprayer is SprayerState.SPRAYING
-    assert sprayer.track.operator_wishes == 1
+    assert sprayer.track.consent.wishes == 1
 
 
 def test_who_may_not_enable_takes_no_consent_away_and_may_stop() -> None:
@@ -302,7 +302,7 @@ def test_who_may_not_enable_takes_no_consent_away_and_may_stop() -> None:
         sprayer.fly(1.0)
     sprayer.wish(True)
     assert sprayer.step().sprayer is SprayerState.SPRAYING
-    assert sprayer.track.operator_wishes == 1
+    assert sprayer.track.consent.wishes == 1
     sprayer.wish(False)
     assert Inhibit.NOT_ENABLED in sprayer.step().inhibits
 

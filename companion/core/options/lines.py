@@ -20,6 +20,7 @@ import numpy as np
 from companion.core.boom import Boom, Paths, time_on_chord
 from companion.core.border import Intervals
 from companion.core.frame import Floats, Place
+from companion.core.inputs import MISSION_MODES
 from companion.core.types import VehicleState, Way
 
 Polyline = tuple[Place, ...]
@@ -50,8 +51,6 @@ WAY_AGE_MAX_S = 31.0
 WAY_ENDS_S = WAY_AGE_MAX_S + 2.0
 # A leg over a line begins and ends so near to its ends: the longest run-in (12 m/s, 2.5 m/s2).
 WAY_BEYOND_M = 30.0
-# The modes that fly the mission, as ArduPilot and PX4 call them.
-MISSION_MODES = frozenset({"AUTO", "MISSION"})
 
 
 class Piece(NamedTuple):
