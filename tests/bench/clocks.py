@@ -53,6 +53,15 @@ class Vehicle:
 
     def flown(self, end_s: float, *, enabled: bool = True) -> Iterator[tuple[float, VehicleState]]:
         """Yield our time and the state at every position."""
+        for received_s, _, track in self.tracked(end_s, enabled=enabled):
+            state = estimate(track, received_s)
+            assert state is not None
+            yield received_s, state
+
+    def tracked(
+        self, end_s: float, *, enabled: bool = True
+    ) -> Iterator[tuple[float, float, Track]]:
+        """Yield when every position came, how far its time is off, and what is known then."""
         rng = np.random.default_rng(self.seed)
         track, ask_s = Track(consent=Consent(enabled=enabled)), 0.5
         for i in range(round(end_s * self.hz)):
@@ -70,9 +79,8 @@ class Vehicle:
                 longitude_deg=longitude,
             )
             track = observe(track, item, SETUP)
-            state = estimate(track, item.received_s)
-            assert state is not None
-            yield item.received_s, state
+            assert track.clock is not None
+            yield item.received_s, item.boot_s + track.clock.sent_offset_s - sent_s, track
 
     def exchange(self, asked_s: float, there_s: float, back_s: float) -> ClockReport:
         answered_s = asked_s + there_s + back_s

@@ -19,6 +19,7 @@ from tests.bench.clocks import (
     STEPS_S,
     UP_S,
     Vehicle,
+    is_trusted,
     shifts_m,
 )
 
@@ -57,9 +58,20 @@ def test_a_clock_that_is_set_closes_until_it_is_known_again(
 def test_a_rate_that_wanders_is_followed() -> None:
     # A simulation that is 1 % slow for twenty seconds, and then in time again.
     slow = tuple((20.0 + i / 50, -0.0002) for i in range(1000))
-    times, off = shifts_m(Vehicle(steps=slow))
-    # 0.031 s of clock at 5 m/s: a place without noise is followed as it is dated.
-    assert np.abs(off).max() <= 0.16
+    vehicle = Vehicle(steps=slow)
+    # Asked once a second: by 3.5 s after the rate changed the time is 0.0307 s off, 0.154 m at
+    # 5 m/s, and two answers that do not go with it close. Asked five times a second, as `run` does
+    # where it is answered, 0.07 m (below).
+    times, late_s = [], []
+    for now_s, off_s, track in vehicle.tracked(60.0):
+        state = estimate(track, now_s)
+        assert state is not None
+        if is_trusted(state, now_s):
+            times.append(now_s)
+            late_s.append(off_s)
+            # The place adds nothing to that: a filter that was slow to follow hid a fifth of it.
+            assert abs(state.east_m - SPEED_M_S * (now_s - off_s)) <= 0.005
+    assert np.abs(late_s).max() <= 0.031
     assert len(times) > 0.75 * 60.0 * 20.0
 
 
@@ -184,5 +196,5 @@ def test_answers_that_go_on_to_be_impossible_close() -> None:
 def test_a_rate_that_wanders_is_followed_by_frequent_exchanges() -> None:
     slow = tuple((20.0 + i / 50, -0.0002) for i in range(1000))
     times, off = shifts_m(replace(BUSY, steps=slow))
-    assert np.abs(off).max() <= 0.15
+    assert np.abs(off).max() <= 0.08
     assert closed_s(times) <= 0.5
