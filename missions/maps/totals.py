@@ -14,7 +14,7 @@ from companion.core.frame import LocalFrame
 from companion.core.prescription import without_overlay
 from missions.maps.build import frame_for
 from missions.maps.cells import cell_areas_m2, shares_inside
-from missions.maps.convert.plain_zones import plain_zones
+from missions.maps.convert.cell_zones import plain_zones
 from missions.maps.convert.rasterise import in_field
 from missions.maps.crs import Objects
 from missions.maps.local import Area, make_valid, polygons_of, project, project_all

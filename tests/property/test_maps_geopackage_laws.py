@@ -18,8 +18,8 @@ from shapely import MultiPolygon, Polygon, box
 from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
+from missions.maps.geopackage.layers import CurvedError, areas_of, polygons_in
 from missions.maps.geopackage.reader import read_geopackage
-from missions.maps.geopackage.wkb import CurvedError, areas_of, polygons_in
 from missions.maps.geopackage.writer import write_geopackage
 from missions.maps.kml.reader import read_kml
 from missions.maps.kml.writer import write_kml

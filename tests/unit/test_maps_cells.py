@@ -17,9 +17,8 @@ from pyproj import CRS, Transformer
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from missions.maps.convert import cell_zones, scan
-from missions.maps.convert.cell_zones import zones_of
-from missions.maps.convert.plain_zones import outline_of_rates, plain_zones
+from missions.maps.convert import cell_zones, rasterise
+from missions.maps.convert.cell_zones import outline_of_rates, plain_zones, zones_of
 from missions.maps.convert.rasterise import cell_rates, cells_of, metres_per_degree, north_up
 from missions.maps.model import Affine, MapCells, MapFile, MapZone
 from missions.maps.totals import as_sprayed, totals
@@ -293,12 +292,12 @@ def test_a_map_without_any_rate_gives_no_cells() -> None:
 
 
 def test_hostile_polygons_end_at_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scan, "MAX_CROSSINGS", 7)
+    monkeypatch.setattr(rasterise, "MAX_CROSSINGS", 7)
     with pytest.raises(MapError, match="too many edges") as caught:
         cells_of(a_map([(square(0, -4, 4, 0), 1.0)]), 1.0)
     assert caught.value.code == "too-large"
-    monkeypatch.setattr(scan, "MAX_CROSSINGS", 8)
-    monkeypatch.setattr(scan, "MAX_PAINTED", 15)
+    monkeypatch.setattr(rasterise, "MAX_CROSSINGS", 8)
+    monkeypatch.setattr(rasterise, "MAX_PAINTED", 15)
     with pytest.raises(MapError, match="same ground") as caught:
         cells_of(a_map([(square(0, -4, 4, 0), 1.0)]), 1.0)
     assert caught.value.code == "too-large"

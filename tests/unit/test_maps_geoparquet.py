@@ -16,8 +16,7 @@ from pyproj import CRS, Geod
 from shapely import MultiPolygon, Point, Polygon, box
 
 from companion.errors import MapError
-from missions.maps.adapt.geoparquet import read_geoparquet
-from missions.maps.adapt.parquet_file import read_table
+from missions.maps.adapt.geoparquet import read_geoparquet, read_table
 from missions.maps.adapt.reader import read_adapt
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given

@@ -26,9 +26,9 @@ from missions.maps.adapt.reader import read_adapt
 from missions.maps.assemble import map_of
 from missions.maps.cells import bounds_deg
 from missions.maps.declared import Given
+from missions.maps.geotiff.bands import parse_world_file
 from missions.maps.geotiff.dji import read_dji
 from missions.maps.geotiff.reader import read_geotiff
-from missions.maps.geotiff.world_file import parse_world_file
 from missions.maps.layer import Grid
 
 WEST, NORTH, CELL = 114.5, 36.0, 1e-4

@@ -431,7 +431,7 @@ def test_links_in_a_circle_or_out_of_the_archive_end(tmp_path: Path) -> None:
 def test_linked_files_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = zipped(tmp_path, {"doc.kml": kml(links("a.kml")), "a.kml": MAY})
     assert len(read_kml(path).geometries) == 1
-    monkeypatch.setattr("missions.maps.kml.files.MAX_ELEMENTS", 15)
+    monkeypatch.setattr("missions.maps.kml.reader.MAX_ELEMENTS", 15)
     assert refused(path).code == "too-large"
 
 

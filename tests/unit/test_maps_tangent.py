@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pyproj import Transformer
 
 from companion.core.frame import LocalFrame
-from missions.maps.text.tangent import TangentPlane, from_ecef, to_ecef
+from missions.maps.text.text_points import TangentPlane, from_ecef, to_ecef
 
 
 def degrees(limit: float) -> st.SearchStrategy[float]:

@@ -20,13 +20,13 @@ from missions.maps.convert.make_map import Plots, Points, make_plots, make_point
 from missions.maps.declared import Given
 from missions.maps.layer import Grid
 from missions.maps.model import MapCells, MapFile, MapZone
-from missions.maps.text.point_grid import MERGES, cell_numbers, cell_size, layout_for, merged
 from missions.maps.text.reader import (
     grid_of_points,
     read_text_map,
     text_map_of,
     write_text_map,
 )
+from missions.maps.text.text_lattice import MERGES, cell_numbers, cell_size, layout_for, merged
 from missions.maps.text.text_points import MAX_POINTS, TextMap, parse_text_map, text_of
 
 ORIGIN = (39.5, -0.4, 50.0)

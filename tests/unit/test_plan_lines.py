@@ -23,8 +23,7 @@ from companion.core.options.lines import Lines
 from companion.errors import ConfigError, MapError
 from companion.record.layers import Ground
 from companion.record.setup_json import field_names_of, setup_from_json, setup_to_json
-from missions.maps.compiling import compiled_setup
-from missions.maps.plan_lines import read_plan_lines
+from missions.maps.compiling import compiled_setup, read_plan_lines
 from tests.builders import setup
 
 EXAMPLE = "examples/anyang/config.toml"

@@ -11,8 +11,8 @@ import typer
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
 from missions.maps.layer import read_bytes
 from missions.maps.model import map_error
-from missions.maps.text.point_grid import M2_PER_HA, MERGES
 from missions.maps.text.reader import PointGrid, grid_of_points, grid_problems
+from missions.maps.text.text_lattice import M2_PER_HA, MERGES
 from missions.maps.text.text_points import parse_text_map
 from missions.maps.whole_file import write_whole
 

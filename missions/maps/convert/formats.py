@@ -14,7 +14,7 @@ import shapely
 from shapely import MultiPolygon
 
 from companion.errors import MapError
-from missions.maps.convert.plain_zones import outline_of_rates, plain_zones
+from missions.maps.convert.cell_zones import outline_of_rates, plain_zones
 from missions.maps.convert.rasterise import cells_of, in_field, north_up
 from missions.maps.crs import is_wgs84
 from missions.maps.local import polygons_of

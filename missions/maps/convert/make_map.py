@@ -16,8 +16,7 @@ import shapely
 
 from companion.core.frame import LocalFrame
 from missions.maps.model import Floats, MapFile, MapZone
-from missions.maps.text.tangent import TangentPlane
-from missions.maps.text.text_points import MAX_POINTS, TextMap
+from missions.maps.text.text_points import MAX_POINTS, TangentPlane, TextMap
 
 PLOTS_MAX = 100_000
 RANGE_MAX_M = 20_000.0

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import accumulate, chain
 
-from missions.maps.attributes import column_of
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely import GeometryType
+from shapely.errors import ShapelyError
+from shapely.geometry.base import BaseGeometry
+
+from missions.maps.fields import column_of
 from missions.maps.geopackage.sqlite import Cell, Database, not_a_table, quoted
-from missions.maps.layer import Value, check_counts
+from missions.maps.layer import Value, check_coordinates, check_counts
+from missions.maps.local import Area, as_area
 from missions.maps.model import map_error
 from missions.maps.outline import BOUNDARY_NAME
 
@@ -196,3 +206,188 @@ def check_size(database: Database, table: LayerTable) -> None:
 
 def _damaged(database: Database, text: str) -> Exception:
     return map_error(database.path, text, fix=_EXPORT_AGAIN, code="truncated")
+
+
+# Well-known binary: the polygons in it, heights and measures left behind.
+#
+# Taken apart here and not in GEOS, which follows nested collections as deep as the stack goes, and
+# checks neither counts against what is there nor that a ring closes. Types and byte order are those
+# of OGC 06-103r4, section 8.2; the flags of the older extended form (bits 29 to 31) are known too.
+
+Floats = NDArray[np.float64]
+# Outside first, then the holes.
+Rings = list[Floats]
+
+_DEPTH_MAX = 8
+_POINT, _LINE, _POLYGON, _CIRCULAR, _CURVE_POLYGON = 1, 2, 3, 8, 10
+_MULTI_POLYGON, _MULTI_SURFACE = 6, 12
+_NAMES = {
+    1: "Point", 2: "LineString", 3: "Polygon", 4: "MultiPoint", 5: "MultiLineString",
+    6: "MultiPolygon", 7: "GeometryCollection", 8: "CircularString", 9: "CompoundCurve",
+    10: "CurvePolygon", 11: "MultiCurve", 12: "MultiSurface",
+}  # fmt: skip
+_MARKS = (_POINT, _LINE, 4, 5)
+# What the parts of these have to be.
+_PARTS = {
+    _MULTI_POLYGON: (_POLYGON,),
+    _MULTI_SURFACE: (_POLYGON, _CURVE_POLYGON),
+    _CURVE_POLYGON: (_LINE,),
+}
+
+
+class CurvedError(ValueError):
+    """Ground whose edge is an arc of a circle."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """The polygons of one geometry, and what it calls itself."""
+
+    kind: str
+    polygons: list[Rings] = field(default_factory=list)
+    mark: BaseGeometry | None = None
+
+    @property
+    def vertex_count(self) -> int:
+        """Return the number of vertices of all rings."""
+        return sum(len(ring) for rings in self.polygons for ring in rings)
+
+    @property
+    def reason(self) -> str:
+        """Return why there is no ground, empty where there is."""
+        if self.polygons:
+            return ""
+        return "no-area" if "Polygon" in self.kind else f"not-a-polygon:{self.kind}"
+
+
+def polygons_in(blob: bytes, start: int = 0) -> Found:
+    """Return the polygons of the geometry that begins at byte `start` and ends with the blob.
+
+    Raises `ValueError` for bytes that are no geometry, `CurvedError` for arcs.
+    """
+    polygons: list[Rings] = []
+    try:
+        kind, _, _, _ = _head(blob, start)
+        end = _walk(blob, start, polygons, depth=0)
+    except (struct.error, IndexError):
+        raise ValueError("it ends too early") from None
+    if end != len(blob):
+        raise ValueError(f"{len(blob) - end} bytes are left over at its end")
+    mark = _mark(blob[start:]) if kind in _MARKS else None
+    return Found(kind=_NAMES[kind], polygons=polygons, mark=mark)
+
+
+def _mark(blob: bytes) -> BaseGeometry | None:
+    """Return points or lines, whose nesting and lengths were looked at; None for broken ones."""
+    try:
+        found = shapely.force_2d(shapely.from_wkb(blob))
+        check_coordinates(shapely.get_coordinates(found))
+    except (ShapelyError, ValueError):
+        return None
+    return None if found.is_empty else found
+
+
+def areas_of(records: Sequence[Sequence[Rings]]) -> list[Area | None]:
+    """Return the polygon or multipolygon of every record, None for one without polygons."""
+    polygons = list(chain.from_iterable(records))
+    if not polygons:
+        return [None] * len(records)
+    rings = list(chain.from_iterable(polygons))
+    points = np.ascontiguousarray(np.concatenate(rings), dtype=np.float64)
+    built = shapely.from_ragged_array(
+        GeometryType.POLYGON, points, (_offsets(rings), _offsets(polygons))
+    ).tolist()
+    ends = list(accumulate(len(record) for record in records))
+    return [
+        as_area(built[end - len(record) : end]) for end, record in zip(ends, records, strict=True)
+    ]
+
+
+def _offsets(groups: Iterable[Sequence[object] | Floats]) -> NDArray[np.int64]:
+    return np.array([0, *accumulate(len(group) for group in groups)], dtype=np.int64)
+
+
+def _head(blob: bytes, at: int) -> tuple[int, int, str, int]:
+    """Return kind, numbers per point, byte order, and where the content begins."""
+    if blob[at] > 1:
+        raise ValueError(f"its byte order is {blob[at]}")
+    order = "<" if blob[at] else ">"
+    code = struct.unpack_from(f"{order}I", blob, at + 1)[0]
+    at += 9 if code & 0x20000000 else 5
+    thousands, kind = divmod(code & 0x1FFFFFFF, 1000)
+    if kind not in _NAMES or thousands > 3:
+        raise ValueError(f"its type {code} is not known")
+    heights = bool(code & 0x80000000) or thousands in (1, 3)
+    measures = bool(code & 0x40000000) or thousands in (2, 3)
+    return kind, 2 + heights + measures, order, at
+
+
+def _walk(blob: bytes, at: int, polygons: list[Rings], *, depth: int) -> int:
+    """Append the polygons of the geometry at `at`, and return where it ends."""
+    if depth > _DEPTH_MAX:
+        raise ValueError("it nests too deep")
+    kind, width, order, at = _head(blob, at)
+    if kind == _POINT:
+        return _skipped(blob, at, 8 * width)
+    count = struct.unpack_from(f"{order}I", blob, at)[0]
+    at += 4
+    if kind in (_LINE, _CIRCULAR):
+        return _skipped(blob, at, 8 * width * count)
+    if kind == _POLYGON:
+        return _polygon(blob, at, count, (width, order), polygons)
+    if kind == _CURVE_POLYGON:
+        return _straight(blob, at, count, polygons)
+    for _ in range(count):
+        if _head(blob, at)[0] not in _PARTS.get(kind, _NAMES):
+            raise ValueError(f"a part of its {_NAMES[kind]} is of another type")
+        at = _walk(blob, at, polygons, depth=depth + 1)
+    return at
+
+
+def _skipped(blob: bytes, at: int, size_bytes: int) -> int:
+    if at + size_bytes > len(blob):
+        raise ValueError("it ends too early")
+    return at + size_bytes
+
+
+def _polygon(blob: bytes, at: int, count: int, form: tuple[int, str], polygons: list[Rings]) -> int:
+    rings: Rings = []
+    for _ in range(count):
+        at = _ring(blob, at, form, rings)
+    _add(rings, polygons)
+    return at
+
+
+def _straight(blob: bytes, at: int, count: int, polygons: list[Rings]) -> int:
+    """Read a curve polygon, which is as good as a polygon where its rings are straight."""
+    rings: Rings = []
+    for _ in range(count):
+        kind, width, order, at = _head(blob, at)
+        if kind not in _PARTS[_CURVE_POLYGON]:
+            raise CurvedError(f"its edge is a {_NAMES[kind]}")
+        at = _ring(blob, at, (width, order), rings)
+    _add(rings, polygons)
+    return at
+
+
+def _add(rings: Rings, polygons: list[Rings]) -> None:
+    if not rings or not len(rings[0]):
+        if any(len(ring) for ring in rings):
+            raise ValueError("it has a hole, but no outside")
+        return
+    polygons.append([ring for ring in rings if len(ring)])
+
+
+def _ring(blob: bytes, at: int, form: tuple[int, str], rings: Rings) -> int:
+    width, order = form
+    count = int(struct.unpack_from(f"{order}I", blob, at)[0])
+    start, end = at + 4, at + 4 + 8 * width * count
+    if end > len(blob):
+        raise ValueError("it ends too early")
+    points = np.frombuffer(blob, dtype=f"{order}f8", count=width * count, offset=start)
+    ring = points.reshape(count, width)[:, :2]
+    if count and not (count >= 4 and ring[0, 0] == ring[-1, 0] and ring[0, 1] == ring[-1, 1]):
+        raise ValueError("a ring does not close")
+    check_coordinates(ring)
+    rings.append(ring)
+    return end

@@ -10,22 +10,27 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 
-from missions.maps.attributes import column_of, stated_unit
 from missions.maps.bundle import open_bundle
-from missions.maps.geopackage.geopackage_crs import UNDEFINED_SRS, layer_crs
+from missions.maps.crs import parse_crs
+from missions.maps.fields import column_of, stated_unit
 from missions.maps.geopackage.layers import (
+    CurvedError,
+    Found,
     LayerTable,
+    Rings,
+    areas_of,
     check_size,
     chosen_layer,
     is_numeric,
     is_outline,
     layers_of,
+    polygons_in,
     value_of,
 )
 from missions.maps.geopackage.sqlite import Cell, Database, check_closed, open_database, quoted
-from missions.maps.geopackage.wkb import CurvedError, Found, Rings, areas_of, polygons_in
 from missions.maps.layer import Column, Layer, Value, check_counts, digest, read_bytes
 from missions.maps.local import Area
 from missions.maps.model import map_error
@@ -195,3 +200,60 @@ def _header(blob: bytes) -> tuple[int, int]:
         raise ValueError(f"its envelope has the code {envelope}")
     srs_id = struct.unpack_from("<i" if flags & 1 else ">i", blob, 4)[0]
     return srs_id, 8 + _ENVELOPE_BYTES[envelope]
+
+
+# The coordinate reference system that a GeoPackage states for a layer.
+
+# srs_id of coordinates that nobody has placed on the earth: geographic, and in a plane.
+UNDEFINED_SRS = (0, -1)
+_TEXT_MAX = 100_000
+
+
+def layer_crs(database: Database, table: LayerTable) -> CRS | None:
+    """Return the layer's CRS, None where the file leaves it open (srs_id 0 and -1)."""
+    if table.srs_id in UNDEFINED_SRS or "gpkg_spatial_ref_sys" not in database.tables:
+        return None
+    sql = (
+        "SELECT organization, organization_coordsys_id, definition, srs_id "
+        "FROM gpkg_spatial_ref_sys"
+    )
+    found = [row[:3] for row in database.rows(sql) if row[3] == table.srs_id]
+    if len(found) != 1:
+        raise map_error(
+            database.path,
+            f"it does not describe its coordinate reference system {table.srs_id}",
+            fix=_EXPORT_AGAIN,
+            code="no-crs",
+        )
+    organization, code, definition = (str(cell or "") for cell in found[0])
+    return _defined(database.path, f"{organization}:{code}", definition)
+
+
+def _defined(path: Path, code: str, definition: str) -> CRS | None:
+    """Return the CRS of its EPSG code or else its text; the two may not name different ones."""
+    # Only WKT: what else PROJ reads may be a name, a path, or an address.
+    written = "[" in definition and len(definition) <= _TEXT_MAX
+    text = parse_crs(definition, path=path, source="the definition in it") if written else None
+    if not code.upper().startswith("EPSG:"):
+        return text
+    crs = parse_crs(code, path=path, source=f"its code {code}")
+    own = _stated_code(text)
+    if own is not None and own != code.upper():
+        raise map_error(
+            path,
+            f"it names its coordinate reference system {code}, but describes {own}",
+            fix=_EXPORT_AGAIN,
+            code="wrong-crs",
+        )
+    return crs
+
+
+def _stated_code(crs: CRS | None) -> str | None:
+    """Return the EPSG code that a definition states itself, not one that merely fits."""
+    if crs is None:
+        return None
+    source = crs.source_crs if crs.is_bound and crs.source_crs is not None else crs
+    stated = source.to_json_dict().get("id")
+    if not isinstance(stated, dict) or str(stated.get("authority")).upper() != "EPSG":
+        return None
+    return f"EPSG:{stated.get('code')}"

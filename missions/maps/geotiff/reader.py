@@ -13,9 +13,15 @@ from pathlib import Path
 
 from missions.maps.adapt.catalogue import Operation, described_beside
 from missions.maps.bundle import Bundle, files_beside
-from missions.maps.geotiff.bands import ReadBand, class_problem, usable
+from missions.maps.geotiff.bands import (
+    ReadBand,
+    class_problem,
+    difference,
+    parse_world_file,
+    usable,
+    world_file_of,
+)
 from missions.maps.geotiff.file import Raster, read_raster
-from missions.maps.geotiff.world_file import difference, parse_world_file, world_file_of
 from missions.maps.layer import Band, Grid, digest
 from missions.maps.model import Affine, Problem, map_error
 

@@ -2,17 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
-from missions.maps.isoxml.contents import instead_of
-from missions.maps.isoxml.field import field_of
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely import MultiPolygon, Polygon
+from shapely.errors import ShapelyError
+
+from missions.maps.crs import WGS84
+from missions.maps.isoxml.field import check_grid_in_field, field_of
 from missions.maps.isoxml.files import TaskFiles
-from missions.maps.isoxml.grid import grid_of_task
+from missions.maps.isoxml.polygons import (
+    FIELD,
+    OBSTACLES,
+    ZONE,
+    ground_of_polygons,
+    point_count,
+)
+from missions.maps.isoxml.rates import (
+    Rates,
+    check_shown,
+    key_among,
+    rates_of,
+    shown_in_zones,
+    special_problems,
+)
 from missions.maps.isoxml.references import References, product_names
-from missions.maps.isoxml.task import chosen_task
-from missions.maps.isoxml.zones import zones_layer
-from missions.maps.layer import Grid, Layer
+from missions.maps.isoxml.task import Task, TreatmentZone, chosen_task, instead_of
+from missions.maps.isoxml.values import EXPORT_AGAIN, integer, number, required, text
+from missions.maps.layer import Band, Column, Grid, Layer, check_counts
+from missions.maps.local import as_area, polygons_of
+from missions.maps.model import Affine, Problem, map_error
 
 
 def read_isoxml(path: Path, layer: str | None = None) -> Layer | Grid:
@@ -31,3 +54,354 @@ def read_isoxml(path: Path, layer: str | None = None) -> Layer | Grid:
     else:
         found = zones_layer(files, task, references, boundary)
     return replace(found, instead=instead, problems=(*files.problems, *problems, *found.problems))
+
+
+# Polygon treatment zones of an ISOXML task, as a layer of records.
+
+
+def zones_layer(
+    files: TaskFiles, task: Task, references: References, boundary: MultiPolygon | None
+) -> Layer:
+    """Return the zones that have polygons; the zones of the special codes need none."""
+    rates, problems = rates_of(task, references)
+    zones = [zone for zone in task.zones.values() if zone.polygons]
+    used = [one for one in rates if any(zone.code in one.by_code for zone in zones)]
+    if not used:
+        raise map_error(
+            files.path,
+            f"no treatment zone of task {task.id[:40]} that has ground has a rate",
+            fix="export the task with an application rate by volume, DDI 0001",
+            code="no-rate-column",
+        )
+    for one in used:
+        problems += check_shown(one, shown_in_zones(one), references)
+    problems += special_problems(task, used)
+    problems += _without_ground(task)
+    geometries, skipped, left_out = _ground(files, zones)
+    problems += left_out
+    return Layer(
+        format="isoxml",
+        crs=WGS84,
+        columns=(
+            Column(name="name", values=tuple(zone.label for zone in zones), numeric=False),
+            *(_column(one, zones, task) for one in used),
+        ),
+        geometries=tuple(geometries),
+        sha256=files.sha256,
+        boundary=boundary,
+        skipped=skipped,
+        problems=tuple(problems),
+    )
+
+
+def _column(one: Rates, zones: list[TreatmentZone], task: Task) -> Column:
+    return Column(
+        name=one.name,
+        values=tuple(one.amount(zone.code) for zone in zones),
+        numeric=True,
+        unit=one.family.unit,
+        is_rate=True,
+        default=one.amount(task.default_code),
+    )
+
+
+def _ground(
+    files: TaskFiles, zones: list[TreatmentZone]
+) -> tuple[list[Polygon | MultiPolygon | None], dict[int, str], list[Problem]]:
+    """Return the ground of every zone, why some have none, and what polygons were left out."""
+    count = sum(point_count(zone.polygons) for zone in zones)
+    check_counts(files.path, records=len(zones), vertices=count)
+    geometries: list[Polygon | MultiPolygon | None] = []
+    skipped: dict[int, str] = {}
+    odd = []
+    for index, zone in enumerate(zones):
+        # Some programs write the outline of a zone as the boundary of a field.
+        ground, others = ground_of_polygons(
+            zone.polygons, (ZONE, FIELD), where=f"treatment zone {zone.code}", path=files.path
+        )
+        blocked, _ = ground_of_polygons(
+            zone.polygons, OBSTACLES, where=f"treatment zone {zone.code}", path=files.path
+        )
+        if ground is not None and blocked is not None and ground.is_valid and blocked.is_valid:
+            ground = as_area(polygons_of(shapely.difference(ground, blocked)))
+        geometries.append(ground)
+        if ground is None:
+            skipped[index] = "not-a-polygon:no treatment zone (PLN type 2)"
+        elif others:
+            odd.append(zone.label)
+    problems = []
+    if odd:
+        problems.append(
+            Problem(
+                severity="warning",
+                code="polygon-type",
+                text="polygons that are marked as neither treatment zone nor field (obstacles, "
+                "roads, water) are left out",
+                where=", ".join(odd[:5]) + (", …" if len(odd) > 5 else ""),
+                fix="mark the ground to spray as treatment zone (PLN type 2)",
+            )
+        )
+    return geometries, skipped, problems
+
+
+def _without_ground(task: Task) -> list[Problem]:
+    """Return a warning for zones with values that are nowhere and for no special case."""
+    nowhere = [
+        zone.label
+        for zone in task.zones.values()
+        if zone.variables and not zone.polygons and zone.code not in task.special_codes
+    ]
+    if not nowhere:
+        return []
+    problem = Problem(
+        severity="warning",
+        code="zone-without-ground",
+        text=f"{len(nowhere)} treatment zones have a value but no polygon",
+        where=", ".join(nowhere[:5]) + (", …" if len(nowhere) > 5 else ""),
+        fix="export the task again, or remove them",
+    )
+    return [problem]
+
+
+# Grids of an ISOXML task: type 1, a treatment zone's code for each cell; type 2, its values.
+#
+# A and B of a GRD are the minimum north and east, so the corner in the south-west; C and D the size
+# of a cell in degrees; E and F the numbers of columns and rows. Rows go from south to north, the
+# cells of a row from west to east; type 2 holds 32-bit integers with the low byte first, for each
+# cell one for every process data variable of its treatment zone.
+
+
+def grid_of_task(
+    files: TaskFiles,
+    element: Element,
+    task: Task,
+    references: References,
+    boundary: MultiPolygon | None,
+) -> Grid:
+    """Return the cells of the task's grid, one band for each product."""
+    shape = grid_shape(element, files.path)
+    content = files.referred(shape.name, ".bin")
+    if shape.type == 1:
+        bands, problems = _by_codes(shape, content, task, references)
+    else:
+        bands, problems = _by_values(shape, content, element, task, references)
+    problems = [*declared_length(shape, content), *problems]
+    if boundary is not None:
+        most = bands[0].values if len(bands) == 1 else np.fmax.reduce([b.values for b in bands])
+        problems += _in_field(most, shape, boundary, files.path)
+    return Grid(
+        format="isoxml",
+        crs=WGS84,
+        transform=shape.transform,
+        bands=tuple(bands),
+        sha256=files.sha256,
+        boundary=boundary,
+        problems=tuple(problems),
+    )
+
+
+def _in_field(
+    rates: NDArray[np.float64], shape: GridShape, boundary: MultiPolygon, path: Path
+) -> list[Problem]:
+    try:
+        return check_grid_in_field(rates, shape.transform, boundary, path)
+    except ShapelyError as error:
+        raise map_error(
+            path,
+            f"grid and field cannot be compared ({str(error)[:120]})",
+            fix=EXPORT_AGAIN,
+            code="broken-geometry",
+        ) from None
+
+
+def _by_codes(
+    shape: GridShape, content: bytes, task: Task, references: References
+) -> tuple[list[Band], list[Problem]]:
+    """Return the bands of a grid of type 1."""
+    path = references.path
+    check_length(shape, content, path, cell_bytes=1, bands=1)
+    codes = np.frombuffer(content, dtype=np.uint8).reshape(shape.rows, shape.columns)
+    counts = np.bincount(codes.ravel(), minlength=256)
+    undefined = [code for code in np.flatnonzero(counts).tolist() if code not in task.zones]
+    if undefined:
+        shown = ", ".join(map(str, undefined[:30])) + (", …" if len(undefined) > 30 else "")
+        raise map_error(
+            path,
+            f"{int(counts[undefined].sum())} of {codes.size} cells of its grid have codes that "
+            f"are no treatment zone of task {task.id[:40]}: {shown}",
+            fix="export the task again with all of its treatment zones",
+            code="undefined-code",
+        )
+    rates, problems = rates_of(task, references)
+    used = [one for one in rates if any(counts[code] for code in one.by_code if code < 256)]
+    if not used:
+        raise _no_rate(task, path)
+    if codes.size * len(used) > CELLS_MAX:
+        check_length(shape, content, path, cell_bytes=1, bands=len(used))
+    bands = []
+    for one in used:
+        problems += check_shown(one, shown_in_zones(one), references)
+        table = np.full(256, np.nan)
+        for code in one.by_code:
+            amount = one.amount(code)
+            if amount is not None and code < 256:
+                table[code] = amount
+        bands.append(_band(one, table[codes], task))
+    return bands, [*problems, *special_problems(task, used)]
+
+
+def _by_values(
+    shape: GridShape, content: bytes, element: Element, task: Task, references: References
+) -> tuple[list[Band], list[Problem]]:
+    """Return the bands of a grid of type 2, for the variables of the zone that the grid names."""
+    path = references.path
+    zone = _template(element, task, path)
+    count = len(zone.variables)
+    if not count:
+        raise _no_rate(task, path)
+    check_length(shape, content, path, cell_bytes=4, bands=count)
+    raw = np.frombuffer(content, dtype="<i4").reshape(shape.rows, shape.columns, count)
+    rates, problems = rates_of(task, references)
+    bands, used = [], []
+    for index, variable in enumerate(zone.variables):
+        one = key_among(rates, zone.code, variable)
+        if one is None:
+            continue
+        own = raw[:, :, index]
+        shown = {variable.presentation: (int(own.min()), int(own.max()))}
+        problems += check_shown(one, shown, references)
+        bands.append(_band(one, own / one.family.raw_per_unit, task))
+        used.append(one)
+    if not bands:
+        raise _no_rate(task, path)
+    return bands, [*problems, *special_problems(task, used)]
+
+
+def _template(element: Element, task: Task, path: Path) -> TreatmentZone:
+    """Return the treatment zone whose variables a grid of type 2 holds."""
+    if text(element, "J") is None:
+        raise map_error(
+            path,
+            "its grid of type 2 does not name the treatment zone whose values it holds (J)",
+            fix=EXPORT_AGAIN,
+            code="undefined-code",
+        )
+    code = integer(element, "J", path, low=0, high=254)
+    if code not in task.zones:
+        raise map_error(
+            path,
+            f"its grid holds values of treatment zone {code}, which task {task.id[:40]} does not "
+            "have",
+            fix=EXPORT_AGAIN,
+            code="undefined-code",
+        )
+    return task.zones[code]
+
+
+def _band(one: Rates, values: NDArray[np.float64], task: Task) -> Band:
+    return Band(
+        name=one.name,
+        values=values,
+        unit=one.family.unit,
+        is_rate=True,
+        default=one.amount(task.default_code),
+    )
+
+
+def _no_rate(task: Task, path: Path) -> Exception:
+    return map_error(
+        path,
+        f"no treatment zone in the grid of task {task.id[:40]} has a rate",
+        fix="export the task with an application rate by volume, DDI 0001",
+        code="no-rate-column",
+    )
+
+
+# Place and size of an ISOXML grid, and whether its binary is as long as that asks for.
+
+# Cells of all bands together; 16 million are 128 MB.
+CELLS_MAX = 16_000_000
+_SIDE_MAX = 1_000_000
+_BYTES_MAX = 2**32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridShape:
+    """What a GRD says of its cells."""
+
+    name: str
+    rows: int
+    columns: int
+    transform: Affine
+    type: int
+    declared_bytes: int | None
+
+
+def grid_shape(element: Element, path: Path) -> GridShape:
+    """Return what a GRD element says, within bounds."""
+    south = number(element, "A", path, low=-90.0, high=90.0, code="out-of-range")
+    west = number(element, "B", path, low=-180.0, high=180.0, code="out-of-range")
+    north_deg = number(element, "C", path, low=1e-9, high=1.0)
+    east_deg = number(element, "D", path, low=1e-9, high=1.0)
+    columns = integer(element, "E", path, low=1, high=_SIDE_MAX)
+    rows = integer(element, "F", path, low=1, high=_SIDE_MAX)
+    kind = integer(element, "I", path, low=1, high=2)
+    length = text(element, "H")
+    shape = GridShape(
+        name=required(element, "G", path),
+        rows=rows,
+        columns=columns,
+        transform=(east_deg, 0.0, west, 0.0, north_deg, south),
+        type=kind,
+        declared_bytes=None
+        if length is None
+        else integer(element, "H", path, low=0, high=_BYTES_MAX),
+    )
+    if not (south + rows * north_deg <= 90.0 and west + columns * east_deg <= 180.0):
+        raise map_error(
+            path,
+            f"its grid {shape.name[:40]} reaches beyond 90 degrees of latitude or 180 of longitude",
+            fix=EXPORT_AGAIN,
+            code="out-of-range",
+        )
+    return shape
+
+
+def check_length(
+    shape: GridShape, content: bytes, path: Path, *, cell_bytes: int, bands: int
+) -> None:
+    """Refuse a binary that does not hold what the grid says, before anything is made of it."""
+    if shape.rows * shape.columns * bands > CELLS_MAX:
+        raise map_error(
+            path,
+            f"its grid has {shape.rows} x {shape.columns} cells for {bands} values, more than "
+            f"{CELLS_MAX} in all",
+            fix="export one field, or larger cells",
+            code="too-large",
+        )
+    expected = shape.rows * shape.columns * cell_bytes * bands
+    if len(content) != expected:
+        values = f" x {bands} values" if bands > 1 else ""
+        each = "byte" if cell_bytes == 1 else "bytes"
+        raise map_error(
+            path,
+            f"its grid {shape.name[:40]} has {len(content)} bytes, but {shape.rows} rows x "
+            f"{shape.columns} columns x {cell_bytes} {each}{values} are {expected}",
+            fix="export the task again, and copy all of its files",
+            code="binary-length",
+        )
+
+
+def declared_length(shape: GridShape, content: bytes) -> list[Problem]:
+    """Return a warning where the declared length is wrong and the file is as it has to be."""
+    if shape.declared_bytes is None or shape.declared_bytes == len(content):
+        return []
+    problem = Problem(
+        severity="warning",
+        code="binary-length",
+        text=f"the task declares {shape.declared_bytes} bytes for its grid, which has "
+        f"{len(content)}, as its rows and columns ask for",
+        where=shape.name,
+        fix=EXPORT_AGAIN,
+    )
+    return [problem]

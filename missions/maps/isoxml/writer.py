@@ -10,24 +10,20 @@ from __future__ import annotations
 
 import shutil
 import zipfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
 from io import BytesIO
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
+import shapely
+from shapely import MultiPolygon, Polygon
+from shapely.errors import ShapelyError
 
-from missions.maps.isoxml.elements import (
-    DEFAULT_CODE,
-    add_field,
-    add_polygons,
-    add_treatment_zone,
-    decimal,
-    new_task_data,
-    printable,
-    raw_rate,
-)
-from missions.maps.isoxml.grouping import grouped, outline
-from missions.maps.model import MapCells, MapFile, map_error
+from missions.maps.local import frame_around, polygons_of, project
+from missions.maps.model import MapCells, MapFile, MapZone, map_error
 from missions.maps.whole_file import not_written, write_whole
 
 GRID_NAME = "GRD00001"
@@ -152,3 +148,155 @@ def _write_folder(path: Path, task_data: bytes, grid: bytes | None) -> None:
             shutil.rmtree(part, ignore_errors=True)
     except OSError as error:
         raise not_written(path, error) from None
+
+
+# Zones of a map as treatment zones of a task, which has room for only so many.
+
+# Codes go from 0 to 254 (ISO 11783-10), three of which are for the special cases.
+ZONES_MAX = 252
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ZoneGroup:
+    """What becomes one treatment zone; `raw` None where no rate is prescribed."""
+
+    name: str
+    raw: int | None
+    polygons: tuple[Polygon, ...]
+
+
+def grouped(zones: Sequence[MapZone], path: Path) -> list[ZoneGroup]:
+    """Return each zone by itself, or where they are too many, all of one rate together."""
+    if len(zones) <= ZONES_MAX:
+        return [
+            ZoneGroup(
+                name=printable(zone.name),
+                raw=_raw(zone),
+                polygons=tuple(polygons_of(zone.geometry)),
+            )
+            for zone in zones
+        ]
+    by_raw: dict[int | None, list[MapZone]] = {}
+    for zone in zones:
+        by_raw.setdefault(_raw(zone), []).append(zone)
+    if len(by_raw) > ZONES_MAX:
+        raise map_error(
+            path,
+            f"the map has {len(by_raw)} different rates, and ISOXML has room for {ZONES_MAX} "
+            "treatment zones",
+            fix="round the rates (--round), or convert the map to another format",
+            code="too-many-rates",
+        )
+    return [
+        ZoneGroup(
+            name="no rate" if raw is None else f"{raw / 1e4:.10g} L/ha",
+            raw=raw,
+            polygons=tuple(part for zone in ones for part in polygons_of(zone.geometry)),
+        )
+        for raw, ones in by_raw.items()
+    ]
+
+
+def outline(zones: Sequence[MapZone], path: Path) -> MultiPolygon | None:
+    """Return the ground of all zones together, as the outline of a field that has none."""
+    if not zones:
+        return None
+    try:
+        united = shapely.union_all(np.array([zone.geometry for zone in zones], dtype=object))
+    except ShapelyError as error:
+        raise map_error(
+            path,
+            f"the zones have no outline ({str(error)[:120]})",
+            fix="give the map a boundary, or repair its zones",
+            code="broken-geometry",
+        ) from None
+    return MultiPolygon(polygons_of(united))
+
+
+def _raw(zone: MapZone) -> int | None:
+    return None if zone.rate_l_ha is None else raw_rate(zone.rate_l_ha)
+
+
+# The elements of ISOXML task data as they are written (ISO 11783-10, version 4).
+
+# Treatment zones of the special cases: default, position lost, out of field.
+DEFAULT_CODE = 0
+# DDI 0001 has 0.01 mm3/m2 a step (ISO 11783-11), so 10 000 steps are 1 L/ha.
+RAW_PER_L_HA = 10_000
+_NAME_MAX = 32
+_FIELD, _ZONE = "1", "2"
+_PRESENTATION = "VPN1"
+
+
+def raw_rate(rate_l_ha: float) -> int:
+    """Return a rate as the raw value of DDI 0001.
+
+    >>> raw_rate(49.0)
+    490000
+    """
+    return round(rate_l_ha * RAW_PER_L_HA)
+
+
+def decimal(number: float) -> str:
+    """Return a number with all of its digits and without an exponent.
+
+    >>> decimal(1.1178e-05)
+    '0.000011178'
+    """
+    return format(Decimal(repr(float(number))), "f")
+
+
+def printable(name: str) -> str:
+    """Return a name without what XML cannot hold, as long as a designator may be."""
+    return " ".join("".join(one for one in name if one.isprintable()).split())[:_NAME_MAX]
+
+
+def new_task_data(name: str) -> tuple[Element, Element]:
+    """Return the root, and in it the one task, planned, with its codes and no zones yet."""
+    root = Element(
+        "ISO11783_TaskData",
+        VersionMajor="4",
+        VersionMinor="3",
+        ManagementSoftwareManufacturer="vrspray",
+        ManagementSoftwareVersion="1",
+        DataTransferOrigin="1",
+    )
+    SubElement(root, "VPN", A=_PRESENTATION, B="0", C=decimal(1 / RAW_PER_L_HA), D="2", E="l/ha")
+    task = SubElement(root, "TSK", A="TSK1", B=name or "Prescription", G="1")
+    for key, code in zip("HIJ", range(DEFAULT_CODE, DEFAULT_CODE + 3), strict=True):
+        task.set(key, str(code))
+    return root, task
+
+
+def add_field(root: Element, task: Element, boundary: MultiPolygon) -> None:
+    """Add the field with its outline before the task, which refers to it."""
+    local = project(boundary, frame_around([boundary]))
+    field = Element("PFD", A="PFD1", C=task.get("B", ""), D=str(round(local.area)))
+    add_polygons(field, boundary.geoms, kind=_FIELD)
+    root.insert(list(root).index(task), field)
+    task.set("E", "PFD1")
+
+
+def add_treatment_zone(task: Element, code: int, name: str, raw: int | None) -> Element:
+    """Add a treatment zone with its value of DDI 0001, or without any."""
+    zone = SubElement(task, "TZN", A=str(code))
+    if name:
+        zone.set("B", name)
+    if raw is not None:
+        SubElement(zone, "PDV", A="0001", B=str(raw), E=_PRESENTATION)
+    return zone
+
+
+def add_polygons(parent: Element, polygons: Iterable[Polygon], *, kind: str = _ZONE) -> None:
+    """Add polygons with their rings, before the values that a zone has already."""
+    for index, polygon in enumerate(polygons):
+        element = Element("PLN", A=kind)
+        parent.insert(index, element)
+        for ring_kind, ring in (
+            ("1", polygon.exterior),
+            *(("2", interior) for interior in polygon.interiors),
+        ):
+            line = SubElement(element, "LSG", A=ring_kind)
+            for east, north in ring.coords:
+                # Nine decimals of a degree are 0.1 mm.
+                SubElement(line, "PNT", A="2", C=f"{north:.9f}", D=f"{east:.9f}")

@@ -6,19 +6,22 @@ text of a description is for people: no rate is read out of it.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from urllib.parse import unquote
 from xml.etree.ElementTree import Element
 
+from missions.maps.bundle import Bundle, open_bundle
 from missions.maps.crs import WGS84
-from missions.maps.geopackage.wkb import areas_of
-from missions.maps.kml.files import KmlFiles, read_files
+from missions.maps.fields import column_of, stated_unit
+from missions.maps.geopackage.layers import areas_of
 from missions.maps.kml.geometry import Ground, ground_of, local_name
-from missions.maps.kml.kml_attributes import columns_of, has_attributes
-from missions.maps.layer import MAX_RECORDS, Layer, check_counts, digest
-from missions.maps.model import map_error
+from missions.maps.layer import MAX_RECORDS, Column, Layer, check_counts, digest, read_bytes
+from missions.maps.model import Problem, map_error
 from missions.maps.outline import BOUNDARY_NAME, outline_of
+from missions.maps.xmltree import MAX_ELEMENTS, parse_xml
 
 _CONTAINERS = ("kml", "Document", "Folder")
 
@@ -156,3 +159,245 @@ def _inside(
             code="no-layer",
         )
     return found
+
+
+# What KML placemarks say in ExtendedData, as columns.
+#
+# Three forms (OGC 12-007r2, section 9.4): `Data` with a name and a value, `SchemaData` with fields
+# whose types a `Schema` declares, and elements of other namespaces. All of it is text.
+
+_NUMERIC = frozenset({"int", "uint", "short", "ushort", "float", "double"})
+_TRUTH = frozenset({"bool", "boolean"})
+_NAME = "name"
+_COLUMNS_MAX = 255  # as many as a shapefile can have
+_CELLS_MAX = 10_000_000
+
+
+@dataclass(slots=True)
+class _Fields:
+    """Types and titles that the file declares for its fields, by name."""
+
+    types: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
+    titles: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
+
+
+def has_attributes(placemark: Element) -> bool:
+    """Tell whether a placemark says anything in ExtendedData."""
+    return any(True for _ in _pairs(placemark, _Fields()))
+
+
+def columns_of(root: Element, placemarks: Sequence[Element], path: Path) -> tuple[Column, ...]:
+    """Return a column for every name in ExtendedData, and one for the placemarks' names."""
+    fields = _declared(root)
+    rows = [_row(placemark, fields, path) for placemark in placemarks]
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    if len(names) > _COLUMNS_MAX or len(names) * len(rows) > _CELLS_MAX:
+        raise map_error(
+            path,
+            f"{len(names)} attributes of {len(rows)} placemarks are too many",
+            fix="keep the rate and its unit",
+            code="too-large",
+        )
+    columns = [
+        column_of(
+            name,
+            [row.get(name) for row in rows],
+            declared=bool(fields.types[name]) and fields.types[name] <= _NUMERIC,
+            unit=stated_unit(fields.titles[name], column=name, path=path),
+        )
+        for name in names
+    ]
+    labels = [_text(placemark, _NAME) for placemark in placemarks]
+    if any(labels) and _NAME not in (name.casefold() for name in names):
+        columns.append(column_of(_NAME, labels))
+    return tuple(columns)
+
+
+def _declared(root: Element) -> _Fields:
+    fields = _Fields()
+    for element in root.iter():
+        if local_name(element) == "SimpleField":
+            name = element.get("name", "").strip()
+            fields.types[name].add(element.get("type", "").rpartition(":")[2].casefold())
+            title = _text(element, "displayName")
+            if title:
+                fields.titles[name].add(title)
+    return fields
+
+
+def _row(placemark: Element, fields: _Fields, path: Path) -> dict[str, str | None]:
+    """Return one placemark's values by name; a name with two values is refused."""
+    row: dict[str, str | None] = {}
+    for name, text in _pairs(placemark, fields):
+        value = text
+        if value is not None and fields.types[name] & _TRUTH:
+            value = {"1": "true", "0": "false"}.get(value, value)
+        known = row.get(name)
+        if known is not None and value is not None and known != value:
+            raise map_error(
+                path,
+                f"a placemark says {name} twice: {known[:40]} and {value[:40]}",
+                fix="keep one of them",
+                code="several-columns",
+            )
+        row[name] = known if value is None else value
+    return row
+
+
+def _pairs(placemark: Element, fields: _Fields) -> Iterator[tuple[str, str | None]]:
+    """Yield name and value of all that a placemark says; None for a blank."""
+    for extended in placemark:
+        if local_name(extended) != "ExtendedData":
+            continue
+        for element in extended:
+            kind = local_name(element)
+            if kind == "Data":
+                name = element.get("name", "").strip()
+                title = _text(element, "displayName")
+                if title:
+                    fields.titles[name].add(title)
+                yield name, _text(element, "value")
+            elif kind == "SchemaData":
+                for simple in element:
+                    if local_name(simple) == "SimpleData":
+                        yield simple.get("name", "").strip(), (simple.text or "").strip() or None
+            elif not len(element):
+                yield kind, (element.text or "").strip() or None
+
+
+def _text(element: Element, kind: str) -> str | None:
+    text = next((child.text for child in element if local_name(child) == kind), None)
+    return (text or "").strip() or None
+
+
+# The XML of a KML file, or of a KMZ archive and the files that its own file links to.
+#
+# GDAL, and so QGIS, writes one file for each layer into an archive, and a `doc.kml` that holds
+# nothing but network links to them. Links that lead out of the archive are never followed.
+
+_MAIN = "doc.kml"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KmlFiles:
+    """One tree with all linked files grafted into it, and the bytes of which it was made.
+
+    `folder` is what is left of `--layer` when no file of that name was meant.
+    """
+
+    root: Element
+    contents: tuple[bytes, ...]
+    folder: str | None
+    problems: tuple[Problem, ...] = ()
+
+
+def read_files(path: Path, layer: str | None) -> KmlFiles:
+    """Return the tree of a `.kml`, or of an archive or a folder with KML files."""
+    if not path.is_dir() and path.suffix.casefold() not in (".kmz", ".zip"):
+        content = read_bytes(path)
+        root = parse_xml(content, path)
+        problems = _problems(sum(1 for _ in _links(root)), path)
+        return KmlFiles(root=root, contents=(content,), folder=layer, problems=problems)
+    bundle = open_bundle(path)
+    name, used = _main_file(bundle, path, layer)
+    content = bundle.read(name)
+    root = parse_xml(content, path, name=name)
+    linked, lost = _graft(root, name, bundle, path)
+    return KmlFiles(
+        root=root,
+        contents=(content, *linked),
+        folder=None if used else layer,
+        problems=_problems(lost, path),
+    )
+
+
+def _main_file(bundle: Bundle, path: Path, layer: str | None) -> tuple[str, bool]:
+    """Return the file that is meant, and whether `layer` was needed to say so.
+
+    A KMZ archive's own file is `doc.kml` at its top; others beside it are for network links.
+    """
+    names = bundle.with_suffix(".kml")
+    main = [name for name in names if name.casefold() == _MAIN]
+    meant = main or names
+    # By its suffix a name can only be that of a file; without it, it may be a folder's.
+    named = [name for name in names if layer in (name, PurePosixPath(name).name)]
+    if len(named) == 1:
+        return named[0], True
+    if len(meant) == 1:
+        return meant[0], False
+    asked = [name for name in names if layer == PurePosixPath(name).stem]
+    if len(asked) == 1:
+        return asked[0], True
+    raise map_error(
+        path,
+        f"it holds the KML files {', '.join(names[:10])}" if names else "it holds no KML file",
+        fix="name one of them with --layer" if names else "name the file of the map itself",
+        code="several-layers" if names else "no-file",
+    )
+
+
+def _graft(root: Element, name: str, bundle: Bundle, path: Path) -> tuple[list[bytes], int]:
+    """Put linked files of the archive in place of their links; the rest is counted.
+
+    One level and each file once, so that links in a circle come to an end.
+    """
+    contents: list[bytes] = []
+    done, lost = {name}, 0
+    elements = sum(1 for _ in root.iter())
+    for parent, link in list(_links(root)):
+        target = _target(link, name)
+        if target in done:
+            continue
+        if target not in bundle.files:
+            lost += 1
+            continue
+        done.add(target)
+        contents.append(bundle.read(target))
+        tree = parse_xml(contents[-1], path, name=target)
+        elements += sum(1 for _ in tree.iter())
+        if elements > MAX_ELEMENTS:
+            raise map_error(
+                path,
+                f"its files have more than {MAX_ELEMENTS} elements",
+                fix="export the map of one field alone",
+                code="too-large",
+            )
+        lost += sum(1 for _ in _links(tree))
+        parent[list(parent).index(link)] = tree
+    return contents, lost
+
+
+def _links(root: Element) -> Iterator[tuple[Element, Element]]:
+    """Yield every network link and the element around it."""
+    for parent in root.iter():
+        for child in parent:
+            if local_name(child) == "NetworkLink":
+                yield parent, child
+
+
+def _target(link: Element, name: str) -> str:
+    """Return the name in the archive that a link leads to, as far as it leads there."""
+    text = next(
+        (
+            (href.text or "").strip()
+            for place in link
+            if local_name(place) in ("Link", "Url")
+            for href in place
+            if local_name(href) == "href"
+        ),
+        "",
+    )
+    return (PurePosixPath(name).parent / unquote(text)).as_posix()
+
+
+def _problems(count: int, path: Path) -> tuple[Problem, ...]:
+    if not count:
+        return ()
+    problem = Problem(
+        severity="warning",
+        code="network-link",
+        text=f"{count} links to other files or servers are not followed",
+        where=str(path),
+        fix="save what they show as a file of its own, if it belongs to the map",
+    )
+    return (problem,)

@@ -7,15 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 import shapely
+from shapely import Geometry, Polygon
 from shapely.errors import ShapelyError
 
-from missions.maps.lint.place import place_problems
+from companion.core.frame import WGS84
+from missions.maps.cells import shares_inside, to_degrees
 from missions.maps.lint.plan import Plan
-from missions.maps.lint.rates import ground_problems, rate_problems
 from missions.maps.lint.shapes import overlap_problems, shape_problems
 from missions.maps.lint.short import short_problems
-from missions.maps.lint.survey import Survey
-from missions.maps.model import MapFile, Problem, map_error
+from missions.maps.lint.survey import Survey, area_text, latitude_longitude
+from missions.maps.local import project
+from missions.maps.model import MapCells, MapFile, Problem, map_error
 from missions.maps.overlaps import check_outline
 from missions.maps.totals import Totals, totals
 
@@ -176,3 +178,349 @@ def _unusable(map_file: MapFile, error: ShapelyError) -> Exception:
         fix="export the map again",
         code="broken-geometry",
     )
+
+
+# Rates and the ground they stand on: zero, none, outside; each is another thing in flight.
+
+# Herbicides in water need some 400 L/ha at most, liquid fertiliser some 1 000.
+RATE_HIGH_L_HA = 2_000.0
+# Even ultra-low-volume spraying puts down more, as a rule 1 to 5 L/ha; NDVI lies below 1.
+RATE_LOW_L_HA = 1.0
+# A map drawn by hand never meets its boundary exactly: this share of the field is let pass.
+SHARE_MIN = 0.002
+AREA_MIN_M2 = 1.0
+
+
+def rate_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Problem]:
+    """Return what the rates themselves give reason to ask."""
+    rates = survey.rates[survey.rated]
+    problems = []
+    if not len(rates) or (survey.cells is None and not survey.rated.all()):
+        problems.append(_null_rate(survey, default_rate_l_ha))
+    if not len(rates):
+        return problems
+    zero_ha = survey.hectares(survey.rates == 0.0)
+    most = float(rates.max())
+    if not most > 0.0:
+        problems.append(
+            Problem(
+                severity="warning",
+                code="all-zero",
+                text=f"every rate is 0, on {zero_ha:.3f} ha: nothing would be sprayed",
+                where=f"{survey.map_file.rate_field}: {survey.rate_spots(0.0)}",
+                fix="check the rate column (--rate-field)",
+            )
+        )
+    elif zero_ha > 0.0 and survey.cells is None and not survey.rated.all():
+        none_ha = survey.hectares(~survey.rated)
+        problems.append(
+            Problem(
+                severity="warning",
+                code="zero-and-none",
+                text=f"{zero_ha:.3f} ha have the rate 0 and {none_ha:.3f} ha have none: both stay "
+                "dry, but a default rate would fall on the second",
+                where=f"rate 0: {survey.rate_spots(0.0)}",
+                fix="write 0 where nothing may fall, and leave out the zones that mean nothing",
+            )
+        )
+    if 0.0 < most < RATE_LOW_L_HA:
+        problems.append(
+            Problem(
+                severity="warning",
+                code="low-rate",
+                text=f"the largest rate is {most:g} L/ha: values from 0 to 1 look like a "
+                "vegetation index or a share, and not like litres",
+                where=f"{survey.map_file.rate_field}: {survey.rate_spots(most)}",
+                fix="check the rate column (--rate-field) and its unit (--unit); an index has to "
+                "be turned into rates first",
+            )
+        )
+    if not most <= RATE_HIGH_L_HA:
+        problems.append(
+            Problem(
+                severity="warning",
+                code="high-rate",
+                text=f"the largest rate is {most:.0f} L/ha, more than any sprayer's use",
+                where=f"{survey.map_file.rate_field}: {survey.rate_spots(most)}",
+                fix="check the rate column (--rate-field) and its unit (--unit)",
+            )
+        )
+    return problems
+
+
+def _null_rate(survey: Survey, default_rate_l_ha: float | None) -> Problem:
+    then = "the valves close there"
+    if default_rate_l_ha is not None and survey.boundary is not None:
+        then = f"inside the boundary the default rate of {default_rate_l_ha:g} L/ha falls there"
+    if survey.cells is not None:
+        what, where = "cells", survey.cell_spots(~survey.rated)
+    else:
+        what, where = "zones", survey.zone_spots(np.flatnonzero(~survey.rated).tolist())
+    return Problem(
+        severity="warning" if survey.rated.any() else "error",
+        code="null-rate",
+        text=f"{int((~survey.rated).sum())} of {survey.rates.size} {what} without a rate, "
+        f"{survey.hectares(~survey.rated):.3f} ha in all{_bare_text(survey)}; {then}",
+        where=where,
+        fix="give them a rate, 0 for none",
+    )
+
+
+def _bare_text(survey: Survey) -> str:
+    """Return how much of the ground without a rate no zone with one covers."""
+    if survey.cells is not None or not survey.rated.any() or not survey.is_simple:
+        return ""
+    rated = shapely.union_all(survey.local[survey.rated])
+    bare = shapely.difference(shapely.union_all(survey.local[~survey.rated]), rated)
+    return f", {bare.area / 10_000:.3f} ha of it under no zone with a rate"
+
+
+def ground_problems(survey: Survey, default_rate_l_ha: float | None) -> list[Problem]:
+    """Return where map and boundary do not cover the same ground."""
+    boundary = survey.boundary
+    if boundary is None or not (survey.meets_boundary and survey.is_simple):
+        return []
+    found = (
+        _of_zones(survey, boundary)
+        if survey.cells is None
+        else _of_cells(survey, survey.cells, boundary)
+    )
+    (empty_m2, empty_where), (outside_m2, outside_where) = found
+    least_m2 = max(AREA_MIN_M2, SHARE_MIN * boundary.area)
+    problems = []
+    if empty_m2 >= least_m2:
+        then = "the valves close there"
+        nowhere = "in no zone" if survey.cells is None else "in no cell with a rate"
+        if default_rate_l_ha is not None:
+            litres = default_rate_l_ha * empty_m2 / 10_000.0
+            then = f"the default rate of {default_rate_l_ha:g} L/ha falls there, {litres:.1f} L"
+        problems.append(
+            Problem(
+                severity="warning",
+                code="uncovered",
+                text=f"{area_text(empty_m2)} inside the field's boundary "
+                f"({boundary.area / 10_000:.3f} ha) {nowhere}; {then}",
+                where=empty_where,
+                fix="draw the map up to the boundary, or check that both are of the same field",
+            )
+        )
+    if outside_m2 >= least_m2:
+        problems.append(
+            Problem(
+                severity="warning",
+                code="outside-boundary",
+                text=f"{area_text(outside_m2)} with a rate outside the field's boundary; they are "
+                "not sprayed",
+                where=outside_where,
+                fix="correct the boundary, or check that map and boundary are of the same field",
+            )
+        )
+    return problems
+
+
+Ground = tuple[tuple[float, str], tuple[float, str]]
+
+
+def _of_zones(survey: Survey, boundary: Geometry) -> Ground:
+    """Return the ground of the boundary without a zone, and of zones outside it; with places."""
+    empty = shapely.difference(boundary, survey.covered)
+    shapely.prepare(boundary)
+    out = survey.rated & (survey.rates > 0.0) & ~shapely.contains_properly(boundary, survey.local)
+    outside = shapely.difference(survey.local[out], boundary)
+    area_m2 = shapely.area(outside)
+    where = ""
+    if len(area_m2):
+        worst = int(np.argmax(area_m2))
+        name = survey.zone_name(int(np.flatnonzero(out)[worst]))
+        where = f"{name} at {survey.spot(outside[worst])}"
+    return (empty.area, _largest(survey, empty)), (float(area_m2.sum()), where)
+
+
+def _of_cells(survey: Survey, cells: MapCells, boundary: Geometry) -> Ground:
+    """Return the same for cells, and for ground beyond the rows and columns."""
+    rows, columns = survey.rates.shape
+    longitude, latitude = to_degrees(
+        cells, np.array([0.0, columns, columns, 0.0]), np.array([0.0, 0.0, rows, rows])
+    )
+    grid = project(Polygon(np.column_stack([longitude, latitude])), survey.frame)
+    beyond = shapely.difference(boundary, grid)
+    bare = survey.cells_inside & ~survey.rated
+    outside = ~survey.cells_inside & survey.rated & (survey.rates > 0.0)
+    where = survey.cell_spots(bare) or _largest(survey, beyond)
+    share_m2 = survey.area_m2
+    if survey.boundary_deg is not None:
+        share_m2 = shares_inside(cells, survey.boundary_deg) * survey.area_m2
+    empty_m2 = beyond.area + float(share_m2[~survey.rated].sum())
+    sprayed = survey.rated & (survey.rates > 0.0)
+    outside_m2 = float((survey.area_m2 - share_m2)[sprayed].sum())
+    return (empty_m2, where), (outside_m2, survey.cell_spots(outside))
+
+
+def _largest(survey: Survey, ground: Geometry) -> str:
+    parts = shapely.get_parts(ground)
+    if not len(parts):
+        return ""
+    largest = parts[int(np.argmax(shapely.area(parts)))]
+    return f"the largest part at {survey.spot(largest)}"
+
+
+# Where the map lies on earth, against the field and the home that are known.
+
+Bounds = tuple[float, float, float, float]
+
+# A map over more than this holds a zone of another field.
+FAR_APART_M = 20_000.0
+# Nobody farms beyond the northern end of Norway's fields; there the two axes are exchanged.
+LATITUDE_MAX_DEG = 66.0
+# A sprayer that is carried to the field stands beside it; beyond the second, something is wrong.
+HOME_NEAR_M = 2_000.0
+HOME_FAR_M = 20_000.0
+
+
+def place_problems(survey: Survey, homes: Sequence[tuple[float, float]]) -> list[Problem]:
+    """Return where the map lies in an odd place, or far from the field or from home."""
+    return [*_field(survey), *_home(survey, homes), *_apart(survey), *_odd(survey)]
+
+
+def gap_m(one: Bounds, two: Bounds) -> float:
+    """Return the distance between two boxes of west, south, east, north; 0 where they meet.
+
+    >>> gap_m((0.0, 0.0, 1.0, 1.0), (0.5, 0.5, 2.0, 2.0))
+    0.0
+    >>> round(gap_m((0.0, 0.0, 1.0, 0.0), (2.0, 0.0, 3.0, 0.0)))
+    111319
+    """
+    west, south = max(one[0], two[0]), max(one[1], two[1])
+    east, north = min(one[2], two[2]), min(one[3], two[3])
+    longitudes = (east, west) if west > east else (west, west)
+    latitudes = (north, south) if south > north else (south, south)
+    return float(WGS84.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])[2])
+
+
+def _field(survey: Survey) -> list[Problem]:
+    if survey.boundary_deg is None or survey.meets_boundary or not survey.rated.any():
+        return []
+    bounds = _bounds(survey.boundary_deg)
+    away_m = gap_m(survey.bounds_deg, bounds)
+    exchanged = _exchanged(survey, bounds, away_m)
+    if exchanged is not None:
+        return [exchanged]
+    far = f"{away_m / 1000:.1f} km away from" if away_m > 50.0 else "beside"
+    return [
+        Problem(
+            severity="error",
+            code="far-from-field",
+            text=f"the map lies {far} the field's boundary and has no ground in common with it: "
+            "nothing would be sprayed",
+            where=f"map at {_middle(survey.bounds_deg)}, field at {_middle(bounds)}",
+            fix="give map and boundary (prescription.boundary) of the same field, or correct the "
+            "CRS with --crs",
+        )
+    ]
+
+
+def _home(survey: Survey, homes: Sequence[tuple[float, float]]) -> list[Problem]:
+    if not homes:
+        return []
+    boxes = [(longitude, latitude, longitude, latitude) for latitude, longitude in homes]
+    away_m = [gap_m(survey.bounds_deg, box) for box in boxes]
+    nearest = int(np.argmin(away_m))
+    if away_m[nearest] <= HOME_NEAR_M:
+        return []
+    exchanged = _exchanged(survey, boxes[nearest], away_m[nearest])
+    if exchanged is not None:
+        return [exchanged]
+    return [
+        Problem(
+            severity="error" if away_m[nearest] > HOME_FAR_M else "warning",
+            code="far-from-home",
+            text=f"the map lies {away_m[nearest] / 1000:.1f} km away from the home point",
+            where=f"map at {_middle(survey.bounds_deg)}, "
+            f"home at {latitude_longitude(*homes[nearest])}",
+            fix="check that the map is of this field, its CRS (--crs), and the home point (--home, "
+            "mission.depots)",
+        )
+    ]
+
+
+def _exchanged(survey: Survey, known: Bounds, away_m: float) -> Problem | None:
+    """Return the problem of a map that would be in place with its axes the other way round."""
+    west, south, east, north = survey.bounds_deg
+    turned = (south, west, north, east)
+    if max(abs(west), abs(east)) > 90.0 or away_m <= HOME_FAR_M:
+        return None
+    turned_m = gap_m(turned, known)
+    if turned_m > HOME_FAR_M:
+        return None
+    return Problem(
+        severity="error",
+        code="swapped-axes",
+        text=f"the map lies {away_m / 1000:.0f} km away; with latitude and longitude exchanged it "
+        f"would be {turned_m / 1000:.1f} km away: its file has them the wrong way round",
+        where=f"map at {_middle(survey.bounds_deg)}, expected near {_middle(known)}",
+        fix=_put_right(survey),
+    )
+
+
+def _put_right(survey: Survey) -> str:
+    """Return how to exchange the axes in the format of the map."""
+    if survey.map_file.format == "text-map":
+        return "latitude stands first in this format: exchange the two columns"
+    if survey.map_file.format == "csv" and survey.cells is not None:
+        return "exchange the names of the two columns"
+    return "export the map with the longitude first"
+
+
+def _apart(survey: Survey) -> list[Problem]:
+    west, south, east, north = survey.bounds_deg
+    reach_m = max(
+        gap_m((west, south, west, south), (east, south, east, south)),
+        gap_m((west, south, west, south), (west, north, west, north)),
+    )
+    if reach_m <= FAR_APART_M:
+        return []
+    where = f"from {south:.4f}, {west:.4f} to {north:.4f}, {east:.4f}"
+    if survey.cells is None:
+        centres = shapely.get_coordinates(shapely.centroid(survey.local))
+        middle = np.median(centres, axis=0)
+        where = survey.zone_spots([int(np.argmax(np.hypot(*(centres - middle).T)))])
+    return [
+        Problem(
+            severity="warning",
+            code="far-apart",
+            text=f"the map reaches over {reach_m / 1000:.0f} km, more than a field",
+            where=where,
+            fix="check the zone that lies far from the others, and the CRS (--crs)",
+        )
+    ]
+
+
+def _odd(survey: Survey) -> list[Problem]:
+    latitude, longitude = survey.frame.latitude_deg, survey.frame.longitude_deg
+    if abs(latitude) < 1.0 and abs(longitude) < 1.0:
+        text = "the map lies in the sea off Africa, where latitude and longitude are 0"
+        fix = "check the CRS: metres may have been written as degrees"
+    elif not abs(latitude) <= LATITUDE_MAX_DEG:
+        text = f"the map lies at latitude {latitude:.2f}, where nobody farms"
+        fix = "check whether latitude and longitude are exchanged, and the CRS"
+    else:
+        return []
+    return [
+        Problem(
+            severity="warning",
+            code="odd-place",
+            text=text,
+            where=latitude_longitude(latitude, longitude),
+            fix=fix,
+        )
+    ]
+
+
+def _bounds(area: shapely.Geometry) -> Bounds:
+    west, south, east, north = shapely.bounds(area).tolist()
+    return west, south, east, north
+
+
+def _middle(bounds: Bounds) -> str:
+    west, south, east, north = bounds
+    return latitude_longitude((south + north) / 2, (west + east) / 2)

@@ -18,10 +18,15 @@ from companion.core.frame import LocalFrame
 from missions.maps.crs import EXTENT_MAX_M
 from missions.maps.layer import Band, Grid, digest, read_bytes
 from missions.maps.model import Affine, Floats, Problem, map_error
-from missions.maps.text.point_grid import MERGES, GridLayout, cell_numbers, layout_for, merged
-from missions.maps.text.tangent import TangentPlane
-from missions.maps.text.text_lattice import text_map_of
-from missions.maps.text.text_points import TextMap, parse_text_map, write_text_map
+from missions.maps.text.text_lattice import (
+    MERGES,
+    GridLayout,
+    cell_numbers,
+    layout_for,
+    merged,
+    text_map_of,
+)
+from missions.maps.text.text_points import TangentPlane, TextMap, parse_text_map, write_text_map
 
 __all__ = ["PointGrid", "grid_of_points", "read_text_map", "text_map_of", "write_text_map"]
 
