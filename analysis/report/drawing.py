@@ -49,6 +49,13 @@ if TYPE_CHECKING:
     from analysis.track import Floats, Ints
 
 
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from analysis.report.figures.style import Drawn
+
+
 def drawn_of(assessment: Assessment, clock: Clock, treated: Treated) -> Iterator[Drawn]:
     """Yield every figure that this flight gives something to draw for."""
     flight, cells = assessment.flight, assessment.cells

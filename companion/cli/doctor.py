@@ -23,14 +23,20 @@ from companion.cli.systemd import is_ours, properties, quoted, read_unit, unit_p
 from companion.config import Config
 from companion.core.setup import Setup
 from companion.doctor.check import Check, Status, application_check, fail, is_ready, split_advice
-from companion.doctor.computer import computer_checks, read_computer, read_device, serial_check
+from companion.doctor.computer import (
+    Service,
+    computer_checks,
+    read_computer,
+    read_device,
+    serial_check,
+    service_checks,
+)
 from companion.doctor.engine_trial import engine_checks, read_engine
 from companion.doctor.gpio import gpio_checks, read_chip, read_register
 from companion.doctor.listen import listen
 from companion.doctor.outputs import output_checks
 from companion.doctor.paper import configuration_checks, map_checks, refused_configuration
 from companion.doctor.sensors import Read, read_sensors, sensor_check
-from companion.doctor.service import Service, service_checks
 from companion.doctor.vehicle import Heard, link_checks, no_link
 from companion.errors import ConfigError, LinkError
 

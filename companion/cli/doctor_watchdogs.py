@@ -6,7 +6,8 @@ import asyncio
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 from companion.cli.answer import note
 from companion.cli.ground_doing import in_words
@@ -17,19 +18,10 @@ from companion.cli.output_parts import engine_setup, servo_options
 from companion.cli.run import component_options
 from companion.cli.systemd import read_unit, systemctl, unit_path
 from companion.config import Config
-from companion.doctor.check import Check
-from companion.doctor.computer import hardware_watchdog_check, read_computer
+from companion.doctor.check import Check, Status, fail, not_applicable, ok, warn
+from companion.doctor.computer import WATCHDOG_MAX_S, hardware_watchdog_check, read_computer
 from companion.doctor.engine_trial import EngineTrial, try_engine
-from companion.doctor.script_trial import try_script
-from companion.doctor.watchdogs import (
-    Question,
-    Systemd,
-    asked_check,
-    engine_checks,
-    questions,
-    script_check,
-    systemd_checks,
-)
+from companion.doctor.script_trial import ScriptTrial, try_script
 
 _UNIT = "LoadState,ActiveState,WatchdogUSec,WatchdogTimestampMonotonic"
 
@@ -113,3 +105,215 @@ def _has_terminal() -> bool:
         return os.isatty(sys.stdin.fileno())
     except (OSError, ValueError, AttributeError):
         return False
+
+
+# Do the watchdogs bark: what was tried and what the operator said, judged.
+
+# docs/safety.md: after the death or the stop of the companion, on lines of this computer.
+CLOSED_MAX_S = 0.35
+# The script's 0.3 s, one run of it, and what a message takes.
+SCRIPT_MAX_S = 0.35
+_UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
+_BUSY = "see what else this computer does: vrspray doctor (real-time, cpu-governor, throttling)"
+_SCRIPT = "install the script anew, and set SPRW_TIMEOUT_MS to 300: deploy/ardupilot/README.md"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Systemd:
+    """What systemd says: of its hardware watchdog, and of our unit; None where it says nothing."""
+
+    runtime_watchdog: str | None = None
+    unit: Mapping[str, str] | None = None
+    now_s: float = 0.0
+    has_closer: bool = False
+
+
+def engine_checks(found: EngineTrial | None, *, lease_s: float) -> Iterator[Check]:
+    """Yield what the trial of the valve engine showed; None: no engine is used."""
+    names = ("engine-lease", "engine-killed", "engine-alive")
+    if found is None:
+        yield from (not_applicable(name, "no GPIO lines are used") for name in names)
+        return
+    if found.problem is not None:
+        yield fail(names[0], found.problem, "vrspray doctor says what the engine lacks")
+        yield from (not_applicable(name, "the engine did not start") for name in names[1:])
+        return
+    yield _closes(names[0], found.lease_s, "after a lease", f"(output.lease_s = {lease_s:g})")
+    yield _closes(names[1], found.killed_s, "after the engine was killed", "")
+    yield _alive(names[2], found)
+
+
+def _closes(name: str, after_s: float | None, when: str, more: str) -> Check:
+    if after_s is None:
+        return fail(name, f"valves stay open {when}", "do not fly; " + _BUSY)
+    text = f"closed {after_s * 1e3:.0f} ms {when} {more}".strip()
+    if not after_s <= CLOSED_MAX_S:
+        return fail(name, text, _BUSY)
+    return ok(name, text)
+
+
+def _alive(name: str, found: EngineTrial) -> Check:
+    if found.alive_changes is None:
+        return not_applicable(name, "gpio.alive_line is not set")
+    if found.alive_changes < 2:
+        return fail(name, "ALIVE does not toggle while plans come", _BUSY)
+    if found.is_alive_after:
+        return fail(name, "ALIVE toggles though the engine was killed", "do not fly; report it")
+    return ok(name, f"toggled {found.alive_changes} times while plans came, stood still after")
+
+
+def script_check(found: ScriptTrial | None, *, why: str = "", words: str = "") -> Check:
+    """Return what the trial of the watchdog script showed; `why` there was none.
+
+    `words` are the reasons for which the vehicle is not one to try it at.
+    """
+    name = "script-closes"
+    if found is None or found.is_px4:
+        px4 = "PX4 has no script: a driver board with alive dither does it"
+        return not_applicable(name, why if found is None else px4)
+    if found.reasons:
+        what, _, fix = words.partition("; ")
+        return fail(name, f"not tried: {what}", fix or "see docs/doctor.md")
+    if found.problem is not None:
+        return fail(name, f"not tried: {found.problem}", "vrspray doctor says what is wrong")
+    if found.closed_s is None or found.open_s is None:
+        return fail(name, "an output stays as ordered when the sign of life stops", _SCRIPT)
+    text = f"closed {found.open_s:.2f} to {found.closed_s:.2f} s after the last sign of life"
+    if not found.open_s <= SCRIPT_MAX_S:
+        return fail(name, text, _SCRIPT)
+    return ok(name, text)
+
+
+def systemd_checks(found: Systemd) -> Iterator[Check]:
+    """Yield the checks of systemd's own watchdogs."""
+    yield _runtime(found.runtime_watchdog)
+    yield _fed(found)
+    name = "service-closer"
+    if found.unit is None or found.unit.get("LoadState") != "loaded":
+        yield not_applicable(name, "the service is not installed")
+    elif found.has_closer:
+        yield ok(name, "ExecStopPost closes the lines after every end")
+    else:
+        fix = "vrspray service install writes it anew"
+        yield warn(name, "the unit has no ExecStopPost that closes", fix)
+
+
+def _runtime(value: str | None) -> Check:
+    name = "system-watchdog"
+    fix = f"write RuntimeWatchdogSec={WATCHDOG_MAX_S} into /etc/systemd/system.conf, then restart"
+    if value is None:
+        return not_applicable(name, "there is no systemd on this computer")
+    seconds = seconds_of(value)
+    if seconds is None or not seconds > 0.0:
+        return warn(name, "systemd feeds no hardware watchdog: a hung kernel stays hung", fix)
+    if not seconds <= WATCHDOG_MAX_S:
+        return warn(name, f"{value}: a Raspberry Pi's counter holds {WATCHDOG_MAX_S} s", fix)
+    return ok(name, f"RuntimeWatchdogSec is {value}")
+
+
+def _fed(found: Systemd) -> Check:
+    name, unit = "watchdog-feed", found.unit
+    if unit is None or unit.get("LoadState") != "loaded":
+        return not_applicable(name, "the service is not installed")
+    limit_s = seconds_of(unit.get("WatchdogUSec", ""))
+    if limit_s is None or not limit_s > 0.0:
+        return warn(name, "the unit has no WatchdogSec", "vrspray service install writes it anew")
+    if unit.get("ActiveState") != "active":
+        why = "the service does not run: start it, and ask again with --watchdogs"
+        return not_applicable(name, why)
+    stamp = unit.get("WatchdogTimestampMonotonic", "")
+    age_s = found.now_s - int(stamp) / 1e6 if stamp.isdecimal() and int(stamp) else None
+    if age_s is None or not 0.0 <= age_s <= limit_s:
+        return fail(name, "the control loop feeds it no more", "see journalctl -u vrspray")
+    return ok(name, f"fed {age_s:.1f} s ago, WatchdogSec is {limit_s:g}")
+
+
+def seconds_of(text: str) -> float | None:
+    """Return a time as systemd writes it; None for anything else, such as `infinity`.
+
+    >>> seconds_of("1min 30s"), seconds_of("250ms"), seconds_of("0"), seconds_of("infinity")
+    (90.0, 0.25, 0.0, None)
+    """
+    if text.strip() == "0":
+        return 0.0
+    total = 0.0
+    for word in text.split():
+        number = word.rstrip("abcdefghijklmnopqrstuvwxyz")
+        unit = _UNITS_S.get(word[len(number) :])
+        if unit is None or not number.replace(".", "", 1).isdecimal():
+            return None
+        total += float(number) * unit
+    return total if text.strip() else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """What only a person can see: what to do, what to look at, and what to do about a no."""
+
+    name: str
+    text: str
+    fix: str
+    applies: bool = True
+    otherwise: str = ""
+
+
+def questions(
+    *,
+    has_dither: bool,
+    is_servo: bool,
+    has_cutoff: bool,
+    has_alive: bool,
+    has_estop: bool,
+) -> tuple[Question, ...]:
+    """Return all questions; those without a meaning here say why."""
+    return (
+        Question(
+            name="board-dither",
+            text="Let a valve run (vrspray ground prime --valve NAME) and pull the cable between "
+            "flight controller and driver board's orders, or kill -STOP the companion: did it "
+            "close within half a second",
+            fix="do not fly: see output.dither_us and docs/driver-board.md",
+            applies=is_servo and has_dither,
+            otherwise="output.dither_us is 0, or no servo outputs are used",
+        ),
+        Question(
+            name="dead-man",
+            text="Let a valve run and pull the wire of ALIVE: did pump and master valve drop "
+            "within half a second",
+            fix="do not fly: see the monostable and its relay (docs/gpio.md)",
+            applies=has_alive,
+            otherwise="gpio.alive_line is not set",
+        ),
+        Question(
+            name="pump-cutoff-works",
+            text="With the pump on and the companion off, throw the pump's cut-off: did it stop",
+            fix="do not fly: with open valves nothing else ends the spraying",
+            applies=has_cutoff,
+            otherwise="safety.pump_cutoff is not declared",
+        ),
+        Question(
+            name="estop-works",
+            text="Press the emergency stop with the pump on: did the pump stop at once",
+            fix="do not fly: see its wiring (docs/safety.md)",
+            applies=has_estop,
+            otherwise="safety.estop_line is not set",
+        ),
+    )
+
+
+def asked_check(question: Question, said: bool | None, *, why: str = "not answered") -> Check:
+    """Return what an answer makes of a question; None: there was none, and `why`."""
+    if not question.applies:
+        return not_applicable(question.name, question.otherwise)
+    if said is None:
+        # Nobody has looked: whether it works is as unknown as before.
+        return Check(
+            name=question.name,
+            status=Status.WARN,
+            text=why,
+            fix=f"try it, and answer at a terminal: {question.text}?",
+            is_open=True,
+        )
+    if said:
+        return ok(question.name, "the operator has seen it")
+    return fail(question.name, "the operator has not seen it", question.fix)

@@ -39,8 +39,7 @@ from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_budget import dither_too_much
 from companion.output.servo import DITHER_S
-from companion.ports import PlanExecutor
-from companion.record.commit_pace import commit_every_s
+from companion.ports import COMMIT_EVERY_S, PlanExecutor
 from companion.record.continuing import Treated, continued, read_treated_ground, rest_of
 from companion.record.folder import journals
 from companion.record.journal import Journal
@@ -378,3 +377,21 @@ def _left(found: Treated) -> Unfinished | None:
     if not left_m2 > LEFT_MIN_SHARE * field.area:
         return None
     return Unfinished(path=found.path, left_share=left_m2 / field.area, left_ha=left_m2 / 10_000.0)
+
+
+# How often a flight is committed: once a second, sooner where that is too much of the field.
+
+COMMIT_LEAST_S = 0.1
+# Of the field: the swath of half the time between two commits, which is how far what is known
+# after a cut of power may be from what was treated (`companion.runtime.coverage_ahead_s`). On
+# 0.3 ha, at 5 m/s with 6 m, that is a commit each 0.2 s; from 1.5 ha on it is one a second.
+UNKNOWN_SHARE = 0.001
+
+
+def commit_every_s(setup: Setup, speed_m_s: float | None) -> float:
+    """Return the time between two commits; `speed_m_s` None: the most that is sprayed at."""
+    if not setup.records_coverage:
+        return COMMIT_EVERY_S
+    fastest_m_s = setup.limits.speed_max_m_s if speed_m_s is None else speed_m_s
+    half_s = UNKNOWN_SHARE * setup.prescription.field.area / (setup.boom.width_m * fastest_m_s)
+    return min(max(2.0 * half_s, COMMIT_LEAST_S), COMMIT_EVERY_S)

@@ -10,7 +10,7 @@ import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
-from companion.link.decode import FROM_ANYONE, FROM_VEHICLE
+from companion.link.codec import FROM_ANYONE, FROM_VEHICLE
 
 READ = tuple(sorted({*FROM_VEHICLE, *FROM_ANYONE}))
 _ALL = tuple(sorted(mavlink.mavlink_map))

@@ -24,8 +24,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from analysis.calibration.flow_record import record_of
-from analysis.calibration.identify import Identified, identify
-from analysis.calibration.lag_fit import trimmed_ml
+from analysis.calibration.identify import Identified, identify, trimmed_ml
 from analysis.calibration.steps import Kind
 from companion.config import load
 from companion.core.types import Decision, FlowReport
@@ -41,7 +40,7 @@ from tests.bench.identification_figures import Compared, all_four, summary
 from tests.bench.sprayers import PLANT, nominal_lag, scaled_flow, scaled_lag, with_sprayer
 
 if TYPE_CHECKING:
-    from analysis.calibration.lag_fit import Fit
+    from analysis.calibration.identify import Fit
     from analysis.flight_record import FlightRecord, Floats
     from companion.core.setup import Setup
     from companion.core.types import Input

@@ -21,13 +21,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.cli.run import commit_every_s
 from companion.core.controller import Memory, expected_coverage
 from companion.core.options.coverage import Coverage
 from companion.core.options.overlap import OverlapGuard
 from companion.core.setup import Setup
 from companion.core.types import Input, OperatorCommand, VehicleState
 from companion.ports import COMMIT_EVERY_S
-from companion.record.commit_pace import commit_every_s
 from companion.record.continuing import SWITCH_OFF_PERCENT
 from companion.runtime import COVERAGE_EVERY_S, coverage_ahead_s
 from sitl.demo_field import START_S, demo_route

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from analysis.calibration.flow_record import FlowRecord
-from analysis.calibration.identify import identify
-from analysis.calibration.lag_fit import Meter
+from analysis.calibration.identify import Meter, identify
 from analysis.calibration.result import settings as to_paste
 from companion.core.schedule import LagModel
 from tests.unit.calibration_bench import PERIOD_S, Bench, metered

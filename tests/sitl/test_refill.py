@@ -8,13 +8,12 @@ from dataclasses import dataclass
 
 import pytest
 
-from companion.cli.sensor_parts import follow_refills
+from companion.cli.sensor_parts import TankSensor, follow_refills
 from companion.core.options.liquid_evidence import Detection
 from companion.core.types import FaultKind, Inhibit, TankReport
 from companion.link.component import ComponentOptions
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.runtime import run
-from companion.sensors.tank import TankSensor
 from tests import builders
 from tests.sitl.test_run_flight import CHANNELS, Notes
 from tests.sitl.wire_peer import WirePeer, over_wire

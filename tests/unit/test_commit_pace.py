@@ -7,10 +7,10 @@ from dataclasses import replace
 import pytest
 from shapely.geometry import box
 
+from companion.cli.run import COMMIT_LEAST_S, UNKNOWN_SHARE, commit_every_s
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
 from companion.ports import COMMIT_EVERY_S
-from companion.record.commit_pace import COMMIT_LEAST_S, UNKNOWN_SHARE, commit_every_s
 from tests.builders import setup
 
 SPEED_M_S = 5.0

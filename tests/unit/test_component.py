@@ -19,8 +19,8 @@ from companion.core.types import (
     Telemetry,
 )
 from companion.link.announcer import reasons
+from companion.link.codec import FROM_ANYONE, FROM_VEHICLE
 from companion.link.component import Component, ComponentOptions
-from companion.link.decode import FROM_ANYONE, FROM_VEHICLE
 from companion.link.vehicle_link import VehicleLink
 from tests import builders
 

@@ -12,11 +12,12 @@ from companion.doctor.computer import (
     Computer,
     Folder,
     HardwareWatchdog,
+    Service,
     computer_checks,
     read_computer,
+    service_checks,
     try_folder,
 )
-from companion.doctor.service import Service, service_checks
 
 GOOD = Computer(
     python=(3, 11, 7),

@@ -10,13 +10,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import HeartbeatReport, Input, LandedReport, SprayPlan
-from companion.doctor import engine_trial
-from companion.doctor.check import Check, Status, is_ready
-from companion.doctor.engine_trial import EngineTrial, try_engine
-from companion.doctor.script_trial import ScriptTrial, try_script
-from companion.doctor.watchdogs import (
+from companion.cli.doctor_watchdogs import (
     Systemd,
     asked_check,
     engine_checks,
@@ -25,6 +19,12 @@ from companion.doctor.watchdogs import (
     seconds_of,
     systemd_checks,
 )
+from companion.core.nozzle import PwmLimits
+from companion.core.types import HeartbeatReport, Input, LandedReport, SprayPlan
+from companion.doctor import engine_trial
+from companion.doctor.check import Check, Status, is_ready
+from companion.doctor.engine_trial import EngineTrial, try_engine
+from companion.doctor.script_trial import ScriptTrial, try_script
 from companion.ground.work import GroundSetup
 from companion.output.autopilot_options import ServoOptions
 from companion.output.engine.setup import EngineSetup

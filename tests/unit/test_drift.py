@@ -22,8 +22,7 @@ from companion.core.safety import Limits
 from companion.core.types import Inhibit, Input, VehicleState, WindReport
 from companion.record.setup_json import field_names_of, setup_to_json
 from missions.maps.compiling import compiled_setup
-from sitl.ballistics import Air, fall, spectrum_um
-from sitl.droplets import TRUTHS, landed, law, shift_of, with_wind
+from sitl.droplets import TRUTHS, Air, fall, landed, law, shift_of, spectrum_um, with_wind
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import lags as true_lags
 from sitl.profile import load_profile

@@ -20,7 +20,7 @@ import pytest
 from isoxml.models.ddi_entities import DDEntity
 from isoxml.util.isoxml_io import isoxml_from_path
 
-from analysis.exports.isoxml_log import logged, records
+from analysis.exports.isoxml_task import logged, records
 from analysis.exports.output import write_beside, write_folder
 from analysis.exports.registry import format_for
 from analysis.exports.source import Source

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from companion.core.types import SprayPlan, TimedChange, UtcReport
-from companion.link.decode import FROM_VEHICLE
+from companion.link.codec import FROM_VEHICLE
 from companion.output.engine.wire import Issued
 from companion.output.gpio import GpioExecutor
 from companion.output.none import DryRunExecutor

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.core.types import TimedChange
-from companion.link import outputs, px4
+from companion.link import outputs
 from companion.link.component import Component, ComponentOptions
 from companion.link.encode import Encoder
 from companion.link.outputs import ParameterReader
@@ -81,7 +81,7 @@ def test_one_command_carries_all_six_values_and_nothing_unknown() -> None:
         frames.append(frame)
         return True
 
-    orders = px4.ActuatorOrders(encoder, send, closed_us=1000, full_us=2000)
+    orders = outputs.ActuatorOrders(encoder, send, closed_us=1000, full_us=2000)
     assert orders.order(1, 1000)
     assert orders.order(3, 1500)
     assert orders.order(4, 1875)
@@ -98,21 +98,21 @@ def test_one_command_carries_all_six_values_and_nothing_unknown() -> None:
 
 def test_there_is_no_seventh_actuator() -> None:
     encoder = Encoder(system_id=1, component_id=191)
-    orders = px4.ActuatorOrders(encoder, lambda _: True, closed_us=1000, full_us=2000)
+    orders = outputs.ActuatorOrders(encoder, lambda _: True, closed_us=1000, full_us=2000)
     assert [orders.order(channel, 1500) for channel in (0, 7, 9)] == [False] * 3
 
 
 def test_a_driver_that_is_closed_at_the_long_pulse_is_closed_at_plus_one() -> None:
     encoder = Encoder(system_id=1, component_id=191)
-    orders = px4.ActuatorOrders(encoder, lambda _: True, closed_us=1900, full_us=1100)
+    orders = outputs.ActuatorOrders(encoder, lambda _: True, closed_us=1900, full_us=1100)
     assert [orders.value(pulse) for pulse in (1900, 1500, 1100, 2500)] == [1.0, 0.0, -1.0, 1.0]
 
 
 @given(st.integers(-(2**31), 2**31 - 1).filter(lambda n: not _is_signalling(n)))
 def test_a_whole_number_survives_where_px4_puts_it(number: int) -> None:
     (value,) = struct.unpack("<f", struct.pack("<i", number))
-    assert px4.parameter_value(value, 6) == number
-    assert px4.parameter_value(float(number), 9) == float(number)
+    assert outputs.px4_parameter_value(value, 6) == number
+    assert outputs.px4_parameter_value(float(number), 9) == float(number)
     assert outputs.parameter_value(float(number), 6) == float(number)
 
 

@@ -11,13 +11,11 @@ from types import ModuleType
 
 import pytest
 
-from companion.cli.sensor_parts import PressureSensor
+from companion.cli.sensor_parts import PressureSensor, TankSensor
 from companion.core.types import PressureReport, TankReport
 from companion.errors import SensorError
 from companion.sensors.current_loop import CurrentLoop
-from companion.sensors.gauge import Gauge
-from companion.sensors.tank import TankSensor
-from companion.sensors.voltage import I2cVoltage, IioVoltage
+from companion.sensors.voltage import Gauge, I2cVoltage, IioVoltage
 
 LOOP = CurrentLoop(name="pressure", shunt_ohm=100.0, at_4_ma=0.0, at_20_ma=1000.0)
 
@@ -168,7 +166,7 @@ async def test_a_bus_that_hangs_does_not_delay_the_end() -> None:
 async def test_a_bus_that_hangs_from_the_beginning_is_said_and_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("companion.sensors.gauge.OPEN_MAX_S", 0.05)
+    monkeypatch.setattr("companion.sensors.voltage.OPEN_MAX_S", 0.05)
     source = HangingBus(hangs=True)
     made = Gauge(LOOP, source, rate_hz=200.0, window_s=0.3)
     try:

@@ -10,18 +10,17 @@ from types import SimpleNamespace
 import pytest
 
 from companion import runtime
-from companion.cli.sensor_parts import PressureSensor, build_sensors
+from companion.cli.sensor_parts import PressureSensor, TankSensor, build_sensors
 from companion.config import load
 from companion.config.rules import without_effect
 from companion.core.estimator import Track, observe
 from companion.core.inputs import AutopilotLiquid
 from companion.core.types import BatteryReport, Decision, FlowReport, Input, PressureReport
 from companion.errors import ConfigError, SensorError
-from companion.link.decode import FROM_VEHICLE
+from companion.link.codec import FROM_VEHICLE
 from companion.link.streams import wanted_streams
 from companion.ports import Sensor
 from companion.sensors.flow_meter import FlowMeter
-from companion.sensors.tank import TankSensor
 from missions.maps.compiling import compiled_setup
 from tests.builders import position, setup
 

@@ -10,10 +10,9 @@ import pytest
 
 from companion.errors import ConfigError, VrsprayError
 from sitl.anyang import anyang_items
-from sitl.serve import ServeOptions, _Run
+from sitl.serve import Operator, ServeOptions, Step, _Run
 from sitl.serve_mission import home_of_file
 from sitl.stub.mission_items import MissionItem
-from sitl.stub.operator import Operator, Step
 from sitl.stub.protocol import dialect
 from tests.unit.stub_bench import Bench, mission
 

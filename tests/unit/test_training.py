@@ -16,11 +16,11 @@ from analysis.report import contents
 from companion.cli import ground_doing
 from companion.cli.app import execute
 from companion.cli.run import component_options, training_mark
+from companion.cli.sensor_parts import TankSensor
 from companion.config import load
 from companion.link.component import Component, ComponentOptions
 from companion.record.journal import Journal
 from companion.record.reader import read_journal
-from companion.sensors.tank import TankSensor
 from tests import builders
 from tests.unit import report_flight
 from tests.unit.test_component import Peer
