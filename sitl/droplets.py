@@ -2,7 +2,7 @@
 
     python -m sitl.droplets
 
-The first table compares the controller's offset with ballistic droplets (`sitl/ballistics.py`)
+The first table compares the controller's offset with ballistic droplets (`sitl/droplets.py`)
 that fall as assumed, and otherwise. The second flies the field of Wang et al. 2024 with and
 without the offset, moves the liquid to where its droplets land, and judges the ground.
 """
