@@ -6,6 +6,7 @@ the companion's monotonic clock, unless a name says otherwise (`boot_s`: the aut
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
@@ -203,6 +204,21 @@ class SprayPlan:
                 break
             duty[change.valve] = change.duty
         return tuple(duty)
+
+    def duties_until(self, until_s: float) -> Iterator[tuple[float, tuple[float, ...]]]:
+        """Yield (time, duty of each valve) of all that the plan brings about by a time, in order.
+
+        The first is that of its issue, the last, where the lease has ended by then, is closed.
+        """
+        duty = list(self.duty)
+        yield self.issued_s, self.duty
+        for change in self.changes:
+            if change.at_s > until_s or change.at_s >= self.lease_until_s:
+                break
+            duty[change.valve] = change.duty
+            yield max(change.at_s, self.issued_s), tuple(duty)
+        if self.lease_until_s <= until_s:
+            yield self.lease_until_s, (0.0,) * len(duty)
 
     def fraction_at(self, drive: int, at_s: float) -> float:
         """Return what the plan has brought a drive to by a time; 0 after it, or without it."""

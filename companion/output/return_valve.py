@@ -37,22 +37,16 @@ def spray_spans(plan: SprayPlan, from_s: float) -> list[Span]:
     ...                       lease_until_s=1.3), 1.0)
     [Span(start_s=1.1, end_s=1.2)]
     """
-    duty = list(plan.duty)
     spans: list[Span] = []
-    since_s = from_s if any(duty) else None
-    for change in plan.changes:
-        if not change.at_s < plan.lease_until_s:
-            break
-        duty[change.valve] = change.duty
-        at_s = max(change.at_s, from_s)
+    since_s: float | None = None
+    for begins_s, duty in plan.duties_until(plan.lease_until_s):
+        at_s = max(begins_s, from_s)
         if since_s is None and any(duty):
             since_s = at_s
         elif since_s is not None and not any(duty):
             if at_s > since_s:
                 spans.append(Span(since_s, at_s))
             since_s = None
-    if since_s is not None and since_s < plan.lease_until_s:
-        spans.append(Span(since_s, plan.lease_until_s))
     return spans
 
 

@@ -26,23 +26,6 @@ _KEPT = 4096
 _logger = logging.getLogger(__name__)
 
 
-def duties_at(plan: SprayPlan, now_s: float) -> tuple[float, ...]:
-    """Return the duty of each valve at `now_s`: all zero once the lease has ended.
-
-    >>> plan = SprayPlan(sequence=1, issued_s=0.0, duty=(0.5,), changes=(), lease_until_s=0.3)
-    >>> duties_at(plan, 0.2), duties_at(plan, 0.3)
-    ((0.5,), (0.0,))
-    """
-    if not now_s < plan.lease_until_s:
-        return (0.0,) * len(plan.duty)
-    duty = list(plan.duty)
-    for change in plan.changes:
-        if not change.at_s <= now_s:
-            break
-        duty[change.valve] = change.duty
-    return tuple(duty)
-
-
 def fractions_at(plan: SprayPlan, now_s: float, count: int) -> tuple[float, ...]:
     """Return what each of `count` drives is to have at `now_s`: all stopped after the lease.
 
@@ -199,7 +182,7 @@ class TimedExecutor:
         """Return the duties to have now; without a plan, and with a fault, closed."""
         if self._plan is None or self.fault is not None:
             return (0.0,) * self._count
-        return duties_at(self._plan, now_s + _EARLY_S)
+        return self._plan.duty_at(now_s + _EARLY_S)
 
     def _follow(self, now_s: float, *, replaced: SprayPlan | None = None) -> None:
         """Bring every valve to what it should have now."""

@@ -21,7 +21,6 @@ from companion.core.options.liquid_evidence import (
     Watching,
     bin_length_s,
     collected,
-    duties_of,
     expected_ml,
     name_of,
     valve_of,
@@ -592,8 +591,8 @@ def test_changes_of_a_plan_count_from_their_own_times_until_its_lease_ends() -> 
         ),
         lease_until_s=10.3,
     )
-    assert list(duties_of(plan, 10.1)) == [(10.0, (0.0, 0.5)), (10.0, (0.3, 0.5))]
-    assert list(duties_of(plan, 11.0))[2:] == [(10.2, (0.3, 0.0)), (10.3, (0.0, 0.0))]
+    assert list(plan.duties_until(10.1)) == [(10.0, (0.0, 0.5)), (10.0, (0.3, 0.5))]
+    assert list(plan.duties_until(11.0))[2:] == [(10.2, (0.3, 0.0)), (10.3, (0.0, 0.0))]
 
 
 def test_expected_volume_is_that_of_the_orders_in_their_time() -> None:

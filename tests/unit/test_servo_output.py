@@ -10,7 +10,7 @@ import pytest
 
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.servo import ServoExecutor, ServoOptions
-from companion.output.timed import duties_at, next_event_s
+from companion.output.timed import next_event_s
 from tests.builders import now, plan
 
 CHANNELS = (9, 10)
@@ -393,7 +393,7 @@ def test_changes_happen_in_their_order_until_the_lease_ends() -> None:
         TimedChange(at_s=9.0, valve=0, duty=0.9),
     )
     given = SprayPlan(sequence=1, issued_s=0.0, duty=(0.2,), changes=changes, lease_until_s=2.0)
-    assert [duties_at(given, t)[0] for t in (0.5, 1.0, 1.4, 1.5, 1.99, 2.0, 9.5)] == [
+    assert [given.duty_at(t)[0] for t in (0.5, 1.0, 1.4, 1.5, 1.99, 2.0, 9.5)] == [
         0.2,
         0.5,
         0.5,

@@ -10,7 +10,7 @@ import pytest
 
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from companion.output import timed
-from companion.output.timed import Lateness, TimedExecutor, duties_at, next_event_s
+from companion.output.timed import Lateness, TimedExecutor, next_event_s
 
 
 class Loop:
@@ -113,12 +113,12 @@ def started(loop: Loop, *, has_return: bool = False, gathers: bool = False) -> O
 
 def test_duties_follow_the_changes_up_to_and_with_now_until_the_lease_ends() -> None:
     given = plan(1, (0.2, 0.3), (10.1, 0, 0.5), (10.2, 1, 0.0), (10.25, 0, 0.7))
-    assert duties_at(given, 10.0999) == (0.2, 0.3)
-    assert duties_at(given, 10.1) == (0.5, 0.3)
-    assert duties_at(given, 10.2) == (0.5, 0.0)
-    assert duties_at(given, 10.2999) == (0.7, 0.0)
-    assert duties_at(given, 10.3) == (0.0, 0.0)
-    assert duties_at(given, float("nan")) == (0.0, 0.0)
+    assert given.duty_at(10.0999) == (0.2, 0.3)
+    assert given.duty_at(10.1) == (0.5, 0.3)
+    assert given.duty_at(10.2) == (0.5, 0.0)
+    assert given.duty_at(10.2999) == (0.7, 0.0)
+    assert given.duty_at(10.3) == (0.0, 0.0)
+    assert given.duty_at(float("nan")) == (0.0, 0.0)
 
 
 def test_the_next_event_is_the_next_change_or_the_end_of_the_lease() -> None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.options.flow_meter import ML_S_PER_L_MIN, STALE_S, is_usable
 from companion.core.schedule import LagModel
-from companion.core.types import FaultKind, FlowReport, PressureReport, SprayPlan
+from companion.core.types import FaultKind, FlowReport, PressureReport
 
 # Whole periods of about this time: short enough to see a fault within a second, long enough that
 # 1 % of noise a period and the meter's pulses leave about 1 %.
@@ -92,19 +92,6 @@ def bin_length_s(period_s: float, wanted_s: float = BIN_S) -> float:
     3.0
     """
     return max(round(wanted_s / period_s), 1) * period_s
-
-
-def duties_of(plan: SprayPlan, until_s: float) -> Iterable[tuple[float, tuple[float, ...]]]:
-    """Yield (time, duty of each valve) of what `plan` has brought about by `until_s`."""
-    duty = list(plan.duty)
-    yield plan.issued_s, tuple(duty)
-    for change in plan.changes:
-        if change.at_s > until_s or change.at_s >= plan.lease_until_s:
-            break
-        duty[change.valve] = change.duty
-        yield max(change.at_s, plan.issued_s), tuple(duty)
-    if plan.lease_until_s <= until_s:
-        yield plan.lease_until_s, (0.0,) * len(duty)
 
 
 def with_orders(

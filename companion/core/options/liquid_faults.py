@@ -21,7 +21,6 @@ from companion.core.options.liquid_evidence import (
     Evidence,
     Watching,
     collected,
-    duties_of,
     heard,
     name_of,
     name_of_nothing,
@@ -374,7 +373,7 @@ def _ordered(
     before = memory.collecting.orders
     orders = with_orders(
         before,
-        (watching.order(at_s, duties, index) for at_s, duties in duties_of(plan, now_s)),
+        (watching.order(at_s, duties, index) for at_s, duties in plan.duties_until(now_s)),
         keep_from_s=now_s - _kept_s(watching),
     )
     changed_s, open_s = memory.changed_s, memory.open_s

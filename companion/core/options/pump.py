@@ -267,19 +267,13 @@ def behind_path(plan: SprayPlan, drive: DrivePlan) -> DrivePlan:
     >>> [change.at_s for change in behind_path(plan, DrivePlan(fraction=0.5)).changes]
     [0.2]
     """
-    duty = list(plan.duty)
     # At one moment the valves go first: an opening one is open for the pump that starts with it.
     times = {change.at_s for change in plan.changes} | {change.at_s for change in drive.changes}
-    start = drive.fraction if any(duty) else 0.0
+    start = drive.fraction if any(plan.duty) else 0.0
     made: list[DriveChange] = []
     stands = start
-    valves = iter(plan.changes)
-    ahead = next(valves, None)
     for at_s in sorted(times):
-        while ahead is not None and ahead.at_s <= at_s:
-            duty[ahead.valve] = ahead.duty
-            ahead = next(valves, None)
-        wanted = drive.at(at_s) if any(duty) else 0.0
+        wanted = drive.at(at_s) if any(plan.duty_at(at_s)) else 0.0
         if wanted != stands:
             made.append(DriveChange(at_s=at_s, fraction=wanted))
             stands = wanted
