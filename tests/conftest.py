@@ -16,8 +16,6 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.virtual_time import JumpingLoop
-
 LoopFactory = Callable[[], asyncio.AbstractEventLoop]
 SAMPLES_VARIABLE = "VRSPRAY_SAMPLES"
 GRACE_S = 2.0
@@ -56,6 +54,9 @@ def pytest_unconfigure() -> None:
 def pytest_asyncio_loop_factories(item: pytest.Item) -> Mapping[str, LoopFactory]:
     """Have tests that are marked so run on virtual time, all others on that of the computer."""
     if item.get_closest_marker("virtual_time") is not None:
+        # Only here: this file serves projects of one test as well.
+        from tests.virtual_time import JumpingLoop
+
         return {"virtual": JumpingLoop}
     return {"real": asyncio.new_event_loop}
 
