@@ -56,11 +56,13 @@ class LinkTable(Table):
 class PrescriptionTable(Table):
     """The map, and how it is read."""
 
-    file: Text = Field(description="the map, relative to this file")
+    file: Text = Field(
+        description="the flight map (.flightmap.gpkg), or a map to compile first; relative to this file"
+    )
     sha256: str | None = Field(
         default=None,
         pattern=r"^[0-9a-f]{8,64}$",
-        description="first digits of the hash that `map check` shows; another map is refused",
+        description="first digits of the hash of the map or the flight map; another map is refused",
     )
     rate_field: Text | None = Field(
         default=None, description="where the map has several candidates"

@@ -32,10 +32,10 @@ from companion.flight_map.sources import named_files, sources_of
 
 _logger = logging.getLogger(__name__)
 
-_FOLDER = "flight-maps"
+_FOLDER = "flightmaps"
 _KEPT_MAX = 8
-# A raster of 16 million cells takes a small computer a minute.
-_TIMEOUT_S = 900.0
+# systemd waits 120 s for a start (companion/cli/vrspray.service).
+_TIMEOUT_S = 100.0
 _WRITTEN = (0, 1)
 _COMPILER = ("map", "compile")
 
@@ -181,7 +181,8 @@ def _run(named: str, order: Sequence[str], out: Path) -> None:
     if not isinstance(text, str):
         raise _failed(named, f"the compiler ended with {done.returncode}")
     if isinstance(problems, list) and problems:
-        raise MapError(text, code=str(problems[0]["code"]), fix=str(problems[0]["fix"]))
+        reason, fix = (str(problems[0][key]) for key in ("code", "fix"))
+        raise MapError(text, code=reason, fix=fix)
     raise ConfigError(text)
 
 

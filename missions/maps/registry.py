@@ -14,10 +14,12 @@ from shapely import MultiPolygon
 from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
+from companion.flight_map import is_flight_map
 from missions.maps.adapt.geoparquet import read_geoparquet
 from missions.maps.adapt.reader import read_adapt
 from missions.maps.assemble import crs_of, ground_of, map_of, zone_names
 from missions.maps.bundle import Bundle, open_bundle
+from missions.maps.compiled import read_compiled
 from missions.maps.crs import to_longitude_latitude
 from missions.maps.csvfile.reader import read_csv
 from missions.maps.declared import Given
@@ -96,6 +98,8 @@ def read_map(
     rates by weight, width and speed for rates by time; how P2's text map makes its cells.
     """
     path = Path(path)
+    if is_flight_map(path):
+        return read_compiled(path)
     given = Given(
         unit=unit,
         density_kg_l=density_kg_l,

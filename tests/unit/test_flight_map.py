@@ -15,6 +15,7 @@ import shapely
 from companion.assembly import build_setup
 from companion.cli.app import execute
 from companion.config import load
+from companion.config.tables import PrescriptionTable
 from companion.core.prescription import Prescription
 from companion.errors import ConfigError, MapError
 from companion.flight_map import (
@@ -27,7 +28,14 @@ from companion.flight_map import (
 from companion.flight_map import child as child_module
 from companion.problem import Problem
 from missions.maps.build import build_prescription, frame_for
-from missions.maps.compiling import MapOrder, compile_map, compiled_setup, read_configured_map
+from missions.maps.compiling import (
+    MapOrder,
+    compile_map,
+    compiled_setup,
+    read_configured_map,
+    read_ordered_map,
+)
+from missions.maps.registry import read_map
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 ANYANG = EXAMPLES / "anyang" / "config.toml"
@@ -286,3 +294,62 @@ def test_a_flight_map_that_was_changed_is_refused(sql: str, tmp_path: Path) -> N
         read_flight_map(path)
     assert "\n" not in str(refused.value)
     assert refused.value.code == "flight-map"
+
+
+# What the files of the samples leave open.
+SAMPLES: list[tuple[str, dict[str, object]]] = [
+    ("01_shp_lha_multipolygon/Rx.shp", {}),
+    ("03_shp_value_noUnit/20250415_211530.shp", {"unit": "L/ha"}),
+    ("07_isoxml_v3_onesoil", {"layer": "TSK2"}),
+    ("08_isoxml_v4_tzn_vector_map1", {"density_kg_l": 1.2}),
+    ("10_geojson", {"unit": "L/ha"}),
+    (
+        "14_geotiff_adapt",
+        {
+            "layer": "RasterRx-15.tiff",
+            "rate_field": "Product 2",
+            "density_kg_l": 1.2,
+        },
+    ),
+    ("06_isoxml_v3_grid2_lha", {}),
+]
+
+
+@pytest.mark.parametrize(("name", "answers"), SAMPLES, ids=[name for name, _ in SAMPLES])
+def test_real_maps_come_back_to_the_last_bit(
+    name: str, answers: dict[str, object], samples: Path, tmp_path: Path
+) -> None:
+    table = PrescriptionTable.model_validate(
+        {"file": str(samples / name), "overlap": "max", **answers}
+    )
+    order = MapOrder(table=table)
+    map_file = read_ordered_map(order)
+    source = build_prescription(map_file, frame_for(map_file), overlap="max")
+    path = tmp_path / "a.flightmap.gpkg"
+    write_flight_map(path, compile_map(order, map_file=map_file))
+    again = read_flight_map(path)
+    assert_same(again.prescription, source)
+    assert_same(
+        again.moved(3.0, 4.0),
+        build_prescription(
+            map_file, frame_for(map_file), overlap="max", offset_east_m=3.0, offset_north_m=4.0
+        ),
+    )
+
+
+def test_a_flight_map_can_be_looked_at_and_planned_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight_map = written(tmp_path)
+    found = read_map(flight_map.path)
+    source = read_configured_map(load(ANYANG))
+    assert (found.format, found.unit, found.rates_l_ha) == ("flight map", "L/ha", source.rates_l_ha)
+    for zone, other in zip(found.zones, source.zones, strict=True):
+        assert zone.name == other.name
+        assert zone.geometry.symmetric_difference(other.geometry).area < 1e-15
+    config = config_naming(tmp_path, flight_map.path.name)
+    assert execute(["map", "check", str(flight_map.path), "--config", str(config)]) == 0
+    boundary = tmp_path / "boundary.geojson"
+    boundary.write_bytes((EXAMPLES / "anyang" / "boundary.geojson").read_bytes())
+    order = ["plan", str(boundary), "--config", str(config), "--out", str(tmp_path / "a.plan")]
+    assert execute(order) == 0, capsys.readouterr().err

@@ -8,8 +8,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = [
-    *sorted((ROOT / "companion" / "maps").rglob("*.py")),
-    *sorted((ROOT / "companion" / "cli").glob("map*.py")),
+    *sorted((ROOT / "missions" / "maps").rglob("*.py")),
+    *sorted((ROOT / "companion" / "flight_map").rglob("*.py")),
     ROOT / "companion" / "assembly.py",
     ROOT / "companion" / "errors.py",
 ]
