@@ -57,7 +57,7 @@ class PrescriptionTable(Table):
     """The map, and how it is read."""
 
     file: Text = Field(
-        description="the flight map (.flightmap.gpkg), or a map to compile first; relative to this file"
+        description="the flight map, or a map to compile first, relative to this file"
     )
     sha256: str | None = Field(
         default=None,
