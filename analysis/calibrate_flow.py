@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from analysis.bucket_words import _cell, heading, point_cells, residuals
+from analysis.bucket_table import _cell, heading, point_cells, residuals
 from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
@@ -137,7 +137,7 @@ def _toml(sets: Sequence[dict[str, Any]]) -> str:
 
 def compared(curves: Sequence[BucketCurve]) -> list[dict[str, Any]]:
     """Return each curve beside P1's table and law, and where these two disagree."""
-    from analysis.published_flow import disagreements, nearest_set
+    from analysis.published import disagreements, nearest_set
 
     found = []
     for curve in curves:

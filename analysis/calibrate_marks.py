@@ -13,8 +13,7 @@ from companion.cli.answer import AsJson, answer, note
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.least_squares import Estimate
-    from analysis.marks import Mark, MarksFit
+    from analysis.marks import Estimate, Mark, MarksFit
 
 COLUMNS = ("course_deg", "speed_m_s", "mark_m")
 FAR_M = 50.0

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from analysis.bucket import BucketCurve
-    from analysis.marks import MarksFit
-    from analysis.marks_design import Mark
+    from analysis.marks import Mark, MarksFit
 
 # Okabe and Ito's colours, told apart by all kinds of eyes.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from analysis.bucket_scale import PULSE_FULL_US
-from analysis.bucket_table import pump_curve_of
-from analysis.bucket_words import heading, point_cells, residuals
+from analysis.bucket import PULSE_FULL_US
+from analysis.bucket_table import heading, point_cells, pump_curve_of, residuals
 from companion.cli.answer import answer, note
 
 if TYPE_CHECKING:

@@ -15,11 +15,33 @@ from numpy.typing import NDArray
 from companion.core.boom import Boom, Valve
 
 if TYPE_CHECKING:
-    from analysis.spans import Spans
     from companion.core.nozzle import NozzleSet
     from companion.core.options.lines import Lines
     from companion.core.prescription import Prescription
     from companion.core.types import TimedChange
+
+
+from collections.abc import Iterable
+
+# Spans of time: (from, until) in seconds.
+
+Spans = tuple[tuple[float, float], ...]
+
+
+def joined(spans: Iterable[tuple[float, float]]) -> Spans:
+    """Return the spans in order and apart.
+
+    >>> joined([(5.0, 6.0), (1.0, 2.0), (2.0, 3.0)])
+    ((1.0, 3.0), (5.0, 6.0))
+    """
+    found: list[tuple[float, float]] = []
+    for begin_s, end_s in sorted(spans):
+        if found and begin_s <= found[-1][1]:
+            found[-1] = (found[-1][0], max(found[-1][1], end_s))
+        else:
+            found.append((begin_s, end_s))
+    return tuple(found)
+
 
 Floats = NDArray[np.float64]
 Fidelity = Literal["averaged", "pulsed"]

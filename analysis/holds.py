@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from analysis.spans import joined
+from analysis.flight_record import joined
 from analysis.transitions import LEVEL_FROM, LEVEL_TO, ML_M_PER_L_HA_M, Sides
 
 if TYPE_CHECKING:

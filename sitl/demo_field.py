@@ -11,8 +11,7 @@ from companion.core.schedule import LagModel
 from companion.core.setup import Setup
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_lag, anyang_route
-from sitl.route import Route
-from sitl.trajectory import Trajectory
+from sitl.trajectory import Route, Trajectory
 from sitl.vehicle import Vehicle
 
 # P1 flew its rates at 5 m/s; the example's map is for this speed.

@@ -19,10 +19,19 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from analysis.published import p1_lag_distance_m
-from sitl.demo import METHODS, SCHEDULED, DemoResult, Flown
+from sitl.demo import (
+    CELL_M,
+    MARGIN_X_M,
+    MARGIN_Y_M,
+    METHODS,
+    SCHEDULED,
+    DemoResult,
+    FieldAxes,
+    Flown,
+    field_axes,
+)
 from sitl.demo_field import demo_setup
 from sitl.demo_style import COLOURS, DPI, FAINT, INK, QUIET, STYLE, TITLES, new_figure, shown
-from sitl.demo_traces import CELL_M, MARGIN_X_M, MARGIN_Y_M, FieldAxes, field_axes
 
 if TYPE_CHECKING:
     from pathlib import Path

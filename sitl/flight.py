@@ -47,16 +47,14 @@ from sitl.liquid_faults import LiquidFault, LiquidSensors
 from sitl.navigation import Navigation
 from sitl.outputs import WIRE_S, AveragedOutput, Output, PlanFollower, ServoOutput, TakesEdges
 from sitl.plants import duty_plant, edge_plant
-from sitl.route import Route
+from sitl.trajectory import Route
 from sitl.vehicle import STRAIGHT_DEG
 from sitl.wang import POLL_S, WangController
 
 if TYPE_CHECKING:
-    from sitl.flow_law import FlowLaw
     from sitl.plant import Plant
-    from sitl.profile import PlantProfile
-    from sitl.route import Route
-    from sitl.trajectory import Trajectory
+    from sitl.profile import FlowLaw, PlantProfile
+    from sitl.trajectory import Route, Trajectory
 
 
 # Without a position a step follows after this, as in the runtime.

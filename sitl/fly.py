@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from analysis.flight_record import Fidelity, FlightRecord
     from companion.core.options.drift import Drift
     from companion.core.types import Decision, Input
-    from sitl.flow_law import FlowLaw
+    from sitl.profile import FlowLaw
     from sitl.vehicle import Leg
 
 

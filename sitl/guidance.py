@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.route import Route, lines_of
+from sitl.trajectory import Route, lines_of
 
 Floats = NDArray[np.float64]
 Line = tuple[float, float, float, float, float]

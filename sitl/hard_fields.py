@@ -16,8 +16,7 @@ import shapely
 from shapely import Polygon
 
 from companion.core.prescription import Prescription, Zone
-from sitl.route import Leg, Route
-from sitl.trajectory import Floats, Trajectory
+from sitl.trajectory import Floats, Leg, Route, Trajectory
 from sitl.vehicle import STEP_S, Vehicle
 
 # The field reaches farther to both sides than a boom of 6 m, so that no strip meets the border

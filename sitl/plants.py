@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sitl.approach import Approach
+from sitl.drives import Approach
 from sitl.meter import Metering, MeterStream
 from sitl.plant import AveragedPlant, Floats, Plant, PulsedPlant
 from sitl.pump_plant import PumpPlant

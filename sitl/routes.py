@@ -16,8 +16,8 @@ from shapely import LineString
 from companion.core.frame import LocalFrame
 from companion.errors import ConfigError
 from sitl.earth import Earth
-from sitl.stub.flight_plan import SAME_PLACE_M, plan_flight
-from sitl.stub.mission_file import read_mission
+from sitl.stub.flight import SAME_PLACE_M, plan_flight
+from sitl.stub.mission_items import read_mission
 from sitl.vehicle import Leg, Route
 
 if TYPE_CHECKING:

@@ -24,8 +24,7 @@ from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.earth import Earth
-from sitl.flow_law import FlowLaw
-from sitl.profile import load_profile
+from sitl.profile import FlowLaw, load_profile
 from sitl.serve_mission import (
     MissionWatch,
     first_course_deg,
@@ -35,8 +34,7 @@ from sitl.serve_mission import (
 )
 from sitl.stub.build import StubOptions, TruthLog, build_autopilot, firmware_of
 from sitl.stub.firmware import Firmware
-from sitl.stub.liquid import LiquidOptions, words_of
-from sitl.stub.liquid_entries import TAKE_OFF
+from sitl.stub.liquid import TAKE_OFF, LiquidOptions, words_of
 from sitl.stub.mission_items import MissionItem
 from sitl.stub.parameters import OUTPUT_COUNT
 from sitl.stub.px4 import px4_parameters

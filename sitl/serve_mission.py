@@ -14,9 +14,8 @@ from sitl.anyang import anyang_items
 from sitl.earth import Earth
 from sitl.stub.autopilot import Autopilot
 from sitl.stub.firmware import Firmware
-from sitl.stub.flight_plan import starts_with_take_off
-from sitl.stub.mission_file import read_mission
-from sitl.stub.mission_items import PLACE_FRAMES, MissionItem, item_message
+from sitl.stub.flight import starts_with_take_off
+from sitl.stub.mission_items import PLACE_FRAMES, MissionItem, item_message, read_mission
 from sitl.stub.parameters import SPEED_MAX_M_S, SPEED_MIN_M_S
 from sitl.stub.protocol import dialect
 

@@ -17,13 +17,12 @@ from typing import Literal
 
 from analysis.evaluation import Distances, Evaluation, evaluate
 from analysis.flight_record import FlightRecord, whole_boom
+from analysis.flow_accuracy import RateAccuracy, accuracy_by_rate, pooled_by_rate, pooled_percent
 from analysis.published import P1_RATES_L_HA, P1_RESULTS, P1LagDistance, p1_lag_distance_m
-from analysis.rate_accuracy import RateAccuracy, accuracy_by_rate, pooled_by_rate, pooled_percent
 from analysis.strips import strips_of
 from companion.core.setup import Setup
-from sitl.demo import P1_LOOK_AHEAD_S, PROFILE, SCHEDULED
+from sitl.demo import P1_LOOK_AHEAD_S, PROFILE, SCHEDULED, do_all
 from sitl.demo_field import MAP_SPEED_M_S, demo_lags, demo_setup, demo_trajectory
-from sitl.demo_pool import do_all
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.wang import WangController, curve_duties, eq_2_duties, table_2_sets

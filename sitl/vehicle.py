@@ -12,8 +12,7 @@ from typing import Literal
 import numpy as np
 
 from sitl.guidance import STEP_S, ArduCopter, Guidance, Px4
-from sitl.route import Leg, Route, lines_of
-from sitl.trajectory import Trajectory, Truth
+from sitl.trajectory import Leg, Route, Trajectory, Truth, lines_of
 
 __all__ = ["STEP_S", "Leg", "Route", "Trajectory", "Truth", "Vehicle"]
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from analysis.published_flow import SETS
+from analysis.published import SETS
 from companion.core.frame import course_deg, look_ahead_point
 from companion.core.nozzle import FLOW_LAWS, FlowCurve, NozzleSet, allowed_duty, flow_for_rate
 from companion.core.types import SprayPlan, Telemetry, TimedChange

@@ -15,7 +15,6 @@ import numpy as np
 
 from analysis.assess.ground_elements import SquareGrid, slices_of, summed
 from analysis.assess.ground_rates import ground_rates
-from analysis.assess.rate_wishes import percent_at
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.holds import CLEAR_M
 from analysis.lag import Verdict
@@ -43,6 +42,16 @@ if TYPE_CHECKING:
     from analysis.track import Bools, Floats
     from companion.core.prescription import Prescription
     from companion.core.setup import Setup
+
+
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+from companion.core.nozzle import is_override
+
+if TYPE_CHECKING:
+    from analysis.flown.applied_flight import AppliedFlight
+    from analysis.track import Floats
 
 
 OFF_BY = 0.10
@@ -447,3 +456,34 @@ def marks_of(strip: Strip, setup: Setup) -> Marks:
         usual=usual,
         at_border=~strip.grazing[kept],
     )
+
+
+# What the operator wished of the rates in flight: another percentage than all of them.
+
+# As `companion/link/commands.py` writes the event.
+_EVENT = re.compile(r"rate override (\d+(?:\.\d+)?(?:e[+-]?\d+)?) %")
+
+
+class RateWish(NamedTuple):
+    """From when on which percentage of the prescribed rates was asked for."""
+
+    at_s: float
+    percent: float
+
+
+def rate_wishes(flight: AppliedFlight) -> list[RateWish]:
+    """Return the operator's wishes in order of time, as the journal's events have them."""
+    found = []
+    for event in flight.events:
+        match = _EVENT.fullmatch(event.text)
+        if match and is_override(float(match[1])):
+            found.append(RateWish(event.at_s, float(match[1])))
+    return sorted(found)
+
+
+def percent_at(flight: AppliedFlight, time_s: Floats) -> Floats:
+    """Return the percentage asked for at each time; 100 before the first wish."""
+    wishes = rate_wishes(flight)
+    percents = np.array([100.0, *(wish.percent for wish in wishes)])
+    found: Floats = percents[np.searchsorted([wish.at_s for wish in wishes], time_s, "right")]
+    return found

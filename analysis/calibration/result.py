@@ -11,8 +11,7 @@ from analysis.calibration.steps import Kind
 from companion.errors import VrsprayError
 
 if TYPE_CHECKING:
-    from analysis.calibration.identify import Identified
-    from analysis.calibration.interval import Estimate
+    from analysis.calibration.identify import Estimate, Identified
 
 # Which of an estimate's three figures is the safe one to fly with; the others fly their value.
 SAFE_LOW, SAFE_HIGH = "on_start_s", "off_end_s"

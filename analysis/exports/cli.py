@@ -11,8 +11,8 @@ from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
     from analysis.exports.registry import Format
-    from analysis.exports.source import Shape, Source
     from analysis.exports.units import System
+from analysis.exports.source import Shape, Source
     from analysis.flown.applied_flight import AppliedFlight
     from companion.errors import UnreadableError
 

@@ -19,8 +19,8 @@ import pyarrow.parquet as pq
 import shapely
 from numpy.typing import NDArray
 
+from analysis.exports.about import utc_text
 from analysis.exports.output import zipped
-from analysis.exports.utc import utc_text
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content

@@ -18,8 +18,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
-from analysis.exports.ground import geographic
-from analysis.exports.output import zipped
+from analysis.exports.output import geographic, zipped
 
 if TYPE_CHECKING:
     from analysis.exports.about import About
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from analysis.exports.utc import utc_ms
+from analysis.exports.about import utc_ms
 
 if TYPE_CHECKING:
     from analysis.exports.samples import Samples

@@ -17,8 +17,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
-from analysis.exports.ground import geographic
-from analysis.exports.output import zipped
+from analysis.exports.output import geographic, zipped
 
 if TYPE_CHECKING:
     from analysis.exports.columns import Column

@@ -12,8 +12,21 @@ import zipfile
 from collections.abc import Iterable, Mapping
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
 
 from companion.errors import VrsprayError
+
+if TYPE_CHECKING:
+    from shapely import MultiPolygon, Polygon
+
+    from companion.core.frame import LocalFrame
+
+    Ground = Polygon | MultiPolygon
+
 
 # Content of files by their names, in the order in which they are moved: what makes the others
 # worth reading comes last.
@@ -137,3 +150,21 @@ def _not_written(out: Path, error: OSError) -> ExportError:
     return ExportError(
         f"{out}: cannot be written ({error.strerror or error}); check folder, rights and space"
     )
+
+
+# From the flight's own frame to longitude and latitude, for whole geometries.
+
+Floats = NDArray[np.float64]
+
+
+def geographic(grounds: list[Ground], frame: LocalFrame) -> list[Ground]:
+    """Return polygons in longitude and latitude, counter-clockwise (RFC 7946)."""
+    if not grounds:
+        return []
+
+    def moved(points: Floats) -> Floats:
+        latitude_deg, longitude_deg = frame.to_geographic_all(*points.T.tolist())
+        return np.stack((longitude_deg, latitude_deg), axis=1)
+
+    turned = shapely.orient_polygons(np.array(grounds, dtype=object))
+    return cast("list[Ground]", shapely.transform(turned, moved).tolist())

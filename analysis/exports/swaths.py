@@ -15,14 +15,14 @@ import shapely
 from numpy.typing import NDArray
 from shapely import MultiPoint, MultiPolygon, Polygon
 
-from analysis.exports.ground import geographic
+from analysis.exports.output import geographic
 from analysis.exports.samples import FLOW_MIN_L_MIN, duty_at
 from analysis.strips import Strip, strips_of
 
 if TYPE_CHECKING:
     from shapely import MultiPolygon, Polygon
 
-    from analysis.exports.ground import Ground
+    from analysis.exports.output import Ground
     from analysis.flight_record import FlightRecord
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.track import Track

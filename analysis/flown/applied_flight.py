@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.spans import Spans
+from analysis.flight_record import Spans
 from companion.core.setup import Setup
 from companion.record.writer import Event
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from analysis.flight_record import Spans, joined
 from analysis.flown.applied_flight import Floats, ValveChanges
 from analysis.flown.holes import Hole
-from analysis.spans import Spans, joined
 
 # Longer than this between two samples nobody knows what the sprayer did.
 GAP_S = 1.0

@@ -12,7 +12,7 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 from matplotlib.ticker import NullLocator
 
-from analysis.report.definitions import CAUSES
+from analysis.report.contents import CAUSES
 from analysis.report.figures import over_time
 from analysis.report.figures.sheet import NOTHING_COLOUR, Sheet, dress, sheet_of
 from analysis.report.figures.style import (
@@ -37,8 +37,7 @@ if TYPE_CHECKING:
 
     from analysis.assess.assessment import Assessment
     from analysis.assess.breakdowns import Group
-    from analysis.assess.cell_maps import CellMaps
-    from analysis.assess.histogram import Histogram
+    from analysis.assess.cell_maps import CellMaps, Histogram
     from analysis.assess.intervals import Interval
     from analysis.evaluation import Evaluation
     from analysis.lag import Step

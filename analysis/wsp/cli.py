@@ -15,10 +15,18 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from analysis.report.folder import check_folder
-from analysis.wsp.card import INSET_MM, Card, Method
+from analysis.wsp.card import (
+    CARD_WIDTH_MM,
+    INSET_MM,
+    Card,
+    Method,
+    Reading,
+    SheetResult,
+    read_sheet,
+)
 from analysis.wsp.figure import draw_distributions
+from analysis.wsp.flight_ties import Position, placed, read_positions
 from analysis.wsp.image import LEAST_DPI, MOST_DPI, ImageError, Sheet, sheets_of
-from analysis.wsp.positions import Position, placed, read_positions
 from analysis.wsp.results import (
     Numbered,
     Row,
@@ -30,8 +38,7 @@ from analysis.wsp.results import (
     summary,
     table_lines,
 )
-from analysis.wsp.sheet import CARD_WIDTH_MM, Reading, SheetResult, read_sheet
-from analysis.wsp.spread import SPREADS, spread_of
+from analysis.wsp.sizes import SPREADS, spread_of
 from analysis.wsp.stains import THRESHOLD, Threshold
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note

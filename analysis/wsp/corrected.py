@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from analysis.wsp.outlines import Outlines, outlines_of
-from analysis.wsp.overlap import drops_px
-from analysis.wsp.sizes import LEAST_DROP_UM, sizes, stain_um
-from analysis.wsp.spread import Spread
-from analysis.wsp.stains import LEAST_CONTRAST, Stains, segment
+from analysis.wsp.sizes import LEAST_DROP_UM, Spread, sizes, stain_um
+from analysis.wsp.stains import LEAST_CONTRAST, Stains, drops_px, segment
 
 # Stains at the limit of what counts: found where blur leaves no pixel dark, sized by their peaks.
 #

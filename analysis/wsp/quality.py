@@ -9,10 +9,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.wsp.cards import FLAT, YELLOW_ABOVE_BLUE
-from analysis.wsp.overlap import UNRELIABLE_PERCENT
+from analysis.wsp.image import FLAT, YELLOW_ABOVE_BLUE
 from analysis.wsp.rectangle import Rectangle
-from analysis.wsp.stains import Stains
+from analysis.wsp.stains import UNRELIABLE_PERCENT, Stains
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

@@ -10,12 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from analysis.wsp.card import Card, Method
-from analysis.wsp.overlap import LAW, UNRELIABLE_PERCENT
+from analysis.wsp.card import Card, Method, SheetResult
 from analysis.wsp.quality import FUNGICIDE_PER_CM2, INSECTICIDE_PER_CM2, OVERSPRAY_PERCENT
-from analysis.wsp.sheet import SheetResult
-from analysis.wsp.sizes import LEAST_DROP_UM
-from analysis.wsp.spread import second_of
+from analysis.wsp.sizes import LEAST_DROP_UM, second_of
+from analysis.wsp.stains import LAW, UNRELIABLE_PERCENT
 
 # Columns of a card's figures, in the order of CSV; those of the second spread factor follow.
 SIZES = (

@@ -14,8 +14,8 @@ from sitl.stub.outputs import ServoOutputs
 from sitl.stub.protocol import Message, dialect
 
 if TYPE_CHECKING:
-    from sitl.stub.channel import Channel
     from sitl.stub.firmware import Autopilot
+    from sitl.stub.protocol import Channel
 
 # The main loop runs at 400 Hz; an interval below it is too fast to keep.
 _INTERVAL_MIN_S = 0.0025

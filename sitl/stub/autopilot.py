@@ -13,24 +13,22 @@ from itertools import count
 from typing import Protocol
 
 from sitl.stub import actions, mission, services
-from sitl.stub.channel import Channel
-from sitl.stub.faults import Fault, FaultClock, FaultKind
-from sitl.stub.firmware import Upload
+from sitl.stub.faults import Fault, FaultClock, FaultKind, rc_pulses_us
+from sitl.stub.firmware import Parts, Upload
 from sitl.stub.liquid import Battery
 from sitl.stub.mission_items import MissionItem
 from sitl.stub.modes import AUTO, INFO
 from sitl.stub.outputs import OutputState
-from sitl.stub.parts import Parts
 from sitl.stub.protocol import (
     AUTOPILOT_COMPONENT,
     AUTOPILOT_SYSTEM,
+    Channel,
     Message,
     Speaker,
     dialect,
     sender,
     target,
 )
-from sitl.stub.rc import rc_pulses_us
 from sitl.stub.strangers import Strangers
 from sitl.stub.world import Pose
 

@@ -16,20 +16,17 @@ from companion.errors import ConfigError
 from sitl.earth import Earth
 from sitl.stub.ardupilot import ardupilot
 from sitl.stub.autopilot import Autopilot
-from sitl.stub.estimator import ARDUPILOT_NOISE, PX4_NOISE, Estimator, EstimatorNoise
 from sitl.stub.faults import Fault, FaultClock
-from sitl.stub.firmware import Firmware
+from sitl.stub.firmware import Firmware, Parts
 from sitl.stub.flight import Flight
 from sitl.stub.mission_items import MissionItem
-from sitl.stub.outputs import Outputs, ServoOrder, ServoOutputs
+from sitl.stub.outputs import ActuatorOutputs, Outputs, ServoOrder, ServoOutputs
 from sitl.stub.parameters import Parameters
-from sitl.stub.parts import Parts
 from sitl.stub.protocol import SigningKey
 from sitl.stub.px4 import COMMANDS_PER_S, nan_keeps, px4, px4_parameters
-from sitl.stub.px4_outputs import ActuatorOutputs
 from sitl.stub.scenario import Scenario
 from sitl.stub.sprayer import Sprayer
-from sitl.stub.world import Pose, World
+from sitl.stub.world import ARDUPILOT_NOISE, PX4_NOISE, Estimator, EstimatorNoise, Pose, World
 from sitl.vehicle import Corners
 
 AUTOPILOTS = ("ardupilot", "px4")

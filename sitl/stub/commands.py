@@ -14,8 +14,8 @@ from sitl.stub.parameters import SPEED_MAX_M_S, SPEED_MIN_M_S
 from sitl.stub.protocol import Message, dialect, sender
 
 if TYPE_CHECKING:
-    from sitl.stub.channel import Channel
     from sitl.stub.firmware import Autopilot
+    from sitl.stub.protocol import Channel
 
 ACCEPTED: int = dialect.MAV_RESULT_ACCEPTED
 REJECTED: int = dialect.MAV_RESULT_TEMPORARILY_REJECTED

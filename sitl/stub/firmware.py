@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from sitl.stub.channel import Channel
 from sitl.stub.faults import Fault, FaultClock, FaultKind
 from sitl.stub.flight import Flight
 from sitl.stub.liquid import Battery
@@ -20,8 +19,8 @@ from sitl.stub.mission_items import MissionItem
 from sitl.stub.modes import INFO
 from sitl.stub.outputs import Outputs
 from sitl.stub.parameters import Parameters
-from sitl.stub.protocol import Message, dialect
-from sitl.stub.world import Pose
+from sitl.stub.protocol import Channel, Message, SigningKey, dialect
+from sitl.stub.world import Estimator, Pose
 
 Params = tuple[float, ...]
 Builder = Callable[["Autopilot", float], Message]
@@ -206,3 +205,30 @@ class CommandQueue:
     def next_due_s(self) -> float:
         """Return when the next job is due; infinite without one."""
         return self._jobs[0][0] if self._jobs else float("inf")
+
+
+# What an autopilot is put together from.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parts:
+    """The parts, and how its clock runs; `uptime_s` is how long it has run at the start."""
+
+    firmware: Firmware
+    flight: Flight
+    estimator: Estimator
+    outputs: Outputs
+    parameters: Parameters
+    faults: FaultClock
+    wind_towards_m_s: tuple[float, float] = (0.0, 0.0)
+    drift_ppm: float = 0.0
+    uptime_s: float = 0.0
+    key: SigningKey | None = None
+    seed: int = 0
+
+    def queue(self) -> CommandQueue | None:
+        """Return the queue that commands go through, for a firmware that has one."""
+        depth = self.firmware.queue_depth
+        if depth is None:
+            return None
+        return CommandQueue(depth=depth, per_s=self.firmware.commands_per_s, seed=self.seed)

@@ -15,8 +15,8 @@ from sitl.stub.modes import AUTO, Phase
 from sitl.stub.protocol import Message, dialect, sender
 
 if TYPE_CHECKING:
-    from sitl.stub.channel import Channel
     from sitl.stub.firmware import Autopilot
+    from sitl.stub.protocol import Channel
 
 _ACCEPTED = dialect.MAV_MISSION_ACCEPTED
 _SLOW_S = 1.0

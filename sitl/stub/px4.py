@@ -16,10 +16,11 @@ from sitl.stub.px4_commands import (
     AT_ONCE,
     COMMANDS,
     DO_SET_ACTUATOR,
+    base_mode,
+    custom_mode,
     handle_set_mode,
     set_actuators,
 )
-from sitl.stub.px4_modes import base_mode, custom_mode
 from sitl.stub.streams import COMMON, HEALTHY, LOST, estimated, version_word
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import Protocol, cast
 
 from companion.errors import LinkError
 from sitl.stub.autopilot import Autopilot
-from sitl.stub.channel import Channel
+from sitl.stub.protocol import Channel
 
 _TICK_S = 0.02
 

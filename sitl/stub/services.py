@@ -9,8 +9,8 @@ from sitl.stub.modes import WARNING
 from sitl.stub.protocol import AUTOPILOT_SYSTEM, Message, dialect, sender
 
 if TYPE_CHECKING:
-    from sitl.stub.channel import Channel
     from sitl.stub.firmware import Autopilot
+    from sitl.stub.protocol import Channel
 
 # A link carries so many PARAM_VALUE in one go; the rest of a list follows.
 LIST_BURST = 10

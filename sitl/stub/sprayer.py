@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from companion.errors import ConfigError
 from sitl.board import SERVO_FRAME_S, DriverBoard
 from sitl.drives import Motors
-from sitl.flow_law import FlowLaw
 from sitl.plants import edge_plant
-from sitl.profile import load_profile
-from sitl.stub.liquid import Battery, Liquid, LiquidOptions
-from sitl.stub.liquid_entries import SPRAYING
+from sitl.profile import FlowLaw, load_profile
+from sitl.stub.liquid import SPRAYING, Battery, Liquid, LiquidOptions
 from sitl.stub.outputs import ServoOrder
 
 Floats = NDArray[np.float64]

@@ -8,11 +8,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from sitl.stub.faults import FaultKind
+from sitl.stub.faults import RC_COUNT, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Builder
 from sitl.stub.modes import LANDED_STATES
 from sitl.stub.protocol import Message, clipped, dialect
-from sitl.stub.rc import RC_COUNT, rc_pulses_us
 from sitl.stub.world import Pose
 
 if TYPE_CHECKING:

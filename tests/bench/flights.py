@@ -14,8 +14,8 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 from analysis.evaluation import Evaluation, evaluate, limit_ratio, whole_boom
+from sitl.demo import do_all
 from sitl.demo_field import demo_trajectory
-from sitl.demo_pool import do_all
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets

@@ -14,8 +14,7 @@ from analysis.evaluation import Evaluation, evaluate
 from analysis.flight_record import FlightRecord
 from sitl.anyang import EXAMPLE
 from sitl.flight import FlightOptions, fly
-from sitl.flow_law import FLOW_LAWS, FlowLaw
-from sitl.profile import load_profile
+from sitl.profile import FLOW_LAWS, FlowLaw, load_profile
 from tests.bench import flights
 from tests.bench.accuracy import accuracy
 from tests.bench.figures import Figure

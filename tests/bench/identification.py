@@ -31,7 +31,7 @@ from companion.core.types import Decision, FlowReport
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.calibration_mission import write_calibration
-from sitl.demo_pool import do_all
+from sitl.demo import do_all
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.routes import read_route

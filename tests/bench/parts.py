@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from functools import partial
 from typing import TypeVar
 
-from sitl.demo_pool import do_all
+from sitl.demo import do_all
 from tests.bench import (
     clocks,
     flow_laws,

@@ -34,8 +34,7 @@ from sitl.demo_field import START_S, demo_route
 from sitl.deposit import L_HA_PER_ML_M2, Deposit
 from sitl.flight import FlightOptions, FlightResult, OnStep, fly
 from sitl.profile import PlantProfile, load_profile
-from sitl.route import Leg, Route
-from sitl.trajectory import Trajectory
+from sitl.trajectory import Leg, Route, Trajectory
 from sitl.vehicle import Vehicle
 from tests.bench.fields import PLOT_LENGTH_M, PLOT_WIDTH_M, PROFILE, example, grid_zones
 

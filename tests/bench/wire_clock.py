@@ -28,7 +28,7 @@ from companion.ports import PlanExecutor, Recorder
 from companion.runtime import run
 from missions.maps.compiling import compiled_setup
 from sitl.serve import ServeOptions, _Run
-from sitl.stub.channel import Channel
+from sitl.stub.protocol import Channel
 from tests.bench.wire import MEAN_ABS_MAX_M, RTK, WORST_MAX_M, example
 from tests.virtual_time import START_S, WIRE_S, Delivery, JumpingLoop, WireLink
 

@@ -20,9 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from analysis.wsp.card import INSET_MM, Card, Method
+from analysis.wsp.card import INSET_MM, Card, Method, Reading, SheetResult, read_sheet
 from analysis.wsp.image import sheets_of
-from analysis.wsp.sheet import Reading, SheetResult, read_sheet
 from analysis.wsp.sizes import LEAST_DROP_UM
 from analysis.wsp.synthetic import Scanner, Spray, TrueSheet, a4_places, draw_sheet, save
 

@@ -17,7 +17,7 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.surroundings import Surroundings
 from missions.terrain.ground import Terrain
-from sitl.stub.mission_file import read_mission
+from sitl.stub.mission_items import read_mission
 from tests.bench.missions import FRAME, to_degrees
 from tests.sitl.upload_bench import stub_on_a_port
 from tests.unit.test_missions_terrain import dem_of, hill

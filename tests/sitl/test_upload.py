@@ -18,8 +18,7 @@ import pytest
 from missions.errors import UploadError
 from missions.upload.reading import read_mission_file
 from missions.upload.transfer import put
-from sitl.stub.mission_file import read_mission
-from sitl.stub.mission_items import MissionItem
+from sitl.stub.mission_items import MissionItem, read_mission
 from tests.sitl.upload_bench import sorties, stub_on_a_port
 from tests.sitl.wire_peer import free_port
 

@@ -22,7 +22,7 @@ from analysis.bucket import BucketCurve, Catch, fit_bucket
 from analysis.bucket_table import valves_of
 from analysis.calibrate_flow import flow
 from analysis.csv_rows import TableError
-from analysis.published_flow import EIGHT, SETS, TWELVE, disagreements, excess_percent
+from analysis.published import EIGHT, SETS, TWELVE, disagreements, excess_percent
 from sitl.profile import load_profile
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang" / "config.toml"

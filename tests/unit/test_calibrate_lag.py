@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from analysis.calibration.flow_record import FlowRecord, record_of
-from analysis.calibration.identify import identify
-from analysis.calibration.interval import jackknife, mean_of
+from analysis.calibration.identify import identify, jackknife, mean_of
 from analysis.calibration.result import TooFewStepsError, as_json, refusal, settings
 from analysis.calibration.steps import Kind, Reject, find_steps, is_trim
 from companion.cli.app import execute

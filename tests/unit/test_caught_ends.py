@@ -19,8 +19,8 @@ from companion.errors import JournalError
 from companion.record.journal import Journal
 from companion.record.writer import Writer
 from companion.runtime import run
+from sitl.demo import _interrupt_held_back, _pool
 from sitl.demo_cli import _termination_as_interrupt
-from sitl.demo_pool import _interrupt_held_back, _pool
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.server import _TcpServer
 from tests.builders import setup

@@ -15,11 +15,21 @@ from analysis.replay import replay
 from companion.core.prescription import Prescription
 from companion.errors import ConfigError
 from sitl.anyang import anyang_route
-from sitl.demo import METHODS, PERFECT, DemoOptions, DemoResult, check, fly_demo, jobs_of, scaled
+from sitl.demo import (
+    CELL_M,
+    METHODS,
+    PERFECT,
+    DemoOptions,
+    DemoResult,
+    check,
+    field_axes,
+    fly_demo,
+    jobs_of,
+    scaled,
+)
 from sitl.demo_cli import WIDE, _print, _write
 from sitl.demo_field import demo_lags, demo_route, demo_setup, demo_trajectory
 from sitl.demo_page import ACCURACY, COLUMNS, SETTLED, page, rows_of, sentence
-from sitl.demo_traces import CELL_M, field_axes
 from sitl.knowledge import perfect_setup
 from sitl.profile import load_profile
 

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from sitl.demo_pool import do_all
+from sitl.demo import do_all
 
 
 @pytest.mark.parametrize("processes", [1, 2])

@@ -26,8 +26,8 @@ from sitl.droplets import TRUTHS, Air, fall, landed, law, shift_of, spectrum_um,
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import lags as true_lags
 from sitl.profile import load_profile
-from sitl.route import Leg
-from sitl.route import Route as SimulatedRoute
+from sitl.trajectory import Leg
+from sitl.trajectory import Route as SimulatedRoute
 from sitl.vehicle import Vehicle
 from tests.builders import SPRAYING, along, flying, position, setup
 

@@ -14,7 +14,7 @@ from companion.output.engine.lines import FileLines
 from companion.output.engine.spi595 import SpiDevice
 from companion.output.gpio import EngineChild
 from companion.record.new_file import open_for_flight
-from sitl.stub.channel import Channel
+from sitl.stub.protocol import Channel
 from sitl.stub.server import open_link
 
 

@@ -16,8 +16,7 @@ from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.knowledge import lags
 from sitl.outputs import PlanFollower
 from sitl.profile import load_profile
-from sitl.route import Leg, Route
-from sitl.trajectory import Trajectory
+from sitl.trajectory import Leg, Route, Trajectory
 from sitl.vehicle import Vehicle
 from tests.builders import setup
 

@@ -12,9 +12,8 @@ from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ConfigError
 from sitl.demo_field import demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly, sprayer
-from sitl.flow_law import FLOW_LAWS, FlowLaw, flow_by_law
 from sitl.knowledge import lags, measured_sets, perfect_setup, true_sets
-from sitl.profile import PROFILES, flow_table, load_profile
+from sitl.profile import FLOW_LAWS, PROFILES, FlowLaw, flow_by_law, flow_table, load_profile
 
 WANG = load_profile("wang-2024")
 LARGE = WANG.nozzle_sets[1]

@@ -15,8 +15,7 @@ from analysis.evaluation import evaluate
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import record_of
 from analysis.flown.holes import Hole, change_holes, closed_over, doubtful_holes, sample_holes
-from analysis.flown.read_applied import clock_offset_s, rates_of, read_applied
-from analysis.flown.table_rows import rows_of
+from analysis.flown.read_applied import clock_offset_s, rates_of, read_applied, rows_of
 from companion.errors import JournalError, VrsprayError
 from tests.unit.applied_flights import changes_of
 from tests.unit.export_flight import fly

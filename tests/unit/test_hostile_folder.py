@@ -17,7 +17,7 @@ from companion.output.engine.setup import EngineSetup
 from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack
 from companion.output.engine.wiring import Wiring
 from companion.output.gpio import COMMAND, EngineChild
-from sitl.demo_pool import do_all
+from sitl.demo import do_all
 from tests.unit.test_service_unit import UNIT
 
 VRSPRAY = Path(sys.executable).with_name("vrspray")

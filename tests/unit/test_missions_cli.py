@@ -20,7 +20,7 @@ import missions.cli
 import missions.files.write
 from companion.cli.app import INTERRUPTED, execute
 from missions.upload.following import sorties_from
-from sitl.stub.mission_file import read_mission
+from sitl.stub.mission_items import read_mission
 from tests.bench.missions import to_degrees
 
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang"

@@ -14,7 +14,7 @@ from shapely import LineString, Point, Polygon, box
 
 from companion.cli.app import execute
 from missions.plan import Settings
-from sitl.stub.mission_file import read_mission
+from sitl.stub.mission_items import read_mission
 from tests.unit.test_missions_cli import written
 from tests.unit.test_missions_obstacles import degrees, ways_m
 from tests.unit.test_missions_terrain import tile

@@ -21,7 +21,7 @@ from missions.field import build_field
 from missions.files.write import paths_of, write_plan
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
-from sitl.stub.mission_file import read_mission
+from sitl.stub.mission_items import read_mission
 from tests.bench.missions import FRAME, to_degrees
 
 

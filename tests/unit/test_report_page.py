@@ -15,7 +15,7 @@ import pytest
 
 from analysis.assess.assessment import assess
 from analysis.assess.causes import Cause
-from analysis.assess.histogram import Histogram
+from analysis.assess.cell_maps import Histogram
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report, embedded, page_of
 from analysis.report.clock import clock_of

@@ -21,7 +21,7 @@ from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.fly import zero_rate_ml
 from sitl.profile import PlantProfile, load_profile
-from sitl.route import Route
+from sitl.trajectory import Route
 from sitl.vehicle import Vehicle
 from tests.unit.sample_route import SPEED_M_S, Line, along_edge, route_of, swaths
 

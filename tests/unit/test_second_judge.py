@@ -15,8 +15,7 @@ from companion.core.frame import LocalFrame
 from sitl.anyang import EXAMPLE
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
-from sitl.flow_law import FlowLaw
-from sitl.profile import load_profile
+from sitl.profile import FlowLaw, load_profile
 from tests.bench.flow_laws import second
 from tests.second_judge import Ground, Verdict, flat
 

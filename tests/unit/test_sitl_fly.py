@@ -17,8 +17,7 @@ from sitl.calibration_mission import write_mission
 from sitl.fly import FlyOptions, fly_mission, prepare
 from sitl.fly_files import fly_lines
 from sitl.routes import read_route
-from sitl.stub.mission_file import read_mission
-from sitl.stub.mission_items import landing
+from sitl.stub.mission_items import landing, read_mission
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 ANYANG = EXAMPLES / "anyang"

@@ -15,8 +15,7 @@ from companion.sensors.voltage import IioVoltage
 from sitl.liquid_faults import LiquidFaultKind, healthy_kpa
 from sitl.serve import ServeOptions, serve
 from sitl.stub.build import StubOptions, build_autopilot
-from sitl.stub.liquid import FLIGHT_BATTERY, LiquidOptions
-from sitl.stub.liquid_entries import LiquidEntry
+from sitl.stub.liquid import FLIGHT_BATTERY, LiquidEntry, LiquidOptions
 from sitl.stub.outputs import ServoOrder
 from sitl.stub.protocol import dialect
 from sitl.stub.scenario import load_scenario

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from companion.errors import ConfigError
-from sitl.stub.mission_file import read_mission
-from sitl.stub.mission_items import MissionItem, item_message, item_of
+from sitl.stub.mission_items import MissionItem, item_message, item_of, read_mission
 from sitl.stub.protocol import dialect
 from tests.unit.stub_bench import Bench, Peer, mission
 

@@ -13,9 +13,8 @@ from companion.errors import ConfigError
 from missions.files.plan_rules import plan_problems
 from sitl.earth import Earth
 from sitl.serve_mission import mission_items
-from sitl.stub.flight_plan import plan_flight
-from sitl.stub.mission_file import read_mission
-from sitl.stub.mission_items import FLOWN, MissionItem, item_message
+from sitl.stub.flight import plan_flight
+from sitl.stub.mission_items import FLOWN, MissionItem, item_message, read_mission
 from sitl.stub.protocol import dialect
 from tests.firmware.mission_facts import COMMANDS, FRAMES, NUMBERED, NUMBERS, PLACED
 from tests.unit.stub_bench import HOME, Bench, of_firmware, place

@@ -12,14 +12,19 @@ from typer.testing import CliRunner
 
 from analysis.evaluation import Distances
 from analysis.flight_record import FlightRecord
-from analysis.flow_accuracy import flow_accuracy
+from analysis.flow_accuracy import (
+    RateAccuracy,
+    accuracy_by_rate,
+    flow_accuracy,
+    pooled_by_rate,
+    pooled_percent,
+)
 from analysis.published import (
     P1_RATES_L_HA,
     P1_SPRAYING_ACCURACY_PERCENT,
     P1LagDistance,
     p1_lag_distance_m,
 )
-from analysis.rate_accuracy import RateAccuracy, accuracy_by_rate, pooled_by_rate, pooled_percent
 from analysis.strips import strips_of
 from companion.errors import ConfigError
 from sitl import validation, validation_flights, validation_page

@@ -9,8 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.wsp.sizes import fraction_um, sizes, stain_um
-from analysis.wsp.spread import DEPOSITSCAN, SPREADS, SpreadError, second_of, spread_of
+from analysis.wsp.sizes import (
+    DEPOSITSCAN,
+    SPREADS,
+    SpreadError,
+    fraction_um,
+    second_of,
+    sizes,
+    spread_of,
+    stain_um,
+)
 from analysis.wsp.stains import grey_of, midway, segment
 
 PX_UM = 25_400.0 / 600.0

@@ -12,8 +12,7 @@ from scipy import ndimage
 
 from analysis.wsp.corrected import Counted, at_edge, crossings, drops_on, notches, seen_share
 from analysis.wsp.outlines import Outlines, outlines_of
-from analysis.wsp.overlap import drops_px
-from analysis.wsp.stains import segment
+from analysis.wsp.stains import drops_px, segment
 
 SIDE, BEYOND = 700, 30
 PAPER, STAIN, LEVEL = 180.0, 80.0, 130

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from analysis.wsp.corrected import by_peak, corrected, full_grey, with_faint
-from analysis.wsp.spread import DEPOSITSCAN
+from analysis.wsp.sizes import DEPOSITSCAN
 from analysis.wsp.stains import grey_of, segment
 from analysis.wsp.synthetic import Scanner, Spray, TrueSheet, draw_card
 

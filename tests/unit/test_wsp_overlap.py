@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from analysis.wsp.corrected import without_holes
-from analysis.wsp.overlap import drops_px
+from analysis.wsp.stains import drops_px
 
 SIDE = 900
 EVERYWHERE = np.ones((SIDE, SIDE), dtype=np.bool_)

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.wsp.card import Card, Method
+from analysis.wsp.card import Card, Method, Reading, read_sheet
 from analysis.wsp.image import Sheet
 from analysis.wsp.results import density_class
-from analysis.wsp.sheet import Reading, read_sheet
 from analysis.wsp.synthetic import Scanner, Spray, draw_card
 
 WHOLE = Reading(method=Method(inset_mm=0.0), whole=True)

@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.wsp.card import INSET_MM, Method
-from analysis.wsp.cards import find_cards
-from analysis.wsp.image import Sheet
+from analysis.wsp.card import INSET_MM, Method, Reading, SheetResult, read_sheet
+from analysis.wsp.image import Sheet, find_cards
 from analysis.wsp.rectangle import Rectangle, around
-from analysis.wsp.sheet import Reading, SheetResult, read_sheet
 from analysis.wsp.synthetic import Scanner, Spray, TrueSheet, draw_card, draw_sheet
 
 DPI = 300.0

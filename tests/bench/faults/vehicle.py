@@ -11,7 +11,6 @@ from collections.abc import Callable
 from sitl.board import DriverBoard
 from sitl.profile import load_profile
 from sitl.stub.build import StubOptions, build_autopilot
-from sitl.stub.channel import Channel
 from sitl.stub.modes import AUTO, Phase
 from sitl.stub.outputs import ServoOrder
 from sitl.stub.protocol import (
@@ -19,6 +18,7 @@ from sitl.stub.protocol import (
     COMPANION_COMPONENT,
     GROUND_COMPONENT,
     GROUND_SYSTEM,
+    Channel,
     Message,
     Speaker,
     dialect,
