@@ -16,18 +16,10 @@ from analysis.smoothing import rise_over
 from analysis.transitions import ML_M_PER_L_HA_M
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from analysis.strips import Strip
-    from analysis.track import Bools, Floats
-
-
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from analysis.strips import Strip
+    from analysis.track import Bools, Floats
 
 
 SAMPLE_S = 0.01

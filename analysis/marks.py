@@ -15,22 +15,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from analysis.student import t_factor
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-
 from statistics import NormalDist
 from typing import TYPE_CHECKING
 
+import numpy as np
 from numpy.typing import NDArray
 
-from analysis.student import t_inside
+from analysis.student import t_factor, t_inside
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

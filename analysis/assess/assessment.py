@@ -15,8 +15,7 @@ from analysis.dose import misapplied_parts
 from analysis.evaluation import Evaluation, evaluate_strips
 from analysis.flow_accuracy import flow_samples
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
-from analysis.flown.metered import counted
-from analysis.flown.modelled_flow import ordered_s
+from analysis.flown.modelled_flow import counted, ordered_s
 from analysis.flown.unknown import GAP_S
 from analysis.strips import Strip, strips_of
 

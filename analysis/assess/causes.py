@@ -7,18 +7,22 @@ of rate or of speed; a flight should know the same of itself.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from analysis.assess.ground_elements import SquareGrid, slices_of, summed
-from analysis.assess.ground_rates import ground_rates
+from analysis.assess.zone_lookup import ground_rates
+from analysis.changes import SPEED_MIN_M_S
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.holds import CLEAR_M
 from analysis.lag import Verdict
+from analysis.smoothing import rise_over
 from analysis.transitions import ML_M_PER_L_HA_M
+from companion.core.nozzle import is_override
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -28,30 +32,9 @@ if TYPE_CHECKING:
     from analysis.lag import Step
     from analysis.strips import Strip
     from analysis.track import Bools, Floats
-    from companion.core.schedule import LagModel
-
-
-from typing import TYPE_CHECKING
-
-from analysis.changes import SPEED_MIN_M_S
-from analysis.smoothing import rise_over
-
-if TYPE_CHECKING:
-    from analysis.flown.applied_flight import AppliedFlight
-    from analysis.strips import Strip
-    from analysis.track import Bools, Floats
     from companion.core.prescription import Prescription
+    from companion.core.schedule import LagModel
     from companion.core.setup import Setup
-
-
-import re
-from typing import TYPE_CHECKING, NamedTuple
-
-from companion.core.nozzle import is_override
-
-if TYPE_CHECKING:
-    from analysis.flown.applied_flight import AppliedFlight
-    from analysis.track import Floats
 
 
 OFF_BY = 0.10

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from analysis.assess.ground_elements import Grid, Slices, SquareGrid, slices_of, summed
-from analysis.assess.ground_rates import rates_of_squares
+from analysis.assess.zone_lookup import rates_of_squares
 from companion.core.nozzle import flow_for_rate
 
 if TYPE_CHECKING:
@@ -26,12 +26,6 @@ if TYPE_CHECKING:
     from analysis.track import Bools, Floats, Ints
     from companion.core.cells import CellGrid
     from companion.core.prescription import Prescription
-
-
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from analysis.track import Floats, Ints
 
 
 # How often cells deviate by how much.

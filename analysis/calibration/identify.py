@@ -4,32 +4,21 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from statistics import fmean, median, variance
-from typing import TYPE_CHECKING
+from statistics import NormalDist, fmean, median, stdev, variance
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from analysis.calibration.steps import Kind, Reject, Step, find_steps, settle_s
+from analysis.student import t_factor
 
 if TYPE_CHECKING:
     from analysis.calibration.flow_record import Floats, FlowRecord
+    from analysis.calibration.steps import Step
     from companion.core.schedule import LagModel
 
-
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from analysis.calibration.flow_record import Floats
-    from analysis.calibration.steps import Step
-
-
-from collections.abc import Callable
-from statistics import NormalDist, stdev
-from typing import TypeVar
-
-from analysis.student import t_factor
 
 # Means with 95 % intervals from few values: Student's t, and the jackknife for what is no mean.
 

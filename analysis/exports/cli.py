@@ -10,9 +10,9 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
+    from analysis.exports.columns import System
     from analysis.exports.registry import Format
-    from analysis.exports.units import System
-from analysis.exports.source import Shape, Source
+    from analysis.exports.source import Shape, Source
     from analysis.flown.applied_flight import AppliedFlight
     from companion.errors import UnreadableError
 
@@ -122,8 +122,8 @@ def _write(source: Source, form: Format, out: Path, *, force: bool) -> int:
 
 
 def _system(form: Format, units: str) -> System:
+    from analysis.exports.columns import SYSTEMS
     from analysis.exports.output import ExportError
-    from analysis.exports.units import SYSTEMS
 
     found = next((each for each in SYSTEMS if each == units), None)
     if found is None:

@@ -5,7 +5,6 @@ characters, as a dBASE table has them, and follows the names of John Deere's exp
 have one. What a program does not know it passes over, so the facts of the flight are columns too.
 """
 
-
 from __future__ import annotations
 
 import re
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from analysis.exports.about import About
     from analysis.exports.samples import Samples
     from analysis.exports.swaths import Swaths
-
 
 
 from typing import Literal, get_args

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.exports.columns import Column, valve_columns
-from analysis.exports.units import Unit
+from analysis.exports.columns import Column, Unit, valve_columns
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content

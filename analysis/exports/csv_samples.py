@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.exports.columns import Column, plain_names
+from analysis.exports.columns import Column, Unit, plain_names
 from analysis.exports.csv_points import described
-from analysis.exports.units import Unit
 from analysis.strips import strips_of
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
@@ -18,6 +19,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
+from analysis.exports.about import utc_ms
 from analysis.exports.output import geographic, zipped
 
 if TYPE_CHECKING:
@@ -26,15 +28,6 @@ if TYPE_CHECKING:
     from analysis.exports.samples import Samples
     from analysis.exports.source import Source
     from companion.core.boom import Boom
-
-
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
-from analysis.exports.about import utc_ms
-
-if TYPE_CHECKING:
-    from analysis.exports.samples import Samples
 
 
 # The time log of ISO 11783-10: TLG00001.xml names what TLG00001.bin holds, record by record.

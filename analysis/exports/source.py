@@ -7,10 +7,9 @@ from functools import cached_property
 from typing import Literal
 
 from analysis.exports.about import About, about
-from analysis.exports.columns import Column, point_columns, swath_columns
+from analysis.exports.columns import Column, System, Unit, point_columns, swath_columns, units_of
 from analysis.exports.samples import Samples, samples_of
 from analysis.exports.swaths import Swaths, swaths_of
-from analysis.exports.units import System, Unit, units_of
 from analysis.flight_record import FlightRecord
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import record_of

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from analysis.flight_record import FlightMeta, FlightRecord
-from analysis.flown.metered import metered
-from analysis.flown.modelled_flow import ordered_s, valve_flows
-from analysis.flown.pumped_flow import pumped_ml
+from analysis.flown.modelled_flow import metered, ordered_s, pumped_ml, valve_flows
 from analysis.flown.unknown import with_gaps
 from companion.core.types import TimedChange
 from companion.errors import VrsprayError

@@ -7,6 +7,7 @@ Pulses and the wait for the next period of a trim are left out: means over a per
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,11 +17,11 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from analysis.flown.applied_flight import ValveChanges
+    from analysis.flown.applied_flight import AppliedFlight, Floats, Series, ValveChanges
     from companion.core.nozzle import NozzleSet
     from companion.core.schedule import LagModel
 
-Floats = NDArray[np.float64]
+
 Ints = NDArray[np.int64]
 
 ML_S_PER_L_MIN = 1000.0 / 60.0
@@ -142,3 +143,112 @@ def _lags(before: Floats, after: Floats, lag: LagModel) -> tuple[Floats, Floats]
     lag_s = np.select(kinds, [lag.on_s, lag.off_s, lag.up_s], lag.down_s)
     half_s = np.select(kinds, [rise_s, fall_s, min(rise_s, lag.up_s)], min(rise_s, lag.down_s))
     return lag_s, np.maximum(half_s, 0.5 * RAMP_MIN_S)
+
+
+# The modelled volume scaled to what the flow meter counted.
+#
+# A meter counts for all valves together, and pulse by pulse: so in windows long enough for its
+# resolution the model's volume is scaled by what came through, and the model says which valve.
+
+# A window holds at least so much: 230 pulses of a meter of 4600 pulses/L, 0.4 % each way.
+WINDOW_ML = 50.0
+# A meter that differs by more has failed, or its flow is not the valves': the model stands there.
+RATIO_MIN, RATIO_MAX = 0.5, 2.0
+
+
+def counted(series: Series) -> tuple[Floats, Floats]:
+    """Return times and counts that are sound; a count that began anew goes on from the last."""
+    sound = np.isfinite(series.value)
+    time_s, value = series.time_s[sound], series.value[sound]
+    if not len(value):
+        return time_s, value
+    rises = np.diff(value)
+    # What was counted up to a restart is not lost; what fell between the two counts is.
+    return time_s, np.concatenate(([0.0], np.cumsum(np.where(rises >= 0.0, rises, value[1:]))))
+
+
+def metered(flight: AppliedFlight, time_s: Floats, volume_ml: Floats) -> Floats:
+    """Return the modelled volume with the meter's total; the model where there is no meter."""
+    if flight.meter_ml is None:
+        return volume_ml
+    count_s, count_ml = counted(flight.meter_ml)
+    if len(count_s) < 2:
+        return volume_ml
+    factors = _factors(time_s, volume_ml.sum(axis=1), count_s, count_ml)
+    steps = np.diff(volume_ml, axis=0) * factors[:, np.newaxis]
+    return np.concatenate((volume_ml[:1], volume_ml[0] + np.cumsum(steps, axis=0)))
+
+
+def _factors(time_s: Floats, total_ml: Floats, count_s: Floats, count_ml: Floats) -> Floats:
+    """Return meter over model for every step of time; 1 outside the meter's time."""
+    model_ml = np.interp(count_s, time_s, total_ml)
+    inside = (count_s >= time_s[0]) & (count_s <= time_s[-1])
+    model_ml, read_ml, read_s = model_ml[inside], count_ml[inside], count_s[inside]
+    factors = np.ones(len(time_s) - 1)
+    if len(read_s) < 2 or not model_ml[-1] - model_ml[0] >= WINDOW_ML:
+        return factors
+    windows = max(int((model_ml[-1] - model_ml[0]) / WINDOW_ML), 1)
+    wanted = np.linspace(model_ml[0], model_ml[-1], windows + 1)
+    ends = np.unique(np.clip(np.searchsorted(model_ml, wanted), 0, len(model_ml) - 1))
+    given, asked = np.diff(read_ml[ends]), np.diff(model_ml[ends])
+    ratio = np.divide(given, asked, out=np.ones(len(asked)), where=asked > 0.0)
+    ratio[~((ratio >= RATIO_MIN) & (ratio <= RATIO_MAX))] = 1.0
+    middle_s = 0.5 * (time_s[1:] + time_s[:-1])
+    index = np.searchsorted(read_s[ends], middle_s, "right") - 1
+    known = (index >= 0) & (index < len(ratio))
+    factors[known] = ratio[index[known]]
+    return factors
+
+
+# The flow of a sprayer whose pump makes it: the pump's total, over the sections that are open.
+
+# Below this share of its width a section is closed: what is left of a ramp is rounding.
+OPEN_MIN = 1e-6
+
+
+def pumped_ml(flight: AppliedFlight, time_s: Floats) -> Floats:
+    """Return the modelled cumulative volume of each section.
+
+    What the motor was told is known at the decisions only, so the moment of a change is known to
+    half of the time between two of them. The flow follows as an exponential after a dead time.
+    """
+    setup = flight.setup
+    if setup.pump is None or setup.pumping is None:
+        raise ValueError("the flow is not made by a pump")
+    step_s = float(time_s[1] - time_s[0])
+    total_ml_s = _followed(flight, setup.pumping.lag, time_s, step_s)
+    shares = np.array([[valve.width_m for valve in setup.boom.valves]]).repeat(len(time_s), axis=0)
+    if setup.pump.way != "always":
+        shares *= np.stack([_open_part(flight, i, time_s) for i in range(shares.shape[1])], axis=1)
+    whole = shares.sum(axis=1, keepdims=True)
+    shares = np.divide(shares, whole, out=np.zeros_like(shares), where=whole > OPEN_MIN)
+    drops = shares * total_ml_s[:, np.newaxis] * step_s
+    volume_ml: Floats = np.cumsum(drops, axis=0) - drops[:1]
+    return volume_ml
+
+
+def _followed(flight: AppliedFlight, lag: LagModel, time_s: Floats, step_s: float) -> Floats:
+    """Return the pump's flow [mL/s] at each time: the ordered one, after its lag."""
+    flowing = flight.flow_l_min * ML_S_PER_L_MIN
+    dead_s = min(lag.up_s - lag.up_time_s, lag.down_s - lag.down_time_s) + lag.output_s
+    last = np.searchsorted(flight.time_s, time_s - dead_s, "right") - 1
+    asked = np.where(last >= 0, flowing[np.maximum(last, 0)], 0.0)
+    up, down = (
+        1.0 - math.exp(-step_s / constant_s) if constant_s > 0.0 else 1.0
+        for constant_s in (lag.up_time_s, lag.down_time_s)
+    )
+    now, found = 0.0, []
+    for value in asked.tolist():
+        now += (value - now) * (up if value > now else down)
+        found.append(now)
+    return np.array(found)
+
+
+def _open_part(flight: AppliedFlight, valve: int, time_s: Floats) -> Floats:
+    """Return how far a section is open at each time, 0 to 1."""
+    its = flight.changes.valve == valve
+    levels = (flight.changes.duty[its] > 0.0).astype(np.float64)
+    flow = ramped(ordered_s(flight.changes)[its], levels, flight.setup.lag)
+    if not len(flow.knot_s):
+        return np.zeros(len(time_s))
+    return np.interp(time_s, flow.knot_s, flow.flow_ml_s, left=0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,13 +47,6 @@ if TYPE_CHECKING:
     from analysis.report.figures.style import Drawn
     from analysis.report.treated import Treated
     from analysis.track import Floats, Ints
-
-
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from analysis.report.figures.style import Drawn
 
 
 def drawn_of(assessment: Assessment, clock: Clock, treated: Treated) -> Iterator[Drawn]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from analysis.csv_rows import read_rows
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import heading_deg
-from analysis.flown.pumped_flow import pumped_ml
+from analysis.flown.modelled_flow import pumped_ml
 from analysis.wsp.results import Numbered
 from companion.core.boom import Boom
 from companion.core.prescription import Prescription

@@ -11,8 +11,15 @@ from hypothesis import strategies as st
 
 from analysis.evaluation import evaluate
 from analysis.flown.applied_record import EvaluationError, record_of
-from analysis.flown.metered import WINDOW_ML, counted
-from analysis.flown.modelled_flow import ML_S_PER_L_MIN, flow_of, levels_ml_s, ramped, valve_flows
+from analysis.flown.modelled_flow import (
+    ML_S_PER_L_MIN,
+    WINDOW_ML,
+    counted,
+    flow_of,
+    levels_ml_s,
+    ramped,
+    valve_flows,
+)
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.schedule import LagModel
 from tests.builders import CURVE, LAG
