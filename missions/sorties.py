@@ -26,7 +26,7 @@ from missions.plan import Kind, Leg, Place, Settings, Sortie, nose_s
 from missions.refill_search import beside, build_limits, build_passes, several
 from missions.refills import Limits, Part, Passes, flown_by
 from missions.savings import Sortie as Order
-from missions.savings import by_savings, one_chain
+from missions.savings import by_savings, one_chain, turned
 from missions.search import improve
 from missions.strips import Floats, lengths_m
 from missions.timing import timed
@@ -43,6 +43,10 @@ TANKS_MAX = 1500
 # With more pieces the annealing finds little in its time that regrouping does not find sooner.
 ANNEALED_MAX = 400
 TOUCH_M = 1e-3
+# One sortie is flown the way round on which the ferry out is the shorter one: the longer one leads
+# along the lines, and before the first of them the aircraft would turn back with its nose a second
+# or more behind; and it carries the whole tank. So much longer it may be.
+FERRY_LESS_M = 1.0
 # What one kick of a tour takes, counted in moves of the search over many sorties.
 MOVES_A_KICK = 100
 # An order that is cut into many sorties is worth less of it.
@@ -298,6 +302,9 @@ def _drawn(
     home_m = ways.home_ways_m(outer.reshape(-1, 2))
     both = motion.legs_s(home_m).reshape(len(ways.depots), -1, 2).sum(axis=2)
     homes = np.argmin(both, axis=0).tolist()
+    out_m, back_m = home_m.reshape(len(ways.depots), -1, 2)[homes[0], 0].tolist()
+    if len(orders) == 1 and out_m > back_m + FERRY_LESS_M:
+        orders = [turned(orders[0])]
     ranked = sorted(range(len(orders)), key=lambda at: (homes[at], min(orders[at])))
     drawn = _Drawn(pieces=pieces, ways=ways, speed_m_s=motion.speed_m_s)
     return ranked, tuple(

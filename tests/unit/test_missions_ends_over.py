@@ -178,3 +178,14 @@ def test_ends_over_the_border_of_the_configured_map(
     assert over["reachable_percent"] > whole["reachable_percent"] - 0.2
     assert over["overlap_litres_percent"] < whole["overlap_litres_percent"]
     assert over["volume_l"] < whole["volume_l"]
+
+
+def test_one_sortie_has_its_longer_ferry_behind_its_last_line() -> None:
+    # Of an odd number of passes the last one ends far from where the first one begins: the way
+    # back from there is flown with closed valves, and no ferry leads along the first line, where
+    # the aircraft would have to turn back.
+    for length_m, across_m in ((120.0, 18.0), (100.0, 29.0), (120.0, 28.0)):
+        field = field_of(box(0.0, 0.0, length_m, across_m))
+        settings = Settings(swath_width_m=WIDTH_M, speed_m_s=6.0)
+        (sortie,) = plan_mission(field, settings, Uniform(rate_l_ha=20.0)).sorties
+        assert sortie.legs[0].length_m < 30.0 < 90.0 < sortie.legs[-1].length_m
