@@ -10,17 +10,17 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import shapely
 from pyproj import CRS
-from shapely import MultiPolygon
+from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
-from companion.flight_map import is_flight_map
+from companion.core.frame import LocalFrame
+from companion.flight_map import is_flight_map, read_flight_map
 from missions.maps.adapt.geoparquet import read_geoparquet
 from missions.maps.adapt.reader import read_adapt
 from missions.maps.assemble import crs_of, ground_of, map_of, zone_names
 from missions.maps.bundle import Bundle, open_bundle
-from missions.maps.compiled import read_compiled
-from missions.maps.crs import to_longitude_latitude
+from missions.maps.crs import Floats, to_longitude_latitude
 from missions.maps.csvfile.reader import read_csv
 from missions.maps.declared import Given
 from missions.maps.geojson.reader import is_geojson, read_geojson
@@ -30,9 +30,8 @@ from missions.maps.geotiff.reader import read_geotiff
 from missions.maps.isoxml.reader import read_isoxml
 from missions.maps.kml.reader import read_kml
 from missions.maps.layer import Grid, Layer, Value
-from missions.maps.local import Area, polygons_of
-from missions.maps.model import MapFile, map_error
-from missions.maps.outline import BOUNDARY_NAME
+from missions.maps.local import BOUNDARY_NAME, Area, polygons_of
+from missions.maps.model import MapFile, MapZone, map_error
 from missions.maps.shapefile.reader import read_shapefile
 from missions.maps.text.reader import read_text_map
 
@@ -369,3 +368,45 @@ def _named(found: Sequence[_Candidate], layer: str) -> list[_Candidate]:
         if meant:
             return meant
     return []
+
+
+# A flight map read as any other map: to plan over what will be flown, and to look at it.
+
+
+def read_compiled(path: Path) -> MapFile:
+    """Return a flight map in longitude and latitude; of cells, the ground of each rate.
+
+    Its rates are L/ha already, its boundary is without the exclusions.
+    """
+    found = read_flight_map(path)
+    prescription = found.prescription
+    *areas, field = _degrees(
+        [*(zone.polygon for zone in prescription.zones), prescription.field], found.frame
+    )
+    zones = [
+        MapZone(name=zone.name, geometry=area, rate_l_ha=zone.rate_l_ha)
+        for zone, area in zip(prescription.zones, areas, strict=True)
+        if not area.is_empty
+    ]
+    return MapFile(
+        path=path,
+        format="flight map",
+        crs="EPSG:4326",
+        unit="L/ha",
+        rate_field="rate_l_ha",
+        zones=tuple(zones),
+        sha256=prescription.sha256,
+        boundary=MultiPolygon(polygons_of(field)),
+        default_rate_l_ha=prescription.default_rate_l_ha,
+    )
+
+
+def _degrees(areas: Sequence[Area], frame: LocalFrame) -> list[Area]:
+    def there(places: Floats) -> Floats:
+        latitudes, longitudes = frame.to_geographic_all(
+            places[:, 0].tolist(), places[:, 1].tolist()
+        )
+        return np.column_stack([longitudes, latitudes])
+
+    found = shapely.transform(np.array(areas, dtype=object), there)
+    return [area for area in found if isinstance(area, Polygon | MultiPolygon)]

@@ -19,10 +19,8 @@ from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
 from missions.maps.geopackage.layers import CurvedError, areas_of, polygons_in
-from missions.maps.geopackage.reader import read_geopackage
-from missions.maps.geopackage.writer import write_geopackage
-from missions.maps.kml.reader import read_kml
-from missions.maps.kml.writer import write_kml
+from missions.maps.geopackage.reader import read_geopackage, write_geopackage
+from missions.maps.kml.reader import read_kml, write_kml
 from missions.maps.layer import Layer
 from missions.maps.model import MapFile, MapZone
 

@@ -18,8 +18,7 @@ from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
 from missions.maps.cli import convert as convert_cli
-from missions.maps.convert.formats import WRITERS, Writer
-from missions.maps.convert.writers import write_map
+from missions.maps.convert.formats import WRITERS, Writer, write_map
 from missions.maps.model import MapCells, MapFile
 from missions.maps.registry import read_map
 

@@ -20,8 +20,7 @@ from shapely import MultiPolygon, Polygon, box
 from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
-from missions.maps.geopackage.reader import read_geopackage
-from missions.maps.geopackage.writer import write_geopackage
+from missions.maps.geopackage.reader import read_geopackage, write_geopackage
 from missions.maps.layer import Layer
 from missions.maps.model import MapFile, MapZone
 

@@ -17,8 +17,7 @@ from shapely import LinearRing, MultiPolygon, Polygon, box
 from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
-from missions.maps.kml.reader import read_kml
-from missions.maps.kml.writer import write_kml
+from missions.maps.kml.reader import read_kml, write_kml
 from missions.maps.layer import Layer
 from missions.maps.model import MapFile, MapZone
 

@@ -22,7 +22,7 @@ from shapely.affinity import rotate
 
 from companion.cli.app import execute
 from missions.maps.cells import shares_inside
-from missions.maps.convert.writers import write_map
+from missions.maps.convert.formats import write_map
 from missions.maps.lint import Plan, summary
 from missions.maps.model import MapCells, MapFile, MapZone
 from missions.maps.totals import Totals, totals

@@ -17,13 +17,12 @@ from pyproj import CRS
 
 from companion.errors import MapError
 from missions.maps.adapt.catalogue import Operation, Variable, described_beside
-from missions.maps.bundle import Bundle, files_beside, open_bundle
+from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.crs import WGS84, parse_crs
 from missions.maps.geopackage.layers import CurvedError, Found, areas_of, polygons_in
 from missions.maps.layer import Column, Layer, Value, check_counts, digest
 from missions.maps.local import Area
 from missions.maps.model import map_error
-from missions.maps.one_of import one_of
 
 SUFFIXES = (".parquet", ".geoparquet")
 

@@ -15,8 +15,7 @@ from companion.errors import MapError
 from missions.maps.cli.options import File, Reading, reading_options
 from missions.maps.convert.cell_zones import outline_of_rates
 from missions.maps.convert.compare import CHANGE_MAX_L_HA, Comparison, compare
-from missions.maps.convert.formats import Wish, keeps_cells, keeps_raster
-from missions.maps.convert.writers import write_map, writer_for
+from missions.maps.convert.formats import Wish, keeps_cells, keeps_raster, write_map, writer_for
 from missions.maps.local import polygons_of
 from missions.maps.model import MapFile, Problem, map_error
 from missions.maps.registry import read_map

@@ -168,7 +168,7 @@ def _new_points(
 
 
 def _new_plots(out: Path, wanted: Plots, *, force: bool) -> dict[str, Any]:
-    from missions.maps.convert.writers import write_map
+    from missions.maps.convert.formats import write_map
 
     made = make_plots(wanted, out, map_format=out.suffix.lstrip("."))
     write_map(made, out, force=force)

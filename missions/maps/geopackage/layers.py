@@ -17,9 +17,8 @@ from shapely.geometry.base import BaseGeometry
 from missions.maps.fields import column_of
 from missions.maps.geopackage.sqlite import Cell, Database, not_a_table, quoted
 from missions.maps.layer import Value, check_coordinates, check_counts
-from missions.maps.local import Area, as_area
+from missions.maps.local import BOUNDARY_NAME, Area, as_area
 from missions.maps.model import map_error
-from missions.maps.outline import BOUNDARY_NAME
 
 # Declared types that can hold no polygon; GEOMETRY and the others can.
 _NO_GROUND = frozenset({"POINT", "MULTIPOINT", "LINESTRING", "MULTILINESTRING"})

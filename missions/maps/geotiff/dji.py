@@ -10,12 +10,11 @@ from pathlib import Path, PurePosixPath
 
 from shapely import MultiPolygon
 
-from missions.maps.bundle import Bundle, open_bundle
+from missions.maps.bundle import Bundle, one_of, open_bundle
 from missions.maps.geotiff.reader import grid_of_tiff
 from missions.maps.layer import Grid
+from missions.maps.local import outline_of
 from missions.maps.model import Problem, map_error
-from missions.maps.one_of import one_of
-from missions.maps.outline import outline_of
 from missions.maps.shapefile.files import find_shapefile
 from missions.maps.shapefile.reader import read_shapefile
 

@@ -13,24 +13,26 @@ from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
 from missions.maps.crs import WGS84
-from missions.maps.isoxml.field import check_grid_in_field, field_of
-from missions.maps.isoxml.files import TaskFiles
-from missions.maps.isoxml.polygons import (
+from missions.maps.isoxml.field import (
     FIELD,
     OBSTACLES,
     ZONE,
+    check_grid_in_field,
+    field_of,
     ground_of_polygons,
     point_count,
 )
+from missions.maps.isoxml.files import TaskFiles
 from missions.maps.isoxml.rates import (
     Rates,
+    References,
     check_shown,
     key_among,
+    product_names,
     rates_of,
     shown_in_zones,
     special_problems,
 )
-from missions.maps.isoxml.references import References, product_names
 from missions.maps.isoxml.task import Task, TreatmentZone, chosen_task, instead_of
 from missions.maps.isoxml.values import EXPORT_AGAIN, integer, number, required, text
 from missions.maps.layer import Band, Column, Grid, Layer, check_counts

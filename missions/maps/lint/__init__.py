@@ -5,7 +5,7 @@ docs/map-check.md lists every code.
 """
 
 from missions.maps.lint.check import check_map, summary
-from missions.maps.lint.plan import Plan, Sprayer
+from missions.maps.lint.short import Plan, Sprayer
 from missions.maps.points import point_rates
 
 __all__ = ["Plan", "Sprayer", "check_map", "point_rates", "summary"]

@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from shapely import STRtree
+from shapely import MultiPolygon, STRtree
 
 from companion.core.frame import LocalFrame
 from companion.wording import counted
 from missions.maps.cells import to_degrees
-from missions.maps.lint.plan import Sprayer
 from missions.maps.lint.shapes import SLIVER_WIDTH_M, SMALL_M2
 from missions.maps.lint.survey import (
     PLACES_MAX,
@@ -244,3 +243,54 @@ def _cell_problems(survey: Survey, sprayer: Sprayer, direction: Floats) -> list[
         text = f"the cells are {runs.width_m:.2f} m wide across the passes,"
         problems.append(_narrow(sprayer, text, survey.cell_spots(survey.rated)))
     return problems
+
+
+# What is known about the flight for which a map is checked; all of it may be missing.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sprayer:
+    """What the sprayer needs of a zone, so that its rate is really there.
+
+    Args:
+        speed_m_s: planned, in the passes.
+        lag_s: of the slowest kind of change, the output's delay included.
+        period_s: of a PWM period, which a change may have to wait for.
+        strip_m: width of the narrowest valve's strip.
+        across: what a strip over several zones sprays, as `prescription.across`.
+        angle_deg: of the passes, clockwise from north; None where the planner chooses.
+        speed_min_m_s: below which nothing is sprayed.
+    """
+
+    speed_m_s: float
+    lag_s: float
+    period_s: float
+    strip_m: float
+    across: str = "centre"
+    angle_deg: float | None = None
+    speed_min_m_s: float = 0.0
+
+    @property
+    def settle_s(self) -> float:
+        """Return how long a rate must last: the lag of a change and one PWM period."""
+        return self.lag_s + self.period_s
+
+    @property
+    def length_min_m(self) -> float:
+        """Return how long a zone must be along the passes."""
+        return self.speed_m_s * self.settle_s
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """Where the field and the home are, in longitude and latitude, and what flies there.
+
+    `boundary` and `default_rate_l_ha` stand above the map's own; homes are (latitude, longitude).
+    Nothing falls on `exclusions`.
+    """
+
+    boundary: MultiPolygon | None = None
+    exclusions: tuple[MultiPolygon, ...] = ()
+    default_rate_l_ha: float | None = None
+    homes: tuple[tuple[float, float], ...] = ()
+    sprayer: Sprayer | None = None
