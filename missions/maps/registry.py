@@ -23,7 +23,7 @@ from missions.maps.bundle import Bundle, open_bundle
 from missions.maps.crs import Floats, to_longitude_latitude
 from missions.maps.csvfile.reader import read_csv
 from missions.maps.declared import Given
-from missions.maps.geojson.reader import is_geojson, read_geojson
+from missions.maps.geojson import is_geojson, read_geojson
 from missions.maps.geopackage.reader import read_geopackage
 from missions.maps.geotiff.dji import RX_FOLDER, SHAPE_FOLDER, read_dji
 from missions.maps.geotiff.reader import read_geotiff

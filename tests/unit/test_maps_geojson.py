@@ -13,9 +13,8 @@ import shapely
 from shapely import box
 
 from companion.errors import MapError
-from missions.maps import layer
-from missions.maps.geojson import reader as geojson
-from missions.maps.geojson.reader import read_geojson
+from missions.maps import geojson, layer
+from missions.maps.geojson import read_geojson
 from missions.maps.registry import read_area, read_map
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from missions.maps.geojson.reader import write_geojson
+from missions.maps.geojson import write_geojson
 from missions.maps.model import MapZone
 from missions.maps.registry import read_map
 from missions.maps.shapefile import reader

@@ -65,7 +65,7 @@ def _shapefile(map_file: MapFile, path: Path, _: Wish) -> None:
 
 
 def _geojson(map_file: MapFile, path: Path, _: Wish) -> None:
-    from missions.maps.geojson.reader import write_geojson
+    from missions.maps.geojson import write_geojson
 
     write_geojson(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
 
