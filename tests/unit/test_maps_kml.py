@@ -460,8 +460,8 @@ def test_other_xml_is_refused(tmp_path: Path) -> None:
     [
         ("layer.MAX_RECORDS", 1),
         ("layer.MAX_VERTICES", 7),
-        ("kml.kml_attributes._CELLS_MAX", 1),
-        ("kml.kml_attributes._COLUMNS_MAX", 0),
+        ("kml.reader._CELLS_MAX", 1),
+        ("kml.reader._COLUMNS_MAX", 0),
         ("kml.geometry.MAX_VERTICES", 2),
     ],
 )
