@@ -18,9 +18,8 @@ from companion.cli.answer import AsJson, answer, note
 from companion.cli.progress import Tell, progress
 from companion.wording import counted
 from missions.files.fence import Fences, fence_warnings
-from missions.files.fleet import write_fleet
 from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
-from missions.files.write import check_suffix, older_sorties
+from missions.files.write import check_suffix, older_sorties, write_fleet
 from missions.maps.cli.grid import parse_mark
 from missions.maps.cli.options import Reading, reading_options
 from missions.maps.whole_file import check_folder

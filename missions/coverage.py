@@ -10,7 +10,18 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from missions.demand import Rates, Uniform
-from missions.strips import Floats, Objects, rectangles, whole
+from missions.strips import (
+    NARROWER_M,
+    Floats,
+    Objects,
+    joined,
+    no_lines,
+    rectangles,
+    stretched,
+    united,
+    whole,
+)
+from missions.swaths import LINE_MIN_M
 
 # Less than this is no ground but the last digits of large numbers.
 NOISE_M2 = 1e-6
@@ -92,3 +103,112 @@ def of_rated_ground(
         percent=100.0 * float(treated.mean()),
         without_rate_m2=ground.area * float((~rated).mean()),
     )
+
+
+# What passes and inner lines leave out: sharp corners, and places no wider than a swath.
+
+# So much may stay uncovered of what can be reached: half of what the plan as a whole may miss.
+LEFT_SHARE = 0.0005
+PATCH_MIN_M2 = 0.02
+# What margins take of a place that is too narrow for them; at corners it is less than this.
+PLACE_M2 = 2.0
+ROUNDS = 4
+PATCHES_MAX = 200
+ANGLES, ASIDE = 12, 7
+# A line grows to both sides from a seed of this half length.
+SEED_M = 0.05
+
+
+def patches(
+    lines: Floats,
+    ground: BaseGeometry,
+    width_m: float,
+    *,
+    left_share: float = LEFT_SHARE,
+    target: BaseGeometry | None = None,
+    covered: BaseGeometry | None = None,
+) -> Floats:
+    """Return more lines, for ground that the others miss though a strip could reach it.
+
+    That ground is the `target`, where it is given.
+    """
+    if target is None:
+        target = reachable(ground, width_m)
+    if covered is None:
+        covered = united(lines, width_m)
+    allowed_m2 = left_share * target.area
+    tight = ground.buffer(NARROWER_M)
+    shapely.prepare(tight)
+    added = no_lines()
+    for _ in range(ROUNDS):
+        missing = shapely.get_parts(target.difference(covered))
+        area_m2 = shapely.area(missing)
+        order = np.argsort(-area_m2, kind="stable")
+        # No more of them than have to be covered.
+        still_m2 = area_m2.sum() - np.concatenate([[0.0], np.cumsum(area_m2[order])[:-1]])
+        largest = missing[order[still_m2 > allowed_m2]][:PATCHES_MAX]
+        if not len(largest):
+            break
+        new = joined([_over(patch, tight, width_m) for patch in largest])
+        if not len(new):
+            break
+        added = joined([added, new])
+        covered = whole(np.array([covered, *rectangles(new, width_m)]))
+    return added
+
+
+def narrow_patches(
+    lines: Floats, ground: BaseGeometry, limit: BaseGeometry, width_m: float
+) -> Floats:
+    """Return more lines for places of the limit that margins make narrower than a swath.
+
+    A ditch that is a swath wide to the centimetre is flown across there, stroke by stroke.
+    """
+    whole = reachable(limit, width_m).intersection(ground)
+    lost = shapely.get_parts(whole.difference(reachable(ground, width_m)))
+    places = lost[shapely.area(lost) > PLACE_M2]
+    if not len(places):
+        return no_lines()
+    return patches(lines, ground, width_m, target=shapely.union_all(places))
+
+
+def _over(patch: BaseGeometry, ground: BaseGeometry, width_m: float) -> Floats:
+    """Return the line whose strip covers most of a patch and nothing outside; none for crumbs."""
+    if not patch.area > PATCH_MIN_M2:
+        return no_lines()
+    lines = _candidates(patch, ground, width_m)
+    if not len(lines):
+        return no_lines()
+    strips = rectangles(lines, width_m)
+    inside = shapely.covers(ground, rectangles(lines, width_m - 2.0 * NARROWER_M))
+    gain = np.where(inside, shapely.area(shapely.intersection(strips, patch)), 0.0)
+    best = int(np.argmax(gain))
+    if not gain[best] > PATCH_MIN_M2:
+        return no_lines()
+    return lines[[best]]
+
+
+def _candidates(patch: BaseGeometry, ground: BaseGeometry, width_m: float) -> Floats:
+    """Return lines over the patch in many directions, moved aside from it by parts of a swath."""
+    near = patch.buffer(2.0 * width_m).intersection(ground)
+    points = shapely.get_coordinates(near)
+    step = np.diff(points, axis=0)
+    long = step[np.argsort(-np.hypot(*step.T), kind="stable")[:ANGLES]]
+    courses = np.concatenate(
+        [np.arctan2(long[:, 1], long[:, 0]), np.arange(ANGLES) * np.pi / ANGLES]
+    )
+    courses = np.concatenate([courses, courses + np.pi / 2.0])
+    corners = shapely.get_coordinates(patch)
+    middle = shapely.get_coordinates(patch.representative_point())[0]
+    along = np.column_stack([np.cos(courses), np.sin(courses)])
+    right = np.column_stack([along[:, 1], -along[:, 0]])
+    s, t, here = corners @ along.T, corners @ right.T, along @ middle
+    half_m = width_m / 2.0
+    aside = np.linspace(t.max(axis=0) - half_m, t.min(axis=0) + half_m, ASIDE)
+    places = (along * here[:, None])[None, :, :] + right * aside[:, :, None]
+    seeds = np.concatenate([places - along * SEED_M, places + along * SEED_M], axis=2)
+    seeds = seeds.reshape(-1, 4)
+    before_m, after_m = np.tile(here - s.min(axis=0), ASIDE), np.tile(s.max(axis=0) - here, ASIDE)
+    inside = shapely.covers(ground, rectangles(seeds, width_m - 2.0 * NARROWER_M))
+    wanted = np.maximum(np.stack([before_m, after_m])[:, inside], LINE_MIN_M / 2.0)
+    return stretched(seeds[inside], wanted[0], wanted[1], ground, width_m)

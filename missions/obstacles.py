@@ -22,8 +22,7 @@ from missions.errors import PlanError
 from missions.maps.layer import Value, as_number
 from missions.maps.local import make_valid, project_all
 from missions.maps.registry import Record, read_records
-from missions.nearness import check_near
-from missions.reading_outline import NOTHING_TOLD, told
+from missions.reading_outline import NOTHING_TOLD, check_near, told
 
 RADIUS_MAX_M, CORRIDOR_MAX_M, HEIGHT_MAX_M = 100.0, 500.0, 500.0
 # Points grow to polygons of 16 corners around their circle, not in it; corners of areas are rounded

@@ -13,12 +13,11 @@ import numpy as np
 from companion.core.frame import LocalFrame
 from missions.corners import CornerRule
 from missions.coverage import Coverage
-from missions.energy import J_WH, STRAIGHT_DEG, Battery
+from missions.energy import J_WH, STRAIGHT_DEG, VERTICALS, Battery, Vertical
 from missions.field import Field
 from missions.strips import Floats
 from missions.terrain.ground import Terrain
 from missions.turns import Motion, Turn
-from missions.verticals import VERTICALS, Vertical
 
 Place = tuple[float, float]
 Kind = Literal["spray", "transit", "ferry"]
@@ -144,7 +143,7 @@ class Leg:
     """A way at one speed: a straight spray line, or a transit or ferry that may bend.
 
     One flown `through` leads from a line into the next, which goes on straight. `seconds` are
-    those of `missions.timing`, once the whole sortie is known. `overlap_l` of `volume_l` fall on
+    those of `missions.stops`, once the whole sortie is known. `overlap_l` of `volume_l` fall on
     treated ground though valves close there; None where none do. `height_m` is None at that of the
     lines.
     """

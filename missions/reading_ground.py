@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import shapely
 
 from companion.config import Config
@@ -18,9 +19,8 @@ from missions.field import Field, local_area
 from missions.maps.registry import read_area
 from missions.reading_outline import told
 from missions.run_in import RunIn
-from missions.swath_table import SwathPoint, swath_width_m
+from missions.terrain.dem import read_dem
 from missions.terrain.ground import Terrain
-from missions.terrain.reading import read_dem
 from missions.wind import WindBuffer
 
 Autopilot = Literal["ardupilot", "px4"]
@@ -195,3 +195,53 @@ def spacing_m(
             f"{100.0 * (boom_m / width_m - 1.0):+.0f} % off; make boom and valves as wide"
         )
     return width_m
+
+
+# The measured swath by height and speed: bilinear inside the table, nothing outside it.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwathPoint:
+    """One measurement: the width that was wet evenly at a height and a speed."""
+
+    height_m: float
+    speed_m_s: float
+    width_m: float
+
+
+def swath_width_m(points: Sequence[SwathPoint], *, height_m: float, speed_m_s: float) -> float:
+    """Return the swath at a height and a speed.
+
+    >>> table = [SwathPoint(height_m=h, speed_m_s=v, width_m=w)
+    ...          for h, v, w in ((2, 4, 5.0), (2, 8, 6.0), (4, 4, 6.0), (4, 8, 8.0))]
+    >>> swath_width_m(table, height_m=3.0, speed_m_s=6.0)
+    6.25
+
+    Raises:
+        PlanError: for a table with holes, and outside of it.
+    """
+    widths = {(point.height_m, point.speed_m_s): point.width_m for point in points}
+    if len(widths) < len(points):
+        raise PlanError("mission.swath has two widths for one height and speed; keep one")
+    heights = sorted({height for height, _ in widths})
+    speeds = sorted({speed for _, speed in widths})
+    for height in heights:
+        for speed in speeds:
+            if (height, speed) not in widths:
+                raise PlanError(
+                    f"mission.swath has no width at {height:g} m and {speed:g} m/s; measure every "
+                    "speed at every height"
+                )
+    for value, known, name, unit in (
+        (height_m, heights, "height_m", "m"), (speed_m_s, speeds, "speed_m_s", "m/s")
+    ):  # fmt: skip
+        if not known[0] <= value <= known[-1]:
+            raise PlanError(
+                f"mission.{name} = {value:g} lies outside mission.swath, which was measured from "
+                f"{known[0]:g} to {known[-1]:g} {unit}; measure it there, or fly within"
+            )
+    by_speed = [
+        float(np.interp(height_m, heights, [widths[height, speed] for height in heights]))
+        for speed in speeds
+    ]
+    return float(np.interp(speed_m_s, speeds, by_speed))

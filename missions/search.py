@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from missions.network import Network
-from missions.savings import Lasts, Sortie, turned
 from missions.searching import steps
+from missions.tour import Lasts, Sortie, turned
 
 # The first moves may cost some twenty seconds of flight, the last ones next to nothing.
 HOT_S, COLD_S = 20.0, 0.3

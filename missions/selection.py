@@ -20,8 +20,7 @@ from shapely.geometry.base import BaseGeometry
 
 from missions.boom import SLACK_M, Boom, where_inside
 from missions.coverage import reachable
-from missions.fitted_lines import edges_along
-from missions.open_lines import evenly
+from missions.open_lines import edges_along, evenly
 from missions.strips import Floats, directions, joined, lengths_m
 from missions.swaths import axes
 from missions.turns import Motion

@@ -13,11 +13,10 @@ from missions.paced import Paced, paced
 from missions.plan import Settings, Sortie
 from missions.run_in import RunIn, slow_starts, with_run_ins
 from missions.spacing import Spacing
+from missions.stops import timed
 from missions.strips import Floats
 from missions.terrain.ground import Terrain
-from missions.terrain.heights import return_warnings
-from missions.terrain.slopes import slowed
-from missions.timing import timed
+from missions.terrain.heights import return_warnings, slowed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,8 +26,7 @@ from missions.errors import FenceError, PlanError
 from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
 from missions.field import Field
 from missions.files.fence_corners import with_corners
-from missions.files.limits import NAMES
-from missions.files.plan_rules import FENCE_CORNERS_MAX
+from missions.files.plan_rules import FENCE_CORNERS_MAX, NAMES
 from missions.maps.local import polygons_of
 from missions.plan import Place, Plan, Settings, Sortie
 from missions.strips import Objects

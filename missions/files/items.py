@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from missions.files.limits import check_sprayer
+from missions.files.plan_rules import check_sprayer
 from missions.plan import Place, Plan, Settings, Sortie
 from missions.stops import Stop, waypoints_of
 from missions.terrain.ground import Terrain

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
 
 from missions.errors import PlanError
-from missions.files.fence import Fences
-from missions.files.geojson import geojson_text
-from missions.files.kml import kml_text
-from missions.files.plan_file import plan_text
-from missions.files.waypoints import waypoints_text
+from missions.files.fence import Fences, fence_content
+from missions.files.items import ABOVE_GROUND, RELATIVE, WAYPOINT, Item, items_of
+from missions.files.plan_rules import check_content, check_items
 from missions.maps.whole_file import write_whole
-from missions.plan import Plan
+from missions.plan import Leg, Place, Plan, Sortie
 
 ONE_SORTIE = (".plan", ".waypoints")
 FORMATS = (*ONE_SORTIE, ".geojson", ".kml")
@@ -95,3 +97,256 @@ def write_plan(
     for path, text in zip(paths, texts, strict=True):
         write_whole(path, text.encode("utf-8"))
     return paths
+
+
+# The files of several aircraft: one set for each, numbered beside the one that was asked for.
+
+
+def fleet_path(out: Path, aircraft: int, count: int) -> Path:
+    """Return the file of one aircraft.
+
+    >>> fleet_path(Path("m.plan"), 2, 3).name, fleet_path(Path("m.plan"), 1, 1).name
+    ('m-a2.plan', 'm.plan')
+    """
+    return out if count == 1 else out.with_name(f"{out.stem}-a{aircraft}{out.suffix}")
+
+
+def write_fleet(
+    plan: Plan, out: Path, *, with_sprayer: bool = False, fences: Fences | None = None
+) -> tuple[list[Path], list[Path]]:
+    """Write the files of every aircraft; return the missions, and the lines for their sprayers.
+
+    The first sortie of an aircraft is in its first file, whatever its number in the whole plan.
+    """
+    crafts = sorted({sortie.aircraft for sortie in plan.sorties})
+    count = max(crafts)
+    files: list[Path] = []
+    marks: list[Path] = []
+    for aircraft in crafts:
+        own = [sortie for sortie in plan.sorties if sortie.aircraft == aircraft]
+        path = fleet_path(out, aircraft, count)
+        files += write_plan(
+            replace(plan, sorties=tuple(own)), path, with_sprayer=with_sprayer, fences=fences
+        )
+        lines = lines_path(path)
+        if lines is not None:
+            marks.append(lines)
+    return files, marks
+
+
+# The whole plan as GeoJSON: a line for each leg, a point for each depot.
+
+# 1e-9 degrees are 0.1 mm.
+DIGITS = 9
+
+
+def geojson_text(plan: Plan) -> str:
+    """Return the content of the file."""
+    features = [
+        _leg(plan, sortie, sequence, leg)
+        for sortie in plan.sorties
+        for sequence, leg in enumerate(sortie.legs)
+        if leg.length_m > 0.0
+    ]
+    features += [_depot(plan, number, depot) for number, depot in enumerate(plan.depots, start=1)]
+    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+
+
+def _place(plan: Plan, place: Place) -> list[float]:
+    latitude_deg, longitude_deg = plan.frame.to_geographic(*place)
+    return [round(longitude_deg, DIGITS), round(latitude_deg, DIGITS)]
+
+
+def _leg(plan: Plan, sortie: Sortie, sequence: int, leg: Leg) -> dict[str, Any]:
+    return {
+        "type": "Feature",
+        "properties": {
+            "kind": leg.kind,
+            "sortie": sortie.number,
+            "sequence": sequence,
+            "speed_m_s": leg.speed_m_s,
+            "volume_l": round(leg.volume_l, 6),
+            "height_m": plan.settings.height_m if leg.height_m is None else leg.height_m,
+        },
+        "geometry": {
+            "type": "LineString",
+            "coordinates": [_place(plan, point) for point in leg.points],
+        },
+    }
+
+
+def _depot(plan: Plan, number: int, depot: Place) -> dict[str, Any]:
+    return {
+        "type": "Feature",
+        "properties": {"kind": "depot", "number": number},
+        "geometry": {"type": "Point", "coordinates": _place(plan, depot)},
+    }
+
+
+# The whole plan as KML, to look at: a folder for each sortie, a colour for each kind of leg.
+#
+# With an elevation model heights are above sea level, as the model has them; without one they are
+# above whatever ground the viewer knows, because nothing says how high the depot is.
+
+# Alpha, blue, green, red.
+COLOURS = {"spray": "ff3ca03c", "transit": "ff00a5ff", "ferry": "ff3232dc"}
+
+
+def kml_text(plan: Plan) -> str:
+    """Return the content of the file."""
+    styles = [
+        f'<Style id="{kind}"><LineStyle><color>{colour}</color><width>2</width></LineStyle></Style>'
+        for kind, colour in COLOURS.items()
+    ]
+    folders = [
+        f"<Folder><name>{escape(f'Sortie {sortie.number}: {sortie.volume_l:.1f} L')}</name>"
+        + "".join(_kml_leg(plan, leg) for leg in sortie.legs if leg.length_m > 0.0)
+        + "</Folder>"
+        for sortie in plan.sorties
+    ]
+    depots = [
+        f"<Placemark><name>Depot {number}</name><Point><coordinates>{_kml_place(plan, depot)}"
+        "</coordinates></Point></Placemark>"
+        for number, depot in enumerate(plan.depots, start=1)
+    ]
+    body = "\n".join([*styles, *folders, *depots])
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document>\n{body}\n</Document></kml>\n'
+    )
+
+
+def _kml_place(plan: Plan, place: Place) -> str:
+    latitude_deg, longitude_deg = plan.frame.to_geographic(*place)
+    return f"{longitude_deg:.9f},{latitude_deg:.9f}"
+
+
+def _kml_leg(plan: Plan, leg: Leg) -> str:
+    height_m = plan.settings.height_m if leg.height_m is None else leg.height_m
+    if plan.terrain is None:
+        mode, heights = "relativeToGround", [(place, height_m) for place in leg.points]
+    else:
+        way = plan.terrain.straight_parts(leg.points)
+        mode = "absolute"
+        heights = [
+            ((east_m, north_m), ground_m + height_m)
+            for (east_m, north_m), ground_m in zip(
+                way.places.tolist(), way.ground_m.tolist(), strict=True
+            )
+        ]
+    line = " ".join(f"{_kml_place(plan, place)},{above_m:.2f}" for place, above_m in heights)
+    return (
+        f"<Placemark><name>{leg.kind}</name><styleUrl>#{leg.kind}</styleUrl>"
+        f"<LineString><altitudeMode>{mode}</altitudeMode>"
+        f"<coordinates>{line}</coordinates></LineString></Placemark>"
+    )
+
+
+# QGroundControl's `.plan`: one sortie, with the field as its fence and the depots as rally points.
+#
+# What the loader needs beyond its documentation: `geoFence` and `rallyPoints` must be there, a
+# simple item has exactly seven parameters, and of `Altitude`, `AltitudeMode` and
+# `AMSLAltAboveTerrain` all or none.
+
+FIRMWARES = {"ardupilot": 3, "px4": 12}  # MAV_AUTOPILOT
+COPTER = 2  # MAV_TYPE_QUADROTOR
+# By frame: heights above home, absolute, and above the ground as the vehicle knows it.
+ALTITUDE_MODES = {RELATIVE: 1, 0: 2, ABOVE_GROUND: 4}
+
+
+def plan_text(
+    plan: Plan, sortie: Sortie, *, with_sprayer: bool = False, fences: Fences | None = None
+) -> str:
+    """Return the content of the file; `fences` are those of the plan, where they are at hand."""
+    fence = (fences or Fences(plan)).of(sortie)
+    home = plan.frame.to_geographic(*plan.depots[sortie.depot])
+    items = items_of(plan, sortie, with_sprayer=with_sprayer)
+    check_items(plan, sortie, len(items))
+    content = {
+        "fileType": "Plan",
+        "geoFence": fence_content(plan, fence),
+        "groundStation": "vrspray",
+        "mission": {
+            "cruiseSpeed": plan.settings.speed_m_s,
+            "firmwareType": FIRMWARES[plan.settings.autopilot],
+            "globalPlanAltitudeMode": _mode_of_all(items),
+            "hoverSpeed": plan.settings.speed_m_s,
+            "items": [_simple(number, item) for number, item in enumerate(items, start=1)],
+            "plannedHomePosition": [*_rounded(home), 0.0],
+            "vehicleType": COPTER,
+            "version": 2,
+        },
+        "rallyPoints": {
+            "points": [[*_rounded(plan.frame.to_geographic(*depot)), 0.0] for depot in plan.depots],
+            "version": 2,
+        },
+        "version": 1,
+    }
+    check_content(plan, sortie, content)
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def _mode_of_all(items: Sequence[Item]) -> int:
+    """Return the one altitude mode of a plan; 0 where they are mixed."""
+    modes = {ALTITUDE_MODES[item.frame] for item in items if item.has_place}
+    return modes.pop() if len(modes) == 1 else 0
+
+
+def _rounded(place: tuple[float, float]) -> list[float]:
+    return [round(place[0], DIGITS), round(place[1], DIGITS)]
+
+
+def _simple(number: int, item: Item) -> dict[str, Any]:
+    place = _rounded((item.latitude_deg, item.longitude_deg))
+    found: dict[str, Any] = {
+        "autoContinue": True,
+        "command": item.command,
+        "doJumpId": number,
+        "frame": item.frame,
+        "params": [*item.params, *place, item.altitude_m],
+        "type": "SimpleItem",
+    }
+    if item.has_place:
+        found |= {
+            "AMSLAltAboveTerrain": None,
+            "Altitude": item.altitude_m,
+            "AltitudeMode": ALTITUDE_MODES[item.frame],
+        }
+    return found
+
+
+# QGC WPL 110 (`.waypoints`), for Mission Planner and MAVProxy: one sortie, row 0 is home.
+
+ABSOLUTE = 0  # MAV_FRAME_GLOBAL: the frame of home
+
+
+def waypoints_text(plan: Plan, sortie: Sortie, *, with_sprayer: bool = False) -> str:
+    """Return the content of the file; there is no NaN in it: readers stumble over the word."""
+    latitude_deg, longitude_deg = plan.frame.to_geographic(*plan.depots[sortie.depot])
+    home = Item(
+        command=WAYPOINT,
+        frame=RELATIVE,
+        params=(0.0, 0.0, 0.0, 0.0),
+        latitude_deg=latitude_deg,
+        longitude_deg=longitude_deg,
+    )
+    own = items_of(plan, sortie, with_sprayer=with_sprayer)
+    check_items(plan, sortie, len(own))
+    items = (home, *own)
+    lines = ["QGC WPL 110", *(_row(number, item) for number, item in enumerate(items))]
+    return "\n".join(lines) + "\n"
+
+
+def _row(number: int, item: Item) -> str:
+    columns = [
+        str(number),
+        str(int(number == 0)),
+        str(item.frame if number else ABSOLUTE),
+        str(item.command),
+        *(f"{value or 0.0:g}" for value in item.params),
+        f"{item.latitude_deg:.9f}",
+        f"{item.longitude_deg:.9f}",
+        f"{item.altitude_m:.3f}",
+        "1",
+    ]
+    return "\t".join(columns)

@@ -17,9 +17,8 @@ from missions.errors import UploadError
 from missions.maps.compiling import compiled_setup
 from missions.upload.checks import FIRMWARES
 from missions.upload.following import each_when_flown, sorties_from
-from missions.upload.items import MissionFile
+from missions.upload.items import MissionFile, elsewhere
 from missions.upload.mavsdk_vehicle import connected
-from missions.upload.places import elsewhere
 from missions.upload.reading import read_mission_file
 from missions.upload.transfer import TransferError, Uploaded, What, put
 

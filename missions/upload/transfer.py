@@ -8,8 +8,7 @@ from typing import Literal, Protocol
 
 from missions.errors import UploadError
 from missions.upload.checks import FIRMWARES, Compared, blame, compare, crowded, refusal
-from missions.upload.items import Firmware, MissionFile, WireItem
-from missions.upload.places import misplaced
+from missions.upload.items import Firmware, MissionFile, WireItem, misplaced
 
 What = Literal["mission", "fence"]
 Progress = Callable[[What, float], None]

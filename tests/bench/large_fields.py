@@ -27,7 +27,7 @@ from shapely.geometry.base import BaseGeometry
 from missions.demand import Uniform
 from missions.energy import Battery
 from missions.field import Field, build_field
-from missions.files.geojson import geojson_text
+from missions.files.write import geojson_text
 from missions.plan import Settings
 from missions.planner import plan_mission
 from tests.bench.parcels import read_parcel

@@ -27,7 +27,7 @@ from analysis.border import off_target_ml
 from analysis.strips import strips_of
 from companion.config import Config, load
 from companion.core.setup import Setup
-from missions.files.geojson import geojson_text
+from missions.files.write import geojson_text
 from missions.maps.compiling import compiled_setup
 from missions.plan import Plan, Sortie
 from missions.planner import plan_mission

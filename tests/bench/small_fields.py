@@ -25,8 +25,8 @@ from missions.layouts import LOST_SHARE
 from missions.plan import LEAVE_PERCENT, Leg, Plan, Settings, Sortie
 from missions.planner import plan_mission
 from missions.sheet import sheet
+from missions.stops import timed
 from missions.strips import Floats, directions, lengths_m, rectangles
-from missions.timing import timed
 from tests.bench.missions import say
 from tests.bench.peers import lines_of
 from tests.mission_judge import Drawn

@@ -12,23 +12,22 @@ from hypothesis import strategies as st
 from shapely import Polygon
 from shapely.affinity import rotate
 
-from missions.coverage import reachable
+from missions.coverage import patches, reachable
 from missions.demand import Uniform, cut, demands
 from missions.field import build_field
 from missions.free_space import free_space
 from missions.layouts import spray_lines
 from missions.network import build_network
 from missions.open_lines import needed_passes, open_lines
-from missions.patches import patches
 from missions.plan import Settings
 from missions.planner import plan_mission
-from missions.savings import by_savings, cost_s
 from missions.search import improve
 from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing
 from missions.stops import near_pairs, waypoints_of
 from missions.strips import joined, lengths_m, rectangles, united
 from missions.swaths import border_passes, inner_ground, inner_lines
+from missions.tour import by_savings, cost_s
 from missions.turns import Motion
 from missions.ways import build_ways
 from tests.bench.missions import FRAME, random_field, to_degrees

@@ -13,12 +13,11 @@ from shapely import Polygon, box
 
 from companion.config.tables import MissionTable
 from missions.demand import Uniform
-from missions.energy import Battery
+from missions.energy import Battery, Vertical
 from missions.errors import PlanError
 from missions.plan import Leg, Plan, Settings, Sortie, sortie_wh
 from missions.planner import plan_mission
 from missions.reading_fleet import battery_of
-from missions.verticals import Vertical
 from missions.ways import build_ways
 from tests.unit.test_missions_plan import field_of, plan_of
 

@@ -13,9 +13,8 @@ import shapely
 from shapely import LineString, Polygon, box
 
 from companion.cli.app import execute
-from missions.boom import INSIDE_M, Boom, boom_of
+from missions.boom import INSIDE_M, Boom, boom_of, side_by_side
 from missions.demand import Uniform
-from missions.ends_over import side_by_side
 from missions.field import Field, build_field
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission

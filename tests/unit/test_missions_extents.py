@@ -7,7 +7,7 @@ import pytest
 from shapely import box
 
 from missions.demand import Uniform, demands
-from missions.extents import extents_of
+from missions.strips import extents_of
 
 VALVES = tuple((right_m, 1.0) for right_m in (-2.5, -1.5, -0.5, 0.5, 1.5, 2.5))
 FIELD = box(0, 0, 50, 200)

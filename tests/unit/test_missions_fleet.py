@@ -12,7 +12,7 @@ from shapely import Polygon, box
 from shapely.affinity import rotate
 
 from missions.errors import PlanError
-from missions.files.fleet import write_fleet
+from missions.files.write import write_fleet
 from missions.plan import Plan
 from missions.schedule import separation_m, way_of
 from missions.sheet import sheet, sortie_lines

@@ -12,8 +12,7 @@ from shapely.affinity import rotate
 
 from missions import open_lines as lines_module
 from missions.coverage import measure
-from missions.fitted_lines import edges_along, fitted_lines
-from missions.open_lines import needed_passes, open_lines
+from missions.open_lines import edges_along, fitted_lines, needed_passes, open_lines
 from missions.strips import lengths_m
 from missions.swaths import border_passes
 from missions.turns import Motion

@@ -23,9 +23,8 @@ from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_
 from missions.field import Field, build_field
 from missions.files.fence import Fences, fence_warnings
 from missions.files.fence_corners import with_corners
-from missions.files.geojson import geojson_text
-from missions.files.plan_file import plan_text
 from missions.files.plan_rules import FENCE_CORNERS_MAX
+from missions.files.write import geojson_text, plan_text
 from missions.free_space import CORNERS_MAX, free_space
 from missions.maps.local import make_valid
 from missions.plan import Plan, Settings

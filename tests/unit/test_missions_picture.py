@@ -12,8 +12,7 @@ import shapely
 from shapely import Polygon
 
 from companion.cli.app import execute
-from missions.picture import draw_plan, sprayed_twice
-from missions.picture_legend import colour_of
+from missions.picture import colour_of, draw_plan, sprayed_twice
 from missions.strips import rectangles
 from tests.unit.test_missions_cli import written
 

@@ -15,9 +15,9 @@ from missions.demand import Rates, Uniform, cut, demands
 from missions.errors import PlanError
 from missions.field import Field, build_field
 from missions.free_space import free_space
-from missions.map_rates import MapRates
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
+from missions.reading import MapRates
 from missions.strips import lengths_m, rectangles
 from missions.turns import Motion
 from missions.ways import build_ways, edge_places

@@ -16,12 +16,12 @@ from shapely.affinity import rotate
 from missions.demand import Uniform, demands
 from missions.energy import Battery
 from missions.field import build_field
-from missions.files.geojson import geojson_text
+from missions.files.write import geojson_text
 from missions.free_space import free_space
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
+from missions.refill_search import merged, regrouped
 from missions.refills import Limits, Part, Passes, Times, flown_by, plainly, split
-from missions.regroup import merged, regrouped
 from missions.sheet import sheet
 from missions.strips import Floats
 from missions.turns import Motion

@@ -15,8 +15,7 @@ from missions.demand import Uniform
 from missions.files.items import CHANGE_SPEED, SPRAYER, items_of
 from missions.paced import paced
 from missions.plan import Leg, Plan, Settings, Sortie
-from missions.short import short_warnings
-from missions.speeds import stretches_of
+from missions.speeds import short_warnings, stretches_of
 from missions.strips import Floats
 from tests.bench.missions import FRAME
 from tests.unit.test_missions_zero import Bare, planned

@@ -24,10 +24,8 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.strips import Floats
 from missions.surroundings import Surroundings
-from missions.terrain.dem import WGS84_CRS, Dem
-from missions.terrain.ground import Terrain
-from missions.terrain.profile import kept_points
-from missions.terrain.reading import read_dem
+from missions.terrain.dem import WGS84_CRS, Dem, read_dem
+from missions.terrain.ground import Terrain, kept_points
 from tests.bench.missions import FRAME, to_degrees
 from tests.unit.test_missions_cli import run, written
 

@@ -13,10 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from missions.corners import LAGS_S, PX4_DRAG_S, PX4_TURNING_S, parts_s
+from missions.energy import VERTICALS
 from missions.plan import JERKS_M_S3, Leg, Settings, Sortie
-from missions.timing import timed
+from missions.stops import timed
 from missions.turns import Motion
-from missions.verticals import VERTICALS
 from sitl.vehicle import Leg as Flown
 from sitl.vehicle import Route, Vehicle
 

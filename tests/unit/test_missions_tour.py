@@ -14,15 +14,13 @@ from missions.demand import Pieces, Uniform
 from missions.field import build_field
 from missions.free_space import free_space
 from missions.network import Network, build_network
-from missions.one_tour import tour_of
 from missions.plan import Settings
 from missions.planner import plan_mission
-from missions.savings import by_savings, cost_s
 from missions.strips import Floats, joined, lengths_m
 from missions.swaths import axes
-from missions.tour import shortest_tour
+from missions.tour import by_savings, cost_s, shortest_tour
 from missions.turns import Motion
-from missions.worth import worthwhile
+from missions.worth import tour_of, worthwhile
 from tests.bench.missions import FRAME, comb, to_degrees
 
 MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5)

@@ -15,7 +15,7 @@ from shapely import Polygon, box
 from companion.config import load
 from missions.errors import PlanError
 from missions.field import build_field
-from missions.swath_table import SwathPoint, swath_width_m
+from missions.reading_ground import SwathPoint, swath_width_m
 from missions.wind import WindBuffer
 from tests.bench.missions import FRAME, to_degrees
 from tests.unit.test_missions_cli import ANYANG, run, written

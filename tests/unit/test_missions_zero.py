@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from shapely import box
 
 from missions.coverage import measure, of_rated_ground
+from missions.demand import GAP_MIN_M, stretches
 from missions.field import build_field
 from missions.plan import Leg, Plan, Settings, flown_lines
 from missions.planner import plan_mission
-from missions.stretches import GAP_MIN_M, stretches
 from missions.strips import Floats, rectangles
 from tests.bench.missions import FRAME, to_degrees
 
