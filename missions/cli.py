@@ -27,7 +27,7 @@ from missions.obstacles import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
-from missions.prices import overlap_warnings, prices
+from missions.prices import closing_hint, overlap_warnings, prices
 from missions.reading import Asked, Task, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
@@ -252,8 +252,9 @@ def plan(
         )  # fmt: skip
     warnings = (*warnings, *overlap_warnings(planned, result["overlap_litres_percent"]))
     result["warnings"] = list(warnings)
+    said = _choices(planned, result, [text for _, text in choices], asked=asks or sprayer)
     answer(
-        result, [*_lines(planned, result, files), *(f"choice    {text}" for _, text in choices)],
+        result, [*_lines(planned, result, files), *(f"choice    {text}" for text in said)],
         as_json=as_json,
     )  # fmt: skip
     if once:
@@ -356,6 +357,11 @@ def _check_outputs(
     for path in (out, png, pilot_sheet):
         if path is not None:
             check_folder(path)
+
+
+def _choices(planned: Plan, result: dict[str, Any], prices: list[str], *, asked: bool) -> list[str]:
+    """Return the other choices with their prices; where none was asked for, what costs nothing."""
+    return prices if asked else list(closing_hint(planned, result["overlap_litres_percent"]))
 
 
 def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str]:

@@ -70,6 +70,18 @@ def overlap_warnings(plan: Plan, overlap_litres_percent: float) -> tuple[str, ..
     )
 
 
+def closing_hint(plan: Plan, overlap_litres_percent: float) -> tuple[str, ...]:
+    """Return what spares litres that fall twice and costs nothing, where it is not taken."""
+    settings = plan.settings
+    closes = settings.switch_off_percent is not None or not settings.valves
+    if closes or not overlap_litres_percent > OVERLAP_MAX_PERCENT:
+        return ()
+    return (
+        f"{overlap_litres_percent:.1f} % of the litres fall twice: coverage.switch_off_percent = "
+        "100 has the companion close valves over treated ground, and the plan count on it",
+    )
+
+
 def _choices(settings: Settings, now: Price, *, closes: bool) -> Iterator[tuple[str, Settings]]:
     """Yield the options that are not taken, and the defaults of those that are."""
     if settings.leave_max_percent > LEAVE_PERCENT:
