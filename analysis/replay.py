@@ -540,7 +540,7 @@ class ReplayedGround:
     def _at_the_end(
         self, kept: Coverage, memory: Memory, state: VehicleState | None, now_s: float
     ) -> int:
-        least = Coverage() if memory.watched.swath is None else memory.watched.swath.coverage
+        least = Coverage() if memory.watched.area is None else memory.watched.area.coverage
         most = self._expected(memory, state, now_s, ahead_s=END_WITHIN_S)
         return cells_without(least, kept) + cells_without(kept, most.joined(least))
 

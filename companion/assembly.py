@@ -20,7 +20,7 @@ from companion.core.inputs import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits, flow_for_rate
 from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.lines import Lines
-from companion.core.options.liquid_evidence import BIN_S, RESTLESS_SHARE, Detection
+from companion.core.options.liquid_evidence import BIN_S, UNSTEADY_SHARE, Detection
 from companion.core.options.overlap import OverlapGuard
 from companion.core.setup import Setup
 from companion.errors import ConfigError
@@ -30,7 +30,7 @@ from companion.problem import Problem
 # The autopilot tells whole millilitres ten times a second, up to a tenth of a second old: over half
 # a second that is a quarter of the flow, from one bin to the next.
 AUTOPILOT_BIN_S = 0.55
-AUTOPILOT_RESTLESS_SHARE = 0.25
+AUTOPILOT_UNSTEADY_SHARE = 0.25
 # More rates than these are named by their range: the line must stay readable.
 RATES_NAMED_MAX = 6
 
@@ -193,7 +193,7 @@ def _detection(config: Config) -> Detection | None:
         meter_required=table.meter_required,
         closed_check=table.closed_check,
         bin_s=AUTOPILOT_BIN_S if by_autopilot else BIN_S,
-        restless_share=AUTOPILOT_RESTLESS_SHARE if by_autopilot else RESTLESS_SHARE,
+        unsteady_share=AUTOPILOT_UNSTEADY_SHARE if by_autopilot else UNSTEADY_SHARE,
     )
 
 

@@ -14,7 +14,7 @@ import shapely
 
 from companion.core.controller import Memory, step
 from companion.core.nozzle import FlowCurve, NozzleSet
-from companion.core.options.pump import Pump, Way
+from companion.core.options.pump import Pump, PumpOutlet
 from companion.core.prescription import Prescription
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
@@ -39,13 +39,18 @@ VALVE_LAG = LagModel(
 )  # fmt: skip
 
 
-def pump(way: Way, lag: LagModel = PUMP_LAG) -> Pump:
+def pump(way: PumpOutlet, lag: LagModel = PUMP_LAG) -> Pump:
     """Return a pump that makes the flow."""
-    return Pump(control="modulates", way=way, lag=lag, curve=CURVE, fraction_min=0.1)
+    return Pump(control="modulates", outlet=way, lag=lag, curve=CURVE, fraction_min=0.1)
 
 
 def pump_setup(
-    rates: Sequence[float], way: Way, *, length_m: float = 30.0, valves: int = 3, **change: object
+    rates: Sequence[float],
+    way: PumpOutlet,
+    *,
+    length_m: float = 30.0,
+    valves: int = 3,
+    **change: object,
 ) -> Setup:
     """Return a set-up over plots in a row, of which a rate of 0 is not sprayed."""
     zones = plots([rates], length_m=length_m)
@@ -79,7 +84,7 @@ class Plant:
 
     tick_s = 0.005
 
-    def __init__(self, way: Way) -> None:
+    def __init__(self, way: PumpOutlet) -> None:
         self.way = way
         self.flow = 0.0  # of the pump, L/min
         self.orders: list[tuple[float, float]] = [(-math.inf, 0.0)]
@@ -135,7 +140,7 @@ def fly(
     """Return a flight along the middle of the plots."""
     flown, memory = Flown(), Memory()
     assert made.pump is not None
-    plant = Plant(made.pump.way)
+    plant = Plant(made.pump.outlet)
     steps = math.ceil((to_m - from_m) / speed_m_s / STEP_S)
     for number in range(steps):
         now_s = number * STEP_S

@@ -218,7 +218,7 @@ def pumped_ml(flight: AppliedFlight, time_s: Floats) -> Floats:
     step_s = float(time_s[1] - time_s[0])
     total_ml_s = _followed(flight, setup.pumping.lag, time_s, step_s)
     shares = np.array([[valve.width_m for valve in setup.boom.valves]]).repeat(len(time_s), axis=0)
-    if setup.pump.way != "always":
+    if setup.pump.outlet != "always":
         shares *= np.stack([_open_part(flight, i, time_s) for i in range(shares.shape[1])], axis=1)
     whole = shares.sum(axis=1, keepdims=True)
     shares = np.divide(shares, whole, out=np.zeros_like(shares), where=whole > OPEN_MIN)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.options.atomisers import Atomiser, DropletLaw
-from companion.core.options.pump import Pump, Way
+from companion.core.options.pump import Pump, PumpOutlet
 from companion.core.schedule import LagModel
 
 if TYPE_CHECKING:
@@ -287,7 +287,7 @@ def has_valve_outputs(config: Document) -> bool:
     return any(valve.channel is not None for valve in config.valve)
 
 
-def way_of(config: Document) -> Way:
+def outlet_of(config: Document) -> PumpOutlet:
     """Return what lets out what is pumped."""
     if makes_flow(config) and not has_valve_outputs(config):
         return "always"
@@ -311,13 +311,13 @@ def pump_of(config: Document) -> Pump | None:
     if table.control == "constant":
         return Pump(
             control="constant",
-            way=way_of(config),
+            outlet=outlet_of(config),
             lag=_no_lag(),
             run_fraction=((table.run_us or table.max_us) - table.stop_us) / span_us,
         )
     return Pump(
         control="modulates",
-        way=way_of(config),
+        outlet=outlet_of(config),
         lag=_lag(config, table),
         curve=pump_curve(table),
         fraction_min=fraction_min(config) or 0.0,

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from companion.core.frame import LocalFrame
 from companion.core.motion import gained_s
-from companion.core.types import LegReport, StopAhead, Way
+from companion.core.types import LegReport, MissionLeg, StopAhead
 
 # The autopilot says at 2 Hz which item it flies to; three seconds without are no news but a loss.
 LEG_AGE_MAX_S = 3.0
@@ -41,7 +41,7 @@ LEARN_SPEED_MIN_M_S = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Leg:
+class StoppingLeg:
     """A leg that ends in a stop, in the flight's frame, and how hard is braked at its end."""
 
     received_s: float
@@ -53,7 +53,7 @@ class Leg:
     braking_m_s2: float
 
 
-def leg_of(report: LegReport, frame: LocalFrame, braking_m_s2: float | None) -> Leg | None:
+def leg_of(report: LegReport, frame: LocalFrame, braking_m_s2: float | None) -> StoppingLeg | None:
     """Return the leg of a report; None where it is of no use, or none is to be used."""
     places = (
         (report.from_latitude_deg, report.from_longitude_deg),
@@ -67,7 +67,7 @@ def leg_of(report: LegReport, frame: LocalFrame, braking_m_s2: float | None) -> 
     length_m = math.hypot(to_east - east, to_north - north)
     if not LEG_MIN_M <= length_m < math.inf:
         return None
-    return Leg(
+    return StoppingLeg(
         received_s=report.received_s,
         to_east_m=to_east,
         to_north_m=to_north,
@@ -78,7 +78,7 @@ def leg_of(report: LegReport, frame: LocalFrame, braking_m_s2: float | None) -> 
     )
 
 
-def way_of(report: LegReport, frame: LocalFrame) -> Way | None:
+def mission_leg_of(report: LegReport, frame: LocalFrame) -> MissionLeg | None:
     """Return the way of a leg, whether it ends in a stop or not; None where it is no place."""
     way = _way(
         report.received_s,
@@ -93,11 +93,11 @@ def way_of(report: LegReport, frame: LocalFrame) -> Way | None:
 
 def _way(
     received_s: float, start: tuple[float, float], end: tuple[float, float], frame: LocalFrame
-) -> Way | None:
+) -> MissionLeg | None:
     if not all(abs(place[0]) <= 90.0 and abs(place[1]) <= 180.0 for place in (start, end)):
         return None
     (east_m, north_m), (to_east_m, to_north_m) = frame.to_local(*start), frame.to_local(*end)
-    return Way(
+    return MissionLeg(
         received_s=received_s,
         from_east_m=east_m,
         from_north_m=north_m,
@@ -121,7 +121,7 @@ class Approach(NamedTuple):
 
 
 def approach(
-    leg: Leg,
+    leg: StoppingLeg,
     *,
     place: tuple[float, float],
     velocity: tuple[float, float],

@@ -36,7 +36,7 @@ from companion.core.options.lines import add_off_lines
 from companion.core.options.liquid_faults import WatchMemory
 from companion.core.options.overlap import guarded, treated_before
 from companion.core.options.pump import constant_drive, liquid_of, modulated, on_off, sections
-from companion.core.options.treated_area import Swath
+from companion.core.options.treated_area import TreatedArea
 from companion.core.safety import UNASKED, Permission, closed_plan, guard, permit, shown
 from companion.core.schedule import Dosing, ValveSchedule, rate_at, schedule, sticky_border_s
 from companion.core.setup import Setup
@@ -57,7 +57,7 @@ class Watched(NamedTuple):
     """
 
     watch: WatchMemory | None = None
-    swath: Swath | None = None
+    area: TreatedArea | None = None
     ran_s: float = -math.inf
 
 
@@ -117,7 +117,7 @@ def step(
     if permission.reasons or state is None:
         return _closed(setup, state, permission, watched, ordering.trim, sequence, now_s)
     in_force = _in_force(setup, before, now_s)
-    routes = _routes(setup, state, memory.routes, watched.swath, now_s)
+    routes = _routes(setup, state, memory.routes, watched.area, now_s)
     orders = _orders(
         setup, state, routes.routes, ordering, liquid,
         in_force=in_force, ran_s=watched.ran_s, now_s=now_s,
@@ -159,9 +159,9 @@ def _watch(
         watch = liquid_faults.follow(
             setup.watching, watch or WatchMemory(), liquid, state, index=set_index, now_s=now_s
         )
-    if setup.swathing is not None:
+    if setup.recording is not None:
         area = treated_area.follow(
-            setup.swathing, area, plan, state,
+            setup.recording, area, plan, state,
             pumped=liquid if setup.pumping is not None else None,
             findings=_findings(setup, watch), drift_m=drift_m, now_s=now_s,
         )  # fmt: skip
@@ -188,11 +188,11 @@ def expected_coverage(
     With `cut_s` at `now_s` it is that of a flight that ends now. `memory` is what the step of
     `now_s` has left; nothing is treated where no record is kept.
     """
-    if setup.swathing is None:
+    if setup.recording is None:
         return Coverage()
     pumped = None if setup.pumping is None else liquid_of(setup.pumping, memory.plan)
     return treated_area.expected(
-        setup.swathing, memory.watched.swath, memory.plan, state,
+        setup.recording, memory.watched.area, memory.plan, state,
         pumped=pumped, findings=_findings(setup, memory.watched.watch),
         drift_m=memory.routes.drift_m, now_s=now_s, cut_s=cut_s,
     )  # fmt: skip
@@ -237,7 +237,7 @@ def _closed(
 
 
 def _routes(
-    setup: Setup, state: VehicleState, before: KnownRoutes, area: Swath | None, now_s: float
+    setup: Setup, state: VehicleState, before: KnownRoutes, area: TreatedArea | None, now_s: float
 ) -> KnownRoutes:
     """Return what each valve is prescribed along its way: carried on, or found anew."""
     drift_m = offset(setup.drift, state, now_s)

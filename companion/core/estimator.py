@@ -15,7 +15,15 @@ from typing import Any
 
 from companion.core import motion
 from companion.core.arithmetic import exp
-from companion.core.braking import Approach, Leg, approach, learned, leg_of, stop_ahead, way_of
+from companion.core.braking import (
+    Approach,
+    StoppingLeg,
+    approach,
+    learned,
+    leg_of,
+    mission_leg_of,
+    stop_ahead,
+)
 from companion.core.clock import Clock, on_time_s, tick
 from companion.core.inputs import MISSION_MODES
 from companion.core.motion import (
@@ -41,7 +49,7 @@ from companion.core.motion import (
     told,
 )
 from companion.core.nozzle import is_override
-from companion.core.positions import Order, Place, Stand, look, noted, sorted_in
+from companion.core.positions import Arrival, LastPlace, PositionStream, look, noted, sorted_in
 from companion.core.safety import NO_CONSENT, Consent, consented
 from companion.core.setup import Setup
 from companion.core.types import (
@@ -55,6 +63,7 @@ from companion.core.types import (
     Input,
     LandedReport,
     LegReport,
+    MissionLeg,
     OperatorCommand,
     OutputReport,
     PressureReport,
@@ -68,7 +77,6 @@ from companion.core.types import (
     Telemetry,
     UtcReport,
     VehicleState,
-    Way,
     WindReport,
 )
 
@@ -218,7 +226,7 @@ SPEED_REPORT_AGE_MAX_S = 1.0
 STATUS_AGE_MAX_S = 5.0
 # Asked for at 5 to 10 Hz, of which a slowed-down link leaves a quarter.
 RANGE_AGE_MAX_S = 1.0
-_NOTHING_HEARD = Order()
+_NOTHING_HEARD = PositionStream()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -226,11 +234,11 @@ class Track:
     """All that has been heard so far, as far as it matters."""
 
     motion: Motion | None = None
-    stand: Stand | None = None
+    last_place: LastPlace | None = None
     clock: Clock | None = None
     clock_report: ClockReport | None = None
     clock_refused: bool = False  # the last exchange cannot be true beside the positions
-    order: Order = _NOTHING_HEARD
+    order: PositionStream = _NOTHING_HEARD
     position_valid: bool = False
     position_received_s: float = -math.inf
     speed: SpeedReport | None = None
@@ -245,9 +253,9 @@ class Track:
     counted: FlowReport | None = None  # the autopilot's, until the next position dates it
     pressure: PressureReport | None = None
     tank: TankReport | None = None
-    leg: Leg | None = None
-    way: Way | None = None  # only where lines are to be followed
-    way_before: Way | None = None
+    leg: StoppingLeg | None = None
+    mission_leg: MissionLeg | None = None  # only where lines are to be followed
+    mission_leg_before: MissionLeg | None = None
     braking_m_s2: float | None = None  # as seen at the ends of legs so far
     rate_percent: float = 100.0
     consent: Consent = NO_CONSENT
@@ -265,13 +273,15 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
         return by_setup(track, item, setup)
     if isinstance(item, LegReport):
         leg = leg_of(item, setup.frame, setup.mission_braking_m_s2)
-        way = None if setup.lines is None else way_of(item, setup.frame)
-        before = track.way if _is_new_way(track.way, way) else track.way_before
-        return replace(track, leg=leg, way=way, way_before=before)
+        told = None if setup.lines is None else mission_leg_of(item, setup.frame)
+        before = (
+            track.mission_leg if _is_new_leg(track.mission_leg, told) else track.mission_leg_before
+        )
+        return replace(track, leg=leg, mission_leg=told, mission_leg_before=before)
     return _KEEP[type(item)](track, item)
 
 
-def _is_new_way(before: Way | None, now: Way | None) -> bool:
+def _is_new_leg(before: MissionLeg | None, now: MissionLeg | None) -> bool:
     """Return whether another leg is flown than before."""
     if now is None or before is None:
         return True
@@ -365,10 +375,10 @@ _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
 
 def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
     order, kind = sorted_in(track.order, item)
-    if kind is Place.AGAIN:
+    if kind is Arrival.AGAIN:
         return replace(track, order=order)  # a copy, or not yet known to be anything else
     track = replace(track, order=order)
-    if kind is Place.ANEW:
+    if kind is Arrival.ANEW:
         track = _restarted(track)
     place = _place(item, setup)
     if place is None:
@@ -378,7 +388,7 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
     if before is not None and stand.is_frozen:
         # It is kept out of the filters, and what comes after it has to be confirmed.
         still = replace(before, boot_s=item.boot_s, confirm_left=CONFIRM_COUNT)
-        return replace(track, motion=still, stand=stand)
+        return replace(track, motion=still, last_place=stand)
     at_once = not track.consent.enabled or before is None
     ticked = tick(track.clock, item, track.clock_report, at_once=at_once)
     clock = ticked.clock
@@ -398,7 +408,7 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         clock_refused=ticked.is_refused,
         flow=_dated(track, clock),
         counted=None,
-        stand=stand,
+        last_place=stand,
         position_valid=motion.confirm_left == 0,
         position_received_s=item.received_s,
         braking_m_s2=_learned_braking(track, motion, item.received_s),
@@ -409,18 +419,18 @@ def _restarted(track: Track) -> Track:
     """Forget what was known by the autopilot's old clock, but an exchange with the new one."""
     exchange = track.order.exchange
     return replace(
-        track, motion=None, clock=None, clock_report=exchange, clock_refused=False, stand=None
+        track, motion=None, clock=None, clock_report=exchange, clock_refused=False, last_place=None
     )
 
 
-def _stand(track: Track, item: Telemetry) -> Stand:
+def _stand(track: Track, item: Telemetry) -> LastPlace:
     """Return what shows a place that stands still while the vehicle does not."""
     motion, expected_m_s = track.motion, None
     if motion is not None and 0.0 < item.boot_s - motion.boot_s < BRIDGED_MAX_S:
         east, north = motion.after(item.boot_s - motion.boot_s)
         expected_m_s = math.hypot(east.velocity_m_s, north.velocity_m_s)
     checked_m_s = _checked_speed(track, item.received_s)
-    return look(track.stand, item, expected_m_s=expected_m_s, reported_m_s=checked_m_s)
+    return look(track.last_place, item, expected_m_s=expected_m_s, reported_m_s=checked_m_s)
 
 
 def _place(item: Telemetry, setup: Setup) -> tuple[float, float] | None:
@@ -472,7 +482,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         velocity_known=known,
         position_received_s=motion.received_s,
         position_valid=track.position_valid,
-        position_frozen=track.stand is not None and track.stand.is_frozen,
+        position_frozen=track.last_place is not None and track.last_place.is_frozen,
         clock_agrees=_clock_agrees(track, now_s),
         checked_speed_m_s=checked,
         fix=None if gnss is None else gnss.fix,
@@ -499,8 +509,8 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         wind=track.wind if track.wind and track.wind.east_m_s is not None else None,
         rate_percent=track.rate_percent,
         stop_ahead=_stop_ahead(track, east, north, now_s),
-        way=track.way,
-        way_before=track.way_before,
+        mission_leg=track.mission_leg,
+        mission_leg_before=track.mission_leg_before,
     )
 
 
@@ -529,7 +539,9 @@ def _stop_ahead(track: Track, east: Told, north: Told, now_s: float) -> StopAhea
     return stop_ahead(leg.braking_m_s2 if track.braking_m_s2 is None else track.braking_m_s2, seen)
 
 
-def _approach(track: Track, leg: Leg, east: Told, north: Told, now_s: float) -> Approach | None:
+def _approach(
+    track: Track, leg: StoppingLeg, east: Told, north: Told, now_s: float
+) -> Approach | None:
     """Return how the vehicle comes to the end of its leg, while the mission is being flown."""
     if track.heartbeat is None or track.heartbeat.mode not in MISSION_MODES:
         return None

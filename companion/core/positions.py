@@ -99,7 +99,7 @@ NO_COPIES = Lateness()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Order:
+class PositionStream:
     """The stream of positions so far, and what may be another run of the autopilot's clock."""
 
     boot_s: float | None = None
@@ -113,7 +113,7 @@ class Order:
     lateness: Lateness = NO_COPIES
 
 
-class Place(Enum):
+class Arrival(Enum):
     """What a position is in the stream."""
 
     NEXT = "next"
@@ -121,7 +121,7 @@ class Place(Enum):
     ANEW = "anew"  # the first that is believed of another run of the clock
 
 
-def noted(order: Order, item: Input) -> Order:
+def noted(order: PositionStream, item: Input) -> PositionStream:
     """Return the order with one more piece of evidence; most inputs are none."""
     if isinstance(item, ClockReport):
         is_sound = 0.0 <= item.round_trip_s <= ROUND_TRIP_MAX_S and math.isfinite(item.offset_s)
@@ -133,7 +133,7 @@ def noted(order: Order, item: Input) -> Order:
     return order
 
 
-def _noted_utc(order: Order, item: UtcReport) -> Order:
+def _noted_utc(order: PositionStream, item: UtcReport) -> PositionStream:
     if item.boot_s is None or not math.isfinite(item.utc_s):
         return order
     epoch_s = item.utc_s - item.boot_s
@@ -145,24 +145,24 @@ def _noted_utc(order: Order, item: UtcReport) -> Order:
     return order
 
 
-def sorted_in(order: Order, item: Telemetry) -> tuple[Order, Place]:
+def sorted_in(order: PositionStream, item: Telemetry) -> tuple[PositionStream, Arrival]:
     """Return the order after one more position, and what that is."""
     seen_s = item.received_s - item.boot_s
     if not math.isfinite(seen_s):
-        return order, Place.NEXT  # no number, which is for others to judge
+        return order, Arrival.NEXT  # no number, which is for others to judge
     if order.boot_s is None:
-        return _followed(order, item, seen_s), Place.NEXT
+        return _followed(order, item, seen_s), Arrival.NEXT
     if item.boot_s > order.boot_s and seen_s >= order.offset_s - AHEAD_MAX_S:
         off_s = seen_s - order.offset_s
         if off_s >= -_FOLLOW_MAX_S:
             seen_s = order.offset_s + _FOLLOW * min(off_s, _FOLLOW_MAX_S)
-        return _followed(order, item, seen_s), Place.NEXT
+        return _followed(order, item, seen_s), Arrival.NEXT
     late_s = seen_s - order.offset_s
     if late_s > 0.0 and item.boot_s != order.boot_s:
         order = replace(order, lateness=order.lateness.seen(late_s))
     waits = item.received_s <= order.received_s + order.lateness.wait_s
     if waits or item.boot_s == order.boot_s:
-        return order, Place.AGAIN
+        return order, Arrival.AGAIN
     run, others = _run(order.runs, item, seen_s)
     if _is_believed(order, run):
         exchange = order.exchange
@@ -170,11 +170,11 @@ def sorted_in(order: Order, item: Telemetry) -> tuple[Order, Place]:
             exchange = None  # with the clock as it was
         lateness = order.lateness._replace(pending_s=0.0)  # that was no copies
         anew = replace(order, exchange=exchange, epoch_s=None, utc=None, lateness=lateness)
-        return _followed(anew, item, run.offset_s), Place.ANEW
-    return replace(order, runs=(*others, run)[-_RUNS_MAX:]), Place.AGAIN
+        return _followed(anew, item, run.offset_s), Arrival.ANEW
+    return replace(order, runs=(*others, run)[-_RUNS_MAX:]), Arrival.AGAIN
 
 
-def _followed(order: Order, item: Telemetry, offset_s: float) -> Order:
+def _followed(order: PositionStream, item: Telemetry, offset_s: float) -> PositionStream:
     return replace(
         order,
         boot_s=item.boot_s,
@@ -202,7 +202,7 @@ def _run(runs: tuple[Run, ...], item: Telemetry, seen_s: float) -> tuple[Run, tu
     return begun, runs
 
 
-def _is_believed(order: Order, run: Run) -> bool:
+def _is_believed(order: PositionStream, run: Run) -> bool:
     """Whether a run is the clock begun anew, and no copies of what was sent before."""
     if run.positions < RUN_COUNT:
         return False
@@ -236,7 +236,7 @@ STOP_M_S = 0.8
 BRAKE_MAX_M_S2 = 5.0
 
 
-class Stand(NamedTuple):
+class LastPlace(NamedTuple):
     """The last place to the bit and when (the autopilot's clock), and whether it is frozen.
 
     `way_m` is how far the vehicle claims to have gone since it was first at that place.
@@ -250,19 +250,19 @@ class Stand(NamedTuple):
 
 
 def look(
-    before: Stand | None,
+    before: LastPlace | None,
     item: Telemetry,
     *,
     expected_m_s: float | None,
     reported_m_s: float | None,
-) -> Stand:
+) -> LastPlace:
     """Return where the positions stand after one more.
 
     `expected_m_s` is how fast the vehicle should be by the positions so far, `reported_m_s` what
     the autopilot says in VFR_HUD; None where not known.
     """
     if before is None:
-        return Stand(item.latitude_deg, item.longitude_deg, item.boot_s, 0.0, False)
+        return LastPlace(item.latitude_deg, item.longitude_deg, item.boot_s, 0.0, False)
     same = (item.latitude_deg, item.longitude_deg) == before[:2]
     dt_s = item.boot_s - before.boot_s
     said_m_s = _said(item)
@@ -273,7 +273,7 @@ def look(
     is_frozen = (same and (before.is_frozen or way_m > FROZEN_M)) or (
         said_m_s == 0.0 and expected_m_s is not None and expected_m_s >= most_m_s
     )
-    return Stand(item.latitude_deg, item.longitude_deg, item.boot_s, way_m, is_frozen)
+    return LastPlace(item.latitude_deg, item.longitude_deg, item.boot_s, way_m, is_frozen)
 
 
 def _said(item: Telemetry) -> float | None:

@@ -18,7 +18,7 @@ from companion.core.options.lines import Lines
 from companion.core.options.liquid_evidence import Detection, Watching
 from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump, Pumping
-from companion.core.options.treated_area import Lags, SwathSettings
+from companion.core.options.treated_area import Lags, TreatedAreaSettings
 from companion.core.prescription import Prescription
 from companion.core.safety import Limits
 from companion.core.schedule import LagModel, Timing
@@ -59,7 +59,7 @@ class Setup:
     pumping: Pumping | None = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
     watching: Watching | None = field(init=False, repr=False, compare=False)
-    swathing: SwathSettings | None = field(init=False, repr=False, compare=False)
+    recording: TreatedAreaSettings | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not 0.05 <= self.lease_s <= 5.0:
@@ -88,10 +88,10 @@ class Setup:
         if self.detection is not None:
             watching = Watching.of(self.detection, doses.nozzle_sets, doses.lag, doses.pwm)
         object.__setattr__(self, "watching", watching)
-        object.__setattr__(self, "swathing", self._swathing() if self.records_coverage else None)
+        object.__setattr__(self, "recording", self._recording() if self.records_coverage else None)
 
-    def _swathing(self) -> SwathSettings:
-        return SwathSettings(
+    def _recording(self) -> TreatedAreaSettings:
+        return TreatedAreaSettings(
             boom=self.boom,
             lags=Lags(valve=self.lag, flow=self.doses.lag),
             is_pumped=self.pumping is not None,

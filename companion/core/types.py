@@ -57,6 +57,7 @@ __all__ = [
     "LandedReport",
     "LegReport",
     "Method",
+    "MissionLeg",
     "OperatorCommand",
     "OutputReport",
     "PressureReport",
@@ -73,7 +74,6 @@ __all__ = [
     "TimedChange",
     "UtcReport",
     "VehicleState",
-    "Way",
     "WindReport",
 ]
 
@@ -324,7 +324,7 @@ class FaultKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Way:
+class MissionLeg:
     """The leg of its mission that the vehicle now flies, in the flight's frame.
 
     `longer` is another leg of the mission, on which this one lies whole.
@@ -335,7 +335,7 @@ class Way:
     from_north_m: float
     to_east_m: float
     to_north_m: float
-    longer: Way | None = None
+    longer: MissionLeg | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -395,8 +395,8 @@ class VehicleState:
     estop: bool | None = None  # None: no switch has been heard of
     active: bool = True
     operator_wishes: int = 0  # how often the operator has enabled anew, or disabled
-    way: Way | None = None  # None: it is not used, or nothing was heard of it
-    way_before: Way | None = None  # the one that it was before, last heard of then
+    mission_leg: MissionLeg | None = None  # None: it is not used, or nothing was heard of it
+    mission_leg_before: MissionLeg | None = None  # the one that it was before, last heard of then
     clock_agrees: bool = True  # what is known of the autopilot's clock goes together
 
 

@@ -12,7 +12,14 @@ from dataclasses import dataclass, replace
 from typing import TypeGuard, get_args
 
 from companion.core.inputs import MISSION_MODES
-from companion.core.positions import AHEAD_MAX_S, BOOT_WRAP_S, Order, Place, noted, sorted_in
+from companion.core.positions import (
+    AHEAD_MAX_S,
+    BOOT_WRAP_S,
+    Arrival,
+    PositionStream,
+    noted,
+    sorted_in,
+)
 from companion.core.types import (
     ClockReport,
     Decision,
@@ -119,7 +126,7 @@ class Component:
         self._flies_mission = False
         self._supervisor: StreamSupervisor | None = None
         self.streams: tuple[Stream, ...] = ()
-        self._order = Order()
+        self._order = PositionStream()
         self._news = News()
         self.clock = ClockExchanges()
         self._timesync_s = float("-inf")
@@ -163,7 +170,7 @@ class Component:
         return None if self._supervisor is None else self._supervisor.rate_hz(_POSITION)
 
     def order(self, channel: int, pulse_us: int) -> bool:
-        """Order a servo output; False where nobody is there to take it."""
+        """PositionStream a servo output; False where nobody is there to take it."""
         return self.outputs.order(channel, pulse_us)
 
     def fault(self, text: str) -> None:
@@ -292,10 +299,10 @@ class Component:
     def _watch_boot(self, item: Telemetry) -> None:
         """Notice a reboot, after which an autopilot has forgotten what was asked of it."""
         self._order, place = sorted_in(self._order, item)
-        if place is Place.ANEW:
+        if place is Arrival.ANEW:
             self._meet(item.received_s)
             self._news.begin_anew(item.received_s)
-        elif place is Place.AGAIN and self.meter.copied(item.received_s):
+        elif place is Arrival.AGAIN and self.meter.copied(item.received_s):
             self.warn("positions come twice or late")
             text = (
                 f"{self.meter.copied_positions} positions came twice or too late and were dropped"
@@ -373,7 +380,7 @@ class News:
         self._newest.clear()
         self._wary_until_s = now_s + _LATE_MAX_S
 
-    def is_old(self, message: Message, order: Order) -> bool:
+    def is_old(self, message: Message, order: PositionStream) -> bool:
         """Return whether something newer is known; what has no time is as new as it comes.
 
         After a restart what is ahead of the positions is of the clock before it.

@@ -26,6 +26,15 @@ _SET = "frozenset"
 
 FieldNames = Mapping[str, Sequence[str]]
 
+# What older journals call types, and fields of them: they stay readable.
+_RENAMED_TYPES = {"Way": "MissionLeg"}
+_RENAMED_FIELDS = {
+    ("VehicleState", "way"): "mission_leg",
+    ("VehicleState", "way_before"): "mission_leg_before",
+    ("Pump", "way"): "outlet",
+    ("Detection", "restless_share"): "unsteady_share",
+}
+
 
 def _core_types(modules: Sequence[ModuleType]) -> dict[str, type]:
     """Return every dataclass and enumeration that the modules of the core can name."""
@@ -78,14 +87,15 @@ def from_plain(plain: object, field_names: FieldNames) -> object:
     ((name, content),) = plain.items()
     if name == _SET:
         return frozenset(from_plain(item, field_names) for item in content)
-    kind = _TYPES.get(name)
+    kind = _TYPES.get(_RENAMED_TYPES.get(name) or name)
     if kind is None:
         raise ValueError(f"unknown type {name}")
     if issubclass(kind, Enum):
         return kind(content)
     try:
         values = [from_plain(item, field_names) for item in content]
-        return kind(**dict(zip(field_names[name], values, strict=True)))
+        names = [_RENAMED_FIELDS.get((name, field), field) for field in field_names[name]]
+        return kind(**dict(zip(names, values, strict=True)))
     except (TypeError, KeyError, ValueError) as error:
         raise ValueError(f"no {name} of this version: {error}") from error
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from companion.core.crossings import Route, find_routes
 from companion.core.options.lines import Lines, Piece, Polyline, add_off_lines
 from companion.core.prescription import Prescription, Zone
-from companion.core.types import VehicleState, Way
+from companion.core.types import MissionLeg, VehicleState
 from tests.builders import along, boom, flying
 from tests.property.test_core_laws import turned
 
@@ -148,13 +148,13 @@ def test_a_leg_only_takes_away_and_without_one_the_mission_opens_nothing(
         leg = (begin, (piece.east_m + ue * length, piece.north_m + un * length))
     way = None
     if leg is not None:
-        way = Way(
+        way = MissionLeg(
             received_s=10.0 - age_s, from_east_m=leg[0][0], from_north_m=leg[0][1],
             to_east_m=leg[1][0], to_north_m=leg[1][1],
         )  # fmt: skip
 
     def flown(mode: str) -> set[Piece]:
-        now = replace(state, mode=mode, way=way)
+        now = replace(state, mode=mode, mission_leg=way)
         return set(lines.flown(now, back_s=BACK_S, ahead_s=AHEAD_S, reach_m=BOOM.reach_m))
 
     assert flown("AUTO") == flown("MISSION")

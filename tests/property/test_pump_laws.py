@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 from companion.core.controller import Memory, step
 from companion.core.nozzle import FlowCurve
 from companion.core.options.atomisers import Atomiser, DropletLaw
-from companion.core.options.pump import Pump, Way, behind_path
+from companion.core.options.pump import Pump, PumpOutlet, behind_path
 from companion.core.setup import Setup
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from tests.builders import SPRAYING, flying
 from tests.pump_flight import PUMP_LAG, fly, is_open, prescribed_ml, pump_setup
 
-WAYS: tuple[Way, ...] = ("valves", "return", "always")
+WAYS: tuple[PumpOutlet, ...] = ("valves", "return", "always")
 RATES = st.lists(
     st.sampled_from([0.0, 12.0, 15.0, 18.0, 20.0, 22.0, 25.0]), min_size=1, max_size=3
 ).filter(any)
@@ -33,7 +33,7 @@ SPINNER = Atomiser(
 @settings(max_examples=6)
 @given(rates=RATES, way=st.sampled_from(WAYS), speed_m_s=st.floats(3.5, 6.0))
 def test_the_volume_over_the_field_is_within_one_percent(
-    rates: list[float], way: Way, speed_m_s: float
+    rates: list[float], way: PumpOutlet, speed_m_s: float
 ) -> None:
     made = pump_setup(rates, way)
     flown = fly(made, from_m=-20.0, to_m=30.0 * len(rates) + 20.0, speed_m_s=speed_m_s)
@@ -124,7 +124,7 @@ def test_no_plan_at_all_lets_a_pump_work_against_shut_valves(
     ],
 )
 def test_what_is_stale_missing_or_no_number_stops_every_drive(
-    way: Way, wrong: dict[str, object]
+    way: PumpOutlet, wrong: dict[str, object]
 ) -> None:
     made = pump_setup([20.0, 20.0], way, atomisers=(SPINNER,))
     memory = Memory()
@@ -140,7 +140,7 @@ def test_what_is_stale_missing_or_no_number_stops_every_drive(
 
 def test_a_constant_pump_runs_only_where_there_is_a_way_out() -> None:
     for way in ("valves", "return"):
-        constant = Pump(control="constant", way=way, lag=PUMP_LAG, run_fraction=0.7)
+        constant = Pump(control="constant", outlet=way, lag=PUMP_LAG, run_fraction=0.7)
         made = pump_setup([20.0, 0.0, 20.0], "valves", pump=constant)
         ran = set()
         for decision in fly_plans(made):

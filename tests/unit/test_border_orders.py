@@ -12,7 +12,7 @@ from companion.config.load import load
 from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
 from companion.core.options.lines import Lines
-from companion.core.options.pump import Way as PumpWay
+from companion.core.options.pump import PumpOutlet
 from companion.core.prescription import Prescription, Zone
 from companion.core.schedule import LagModel, Order, Overdrive, Timing, orders, schedule, shut_spans
 from companion.core.setup import Setup
@@ -208,7 +208,7 @@ ANYHOW = replace(setup().limits, modes=frozenset({"GUIDED"}))
 @pytest.mark.parametrize("pump_way", ["valves", "return", "always"])
 @pytest.mark.parametrize("speed_m_s", [4.0, 6.0])
 def test_a_pump_with_sections_keeps_to_the_border_behind_short_zones(
-    pump_way: PumpWay, speed_m_s: float
+    pump_way: PumpOutlet, speed_m_s: float
 ) -> None:
     # The east end slants: the sections leave one after the other.
     ground = shapely.Polygon([(0.0, -3.0), (16.0, -3.0), (13.0, 9.0), (-2.0, 9.0)])
@@ -223,7 +223,11 @@ def test_a_section_is_shut_for_the_border_where_a_rate_of_0_lies_before_it() -> 
 
 
 def spilled_behind_pump(
-    pump_way: PumpWay, rows: Prescription, ground: shapely.Polygon, speed_m_s: float, **lag: object
+    pump_way: PumpOutlet,
+    rows: Prescription,
+    ground: shapely.Polygon,
+    speed_m_s: float,
+    **lag: object,
 ) -> list[float]:
     """Return when a pump's flow came out of a strip that was partly outside."""
     made = pump_setup(

@@ -74,7 +74,7 @@ def test_the_same_pass_again_applies_nothing() -> None:
     own = field(overlap=HALF)
     first, memory = opened(own)
     assert opening(first) == set(range(6))
-    assert memory.watched.swath is not None
+    assert memory.watched.area is not None
     again, _ = opened(own, memory=replace(memory, plan=None), start_s=30.0)
     assert not opening(again)
 
@@ -128,8 +128,8 @@ def test_a_staggered_boom_does_not_see_the_wake_of_its_front_row() -> None:
     assert any(free)
     assert guarded == free
     # Not because it sees nothing: farther back than its wake it does.
-    assert memory.watched.swath is not None
-    seen = memory.watched.swath.before(1e9, here=(20.0, 3.0), behind_m=wake_m(own.boom))
+    assert memory.watched.area is not None
+    seen = memory.watched.area.before(1e9, here=(20.0, 3.0), behind_m=wake_m(own.boom))
     assert seen is not None
     assert seen.area_m2 > 50.0
 
@@ -165,10 +165,10 @@ def test_whoever_hardly_moves_keeps_what_lies_farther_back() -> None:
     # Half a metre a second, stamped every other second: still more than a wake is remembered.
     own = replace(slow_field(staggered(3.0, 2.0)), overlap=HALF)
     _, memory = at_speed(own, [4.0] * 4 + [0.5] * 26, until_m=20.0)
-    assert memory.watched.swath is not None
-    first = memory.watched.swath.older[0]
-    assert len(memory.watched.swath.older) == SNAPSHOTS_MAX
-    assert memory.watched.swath.way_m - first.way_m >= wake_m(own.boom)
+    assert memory.watched.area is not None
+    first = memory.watched.area.older[0]
+    assert len(memory.watched.area.older) == SNAPSHOTS_MAX
+    assert memory.watched.area.way_m - first.way_m >= wake_m(own.boom)
 
 
 @pytest.mark.parametrize(("spread_m", "wake"), [(0.0, 1.0), (3.0, 4.0), (90.0, 25.0)])

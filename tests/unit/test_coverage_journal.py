@@ -203,8 +203,8 @@ def journal(folder: Path, own: Setup, until_s: float = 17.0, **how: Any) -> Path
             decision: Decision
             decision, memory = step(own, estimate(track, now_s), memory, now_s)
             made.record_decision(decision)
-            if memory.watched.swath is not None:
-                made.record_coverage(memory.watched.swath.coverage)
+            if memory.watched.area is not None:
+                made.record_coverage(memory.watched.area.coverage)
         return made.path
 
 

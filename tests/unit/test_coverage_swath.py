@@ -12,7 +12,7 @@ import shapely
 from companion.core.controller import Memory, expected_coverage, step
 from companion.core.options import treated_area
 from companion.core.options.coverage import Coverage
-from companion.core.options.treated_area import Swath, Toggle, follow
+from companion.core.options.treated_area import FlowEdge, TreatedArea, follow
 from companion.core.prescription import Prescription
 from companion.core.setup import Setup
 from companion.core.types import FaultKind, Finding, SprayPlan, TimedChange, VehicleState
@@ -42,8 +42,8 @@ def flown(
 
 def treated(own: Setup, end_m: float = 60.0, **how: float) -> Coverage:
     memory, _, _ = flown(own, end_m, **how)
-    assert memory.watched.swath is not None
-    return memory.watched.swath.coverage
+    assert memory.watched.area is not None
+    return memory.watched.area.coverage
 
 
 def along_middle(made: Coverage, north_m: float = 3.1) -> tuple[float, float]:
@@ -56,7 +56,7 @@ def along_middle(made: Coverage, north_m: float = 3.1) -> tuple[float, float]:
 
 def test_without_a_record_nothing_is_kept() -> None:
     memory, _, _ = flown(setup())
-    assert memory.watched.swath is None
+    assert memory.watched.area is None
 
 
 def test_a_pass_treats_from_boundary_to_boundary() -> None:
@@ -117,11 +117,11 @@ def test_a_turn_is_swept_as_it_is_flown() -> None:
             **along(course),
         )
         _, memory = step(own, state, memory, now)
-    assert memory.watched.swath is not None
+    assert memory.watched.area is not None
     angles = np.radians(np.arange(20.0, 70.0, 0.5))
     for aside, inside in ((-2.8, True), (0.0, True), (2.8, True), (-3.3, False), (3.3, False)):
         east, north = -(radius + aside) * np.cos(angles), (radius + aside) * np.sin(angles)
-        assert (memory.watched.swath.coverage.covered_at(east, north) == inside).all(), aside
+        assert (memory.watched.area.coverage.covered_at(east, north) == inside).all(), aside
 
 
 def test_a_jump_of_the_position_leaves_nothing_between() -> None:
@@ -132,8 +132,8 @@ def test_a_jump_of_the_position_leaves_nothing_between() -> None:
     for i in range(140):
         now = 10.0 + i / 20.0
         _, memory = step(own, flying(now, (300.0 if i >= 40 else 0.0) + 0.25 * i), memory, now)
-    assert memory.watched.swath is not None
-    made = memory.watched.swath.coverage
+    assert memory.watched.area is not None
+    made = memory.watched.area.coverage
     assert made.covered_at(np.array([5.0, 315.0]), np.full(2, 3.0)).all()
     assert not made.covered_at(np.arange(15.0, 300.0), np.full(285, 3.0)).any()
 
@@ -149,21 +149,21 @@ def plan(*, issued_s: float, duty: tuple[float, ...], lease_s: float = 0.3) -> S
 
 def swept(own: Setup, duty: tuple[float, ...], *findings: Finding) -> Coverage:
     """A flight of five seconds with one duty throughout, whatever the map says."""
-    swath: Swath | None = None
+    area: TreatedArea | None = None
     for i in range(101):
         now = 10.0 + i / 20.0
         order = plan(issued_s=now - 0.05, duty=duty)
-        swath = follow(
-            own.swathing,
-            swath,
+        area = follow(
+            own.recording,
+            area,
             order,
             flying(now, 0.25 * i),
             findings=findings,
             drift_m=None,
             now_s=now,
         )
-    assert swath is not None
-    return swath.coverage
+    assert area is not None
+    return area.coverage
 
 
 def found(kind: FaultKind, valve: int | None = None) -> Finding:
@@ -201,22 +201,22 @@ def test_a_clog_or_a_finding_without_a_valve_changes_nothing() -> None:
 
 
 def test_a_lease_that_ends_closes() -> None:
-    own, swath = given(), None
+    own, area = given(), None
     order = plan(issued_s=10.0, duty=OPEN)
     for i in range(101):
         now = 10.0 + i / 20.0
-        swath = follow(
-            own.swathing, swath, order, flying(now, 0.25 * i), findings=(), drift_m=None, now_s=now
+        area = follow(
+            own.recording, area, order, flying(now, 0.25 * i), findings=(), drift_m=None, now_s=now
         )
-    assert swath is not None
+    assert area is not None
     closes_s = 0.3 + LAG.off_s + LAG.output_s
-    assert along_middle(swath.coverage)[1] == pytest.approx(SPEED * closes_s, abs=0.11)
+    assert along_middle(area.coverage)[1] == pytest.approx(SPEED * closes_s, abs=0.11)
 
 
 def test_a_change_that_overtakes_the_one_before_undoes_it() -> None:
-    off = Toggle(10.2, 1, opens=False)
-    assert treated_area.toggled((off,), Toggle(10.1, 1, opens=True)) == ()
-    other = Toggle(10.1, 0, opens=True)
+    off = FlowEdge(10.2, 1, opens=False)
+    assert treated_area.toggled((off,), FlowEdge(10.1, 1, opens=True)) == ()
+    other = FlowEdge(10.1, 0, opens=True)
     assert treated_area.toggled((off,), other) == (off, other)
 
 
@@ -227,14 +227,14 @@ def test_an_opening_of_a_moment_treats_its_moment() -> None:
     )
     order = replace(plan(issued_s=10.0, duty=SHUT, lease_s=9.0), changes=changes)
     own = given()
-    swath: Swath | None = None
+    area: TreatedArea | None = None
     for i in range(101):
         now = 10.0 + i / 20.0
-        swath = follow(
-            own.swathing, swath, order, flying(now, 0.25 * i), findings=(), drift_m=None, now_s=now
+        area = follow(
+            own.recording, area, order, flying(now, 0.25 * i), findings=(), drift_m=None, now_s=now
         )
-    assert swath is not None
-    ends = along_middle(swath.coverage, 5.5)
+    assert area is not None
+    ends = along_middle(area.coverage, 5.5)
     assert ends == pytest.approx((SPEED * 0.11, SPEED * (0.4 + 0.12)), abs=0.11)
 
 
@@ -263,10 +263,10 @@ def test_what_is_expected_of_an_end_is_what_comes_of_it() -> None:
 def test_where_nothing_is_open_it_is_what_it_was() -> None:
     own = given()
     memory, state, now = flown(own, 60.0)
-    assert memory.watched.swath is not None
+    assert memory.watched.area is not None
     assert (
         expected_coverage(own, memory, state, now_s=now, cut_s=now + 1.0)
-        is memory.watched.swath.coverage
+        is memory.watched.area.coverage
     )
     assert not expected_coverage(own, Memory(), None, now_s=now, cut_s=now).tiles
 
@@ -281,6 +281,6 @@ def test_whoever_creeps_treats_too(speed_m_s: float) -> None:
         state = flying(now, east_m, 3.0, **along(90.0, speed_m_s))
         _, memory = step(own, state, memory, now)
         now, east_m = now + 0.1, east_m + 0.1 * speed_m_s
-    assert memory.watched.swath is not None
+    assert memory.watched.area is not None
     # Up to two seconds are not stamped yet.
-    assert along_middle(memory.watched.swath.coverage) == pytest.approx((0.0, 5.3), abs=0.8)
+    assert along_middle(memory.watched.area.coverage) == pytest.approx((0.0, 5.3), abs=0.8)

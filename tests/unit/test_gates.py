@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
 from companion.core.estimator import CONFIRM_COUNT, Track, estimate, observe
-from companion.core.positions import Stand, look
+from companion.core.positions import LastPlace, look
 from companion.core.types import (
     Decision,
     EstimatorReport,
@@ -369,7 +369,7 @@ def at(boot_s: float, place: float, velocity: float | None) -> Telemetry:
 
 
 def stands(*items: tuple[Telemetry, float | None, float | None]) -> list[bool]:
-    stand: Stand | None = None
+    stand: LastPlace | None = None
     found = []
     for item, expected_m_s, reported_m_s in items:
         stand = look(stand, item, expected_m_s=expected_m_s, reported_m_s=reported_m_s)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from companion.core.boom import predict
 from companion.core.braking import (
     Approach,
-    Leg,
+    StoppingLeg,
     approach,
     braking_begins_s,
     learned,
@@ -36,7 +36,7 @@ from tests.builders import flying, position, setup
 NAN = math.nan
 SETUP = setup(mission_braking_m_s2=2.5)
 # Eastwards from 0 to 30 m, on the line of `flying`.
-LEG = Leg(
+LEG = StoppingLeg(
     received_s=10.0,
     to_east_m=30.0,
     to_north_m=3.0,
@@ -48,7 +48,7 @@ LEG = Leg(
 
 
 def stop(
-    leg: Leg = LEG,
+    leg: StoppingLeg = LEG,
     *,
     place: tuple[float, float] = (20.0, 3.0),
     velocity: tuple[float, float] = (5.0, 0.0),

@@ -13,7 +13,7 @@ from companion.core.estimator import Track, observe
 from companion.core.options.lines import Lines, Polyline
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
-from companion.core.types import LegReport, TimedChange, VehicleState, Way
+from companion.core.types import LegReport, MissionLeg, TimedChange, VehicleState
 from tests import builders
 from tests.builders import LAG, along, boom, setup
 from tests.unit.test_controller import SPEED, crossing_s
@@ -31,7 +31,7 @@ def on_lines(*polylines: Polyline, aside_m: float = 1.0, **change: object) -> Se
 
 def flying(now_s: float, east_m: float, north_m: float = 3.0, **change: object) -> VehicleState:
     """Return a vehicle on a leg of its mission where one is given, else flown by hand."""
-    mode = "AUTO" if "way" in change else "GUIDED"
+    mode = "AUTO" if "mission_leg" in change else "GUIDED"
     return builders.flying(now_s, east_m, north_m, **({"mode": mode} | change))
 
 
@@ -56,8 +56,10 @@ def opens(given: Setup, state: VehicleState, memory: Memory | None = None) -> bo
     return decision.plan.opens
 
 
-def way(begin: tuple[float, float], end: tuple[float, float], received_s: float = 9.5) -> Way:
-    return Way(
+def way(
+    begin: tuple[float, float], end: tuple[float, float], received_s: float = 9.5
+) -> MissionLeg:
+    return MissionLeg(
         received_s=received_s, from_east_m=begin[0], from_north_m=begin[1],
         to_east_m=end[0], to_north_m=end[1],
     )  # fmt: skip
@@ -214,49 +216,54 @@ def test_what_is_open_closes_at_once_where_the_line_is_left() -> None:
         (way((math.nan, 3.0), (36.0, 3.0)), False),
     ],
 )
-def test_the_leg_that_is_flown_has_to_lie_along_the_line(leg: Way, *, sprayed: bool) -> None:
-    assert opens(on_lines(), flying(10.0, 20.0, way=leg)) is sprayed
+def test_the_leg_that_is_flown_has_to_lie_along_the_line(leg: MissionLeg, *, sprayed: bool) -> None:
+    assert opens(on_lines(), flying(10.0, 20.0, mission_leg=leg)) is sprayed
 
 
 def test_a_run_in_opens_the_line_at_its_start() -> None:
     run_in = way((0.0, 3.0), (12.0, 3.0))
-    assert opens(on_lines(), flying(10.0, 10.5, way=run_in))
+    assert opens(on_lines(), flying(10.0, 10.5, mission_leg=run_in))
 
 
 def test_a_leg_that_was_left_counts_to_its_last_metres_but_not_on_the_way_back() -> None:
     line, ferry = way((12.0, 3.0), (36.0, 3.0)), way((36.0, 3.0), (12.0, 12.0))
-    assert opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=line))
-    assert not opens(on_lines(), flying(10.0, 30.0, way=ferry))
+    assert opens(on_lines(), flying(10.0, 30.0, mission_leg=ferry, mission_leg_before=line))
+    assert not opens(on_lines(), flying(10.0, 30.0, mission_leg=ferry))
     back = {"velocity_east_m_s": -5.0, "heading_deg": 270.0}
-    assert not opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=line, **back))
+    assert not opens(
+        on_lines(), flying(10.0, 30.0, mission_leg=ferry, mission_leg_before=line, **back)
+    )
     assert opens(
-        on_lines(), flying(10.0, 30.0, way=ferry, way_before=replace(line, received_s=-22.9))
+        on_lines(),
+        flying(10.0, 30.0, mission_leg=ferry, mission_leg_before=replace(line, received_s=-22.9)),
     )
     old = replace(line, received_s=-23.1)
-    assert not opens(on_lines(), flying(10.0, 30.0, way=ferry, way_before=old))
+    assert not opens(on_lines(), flying(10.0, 30.0, mission_leg=ferry, mission_leg_before=old))
 
 
 def test_a_way_on_a_line_that_a_longer_leg_flies_is_not_sprayed() -> None:
     given, side_step = on_lines(), way((18.0, 3.0), (30.0, 3.0))
-    assert opens(given, flying(10.0, 20.0, way=side_step))
+    assert opens(given, flying(10.0, 20.0, mission_leg=side_step))
     for ends in (((12.0, 3.0), (36.0, 3.0)), ((36.0, 3.0), (12.0, 3.0))):
         known = replace(side_step, longer=way(*ends))
-        assert not opens(given, flying(10.0, 20.0, way=known))
+        assert not opens(given, flying(10.0, 20.0, mission_leg=known))
     # One that leads far beyond the line is a ferry: it sprays nothing, so that this one has to.
     ferry = replace(side_step, longer=way((12.0, 3.0), (90.0, 3.0)))
-    assert opens(given, flying(10.0, 20.0, way=ferry))
+    assert opens(given, flying(10.0, 20.0, mission_leg=ferry))
 
 
 def test_a_leg_without_length_is_along_no_line() -> None:
-    assert not opens(on_lines(), flying(10.0, 20.0, way=way((40.0, 3.0), (40.0, 3.0))))
+    assert not opens(on_lines(), flying(10.0, 20.0, mission_leg=way((40.0, 3.0), (40.0, 3.0))))
 
 
 @pytest.mark.parametrize("mode", ["AUTO", "MISSION"])
 def test_while_no_leg_is_known_the_mission_sprays_nothing(mode: str) -> None:
     given = on_lines()
-    assert opens(given, flying(10.0, 20.0, way=way(*LINE), mode=mode))
-    assert not opens(given, flying(10.0, 20.0, way=None, mode=mode))
-    assert not opens(given, flying(10.0, 20.0, way=None, way_before=way(*LINE), mode=mode))
+    assert opens(given, flying(10.0, 20.0, mission_leg=way(*LINE), mode=mode))
+    assert not opens(given, flying(10.0, 20.0, mission_leg=None, mode=mode))
+    assert not opens(
+        given, flying(10.0, 20.0, mission_leg=None, mission_leg_before=way(*LINE), mode=mode)
+    )
 
 
 @pytest.mark.parametrize(
@@ -267,29 +274,29 @@ def test_a_leg_counts_until_three_of_px4s_ten_seconds_are_over(
     received_s: float, *, sprayed: bool
 ) -> None:
     told = way(*LINE, received_s=received_s)
-    assert opens(on_lines(), flying(10.0, 20.0, way=told)) is sprayed
+    assert opens(on_lines(), flying(10.0, 20.0, mission_leg=told)) is sprayed
 
 
 def test_a_leg_whose_change_was_lost_opens_its_own_line_only() -> None:
     """It is told again ten seconds later: until then ferries are closed all the same."""
     given = on_lines(LINE, ((36.0, 9.0), (12.0, 9.0)))
     old = way(*LINE, received_s=1.0)
-    assert not opens(given, flying(10.0, 20.0, 9.0, **along(270.0), way=old))
-    assert not opens(given, flying(10.0, 20.0, 3.0, **along(270.0), way=old))
-    assert not opens(given, flying(10.0, 45.0, 3.0, way=old))
+    assert not opens(given, flying(10.0, 20.0, 9.0, **along(270.0), mission_leg=old))
+    assert not opens(given, flying(10.0, 20.0, 3.0, **along(270.0), mission_leg=old))
+    assert not opens(given, flying(10.0, 45.0, 3.0, mission_leg=old))
 
 
 def test_a_leg_says_nothing_of_who_does_not_fly_the_mission() -> None:
     ferry = way((-20.0, 2.0), (60.0, 4.5))
     given = on_lines()
-    assert opens(given, flying(10.0, 20.0, way=ferry, mode="GUIDED"))
-    assert not opens(given, flying(10.0, 20.0, way=ferry))
+    assert opens(given, flying(10.0, 20.0, mission_leg=ferry, mode="GUIDED"))
+    assert not opens(given, flying(10.0, 20.0, mission_leg=ferry))
 
 
 def test_legs_that_come_every_ten_seconds_close_nothing_on_the_line() -> None:
     far = ((0.0, 3.0), (190.0, 3.0))
     given = on_lines(far)
-    found = switches(given, 5.0, 105.0, way=way(*far, received_s=9.9))  # told once in 20 s
+    found = switches(given, 5.0, 105.0, mission_leg=way(*far, received_s=9.9))  # told once in 20 s
     assert [change.duty > 0.0 for change in found] == [True]
 
 
@@ -300,12 +307,12 @@ def test_the_leg_is_heard_only_where_lines_are_followed() -> None:
         received_s=9.5, from_latitude_deg=a, from_longitude_deg=b,
         to_latitude_deg=c, to_longitude_deg=d, stops=False,
     )  # fmt: skip
-    heard = observe(Track(), report, given).way
+    heard = observe(Track(), report, given).mission_leg
     assert heard is not None
     assert (heard.to_east_m, heard.to_north_m) == pytest.approx(LINE[1], abs=1e-3)
-    assert observe(Track(), report, setup()).way is None
+    assert observe(Track(), report, setup()).mission_leg is None
     bad = replace(report, to_latitude_deg=math.nan)
-    assert observe(Track(), bad, given).way is None
+    assert observe(Track(), bad, given).mission_leg is None
 
 
 # ------------------------------------------------------------------------------------- the type

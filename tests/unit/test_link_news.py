@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from companion.core.estimator import Track, observe
-from companion.core.positions import Order
+from companion.core.positions import PositionStream
 from companion.core.types import Input, RcReport
 from companion.link.component import Component, ComponentOptions, News
 from companion.link.messages import ServoOutput
@@ -83,7 +83,7 @@ def outputs(boot_s: float | None, *, port: int = 0) -> ServoOutput:
 
 
 def test_an_old_output_is_no_fault_and_the_microseconds_begin_anew() -> None:
-    news, order = News(), Order()
+    news, order = News(), PositionStream()
     wrap_s = 2**32 / 1e6
     told = [(wrap_s - 1.0, 0), (wrap_s - 0.5, 0), (wrap_s - 1.0, 0), (wrap_s - 0.7, 1), (0.2, 0),
             (wrap_s - 0.1, 0), (0.2, 0), (0.3, 0)]  # fmt: skip
@@ -92,7 +92,7 @@ def test_an_old_output_is_no_fault_and_the_microseconds_begin_anew() -> None:
 
 
 def test_outputs_that_count_from_elsewhere_are_checked_all_the_same() -> None:
-    news, order = News(), Order(boot_s=300.0, received_s=10.0)
+    news, order = News(), PositionStream(boot_s=300.0, received_s=10.0)
     assert not news.is_old(outputs(500.0), order)
     assert news.is_old(outputs(499.0), order)
     news.begin_anew(-10.0)
@@ -102,7 +102,7 @@ def test_outputs_that_count_from_elsewhere_are_checked_all_the_same() -> None:
 
 
 def test_what_has_no_time_is_news() -> None:
-    news, order = News(), Order(boot_s=3000.0, received_s=10.0)
+    news, order = News(), PositionStream(boot_s=3000.0, received_s=10.0)
     assert not news.is_old(outputs(3000.0), order)
     assert not news.is_old(outputs(None), order)
     assert not news.is_old(RcReport(received_s=10.0, pulse_us=()), order)

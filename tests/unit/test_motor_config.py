@@ -53,7 +53,7 @@ def test_the_documents_example_is_a_configuration(tmp_path: Path) -> None:
     pump = pump_of(found)
     assert pump is not None
     assert pump.curve is not None
-    assert (pump.control, pump.way) == ("modulates", "valves")
+    assert (pump.control, pump.outlet) == ("modulates", "valves")
     assert pump.curve.flow_for((1500 - 1000) / 950) == pytest.approx(3.1)
     assert pump.fraction_min == pytest.approx(150 / 950)
     lag = pump.lag
@@ -70,11 +70,11 @@ def test_the_documents_example_is_a_configuration(tmp_path: Path) -> None:
 def test_the_way_out_is_what_the_channels_say(tmp_path: Path) -> None:
     found = pump_of(config(tmp_path, "output.return_channel=15"))
     assert found is not None
-    assert found.way == "return"
+    assert found.outlet == "return"
     bare = REST + re.sub(r"channel = (9|10)\n", "", EXAMPLE)
     found = pump_of(config(tmp_path, text=bare))
     assert found is not None
-    assert found.way == "always"
+    assert found.outlet == "always"
 
 
 PWM_VALVES = REST + EXAMPLE.replace(

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from companion.core.estimator import Track, estimate, observe
-from companion.core.positions import Order, Place, noted, sorted_in
+from companion.core.positions import Arrival, PositionStream, noted, sorted_in
 from companion.core.safety import Consent
 from companion.core.types import ClockReport, HeartbeatReport, Input, Telemetry, UtcReport
 from tests import builders
@@ -51,8 +51,10 @@ def arrived(items: Iterable[Input]) -> list[Input]:
     return sorted(items, key=lambda item: item.received_s)
 
 
-def sort(items: Iterable[Input], order: Order | None = None) -> tuple[Order, list[Place]]:
-    order, places = order or Order(), []
+def sort(
+    items: Iterable[Input], order: PositionStream | None = None
+) -> tuple[PositionStream, list[Arrival]]:
+    order, places = order or PositionStream(), []
     for item in arrived(items):
         if isinstance(item, Telemetry):
             order, place = sorted_in(order, item)
@@ -99,7 +101,7 @@ def test_copies_are_dropped_and_change_nothing(name: str) -> None:
 def test_the_slow_radio_alone_is_no_restart_and_its_positions_are_old() -> None:
     # The quick one falls silent at 10 s; the slow one goes on, three seconds late.
     _, places = sort([*stream(0.0, 10.0), *stream(0.0, 40.0, late_s=3.0)])
-    assert Place.ANEW not in places
+    assert Arrival.ANEW not in places
     track = Track(consent=Consent(enabled=True))
     for item in arrived([*stream(0.0, 10.0), *stream(0.0, 40.0, late_s=3.0)]):
         track = observe(track, item, SETUP)
@@ -112,14 +114,14 @@ def test_the_slow_radio_alone_is_no_restart_and_its_positions_are_old() -> None:
 def test_a_restart_is_believed_from_its_third_position_on() -> None:
     silent_s = 8.0
     _, places = sort([*stream(0.0, 10.0), *restarted(10.0 + silent_s, 20.0, boot_s=7.5)])
-    assert places[100:] == [Place.AGAIN, Place.AGAIN, Place.ANEW, *[Place.NEXT] * 17]
+    assert places[100:] == [Arrival.AGAIN, Arrival.AGAIN, Arrival.ANEW, *[Arrival.NEXT] * 17]
 
 
 def test_a_restart_is_believed_among_late_copies_of_before() -> None:
     late = [item for item in stream(0.0, 10.0, late_s=9.0) if item.received_s > 10.0]
     loop = [item for item in stream(0.0, 10.0, late_s=9.47) if item.received_s > 10.0]
     order, places = sort([*stream(0.0, 10.0), *late, *loop, *restarted(17.0, 30.0, boot_s=6.0)])
-    assert places.count(Place.ANEW) == 1
+    assert places.count(Arrival.ANEW) == 1
     assert order.boot_s == pytest.approx(18.9)
 
 
@@ -130,7 +132,7 @@ def test_a_counter_of_32_bits_begins_anew() -> None:
         *restarted(5.0, 8.0, boot_s=0.0),
     ]
     order, places = sort([*items, exchange(5.15, end_s + 0.15)])
-    assert places[52] is Place.ANEW
+    assert places[52] is Arrival.ANEW
     assert order.boot_s == pytest.approx(2.9)
 
 
@@ -155,9 +157,9 @@ BACK = restarted(10.0, 16.0, boot_s=UP_S - 40.0)  # set back by fifty seconds, a
 def test_a_clock_that_goes_back_needs_evidence(evidence: list[Input], is_believed: bool) -> None:
     told = UtcReport(received_s=5.0, utc_s=UTC_S + 5.0, boot_s=UP_S + 5.0)
     _, places = sort([*stream(0.0, 10.0), told, *BACK, *evidence])
-    assert (Place.ANEW in places) == is_believed
+    assert (Arrival.ANEW in places) == is_believed
     if not is_believed:
-        assert set(places[100:]) == {Place.AGAIN}
+        assert set(places[100:]) == {Arrival.AGAIN}
 
 
 def test_while_it_is_not_known_the_last_good_position_ages() -> None:
@@ -172,10 +174,10 @@ def test_while_it_is_not_known_the_last_good_position_ages() -> None:
 def test_a_clock_far_ahead_is_no_copy_and_one_message_of_it_no_clock() -> None:
     odd = position(9.95, boot_s=UP_S + 5000.0)
     _, places = sort([*stream(0.0, 20.0), odd])
-    assert places.count(Place.AGAIN) == 1
-    assert Place.ANEW not in places
+    assert places.count(Arrival.AGAIN) == 1
+    assert Arrival.ANEW not in places
     _, places = sort([*stream(0.0, 10.0), *restarted(10.0, 12.0, boot_s=UP_S + 5000.0)])
-    assert places[102] is Place.ANEW
+    assert places[102] is Arrival.ANEW
 
 
 # A copy, or the message itself, comes so much later; most of the time there is none of it.

@@ -61,33 +61,36 @@ class Drift:
                 raise ValueError(f"{name} must lie in [0, {most:g}], got {value}")
 
 
-def offset(law: Drift | None, state: VehicleState, now_s: float) -> Offset | None:
-    """Return how far from its nozzle liquid lands; None without a law or a wind to trust."""
-    if law is None:
+def offset(settings: Drift | None, state: VehicleState, now_s: float) -> Offset | None:
+    """Return how far from its nozzle liquid lands; None without settings or a wind to trust."""
+    if settings is None:
         return None
-    wind = law.wind_m_s if law.wind_m_s is not None else _reported(law, state, now_s)
-    if wind is None or not math.hypot(*wind) <= law.wind_max_m_s:
+    wind = settings.wind_m_s if settings.wind_m_s is not None else _reported(settings, state, now_s)
+    if wind is None or not math.hypot(*wind) <= settings.wind_max_m_s:
         return None
-    east_m, north_m = wind[0] * law.fall_s, wind[1] * law.fall_s
+    east_m, north_m = wind[0] * settings.fall_s, wind[1] * settings.fall_s
     east, north = state.velocity_east_m_s, state.velocity_north_m_s
     speed_m_s = math.hypot(east, north)
     if speed_m_s >= MOVING_M_S:
-        east_m += law.forward_carry_m * east / speed_m_s
-        north_m += law.forward_carry_m * north / speed_m_s
+        east_m += settings.forward_carry_m * east / speed_m_s
+        north_m += settings.forward_carry_m * north / speed_m_s
     length_m = math.hypot(east_m, north_m)
-    if not length_m <= law.limit_m:
+    if not length_m <= settings.limit_m:
         if not length_m < math.inf:
             return None
-        east_m, north_m = east_m * law.limit_m / length_m, north_m * law.limit_m / length_m
+        east_m, north_m = (
+            east_m * settings.limit_m / length_m,
+            north_m * settings.limit_m / length_m,
+        )
     return east_m, north_m
 
 
-def _reported(law: Drift, state: VehicleState, now_s: float) -> tuple[float, float] | None:
+def _reported(settings: Drift, state: VehicleState, now_s: float) -> tuple[float, float] | None:
     """Return the wind that the autopilot told, if it is young enough."""
     report = state.wind
     if report is None or report.east_m_s is None or report.north_m_s is None:
         return None
-    if not -CLOCK_SLACK_S <= now_s - report.received_s <= law.wind_age_max_s:
+    if not -CLOCK_SLACK_S <= now_s - report.received_s <= settings.wind_age_max_s:
         return None
     return report.east_m_s, report.north_m_s
 

@@ -71,7 +71,7 @@ class Trimming:
     `apart_s` from each other to tell a sudden change by.
     """
 
-    law: FlowTrim
+    settings: FlowTrim
     delay_s: float
     clear_s: float
     wait_s: float
@@ -79,7 +79,7 @@ class Trimming:
     apart_s: float
 
     @classmethod
-    def of(cls, law: FlowTrim, lag: LagModel, pwm: PwmLimits) -> Trimming:
+    def of(cls, settings: FlowTrim, lag: LagModel, pwm: PwmLimits) -> Trimming:
         """Return the times for a sprayer's lags.
 
         A small change waits half a period in the mean. Three volume-equivalent lags are what a
@@ -89,10 +89,10 @@ class Trimming:
         longest_s = max(lag.on_s, lag.off_s, lag.up_s, lag.down_s)
         clear_s = max(3.0 * longest_s, lag.off_end_s) + lag.output_s + pwm.period_s
         return cls(
-            law=law,
+            settings=settings,
             delay_s=0.5 * (lag.up_s + lag.down_s) + lag.output_s + 0.5 * pwm.period_s,
             clear_s=clear_s,
-            wait_s=max(law.settle_s, clear_s + window_s),
+            wait_s=max(settings.settle_s, clear_s + window_s),
             window_s=window_s,
             apart_s=max(window_s, WINDOW_S),
         )
@@ -208,7 +208,7 @@ def follow(
         after, state = _moved(trimming, before, flows, at_s=report.received_s, dt_s=dt_s)
         if is_saturated and state is FlowTrimState.TRACKING:
             after, state = before._replace(seen=after.seen), FlowTrimState.FROZEN
-    limit = trimming.law.limit
+    limit = trimming.settings.limit
     at_limit_s = after.at_limit_s + dt_s if not abs(after.trim - 1.0) < limit - 1e-9 else 0.0
     if at_limit_s != after.at_limit_s:
         after = after._replace(at_limit_s=at_limit_s)
@@ -226,8 +226,8 @@ def _moved(
     trimming: Trimming, before: SetTrim, flows: Flows, *, at_s: float, dt_s: float
 ) -> tuple[SetTrim, FlowTrimState]:
     """Return the trim a step nearer to the gain, or held where the gain is no drift."""
-    law = trimming.law
-    minimum_ml_s = law.meter_minimum_l_min * ML_S_PER_L_MIN
+    settings = trimming.settings
+    minimum_ml_s = settings.meter_minimum_l_min * ML_S_PER_L_MIN
     if not (flows.expected_ml_s >= minimum_ml_s and flows.expected_ml_s > 0.0):
         return before, FlowTrimState.FROZEN
     gain = flows.metered_ml_s / flows.expected_ml_s
@@ -239,9 +239,9 @@ def _moved(
         return before, FlowTrimState.IMPLAUSIBLE
     if not flows.metered_ml_s >= minimum_ml_s:
         return before, FlowTrimState.FROZEN
-    trim = before.trim + (gain - before.trim) * -math.expm1(-dt_s / law.tau_s)
-    if not abs(trim - 1.0) <= law.limit:
-        trim = 1.0 + math.copysign(law.limit, trim - 1.0)
+    trim = before.trim + (gain - before.trim) * -math.expm1(-dt_s / settings.tau_s)
+    if not abs(trim - 1.0) <= settings.limit:
+        trim = 1.0 + math.copysign(settings.limit, trim - 1.0)
     seen = before.seen
     if not seen or not at_s - seen[-1].at_s < trimming.apart_s:
         seen = (*seen[-1:], Seen(at_s, gain, trim))

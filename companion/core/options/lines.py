@@ -21,7 +21,7 @@ from companion.core.boom import Boom, Paths, time_on_chord
 from companion.core.border import Intervals
 from companion.core.frame import Floats, Place
 from companion.core.inputs import MISSION_MODES
-from companion.core.types import VehicleState, Way
+from companion.core.types import MissionLeg, VehicleState
 
 Polyline = tuple[Place, ...]
 
@@ -156,14 +156,14 @@ class Lines:
         return found
 
 
-def _ways(state: VehicleState) -> tuple[Way, ...] | None:
+def _ways(state: VehicleState) -> tuple[MissionLeg, ...] | None:
     """Return the leg that is flown, and the one before while the vehicle still flies its way.
 
     Autopilots go on to the next item some metres before the end of a leg: a leg that the vehicle
     flies against is not flown yet, and a ferry that ends at the far end of a line is no line. None
     of the legs where it is not known which; None where it is not the mission that is flown.
     """
-    way, before = state.way, state.way_before
+    way, before = state.mission_leg, state.mission_leg_before
     if state.mode not in MISSION_MODES:
         return None
     if way is None or not 0.0 <= state.time_s - way.received_s <= WAY_AGE_MAX_S:
@@ -174,17 +174,17 @@ def _ways(state: VehicleState) -> tuple[Way, ...] | None:
     return tuple(each for each in known if _is_onwards(state, each))
 
 
-def _is_onwards(state: VehicleState, way: Way) -> bool:
+def _is_onwards(state: VehicleState, way: MissionLeg) -> bool:
     east, north = way.to_east_m - way.from_east_m, way.to_north_m - way.from_north_m
     return state.velocity_east_m_s * east + state.velocity_north_m_s * north > 0.0
 
 
-def _is_told(piece: Piece, ways: tuple[Way, ...] | None, course: float) -> bool:
+def _is_told(piece: Piece, ways: tuple[MissionLeg, ...] | None, course: float) -> bool:
     """Return whether a leg that is flown lies along a piece; off the mission any piece will do."""
     return ways is None or any(_sprays(piece, way, course) for way in ways)
 
 
-def _sprays(piece: Piece, way: Way, course: float) -> bool:
+def _sprays(piece: Piece, way: MissionLeg, course: float) -> bool:
     """Return whether a leg is one that sprays a piece.
 
     A way to the next line may lie on one that a longer leg flies whole, before or afterwards: that
@@ -194,7 +194,7 @@ def _sprays(piece: Piece, way: Way, course: float) -> bool:
     return _is_along(piece, way, course) and not is_other
 
 
-def _is_along(piece: Piece, way: Way, course: float) -> bool:
+def _is_along(piece: Piece, way: MissionLeg, course: float) -> bool:
     """Return whether a leg has the direction of a piece, and lies on it as far as it is beside it.
 
     One that ends where the piece begins is along it too: a run-in, or the way over bare ground

@@ -267,7 +267,7 @@ SUPPLY_SHARE = 0.5
 SHUT_SHARE = (0.70, 1.20)
 OPEN_SHARE = (0.75, 1.25)
 # Bins that differ by more than this from one to the next are no liquid: healthy ones differ by 1 %.
-RESTLESS_SHARE = 0.06
+UNSTEADY_SHARE = 0.06
 # One valve is told from the next best by this many squared standard deviations: 1 in 2 000.
 TOLD_APART = 12.0
 # Of a bin: meter, its pulses, and what the lags leave at a change.
@@ -294,7 +294,7 @@ class Evidence(NamedTuple):
     flow: float
     pressure: float | None
     open_ml_s: float
-    restless_share: float = RESTLESS_SHARE
+    unsteady_share: float = UNSTEADY_SHARE
 
     @classmethod
     def of(
@@ -306,7 +306,7 @@ class Evidence(NamedTuple):
         likely_gain: float,
         pressure_gain: float,
         open_ml_s: float,
-        restless_share: float = RESTLESS_SHARE,
+        unsteady_share: float = UNSTEADY_SHARE,
     ) -> Evidence:
         """Return the evidence of the last `count` bins; the first may lie before the fault."""
         bins = tuple(known[-count:])
@@ -321,15 +321,15 @@ class Evidence(NamedTuple):
             flow=math.fsum(each.metered_ml for each in sure) / expected_ml,
             pressure=_mean(pressures) / pressure_gain if pressures else None,
             open_ml_s=open_ml_s,
-            restless_share=restless_share,
+            unsteady_share=unsteady_share,
         )
 
     @property
-    def is_restless(self) -> bool:
+    def is_unsteady(self) -> bool:
         """Whether the flow jumps from bin to bin, as no liquid does."""
         flows = [each.metered_ml / (self.gain * each.all_ml) for each in self.bins]
         moves = [abs(b - a) for a, b in pairwise(flows)]
-        return len(moves) >= 2 and _mean(moves) > self.restless_share
+        return len(moves) >= 2 and _mean(moves) > self.unsteady_share
 
     @property
     def is_supply(self) -> bool:
@@ -344,7 +344,7 @@ def _mean(values: Sequence[float]) -> float:
     return math.fsum(values) / len(values)
 
 
-def name_of_nothing(evidence: Evidence, *, is_air_before: bool, is_tank_low: bool) -> FaultKind:
+def name_of_no_flow(evidence: Evidence, *, is_air_before: bool, is_tank_low: bool) -> FaultKind:
     """Return why nothing of what is ordered is metered."""
     pressure = evidence.pressure
     if pressure is None:
@@ -356,7 +356,7 @@ def name_of_nothing(evidence: Evidence, *, is_air_before: bool, is_tank_low: boo
 
 def name_of(evidence: Evidence) -> FaultKind:
     """Return what is wrong with a flow that is too small or too large."""
-    if evidence.is_restless:
+    if evidence.is_unsteady:
         return FaultKind.AIR
     if evidence.is_supply:
         return FaultKind.SUPPLY
@@ -463,7 +463,7 @@ class Detection:
     `spread` is one standard deviation of metered over expected flow, `closed_share` of the full
     flow may be metered while all is closed; without `closed_check` that is not looked at, for a
     meter that also counts what returns to the tank. A flow is compared over `bin_s`; one that
-    moves by more than `restless_share` from bin to bin is no liquid.
+    moves by more than `unsteady_share` from bin to bin is no liquid.
     """
 
     spread: float = 0.0125
@@ -475,7 +475,7 @@ class Detection:
     meter_required: bool = False
     closed_check: bool = True
     bin_s: float = BIN_S
-    restless_share: float = RESTLESS_SHARE
+    unsteady_share: float = UNSTEADY_SHARE
 
     def __post_init__(self) -> None:
         if not 0.001 <= self.spread <= 0.05:
@@ -484,8 +484,8 @@ class Detection:
             raise ValueError(f"closed_share must lie in [0.001, 0.5], got {self.closed_share}")
         if not 0.05 <= self.bin_s <= 5.0:
             raise ValueError(f"bin_s must lie in [0.05, 5], got {self.bin_s}")
-        if not 0.01 <= self.restless_share <= 1.0:
-            raise ValueError(f"restless_share must lie in [0.01, 1], got {self.restless_share}")
+        if not 0.01 <= self.unsteady_share <= 1.0:
+            raise ValueError(f"unsteady_share must lie in [0.01, 1], got {self.unsteady_share}")
         if not 0.0 <= self.meter_minimum_l_min <= 1e4:
             raise ValueError("meter_minimum_l_min must lie in [0, 1e4]")
         if len(self.pressure_duty) != len(self.pressure_kpa) or len(self.pressure_duty) == 1:
@@ -514,7 +514,7 @@ class Detection:
 class Watching:
     """The law with what a sprayer makes of it: times, and the table of each set by duty."""
 
-    law: Detection
+    settings: Detection
     delay_s: float
     bin_s: float
     closed_after_s: float
@@ -526,7 +526,7 @@ class Watching:
 
     @classmethod
     def of(
-        cls, law: Detection, sets: tuple[NozzleSet, ...], lag: LagModel, pwm: PwmLimits
+        cls, settings: Detection, sets: tuple[NozzleSet, ...], lag: LagModel, pwm: PwmLimits
     ) -> Watching:
         """Return the watching of a sprayer."""
         lags = (lag.on_s, lag.off_s, lag.up_s, lag.down_s)
@@ -534,9 +534,9 @@ class Watching:
         full_ml_s = largest.flow_max_l_min * ML_S_PER_L_MIN
         steps = [step / CURVE_STEPS for step in range(CURVE_STEPS + 1)]
         return cls(
-            law=law,
+            settings=settings,
             delay_s=sum(lags) / len(lags) + lag.output_s,
-            bin_s=bin_length_s(pwm.period_s, law.bin_s),
+            bin_s=bin_length_s(pwm.period_s, settings.bin_s),
             closed_after_s=max(lag.off_end_s, *lags) + lag.output_s + 0.5,
             settle_s=3.0 * max(lags) if max(lags) > SLOW_S else 0.0,
             full_ml_s=full_ml_s,
@@ -566,5 +566,5 @@ class Watching:
                 flows[valve] = flow
                 total += duty
         used = sum(1 for flow in flows if flow > 0.0)
-        pressure = self.law.pressure_at(total / used) if used else None
+        pressure = self.settings.pressure_at(total / used) if used else None
         return Order(at_s, tuple(flows), pressure)

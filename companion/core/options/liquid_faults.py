@@ -23,7 +23,7 @@ from companion.core.options.liquid_evidence import (
     collected,
     heard,
     name_of,
-    name_of_nothing,
+    name_of_no_flow,
     pressed,
     valve_of,
     with_orders,
@@ -101,7 +101,7 @@ def of_spraying(
             return memory
         count = max(round(memory.nothing_s / watching.bin_s), 2)
         evidence = _evidence(watching, memory, count)
-        name = name_of_nothing(
+        name = name_of_no_flow(
             evidence,
             is_air_before=memory.air,
             is_tank_low=_is_tank_low(watching, state),
@@ -115,7 +115,7 @@ def of_spraying(
     return _found(watching, memory, name_of(evidence), evidence)
 
 
-def told_apart(watching: Watching, memory: WatchMemory) -> WatchMemory:
+def with_valve_told(watching: Watching, memory: WatchMemory) -> WatchMemory:
     """Return the memory with the valve of a fault that has none yet, once the orders tell it."""
     for finding in memory.findings:
         is_open = _OF_ONE_VALVE.get(finding.kind)
@@ -131,10 +131,10 @@ def told_apart(watching: Watching, memory: WatchMemory) -> WatchMemory:
 
 def of_closed(watching: Watching, memory: WatchMemory) -> WatchMemory:
     """Return the memory with what is metered while every valve is closed."""
-    tolerated_ml_s = watching.law.closed_share * watching.full_ml_s
+    tolerated_ml_s = watching.settings.closed_share * watching.full_ml_s
     wet = (i for i, each in enumerate(memory.closed) if _flow([each], memory.gain) > tolerated_ml_s)
     bins = memory.closed[next(wet, len(memory.closed)) + 1 :]
-    if len(bins) < CLOSED_BINS or not watching.law.closed_check:
+    if len(bins) < CLOSED_BINS or not watching.settings.closed_check:
         return memory
     flow_ml_s, last_ml_s = _flow(bins, memory.gain), _flow(bins[-CLOSED_LAST_BINS:], memory.gain)
     if not (flow_ml_s > tolerated_ml_s and last_ml_s > tolerated_ml_s):
@@ -171,7 +171,7 @@ def of_sensors(
     if tank is not None and tank.fault:
         memory = _sensor(watching, memory, FaultKind.TANK_FAULT, tank.fault, now_s)
     if _is_tank_low(watching, state) and state.enabled:
-        text = f"tank at its reserve of {watching.law.reserve_l or 0.0:g} L"
+        text = f"tank at its reserve of {watching.settings.reserve_l or 0.0:g} L"
         memory = _with(memory, Finding(kind=FaultKind.TANK_LOW, at_s=now_s, text=text))
     return memory
 
@@ -179,13 +179,13 @@ def of_sensors(
 def _sensor(
     watching: Watching, memory: WatchMemory, kind: FaultKind, text: str, now_s: float
 ) -> WatchMemory:
-    is_closing = kind is FaultKind.METER_FAULT and watching.law.meter_required
+    is_closing = kind is FaultKind.METER_FAULT and watching.settings.meter_required
     memory = _with(memory, Finding(kind=kind, at_s=now_s, text=text))
     return _latched(memory, Inhibit.FLOW_FAULT) if is_closing else memory
 
 
 def _is_tank_low(watching: Watching, state: VehicleState) -> bool:
-    reserve_l, tank = watching.law.reserve_l, state.tank
+    reserve_l, tank = watching.settings.reserve_l, state.tank
     if reserve_l is None or tank is None or tank.level_l is None:
         return False
     return not tank.level_l > reserve_l
@@ -200,7 +200,7 @@ def _evidence(watching: Watching, memory: WatchMemory, count: int) -> Evidence:
         likely_gain=1.0 + (memory.gain - 1.0) * memory.learnt_s / LEARN_S,
         pressure_gain=memory.pressure_gain,
         open_ml_s=watching.open_ml_s,
-        restless_share=watching.law.restless_share,
+        unsteady_share=watching.settings.unsteady_share,
     )
 
 
@@ -401,7 +401,7 @@ def _judged(
             return memory._replace(closed=())
         memory = memory._replace(closed=(*memory.closed[-7:], filled))
         return of_closed(watching, memory)
-    minimum_ml_s = watching.law.meter_minimum_l_min * ML_S_PER_L_MIN
+    minimum_ml_s = watching.settings.meter_minimum_l_min * ML_S_PER_L_MIN
     if not (
         filled.is_whole
         and expected_ml >= minimum_ml_s * length_s
@@ -410,19 +410,19 @@ def _judged(
         return memory
     error = filled.metered_ml / expected_ml - 1.0
     memory = _summed(watching, memory, filled, error)
-    if abs(error) <= watching.law.spread * SLACK_SPREADS and max(memory.low[0], memory.high[0]) < (
-        0.5 * ALARM_SPREADS_S * watching.law.spread
-    ):
+    if abs(error) <= watching.settings.spread * SLACK_SPREADS and max(
+        memory.low[0], memory.high[0]
+    ) < (0.5 * ALARM_SPREADS_S * watching.settings.spread):
         memory = _learnt(watching, memory, filled)
-    alarm = ALARM_SPREADS_S * watching.law.spread
+    alarm = ALARM_SPREADS_S * watching.settings.spread
     if memory.low[0] >= alarm or memory.high[0] >= alarm or memory.nothing_s > 0.0:
         memory = of_spraying(watching, memory, state, alarm=alarm)
-    return told_apart(watching, memory) if memory.findings else memory
+    return with_valve_told(watching, memory) if memory.findings else memory
 
 
 def _summed(watching: Watching, memory: WatchMemory, filled: Bin, error: float) -> WatchMemory:
-    slack = watching.law.spread * SLACK_SPREADS
-    most = 2.0 * ALARM_SPREADS_S * watching.law.spread
+    slack = watching.settings.spread * SLACK_SPREADS
+    most = 2.0 * ALARM_SPREADS_S * watching.settings.spread
     length_s = filled.end_s - filled.begin_s
 
     def more(before: tuple[float, int], beyond: float) -> tuple[float, int]:
@@ -444,7 +444,7 @@ def _learnt(watching: Watching, memory: WatchMemory, filled: Bin) -> WatchMemory
     """Return the meter's gain, and the pressure sensor's, a step nearer to what is seen."""
     length_s = filled.end_s - filled.begin_s
     learnt_s = min(memory.learnt_s + length_s, LEARN_S)
-    share, room = length_s / learnt_s, GAIN_SPREADS * watching.law.spread
+    share, room = length_s / learnt_s, GAIN_SPREADS * watching.settings.spread
     gain = memory.gain + share * (filled.metered_ml / filled.all_ml - memory.gain)
     pressure_gain = memory.pressure_gain
     if filled.pressure is not None:

@@ -18,7 +18,7 @@ from companion.core.boom import Boom, Paths, predict
 from companion.core.crossings import Crossing, Route
 from companion.core.frame import Bools, Floats
 from companion.core.options.coverage import CELL_M, Coverage
-from companion.core.options.treated_area import Swath, wake_m
+from companion.core.options.treated_area import TreatedArea, wake_m
 from companion.core.types import VehicleState
 
 # From when until when a strip is over treated ground.
@@ -79,7 +79,7 @@ def guarded(
 
 def treated_before(
     guard: OverlapGuard,
-    swath: Swath | None,
+    area: TreatedArea | None,
     state: VehicleState,
     boom: Boom,
     *,
@@ -87,13 +87,13 @@ def treated_before(
     now_s: float,
 ) -> Coverage | None:
     """Return the ground that counts as treated: none of what was sprayed a moment ago."""
-    if swath is None:
+    if area is None:
         return None
     # The paths begin behind the boom, and their beginning is looked at too.
     speed_m_s = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
     behind_m = wake_m(boom) + speed_m_s * back_s
     here = (state.east_m, state.north_m)
-    return swath.before(now_s - guard.fresh_s, here=here, behind_m=behind_m)
+    return area.before(now_s - guard.fresh_s, here=here, behind_m=behind_m)
 
 
 def _is_far(treated: Coverage, state: VehicleState, boom: Boom, ahead_s: float) -> bool:

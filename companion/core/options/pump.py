@@ -29,7 +29,7 @@ from companion.core.types import (
 Control = Literal["modulates", "constant"]
 # What lets out what is pumped: the valves alone, a return valve beside them, or nozzles that
 # nothing shuts.
-Way = Literal["valves", "return", "always"]
+PumpOutlet = Literal["valves", "return", "always"]
 
 # An ESC takes a pulse each 20 ms.
 FRAME_HZ = 50.0
@@ -50,7 +50,7 @@ class Pump:
     """
 
     control: Control
-    way: Way
+    outlet: PumpOutlet
     lag: LagModel
     curve: FlowCurve | None = None
     fraction_min: float = 0.0
@@ -102,7 +102,7 @@ class Pumping:
         )
         timing = Timing.of(method, pump.lag, look_ahead_s=look_ahead_s, period_s=pwm.period_s)
         if method is Method.SCHEDULED:
-            timing = _by_way(pump, timing, valve_timing)
+            timing = _by_outlet(pump, timing, valve_timing)
         return cls(
             pump=pump,
             boom=boom,
@@ -118,28 +118,28 @@ class Pumping:
     @property
     def early_s(self) -> float:
         """Return how much sooner than by its own lag a valve opens for the pump's start."""
-        if self.pump.way != "valves" or self.method is not Method.SCHEDULED:
+        if self.pump.outlet != "valves" or self.method is not Method.SCHEDULED:
             return 0.0
         return max(self.timing.on_s - self.valve_timing.on_s, 0.0)
 
     @property
     def early_border_s(self) -> float:
         """Return the same at the border."""
-        if self.pump.way != "valves" or self.method is not Method.SCHEDULED:
+        if self.pump.outlet != "valves" or self.method is not Method.SCHEDULED:
             return 0.0
         return max(self.timing.border_on_s - self.valve_timing.border_on_s, 0.0)
 
 
-def _by_way(pump: Pump, own: Timing, valve: Timing) -> Timing:
+def _by_outlet(pump: Pump, own: Timing, valve: Timing) -> Timing:
     """Return the pump's leads where valves make the edges of what is sprayed.
 
     It stops with the last valve. With a return valve it stands at its flow before the first one
     opens; without one it starts as that valve opens.
     """
-    if pump.way == "always":
+    if pump.outlet == "always":
         return own
     shut = replace(own, off_s=valve.off_s, border_off_s=valve.border_off_s)
-    if pump.way == "valves":
+    if pump.outlet == "valves":
         return shut
     lag = pump.lag
     rise_s = SETTLED_TIMES * lag.up_time_s or 2.0 * (lag.on_s - lag.on_start_s)
@@ -227,7 +227,7 @@ def pump_route(pumping: Pumping, routes: tuple[Route, ...]) -> Route:
     dwell_s = pumping.valve_timing.dwell_min_s
     merge_s = max(MERGE_SHARE * max(lag.up_time_s, lag.down_time_s), MERGE_MIN_S)
     sprayed = tuple(_where_open(route, _on_off(route, dwell_s)) for route in routes)
-    if pumping.pump.way == "always":  # nothing shuts the one nozzle that is outside
+    if pumping.pump.outlet == "always":  # nothing shuts the one nozzle that is outside
         return boom_route(sprayed, pumping.boom, merge_s=merge_s, shuts_outside=True)
     whole = boom_route(sprayed, pumping.boom, merge_s=merge_s)
     return bridged(whole, timing.on_s)
@@ -283,15 +283,15 @@ def behind_path(plan: SprayPlan, drive: DrivePlan) -> DrivePlan:
 def constant_drive(pump: Pump, plan: SprayPlan) -> DrivePlan:
     """Return the plan of a pump that supplies valves: it runs wherever it may."""
     drive = DrivePlan(fraction=pump.run_fraction)
-    return drive if pump.way == "return" else behind_path(plan, drive)
+    return drive if pump.outlet == "return" else behind_path(plan, drive)
 
 
-def liquid_plan(plan: SprayPlan | None, way: Way) -> SprayPlan | None:
+def liquid_plan(plan: SprayPlan | None, outlet: PumpOutlet) -> SprayPlan | None:
     """Return the plan of one valve that is the pump: what of its flow comes out of the nozzles."""
     if plan is None:
         return None
     drive = plan.drives[0] if plan.drives else DrivePlan(fraction=0.0)
-    if way == "return":
+    if outlet == "return":
         drive = behind_path(plan, drive)
     changes = []
     before = drive.fraction
@@ -337,9 +337,9 @@ def modulated(
         sticky_border_s=sticky_border_s(border_buffer_m, speed_m_s),
     )
     drive = as_drive(in_force, found.changes)
-    return behind_path(plan, drive) if pumping.pump.way == "valves" else drive
+    return behind_path(plan, drive) if pumping.pump.outlet == "valves" else drive
 
 
 def liquid_of(pumping: Pumping | None, plan: SprayPlan | None) -> SprayPlan | None:
     """Return the plan that the meter's flow follows: the valves', or that of the pump."""
-    return plan if pumping is None else liquid_plan(plan, pumping.pump.way)
+    return plan if pumping is None else liquid_plan(plan, pumping.pump.outlet)

@@ -1,6 +1,6 @@
 """What the valves sweep: from orders and states to treated ground, by what a valve really does.
 
-When a valve lets liquid out, `swath_liquid` says; its edges carry the volume of the rise and fall,
+When a valve lets liquid out, its flow edges say; they carry the volume of the rise and fall,
 so ground that a later flight begins at such an edge gets its dose, neither more nor less on the
 mean. What the schedule only meant to do is not looked at.
 
@@ -34,7 +34,7 @@ NEAR_M = 1e-6
 TOUCH_M = 0.01
 
 
-class Front(NamedTuple):
+class BoomPose(NamedTuple):
     """Where the boom was, the liquid's offset by the wind in it."""
 
     time_s: float
@@ -45,13 +45,13 @@ class Front(NamedTuple):
 
 def swept(
     boom: Boom,
-    fronts: tuple[Front, ...],
+    poses: tuple[BoomPose, ...],
     is_open: tuple[bool, ...],
-    toggles: tuple[Toggle, ...],
+    flow_edges: tuple[FlowEdge, ...],
 ) -> list[Quad]:
-    """Return the quadrilaterals swept on the way through `fronts`; `is_open` holds at the first."""
-    way = _Way(boom, fronts)
-    stays = _stays(is_open, toggles, fronts[0].time_s, fronts[-1].time_s)
+    """Return the quadrilaterals swept on the way through `poses`; `is_open` holds at the first."""
+    way = _Way(boom, poses)
+    stays = _stays(is_open, flow_edges, poses[0].time_s, poses[-1].time_s)
     return [quad for strip in _strips(boom, stays) for quad in way.quads(*strip)]
 
 
@@ -60,19 +60,19 @@ _Stays = tuple[tuple[float, float], ...]
 
 
 def _stays(
-    is_open: tuple[bool, ...], toggles: tuple[Toggle, ...], start_s: float, end_s: float
+    is_open: tuple[bool, ...], flow_edges: tuple[FlowEdge, ...], start_s: float, end_s: float
 ) -> list[_Stays]:
     """Return when each valve is open between two times."""
     found: list[_Stays] = []
     for valve, opens in enumerate(is_open):
         stays = []
         since_s = start_s
-        for toggle in toggles:
-            if toggle.valve != valve or toggle.at_s > end_s or toggle.opens is opens:
+        for flow_edge in flow_edges:
+            if flow_edge.valve != valve or flow_edge.at_s > end_s or flow_edge.opens is opens:
                 continue
             if opens:
-                stays.append((since_s, toggle.at_s))
-            opens, since_s = toggle.opens, max(toggle.at_s, start_s)
+                stays.append((since_s, flow_edge.at_s))
+            opens, since_s = flow_edge.opens, max(flow_edge.at_s, start_s)
         if opens:
             stays.append((since_s, end_s))
         found.append(tuple(stay for stay in stays if stay[1] > stay[0]))
@@ -100,20 +100,20 @@ def _strips(boom: Boom, stays: list[_Stays]) -> list[_Strip]:
 
 
 class _Way:
-    """The way of the boom through its fronts, in as few straight pieces as it allows.
+    """The way of the boom through its poses, in as few straight pieces as it allows.
 
-    Plain numbers: for some ten fronts that is several times as fast as arrays are.
+    Plain numbers: for some ten poses that is several times as fast as arrays are.
     """
 
-    def __init__(self, boom: Boom, fronts: tuple[Front, ...]) -> None:
-        self._fronts = fronts
+    def __init__(self, boom: Boom, poses: tuple[BoomPose, ...]) -> None:
+        self._fronts = poses
         reach_m = float((np.abs(boom.right_m) + boom.half_width_m).max())
         tips = []
-        for _, east_m, north_m, heading_deg in fronts:
+        for _, east_m, north_m, heading_deg in poses:
             angle = math.radians(heading_deg)
             sin, cos = reach_m * math.sin(angle), reach_m * math.cos(angle)
             tips.append((east_m - cos, north_m + sin, east_m + cos, north_m - sin))
-        self._knots_s = [fronts[bend].time_s for bend in _bends(tips, 0, len(tips) - 1)]
+        self._knots_s = [poses[bend].time_s for bend in _bends(tips, 0, len(tips) - 1)]
 
     def quads(self, left_m: float, right_m: float, forward_m: float, stays: _Stays) -> list[Quad]:
         """Return the quadrilaterals that a strip sweeps while it is open."""
@@ -148,8 +148,8 @@ class _Way:
         )
 
 
-def _time(front: Front) -> float:
-    return front.time_s
+def _time(pose: BoomPose) -> float:
+    return pose.time_s
 
 
 def _bends(tips: list[tuple[float, float, float, float]], first: int, last: int) -> list[int]:
@@ -191,7 +191,7 @@ class Lags(NamedTuple):
     flow: LagModel
 
 
-class Toggle(NamedTuple):
+class FlowEdge(NamedTuple):
     """From `at_s` on liquid comes out of a valve, or none does."""
 
     at_s: float
@@ -207,9 +207,9 @@ def ordered_until(
     now_s: float,
     lags: Lags,
     ordered: tuple[bool, ...],
-    toggles: tuple[Toggle, ...],
+    flow_edges: tuple[FlowEdge, ...],
     lapses: bool,
-) -> tuple[tuple[bool, ...], tuple[Toggle, ...]]:
+) -> tuple[tuple[bool, ...], tuple[FlowEdge, ...]]:
     """Return what is ordered by `now_s` and what becomes of it, after what was until then.
 
     `pumped` is the flow of a pump that makes it, where there is one. With `lapses` a plan ends with
@@ -222,9 +222,9 @@ def ordered_until(
         for valve, (was, opens) in enumerate(zip(ordered, wanted, strict=True)):
             if was != opens:
                 lag_s = (lag.on_s if opens else lag.off_s) + lags.valve.output_s
-                toggles = toggled(toggles, Toggle(at_s + lag_s, valve, opens))
+                flow_edges = with_flow_edge(flow_edges, FlowEdge(at_s + lag_s, valve, opens))
         ordered = wanted
-    return ordered, toggles
+    return ordered, flow_edges
 
 
 def _openings(
@@ -268,34 +268,34 @@ def _real(opened: tuple[bool, ...], findings: tuple[Finding, ...]) -> tuple[bool
     )
 
 
-def toggled(toggles: tuple[Toggle, ...], new: Toggle) -> tuple[Toggle, ...]:
-    """Return the toggles with one more; one that comes before the last of its valve undoes it."""
-    for number in range(len(toggles) - 1, -1, -1):
-        if toggles[number].valve == new.valve:
-            if toggles[number].at_s >= new.at_s:
-                return toggles[:number] + toggles[number + 1 :]
+def with_flow_edge(flow_edges: tuple[FlowEdge, ...], new: FlowEdge) -> tuple[FlowEdge, ...]:
+    """Return the edges with one more; one that comes before the last of its valve undoes it."""
+    for number in range(len(flow_edges) - 1, -1, -1):
+        if flow_edges[number].valve == new.valve:
+            if flow_edges[number].at_s >= new.at_s:
+                return flow_edges[:number] + flow_edges[number + 1 :]
             break
-    return (*toggles, new)
+    return (*flow_edges, new)
 
 
 def open_at(
-    is_open: tuple[bool, ...], toggles: tuple[Toggle, ...], at_s: float
-) -> tuple[tuple[bool, ...], tuple[Toggle, ...]]:
+    is_open: tuple[bool, ...], flow_edges: tuple[FlowEdge, ...], at_s: float
+) -> tuple[tuple[bool, ...], tuple[FlowEdge, ...]]:
     """Return which valves are open at a time, and what follows later."""
     now = list(is_open)
-    for toggle in toggles:
-        if toggle.at_s <= at_s:
-            now[toggle.valve] = toggle.opens
-    return tuple(now), tuple(toggle for toggle in toggles if toggle.at_s > at_s)
+    for flow_edge in flow_edges:
+        if flow_edge.at_s <= at_s:
+            now[flow_edge.valve] = flow_edge.opens
+    return tuple(now), tuple(flow_edge for flow_edge in flow_edges if flow_edge.at_s > at_s)
 
 
-# The way is stamped after this time: a swath of 10 m at 5 m/s is one look at some 2000 cells.
+# The way is stamped after this time: a area of 10 m at 5 m/s is one look at some 2000 cells.
 STAMP_EVERY_S = 2.0
 # States nearer than this add nothing to the way between them: within 0.2 s of braking by 2.5 m/s2
 # a place between two is off by a centimetre.
-FRONT_STEP_M = 0.8
+POSE_STEP_M = 0.8
 # However slowly it flies: well below what counts as a gap.
-FRONT_EVERY_S = 0.5
+POSE_EVERY_S = 0.5
 # States farther apart than these are a gap or a jump: nothing is known of the way between.
 GAP_MAX_S = 1.0
 JUMP_MAX_M = 25.0
@@ -311,7 +311,7 @@ WAKE_MAX_M = 25.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SwathSettings:
+class TreatedAreaSettings:
     """What the record of treated ground has to know of the sprayer, and of earlier flights."""
 
     boom: Boom
@@ -334,20 +334,20 @@ class Snapshot(NamedTuple):
     coverage: Coverage
 
 
-class Swath(NamedTuple):
+class TreatedArea(NamedTuple):
     """What has been treated, and the way that is not yet stamped.
 
-    `fronts` begin with the last stamp, `is_open` holds there; `toggles` come later, in the order of
-    their orders. `ordered` is what was ordered last. `way_m` is how far the boom had come at
+    `poses` begin with the last stamp, `is_open` holds there; `flow_edges` come later, in the order
+    of their orders. `ordered` is what was ordered last. `way_m` is how far the boom had come at
     `place` (east, north); what it flew closed counts as straight.
     """
 
     coverage: Coverage
     older: tuple[Snapshot, ...] = ()
-    fronts: tuple[Front, ...] = ()
+    poses: tuple[BoomPose, ...] = ()
     is_open: tuple[bool, ...] = ()
     ordered: tuple[bool, ...] = ()
-    toggles: tuple[Toggle, ...] = ()
+    flow_edges: tuple[FlowEdge, ...] = ()
     way_m: float = 0.0
     place: Place | None = None
 
@@ -356,7 +356,7 @@ class Swath(NamedTuple):
 
         And before the boom came nearer than `behind_m`, along its way, to where it is now.
         """
-        way_m = self.came_m([*((x, y) for _, x, y, _ in self.fronts), here]) - behind_m
+        way_m = self.came_m([*((x, y) for _, x, y, _ in self.poses), here]) - behind_m
         found = None
         for until_s, at_m, coverage in self.older:
             if until_s <= at_s and at_m <= way_m:
@@ -372,24 +372,24 @@ class Swath(NamedTuple):
             last = place
         return way_m
 
-    def come(self, *more: Front) -> Swath:
-        """Return the swath with the way through its fronts and those ahead counted."""
-        places = [(x, y) for _, x, y, _ in (*self.fronts, *more)]
+    def come(self, *more: BoomPose) -> TreatedArea:
+        """Return the area with the way through its poses and those ahead counted."""
+        places = [(x, y) for _, x, y, _ in (*self.poses, *more)]
         if not places:
             return self
         return self._replace(way_m=self.came_m(places), place=places[-1])
 
 
-def begin(settings: SwathSettings) -> Swath:
-    """Return the swath of a flight that has not sprayed yet."""
+def begin(settings: TreatedAreaSettings) -> TreatedArea:
+    """Return the area of a flight that has not sprayed yet."""
     treated = settings.treated or Coverage()
     shut = (False,) * len(settings.boom.valves)
-    return Swath(treated, (Snapshot(-math.inf, -math.inf, treated),), (), shut, shut)
+    return TreatedArea(treated, (Snapshot(-math.inf, -math.inf, treated),), (), shut, shut)
 
 
 def follow(
-    settings: SwathSettings,
-    swath: Swath | None,
+    settings: TreatedAreaSettings,
+    area: TreatedArea | None,
     plan: SprayPlan | None,
     state: VehicleState | None,
     *,
@@ -397,35 +397,35 @@ def follow(
     findings: tuple[Finding, ...],
     drift_m: Offset | None,
     now_s: float,
-) -> Swath:
-    """Return the swath until `now_s`, where `plan` was the one in force, `pumped` its pump's."""
-    if swath is None:
-        swath = begin(settings)
-    if not (findings or settings.is_pumped) and _stays_so(swath, plan, state, now_s):
-        return swath
-    swath = _ordered(settings, swath, plan, pumped, findings, now_s=now_s)
-    is_at_work = any(swath.is_open) or any(swath.ordered) or bool(swath.toggles)
+) -> TreatedArea:
+    """Return the area until `now_s`, where `plan` was the one in force, `pumped` its pump's."""
+    if area is None:
+        area = begin(settings)
+    if not (findings or settings.is_pumped) and _stays_so(area, plan, state, now_s):
+        return area
+    area = _ordered(settings, area, plan, pumped, findings, now_s=now_s)
+    is_at_work = any(area.is_open) or any(area.ordered) or bool(area.flow_edges)
     if not (is_at_work or (plan is not None and plan.opens)):
-        return swath.come()._replace(fronts=()) if swath.fronts else swath
-    front = _front(state, drift_m)
-    if front is None or not swath.fronts:
-        return _broken_off(settings, swath, front, now_s)
+        return area.come()._replace(poses=()) if area.poses else area
+    pose = _pose(state, drift_m)
+    if pose is None or not area.poses:
+        return _broken_off(settings, area, pose, now_s)
     if not is_at_work:
-        return swath.come(front)._replace(fronts=(front,))
-    return _moved(settings, swath, front, now_s)
+        return area.come(pose)._replace(poses=(pose,))
+    return _moved(settings, area, pose, now_s)
 
 
 def _stays_so(
-    swath: Swath, plan: SprayPlan | None, state: VehicleState | None, now_s: float
+    area: TreatedArea, plan: SprayPlan | None, state: VehicleState | None, now_s: float
 ) -> bool:
     """Return whether nothing has to be noted yet: the usual step, told apart at little cost."""
     if plan is None or state is None or not now_s < plan.lease_until_s:
         return False
-    if not swath.fronts:
-        return not (plan.opens or swath.toggles or any(swath.ordered) or any(swath.is_open))
-    if not 0.0 <= now_s - swath.fronts[0].time_s < STAMP_EVERY_S:
+    if not area.poses:
+        return not (plan.opens or area.flow_edges or any(area.ordered) or any(area.is_open))
+    if not 0.0 <= now_s - area.poses[0].time_s < STAMP_EVERY_S:
         return False
-    ordered = swath.ordered
+    ordered = area.ordered
     for duty, is_open in zip(plan.duty, ordered, strict=True):
         if (duty > 0.0) is not is_open:
             return False
@@ -433,26 +433,28 @@ def _stays_so(
         if change.at_s <= now_s and (change.duty > 0.0) is not ordered[change.valve]:
             return False
     # With a wind's offset that moved meanwhile this is a little off, and no more than that.
-    last_s, east_m, north_m, _ = swath.fronts[-1]
+    last_s, east_m, north_m, _ = area.poses[-1]
     away_m = abs(state.east_m - east_m) + abs(state.north_m - north_m)
-    return away_m < FRONT_STEP_M and state.time_s - last_s < FRONT_EVERY_S
+    return away_m < POSE_STEP_M and state.time_s - last_s < POSE_EVERY_S
 
 
-def _moved(settings: SwathSettings, swath: Swath, front: Front, now_s: float) -> Swath:
-    last = swath.fronts[-1]
-    moved_m = math.hypot(front.east_m - last.east_m, front.north_m - last.north_m)
-    if not (0.0 <= front.time_s - last.time_s <= GAP_MAX_S and moved_m <= JUMP_MAX_M):
-        return _broken_off(settings, swath, front, now_s)
-    if now_s - swath.fronts[0].time_s >= STAMP_EVERY_S:
-        return _stamped(settings.boom, swath, front)
-    if moved_m < FRONT_STEP_M and front.time_s - last.time_s < FRONT_EVERY_S:
-        return swath
-    return swath._replace(fronts=(*swath.fronts, front))
+def _moved(
+    settings: TreatedAreaSettings, area: TreatedArea, pose: BoomPose, now_s: float
+) -> TreatedArea:
+    last = area.poses[-1]
+    moved_m = math.hypot(pose.east_m - last.east_m, pose.north_m - last.north_m)
+    if not (0.0 <= pose.time_s - last.time_s <= GAP_MAX_S and moved_m <= JUMP_MAX_M):
+        return _broken_off(settings, area, pose, now_s)
+    if now_s - area.poses[0].time_s >= STAMP_EVERY_S:
+        return _stamped(settings.boom, area, pose)
+    if moved_m < POSE_STEP_M and pose.time_s - last.time_s < POSE_EVERY_S:
+        return area
+    return area._replace(poses=(*area.poses, pose))
 
 
 def expected(
-    settings: SwathSettings,
-    swath: Swath | None,
+    settings: TreatedAreaSettings,
+    area: TreatedArea | None,
     plan: SprayPlan | None,
     state: VehicleState | None,
     *,
@@ -464,90 +466,96 @@ def expected(
 ) -> Coverage:
     """Return the coverage as it will be if all goes on until `cut_s` and every valve closes then.
 
-    With `cut_s` at `now_s` it is that of a flight that ends now. `swath` and `plan` are what the
+    With `cut_s` at `now_s` it is that of a flight that ends now. `area` and `plan` are what the
     step of `now_s` has left.
     """
-    swath = swath or begin(settings)
-    front = _front(state, drift_m)
-    if front is None or state is None or not swath.fronts:
-        return swath.coverage
-    ahead = _ordered(settings, swath, plan, pumped, findings, now_s=max(cut_s, now_s), lapses=False)
+    area = area or begin(settings)
+    pose = _pose(state, drift_m)
+    if pose is None or state is None or not area.poses:
+        return area.coverage
+    ahead = _ordered(settings, area, plan, pumped, findings, now_s=max(cut_s, now_s), lapses=False)
     lags = settings.lags
     closes_s = cut_s + max(lags.valve.off_s, lags.flow.off_s) + lags.valve.output_s
-    toggles = [toggle for toggle in ahead.toggles if toggle.opens is False or toggle.at_s <= cut_s]
+    flow_edges = [
+        flow_edge
+        for flow_edge in ahead.flow_edges
+        if flow_edge.opens is False or flow_edge.at_s <= cut_s
+    ]
     for valve, is_open in enumerate(ahead.ordered):
         if is_open:
-            toggles.append(Toggle(closes_s, valve, opens=False))
-    last_s = max((toggle.at_s for toggle in toggles), default=now_s)
+            flow_edges.append(FlowEdge(closes_s, valve, opens=False))
+    last_s = max((flow_edge.at_s for flow_edge in flow_edges), default=now_s)
     carried_s = max(min(last_s - now_s, GAP_MAX_S + 1.0), 0.0)
-    fronts = [*swath.fronts]
-    if front.time_s > fronts[-1].time_s:
-        fronts.append(front)
-    end = Front(
-        front.time_s + carried_s,
-        front.east_m + state.velocity_east_m_s * carried_s,
-        front.north_m + state.velocity_north_m_s * carried_s,
-        front.heading_deg + state.yaw_rate_deg_s * carried_s,
+    poses = [*area.poses]
+    if pose.time_s > poses[-1].time_s:
+        poses.append(pose)
+    end = BoomPose(
+        pose.time_s + carried_s,
+        pose.east_m + state.velocity_east_m_s * carried_s,
+        pose.north_m + state.velocity_north_m_s * carried_s,
+        pose.heading_deg + state.yaw_rate_deg_s * carried_s,
     )
-    ahead = ahead._replace(fronts=tuple(fronts), toggles=tuple(toggles))
+    ahead = ahead._replace(poses=tuple(poses), flow_edges=tuple(flow_edges))
     made = _stamped(settings.boom, ahead, end).coverage
     return Coverage(tiles=made.tiles, ahead_s=max(cut_s - now_s, 0.0))
 
 
-def _front(state: VehicleState | None, drift_m: Offset | None) -> Front | None:
+def _pose(state: VehicleState | None, drift_m: Offset | None) -> BoomPose | None:
     if state is None or state.heading_deg is None:
         return None
     east_m, north_m = state.east_m, state.north_m
     if drift_m is not None:
         east_m, north_m = east_m + drift_m[0], north_m + drift_m[1]
-    front = Front(state.time_s, east_m, north_m, state.heading_deg)
-    return front if all(map(math.isfinite, front)) else None
+    pose = BoomPose(state.time_s, east_m, north_m, state.heading_deg)
+    return pose if all(map(math.isfinite, pose)) else None
 
 
 def _ordered(
-    settings: SwathSettings,
-    swath: Swath,
+    settings: TreatedAreaSettings,
+    area: TreatedArea,
     plan: SprayPlan | None,
     pumped: SprayPlan | None,
     findings: tuple[Finding, ...],
     *,
     now_s: float,
     lapses: bool = True,
-) -> Swath:
-    ordered, toggles = ordered_until(
+) -> TreatedArea:
+    ordered, flow_edges = ordered_until(
         plan, pumped, findings, now_s=now_s, lags=settings.lags,
-        ordered=swath.ordered, toggles=swath.toggles, lapses=lapses,
+        ordered=area.ordered, flow_edges=area.flow_edges, lapses=lapses,
     )  # fmt: skip
-    if ordered is swath.ordered:
-        return swath
-    return swath._replace(ordered=ordered, toggles=toggles)
+    if ordered is area.ordered:
+        return area
+    return area._replace(ordered=ordered, flow_edges=flow_edges)
 
 
-def _broken_off(settings: SwathSettings, swath: Swath, front: Front | None, now_s: float) -> Swath:
-    """Return the swath stamped as far as its way is known, and begun anew at `front`."""
-    if len(swath.fronts) > 1:
-        swath = _stamped(settings.boom, swath._replace(fronts=swath.fronts[:-1]), swath.fronts[-1])
-    is_open, toggles = open_at(swath.is_open, swath.toggles, now_s)
-    fronts = () if front is None else (front,)
-    return swath.come(*fronts)._replace(fronts=fronts, is_open=is_open, toggles=toggles)
+def _broken_off(
+    settings: TreatedAreaSettings, area: TreatedArea, pose: BoomPose | None, now_s: float
+) -> TreatedArea:
+    """Return the area stamped as far as its way is known, and begun anew at `pose`."""
+    if len(area.poses) > 1:
+        area = _stamped(settings.boom, area._replace(poses=area.poses[:-1]), area.poses[-1])
+    is_open, flow_edges = open_at(area.is_open, area.flow_edges, now_s)
+    poses = () if pose is None else (pose,)
+    return area.come(*poses)._replace(poses=poses, is_open=is_open, flow_edges=flow_edges)
 
 
-def _stamped(boom: Boom, swath: Swath, front: Front) -> Swath:
-    """Return the swath with its way to `front` stamped."""
-    fronts = (*swath.fronts, front) if front.time_s > swath.fronts[-1].time_s else swath.fronts
-    end_s = fronts[-1].time_s
-    is_open, later = open_at(swath.is_open, swath.toggles, end_s)
-    coverage = swath.coverage
-    if len(fronts) > 1 and (any(swath.is_open) or len(later) < len(swath.toggles)):
-        coverage = coverage.stamped(swept(boom, fronts, swath.is_open, swath.toggles))
-    come = swath.come(front)
-    return Swath(
+def _stamped(boom: Boom, area: TreatedArea, pose: BoomPose) -> TreatedArea:
+    """Return the area with its way to `pose` stamped."""
+    poses = (*area.poses, pose) if pose.time_s > area.poses[-1].time_s else area.poses
+    end_s = poses[-1].time_s
+    is_open, later = open_at(area.is_open, area.flow_edges, end_s)
+    coverage = area.coverage
+    if len(poses) > 1 and (any(area.is_open) or len(later) < len(area.flow_edges)):
+        coverage = coverage.stamped(swept(boom, poses, area.is_open, area.flow_edges))
+    come = area.come(pose)
+    return TreatedArea(
         coverage=coverage,
-        older=_kept(swath.older, Snapshot(end_s, come.way_m, coverage), wake_m(boom)),
-        fronts=fronts[-1:],
+        older=_kept(area.older, Snapshot(end_s, come.way_m, coverage), wake_m(boom)),
+        poses=poses[-1:],
         is_open=is_open,
-        ordered=swath.ordered,
-        toggles=later,
+        ordered=area.ordered,
+        flow_edges=later,
         way_m=come.way_m,
         place=come.place,
     )
