@@ -215,9 +215,9 @@ def test_a_lease_that_ends_closes() -> None:
 
 def test_a_change_that_overtakes_the_one_before_undoes_it() -> None:
     off = FlowEdge(10.2, 1, opens=False)
-    assert treated_area.toggled((off,), FlowEdge(10.1, 1, opens=True)) == ()
+    assert treated_area.with_flow_edge((off,), FlowEdge(10.1, 1, opens=True)) == ()
     other = FlowEdge(10.1, 0, opens=True)
-    assert treated_area.toggled((off,), other) == (off, other)
+    assert treated_area.with_flow_edge((off,), other) == (off, other)
 
 
 def test_an_opening_of_a_moment_treats_its_moment() -> None:

@@ -80,7 +80,7 @@ class Rig:
 
     def __post_init__(self) -> None:
         base = setup()
-        self.watching = Watching.of(self.settings, base.nozzle_sets, base.lag, base.pwm)
+        self.watching = Watching.of(self.law, base.nozzle_sets, base.lag, base.pwm)
         self.memory = WatchMemory()
         self.ml = 0.0
         self.chance = random.Random(self.seed)

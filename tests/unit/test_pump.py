@@ -202,7 +202,7 @@ def test_a_drive_alone_makes_a_plan_that_is_not_off() -> None:
 )
 def test_a_pump_that_cannot_be_is_refused(wrong: dict[str, object]) -> None:
     given: dict[str, object] = {
-        "control": "modulates", "way": "valves", "lag": PUMP_LAG, "curve": CURVE,
+        "control": "modulates", "outlet": "valves", "lag": PUMP_LAG, "curve": CURVE,
     }  # fmt: skip
     with pytest.raises(ValueError, match=r"fraction|curve"):
         Pump(**(given | wrong))  # type: ignore[arg-type]

@@ -269,11 +269,17 @@ def behind_path(plan: SprayPlan, drive: DrivePlan) -> DrivePlan:
     """
     # At one moment the valves go first: an opening one is open for the pump that starts with it.
     times = {change.at_s for change in plan.changes} | {change.at_s for change in drive.changes}
-    start = drive.fraction if any(plan.duty) else 0.0
+    duty = list(plan.duty)
+    start = drive.fraction if any(duty) else 0.0
     made: list[DriveChange] = []
     stands = start
-    for at_s in sorted(times):
-        wanted = drive.at(at_s) if any(plan.duty_at(at_s)) else 0.0
+    valves = iter(plan.changes)
+    ahead = next(valves, None)
+    for at_s in sorted(times):  # up to the lease and beyond: its end is the executor's to mind
+        while ahead is not None and ahead.at_s <= at_s:
+            duty[ahead.valve] = ahead.duty
+            ahead = next(valves, None)
+        wanted = drive.at(at_s) if any(duty) else 0.0
         if wanted != stands:
             made.append(DriveChange(at_s=at_s, fraction=wanted))
             stands = wanted
