@@ -7,7 +7,7 @@ ARGS ?=
 WORKERS ?= 3
 FLIGHT_WORKERS ?= 4
 # What goes by the wall clock.
-IN_REAL_TIME := tests/contract tests/sitl
+IN_REAL_TIME := $(wildcard tests/*/realtime)
 # Each Python needs its own: make PYTHON=python3.13 VENV=.venv-3.13 test
 VENV ?= .venv
 
@@ -20,10 +20,10 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs lock clean bench-missions
+.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs lock clean bench-missions
 
 help: ## what there is
-	@awk -F ':.*## ' '/^[a-z-]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z -]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
 
 setup: $(INSTALLED) ## the virtual environment, from the lock files
 
@@ -47,6 +47,14 @@ test-computing: $(INSTALLED) ## of these all but the flights in real time
 
 test-flights: $(INSTALLED) ## of these the flights in real time: leave them two idle cores
 	$(BIN)/pytest --numprocesses $(FLIGHT_WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS) $(IN_REAL_TIME)
+
+# A change runs the tests of its own package first. What flies replays the recorded flights, too.
+test-companion: ## the companion's tests, but for its flights in real time
+test-missions test-analysis test-sitl: ## the same of another package
+test-companion: ALSO := tests/golden
+test-companion test-missions test-analysis test-sitl: export PYTHONDONTWRITEBYTECODE :=
+test-companion test-missions test-analysis test-sitl: test-%: $(INSTALLED)
+	PYTHONDEVMODE=1 $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --ignore tests/$*/realtime $(ARGS) $* tests/$* $(ALSO)
 
 lint: format-check ruff mypy imports ## format, ruff, mypy, import rules
 
@@ -87,7 +95,7 @@ test-firmware: $(INSTALLED) ## flights beside the real firmwares of VRSPRAY_FIRM
 	$(BIN)/pytest -m firmware $(ARGS) tests/firmware
 
 docs: $(INSTALLED) ## every link in the documents leads somewhere
-	$(BIN)/pytest --quiet tests/unit/test_foundation.py -k link
+	$(BIN)/pytest --quiet tests/project/test_foundation.py -k link
 
 lock: | $(BIN)/python ## choose and pin versions anew (ARGS=--upgrade for the newest)
 	[ -x $(BIN)/uv ] || $(PIP) install --quiet uv

@@ -62,7 +62,14 @@ def pytest_asyncio_loop_factories(item: pytest.Item) -> Mapping[str, LoopFactory
 
 
 # Modules that take longest begin first: the other processes have enough to do meanwhile.
-LONGEST = ("test_mission_chain.py", "test_run_flight.py", "test_ground.py", "test_px4_flight.py")
+LONGEST = (
+    "test_mission_chain.py",
+    "test_clients_mavsdk.py",
+    "test_liquid_wire.py",
+    "test_ground.py",
+    "test_doctor_watchdogs.py",
+    "test_golden.py",
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -28,21 +28,21 @@ SOURCES = (
     "companion/output/timed.py",
 )
 TESTS = (
-    "tests/unit/test_interlock.py",
-    "tests/unit/test_caught_core.py",
-    "tests/unit/test_sprayer_state.py",
-    "tests/unit/test_engine_turns.py",
-    "tests/unit/test_pwm.py",
-    "tests/unit/test_timed.py",
-    "tests/unit/test_schedule_clauses.py",
-    "tests/property/test_pwm_laws.py",
-    "tests/property/test_engine_laws.py",
-    "tests/property/test_engine_machine.py",
+    "tests/companion/test_interlock.py",
+    "tests/companion/test_caught_core.py",
+    "tests/companion/test_sprayer_state.py",
+    "tests/companion/test_engine_turns.py",
+    "tests/companion/test_pwm.py",
+    "tests/companion/test_timed.py",
+    "tests/companion/test_schedule_clauses.py",
+    "tests/companion/test_pwm_laws.py",
+    "tests/companion/test_engine_laws.py",
+    "tests/companion/test_engine_machine.py",
 )
 # The flights of any order of events take minutes where every call is looked at.
 ARGUMENTS = (
     *("-p", "no:xdist", "-p", "no:cacheprovider"),
-    *("--deselect", "tests/unit/test_sprayer_state.py::TestAnyFlight"),
+    *("--deselect", "tests/companion/test_sprayer_state.py::TestAnyFlight"),
 )
 
 

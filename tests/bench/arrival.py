@@ -29,7 +29,7 @@ from companion.record.journal import Journal
 from companion.runtime import NoRecorder, execute, run
 from tests.bench.fields import grid_setup
 from tests.bench.figures import Figure, spread
-from tests.sitl.wire_peer import WirePeer, free_port, over_udp
+from tests.companion.wire_peer import WirePeer, free_port, over_udp
 
 VALVE_COUNT = 24
 # ArduPilot counts its outputs from 1 to 32.

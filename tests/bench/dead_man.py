@@ -24,8 +24,8 @@ from companion.config import load
 from companion.core.frame import LocalFrame
 from sitl.board import DriverBoard
 from sitl.profile import load_profile
+from tests.companion.wire_peer import WirePeer, free_port, over_udp
 from tests.lua_bindings import FakeAutopilot
-from tests.sitl.wire_peer import WirePeer, free_port, over_udp
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang"
 DITHER_US = 8

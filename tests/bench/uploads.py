@@ -20,7 +20,7 @@ from companion.errors import VrsprayError
 from missions.upload.mavsdk_vehicle import connected
 from missions.upload.reading import read_mission_file
 from missions.upload.transfer import put
-from tests.sitl.upload_bench import sorties, stub_on_a_port
+from tests.missions.realtime.upload_bench import sorties, stub_on_a_port
 
 
 async def measure(autopilot: str, files: list[Path]) -> dict[str, Any]:

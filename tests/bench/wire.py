@@ -21,7 +21,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.sitl.wire_peer import free_port
+from tests.companion.wire_peer import free_port
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang"
 MEAN_ABS_MAX_M, WORST_MAX_M = 0.05, 0.20

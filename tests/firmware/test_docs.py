@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.companion.realtime.other_clients import Console, mavproxy, needs_mavproxy
 from tests.firmware.fields import copy_example
 from tests.firmware.firmware import ROOT, WATCHDOG, companion, process, vrspray, with_links
-from tests.sitl.other_clients import Console, mavproxy, needs_mavproxy
 
 pytestmark = [pytest.mark.firmware, needs_mavproxy, pytest.mark.timeout(300)]
 

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
+from tests.companion.realtime.doctor_bench import Guided, guided
 from tests.firmware.fields import write_pass
 from tests.firmware.firmware import vrspray
 from tests.firmware.flights import COPTER, OPEN_US, PX4, Kind, both, ready
 from tests.firmware.station import Station
-from tests.sitl.doctor_bench import Guided, guided
 
 pytestmark = [pytest.mark.firmware, pytest.mark.timeout(300)]
 

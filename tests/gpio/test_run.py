@@ -15,8 +15,8 @@ from companion.output.engine.wiring import Wiring
 from companion.output.gpio import GpioExecutor
 from companion.runtime import NoRecorder, run
 from tests import builders
+from tests.companion.wire_peer import WirePeer, free_port, over_udp
 from tests.gpio.sim import SimChip
-from tests.sitl.wire_peer import WirePeer, free_port, over_udp
 
 pytestmark = pytest.mark.needs_gpiosim
 
