@@ -1,7 +1,7 @@
 """From messages to the vehicle's state at any moment: time-stamped, filtered, extrapolated.
 
 `observe` takes one input in, `estimate` carries the result to a time. Position, velocity and
-acceleration come from GLOBAL_POSITION_INT through `vehicle_motion.py`; the time of a
+acceleration come from GLOBAL_POSITION_INT through the filters of `motion.py`; the time of a
 position is the autopilot's own clock on ours (`clock.py`), less the delay of the autopilot's
 estimator (`lag.position_s`), so that jitter of the link is not taken for motion.
 """
