@@ -74,7 +74,7 @@ imports: $(INSTALLED)
 bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 	$(BIN)/python -m tests.bench $(SEED)
 
-bench-missions: $(INSTALLED) ## plans for 221 outlines, judged apart, beside peers' (ARGS="--count 30 --fields DIR")
+bench-missions: $(INSTALLED) ## plans for 226 outlines, judged apart, beside peers' (ARGS="--count 30 --fields DIR")
 	$(BIN)/python -m tests.bench.outlines $(if $(SEED),--seed $(SEED)) $(ARGS)
 
 mutants: $(INSTALLED) ## each known way to break the code makes a test fail (ARGS="lease" for some)
