@@ -70,6 +70,7 @@ mypy: $(INSTALLED)
 imports: $(INSTALLED)
 	$(BIN)/lint-imports
 	$(BIN)/python -m tests.import_circles
+	$(BIN)/python -m tests.house
 
 bench: $(INSTALLED) ## the figures that README gives (SEED=N for another draw)
 	$(BIN)/python -m tests.bench $(SEED)

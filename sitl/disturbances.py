@@ -1,7 +1,7 @@
 """Errors that a controller knows nothing of, one at a time: of lag, position, its rate, and wind.
 
 Those of lags act on the configuration, those of position on the messages, and wind on where the
-liquid lands. What they cost is measured in `sitl/sensitivity.py`.
+liquid lands. What they cost is measured in `sitl/studies/sensitivity.py`.
 """
 
 from __future__ import annotations

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import sys
-from collections.abc import Iterator
-from datetime import UTC, datetime
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from companion.assembly import build_setup, deliverable
 from companion.cli.answer import AsJson, Overrides, answer
 from companion.cli.doctor_click import guided_click
 from companion.cli.doctor_watchdogs import watchdog_checks
@@ -21,8 +22,19 @@ from companion.cli.run import component_options
 from companion.cli.sensor_parts import build_sensors
 from companion.cli.systemd import is_ours, properties, quoted, read_unit, unit_path, watchdog_is_on
 from companion.config import Config
+from companion.config.rules import mismatches, without_effect
 from companion.core.setup import Setup
-from companion.doctor.check import Check, Status, application_check, fail, is_ready, split_advice
+from companion.doctor.check import (
+    Check,
+    Status,
+    application_check,
+    fail,
+    is_ready,
+    not_applicable,
+    ok,
+    split_advice,
+    warn,
+)
 from companion.doctor.computer import (
     Service,
     computer_checks,
@@ -33,12 +45,17 @@ from companion.doctor.computer import (
 )
 from companion.doctor.engine_trial import engine_checks, read_engine
 from companion.doctor.gpio import gpio_checks, read_chip, read_register
-from companion.doctor.listen import listen
-from companion.doctor.outputs import output_checks
-from companion.doctor.paper import configuration_checks, map_checks, refused_configuration
+from companion.doctor.listen import listen, rest_pulses
 from companion.doctor.sensors import Read, read_sensors, sensor_check
 from companion.doctor.vehicle import Heard, link_checks, no_link
-from companion.errors import ConfigError, LinkError
+from companion.errors import ConfigError, LinkError, MapError
+from companion.flight_map import FlightMap, flight_map_of
+from companion.link.signing import read_key
+from companion.output.autopilot_check import TOLERANCE_US
+from companion.output.autopilot_findings import Finding, findings, px4_wiring
+from companion.output.autopilot_guard import REFUSALS
+from companion.output.autopilot_options import ServoOptions
+from companion.wording import counted
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -187,3 +204,349 @@ def _summary(checks: list[Check]) -> str:
         f"{verdict}: {counts[Status.OK]} ok, {counts[Status.WARN]} to be seen to, "
         f"{counts[Status.FAIL]} failed, {counts[Status.NOT_APPLICABLE]} not applicable"
     )
+
+
+# What can be checked at a desk: configuration, map, what was measured, what was declared.
+
+# Nozzles wear, hoses age, pumps lose pressure: half a year is about one season of spraying.
+CALIBRATION_MAX_DAYS = 180
+# Lags of docs and examples, measured on simulated sprayers: on, off, up, down.
+_EXAMPLE_LAGS = frozenset({(0.10, 0.08, 0.10, 0.10), (0.1028, 0.1059, 0.1033, 0.1030)})
+
+
+def configuration_checks(config: Config, *, today: date) -> Iterator[Check]:
+    """Yield what the configuration alone tells; it has been read, so it is valid by itself."""
+    yield _agreement(config)
+    yield _output(config)
+    yield _dead_man(config)
+    yield _lags(config)
+    yield _age(config.lag.measured_on, today)
+    yield _signing(config)
+
+
+def refused_configuration(error: ConfigError) -> Check:
+    """Return the check of a configuration that cannot be used; its error says what to write."""
+    return fail("configuration", *split_advice(str(error), "see vrspray config check FILE"))
+
+
+def _agreement(config: Config) -> Check:
+    name = "configuration"
+    wrong = [*mismatches(config)]
+    if wrong:
+        return fail(name, f"{wrong[0].key}: {wrong[0].text}", "correct it in the file")
+    idle = [*without_effect(config)]
+    if idle:
+        keys = ", ".join(found.key for found in idle)
+        return warn(name, f"without effect in this version: {keys}", "leave the keys out")
+    return ok(name, f"{config.path} is valid")
+
+
+def _output(config: Config) -> Check:
+    kind = config.output.kind
+    if kind == "none":
+        return warn("output", "a dry run: no valve opens", 'write output.kind = "servo" or "gpio"')
+    what = "servo outputs" if kind == "servo" else f"GPIO lines of {config.output.chip}"
+    channels = ", ".join(str(valve.channel) for valve in config.valve)
+    return ok("output", f"{len(config.valve)} valves on {what} {channels}")
+
+
+def _dead_man(config: Config) -> Check:
+    name = "pump-cutoff"
+    if config.output.kind == "none":
+        return not_applicable(name, "a dry run")
+    if config.safety.pump_cutoff:
+        return ok(name, "declared: a relay cuts the pump when this computer fails; try it")
+    return warn(
+        name,
+        "none declared: a valve that sticks, or a computer that stands still, sprays on",
+        "fit a relay that cuts the pump and write safety.pump_cutoff = true",
+    )
+
+
+def _lags(config: Config) -> Check:
+    lag = config.lag
+    if (lag.on_s, lag.off_s, lag.up_s, lag.down_s) in _EXAMPLE_LAGS:
+        return warn(
+            "lags",
+            "those of an example, measured on a simulated sprayer",
+            "measure yours: vrspray calibrate lag",
+        )
+    if config.settings()["lag.position_s"][1] == "default":
+        return warn(
+            "lags",
+            "lag.position_s is not set: 0 s is taken for the age of a position",
+            "measure it: vrspray calibrate lag-marks, then write it",
+        )
+    return ok("lags", f"on {lag.on_s:g}, off {lag.off_s:g}, position {lag.position_s:g} s")
+
+
+def _age(measured_on: str | None, today: date) -> Check:
+    name = "calibration-age"
+    if measured_on is None:
+        return warn(
+            name,
+            "lag.measured_on is not set: nothing says when flows and lags were measured",
+            'write the day, such as measured_on = "2026-05-01", under [lag]',
+        )
+    fix = "correct lag.measured_on, or the clock of this computer"
+    try:
+        days = (today - date.fromisoformat(measured_on)).days
+    except ValueError:
+        return warn(name, f"{measured_on} is no day", fix)
+    if not days >= 0:
+        return warn(name, f"measured on {measured_on}, which is to come", fix)
+    if not days <= CALIBRATION_MAX_DAYS:
+        fix = "measure again: vrspray calibrate flow, vrspray calibrate lag"
+        return warn(name, f"measured {days} days ago", fix)
+    return ok(name, f"measured {days} days ago")
+
+
+def _signing(config: Config) -> Check:
+    name, file = "signing-key", config.link.signing_key_file
+    if file is None:
+        return not_applicable(name, "messages are not signed")
+    try:
+        read_key(config.resolve(file))
+    except LinkError as error:
+        return fail(name, *split_advice(str(error), "give the path of the key"))
+    return ok(name, "readable by its owner only")
+
+
+def map_checks(
+    config: Config, overrides: Sequence[str] = (), *, now: datetime
+) -> tuple[list[Check], Setup | None]:
+    """Return whether map and boundary can be flown, and what was built of them."""
+    try:
+        flight_map = flight_map_of(config, overrides)
+        setup = build_setup(config, flight_map)
+    except MapError as error:
+        fix = error.fix or "see vrspray map check FILE"
+        return [fail("map", str(error).removesuffix(f"; {error.fix}"), fix), *_no_map()], None
+    except ConfigError as error:
+        advice = split_advice(str(error), "see vrspray config check FILE")
+        return [fail("map", *advice), *_no_map()], None
+    rates = setup.prescription.rates_l_ha
+    area_ha = setup.prescription.field.area / 1e4
+    span = f"{min(rates):g} to {max(rates):g} L/ha" if rates else "no rates"
+    found = [
+        ok("map", f"{area_ha:.2f} ha, {span}"),
+        _flight_map(flight_map, now),
+        _rates(config, setup),
+    ]
+    return found, setup
+
+
+def _no_map() -> list[Check]:
+    return [not_applicable(name, "there is no map") for name in ("flight-map", "rates")]
+
+
+def _flight_map(flight_map: FlightMap, now: datetime) -> Check:
+    """Say which flight map this is, how old it is, and what was found when it was compiled."""
+    name = "flight-map"
+    days = flight_map.age_days(now)
+    age = "on an unknown day" if days is None else f"{counted(int(days), 'day')} ago"
+    text = f"{flight_map.sha256[:8]} of {flight_map.source}, compiled {age}"
+    if not flight_map.findings:
+        return ok(name, f"{text}; nothing found wrong with the map")
+    first = flight_map.findings[0]
+    return warn(
+        name,
+        f"{text}; {counted(len(flight_map.findings), 'finding')}, the first: {first.text}",
+        first.fix or "see vrspray map check FILE",
+    )
+
+
+def _rates(config: Config, setup: Setup) -> Check:
+    """Check the prescribed rates against what the nozzle sets deliver at the planned speed."""
+    if config.mission is None:
+        return not_applicable("rates", "no mission.speed_m_s to compare the rates with")
+    speed_m_s = config.mission.speed_m_s
+    problems = deliverable(setup, speed_m_s)
+    if problems:
+        return warn("rates", problems[0].text, problems[0].fix)
+    return ok("rates", f"the nozzle sets deliver all of them at {speed_m_s:g} m/s")
+
+
+# Can the autopilot's outputs be trusted: parameters, watchdog script, what the outputs read.
+
+_NAMES = ("output-parameters", "disarmed-values", "watchdog-script", "closed-order")
+_MASK_OUTPUTS = 16
+_BOARD = (
+    "fit a driver board that closes when its orders stand still (output.dither_us = 8, "
+    "docs/driver-board.md)"
+)
+_RELAY = "fit a relay that cuts the pump when this computer fails (docs/pump.md)"
+Known = Mapping[str, float | None]
+
+
+def output_checks(heard: Heard | None, options: ServoOptions | None) -> Iterator[Check]:
+    """Yield the checks of servo outputs; without any, or unheard, they say so."""
+    if options is None:
+        yield from (not_applicable(name, "no servo outputs are used") for name in _NAMES)
+        return
+    if heard is None or heard.system_id is None:
+        yield from (not_applicable(name, "no vehicle is heard") for name in _NAMES)
+        return
+    yield from _parameters(heard, options)
+    yield _watchdog(heard, options)
+    yield _closed(heard, options)
+
+
+def _parameters(heard: Heard, options: ServoOptions) -> Iterator[Check]:
+    name, rest = "output-parameters", "disarmed-values"
+    wiring = px4_wiring(options) if heard.is_px4 else None
+    if wiring is not None:
+        text, _, fix = wiring.rpartition(": ")
+        yield fail(name, text, fix)
+        yield not_applicable(rest, "the outputs cannot be had")
+        return
+    if heard.parameters is None:
+        fix = "ask again with a longer --wait-s; see that nothing else loads the link"
+        yield warn(name, "the autopilot's parameters were not read in time", fix)
+        yield not_applicable(rest, "not read")
+        return
+    found = findings(options, heard.parameters, is_px4=heard.is_px4)
+    at_rest = [one for one in found if heard.is_px4 and _is_at_rest(one)]
+    yield _of([one for one in found if one not in at_rest], name, "as they must be")
+    if heard.is_px4:
+        yield _of(at_rest, rest, "closed while disarmed")
+    else:
+        yield not_applicable(rest, "ArduPilot has none")
+
+
+def _is_at_rest(finding: Finding) -> bool:
+    """Return whether it is about PX4's values while disarmed or failed."""
+    return "_DIS" in finding.text.partition(" is ")[0] or "_FAIL" in finding.text
+
+
+def _of(found: list[Finding], name: str, good: str) -> Check:
+    """Return one check of several findings; the first is named, the others counted."""
+    if not found:
+        return ok(name, good)
+    first = found[0]
+    more = f" (and {len(found) - 1} more)" if found[1:] else ""
+    text, _, fix = first.text.rpartition(": set ")
+    if not text:
+        text, _, fix = first.text.rpartition("; set ")
+    done = f"set {fix}" if text else "correct it at the autopilot"
+    return (fail if first.is_fault else warn)(name, f"{text or fix}{more}", done)
+
+
+def _watchdog(heard: Heard, options: ServoOptions) -> Check:
+    """Check what closes the valves when this computer falls silent."""
+    name = "watchdog-script"
+    if heard.is_px4:
+        return _board_alone(name, options)
+    known = heard.parameters
+    if known is None:
+        return warn(name, "its parameters were not read in time", "ask again, longer: --wait-s")
+    trouble = watchdog_trouble(known, options)
+    if trouble is None:
+        return ok(name, "runs, and knows these outputs")
+    text, fix = trouble
+    # A board closes valves only: orders to motors are not dithered.
+    if options.dither_us and not options.drives:
+        return warn(name, f"{text}: only the driver board's alive dither closes", fix)
+    return fail(name, text, fix)
+
+
+def _board_alone(name: str, options: ServoOptions) -> Check:
+    """Check what PX4 leaves, which has no script: a board closes valves, and no motor."""
+    if not options.dither_us:
+        text = "PX4 holds the last order of a dead companion until disarmed"
+        return fail(name, text, _BOARD)
+    if options.drives:
+        text = f"nothing stops the motor at output {options.drives[0].channel} but disarming"
+        return warn(name, f"PX4 has none: {text}", _RELAY)
+    return not_applicable(name, "PX4 has none: the driver board is the watchdog")
+
+
+def watchdog_trouble(known: Known, options: ServoOptions) -> tuple[str, str] | None:
+    """Return what is wrong with the script on the autopilot, and what to do; None if nothing.
+
+    >>> watchdog_trouble({"SPRW_ENABLE": 0.0}, ServoOptions(channels=(9,)))
+    ('SPRW_ENABLE is 0: the script does nothing', 'set SPRW_ENABLE to 1')
+    """
+    enable = known.get("SPRW_ENABLE")
+    if enable is None:
+        return (
+            "SPRW_ENABLE does not answer: the script does not run",
+            "install deploy/ardupilot/vrspray_watchdog.lua and set SCR_ENABLE to 1",
+        )
+    if enable != 1.0:
+        return f"SPRW_ENABLE is {enable:g}: the script does nothing", "set SPRW_ENABLE to 1"
+    guarded = (*options.channels, *(drive.channel for drive in options.drives))
+    missing = [channel for channel in guarded if not _guards(known, channel)]
+    if missing:
+        return (
+            f"output {missing[0]} is not among those that it closes",
+            "set SPRW_FIRST and SPRW_LAST to the outputs of valves and motors, SPRW_MASK to those "
+            "besides",
+        )
+    wrong = _closed_pulse_trouble(known.get("SPRW_CLOSED_US"), options)
+    if wrong is not None:
+        return wrong
+    if options.return_channel is not None and known.get("SPRW_RET_CH") != options.return_channel:
+        fix = f"set SPRW_RET_CH to {options.return_channel}"
+        return "SPRW_RET_CH is not output.return_channel", fix
+    return None
+
+
+def _closed_pulse_trouble(closed_us: float | None, options: ServoOptions) -> tuple[str, str] | None:
+    """Return what is wrong with the script's one pulse: it closes valves and stops motors."""
+    fix = f"set SPRW_CLOSED_US to {options.closed_us}"
+    if closed_us is None:
+        return "SPRW_CLOSED_US does not answer", "ask again, longer: --wait-s"
+    # NaN is not equal to anything, nor at most anything.
+    if closed_us != options.closed_us:
+        return f"SPRW_CLOSED_US is {closed_us:g}, not output.closed_us", fix
+    running = [drive for drive in options.drives if not closed_us <= drive.stop_us]
+    if running:
+        first = running[0]
+        return (
+            f"at SPRW_CLOSED_US = {closed_us:g} the motor at output {first.channel} runs",
+            f"set output.closed_us and SPRW_CLOSED_US to {first.stop_us} or less",
+        )
+    return None
+
+
+def _guards(known: Known, channel: int) -> bool:
+    first, last = known.get("SPRW_FIRST"), known.get("SPRW_LAST")
+    if first is not None and last is not None and 1 <= first <= channel <= last:
+        return True
+    mask = known.get("SPRW_MASK")
+    if mask is None or not 0 <= mask < 1 << _MASK_OUTPUTS:
+        return False
+    return channel <= _MASK_OUTPUTS and bool(int(mask) >> channel - 1 & 1)
+
+
+def _closed(heard: Heard, options: ServoOptions) -> Check:
+    """Check that the outputs followed the order to close."""
+    name = "closed-order"
+    if heard.is_px4:
+        return not_applicable(name, "not on PX4: its outputs follow orders only while armed")
+    if not heard.is_closed_ordered:
+        return not_applicable(name, "tried on a disarmed vehicle only")
+    refused = [result for result in heard.order_results if result in REFUSALS]
+    if refused:
+        fix = "set SERVOn_FUNCTION of the valves to 0"
+        return fail(name, f"order {REFUSALS[refused[0]]} by the autopilot", fix)
+    for channel, pulse_us in rest_pulses(options).items():
+        wrong = _reading(name, channel, heard.outputs_us.get(channel), pulse_us)
+        if wrong is not None:
+            return wrong
+    return ok(name, f"{len(options.outputs)} outputs read as ordered")
+
+
+def _reading(name: str, channel: int, read: int | None, pulse_us: int) -> Check | None:
+    """Return what is wrong with what an output reads; None if it reads as ordered."""
+    if read is None:
+        fix = "see that SERVO_OUTPUT_RAW is streamed (docs/link.md)"
+        return warn(name, f"nothing tells what output {channel} does", fix)
+    if read == 0:
+        fix = "press the safety switch, or set BRD_SAFETY_MASK"
+        return fail(name, f"output {channel} gives no pulse", fix)
+    if not abs(read - pulse_us) <= TOLERANCE_US:
+        fix = f"set SERVO{channel}_FUNCTION to 0, and see who else orders it"
+        return fail(name, f"output {channel} reads {read} us, ordered {pulse_us}", fix)
+    return None

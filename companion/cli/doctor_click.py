@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import os
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from statistics import fmean
 
 from companion import runtime
@@ -18,28 +20,22 @@ from companion.cli.run import build_executor, component_options
 from companion.cli.sensor_parts import build_sensors
 from companion.config import Config
 from companion.core.inputs import AutopilotLiquid
-from companion.doctor.check import Check, fail
-from companion.doctor.click_bench import (
-    AGAIN,
-    END,
-    WET_OPEN_S,
-    WET_TIMES,
-    HeardLink,
-    HeardSensor,
-    Readings,
-    ShortHand,
-    answer_of,
-    dry_check,
-    name_of,
-    not_clicked,
-    wet_checks,
-    wet_click,
-)
+from companion.core.types import BatteryReport, Decision, FaultKind, FlowReport, Input
+from companion.doctor.check import Check, fail, not_applicable, ok, warn
 from companion.errors import VrsprayError
 from companion.ground import shell
-from companion.ground.clicks import ClickFlow, ClickLaw, judge_clicks
-from companion.ground.shell import GroundOutcome
-from companion.ground.work import CLICK_TIMES, GroundTask, clicks, flow_of
+from companion.ground.clicks import ClickFinding, ClickFlow, ClickJudgement, ClickLaw, judge_clicks
+from companion.ground.shell import GroundLink, GroundOutcome, HandHold
+from companion.ground.work import (
+    CLICK_TIMES,
+    STROKES_OVER_S,
+    GroundKind,
+    GroundTask,
+    Hold,
+    Phase,
+    clicks,
+    flow_of,
+)
 from companion.ports import Sensor
 from companion.sensors.estop import EstopSwitch
 from companion.sensors.flow_meter import FlowMeter
@@ -220,3 +216,297 @@ class _Bench:
         sys.stderr.flush()
         said = read_line(self._descriptor)
         return END if said is None or said.lower() in ("q", "quit") else said
+
+
+# Takes down what the flow meter says while one valve is opened; and the hand of a short click.
+
+# A step comes every 0.05 s, and a hold begins with strokes over some time.
+_STROKE_S = 0.1
+_BEGIN_S = STROKES_OVER_S + 2.0 * _STROKE_S
+
+
+@dataclass(slots=True)
+class Readings:
+    """Counts of the meter, and when the operator was asked to begin."""
+
+    counts: list[FlowReport] = field(default_factory=list)
+    ready_s: float = math.inf
+
+    def take(self, items: Sequence[Input], liquid: AutopilotLiquid | None = None) -> None:
+        """Keep the counts among what came in; those of the autopilot where it has the meter."""
+        for item in items:
+            report = item
+            if liquid is not None and isinstance(item, BatteryReport):
+                found = liquid.flow(item)
+                report = item if found is None else found
+            if isinstance(report, FlowReport):
+                self.counts.append(report)
+
+    def is_ready(self) -> None:
+        """Take that the operator is asked to begin: from now on something may flow."""
+        self.ready_s = time.monotonic()
+
+    def idle(self) -> tuple[float, float]:
+        """Return (volume, time) of what was counted before, with all closed; no number: unknown."""
+        before = [each for each in self.counts if each.received_s <= self.ready_s]
+        if len(before) < 2 or not _is_sound(before):
+            return math.nan, math.nan
+        volume_ml = before[-1].volume_ml - before[0].volume_ml
+        return volume_ml, before[-1].received_s - before[0].received_s
+
+    def flow(self, valve: int, open_s: float) -> ClickFlow:
+        """Return what was counted from the last count before the opening to the last of all."""
+        before = [each for each in self.counts if each.received_s <= self.ready_s]
+        after = [each for each in self.counts if each.received_s > self.ready_s]
+        if not before or not after or not _is_sound([before[-1], *after]):
+            return ClickFlow(valve=valve, open_s=open_s, window_s=open_s, metered_ml=math.nan)
+        return ClickFlow(
+            valve=valve,
+            open_s=open_s,
+            window_s=max(after[-1].received_s - before[-1].received_s, open_s),
+            metered_ml=after[-1].volume_ml - before[-1].volume_ml,
+        )
+
+
+def _is_sound(counts: Sequence[FlowReport]) -> bool:
+    return all(math.isfinite(each.volume_ml) and not each.fault for each in counts)
+
+
+class HeardSensor:
+    """A sensor whose counts are taken down."""
+
+    def __init__(self, sensor: Sensor, readings: Readings) -> None:
+        self._sensor = sensor
+        self._readings = readings
+
+    async def open(self, wake: Callable[[], None]) -> None:
+        """Take the sensor."""
+        await self._sensor.open(wake)
+
+    def read(self, now_s: float) -> Sequence[Input]:
+        """Return what it has measured."""
+        found = self._sensor.read(now_s)
+        self._readings.take(found)
+        return found
+
+    async def close(self) -> None:
+        """Let go of it."""
+        await self._sensor.close()
+
+
+class HeardLink:
+    """A link whose counts of the autopilot's flow meter are taken down."""
+
+    def __init__(self, link: GroundLink, readings: Readings, liquid: AutopilotLiquid) -> None:
+        self._link = link
+        self._readings = readings
+        self._liquid = liquid
+
+    @property
+    def fault(self) -> str | None:
+        """Return why nothing reaches the vehicle."""
+        return self._link.fault
+
+    @property
+    def mission_active(self) -> bool | None:
+        """Return whether the vehicle says that it flies its mission."""
+        return self._link.mission_active
+
+    @property
+    def rival(self) -> str | None:
+        """Return who speaks on the link as we do."""
+        return self._link.rival
+
+    async def open(self, wake: Callable[[], None]) -> None:
+        """Open the link."""
+        await self._link.open(wake)
+
+    def receive(self) -> Sequence[Input]:
+        """Return what came in."""
+        found = self._link.receive()
+        self._readings.take(found, self._liquid)
+        return found
+
+    def tell(self, decision: Decision | None, now_s: float) -> None:
+        """Send what is due."""
+        self._link.tell(decision, now_s)
+
+    def tell_fault(self, text: str) -> None:
+        """Tell the operator of something that does not work."""
+        self._link.tell_fault(text)
+
+    def announce(self, text: str) -> None:
+        """Tell the operator's ground station what is done."""
+        self._link.announce(text)
+
+    async def close(self) -> None:
+        """Let go of the link."""
+        await self._link.close()
+
+
+class ShortHand:
+    """One Enter holds for the time of a short dry click; any key, or a signal, ends it.
+
+    Only for what is over within `HOLD_MAX_S`: everything longer wants a key that is really held.
+    """
+
+    HOLD_MAX_S = 2.0
+
+    def __init__(
+        self, hand: HandHold, *, seconds: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        if not 0.0 < seconds <= self.HOLD_MAX_S:
+            raise ValueError(f"a short click takes up to {self.HOLD_MAX_S} s, got {seconds}")
+        self._hand = hand
+        self._seconds = seconds
+        self._clock = clock
+        self._hold = Hold()
+        self._until_s = -math.inf
+
+    def begin(self) -> None:
+        """Begin to hold."""
+        self._hand.begin()
+        self._until_s = self._clock() + self._seconds + _BEGIN_S
+
+    @property
+    def hold(self) -> Hold:
+        """Return the strokes so far, one more at every look."""
+        now_s = self._clock()
+        if now_s < self._until_s:
+            self._hold = self._hold.renewed(now_s)
+        return self._hold
+
+    @property
+    def stopped(self) -> str | None:
+        """Return why the operator ended it."""
+        return self._hand.stopped
+
+
+# The guided click: what is asked, and what an answer or a metered flow makes of each valve.
+
+# Twice, as in the dry click; a second each, so that a turbine's pulses or whole millilitres of the
+# autopilot tell a tenth of one valve's flow (docs/sensors.md). Between them the flow has ended.
+WET_OPEN_S, WET_CLOSED_S, WET_TIMES = 1.0, 0.8, 2
+# Nearer to the others than this one can spray on, and see to it; a loss beyond it closes in flight.
+FAR_SHARE = 0.25
+YES, NO, AGAIN, END = "y", "n", "again", "q"
+
+
+def name_of(valve: str) -> str:
+    """Return the name of the check of a valve.
+
+    >>> name_of("left 1")
+    'click-left-1'
+    """
+    return "click-" + "-".join(valve.split())
+
+
+def wet_click(count: int, valve: int, *, open_s: float = WET_OPEN_S) -> GroundTask:
+    """Return the piece of work that lets one of `count` valves deliver twice.
+
+    >>> [phase.duty for phase in wet_click(2, 1).phases]
+    [(0.0, 1.0), (0.0, 0.0), (0.0, 1.0), (0.0, 0.0)]
+    """
+    closed = (0.0,) * count
+    opened = tuple(1.0 if number == valve else 0.0 for number in range(count))
+    phases = []
+    for number in range(WET_TIMES):
+        at_s = number * (open_s + WET_CLOSED_S)
+        phases += [Phase(at_s=at_s, duty=opened), Phase(at_s=at_s + open_s, duty=closed)]
+    return GroundTask(
+        kind=GroundKind.CLICK,
+        phases=tuple(phases),
+        seconds=WET_TIMES * (open_s + WET_CLOSED_S),
+        is_whole=True,
+    )
+
+
+def answer_of(said: str, names: Sequence[str], asked: str) -> str | None:
+    """Return what an answer means: one of the four, or another valve's name; None: nothing.
+
+    A valve may be called as an answer is; then the answer counts.
+
+    >>> answer_of(" Yes ", ("1", "2"), "1"), answer_of("2", ("1", "2"), "1")
+    ('y', '2')
+    >>> answer_of("1", ("1", "2"), "1"), answer_of("", ("1",), "1")
+    ('y', None)
+    """
+    word = said.strip().lower()
+    for meaning, words in (
+        (YES, ("y", "yes")),
+        (NO, ("n", "no")),
+        (AGAIN, ("a", "again")),
+        (END, ("q", "quit")),
+    ):
+        if word in words:
+            return meaning
+    other = next((name for name in names if name.lower() == word), None)
+    return YES if other is not None and other == asked else other
+
+
+def dry_check(valve: str, answer: str, *, channel: int | None) -> Check:
+    """Return what an answer makes of a valve."""
+    name, where = name_of(valve), f"output {channel}" if channel is not None else "its output"
+    if answer == YES:
+        return ok(name, "clicked")
+    if answer == NO:
+        fix = f"see the plug of its coil, its driver, and that it hangs on {where} (valve.channel)"
+        return fail(name, "did not click", fix)
+    fix = f"swap the wires, or correct valve.channel: {where} moves valve {answer}"
+    return fail(name, f"valve {answer} clicked in its place", fix)
+
+
+def not_clicked(valves: Sequence[str], why: str) -> Iterator[Check]:
+    """Yield the checks of valves whose turn did not come."""
+    yield from (not_applicable(name_of(valve), why) for valve in valves)
+
+
+def wet_checks(judged: ClickJudgement, names: Sequence[str]) -> Iterator[Check]:
+    """Yield what the metered flows make of the valves, and of what they have in common."""
+    for found in judged.valves:
+        yield _wet(found, names[found.valve])
+    yield _common(judged)
+
+
+def _wet(found: ClickFinding, valve: str) -> Check:
+    name, kind = name_of(valve), found.kind
+    if kind is FaultKind.METER_FAULT or found.share is None:
+        fix = "see the meter's wiring and supply, then ask again"
+        return fail(name, "the flow meter gave no sound count", fix)
+    share = f"{100.0 * found.share:.0f} % of the others' flow"
+    if kind is None:
+        return ok(name, f"{share} ({100.0 * found.limit:.0f} % off would be seen)")
+    if kind is FaultKind.STUCK_OPEN:
+        fix = "close the tap, then free or change the valve"
+        return fail(name, "delivers all the time: stuck open", fix)
+    if kind is FaultKind.STUCK_CLOSED:
+        fix = (
+            "does it click (vrspray doctor --click)? then clean nozzle and strainer; else its wire"
+        )
+        return fail(name, "delivers nothing: dead, stuck closed or blocked", fix)
+    judge = warn if abs(found.share - 1.0) <= FAR_SHARE else fail
+    if kind is FaultKind.CLOG:
+        return judge(name, f"{share}: clogged", "clean its nozzles and strainers")
+    return judge(name, f"{share}: worn, or a leak behind it", "change its nozzles, see its hose")
+
+
+def _common(judged: ClickJudgement) -> Check:
+    name, fault = "click-flow", judged.fault
+    if fault is FaultKind.METER_FAULT or judged.common is None:
+        fix = "see the meter's wiring and supply, then ask again"
+        return fail(name, "the flow meter gave no sound count", fix)
+    share = f"valves deliver {100.0 * judged.common:.0f} % of what the table says"
+    idle = f"{0.06 * judged.idle_ml_s:.2f} L/min with all closed"
+    if fault is FaultKind.NO_FLOW:
+        fix = "switch the pump on, open the tap, prime the lines (vrspray ground prime)"
+        return fail(name, "no valve delivers anything", fix)
+    if fault is FaultKind.SUPPLY:
+        fix = "see pump, regulator and filter, or calibrate again (vrspray calibrate flow)"
+        return warn(name, share, fix)
+    if fault is FaultKind.STUCK_OPEN:
+        return fail(
+            name, f"{idle}: a valve stays open", "see which nozzle drips, change that valve"
+        )
+    if fault is FaultKind.LEAK:
+        return fail(name, f"{idle}: a leak", "find it before the valves, or see which nozzle drips")
+    return ok(name, f"{share}, {idle}")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,9 +19,16 @@ from missions.errors import UploadError
 from missions.maps.compiling import compiled_setup
 from missions.upload.checks import FIRMWARES
 from missions.upload.following import each_when_flown, sorties_from
-from missions.upload.items import MissionFile, elsewhere
+from missions.upload.items import (
+    GLOBAL,
+    SAME_FRAME,
+    WAYPOINT,
+    MissionFile,
+    Params,
+    WireItem,
+    elsewhere,
+)
 from missions.upload.mavsdk_vehicle import connected
-from missions.upload.reading import read_mission_file
 from missions.upload.transfer import TransferError, Uploaded, What, put
 
 WAIT_S = 15.0
@@ -156,4 +165,166 @@ def _line(file: Path, done: Uploaded) -> str:
     return (
         f"{file.name}: {counted(done.items, 'item')}{fence} {verb} on the vehicle "
         f"({FIRMWARES[done.firmware]}), read back and the same{again}"
+    )
+
+
+# From a `.plan` or `.waypoints` file to items; what is wrong is said with its place.
+
+BYTES_MAX = 10_000_000
+COLUMNS = 12
+HEADER = "QGC WPL 110"
+RETURN_POINT, POLYGON_IN, POLYGON_OUT, CIRCLE_IN, CIRCLE_OUT = 5000, 5001, 5002, 5003, 5004
+CORNERS_MIN = 3
+
+
+def read_mission_file(path: Path) -> MissionFile:
+    """Return the mission of a file.
+
+    Raises:
+        UploadError: in one line, what is wrong where.
+    """
+    readers: dict[str, Callable[[Path, str], MissionFile]] = {
+        ".plan": _plan, ".waypoints": _waypoints, ".txt": _waypoints,
+    }  # fmt: skip
+    reader = readers.get(path.suffix.casefold())
+    if reader is None:
+        raise UploadError(
+            f"{path}: only .plan and .waypoints are uploaded; write one with vrspray plan --out"
+        )
+    try:
+        if path.stat().st_size > BYTES_MAX:
+            raise UploadError(f"{path}: too large for a mission")
+        found = reader(path, path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UploadError(f"{path}: {error.strerror or error}") from error
+    except RecursionError as error:
+        raise UploadError(f"{path}: not a mission: too deep") from error
+    except UnicodeDecodeError as error:
+        raise UploadError(f"{path}: not a mission: no text") from error
+    if not found.items:
+        raise UploadError(f"{path}: there are no items in it")
+    return found
+
+
+def _number(value: object) -> float:
+    """Return a number; null is a parameter left open."""
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{value!r:.40} is no number")
+    return float(value)
+
+
+def wire_item(command: int, frame: int, numbers: list[float], *, goes_on: bool = True) -> WireItem:
+    """Return an item of its seven numbers, which must fit what travels."""
+    params: Params = (numbers[0], numbers[1], numbers[2], numbers[3])
+    if not (0 <= command <= 65535 and 0 <= frame <= 255):
+        raise ValueError(f"command {command} in frame {frame} does not exist")
+    if any(math.isinf(value) for value in params):
+        raise ValueError("a parameter is infinite")
+    x, y, z = (0.0 if math.isnan(value) else value for value in numbers[4:7])
+    scale = 1e7 if frame in SAME_FRAME else 1.0
+    if frame in SAME_FRAME and not (abs(x) <= 90.0 and abs(y) <= 180.0):
+        raise ValueError(f"{x:g}, {y:g} is no place")
+    if not (abs(x * scale) < 2**31 and abs(y * scale) < 2**31 and abs(z) < 1e6):
+        raise ValueError(f"{x:g}, {y:g}, {z:g} is no place")
+    return WireItem(
+        command=command, frame=frame, params=params, x=round(x * scale), y=round(y * scale), z_m=z,
+        goes_on=goes_on,
+    )  # fmt: skip
+
+
+def _home(numbers: list[float]) -> WireItem:
+    return wire_item(WAYPOINT, GLOBAL, [0.0, 0.0, 0.0, 0.0, *numbers])
+
+
+def _waypoints(path: Path, text: str) -> MissionFile:
+    lines = text.splitlines()
+    if not lines or lines[0].strip() != HEADER:
+        raise UploadError(f"{path}: not a mission: its first line is not {HEADER!r}")
+    items = []
+    for number, line in enumerate(lines[1:], start=2):
+        columns = line.split()
+        if not columns:
+            continue
+        try:
+            if len(columns) != COLUMNS:
+                raise ValueError(f"{COLUMNS} columns are needed, there are {len(columns)}")
+            items.append(
+                wire_item(
+                    int(columns[3]), int(columns[2]), [float(each) for each in columns[4:11]],
+                    goes_on=int(columns[11]) != 0,
+                )
+            )  # fmt: skip
+        except ValueError as error:
+            raise UploadError(f"{path}: line {number}: {error}") from error
+    if not items:
+        raise UploadError(f"{path}: there are no items in it")
+    return MissionFile(path=path, home=items[0], items=tuple(items[1:]))
+
+
+def _plan(path: Path, text: str) -> MissionFile:
+    try:
+        content = json.loads(text)
+    except ValueError as error:
+        raise UploadError(f"{path}: not a plan: {error}") from error
+    where = "its head"
+    try:
+        if content["fileType"] != "Plan":
+            raise ValueError(f"fileType is {content['fileType']!r:.40}, not 'Plan'")
+        mission = content["mission"]
+        where = "plannedHomePosition"
+        home = _home([_number(value) for value in mission["plannedHomePosition"]][:3])
+        items = []
+        for number, item in enumerate(mission["items"], start=1):
+            where = f"item {number}"
+            items.append(_simple(item))
+        where = "geoFence"
+        fence = _fence(content.get("geoFence") or {})
+    except (KeyError, IndexError) as error:
+        raise UploadError(f"{path}: {where}: {error} is missing") from error
+    except (ValueError, TypeError, AttributeError) as error:
+        raise UploadError(f"{path}: {where}: {error}") from error
+    return MissionFile(path=path, home=home, items=tuple(items), fence=fence)
+
+
+def _simple(item: dict[str, Any]) -> WireItem:
+    if item["type"] != "SimpleItem":
+        raise ValueError(
+            f"{item.get('complexItemType', item['type'])!r:.40} is not a simple item; "
+            "upload it from the ground station that made it"
+        )
+    numbers = [_number(value) for value in item["params"]]
+    if len(numbers) != 7:
+        raise ValueError(f"7 parameters are needed, there are {len(numbers)}")
+    return wire_item(
+        int(_number(item["command"])), int(_number(item["frame"])), numbers,
+        goes_on=bool(item["autoContinue"]),
+    )  # fmt: skip
+
+
+def _fence(fence: dict[str, Any]) -> tuple[WireItem, ...]:
+    """Return the fence as items: every corner says how many its polygon has."""
+    items = []
+    for polygon in fence.get("polygons", []):
+        corners = polygon["polygon"]
+        if len(corners) < CORNERS_MIN:
+            raise ValueError(f"a polygon has {len(corners)} corners")
+        command = POLYGON_IN if polygon["inclusion"] else POLYGON_OUT
+        items += [_at(command, corner, len(corners)) for corner in corners]
+    for circle in fence.get("circles", []):
+        radius_m = _number(circle["circle"]["radius"])
+        if not radius_m > 0.0:
+            raise ValueError(f"a circle has a radius of {radius_m:g} m")
+        command = CIRCLE_IN if circle["inclusion"] else CIRCLE_OUT
+        items.append(_at(command, circle["circle"]["center"], radius_m))
+    if fence.get("breachReturn"):
+        items.append(_at(RETURN_POINT, fence["breachReturn"], 0.0))
+    return tuple(items)
+
+
+def _at(command: int, place: list[float], first: float) -> WireItem:
+    latitude_deg, longitude_deg = _number(place[0]), _number(place[1])
+    return wire_item(
+        command, GLOBAL, [float(first), 0.0, 0.0, 0.0, latitude_deg, longitude_deg, 0.0]
     )

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import ImageColor
 
-from analysis.wsp.figure import Axes, Canvas, ticks
+from analysis.wsp.cli import Axes, Canvas, ticks
 
 BLUE, RED = "#4477aa", "#cc3311"
 

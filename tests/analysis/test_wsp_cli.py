@@ -13,8 +13,8 @@ from PIL import Image
 
 from analysis.wsp import cli
 from analysis.wsp.rectangle import Rectangle
-from analysis.wsp.synthetic import Scanner, Spray, draw_sheet, save
 from companion.cli.app import execute
+from sitl.studies.synthetic_cards import Scanner, Spray, draw_sheet, save
 from tests.analysis.test_wsp_flight import flown
 
 DPI = 300.0

@@ -10,7 +10,7 @@ import pytest
 from analysis.wsp.corrected import by_peak, corrected, full_grey, with_faint
 from analysis.wsp.sizes import DEPOSITSCAN
 from analysis.wsp.stains import grey_of, segment
-from analysis.wsp.synthetic import Scanner, Spray, TrueSheet, draw_card
+from sitl.studies.synthetic_cards import Scanner, Spray, TrueSheet, draw_card
 
 MIST = Spray(drops_per_cm2=40.0, nmd_um=75.0, sigma=1.6)
 

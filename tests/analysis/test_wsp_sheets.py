@@ -12,7 +12,7 @@ import pytest
 from analysis.wsp.card import INSET_MM, Method, Reading, SheetResult, read_sheet
 from analysis.wsp.image import Sheet, find_cards
 from analysis.wsp.rectangle import Rectangle, around
-from analysis.wsp.synthetic import Scanner, Spray, TrueSheet, draw_card, draw_sheet
+from sitl.studies.synthetic_cards import Scanner, Spray, TrueSheet, draw_card, draw_sheet
 
 DPI = 300.0
 PX = DPI / 25.4

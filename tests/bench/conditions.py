@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from companion.core.nozzle import flow_for_rate
 from companion.core.setup import Setup
-from sitl.hard_fields import (
+from sitl.studies.hard_fields import (
     CentreLine,
     Pace,
     bands,

@@ -38,10 +38,10 @@ from companion.core.types import (
 from sitl.demo_field import START_S, demo_route
 from sitl.flight import FlightOptions, fly
 from sitl.fly import ON_INPUTS, with_faults
-from sitl.message_way import Way, sent_over
 from sitl.outputs import PlanFollower
 from sitl.profile import load_profile
 from sitl.stub.faults import Fault
+from sitl.studies.message_way import Way, sent_over
 from sitl.vehicle import Vehicle
 from tests.bench.fields import PROFILE, example
 from tests.bench.oracle import Oracle, open_under

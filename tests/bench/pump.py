@@ -1,8 +1,9 @@
 """Lag distances of a sprayer whose pump makes the flow: `python -m tests.bench.pump [SEED…]`.
 
 Two passes over zones of 60 m, rate steps of 30 % of the rate before, gusts of 1 m/s, noise of the
-position, lags measured beforehand on the rig (`python -m sitl.measure_pump`). In the same run the
-controller of Wang et al. 2024 without look-ahead, with its own, and with one tuned to this pump.
+position, lags measured beforehand on the rig (`python -m sitl.studies.measure_pump`). In the same
+run the controller of Wang et al. 2024 without look-ahead, with its own, and with one tuned to this
+pump.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from companion.core.setup import Setup
 from companion.core.types import Method
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import boom, measured_sets, pwm_limits
-from sitl.measure_pump import measure
 from sitl.profile import PlantProfile, load_profile
+from sitl.studies.measure_pump import measure
 from sitl.trajectory import Trajectory
 from sitl.vehicle import Leg, Route, Vehicle
 from sitl.wang import LOOK_AHEAD_S, PROGRAM_S, WangController, curve_duties

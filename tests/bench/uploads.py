@@ -17,8 +17,8 @@ from time import perf_counter
 from typing import Any
 
 from companion.errors import VrsprayError
+from missions.upload.cli import read_mission_file
 from missions.upload.mavsdk_vehicle import connected
-from missions.upload.reading import read_mission_file
 from missions.upload.transfer import put
 from tests.missions.realtime.upload_bench import sorties, stub_on_a_port
 

@@ -6,10 +6,7 @@ import math
 
 import pytest
 
-from companion.core.inputs import AutopilotLiquid
-from companion.core.types import BatteryReport, FaultKind, FlowReport
-from companion.doctor.check import Check, Status
-from companion.doctor.click_bench import (
+from companion.cli.doctor_click import (
     Readings,
     ShortHand,
     answer_of,
@@ -17,6 +14,9 @@ from companion.doctor.click_bench import (
     wet_checks,
     wet_click,
 )
+from companion.core.inputs import AutopilotLiquid
+from companion.core.types import BatteryReport, FaultKind, FlowReport
+from companion.doctor.check import Check, Status
 from companion.ground.clicks import ClickFinding, ClickJudgement
 from companion.ground.work import Hold
 

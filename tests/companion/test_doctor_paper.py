@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from companion.cli.app import execute
+from companion.cli.doctor import configuration_checks, map_checks, refused_configuration
 from companion.config import load
 from companion.doctor.check import Check, Status
-from companion.doctor.paper import configuration_checks, map_checks, refused_configuration
 from companion.errors import ConfigError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"

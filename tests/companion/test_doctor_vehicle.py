@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from companion.cli.doctor import output_checks, watchdog_trouble
 from companion.cli.output_parts import servo_options
 from companion.config import load
 from companion.core.types import Fix
@@ -15,7 +16,6 @@ from companion.doctor import gpio
 from companion.doctor.check import Check, Status
 from companion.doctor.computer import Device, read_device, serial_check
 from companion.doctor.gpio import Chip, Line, gpio_checks, read_chip, read_register
-from companion.doctor.outputs import output_checks, watchdog_trouble
 from companion.doctor.vehicle import Heard, Position, Rate, link_checks, no_link
 from companion.output.autopilot_options import DriveOutput, ServoOptions
 from companion.output.engine.wiring import Wiring

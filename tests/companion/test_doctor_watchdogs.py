@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import pytest
 
 from companion.cli.doctor_watchdogs import (
+    ScriptTrial,
     Systemd,
     asked_check,
     engine_checks,
@@ -18,13 +19,13 @@ from companion.cli.doctor_watchdogs import (
     script_check,
     seconds_of,
     systemd_checks,
+    try_script,
 )
 from companion.core.nozzle import PwmLimits
 from companion.core.types import HeartbeatReport, Input, LandedReport, SprayPlan
 from companion.doctor import engine_trial
 from companion.doctor.check import Check, Status, is_ready
 from companion.doctor.engine_trial import EngineTrial, try_engine
-from companion.doctor.script_trial import ScriptTrial, try_script
 from companion.ground.work import GroundSetup
 from companion.output.autopilot_options import ServoOptions
 from companion.output.engine.setup import EngineSetup

@@ -22,10 +22,10 @@ from companion.core.safety import Limits
 from companion.core.types import Inhibit, Input, VehicleState, WindReport
 from companion.record.setup_json import field_names_of, setup_to_json
 from missions.maps.compiling import compiled_setup
-from sitl.droplets import TRUTHS, Air, fall, landed, law, shift_of, spectrum_um, with_wind
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import lags as true_lags
 from sitl.profile import load_profile
+from sitl.studies.droplets import TRUTHS, Air, fall, landed, law, shift_of, spectrum_um, with_wind
 from sitl.trajectory import Leg
 from sitl.trajectory import Route as SimulatedRoute
 from sitl.vehicle import Vehicle

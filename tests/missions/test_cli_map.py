@@ -12,7 +12,7 @@ from shapely import Polygon
 
 from companion.cli.app import execute, refusal
 from companion.errors import MapError
-from missions.maps.cli.report import ALIKE_SHOWN_MAX, KINDS_SHOWN_MAX, LINE_MAX, report_lines
+from missions.maps.cli.app import ALIKE_SHOWN_MAX, KINDS_SHOWN_MAX, LINE_MAX, report_lines
 from missions.maps.lint import summary
 from missions.maps.model import MapFile, Problem
 from tests.missions.lint_maps import CELL, SOUTH, WEST, a_map, cell, cells_map

@@ -17,10 +17,10 @@ from shapely import MultiPolygon, Point, Polygon, box
 
 from companion.errors import MapError
 from missions.maps.adapt.geoparquet import read_geoparquet, read_table
-from missions.maps.adapt.reader import read_adapt
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
 from missions.maps.layer import Layer
+from missions.maps.registry import read_adapt
 
 WEST, SOUTH, CELL = 114.5, 36.0, 1e-3
 SQUARES = [box(WEST + i * CELL, SOUTH, WEST + (i + 1) * CELL, SOUTH + CELL) for i in range(3)]

@@ -22,7 +22,6 @@ from rasterio.transform import Affine
 from shapely import MultiPolygon, box
 
 from companion.errors import MapError
-from missions.maps.adapt.reader import read_adapt
 from missions.maps.assemble import map_of
 from missions.maps.cells import bounds_deg
 from missions.maps.declared import Given
@@ -30,6 +29,7 @@ from missions.maps.geotiff.bands import parse_world_file
 from missions.maps.geotiff.dji import read_dji
 from missions.maps.geotiff.reader import read_geotiff
 from missions.maps.layer import Grid
+from missions.maps.registry import read_adapt
 
 WEST, NORTH, CELL = 114.5, 36.0, 1e-4
 PLACE = Affine(CELL, 0.0, WEST, 0.0, -CELL, NORTH)

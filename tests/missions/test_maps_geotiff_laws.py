@@ -22,7 +22,6 @@ from shapely import MultiPolygon, box
 
 from companion.errors import MapError
 from missions.maps.adapt.geoparquet import read_geoparquet
-from missions.maps.adapt.reader import read_adapt
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
 from missions.maps.geotiff.dji import read_dji
@@ -30,6 +29,7 @@ from missions.maps.geotiff.reader import read_geotiff
 from missions.maps.geotiff.writer import write_dji, write_geotiff
 from missions.maps.layer import Grid, Layer
 from missions.maps.model import MapCells
+from missions.maps.registry import read_adapt
 
 WEST, NORTH, CELL = 114.5, 36.0, 1e-4
 RATES = np.linspace(0.0, 50.0, 600, dtype="float32").reshape(20, 30)

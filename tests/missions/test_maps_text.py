@@ -16,7 +16,7 @@ from shapely import MultiPolygon, box
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
 from missions.maps.assemble import map_of
-from missions.maps.convert.make_map import Plots, Points, make_plots, make_points, plot_rates
+from missions.maps.cli.new import Plots, Points, make_plots, make_points, plot_rates
 from missions.maps.declared import Given
 from missions.maps.layer import Grid
 from missions.maps.model import MapCells, MapFile, MapZone

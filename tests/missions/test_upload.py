@@ -17,8 +17,8 @@ from companion.cli.app import execute
 from companion.core.frame import LocalFrame
 from missions.errors import UploadError
 from missions.upload.checks import compare, crowded, refusal
+from missions.upload.cli import read_mission_file
 from missions.upload.items import Firmware, MissionFile, WireItem, elsewhere
-from missions.upload.reading import read_mission_file
 from missions.upload.transfer import (
     NotNowError,
     Progress,

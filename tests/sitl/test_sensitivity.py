@@ -22,7 +22,7 @@ from sitl.disturbances import (
     on_ground,
     shortened,
 )
-from sitl.sensitivity import (
+from sitl.studies.sensitivity import (
     SPEED_M_S,
     Cost,
     Figures,
@@ -78,7 +78,7 @@ def test_page_and_picture_hold_what_was_measured(result: Result, tmp_path: Path)
     write_plot(result, plot)
     write_page(result, page, plot=plot)
     text = page.read_text(encoding="utf-8")
-    assert "python -m sitl.sensitivity" in text
+    assert "python -m sitl.studies.sensitivity" in text
     assert "(plot.png)" in text
     assert all(f"| {row.label} |" in text for row in result.rows)
     assert plot.read_bytes().startswith(b"\x89PNG")
@@ -145,7 +145,7 @@ def test_json_is_one_object(
         asked.extend((each.key, list(seeds), fidelity) for each in what)
         return result
 
-    monkeypatch.setattr("sitl.sensitivity.measure", measured)
+    monkeypatch.setattr("sitl.studies.sensitivity.measure", measured)
     page = tmp_path / "page.md"
     given = ["--seeds", "2", "--only", "wind-across", "--page", str(page), "--json"]
     answer = CliRunner().invoke(app, given)

@@ -27,9 +27,9 @@ from analysis.published import (
 )
 from analysis.strips import strips_of
 from companion.errors import ConfigError
-from sitl import validation, validation_flights, validation_page
 from sitl.demo_field import demo_setup
-from sitl.validation_flights import (
+from sitl.studies import validation, validation_flights, validation_page
+from sitl.studies.validation_flights import (
     BOUND_M,
     BOUND_METHODS,
     EVERY_WAY,
@@ -211,12 +211,14 @@ def test_page_and_pictures_show_every_method_beside_the_published(
     result: Validation, tmp_path: Path
 ) -> None:
     validation.check_folder(tmp_path)
-    validation.write_all(full(result), tmp_path, command="python -m sitl.validation --seeds 2")
+    validation.write_all(
+        full(result), tmp_path, command="python -m sitl.studies.validation --seeds 2"
+    )
     page = (tmp_path / "validation.md").read_text(encoding="utf-8")
     for way in EVERY_WAY:
         tables = 4 if way.method == "look-ahead" else 3
         assert page.count(f"| {way.name} |") == tables * len(SPEEDS_M_S)
-    assert "Made by `python -m sitl.validation --seeds 2`" in page
+    assert "Made by `python -m sitl.studies.validation --seeds 2`" in page
     assert "| 3.87 | 3.50 to 4.30 |" in page and "| 0.32 | -0.27 to 0.78 |" in page
     for published in P1_SPRAYING_ACCURACY_PERCENT.values():
         assert " | ".join(f"{cell:.2f}" for cell in published) in page

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from missions.errors import UploadError
-from missions.upload.reading import read_mission_file
+from missions.upload.cli import read_mission_file
 from missions.upload.transfer import put
 from sitl.stub.mission_items import MissionItem, read_mission
 from tests.companion.wire_peer import free_port

@@ -1,6 +1,6 @@
 """What an error that nobody knows of costs: of lag, of position, of its rate, of wind.
 
-    python -m sitl.sensitivity --page docs/sensitivity.md --plot docs/images/sensitivity.png
+    python -m sitl.studies.sensitivity --page docs/sensitivity.md --plot docs/images/sensitivity.png
 
 flies the field of Wang et al. 2024 (P1) with `scheduled`, once undisturbed and once with each
 disturbance, and compares flights of the same seed. Wind is not flown: where the undisturbed
@@ -199,7 +199,7 @@ def flown(what: Disturbance, *, seed: int, fidelity: Fidelity) -> FlightRecord:
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m sitl.sensitivity --seeds 5 --only lag-short-20")
+@app.command(epilog="Example: python -m sitl.studies.sensitivity --seeds 5 --only lag-short-20")
 def sensitivity(
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds 1 to N.")] = 5,
     only: Annotated[
@@ -246,7 +246,7 @@ if __name__ == "__main__":
 
 # How the costs of errors are shown: lines for a terminal, a page, a picture.
 
-COMMAND = "python -m sitl.sensitivity"
+COMMAND = "python -m sitl.studies.sensitivity"
 HEAD = (
     "Disturbance", "Lag mean [m]", "Abs [m]", "Cost [m]", "Worst [m]", "Cost [m]",
     "Misapplied [%]", "Cost [points]", "Outside [mL]",

@@ -14,7 +14,7 @@ from analysis.published import (
     p1_accuracy_percent,
 )
 from companion.errors import ConfigError
-from sitl.validation_flights import (
+from sitl.studies.validation_flights import (
     BOUND_M,
     BOUND_SPEED_M_S,
     BY_TABLE,
@@ -28,7 +28,7 @@ from sitl.validation_flights import (
 if TYPE_CHECKING:
     from analysis.published import P1LagDistance
 
-COMMAND = "python -m sitl.validation"
+COMMAND = "python -m sitl.studies.validation"
 SET_CHANGE_L_MIN = 4.0
 Table = list[tuple[str, ...]]
 

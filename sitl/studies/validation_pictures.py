@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from analysis.published import P1_RATES_L_HA, P1_SPRAYING_ACCURACY_PERCENT
 from companion.errors import ConfigError
 from sitl.demo_style import COLOURS, DPI, INK, QUIET, STYLE, TITLES, new_figure
-from sitl.validation_flights import WAYS, Row, Validation, Way
-from sitl.validation_page import basis, mean_of
+from sitl.studies.validation_flights import WAYS, Row, Validation, Way
+from sitl.studies.validation_page import basis, mean_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

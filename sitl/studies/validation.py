@@ -1,6 +1,6 @@
 """The twin against what Wang et al. 2024 (P1) measured with a real sprayer, as a command.
 
-    python -m sitl.validation --out docs
+    python -m sitl.studies.validation --out docs
 
 `validation_flights` flies, `validation_page` and `validation_pictures` show.
 """
@@ -17,8 +17,8 @@ import typer
 
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError, VrsprayError
-from sitl.validation_flights import EVERY_WAY, SPEEDS_M_S, Validation, validate
-from sitl.validation_page import COMMAND, summary_lines, write_page
+from sitl.studies.validation_flights import EVERY_WAY, SPEEDS_M_S, Validation, validate
+from sitl.studies.validation_page import COMMAND, summary_lines, write_page
 
 IMAGES = "images"
 NOTE_EVERY = 30
@@ -40,7 +40,7 @@ class _Told:
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m sitl.validation --seeds 20 --out docs")
+@app.command(epilog="Example: python -m sitl.studies.validation --seeds 20 --out docs")
 def validation(
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds 1 to N.")] = 20,
     out: Annotated[
@@ -95,7 +95,7 @@ def check_folder(folder: Path) -> None:
 
 def write_all(result: Validation, folder: Path, *, command: str) -> None:
     """Write the page and its pictures."""
-    from sitl.validation_pictures import draw_pictures
+    from sitl.studies.validation_pictures import draw_pictures
 
     names = draw_pictures(result, folder / IMAGES)
     write_page(result, folder, pictures=[f"{IMAGES}/{name}" for name in names], command=command)

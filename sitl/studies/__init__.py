@@ -1,0 +1,1 @@
+"""Studies that no command flies: the papers compared, sensitivity, limits, hard fields."""
