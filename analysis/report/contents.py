@@ -38,7 +38,7 @@ METRICS = (
     "off_target_ml", "missed", "apart", "gap_m2", "overlap_m2", "volume_error_percent",
 )  # fmt: skip
 # Of the journal's meta, what is not shown as such.
-_LONG = ("setup", "config_toml", "application_json")
+_LONG = ("setup", "config_toml", "application_json", "flight_map_json")
 
 
 def contents_of(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -16,9 +17,11 @@ from companion.record.salvage import readable_rows
 from companion.record.totals import missing_rows
 from companion.record.versions import OtherVersionError, read_entries
 from companion.record.whole_file import damaged_pages
+from companion.wording import counted
 
 # In `meta` for programs, or shown elsewhere.
 _LONG = frozenset({"setup", "config_toml"})
+_FLIGHT_MAP = "flight_map_json"
 _LINK = (
     "SELECT count(*), max(lost_percent), max(round_trip_s), min(position_hz), max(bad_frames), "
     "max(unsent_frames) FROM link_stats"
@@ -129,6 +132,9 @@ def _tried(
 def content_lines(content: Mapping[str, Any]) -> Iterator[str]:
     """Yield it for a person."""
     for key, value in content["meta"].items():
+        if key == _FLIGHT_MAP:
+            yield f"flight map: {_told_of_map(str(value))}"
+            continue
         text = " ".join(str(value).split())
         yield f"{key}: {text if len(text) <= 90 else text[:87] + '...'}"
     if content["entries"]:
@@ -144,6 +150,19 @@ def content_lines(content: Mapping[str, Any]) -> Iterator[str]:
         yield f"{event['time'] or '-'} {event['kind']}: {event['text']}"
     for text in content["unread"]:
         yield f"not read: {text}"
+
+
+def _told_of_map(text: str) -> str:
+    """Return in a line which flight map was flown; a journal may say anything there."""
+    try:
+        found = json.loads(text)
+        line = (
+            f"{str(found['sha256'])[:8]} of {found['source']}, compiled {found['compiled_utc']} by "
+            f"{found['compiled_by']}, {counted(len(found['findings']), 'finding')}"
+        )
+    except (ValueError, TypeError, LookupError, RecursionError):
+        line = text
+    return " ".join(line.split())[:200]
 
 
 def _number(value: float | None) -> str:

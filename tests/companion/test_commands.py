@@ -146,7 +146,8 @@ def test_a_vehicle_without_the_office_flies_a_compiled_map(vehicle: Path, tmp_pa
         "--set", "link.url=udpin:127.0.0.1:0", "--set", "output.kind=none",
     )  # fmt: skip
     assert flown.returncode == 0, flown.stderr
-    assert Path(json.loads(flown.stdout)["journal"]).exists()
+    shown = vrspray(vehicle, "flights", "show", json.loads(flown.stdout)["journal"])
+    assert f"flight map: {flight_map.sha256[:8]} of prescription.shp, compiled " in shown.stdout
 
 
 @pytest.mark.parametrize("command", [("config", "check"), ("run", "--config")], ids=" ".join)

@@ -83,6 +83,16 @@ def test_the_companion_names_no_module_of_the_office_in_a_string_either() -> Non
     assert found == []
 
 
+def test_map_readers_know_nothing_of_planning() -> None:
+    found = {
+        f"{relative(path)}: {name}"
+        for path in (ROOT / "missions" / "maps").rglob("*.py")
+        for name in imports(path.read_text())
+        if name.startswith("missions.") and not name.startswith("missions.maps.")
+    }
+    assert found == set()
+
+
 def test_simulation_never_uses_our_own_link() -> None:
     importing = [
         relative(path)
