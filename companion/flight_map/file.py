@@ -214,7 +214,11 @@ def read_flight_map(path: Path) -> FlightMap:
             raise ValueError(f"it is larger than {FILE_BYTES_MAX // 1024**2} MB")
         # Without locks, and without a look at the files that SQLite may find beside it.
         uri = f"{path.resolve().as_uri()}?mode=ro&immutable=1"
-        with closing(sqlite3.connect(uri, uri=True)) as connection:
+        # What is no number is refused, not warned of.
+        with (
+            closing(sqlite3.connect(uri, uri=True)) as connection,
+            np.errstate(all="ignore"),
+        ):
             distrust(connection, path.stat().st_size, tables=_TABLES)
             return _read(path, connection)
     except (*DAMAGE, shapely.errors.ShapelyError, MemoryError) as error:

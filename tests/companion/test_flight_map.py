@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 import sqlite3
+import struct
+import zlib
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -11,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+from pyproj import CRS
 
 from companion.assembly import build_setup
 from companion.cli.app import execute
@@ -26,7 +31,9 @@ from companion.flight_map import (
     write_flight_map,
 )
 from companion.flight_map import child as child_module
+from companion.flight_map import file as file_module
 from companion.problem import Problem
+from companion.record.geopackage import LOCAL_ID, geometry_blob
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.compiling import (
     MapOrder,
@@ -35,6 +42,7 @@ from missions.maps.compiling import (
     read_configured_map,
     read_ordered_map,
 )
+from missions.maps.model import MapCells, MapFile
 from missions.maps.registry import read_map
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -295,6 +303,146 @@ def test_a_flight_map_that_was_changed_is_refused(sql: str, tmp_path: Path) -> N
     assert "\n" not in str(refused.value)
     assert refused.value.code == "flight-map"
 
+
+# ------------------------------------------------------------------ what the hash does not find
+
+CELL_DEG = 1e-4
+
+
+def map_of_cells() -> FlightMap:
+    rates = np.arange(12.0).reshape(3, 4)
+    rates[0, 0] = np.nan
+    map_file = MapFile(
+        path=Path("grid.tif"),
+        format="GeoTIFF",
+        crs="EPSG:4326",
+        unit="L/ha",
+        rate_field="1",
+        zones=(),
+        sha256="0" * 64,
+        cells=MapCells(
+            rates_l_ha=rates,
+            transform=(CELL_DEG, 0.0, 114.5, 0.0, -CELL_DEG, 36.0),
+            crs=CRS.from_epsg(4326),
+        ),
+    )
+    frame = frame_for(map_file)
+    return FlightMap(
+        path=map_file.path,
+        frame=frame,
+        prescription=build_prescription(map_file, frame),
+        is_bounded=False,
+        source="grid.tif",
+        source_rates_l_ha=map_file.rates_l_ha,
+        polylines=(((0.0, 0.0), (5.0, 5.0)),),
+    )
+
+
+def test_cells_without_a_border_have_none_from_the_file_either(tmp_path: Path) -> None:
+    before = map_of_cells()
+    path = write_flight_map(tmp_path / "a.flightmap.gpkg", before).path
+    again = read_flight_map(path)
+    assert_same(again.prescription, before.prescription)
+    assert again.polylines == before.polylines
+    moved = again.moved(2.0, -3.0)
+    assert moved.rate_at(2.0, -3.0) == before.prescription.rate_at(0.0, 0.0)
+    assert moved.cells is not None
+    assert np.allclose(
+        moved.edges_near(-50, -50, 50, 50)[0],
+        before.prescription.edges_near(-52, -47, 48, 53)[0] + np.array([2.0, -3.0, 2.0, -3.0]),
+        atol=1e-9,
+    )
+
+
+def polygon(*places: tuple[float, float]) -> bytes:
+    wkb = shapely.to_wkb(shapely.Polygon(places), byte_order=1)
+    return geometry_blob(wkb, srs_id=LOCAL_ID, is_empty=False)
+
+
+SEVEN, NAN = struct.pack("<d", 7.0), struct.pack("<d", math.nan)
+WARPS = json.dumps([{"x0": 0.0, "y0": 0.0, "scale": 1.0, "terms": [[5, 0], [0, 1], [1, 0]]}] * 2)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value", "why"),
+    [
+        ("zones", "geom", polygon((0, 0), (9, 9), (9, 0), (0, 9)), "crosses itself"),
+        ("zones", "geom", polygon((0, 0), (1e6, 0), (0, 9)), "farther off"),
+        ("zones", "geom", polygon((0, 0), (7, 0), (0, 9)).replace(SEVEN, NAN), "no number"),
+        ("zones", "geom", b"GP", "no GeoPackage geometry"),
+        ("zones", "rate_l_ha", -1.0, "no rate"),
+        ("zones", "rate_l_ha", None, "no rate"),
+        ("zones", "name", b"x", "no name"),
+        ("field", "geom", geometry_blob(shapely.to_wkb(shapely.Point(1, 1)), srs_id=LOCAL_ID,
+                                        is_empty=False), "other than polygons"),
+        ("source_rates", "rate_l_ha", math.inf, "no rate"),
+        ("findings", "severity", "grave", "no severity"),
+        ("sources", "sha256", b"x", "another kind"),
+    ],
+)  # fmt: skip
+def test_a_flight_map_with_the_right_hash_is_looked_at_all_the_same(
+    table: str, column: str, value: object, why: str, tmp_path: Path
+) -> None:
+    found = Problem(severity="warning", code="odd", text="a zone")
+    path = write_flight_map(
+        tmp_path / "a.flightmap.gpkg", replace(compiled(), findings=(found,))
+    ).path
+    changed_with_hash(path, f"UPDATE {table} SET {column} = ?", value)
+    with pytest.raises(MapError, match=why):
+        read_flight_map(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("default_rate_l_ha", "NaN"),
+        ("default_rate_l_ha", "true"),
+        ("overlap", "all"),
+        ("is_bounded", "false"),
+        ("origin_latitude_deg", "91"),
+        ("origin_latitude_deg", "nan"),
+        ("frozen", "[]"),
+        ("frozen", "[" * 5000),
+    ],
+)
+def test_what_a_flight_map_says_of_itself_is_looked_at(
+    key: str, value: str, tmp_path: Path
+) -> None:
+    path = written(tmp_path).path
+    changed_with_hash(path, f"UPDATE meta SET value = ? WHERE key = '{key}'", value)
+    with pytest.raises(MapError, match="no sound flight map"):
+        read_flight_map(path)
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("row_count", 10**9),
+        ("row_count", -3),
+        ("column_count", None),
+        ("classes", zlib.compress(b"\0" * 10**7)),
+        ("rates_l_ha", b"nonsense"),
+        ("warps", WARPS),
+        ("warps", WARPS.replace("1.0", "NaN")),
+        ("warps", "[1, 2]"),
+    ],
+)
+def test_cells_that_lie_nowhere_are_refused(column: str, value: object, tmp_path: Path) -> None:
+    path = write_flight_map(tmp_path / "a.flightmap.gpkg", map_of_cells()).path
+    changed_with_hash(path, f"UPDATE cells SET {column} = ?", value)
+    with pytest.raises(MapError, match="no sound flight map"):
+        read_flight_map(path)
+
+
+def changed_with_hash(path: Path, sql: str, value: object) -> None:
+    """Change a flight map as somebody would who works out its hash anew."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute(sql, (value,))
+        sha256 = file_module._content_sha256(connection)
+        connection.execute("UPDATE meta SET value = ? WHERE key = 'sha256'", (sha256,))
+
+
+# ------------------------------------------------------------------------------------ real maps
 
 # What the files of the samples leave open.
 SAMPLES: list[tuple[str, dict[str, object]]] = [

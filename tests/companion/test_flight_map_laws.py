@@ -13,49 +13,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pyproj import CRS
 
 from companion.config import load
 from companion.errors import MapError
-from companion.flight_map import FlightMap, file, read_flight_map, write_flight_map
-from missions.maps.build import build_prescription, frame_for
+from companion.flight_map import file, read_flight_map, write_flight_map
 from missions.maps.compiling import MapOrder, compile_map
-from missions.maps.model import MapCells, MapFile
+from tests.companion.test_flight_map import map_of_cells
 
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang" / "config.toml"
 TABLES = (
     "zones", "field", "exclusions", "lines", "source_rates", "sources", "findings", "cells", "meta",
 )  # fmt: skip
-CELL_DEG = 1e-4
-
-
-def map_of_cells() -> FlightMap:
-    rates = np.arange(12.0).reshape(3, 4)
-    rates[0, 0] = np.nan
-    map_file = MapFile(
-        path=Path("grid.tif"),
-        format="GeoTIFF",
-        crs="EPSG:4326",
-        unit="L/ha",
-        rate_field="1",
-        zones=(),
-        sha256="0" * 64,
-        cells=MapCells(
-            rates_l_ha=rates,
-            transform=(CELL_DEG, 0.0, 114.5, 0.0, -CELL_DEG, 36.0),
-            crs=CRS.from_epsg(4326),
-        ),
-    )
-    frame = frame_for(map_file)
-    return FlightMap(
-        path=map_file.path,
-        frame=frame,
-        prescription=build_prescription(map_file, frame),
-        is_bounded=False,
-        source="grid.tif",
-        source_rates_l_ha=map_file.rates_l_ha,
-        polylines=(((0.0, 0.0), (5.0, 5.0)),),
-    )
 
 
 @pytest.fixture(scope="module")
