@@ -326,16 +326,24 @@ def _orders(
         own_routes, is_early = sections(
             setup.pumping, routes, ran_s=ran_s, was_early=before.is_early, now_s=now_s
         )
-    valves = []
+    valves: list[ValveSchedule] = []
+    before_key = None
     for valve, route in enumerate(own_routes):
         # In a turn each valve has a speed of its own.
         own = route[0].speed_m_s / speed_m_s if abs(state.yaw_rate_deg_s) > 1.0 else 1.0
+        of_valve = dosing(valve) if setup.pumping is None else on_off
+        # Neighbours in the middle of one zone that have nothing to do have it together.
+        key = (route[0].rate_l_ha, own, in_force[valve], of_valve) if len(route) == 1 else None
+        if key is not None and key == before_key and not valves[-1].changes:
+            valves.append(valves[-1])
+            continue
+        before_key = key
         valves.append(
             schedule(
                 route,
                 valve=valve,
                 timing=setup.timing,
-                dosing=dosing(valve) if setup.pumping is None else on_off,
+                dosing=of_valve,
                 in_force=in_force[valve],
                 speed_soon_m_s=soon_m_s * own,
                 now_s=now_s,
@@ -381,19 +389,24 @@ def _nozzle_sets(
     speed_m_s: float,
 ) -> tuple[int, SetOfRate]:
     """Return the set in use and those of the rates ahead; the middle of the boom decides."""
-
-    def flow_of(rate_l_ha: float) -> float:
-        asked = overridden(rate_l_ha, state.rate_percent, setup.rate_max_l_ha)
-        return flow_for_rate(asked, speed_m_s, setup.boom.width_m)
-
     return sets_ahead(
         setup.nozzle_sets,
         routes[len(routes) // 2],
         in_use=before.set_index,
         before=before.set_of_rate,
-        flow_of=flow_of,
+        flow_of=_flow_of(setup, state, speed_m_s),
         now_s=state.time_s,
     )
+
+
+def _flow_of(setup: Setup, state: VehicleState, speed_m_s: float) -> Callable[[float], float]:
+    """Return the function from a rate of the map to the whole boom's flow [L/min] at a speed."""
+
+    def flow_of(rate_l_ha: float) -> float:
+        asked = overridden(rate_l_ha, state.rate_percent, setup.rate_max_l_ha)
+        return flow_for_rate(asked, speed_m_s, setup.boom.width_m)
+
+    return flow_of
 
 
 # -------------------------------------------------------------------------------- plan and record
@@ -465,16 +478,15 @@ def _decision(
     rates = [valve.rate_now_l_ha for valve in orders.valves]
     if setup.pumping is not None:  # of sections: what is prescribed for them, not open or shut
         rates = [rate_at(route, now_s) for route in routes]
-    percent, limit_l_ha = state.rate_percent, setup.rate_max_l_ha
     # As if all valves of the set had the rate of this one.
-    flows = [
-        flow_for_rate(
-            overridden(rates[valve] or 0.0, percent, limit_l_ha),
-            orders.speed_m_s,
-            setup.boom.width_m,
-        )
-        for valve in nozzles.valves
-    ]
+    flow_of = _flow_of(setup, state, orders.speed_m_s)
+    known = {rate: flow_of(rate or 0.0) for rate in set(rates)}
+    flows = [known[rates[valve]] for valve in nozzles.valves]
+    too_much = {flow for flow in set(flows) if not nozzles.curve.delivers(flow)}
+    late = unresolved = 0
+    for of_valve in orders.valves:
+        late += of_valve.late
+        unresolved += of_valve.unresolved_count
     flow_l_min = _flow(setup, plan, index)
     if setup.trimming is not None and trim is not None:
         trim = flow_trim.ordered(
@@ -488,13 +500,13 @@ def _decision(
         rate_l_ha=tuple(rates),
         target_flow_l_min=sum(flows) / len(flows),
         flow_l_min=flow_l_min * orders.gain,
-        late_count=sum(valve.late for valve in orders.valves),
-        unresolved_count=sum(valve.unresolved_count for valve in orders.valves),
+        late_count=late,
+        unresolved_count=unresolved,
         flow_trim=None if trim is None else trim.sets[index].trim,
         flow_trim_state=None if trim is None else trim.state,
         findings=_findings(setup, watched.watch),
         sprayer=shown(permission.sprayer, is_open=plan.opens),
-        out_of_range_count=sum(not nozzles.curve.delivers(flow) for flow in flows),
+        out_of_range_count=sum([flow in too_much for flow in flows]) if too_much else 0,
     )
     return decision, ordering._replace(trim=trim)
 

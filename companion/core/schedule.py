@@ -322,23 +322,20 @@ def schedule(
     footprint's speed when a trim ordered now would act. What opened at the border stays open when
     it turns out to be due up to `sticky_border_s` later.
     """
-    if len(route) == 1 and _holds(route[0], dosing, speed_soon_m_s, in_force):
-        return ValveSchedule((), False, 0, route[0].rate_l_ha)  # in the middle of a zone
-    unresolved, due = 0, 0
-    made: list[Order] = []
-    rate = route[0].rate_l_ha
-    if len(route) > 1:
-        resolved, unresolved = resolve(route, timing.dwell_min_s)
-        made = orders(resolved, timing, dosing, overdrive)
-        while due + 1 < len(made) and made[due + 1].at_s <= now_s:
-            due += 1
-        if due + 1 < len(made) and _already_ordered(
-            made[due], made[due + 1], in_force, now_s, sticky_border_s
-        ):
-            due += 1
-        rate = made[due].rate_l_ha
+    if len(route) == 1:
+        return _in_zone(route[0].rate_l_ha, valve, dosing, in_force, speed_soon_m_s, now_s)
+    due = 0
+    resolved, unresolved = resolve(route, timing.dwell_min_s)
+    made = orders(resolved, timing, dosing, overdrive)
+    while due + 1 < len(made) and made[due + 1].at_s <= now_s:
+        due += 1
+    if due + 1 < len(made) and _already_ordered(
+        made[due], made[due + 1], in_force, now_s, sticky_border_s
+    ):
+        due += 1
+    rate = made[due].rate_l_ha
     duty = 0.0 if rate is None else dosing(rate, speed_soon_m_s)
-    if made and made[due].driven:
+    if made[due].driven:
         duty = made[due].duty
     changes = []
     late = False
@@ -373,10 +370,24 @@ def _trims(
     return changes
 
 
-def _holds(zone: Crossing, dosing: Dosing, speed_m_s: float, in_force: float) -> bool:
-    """Whether the duty in force is the zone's, to the step below which nothing is ordered."""
-    duty = 0.0 if zone.rate_l_ha is None else dosing(zone.rate_l_ha, speed_m_s)
-    return abs(duty - in_force) < DUTY_STEP and (duty == 0.0) == (in_force == 0.0)
+def _in_zone(
+    rate_l_ha: float | None,
+    valve: int,
+    dosing: Dosing,
+    in_force: float,
+    speed_m_s: float,
+    now_s: float,
+) -> ValveSchedule:
+    """Return what a valve does in the middle of a zone: a trim for the speed, or nothing."""
+    duty = 0.0 if rate_l_ha is None else dosing(rate_l_ha, speed_m_s)
+    moves = abs(duty - in_force)
+    if moves < DUTY_STEP and (duty == 0.0) == (in_force == 0.0):
+        return ValveSchedule((), False, 0, rate_l_ha)
+    if not 0.0 < moves <= SPEED_MAX_SHARE * in_force or duty == 0.0:
+        change = TimedChange(at_s=now_s, valve=valve, duty=duty)
+        return ValveSchedule((change,), False, 0, rate_l_ha)
+    trims = _trims(valve, in_force, duty, now_s, math.inf)
+    return ValveSchedule(tuple(trims), False, 0, rate_l_ha)
 
 
 def sticky_border_s(border_buffer_m: float, speed_m_s: float) -> float:

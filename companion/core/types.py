@@ -6,6 +6,7 @@ the companion's monotonic clock, unless a name says otherwise (`boot_s`: the aut
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
@@ -170,14 +171,19 @@ class SprayPlan:
     drives: tuple[DrivePlan, ...] = ()
 
     def __post_init__(self) -> None:
-        if not all(0.0 <= duty <= 1.0 for duty in self.duty):
-            raise ValueError(f"duty outside [0, 1]: {self.duty}")
-        if not self.issued_s < self.lease_until_s < float("inf"):
+        # Plain loops: twenty times a second, half the time of generators.
+        for duty in self.duty:
+            if not 0.0 <= duty <= 1.0:
+                raise ValueError(f"duty outside [0, 1]: {self.duty}")
+        if not self.issued_s < self.lease_until_s < math.inf:
             raise ValueError(f"lease ends at {self.lease_until_s}, issued at {self.issued_s}")
-        if any(change.valve >= len(self.duty) for change in self.changes):
-            raise ValueError("a change names a valve that the plan does not have")
-        if not all(a.at_s <= b.at_s for a, b in pairwise(self.changes)):
-            raise ValueError("changes are not in order of time")
+        count, before_s = len(self.duty), -math.inf
+        for change in self.changes:
+            if change.valve >= count:
+                raise ValueError("a change names a valve that the plan does not have")
+            if not before_s <= change.at_s:
+                raise ValueError("changes are not in order of time")
+            before_s = change.at_s
 
     @property
     def is_off(self) -> bool:
