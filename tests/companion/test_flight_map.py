@@ -168,6 +168,13 @@ def test_what_is_live_needs_no_new_flight_map(override: str, tmp_path: Path) -> 
     assert build_setup(config, flight_map) is not None
 
 
+def test_a_configuration_that_says_nothing_of_reading_does_not_object(tmp_path: Path) -> None:
+    flight_map = written(tmp_path, ANYANG, "prescription.crs=EPSG:4326")
+    assert difference(flight_map, load(ANYANG)) is None
+    other = load(ANYANG, overrides=["prescription.crs=EPSG:4490"])
+    assert difference(flight_map, other) == ("prescription.crs", "EPSG:4490", "EPSG:4326")
+
+
 def test_the_label_limits_the_rates_of_the_source(tmp_path: Path) -> None:
     flight_map = read_flight_map(written(tmp_path).path)
     with pytest.raises(ConfigError, match=r"above product\.rate_max_l_ha = 5"):
