@@ -15,6 +15,13 @@ if TYPE_CHECKING:
     from analysis.bucket import BucketCurve
 
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+
 # Of a pump's table: the width of the pulse that its speed controller was given.
 PULSE_COLUMN = "us"
 _RANGE = re.compile(r"(\d+)-(\d+)")

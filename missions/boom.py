@@ -17,8 +17,11 @@ from missions.demand import valve_places
 from missions.field import Field
 from missions.plan import Settings
 from missions.strips import (
+    LINE_MIN_M,
     Floats,
     Objects,
+    axes,
+    count_across,
     directions,
     joined,
     lengths_m,
@@ -26,7 +29,6 @@ from missions.strips import (
     rectangles,
     whole,
 )
-from missions.swaths import LINE_MIN_M, axes, count_across
 
 # An edge that is a hair off a line's course must not cut it short, nor close a valve. The ground
 # keeps a larger margin from what may be sprayed (`field.MARGIN_M`).

@@ -14,8 +14,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from companion.cli.answer import AsJson, answer, note
-from companion.cli.progress import Tell, progress
+from companion.cli.answer import AsJson, Tell, answer, note, progress
 from companion.wording import counted
 from missions.files.fence import Fences, fence_warnings
 from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
@@ -23,7 +22,6 @@ from missions.files.write import check_suffix, older_sorties, write_fleet
 from missions.maps.cli.grid import parse_mark
 from missions.maps.cli.options import Reading, reading_options
 from missions.maps.whole_file import check_folder
-from missions.obstacles import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
@@ -31,6 +29,7 @@ from missions.prices import closing_hint, overlap_warnings, prices
 from missions.reading import Asked, Task, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
+from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.searching import Watch, watched
 from missions.sheet import ground_text, sheet, sortie_lines
 from missions.treated_rates import UntreatedRates

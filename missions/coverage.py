@@ -11,6 +11,7 @@ from shapely.geometry.base import BaseGeometry
 
 from missions.demand import Rates, Uniform
 from missions.strips import (
+    LINE_MIN_M,
     NARROWER_M,
     Floats,
     Objects,
@@ -21,7 +22,6 @@ from missions.strips import (
     united,
     whole,
 )
-from missions.swaths import LINE_MIN_M
 
 # Less than this is no ground but the last digits of large numbers.
 NOISE_M2 = 1e-6

@@ -19,8 +19,7 @@ from missions.field import Field
 from missions.free_space import free_space
 from missions.paced import Paced
 from missions.plan import Settings, Sortie
-from missions.strips import Floats, directions, lengths_m
-from missions.swaths import axes
+from missions.strips import Floats, axes, directions, lengths_m
 from missions.ways import Ways, build_ways, suggested_depot
 
 # A line that is cut shorter than this stays whole, in the share of its middle.

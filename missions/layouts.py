@@ -15,6 +15,7 @@ from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from missions.boom import Boom, boom_of, lines_over, passes_over
+from missions.corners import Motion
 from missions.coverage import patches, reachable
 from missions.field import Field
 from missions.free_space import FreeSpace, free_space
@@ -22,9 +23,17 @@ from missions.maps.local import polygons_of
 from missions.open_lines import LEFT_SHARE, fitted_lines, has_edges_along, needed_passes, open_lines
 from missions.plan import LEAVE_PERCENT, Settings
 from missions.selection import Aim, chosen, families
-from missions.strips import Floats, directions, joined, lengths_m, no_lines, whole
-from missions.swaths import border_passes, inner_ground, inner_lines
-from missions.turns import Motion
+from missions.strips import (
+    Floats,
+    border_passes,
+    directions,
+    inner_ground,
+    inner_lines,
+    joined,
+    lengths_m,
+    no_lines,
+    whole,
+)
 from missions.worth import LEFT_SHARE as WORTH_LEFT
 from missions.worth import LINES_MAX, WORTH, Tour, tour_of, worthwhile
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from missions.corners import Motion
 from missions.demand import Pieces
 from missions.free_space import Bools, FreeSpace
 from missions.strips import Floats, directions, lengths_m
-from missions.turns import Motion
 
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 

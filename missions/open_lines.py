@@ -16,10 +16,14 @@ from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
 from missions.boom import SLACK_M
+from missions.corners import Motion
 from missions.coverage import reachable
 from missions.strips import (
+    LINE_MIN_M,
     Floats,
     Objects,
+    axes,
+    count_across,
     directions,
     joined,
     lengths_m,
@@ -27,8 +31,6 @@ from missions.strips import (
     rectangles,
     united,
 )
-from missions.swaths import LINE_MIN_M, axes, count_across
-from missions.turns import Motion
 
 # So much of the reachable ground may be left for patches.
 LEFT_SHARE = 0.0005

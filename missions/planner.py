@@ -14,6 +14,7 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
 from missions.boom import Boom, boom_of, over_warnings
+from missions.corners import Motion
 from missions.coverage import measure, narrow_patches, of_rated_ground
 from missions.demand import M2_PER_HA, Demand, Rates, demands, valve_places
 from missions.errors import OutOfReachError, PlanError
@@ -45,7 +46,6 @@ from missions.strips import (
 )
 from missions.surroundings import NOTHING_AROUND, Surroundings
 from missions.treated_rates import UntreatedRates, demands_once
-from missions.turns import Motion
 from missions.ways import Ways, build_ways, edge_places, far_warnings, suggested_depot
 
 # One sortie may begin and end anywhere: its depot is chosen among so many places of the edge.

@@ -27,7 +27,6 @@ from missions.maps.compiling import read_configured_map
 from missions.maps.local import Area
 from missions.maps.model import MapFile
 from missions.maps.registry import read_map
-from missions.obstacles import Obstacle, read_obstacles
 from missions.plan import Settings
 from missions.reading_fleet import NO_BREAK, BreakAsked, fleet_settings, left_of, untreated
 from missions.reading_ground import (
@@ -40,7 +39,14 @@ from missions.reading_ground import (
     terrain_of,
     wind_of,
 )
-from missions.reading_outline import check_near, near_area, outline_of, told
+from missions.reading_outline import (
+    Obstacle,
+    check_near,
+    near_area,
+    outline_of,
+    read_obstacles,
+    told,
+)
 from missions.remaining import Remaining
 from missions.strips import Floats
 from missions.surroundings import NOTHING_AROUND, Surroundings

@@ -15,13 +15,11 @@ from companion.config import Config
 from companion.config.tables import MissionTable
 from companion.core.frame import LocalFrame
 from missions.errors import PlanError
-from missions.field import Field, local_area
+from missions.field import Field, WindBuffer, local_area
 from missions.maps.registry import read_area
 from missions.reading_outline import told
 from missions.run_in import RunIn
-from missions.terrain.dem import read_dem
-from missions.terrain.ground import Terrain
-from missions.wind import WindBuffer
+from missions.terrain.ground import Terrain, read_dem
 
 Autopilot = Literal["ardupilot", "px4"]
 # The companion doses for the strips of its valves: passes spaced otherwise get another rate.

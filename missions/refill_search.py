@@ -17,6 +17,7 @@ from missions.bands import (
     outermost,
     to_and_fro,
 )
+from missions.corners import Motion
 from missions.demand import Demand
 from missions.plan import Settings
 from missions.refills import (
@@ -34,7 +35,6 @@ from missions.refills import (
 )
 from missions.searching import steps
 from missions.strips import Floats
-from missions.turns import Motion
 from missions.ways import Ways
 
 Sorties = list[list[Part]]

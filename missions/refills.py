@@ -17,12 +17,12 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from missions.corners import Motion
 from missions.demand import Demand
 from missions.energy import J_WH, KG_L, Battery
 from missions.free_space import FreeSpace
 from missions.network import ACROSS_M, JOIN_DEG, JOIN_M, STRAIGHT_M
 from missions.strips import Floats, directions, lengths_m
-from missions.turns import Motion
 
 # A line, and from where to where along it [m]; the second is the lesser where it is flown back.
 Part = tuple[int, float, float]
@@ -63,7 +63,7 @@ class Limits:
 
 
 class Times:
-    """How long ways take, as `missions.turns` has it, fast for one way at a time."""
+    """How long ways take, as `missions.corners` has it, fast for one way at a time."""
 
     def __init__(self, motion: Motion) -> None:
         self._scale: float = KNOTS / math.sqrt(TABLED_M)

@@ -15,8 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
 from missions.errors import PlanError
-from missions.strips import Floats, directions, lengths_m
-from missions.swaths import LINE_MIN_M
+from missions.strips import LINE_MIN_M, Floats, directions, lengths_m
 
 # Legs of one line at several speeds: they touch, and go on straight.
 TOUCH_M, STRAIGHT_DEG = 0.01, 1.0

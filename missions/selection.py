@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
 from missions.boom import SLACK_M, Boom, where_inside
+from missions.corners import Motion
 from missions.coverage import reachable
 from missions.open_lines import edges_along, evenly
-from missions.strips import Floats, directions, joined, lengths_m
-from missions.swaths import axes
-from missions.turns import Motion
+from missions.strips import Floats, axes, directions, joined, lengths_m
 
 # The ground is looked at in so many points, one for 2.5 m2 of a hectare.
 POINTS, STEP_MIN_M = 4_000, 0.25

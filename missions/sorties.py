@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 import shapely
 
+from missions.corners import Motion
 from missions.demand import Demand, Pieces, cut
 from missions.energy import J_WH, KG_L, Battery, Vertical
 from missions.errors import OutOfReachError, PlanError
@@ -30,7 +31,6 @@ from missions.stops import timed
 from missions.strips import Floats, lengths_m
 from missions.tour import Sortie as Order
 from missions.tour import by_savings, one_chain, shortest_tour, turned
-from missions.turns import Motion
 from missions.ways import Ways
 
 # A tank is flown in so many pieces or more, so that cuts need not fall where a line ends.

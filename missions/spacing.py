@@ -20,8 +20,7 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
 from companion.wording import counted
-from missions.ferries import is_high
-from missions.plan import Leg, Place, Settings, Sortie
+from missions.plan import Leg, Place, Settings, Sortie, is_high
 from missions.stops import NEAR_M, SAME_M, is_passed, near_pairs, waypoints_of
 from missions.strips import Floats
 from missions.ways import Ways

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 
 from companion.core.frame import LocalFrame
 from missions.demand import Rates
-from missions.ferries import at_ferry_height
 from missions.field import Field
 from missions.paced import Paced, paced
-from missions.plan import Settings, Sortie
+from missions.plan import Settings, Sortie, at_ferry_height
 from missions.run_in import RunIn, slow_starts, with_run_ins
 from missions.spacing import Spacing
 from missions.stops import timed

@@ -14,13 +14,12 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from missions.boom import Boom
+from missions.corners import Motion
 from missions.demand import Pieces
 from missions.free_space import FreeSpace
 from missions.network import JOIN_M, Network, build_network
-from missions.strips import Floats, Objects, directions, lengths_m, whole
-from missions.swaths import LINE_MIN_M
+from missions.strips import LINE_MIN_M, Floats, Objects, directions, lengths_m, whole
 from missions.tour import Ring, Sortie, by_savings, cost_s, one_chain, shortest_tour
-from missions.turns import Motion
 
 # A plan covers 99.9 % of what a strip can reach; all that is left out together stays below this.
 LEFT_SHARE = 0.00085

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from sitl.edges import BoardEdge
+from sitl.meter import BoardEdge
 
 if TYPE_CHECKING:
-    from sitl.edges import BoardEdge
+    from sitl.meter import BoardEdge
     from sitl.profile import Pulsing
 
 

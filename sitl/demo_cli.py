@@ -22,8 +22,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from companion.cli.answer import AsJson, answer, note
-from companion.cli.progress import progress
+from companion.cli.answer import AsJson, answer, note, progress
 from companion.errors import ConfigError
 from sitl.cli import FlowLaw
 

@@ -48,7 +48,7 @@ from sitl.outputs import WIRE_S
 from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
 from sitl.stub.faults import Fault, FaultClock, FaultKind, read_scenario
-from sitl.stub.modes import MODE_NAMES
+from sitl.stub.mission_items import MODE_NAMES
 from sitl.stub.scenario import check_scenario
 from sitl.vehicle import Corners, Leg, Route, Trajectory, Vehicle
 

@@ -17,7 +17,7 @@ import numpy as np
 from companion.core.boom import Boom, Valve
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
 from companion.core.schedule import LagModel
-from sitl.edges import BoardEdge
+from sitl.meter import BoardEdge
 from sitl.profile import draw_scatter, flow_table
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from companion.core.setup import Setup
     from companion.core.types import SprayPlan, TimedChange
-    from sitl.edges import Edge
+    from sitl.meter import Edge
     from sitl.outputs import Output, TakesDuties, TakesEdges
     from sitl.profile import PlantProfile, Pump, Scatter
 

@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+
+from typing import NamedTuple
+
 # Flows below this are what is left of sums that should be zero [mL/s]; slopes likewise [mL/s2].
 ROUNDING = 1e-9
 # How many periods' noise is asked for at once.
@@ -114,3 +117,32 @@ class VolumeMeter(MeterStream):
         volume_ml = self._flow.volume_at(until_s)
         self._part_ml += volume_ml - self._seen_ml
         self._seen_ml = volume_ml
+
+
+# What reaches a valve: electrical edges, from whatever makes them.
+
+
+class Edge(Protocol):
+    """One valve is to be open or closed from `at_s`; `duty` is the one in force.
+
+    An edge that repeats the state of its valve tells of a new duty: an open valve that stays open,
+    or one that rests in its gap and is now closed for good (`duty` 0).
+    """
+
+    @property
+    def at_s(self) -> float: ...  # noqa: D102
+    @property
+    def valve(self) -> int: ...  # noqa: D102
+    @property
+    def is_open(self) -> bool: ...  # noqa: D102
+    @property
+    def duty(self) -> float: ...  # noqa: D102
+
+
+class BoardEdge(NamedTuple):
+    """An edge that the driver board makes."""
+
+    at_s: float
+    valve: int
+    is_open: bool
+    duty: float

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from companion.core.types import SprayPlan
     from sitl.board import DriverBoard
-    from sitl.edges import Edge
+    from sitl.meter import Edge
     from sitl.profile import PlantProfile
 
 # An order is on its way to the autopilot this long: 44 bytes over a telemetry port.

@@ -21,7 +21,7 @@ from sitl.profile import draw_scatter, flow_table
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from sitl.edges import Edge
+    from sitl.meter import Edge
     from sitl.profile import PlantProfile
 
 Floats = NDArray[np.float64]

@@ -9,13 +9,13 @@ import numpy as np
 from sitl.meter import MeterStream, VolumeMeter
 from sitl.plant import Faults, Floats, Plant
 from sitl.profile import ML_S_PER_L_MIN, flow_table
+from sitl.supply import Supply
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from sitl.edges import Edge
+    from sitl.meter import Edge
     from sitl.profile import PlantProfile
-    from sitl.supply import Supply
 
 
 import math

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 from enum import Enum
 
 from sitl.stub.autopilot import Autopilot
-from sitl.stub.modes import AUTO, LAND, LOITER, Phase
+from sitl.stub.mission_items import AUTO, LAND, LOITER, Phase
 from sitl.stub.protocol import (
     AUTOPILOT_SYSTEM,
     COMPANION_COMPONENT,

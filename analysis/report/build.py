@@ -19,12 +19,11 @@ from markupsafe import Markup
 from analysis.assess.assessment import Assessment, assess
 from analysis.flown.applied_record import EvaluationError
 from analysis.flown.read_applied import read_applied
-from analysis.report.clock import Clock, clock_of, duration_text
 from analysis.report.contents import contents_of
 from analysis.report.facts import facts_of
 from analysis.report.legal import LegalRecord, legal_record
-from analysis.report.told import Told, told_with
-from analysis.report.treated import Treated, treated_of
+from analysis.report.legal_fields import Told, told_with
+from analysis.report.treated import Clock, Treated, clock_of, duration_text, treated_of
 from companion.config.application_table import PROFILES, Profile
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ from analysis.assess.causes import Cause, rate_wishes
 from analysis.flown.holes import UNREAD
 from analysis.flown.unknown import GAP_S
 from analysis.published import P1_RESULTS
-from analysis.report.clock import duration_text
 from analysis.report.facts import wind_note
+from analysis.report.treated import duration_text
 from companion.core.types import Inhibit
 from companion.record.content_hash import content_sha256
 
@@ -24,10 +24,9 @@ if TYPE_CHECKING:
     from analysis.assess.assessment import Assessment
     from analysis.assess.breakdowns import AccuracyGroup
     from analysis.flown.applied_flight import AppliedFlight
-    from analysis.report.clock import Clock
     from analysis.report.legal import LegalRecord
-    from analysis.report.told import Told
-    from analysis.report.treated import Treated
+    from analysis.report.legal_fields import Told
+    from analysis.report.treated import Clock, Treated
 
 
 REPORT_VERSION = 1

@@ -41,10 +41,9 @@ if TYPE_CHECKING:
     from analysis.assess.intervals import Interval
     from analysis.evaluation import Evaluation
     from analysis.lag import Step
-    from analysis.report.clock import Clock
     from analysis.report.figures.sheet import Sheet
     from analysis.report.figures.style import Drawn
-    from analysis.report.treated import Treated
+    from analysis.report.treated import Clock, Treated
     from analysis.track import Floats, Ints
 
 

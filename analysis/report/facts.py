@@ -11,8 +11,7 @@ from analysis.report.legal_fields import Facts
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight, Floats
-    from analysis.report.clock import Clock
-    from analysis.report.treated import Treated
+    from analysis.report.treated import Clock, Treated
 
 # Valves that were open this shortly before the journal ends were open when it was cut.
 CUT_WITHIN_S = 1.5

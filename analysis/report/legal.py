@@ -15,7 +15,7 @@ from companion.config.application_table import ASKED, Profile, is_told, missing
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from analysis.report.told import Told
+    from analysis.report.legal_fields import Told
 
 LAWS: dict[Profile, str] = {
     "eu": "Commission Implementing Regulation (EU) 2023/564, with Article 67(1) of Regulation (EC) "

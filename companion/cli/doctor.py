@@ -51,10 +51,9 @@ from companion.doctor.vehicle import Heard, link_checks, no_link
 from companion.errors import ConfigError, LinkError, MapError
 from companion.flight_map import FlightMap, flight_map_of
 from companion.link.signing import read_key
-from companion.output.autopilot_check import TOLERANCE_US
 from companion.output.autopilot_findings import Finding, findings, px4_wiring
 from companion.output.autopilot_guard import REFUSALS
-from companion.output.autopilot_options import ServoOptions
+from companion.output.autopilot_options import TOLERANCE_US, ServoOptions
 from companion.wording import counted
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)

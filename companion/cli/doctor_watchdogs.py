@@ -32,8 +32,7 @@ from companion.ground.work import (
     observe_ground,
 )
 from companion.link.vehicle_link import VehicleLink
-from companion.output.autopilot_check import TOLERANCE_US, ardupilot_places
-from companion.output.autopilot_options import ServoOptions
+from companion.output.autopilot_options import TOLERANCE_US, ServoOptions, ardupilot_places
 
 _UNIT = "LoadState,ActiveState,WatchdogUSec,WatchdogTimestampMonotonic"
 

@@ -11,12 +11,11 @@ from companion.core.types import SprayPlan
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_options import DriveOutput
-from companion.output.engine.setup import EngineSetup
-from companion.output.engine.wiring import Wiring
+from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.gpio import GpioExecutor
 from companion.output.hardware_pwm import HardwarePwmExecutor, PwmDrive
-from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor, ServoOptions
+from companion.output.timed import DryRunExecutor
 from companion.ports import PlanExecutor
 
 

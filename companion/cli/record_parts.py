@@ -11,8 +11,7 @@ from companion.config.tables import JournalTable
 from companion.errors import JournalError
 from companion.link.vehicle_link import VehicleLink
 from companion.output.gpio import GpioExecutor
-from companion.output.none import DryRunExecutor
-from companion.output.timed import TimedExecutor
+from companion.output.timed import DryRunExecutor, TimedExecutor
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
 from companion.record.read_only import DAMAGE, one_line

@@ -37,8 +37,7 @@ from companion.flight_map import FlightMap, flight_map_of
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
-from companion.output.autopilot_budget import dither_too_much
-from companion.output.servo import DITHER_S
+from companion.output.servo import DITHER_S, dither_too_much
 from companion.ports import COMMIT_EVERY_S, PlanExecutor
 from companion.record.continuing import Treated, continued, read_treated_ground, rest_of
 from companion.record.folder import journals

@@ -15,11 +15,9 @@ from companion.errors import SensorError
 from companion.gpio_chip import find_chip, load_gpiod
 from companion.link.vehicle_link import VehicleLink
 from companion.ports import Sensor
-from companion.sensors.current_loop import CurrentLoop
 from companion.sensors.estop import EstopSwitch
-from companion.sensors.flow_meter import FlowMeter
-from companion.sensors.pulses import Edge, Meter
-from companion.sensors.voltage import Gauge, I2cVoltage, IioVoltage, VoltageSource
+from companion.sensors.flow_meter import Edge, FlowMeter, Meter
+from companion.sensors.voltage import CurrentLoop, Gauge, I2cVoltage, IioVoltage, VoltageSource
 
 # The nozzle sets' largest flow is measured; a burst hose gives more, a broken wire far more.
 FLOW_MAX_FACTOR = 2.0

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, PrivateAttr
 
-from companion.config import application_table, motor_tables, sensor_tables, sprayer_tables, tables
+from companion.config import application_table, sensor_tables, sprayer_tables, tables
 from companion.core.boom import Boom, Valve
 
 Origin = Literal["file", "override", "default"]
@@ -31,9 +31,9 @@ class Document(tables.Table):
     lag: sprayer_tables.LagTable
     output: sprayer_tables.OutputTable = sprayer_tables.OutputTable()
     gpio: sprayer_tables.GpioTable = sprayer_tables.GpioTable()
-    pump: motor_tables.PumpTable | None = None
+    pump: sprayer_tables.PumpTable | None = None
     atomiser: Annotated[
-        tuple[motor_tables.AtomiserTable, ...], Field(strict=False, max_length=32)
+        tuple[sprayer_tables.AtomiserTable, ...], Field(strict=False, max_length=32)
     ] = ()
     safety: tables.SafetyTable = tables.SafetyTable()
     mission: tables.MissionTable | None = None

@@ -14,7 +14,7 @@ from companion.core.schedule import LagModel
 
 if TYPE_CHECKING:
     from companion.config.document import Document
-    from companion.config.motor_tables import AtomiserTable, PumpTable
+    from companion.config.sprayer_tables import AtomiserTable, PumpTable
 
 
 Found = Iterator[tuple[str, str]]

@@ -21,8 +21,7 @@ from companion.core.types import SprayPlan
 from companion.doctor.check import Check, fail, not_applicable, ok, warn
 from companion.errors import ActuatorError
 from companion.output.engine.selftest import SelfTest
-from companion.output.engine.setup import WAKE_LATE_MAX_S, EngineSetup
-from companion.output.engine.wiring import Wiring
+from companion.output.engine.setup import WAKE_LATE_MAX_S, EngineSetup, Wiring
 from companion.output.gpio import GpioExecutor
 
 _STEP_S = 0.005

@@ -12,7 +12,7 @@ from typing import Any
 from companion.doctor.check import Check, fail, not_applicable, ok, warn
 from companion.errors import ActuatorError
 from companion.output.engine.gpiod_lines import CONSUMER, find_chip, keeps_levels, load_gpiod
-from companion.output.engine.wiring import Wiring, hazards
+from companion.output.engine.setup import Wiring, hazards
 
 _NAMES = ("gpio-chip", "gpio-lines", "gpio-wiring")
 

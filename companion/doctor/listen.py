@@ -21,9 +21,8 @@ from companion.core.types import (
 from companion.doctor.vehicle import Heard, Position, Rate
 from companion.errors import LinkError
 from companion.link.vehicle_link import VehicleLink
-from companion.output.autopilot_check import ardupilot_places
 from companion.output.autopilot_findings import more_parameters, wanted_parameters
-from companion.output.autopilot_options import ServoOptions
+from companion.output.autopilot_options import ServoOptions, ardupilot_places
 
 # The first heartbeat is at most a second away, the streams come half a second after that.
 _SETTLE_S = 1.0

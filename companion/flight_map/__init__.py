@@ -7,8 +7,15 @@ it was made with, and what was found on the way.
 
 from companion.flight_map.child import flight_map_of, flight_map_of_file
 from companion.flight_map.file import read_flight_map, write_flight_map
-from companion.flight_map.frozen import difference, frozen_settings
-from companion.flight_map.model import SUFFIX, FlightMap, SourceFile, is_flight_map, moved
+from companion.flight_map.model import (
+    SUFFIX,
+    FlightMap,
+    SourceFile,
+    difference,
+    frozen_settings,
+    is_flight_map,
+    moved,
+)
 
 __all__ = [
     "SUFFIX",

@@ -26,9 +26,14 @@ from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
 from companion.errors import ConfigError, MapError
 from companion.flight_map.file import VERSION, read_flight_map
-from companion.flight_map.frozen import frozen_settings
-from companion.flight_map.model import SUFFIX, FlightMap, is_flight_map
-from companion.flight_map.sources import named_files, sources_of
+from companion.flight_map.model import (
+    SUFFIX,
+    FlightMap,
+    frozen_settings,
+    is_flight_map,
+    named_files,
+    sources_of,
+)
 
 _logger = logging.getLogger(__name__)
 

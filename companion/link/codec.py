@@ -23,8 +23,10 @@ from companion.core.types import (
     UtcReport,
     WindReport,
 )
-from companion.link.census import AUTOPILOT_COMPONENT, Census, Vehicle
+from companion.link.census import AUTOPILOT_COMPONENT, Census, Vehicle, autopilot_name, mode_name
 from companion.link.messages import (
+    CURRENT,
+    TRANSFERS,
     AckReceived,
     CommandReceived,
     Message,
@@ -35,9 +37,8 @@ from companion.link.messages import (
     Sender,
     ServoOutput,
     TimesyncReceived,
+    finite,
 )
-from companion.link.mission_messages import CURRENT, TRANSFERS, finite
-from companion.link.modes import autopilot_name, mode_name
 from companion.link.signing import RADIO_STATUS
 
 __all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]

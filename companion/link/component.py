@@ -38,6 +38,8 @@ from companion.link.messages import (
     AckReceived,
     CommandReceived,
     Message,
+    MissionCurrent,
+    MissionTransfer,
     ParamAsked,
     ParamSet,
     ParamValue,
@@ -46,14 +48,12 @@ from companion.link.messages import (
     Tank,
     TimesyncReceived,
 )
-from companion.link.mission_messages import MissionCurrent, MissionTransfer
 from companion.link.mission_reader import MissionReader
 from companion.link.outputs import ORDERS, Outputs
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent, Service
 from companion.link.signing import Signing
-from companion.link.statistics import Meter
-from companion.link.streams import Stream, StreamRequest, StreamSupervisor, wanted_streams
+from companion.link.streams import Meter, Stream, StreamRequest, StreamSupervisor, wanted_streams
 
 _POSITION = 33
 # How often the time is asked for, in seconds; where answers are slow, bytes are dear.

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from companion.core.types import LegReport
 from companion.link.census import AUTOPILOT_COMPONENT
 from companion.link.encode import Encoder
-from companion.link.mission_messages import (
+from companion.link.messages import (
     MissionCurrent,
     MissionItem,
     MissionStep,

@@ -10,14 +10,13 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from companion.core.types import Decision, Input, OperatorCommand, RateOverride
-from companion.link.census import Census, Vehicle
+from companion.link.census import Census, Vehicle, autopilot_name
 from companion.link.component import Component, ComponentOptions
-from companion.link.modes import autopilot_name
 from companion.link.outputs import OutputListener
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent
 from companion.link.signing import Signing
-from companion.link.statistics import LinkStatistics
+from companion.link.streams import LinkStatistics
 from companion.link.transport import (
     LinkUrl,
     OnBytes,

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from companion.output.autopilot_check import OutputCheck, Reading, ardupilot_places
 from companion.output.autopilot_findings import (
     dead_man,
     findings,
@@ -21,7 +20,7 @@ from companion.output.autopilot_findings import (
     px4_wiring,
     wanted_parameters,
 )
-from companion.output.autopilot_options import ServoOptions
+from companion.output.autopilot_options import OutputCheck, Reading, ServoOptions, ardupilot_places
 
 # MAV_RESULT, and what most likely lies behind it; PX4 only ever accepts.
 REFUSALS = {2: "denied", 3: "not supported", 4: "failed"}

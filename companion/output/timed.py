@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 
 from companion.core.types import SprayPlan
-from companion.output.return_valve import ReturnValve
+from companion.output.pwm import ReturnValve
 
 # What is told of an order: valve, duty, when a plan wanted it (None: a fault did), when it left.
 OnOrder = Callable[[int, float, float | None, float], None]
@@ -271,3 +271,39 @@ class TimedExecutor:
         times = [at_s for at_s in (plan_s, return_s, self._next_own_s()) if at_s is not None]
         if times:
             self._timer = asyncio.get_running_loop().call_at(min(times), self._wake)
+
+
+# No outputs at all: follows plans in time and only remembers what it would have done.
+
+_DRY_KEPT = 10_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DryChange:
+    """A change of duty that an output would have made."""
+
+    at_s: float
+    valve: int
+    duty: float
+
+
+class DryRunExecutor(TimedExecutor):
+    """For the first flights with the sprayer switched off, and for tests."""
+
+    def __init__(self, valve_count: int, *, has_return: bool = False) -> None:
+        super().__init__(valve_count, has_return=has_return)
+        self._duty: list[float | None] = [None] * (valve_count + has_return)
+        self.changes: deque[DryChange] = deque(maxlen=_DRY_KEPT)
+
+    def _apply(self, valve: int, duty: float) -> bool:
+        if self._duty[valve] == duty:
+            return False
+        self._duty[valve] = duty
+        at_s = asyncio.get_running_loop().time()
+        self.changes.append(DryChange(at_s=at_s, valve=valve, duty=duty))
+        return True
+
+    async def stop(self) -> None:
+        """Close what is open; before `start` there is nothing."""
+        if self._is_running:
+            await super().stop()

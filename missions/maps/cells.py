@@ -20,10 +20,10 @@ from missions.maps.crs import (
     SEGMENT_M,
     WGS84,
     Objects,
+    check_extent,
     densified,
     is_wgs84,
 )
-from missions.maps.crs_place import check_extent
 from missions.maps.model import Affine, MapCells, map_error
 
 Floats = NDArray[np.float64]

@@ -22,7 +22,7 @@ from companion.core.prescription import FIELD, Prescription
 from companion.core.setup import Setup
 from companion.errors import ConfigError, MapError
 from companion.flight_map import FlightMap, frozen_settings, is_flight_map, read_flight_map
-from companion.flight_map.sources import named_files, sources_of
+from companion.flight_map.model import named_files, sources_of
 from companion.problem import Problem
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.layer import read_bytes

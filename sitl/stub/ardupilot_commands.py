@@ -9,7 +9,7 @@ from sitl.stub import commands
 from sitl.stub.commands import ACCEPTED, DENIED, FAILED
 from sitl.stub.faults import FaultKind
 from sitl.stub.firmware import CommandHandler, Params
-from sitl.stub.modes import LAND, LOITER, RTL
+from sitl.stub.mission_items import LAND, LOITER, RTL
 from sitl.stub.outputs import ServoOutputs
 from sitl.stub.protocol import Message, dialect
 

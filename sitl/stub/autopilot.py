@@ -16,8 +16,7 @@ from sitl.stub import actions, mission, services
 from sitl.stub.faults import Fault, FaultClock, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Parts, Upload
 from sitl.stub.liquid import Battery
-from sitl.stub.mission_items import MissionItem
-from sitl.stub.modes import AUTO, INFO
+from sitl.stub.mission_items import AUTO, INFO, MissionItem
 from sitl.stub.outputs import OutputState
 from sitl.stub.protocol import (
     AUTOPILOT_COMPONENT,
@@ -29,7 +28,7 @@ from sitl.stub.protocol import (
     sender,
     target,
 )
-from sitl.stub.strangers import Strangers
+from sitl.stub.streams import Strangers
 from sitl.stub.world import Pose
 
 UTC_START_S = 1_774_080_000.0  # 2026-03-21 08:00

@@ -15,8 +15,7 @@ from typing import Protocol
 from sitl.stub.faults import Fault, FaultClock, FaultKind
 from sitl.stub.flight import Flight
 from sitl.stub.liquid import Battery
-from sitl.stub.mission_items import MissionItem
-from sitl.stub.modes import INFO
+from sitl.stub.mission_items import INFO, MissionItem
 from sitl.stub.outputs import Outputs
 from sitl.stub.parameters import Parameters
 from sitl.stub.protocol import Channel, Message, SigningKey, dialect

@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from sitl.earth import Earth
-from sitl.stub.mission_items import ABSOLUTE_FRAMES, ACTION_NAMES, ACTIONS, MissionItem
-from sitl.stub.modes import (
+from sitl.stub.mission_items import (
+    ABSOLUTE_FRAMES,
+    ACTION_NAMES,
+    ACTIONS,
     AUTO,
     BRAKE,
     CRITICAL,
@@ -23,6 +25,7 @@ from sitl.stub.modes import (
     MODE_NAMES,
     RTL,
     FlightEvent,
+    MissionItem,
     Phase,
 )
 from sitl.stub.parameters import (

@@ -10,8 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sitl.stub.firmware import Upload
-from sitl.stub.mission_items import MissionItem, item_message, item_of
-from sitl.stub.modes import AUTO, Phase
+from sitl.stub.mission_items import AUTO, MissionItem, Phase, item_message, item_of
 from sitl.stub.protocol import Message, dialect, sender
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from sitl.stub import commands
 from sitl.stub.commands import ACCEPTED, DENIED, FAILED, REJECTED
 from sitl.stub.firmware import CommandHandler, Params
-from sitl.stub.modes import AUTO, GUIDED, LAND, LOITER, RTL
+from sitl.stub.mission_items import AUTO, GUIDED, LAND, LOITER, RTL
 from sitl.stub.outputs import ActuatorOutputs
 from sitl.stub.protocol import Message, dialect
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sitl.stub.protocol import Channel
 
 
-from sitl.stub.modes import BRAKE
+from sitl.stub.mission_items import BRAKE
 
 # Until this version nobody acknowledged DO_SET_ACTUATOR, and a NaN overwrote (PR #22711).
 ACKNOWLEDGED_SINCE = (1, 14, 2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sitl.stub.faults import FaultKind
-from sitl.stub.modes import WARNING
+from sitl.stub.mission_items import WARNING
 from sitl.stub.protocol import AUTOPILOT_SYSTEM, Message, dialect, sender
 
 if TYPE_CHECKING:

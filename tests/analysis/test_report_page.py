@@ -18,11 +18,10 @@ from analysis.assess.causes import Cause
 from analysis.assess.cell_maps import Histogram
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report, embedded, page_of
-from analysis.report.clock import clock_of
 from analysis.report.contents import METRICS, contents_of, held_between, held_ground
 from analysis.report.drawing import histogram
-from analysis.report.told import told_with
-from analysis.report.treated import treated_of
+from analysis.report.legal_fields import told_with
+from analysis.report.treated import clock_of, treated_of
 from companion.record.writer import Event
 from tests.analysis.report_flight import EU_TOLD, fly
 

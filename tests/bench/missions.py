@@ -27,6 +27,7 @@ from shapely.affinity import rotate, translate
 
 from companion.core.frame import LocalFrame
 from companion.errors import VrsprayError
+from missions.corners import Motion
 from missions.demand import Uniform
 from missions.field import Field, build_field
 from missions.maps.local import Area, as_area, polygons_of
@@ -34,7 +35,6 @@ from missions.maps.registry import read_area
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.strips import Floats, lengths_m, united
-from missions.turns import Motion
 from tests.bench.peers import grid_lines, longest_edge_deg, nearest_order
 
 WIDTH_M, SPEED_M_S, RATE_L_HA, TANK_L = 7.0, 6.0, 20.0, 40.0

@@ -29,6 +29,7 @@ from shapely import box
 
 from analysis.flight_record import FlightRecord
 from companion.config import Config, load
+from missions.corners import Motion
 from missions.coverage import measure
 from missions.demand import Demand, demands
 from missions.files.items import items_of
@@ -38,7 +39,6 @@ from missions.planner import plan_mission
 from missions.reading import Asked, Task, read_task
 from missions.schedule import scheduled
 from missions.strips import Floats
-from missions.turns import Motion
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.vehicle import Vehicle

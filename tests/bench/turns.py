@@ -13,9 +13,9 @@ import json
 import sys
 from typing import Literal
 
+from missions.corners import Motion
 from missions.plan import Leg as Planned
 from missions.plan import nose_s
-from missions.turns import Motion
 from sitl.vehicle import TURN_RATE_DEG_S, Leg, Route, Vehicle
 
 PASSES, LONG_M, ASIDE_M, SPEED_M_S, ACCELERATION_M_S2 = 10, 120.0, 7.0, 6.0, 2.5

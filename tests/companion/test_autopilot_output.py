@@ -9,10 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.output.autopilot_budget import OrderBudget, dither_too_much, order_budget
-from companion.output.autopilot_check import OutputCheck, ardupilot_places
 from companion.output.autopilot_findings import dead_man, findings, wanted_parameters
-from companion.output.servo import ServoExecutor, ServoOptions
+from companion.output.autopilot_options import OutputCheck, ardupilot_places
+from companion.output.servo import (
+    OrderBudget,
+    ServoExecutor,
+    ServoOptions,
+    dither_too_much,
+    order_budget,
+)
 from tests.builders import now, plan
 
 CHANNELS = (1, 2, 3)

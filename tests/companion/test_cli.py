@@ -18,8 +18,8 @@ from companion.core.types import SprayPlan
 from companion.errors import ActuatorError, LinkError, VrsprayError
 from companion.link.vehicle_link import VehicleLink
 from companion.output.gpio import GpioExecutor
-from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor
+from companion.output.timed import DryRunExecutor
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 CONFIG = str(FOLDER / "config.toml")

@@ -8,8 +8,7 @@ from companion.core.nozzle import PwmLimits
 from companion.doctor.check import Status
 from companion.doctor.engine_trial import engine_checks, read_engine
 from companion.output.engine.selftest import SelfTest
-from companion.output.engine.setup import EngineSetup
-from companion.output.engine.wiring import Wiring
+from companion.output.engine.setup import EngineSetup, Wiring
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 FOUND = SelfTest(

@@ -16,8 +16,8 @@ from companion.output.autopilot_findings import findings
 from companion.output.autopilot_options import DriveOutput, ServoOptions
 from companion.output.engine import closer
 from companion.output.hardware_pwm import HardwarePwmExecutor, PwmDrive
-from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor
+from companion.output.timed import DryRunExecutor
 from tests.builders import now, plan
 
 PUMP = DriveOutput(channel=5, stop_us=1100, max_us=1900)

@@ -14,7 +14,7 @@ from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.engine.engine import GAP_S, Engine
 from companion.output.engine.lines import MemoryLines
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import (
     Issued,
     Kind,
@@ -24,7 +24,6 @@ from companion.output.engine.wire import (
     plan_from,
     unpack,
 )
-from companion.output.engine.wiring import Wiring
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 T = PWM.period_s

@@ -14,9 +14,8 @@ from companion.errors import ActuatorError
 from companion.output.engine import closer, gpiod_lines, lines
 from companion.output.engine.gpiod_lines import GpiodLines, find_chip, keeps_levels, load_gpiod
 from companion.output.engine.lines import open_lines
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.spi595 import SpiRegister
-from companion.output.engine.wiring import Wiring
 from tests.fake_gpiod import FakeChip, FakeGpiod
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)

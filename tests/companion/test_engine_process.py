@@ -18,9 +18,8 @@ from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ActuatorError
 from companion.output.engine.selftest import WAKES
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import CHANGES_MAX
-from companion.output.engine.wiring import Wiring
 from companion.output.gpio import LATE_MAX_S, GpioExecutor
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)

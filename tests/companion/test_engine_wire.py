@@ -8,7 +8,7 @@ import pytest
 
 from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.setup import EngineSetup, Wiring, hazards
 from companion.output.engine.wire import (
     CHANGES_MAX,
     PACKET_MAX,
@@ -24,7 +24,6 @@ from companion.output.engine.wire import (
     status_from,
     unpack,
 )
-from companion.output.engine.wiring import Wiring, hazards
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 PLAN = SprayPlan(

@@ -13,9 +13,8 @@ from pathlib import Path
 import pytest
 
 from companion.core.nozzle import PwmLimits
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack
-from companion.output.engine.wiring import Wiring
 from companion.output.gpio import COMMAND, EngineChild
 from sitl.demo import do_all
 from tests.companion.test_service_unit import UNIT

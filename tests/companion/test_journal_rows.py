@@ -13,7 +13,7 @@ from companion.core.types import SprayPlan, TimedChange, UtcReport
 from companion.link.codec import FROM_VEHICLE
 from companion.output.engine.wire import Issued
 from companion.output.gpio import GpioExecutor
-from companion.output.none import DryRunExecutor
+from companion.output.timed import DryRunExecutor
 from companion.record.folder import look_at
 from companion.record.journal import Journal
 from companion.record.reader import read_journal

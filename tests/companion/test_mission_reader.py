@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from companion.core.types import LegReport
 from companion.link.component import Component, ComponentOptions
 from companion.link.encode import Encoder
-from companion.link.mission_messages import (
+from companion.link.messages import (
     MissionCurrent,
     MissionItem,
     MissionStep,

@@ -22,8 +22,8 @@ from companion.config.rules import without_effect
 from companion.errors import ConfigError
 from companion.link.vehicle_link import VehicleLink
 from companion.output.hardware_pwm import HardwarePwmExecutor
-from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor
+from companion.output.timed import DryRunExecutor
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "pump.md").read_text(), re.DOTALL)[0]

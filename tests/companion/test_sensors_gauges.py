@@ -14,8 +14,7 @@ import pytest
 from companion.cli.sensor_parts import PressureSensor, TankSensor
 from companion.core.types import PressureReport, TankReport
 from companion.errors import SensorError
-from companion.sensors.current_loop import CurrentLoop
-from companion.sensors.voltage import Gauge, I2cVoltage, IioVoltage
+from companion.sensors.voltage import CurrentLoop, Gauge, I2cVoltage, IioVoltage
 
 LOOP = CurrentLoop(name="pressure", shunt_ohm=100.0, at_4_ma=0.0, at_20_ma=1000.0)
 

@@ -20,9 +20,8 @@ import pytest
 from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.engine.gpiod_lines import GpiodLines, load_gpiod
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack
-from companion.output.engine.wiring import Wiring
 from companion.output.gpio import COMMAND, EngineChild, GpioExecutor
 from tests.gpio.sim import SimChip
 

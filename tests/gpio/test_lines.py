@@ -12,8 +12,7 @@ from companion.errors import ActuatorError
 from companion.output.engine import closer
 from companion.output.engine.gpiod_lines import GpiodLines, find_chip, load_gpiod
 from companion.output.engine.lines import Lines, open_lines
-from companion.output.engine.setup import EngineSetup
-from companion.output.engine.wiring import Wiring
+from companion.output.engine.setup import EngineSetup, Wiring
 from tests.gpio.sim import SimChip
 
 pytestmark = pytest.mark.needs_gpiosim

@@ -407,8 +407,8 @@ def test_a_virtual_table_is_no_layer(tmp_path: Path) -> None:
 def test_work_without_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = by_gdal(tmp_path / "rx.gpkg", grounds=[SQUARE] * 2000, rates=[1.0] * 2000)
     assert len(read_geopackage(path).geometries) == 2000
-    monkeypatch.setattr("missions.maps.geopackage.sqlite._STEPS_MAX", 1000)
-    monkeypatch.setattr("missions.maps.geopackage.sqlite._STEPS_PER_CALL", 500)
+    monkeypatch.setattr("missions.maps.geopackage.layers._STEPS_MAX", 1000)
+    monkeypatch.setattr("missions.maps.geopackage.layers._STEPS_PER_CALL", 500)
     assert refused(path).code == "too-large"
 
 

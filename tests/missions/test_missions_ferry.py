@@ -246,8 +246,7 @@ def test_the_configuration_refuses_it_too_and_otherwise_sets_it(
 
 
 def test_a_depot_on_the_end_of_a_line_needs_no_ferry_height() -> None:
-    from missions.ferries import at_ferry_height
-    from missions.plan import Leg, Sortie
+    from missions.plan import Leg, Sortie, at_ferry_height
 
     settings = Settings(swath_width_m=6.0, speed_m_s=6.0, ferry_height_m=20.0)
     spray = Leg(kind="spray", points=((0.0, 0.2), (0.0, 90.0)), speed_m_s=6.0)

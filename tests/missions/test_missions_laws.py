@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from shapely import Polygon
 from shapely.affinity import rotate
 
+from missions.corners import Motion
 from missions.coverage import patches, reachable
 from missions.demand import Uniform, cut, demands
 from missions.field import build_field
@@ -25,10 +26,16 @@ from missions.search import improve
 from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing
 from missions.stops import near_pairs, waypoints_of
-from missions.strips import joined, lengths_m, rectangles, united
-from missions.swaths import border_passes, inner_ground, inner_lines
+from missions.strips import (
+    border_passes,
+    inner_ground,
+    inner_lines,
+    joined,
+    lengths_m,
+    rectangles,
+    united,
+)
 from missions.tour import by_savings, cost_s
-from missions.turns import Motion
 from missions.ways import build_ways
 from tests.bench.missions import FRAME, random_field, to_degrees
 

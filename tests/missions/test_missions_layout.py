@@ -11,11 +11,10 @@ from shapely import Polygon, box
 from shapely.affinity import rotate
 
 from missions import open_lines as lines_module
+from missions.corners import Motion
 from missions.coverage import measure
 from missions.open_lines import edges_along, fitted_lines, needed_passes, open_lines
-from missions.strips import lengths_m
-from missions.swaths import border_passes
-from missions.turns import Motion
+from missions.strips import border_passes, lengths_m
 from tests.bench.missions import comb
 from tests.bench.turns import model_s, twin_s
 

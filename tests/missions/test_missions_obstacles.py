@@ -18,7 +18,7 @@ from companion.cli.app import execute
 from companion.errors import MapError
 from missions.field import frame_of
 from missions.maps.registry import read_area
-from missions.obstacles import read_obstacles
+from missions.reading_outline import read_obstacles
 from tests.bench.missions import to_degrees
 from tests.missions.test_missions_cli import written
 

@@ -10,6 +10,7 @@ import shapely
 from shapely import Polygon, box
 
 from companion.core.prescription import Prescription, Zone
+from missions.corners import Motion
 from missions.coverage import measure
 from missions.demand import Rates, Uniform, cut, demands
 from missions.errors import PlanError
@@ -19,7 +20,6 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.reading import MapRates
 from missions.strips import lengths_m, rectangles
-from missions.turns import Motion
 from missions.ways import build_ways, edge_places
 from tests.bench.missions import FRAME, comb, outside_m2, to_degrees, transit_outside_m
 

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from shapely import LineString, box
 from shapely.affinity import rotate
 
+from missions.corners import Motion
 from missions.demand import Uniform, demands
 from missions.energy import Battery
 from missions.field import build_field
@@ -24,7 +25,6 @@ from missions.refill_search import merged, regrouped
 from missions.refills import Limits, Part, Passes, Times, flown_by, plainly, split
 from missions.sheet import sheet
 from missions.strips import Floats
-from missions.turns import Motion
 from tests.bench.large_fields import compared, depots_of
 from tests.mission_fields import degrees
 from tests.mission_judge import Drawn

@@ -18,6 +18,7 @@ from shapely import Polygon, box
 
 from companion.cli.app import execute
 from missions.boom import Boom
+from missions.corners import Motion
 from missions.coverage import measure, reachable
 from missions.demand import Uniform
 from missions.field import build_field
@@ -28,9 +29,7 @@ from missions.planner import plan_mission
 from missions.prices import closing_hint, overlap_warnings
 from missions.selection import Aim, chosen, families
 from missions.sheet import sheet
-from missions.strips import joined, lengths_m, rectangles, united, whole
-from missions.swaths import border_passes
-from missions.turns import Motion
+from missions.strips import border_passes, joined, lengths_m, rectangles, united, whole
 from tests.bench.small_fields import VALVES
 from tests.mission_fields import degrees
 from tests.small_fields import DITCH_M, KINDS, made_up

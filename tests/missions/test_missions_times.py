@@ -12,11 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from missions.corners import LAGS_S, PX4_DRAG_S, PX4_TURNING_S, parts_s
+from missions.corners import LAGS_S, PX4_DRAG_S, PX4_TURNING_S, Motion, parts_s
 from missions.energy import VERTICALS
 from missions.plan import JERKS_M_S3, Leg, Settings, Sortie
 from missions.stops import timed
-from missions.turns import Motion
 from sitl.vehicle import Leg as Flown
 from sitl.vehicle import Route, Vehicle
 

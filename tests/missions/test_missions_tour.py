@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from shapely import Polygon, box
 
 from missions.boom import Boom
+from missions.corners import Motion
 from missions.coverage import measure, reachable
 from missions.demand import Pieces, Uniform
 from missions.field import build_field
@@ -16,10 +17,8 @@ from missions.free_space import free_space
 from missions.network import Network, build_network
 from missions.plan import Settings
 from missions.planner import plan_mission
-from missions.strips import Floats, joined, lengths_m
-from missions.swaths import axes
+from missions.strips import Floats, axes, joined, lengths_m
 from missions.tour import by_savings, cost_s, shortest_tour
-from missions.turns import Motion
 from missions.worth import tour_of, worthwhile
 from tests.bench.missions import FRAME, comb, to_degrees
 

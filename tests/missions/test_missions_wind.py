@@ -14,9 +14,8 @@ from shapely import Polygon, box
 
 from companion.config import load
 from missions.errors import PlanError
-from missions.field import build_field
+from missions.field import WindBuffer, build_field
 from missions.reading_ground import SwathPoint, swath_width_m
-from missions.wind import WindBuffer
 from tests.bench.missions import FRAME, to_degrees
 from tests.missions.test_missions_cli import ANYANG, run, written
 

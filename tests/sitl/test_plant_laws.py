@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from companion.core.types import SprayPlan, TimedChange
 from companion.output.pwm import PulseEngine, needs_restart
 from sitl.board import ValvePulses, phase_of
-from sitl.edges import BoardEdge
 from sitl.knowledge import pwm_limits
+from sitl.meter import BoardEdge
 from sitl.plant import AveragedPlant, Plant, PulsedPlant
 from sitl.profile import PlantProfile, load_profile
 

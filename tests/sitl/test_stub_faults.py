@@ -9,7 +9,7 @@ import pytest
 
 from companion.errors import ConfigError
 from sitl.stub.faults import Fault, FaultKind, read_scenario
-from sitl.stub.modes import AUTO, LOITER, Phase
+from sitl.stub.mission_items import AUTO, LOITER, Phase
 from sitl.stub.protocol import dialect
 from tests.sitl.stub_bench import Bench, mission
 

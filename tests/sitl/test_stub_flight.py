@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sitl.stub.mission_items import MissionItem
-from sitl.stub.modes import AUTO, GUIDED, LAND, LOITER, RTL, Phase
+from sitl.stub.mission_items import AUTO, GUIDED, LAND, LOITER, RTL, MissionItem, Phase
 from sitl.stub.protocol import dialect
 from tests.sitl.stub_bench import Bench, mission, place
 

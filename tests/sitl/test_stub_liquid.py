@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
-from companion.sensors.current_loop import CurrentLoop
-from companion.sensors.voltage import IioVoltage
+from companion.sensors.voltage import CurrentLoop, IioVoltage
 from sitl.liquid_faults import LiquidFaultKind, healthy_kpa
 from sitl.serve import ServeOptions, serve
 from sitl.stub.build import StubOptions, build_autopilot

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from sitl.serve import Operator, Step
-from sitl.stub.modes import AUTO, LAND, Phase
+from sitl.stub.mission_items import AUTO, LAND, Phase
 from sitl.stub.protocol import Listener, SigningKey, Speaker, dialect
 from sitl.stub.scenario import Scenario
 from tests.sitl.stub_bench import Bench, mission

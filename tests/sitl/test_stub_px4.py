@@ -10,8 +10,7 @@ import pytest
 
 from sitl.stub.faults import Fault, FaultKind
 from sitl.stub.firmware import Version
-from sitl.stub.mission_items import MissionItem, item_message
-from sitl.stub.modes import AUTO, LOITER, Phase
+from sitl.stub.mission_items import AUTO, LOITER, MissionItem, Phase, item_message
 from sitl.stub.protocol import dialect
 from sitl.stub.scenario import Scenario
 from tests.sitl.stub_bench import Bench, mission, place

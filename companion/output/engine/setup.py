@@ -8,7 +8,104 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
 from companion.core.nozzle import PwmLimits
-from companion.output.engine.wiring import Wiring
+
+# What hangs on the lines: which level opens, which one is safe, what remains without a program.
+#
+# Outputs are numbered: the valves from the left, the return valve behind them if there is one, the
+# ALIVE line last if there is one. Their levels travel as the bits of one integer.
+
+# Lines that one request of the kernel's GPIO interface can hold, and outputs of 8 registers.
+OUTPUTS_MAX = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wiring:
+    """Lines (or register outputs), kinds of valve, and the drivers' polarity.
+
+    A coil that draws current opens a normally closed valve and shuts a normally open one. With
+    `active_low` a driver sends current while its line is low.
+    """
+
+    valves: tuple[int, ...]
+    return_line: int | None = None
+    alive_line: int | None = None
+    normally_open: bool = False
+    return_normally_open: bool = True
+    active_low: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.valves or len(set(self.lines)) != len(self.lines):
+            raise ValueError(f"each output needs a line of its own, got {self.lines}")
+        if not len(self.lines) <= OUTPUTS_MAX:
+            raise ValueError(f"at most {OUTPUTS_MAX} outputs, got {len(self.lines)}")
+        if not all(0 <= line <= 1023 for line in self.lines):
+            raise ValueError(f"lines are 0 to 1023, got {self.lines}")
+
+    @property
+    def lines(self) -> tuple[int, ...]:
+        """Return the line of each output, by its number."""
+        more = (self.return_line, self.alive_line)
+        return self.valves + tuple(line for line in more if line is not None)
+
+    @property
+    def has_return(self) -> bool:
+        """Return whether there is a return valve."""
+        return self.return_line is not None
+
+    @property
+    def alive(self) -> int | None:
+        """Return the number of the ALIVE output."""
+        return None if self.alive_line is None else len(self.lines) - 1
+
+    def level(self, output: int, *, is_open: bool) -> bool:
+        """Return the level that opens or shuts the valve at an output.
+
+        >>> Wiring(valves=(17,)).level(0, is_open=True)
+        True
+        >>> Wiring(valves=(17,), normally_open=True).level(0, is_open=True)
+        False
+        """
+        opens_idle = self.normally_open if output < len(self.valves) else self.return_normally_open
+        has_current = is_open != opens_idle
+        return has_current != self.active_low
+
+    @property
+    def safe_levels(self) -> int:
+        """Return the levels of the safe state: valves shut, return open, ALIVE low.
+
+        >>> bin(Wiring(valves=(17, 18), normally_open=True).safe_levels)
+        '0b11'
+        """
+        levels = 0
+        for output in range(len(self.valves) + self.has_return):
+            levels |= self.level(output, is_open=output >= len(self.valves)) << output
+        return levels
+
+
+def hazards(wiring: Wiring, *, keeps_levels: bool | None) -> list[str]:
+    """Return what happens to these valves when the program dies or the power fails.
+
+    `keeps_levels` is whether this kernel leaves a released line at its last level (Raspberry Pi's
+    without `strict_gpiod`); None where the driver does not say.
+    """
+    found = []
+    if wiring.normally_open:
+        found.append(
+            "normally open valves spray when their power fails: only the pump's cut-off stops them"
+        )
+        if keeps_levels is False:
+            found.append(
+                "lines become inputs when the engine ends, so normally open valves open: remove "
+                "strict_gpiod from config.txt"
+            )
+    elif keeps_levels:
+        found.append(
+            "a killed engine leaves its valves as they were: add dtparam=strict_gpiod to config.txt"
+        )
+    if wiring.alive_line is None:
+        found.append("no ALIVE line: a stopped computer leaves its valves as they were")
+    return found
+
 
 Backend = Literal["gpiod", "spi595", "memory", "file"]
 

@@ -23,20 +23,24 @@ from missions.maps.bundle import one_of, open_bundle
 from missions.maps.crs import WGS84, parse_crs
 from missions.maps.fields import column_of, stated_unit
 from missions.maps.geopackage.layers import (
+    Cell,
     CurvedError,
+    Database,
     Found,
     LayerTable,
     Rings,
     areas_of,
+    check_closed,
     check_size,
     chosen_layer,
     is_numeric,
     is_outline,
     layers_of,
+    open_database,
     polygons_in,
+    quoted,
     value_of,
 )
-from missions.maps.geopackage.sqlite import Cell, Database, check_closed, open_database, quoted
 from missions.maps.layer import Column, Layer, Value, check_counts, digest, read_bytes
 from missions.maps.local import BOUNDARY_NAME, Area, outline_of
 from missions.maps.model import MapZone, map_error

@@ -15,7 +15,7 @@ from missions.maps.geotiff.reader import grid_of_tiff
 from missions.maps.layer import Grid
 from missions.maps.local import outline_of
 from missions.maps.model import Problem, map_error
-from missions.maps.shapefile.files import find_shapefile
+from missions.maps.shapefile.dbf import find_shapefile
 from missions.maps.shapefile.reader import read_shapefile
 
 RX_FOLDER, SHAPE_FOLDER = "Rx", "ShapeFile"

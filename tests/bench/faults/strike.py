@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING
 
 from sitl.stub.faults import Fault, FaultClock, FaultKind
-from sitl.stub.modes import LOITER, Phase
+from sitl.stub.mission_items import LOITER, Phase
 from tests.bench.faults.cases import PROCESS_KINDS, Draw, Kind
 from tests.bench.faults.place import ORIGIN
 from tests.bench.faults.record import Struck

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from sitl.board import DriverBoard
 from sitl.profile import load_profile
 from sitl.stub.build import StubOptions, build_autopilot
-from sitl.stub.modes import AUTO, Phase
+from sitl.stub.mission_items import AUTO, Phase
 from sitl.stub.outputs import ServoOrder
 from sitl.stub.protocol import (
     AUTOPILOT_SYSTEM,

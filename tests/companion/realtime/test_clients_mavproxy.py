@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sitl.stub.modes import Phase
+from sitl.stub.mission_items import Phase
 from tests.companion.realtime.client_bench import Bench, flying_bench, passes, prescribed_l
 from tests.companion.realtime.other_clients import (
     TO_AUTO,

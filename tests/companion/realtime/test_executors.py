@@ -13,11 +13,10 @@ from companion.cli.output_parts import CompositeExecutor, Part
 from companion.core.nozzle import PwmLimits
 from companion.core.types import TimedChange
 from companion.output.autopilot_options import DriveOutput
-from companion.output.engine.setup import EngineSetup
-from companion.output.engine.wiring import Wiring
+from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.gpio import GpioExecutor
-from companion.output.none import DryRunExecutor
 from companion.output.servo import ServoExecutor, ServoOptions
+from companion.output.timed import DryRunExecutor
 from companion.ports import PlanExecutor
 from tests.builders import now, plan
 from tests.quickest import quickest

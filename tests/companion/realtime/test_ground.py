@@ -16,9 +16,8 @@ from companion.ground.shell import GroundOutcome, perform
 from companion.ground.work import GroundKind, GroundSetup, Hold, clicks, together
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
-from companion.output.engine.setup import EngineSetup
+from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import Issued
-from companion.output.engine.wiring import Wiring
 from companion.output.gpio import GpioExecutor
 from companion.output.servo import ServoExecutor, ServoOptions
 from tests import builders

@@ -14,7 +14,7 @@ import pytest
 
 from sitl.stub.autopilot import Autopilot
 from sitl.stub.build import StubOptions, build_autopilot
-from sitl.stub.modes import AUTO, Phase
+from sitl.stub.mission_items import AUTO, Phase
 from sitl.stub.server import StubServer
 from tests.companion.realtime.other_clients import (
     TO_AUTO,

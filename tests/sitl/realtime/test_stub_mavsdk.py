@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from sitl.stub.build import StubOptions, build_autopilot
-from sitl.stub.modes import AUTO, Phase
+from sitl.stub.mission_items import AUTO, Phase
 from sitl.stub.server import StubServer
 from tests.companion.realtime.other_clients import raw_items
 from tests.companion.wire_peer import free_port
