@@ -16,23 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.exports.columns import Column, Unit, plain_names
+from analysis.exports.csv_points import described
 from analysis.strips import strips_of
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content
     from analysis.exports.source import Source
-
-
-import json
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
-
-from analysis.exports.columns import valve_columns
-
-if TYPE_CHECKING:
-    from analysis.exports.output import Content
-    from analysis.exports.source import Source
-
 
 Floats = NDArray[np.float64]
 
@@ -97,76 +86,3 @@ def _table(columns: list[Column]) -> Iterator[bytes]:
     rows = np.stack([np.asarray(each.values) for each in columns], axis=1)
     for start in range(0, len(rows), _BLOCK):
         yield "".join(form % tuple(row) for row in rows[start : start + _BLOCK].tolist()).encode()
-
-
-# As-applied points as CSV: a row a sample, and what its columns mean in a file beside.
-#
-# The file beside is metadata for tabular data on the web (W3C, `<name>-metadata.json`), which
-# programs look for under this name.
-
-# Nine decimals are a tenth of a millimetre on the ground.
-_DEGREES = Unit(suffix="deg", label="deg", code="arcdeg", decimals=9)
-# Many rows at a time: calls cost more than memory.
-_POINTS_BLOCK = 10_000
-
-
-def make_points(source: Source, out: Path) -> Content:
-    """Return the table and what is to say about it."""
-    samples = source.samples
-    columns = list(source.columns)
-    columns[1:1] = [
-        _degrees("latitude_deg", samples.latitude_deg),
-        _degrees("longitude_deg", samples.longitude_deg),
-    ]
-    columns += valve_columns(samples, source.valve_names, source.units)
-    about = described(out.name, columns, source.facts())
-    return {f"{out.name}-metadata.json": about, out.name: csv_of(columns)}
-
-
-def csv_of(columns: Sequence[Column]) -> Iterator[bytes]:
-    """Yield a table by RFC 4180, but for its line ends, which are those of every other tool."""
-    yield (",".join(quoted(each.name) for each in columns) + "\n").encode()
-    texts = [
-        each.texts() if each.unit is not None else [quoted(text) for text in each.texts()]
-        for each in columns
-    ]
-    rows = [",".join(row) for row in zip(*texts, strict=True)]
-    for start in range(0, len(rows), _POINTS_BLOCK):
-        yield ("\n".join(rows[start : start + _POINTS_BLOCK]) + "\n").encode()
-
-
-def quoted(text: str) -> str:
-    """Return a text as a field of a table.
-
-    >>> quoted('a "b", c'), quoted("plain")
-    ('"a ""b"", c"', 'plain')
-    """
-    if any(sign in text for sign in ',"\r\n'):
-        return '"' + text.replace('"', '""') + '"'
-    return text
-
-
-def described(name: str, columns: Iterable[Column], facts: dict[str, object]) -> Iterable[bytes]:
-    """Return the metadata of a table."""
-    document = {
-        "@context": "http://www.w3.org/ns/csvw",
-        "url": name,
-        "notes": [facts],
-        "tableSchema": {
-            "columns": [
-                {
-                    "name": each.name,
-                    "titles": each.name,
-                    "datatype": "string" if each.unit is None else "number",
-                    "dc:description": each.description,
-                    "schema:unitText": "" if each.unit is None else each.unit.label,
-                }
-                for each in columns
-            ]
-        },
-    }
-    return [json.dumps(document, indent=2, allow_nan=False).encode() + b"\n"]
-
-
-def _degrees(name: str, values: Floats) -> Column:
-    return Column(name=name, short="", description="WGS84", unit=_DEGREES, values=values)
