@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -97,8 +98,7 @@ CURVE_CHORDS = 6
 KNOTS_APART_S = 1e-3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Paths:
+class Paths(NamedTuple):
     """Predicted paths of points of the boom: (points, knots) arrays, knots at `time_s`."""
 
     time_s: tuple[float, ...]

@@ -77,8 +77,13 @@ def _cuts(paths: Paths, ends: Floats, owner: NDArray[np.int64]) -> list[list[_Cu
     found: list[list[_Cut]] = [[] for _ in range(count)]
     if not len(ends):
         return found
-    px, py = paths.east_m[:, :-1].T.ravel(), paths.north_m[:, :-1].T.ravel()
-    dx, dy = paths.step_east_m.T.ravel(), paths.step_north_m.T.ravel()
+    if chords == 1:  # a straight pass, the usual case
+        px, py, reach = paths.east_m[:, 0], paths.north_m[:, 0], paths.length_m[:, 0]
+        dx, dy = paths.step_east_m[:, 0], paths.step_north_m[:, 0]
+    else:
+        px, py = paths.east_m[:, :-1].T.ravel(), paths.north_m[:, :-1].T.ravel()
+        dx, dy = paths.step_east_m.T.ravel(), paths.step_north_m.T.ravel()
+        reach = paths.length_m.T.ravel()
     corners = ends.reshape(-1, 2)
     left = dx[:, None] * corners[:, 1] - dy[:, None] * corners[:, 0]
     own = dx * py - dy * px
@@ -87,7 +92,7 @@ def _cuts(paths: Paths, ends: Floats, owner: NDArray[np.int64]) -> list[list[_Cu
     if not len(rows):
         return found
     l0, l1 = left[rows, 2 * hits].tolist(), left[rows, 2 * hits + 1].tolist()
-    own_, reach_ = own.tolist(), paths.length_m.T.ravel().tolist()
+    own_, reach_ = own.tolist(), reach.tolist()
     px_, py_, dx_, dy_ = px.tolist(), py.tolist(), dx.tolist(), dy.tolist()
     pace = paths.speed_m_s.tolist()
     kept = []
@@ -95,18 +100,18 @@ def _cuts(paths: Paths, ends: Floats, owner: NDArray[np.int64]) -> list[list[_Cu
         rows.tolist(), l0, l1, ends[hits].tolist(), owner[hits].tolist(), strict=True
     ):
         share = (a - own_[row]) / (a - b)
-        reach = reach_[row]
+        reach_m = reach_[row]
         s = (x0 + share * (x1 - x0) - px_[row]) * dx_[row]
         s += (y0 + share * (y1 - y0) - py_[row]) * dy_[row]
-        s /= max(reach, 1e-12)
-        if (START_NUDGE_M if row < count else 0.0) < s <= reach:
+        s /= max(reach_m, 1e-12)
+        if (START_NUDGE_M if row < count else 0.0) < s <= reach_m:
             # In order of the path; leaving before entering, where both are at one place.
-            kept.append((row // count, round(s * 1e6), a > b, row, s, reach, who))
+            kept.append((row // count, round(s * 1e6), a > b, row, s, reach_m, who))
     kept.sort()
     along = np.cumsum(paths.length_m, axis=1).tolist() if chords > 1 else []
-    for chord, _, enters, row, s, reach, who in kept:
+    for chord, _, enters, row, s, reach_m, who in kept:
         point = row - chord * count
-        share = s / reach
+        share = s / reach_m
         v0, v1 = pace[point][chord : chord + 2]
         v0_2 = v0 * v0
         speed = math.sqrt(v0_2 + (v1 * v1 - v0_2) * share)
