@@ -10,10 +10,11 @@ Nothing but the core's own types can come out: a journal is read, never executed
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from types import ModuleType
+from typing import get_args, get_type_hints
 
 import numpy as np
 
@@ -54,7 +55,28 @@ _FIELDS: dict[type, tuple[str, ...]] = {
     for item in _TYPES.values()
     if is_dataclass(item)
 }
-FIELD_NAMES: FieldNames = {item.__name__: names for item, names in _FIELDS.items()}
+
+
+def _kept(kinds: Iterable[object]) -> set[type]:
+    """Return the dataclasses that values of these kinds consist of.
+
+    What a set-up works out of itself is none of them: it is worked out again where it is read.
+    """
+    found: set[type] = set()
+    left = list(kinds)
+    while left:
+        kind = left.pop()
+        left += get_args(kind)
+        if isinstance(kind, type) and kind in _FIELDS and kind not in found:
+            found.add(kind)
+            hints = get_type_hints(kind)
+            left += [hints[name] for name in _FIELDS[kind]]
+    return found
+
+
+_KEPT = _kept((setup.Setup, types.Decision, types.Input))
+# Of what stands in a journal; all else would only lengthen it.
+FIELD_NAMES: FieldNames = {item.__name__: names for item, names in _FIELDS.items() if item in _KEPT}
 
 
 def to_plain(value: object) -> object:

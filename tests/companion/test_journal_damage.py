@@ -182,7 +182,11 @@ def test_what_a_cut_in_the_moment_of_closing_left_half_written_is_undone(path: P
 
 
 @pytest.mark.parametrize("share", [0.95, 0.5])
-def test_a_closed_journal_that_was_cut_off_gives_what_there_is(share: float, path: Path) -> None:
+def test_a_closed_journal_that_was_cut_off_gives_what_there_is(
+    share: float, tmp_path: Path
+) -> None:
+    # So long that its set-up and its first rows are in the first half.
+    path = closed_journal(tmp_path, 1500)
     whole = read_journal(path)
     os.truncate(path, int(path.stat().st_size * share))
     with pytest.raises(JournalError, match="is damaged"):
