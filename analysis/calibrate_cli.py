@@ -74,7 +74,7 @@ def lag(
         refusal,
         table_lines,
     )
-    from companion.record.reader import read_journal
+    from analysis.journals.content import read_journal
 
     if not 0.0 <= meter_lag_s <= 1.0:
         raise ConfigError(f"--meter-lag-s {meter_lag_s:g}: give 0 to 1 s")

@@ -28,3 +28,9 @@ WSP = Command(
     help="Coverage and drop sizes on water-sensitive paper.",
     haste="patient",
 )
+FLIGHTS = Command(
+    target="analysis.journals.cli:app",
+    help="List, show, pin, prune, recover journals.",
+    haste="patient",
+    hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
+)

@@ -36,6 +36,8 @@ from analysis.evaluation import Distances, Evaluation, evaluate_strips
 from analysis.flown.applied_flight import ValveChanges
 from analysis.flown.applied_record import EvaluationError, record_of
 from analysis.flown.read_applied import read_applied
+from analysis.journals.blocks import Entry
+from analysis.journals.content import JournalContent, read_journal
 from analysis.strips import strips_of
 from companion.core.controller import Memory, expected_coverage, step
 from companion.core.estimator import Track, estimate, observe
@@ -46,7 +48,7 @@ from companion.errors import ConfigError, UnreadableError
 from companion.record.codec import FIELD_NAMES, FieldNames, encode
 from companion.record.coverage_table import read_coverage
 from companion.record.new_file import computing
-from companion.record.reader import Entry, JournalContent, opened, read_journal
+from companion.record.reader import opened
 from companion.record.valve_rows import Row, ValveRows
 from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
 

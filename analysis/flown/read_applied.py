@@ -29,15 +29,15 @@ from analysis.flown.holes import (
     within,
 )
 from analysis.flown.unknown import unknown_times
+from analysis.journals.blocks import Entry
+from analysis.journals.content import damages, read_entries
 from companion.core.types import Decision
 from companion.errors import UnreadableError
-from companion.record.blocks import Entry
 from companion.record.codec import FieldNames, decode
 from companion.record.reader import OpenJournal, opened
 from companion.record.setup_json import field_names_of
 from companion.record.valve_rows import ValveRows
-from companion.record.versions import migrated, read_entries
-from companion.record.whole_file import damages
+from companion.record.versions import migrated
 from companion.record.writer import Event
 
 # Which rows of a journal's tables can be believed, row by row: the rest is left out and counted.

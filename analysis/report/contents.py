@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal
 from analysis.assess.causes import Cause, rate_wishes
 from analysis.flown.holes import UNREAD
 from analysis.flown.unknown import GAP_S
+from analysis.journals.content import content_sha256
 from analysis.published import P1_RESULTS
 from analysis.report.facts import wind_note
 from analysis.report.treated import duration_text
 from companion.core.types import Inhibit
-from companion.record.content_hash import content_sha256
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

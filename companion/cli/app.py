@@ -56,12 +56,6 @@ COMMANDS = {
         haste="patient",
         hastes={"check": "quick", "show": "quick", "schema": "quick"},
     ),
-    "flights": Command(
-        target="companion.cli.flights:app",
-        help="List, show, pin, prune, recover journals.",
-        haste="patient",
-        hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
-    ),
 }
 
 

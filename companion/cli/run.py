@@ -43,7 +43,7 @@ from companion.record.continuing import Treated, continued, read_treated_ground,
 from companion.record.folder import journals
 from companion.record.journal import Journal
 from companion.record.read_only import DAMAGE
-from companion.record.reader import opened, read_journal
+from companion.record.reader import is_empty, opened
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -137,7 +137,7 @@ def run_companion(
             )
     except (ActuatorError, LinkError, SensorError):
         # Without link, outputs or sensors the run ends before its first step: no flight to keep.
-        if not read_journal(journal.path).entries:
+        if is_empty(journal.path):
             journal.path.unlink()
         raise
     answer(

@@ -23,8 +23,6 @@ from companion.record.distrust import distrust
 from companion.record.geopackage import wkb_of
 from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
-from companion.record.totals import missing_rows
-from companion.record.whole_file import damages
 
 # Where nothing else is configured, whoever goes on closes a valve that is more over treated ground
 # than over bare: misses and doubles come out even.
@@ -54,41 +52,42 @@ class Treated:
         return 2.0 * float(self.setup.boom.half_width_m.min())
 
 
-def read_treated_ground(path: Path, *, is_lenient: bool = False) -> Treated:
+def read_treated_ground(path: Path) -> Treated:
     """Return what was treated when a flight ended, by it and before it.
 
-    JournalError where the file cannot be used or keeps no coverage. `is_lenient` leaves out what
-    is damaged and says so in `unread`.
+    JournalError where the file cannot be used or keeps no coverage, or where any of it is damaged.
     """
-    with opened(path, is_lenient=is_lenient) as journal:
-        unread = [*journal.unread]
-        if is_lenient:
-            unread += damages(journal.connection)
-            unread += missing_rows(journal.connection, journal.meta)
-        coverage = read_coverage(journal.connection, unread=unread if is_lenient else None)
-        if coverage is None and unread:
-            raise UnreadableError(
-                f"{path}: is damaged: no treated ground can be read of it ({unread[0]}); see "
-                "vrspray flights show"
-            )
-        if coverage is None:
-            raise JournalError(
-                f"{path}: keeps no treated ground: coverage.record was false, or an older version "
-                "wrote it"
-            )
-        setup = journal.setup(unread if is_lenient else None)
-        stopped = _stopped(journal, unread if is_lenient else None)
-        return Treated(
-            path=path,
-            coverage=coverage,
-            frame=setup.frame,
-            setup=setup,
-            stopped=stopped,
-            started_utc=journal.meta.get("started_utc", ""),
-            is_closed=journal.meta.get("closed") == "yes",
-            training=journal.meta.get("training"),
-            unread=tuple(unread),
+    with opened(path) as journal:
+        return treated_ground_of(journal)
+
+
+def treated_ground_of(journal: OpenJournal, unread: list[str] | None = None) -> Treated:
+    """Return what was treated; with `unread` what is damaged is left out and said there."""
+    path = journal.path
+    coverage = read_coverage(journal.connection, unread=unread)
+    if coverage is None and unread:
+        raise UnreadableError(
+            f"{path}: is damaged: no treated ground can be read of it ({unread[0]}); see "
+            "vrspray flights show"
         )
+    if coverage is None:
+        raise JournalError(
+            f"{path}: keeps no treated ground: coverage.record was false, or an older version "
+            "wrote it"
+        )
+    setup = journal.setup(unread)
+    stopped = _stopped(journal, unread)
+    return Treated(
+        path=path,
+        coverage=coverage,
+        frame=setup.frame,
+        setup=setup,
+        stopped=stopped,
+        started_utc=journal.meta.get("started_utc", ""),
+        is_closed=journal.meta.get("closed") == "yes",
+        training=journal.meta.get("training"),
+        unread=tuple(unread or ()),
+    )
 
 
 def _stopped(journal: OpenJournal, unread: list[str] | None) -> tuple[float, float] | None:

@@ -12,9 +12,12 @@ from __future__ import annotations
 import re
 import sqlite3
 import stat
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from functools import cache
 from pathlib import Path
 
-from companion.record.registers import own_tables
+from companion.record.geopackage import SCHEMA
 
 _MIB = 1 << 20
 # One value, as large as any journal's set-up with all its ground. SQLite's own limit is a gigabyte.
@@ -48,6 +51,11 @@ _LISTED = "SELECT type, name, tbl_name, rootpage, sql FROM sqlite_master"
 _SIDES = ("-wal", "-journal", "-shm")
 # The end of a rollback file that names another one (fileformat2.html, section 3).
 _NAMES_ANOTHER = bytes.fromhex("d9d505f920a163d7")
+# SQL of SQLite's own and of GeoPackage's registers comes with the tables; order as they depend.
+TABLES = (
+    "SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%' "
+    "AND sql IS NOT NULL ORDER BY rowid"
+)
 
 
 def known_tables() -> frozenset[str]:
@@ -186,3 +194,25 @@ def _check_rollback(path: Path) -> None:
         return
     if end == _NAMES_ANOTHER and size > len(_NAMES_ANOTHER):
         raise ValueError(f"{path.name} names another file")
+
+
+@contextmanager
+def empty_tables() -> Iterator[sqlite3.Connection]:
+    """Make a journal's tables in memory, without a row of a flight."""
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        connection.executescript(SCHEMA)
+        yield connection
+
+
+@cache
+def own_tables() -> dict[str, tuple[str, tuple[str, ...]]]:
+    """Return the tables of a journal of today, by their names: SQL, and columns."""
+    with empty_tables() as empty:
+        tables = empty.execute(TABLES).fetchall()
+        return {name: (sql, columns_of(empty, name)) for name, sql in tables}
+
+
+def columns_of(connection: sqlite3.Connection, table: str) -> tuple[str, ...]:
+    """Return the names of a table's columns."""
+    rows = connection.execute("SELECT name FROM pragma_table_info(?)", (table,))
+    return tuple(row[0] for row in rows)

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.errors import JournalError
-from companion.record.content_hash import log_of
-from companion.record.read_only import DAMAGE, one_line
+from companion.record.read_only import DAMAGE, log_of, one_line
 from companion.record.reader import OpenJournal, opened
 from companion.record.totals import applied_l
 from companion.record.versions import OtherVersionError

@@ -8,7 +8,7 @@ ValueError, or a row less.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 Value = int | float | str | bytes | None
@@ -21,6 +21,25 @@ _COLUMNS_MAX = 32
 # Bytes of a value by its serial type; of longer ones the type says it.
 _WIDTHS = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)
 _FLOAT, _ZERO, _ONE = 7, 8, 9
+# A letter a column: k the row's number (which is not in the record), i integer, r number, t text,
+# b bytes; a capital: never empty. As in `geopackage.SCHEMA`; other versions have other columns.
+COLUMNS = {
+    "applied": "kbtrrrrrrrrrtt",
+    "zones": "kBtr",
+    "field": "kB",
+    "cells": "kIIBBT",
+    "blocks": "kIIrriIBIB",
+    "block_dictionaries": "kB",
+    "valve_changes": "kiiII",
+    "link_stats": "kRiiiiiiirrrrrr",
+    "events": "ktrTT",
+    "coverage_tiles": "kTIIB",
+    "meta": "kTt",
+}
+_NUMBER_MAX = 2**53
+_GEOMETRY = b"GP"
+_TYPES: dict[str, tuple[type, ...]] = {"i": (int,), "r": (int, float), "t": (str,), "b": (bytes,)}
+Row = tuple[Value, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,3 +186,90 @@ def _value(kind: int, data: bytes) -> Value:
     if kind in (_ZERO, _ONE):
         return kind - _ZERO
     return int.from_bytes(data, "big", signed=True) if data else None
+
+
+def tables_of(cells: Sequence[Cell]) -> set[str]:
+    """Return the tables that a leaf may be of: those that all rows fit that fit any at all."""
+    fitting: set[str] | None = None
+    for cell in cells:
+        tables = {table for table, columns in COLUMNS.items() if fits(cell.types, columns)}
+        if tables:
+            fitting = tables if fitting is None else fitting & tables
+    return fitting or set()
+
+
+def fits(types: Sequence[int], columns: str) -> bool:
+    """Return whether values of these serial types can stand in such columns.
+
+    >>> fits((0, 6, 0, 8, 2), "kiiII"), fits((0, 6, 0, 8, 0), "kiiII"), fits((0, 19, 7), "kTt")
+    (True, False, False)
+    """
+    return len(types) == len(columns) and all(map(_fits, types, columns))
+
+
+def _fits(kind: int, column: str) -> bool:
+    if kind == 0:
+        return column.islower()
+    letter = column.lower()
+    if kind >= 12:
+        return letter == ("t" if kind % 2 else "b")
+    # A number without a fraction is kept as an integer.
+    return letter == "r" or (letter == "i" and kind != 7)
+
+
+def is_of(table: str, row: Row) -> bool:
+    """Return whether a row may be of this table: columns, types, values that no other row has."""
+    columns = COLUMNS[table]
+    if len(row) != len(columns) or not all(map(_is_value, row, columns)):
+        return False
+    check = _CHECKS.get(table)
+    return check is None or check(row)
+
+
+def _is_value(value: Value, column: str) -> bool:
+    if value is None:
+        return column.islower() and column != "k"
+    letter = column.lower()
+    if letter == "k":
+        return _in(value, 1, _NUMBER_MAX)
+    return isinstance(value, _TYPES[letter])
+
+
+def _is_change(values: Row) -> bool:
+    return _in(values[3], 0, 255) and _in(values[4], 0, 1000)
+
+
+def _is_block(values: Row) -> bool:
+    return _in(values[1], values[0], _NUMBER_MAX) and _in(values[2], 1, _NUMBER_MAX)
+
+
+def _is_tile(values: Row) -> bool:
+    return values[1] in ("before", "flight")
+
+
+def _is_geometry(values: Row) -> bool:
+    return isinstance(values[1], bytes) and values[1].startswith(_GEOMETRY)
+
+
+def _is_dictionary(values: Row) -> bool:
+    return not _is_geometry(values)
+
+
+def _is_place(values: Row) -> bool:
+    return values[1] is None or _is_geometry(values)
+
+
+def _in(value: Value, least: Value, most: Value) -> bool:
+    whole = [each for each in (least, value, most) if isinstance(each, int)]
+    return len(whole) == 3 and whole == sorted(whole)
+
+
+_CHECKS: dict[str, Callable[[Row], bool]] = {
+    "applied": _is_place,
+    "zones": _is_geometry,
+    "field": _is_geometry,
+    "blocks": _is_block,
+    "block_dictionaries": _is_dictionary,
+    "valve_changes": _is_change,
+    "coverage_tiles": _is_tile,
+}

@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.atomic_write import sync_folder
-from companion.record.content_hash import log_of
 from companion.record.geopackage import time_text
-from companion.record.kept_pages import page_bytes_of
-from companion.record.leaf_page import Cell, cells_of, values_of
-from companion.record.log_frames import Log, read_log
-from companion.record.stray_rows import is_of, tables_of
+from companion.record.leaf_page import Cell, cells_of, is_of, tables_of, values_of
+from companion.record.log_frames import Log, page_bytes_of, read_log
+from companion.record.read_only import kept_log_of, log_of
 from companion.record.writer import SET_META
 
 EVENT_KIND = "log-damaged"
@@ -100,11 +98,6 @@ def keep_log(path: Path) -> None:
             os.fsync(file.fileno())
         draft.replace(kept_log_of(path))
     sync_folder(path.parent)
-
-
-def kept_log_of(path: Path) -> Path:
-    """Return where the log of a journal is kept if it was damaged."""
-    return path.with_name(path.name + "-wal.damaged")
 
 
 def mark(connection: sqlite3.Connection, damage: LogDamage) -> str | None:

@@ -19,6 +19,9 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
+
+from companion.record.geopackage import PAGE_BYTES
 
 _MAGIC = 0x377F0682  # its last bit: the words of the check sums are big-endian
 _VERSION = 3_007_000
@@ -28,6 +31,9 @@ _PAGE_BYTES = frozenset(2**power for power in range(9, 17))
 _WORD = 0xFFFFFFFF
 
 Sums = tuple[int, int]
+FILE_MAGIC = b"SQLite format 3\x00"
+# SQLite knows no less room in a page.
+_USABLE_MIN = 480
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,3 +177,27 @@ def newest(log: Log) -> Iterator[Frame]:
     """Yield all good frames of whole transactions, the last written first."""
     yield from reversed(log.behind)
     yield from reversed(log.counted)
+
+
+def page_bytes_of(path: Path) -> int:
+    """Return how large the pages of a journal are: as its head says, or as this program has them.
+
+    Not of a journal that this process writes: closing a file gives up the locks on it (POSIX).
+    """
+    with path.open("rb") as file:
+        return page_bytes_in(head_of(file))
+
+
+def head_of(file: BinaryIO) -> bytes:
+    """Return the first bytes of a database; nothing where they are damaged."""
+    head = file.read(100)
+    if len(head) < 100 or not head.startswith(FILE_MAGIC):
+        return b""
+    size = int.from_bytes(head[16:18], "big")
+    is_sound = 512 <= size <= 32768 and not size & (size - 1) and size - head[20] >= _USABLE_MIN
+    return head if is_sound else b""
+
+
+def page_bytes_in(head: bytes) -> int:
+    """Return how large the pages are, by the first bytes of a file."""
+    return int.from_bytes(head[16:18], "big") if head else PAGE_BYTES

@@ -43,12 +43,7 @@ Key = tuple[str, str, int]
 
 
 def pack(lines: Sequence[str]) -> bytes:
-    """Return the lines in few bytes.
-
-    >>> from companion.record.unpacking import unpack
-    >>> unpack(pack(['{"A":[1.5,2]}', '{"A":[1.75,3]}']))
-    ['{"A":[1.5,2]}', '{"A":[1.75,3]}']
-    """
+    """Return the lines in few bytes."""
     packer = Packer()
     for line in lines:
         packer.add(line)

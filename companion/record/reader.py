@@ -7,76 +7,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 from companion.core.setup import Setup
-from companion.core.types import Decision, Input
 from companion.errors import NoMapError, UnreadableError
-from companion.record.blocks import Entry
-from companion.record.codec import FieldNames, decode
 from companion.record.coverage_table import read_treated
 from companion.record.distrust import check_programs
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import read_ground
-from companion.record.read_only import DAMAGE, one_line, read_only, tolerate_damage
+from companion.record.read_only import (
+    DAMAGE,
+    damaged_pages,
+    one_line,
+    read_only,
+    readable_rows,
+    tolerate_damage,
+)
 from companion.record.refusals import check_kind, extent, no_file, refused, why_no_setup
-from companion.record.salvage import readable_rows
-from companion.record.setup_json import field_names_of, setup_from_json
-from companion.record.totals import missing_rows
+from companion.record.setup_json import setup_from_json
 from companion.record.versions import (
     as_far_as_said,
     check_said,
     check_version,
     migrated,
-    read_entries,
 )
-from companion.record.whole_file import damaged_pages
-from companion.record.writer import Event
-
-__all__ = ["Entry", "JournalContent", "OpenJournal", "opened", "read_journal"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JournalContent:
-    """A whole journal: what it says of itself, and all inputs and decisions in their order.
-
-    `unread` says in a line each what is damaged and left out; empty for a sound file.
-    """
-
-    path: Path
-    meta: dict[str, str]
-    setup: Setup
-    field_names: FieldNames
-    entries: tuple[Entry, ...]
-    events: tuple[Event, ...]
-    lost: int
-    unread: tuple[str, ...] = ()
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether the flight ended in order; otherwise its last second may be missing."""
-        return self.meta.get("closed") == "yes"
-
-    @property
-    def training(self) -> str | None:
-        """What of this flight was no spraying of a product: `water`, `dry`, `no`; None: unknown."""
-        return self.meta.get("training")
-
-    def value(self, entry: Entry) -> Input | Decision:
-        """Return the input or the decision itself, exact to the last bit."""
-        try:
-            value = decode(entry.body, self.field_names)
-        except (ValueError, TypeError, RecursionError) as error:
-            raise UnreadableError(
-                f"{self.path}: row {entry.sequence}: {one_line(error)}"
-            ) from error
-        if type(value).__name__ != entry.kind:
-            raise UnreadableError(f"{self.path}: row {entry.sequence} is no {entry.kind}")
-        return cast("Input | Decision", value)
-
-    def items(self) -> Iterator[Input | Decision]:
-        """Return all inputs and decisions in their order."""
-        return (self.value(entry) for entry in self.entries)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,18 +70,6 @@ class OpenJournal:
         return setup if treated is None else replace(setup, treated=treated)
 
 
-def read_journal(path: Path, *, is_lenient: bool = False) -> JournalContent:
-    """Return what is in the file; JournalError, in one line, where it cannot be used.
-
-    An UnreadableError where it is a journal, but damaged or of another version.
-
-    `is_lenient` leaves out what is damaged and says so in `unread`; that rows are missing is said
-    there in any case.
-    """
-    with opened(path, is_lenient=is_lenient) as journal:
-        return _read(journal, is_lenient=is_lenient)
-
-
 @contextmanager
 def opened(path: Path, *, is_lenient: bool = False) -> Iterator[OpenJournal]:
     """Open a journal for reading; whatever SQLite finds inside becomes a JournalError."""
@@ -139,6 +80,12 @@ def opened(path: Path, *, is_lenient: bool = False) -> Iterator[OpenJournal]:
             yield _checked(path, connection, is_lenient=is_lenient)
     except DAMAGE as error:
         raise refused(path, error) from error
+
+
+def is_empty(path: Path) -> bool:
+    """Return whether a journal that has just been closed has neither inputs nor decisions."""
+    with opened(path) as journal:
+        return journal.connection.execute("SELECT 1 FROM blocks LIMIT 1").fetchone() is None
 
 
 def _checked(path: Path, connection: sqlite3.Connection, *, is_lenient: bool) -> OpenJournal:
@@ -206,42 +153,3 @@ def _meta(
         unread.append(f"meta: {one_line(error)}")
     kept = readable_rows(connection, "meta", [True])
     return {str(row[-2]): str(row[-1]) for row in kept if row[-1] is not None}
-
-
-def _read(journal: OpenJournal, *, is_lenient: bool) -> JournalContent:
-    unread = list(journal.unread)
-    if is_lenient:
-        unread += damaged_pages(journal.connection)
-    unread += missing_rows(journal.connection, journal.meta)
-    entries, events = [], []
-    try:
-        for entry in read_entries(
-            journal.connection, journal.version, unread=unread if is_lenient else None
-        ):
-            entries.append(entry)
-    except sqlite3.DatabaseError as error:
-        if not is_lenient:
-            raise
-        unread.append(f"rows behind {entries[-1].sequence if entries else 0}: {one_line(error)}")
-    marks = "SELECT sequence, time_s, kind, text FROM events ORDER BY sequence"
-    last = entries[-1].sequence if entries else 0
-    try:
-        for sequence, at_s, kind, text in journal.connection.execute(marks):
-            # SQLite keeps no NaN: a time that was none comes back as missing.
-            time_s = float("nan") if at_s is None else at_s
-            events.append(Event(at_s=time_s, kind=kind, text=text))
-            last = max(last, sequence)
-    except sqlite3.DatabaseError as error:
-        if not is_lenient:
-            raise
-        unread.append(f"events behind the first {len(events)}: {one_line(error)}")
-    return JournalContent(
-        path=journal.path,
-        meta=journal.meta,
-        setup=journal.setup(unread if is_lenient else None),
-        field_names=field_names_of(journal.meta["setup"]),
-        entries=tuple(entries),
-        events=tuple(events),
-        lost=max(last - len(entries) - len(events), int(journal.meta["lost"])),
-        unread=tuple(unread),
-    )

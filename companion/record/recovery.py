@@ -1,29 +1,34 @@
 """After a crash or a cut of power: the log that was left beside a journal becomes part of it.
 
 SQLite itself takes every transaction whose frames are whole and leaves out the rest. A journal is
-looked at first without writing; what is damaged stays as it is, to the byte, and a copy is made of
-all rows that can still be read.
+looked at first without writing; what is damaged stays as it is, to the byte. What can still be
+read of that is for who has the time: `vrspray flights recover`, in the office.
 """
 
 from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from companion.errors import JournalError
-from companion.record.content_hash import log_of
 from companion.record.distrust import check_beside, check_programs, distrust
 from companion.record.folder import journals
 from companion.record.geopackage import APPLICATION_ID
 from companion.record.layers import box_of_points, set_box
-from companion.record.log_damage import LogDamage, keep_log, kept_log_of, log_damage, mark
-from companion.record.read_only import DAMAGE, one_line, read_only
-from companion.record.salvage import salvage, salvaged_name
+from companion.record.read_only import (
+    DAMAGE,
+    kept_log_of,
+    log_of,
+    one_line,
+    read_only,
+    salvaged_name,
+)
 from companion.record.totals import totals_of
 from companion.record.versions import OtherVersionError, check_version
 from companion.record.writer import SET_META, tell_times_again
@@ -35,8 +40,8 @@ _KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"
 class Recovery:
     """What became of one journal.
 
-    Recovered, open or other-version (both left alone), salvaged, or failed. `is_whole`: nothing
-    that was committed is lost.
+    Recovered, open or other-version (both left alone), damaged (left alone too), salvaged, or
+    failed. `is_whole`: nothing that was committed is lost.
     """
 
     path: Path
@@ -60,28 +65,40 @@ class _Ending:
     totals: Mapping[str, str]
 
 
-class _Told(NamedTuple):
+class Told(NamedTuple):
+    """What became of one journal, and what is said of it."""
+
     outcome: str
     text: str
     is_whole: bool = True
 
 
-_OPEN = _Told("open", "its flight still writes it")
+_OPEN = Told("open", "its flight still writes it")
+SEE_RECOVER = "; vrspray flights recover copies what can be read of it"
+# What is done about a journal that is damaged, and why it counts as that.
+OfDamaged = Callable[[Path, str], Told]
 
 
-def recover_folder(folder: Path) -> list[Recovery]:
+def _left_alone(_: Path, reason: str) -> Told:
+    return Told("damaged", f"{reason}; it is left as it is{SEE_RECOVER}")
+
+
+def recover_folder(folder: Path, of_damaged: OfDamaged = _left_alone) -> list[Recovery]:
     """Recover every journal that was cut; one that a living process holds is left alone."""
     return [
         found
         for path in journals(folder)
-        if ".salvaged." not in path.name and (found := recover(path)) is not None
+        if ".salvaged." not in path.name and (found := recover(path, of_damaged)) is not None
     ]
 
 
-def recover(path: Path) -> Recovery | None:
-    """Recover one journal; None where there is nothing to recover."""
+def recover(path: Path, of_damaged: OfDamaged = _left_alone) -> Recovery | None:
+    """Recover one journal; None where there is nothing to recover.
+
+    `of_damaged` is told a journal that is damaged, and why, and what it says is told.
+    """
     began_s = time.perf_counter()
-    told = _recovered(path)
+    told = _recovered(path, of_damaged)
     if told is None:
         return None
     return Recovery(
@@ -93,34 +110,37 @@ def recover(path: Path) -> Recovery | None:
     )
 
 
-def _recovered(path: Path) -> _Told | None:
+def _recovered(path: Path, of_damaged: OfDamaged) -> Told | None:
     """Return what became of a journal, and what is said of it."""
     try:
         _undo_half_written(path)
         is_left, ending = _looked_at(path)
     except OtherVersionError as error:
-        return _Told("other-version", f"{error}; it was cut and is left alone")
+        return Told("other-version", f"{error}; it was cut and is left alone")
     except (JournalError, *DAMAGE) as error:
         if _is_locked(error):
             return _OPEN
-        return None if salvaged_name(path).exists() else _salvaged(path, one_line(error))
+        return None if salvaged_name(path).exists() else of_damaged(path, one_line(error))
     return _folded_in(path, ending) if is_left else None
 
 
-def _folded_in(path: Path, ending: _Ending | None) -> _Told:
+def _folded_in(path: Path, ending: _Ending | None) -> Told:
+    # Only where a flight was cut: who recovers nothing need not know how a log is made.
+    from companion.record.log_damage import keep_log, log_damage, mark
+
     try:
         damage = log_damage(path)
         if damage is not None:
             keep_log(path)
-        told = _fold_in(path, ending, damage)
+        told = _fold_in(path, ending, None if damage is None else partial(mark, damage=damage))
         if told is None:
             kept_log_of(path).unlink(missing_ok=True)
     except DAMAGE as error:
-        return _OPEN if _is_locked(error) else _Told("failed", f"{one_line(error)}; it can be read")
+        return _OPEN if _is_locked(error) else Told("failed", f"{one_line(error)}; it can be read")
     if told is None:
-        return _Told("recovered", "what was committed is there")
+        return Told("recovered", "what was committed is there")
     text = f"{told}; the damaged log is kept as {kept_log_of(path).name}"
-    return _Told("recovered", text, is_whole=False)
+    return Told("recovered", text, is_whole=False)
 
 
 def _is_locked(error: Exception) -> bool:
@@ -176,13 +196,15 @@ def _ending(connection: sqlite3.Connection, meta: Mapping[str, str]) -> _Ending:
     )
 
 
-def _fold_in(path: Path, ending: _Ending | None, damage: LogDamage | None) -> str | None:
+def _fold_in(
+    path: Path, ending: _Ending | None, mark: Callable[[sqlite3.Connection], str | None] | None
+) -> str | None:
     """Make one file of it; return what is said of a damaged log."""
     with _alone(path) as connection:
         connection.execute("BEGIN IMMEDIATE")
         if ending is not None:
             _settle(connection, ending)
-        told = None if damage is None else mark(connection, damage)
+        told = None if mark is None else mark(connection)
         connection.execute("COMMIT")
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
         connection.execute("PRAGMA journal_mode = DELETE").fetchall()
@@ -211,21 +233,3 @@ def _settle(connection: sqlite3.Connection, ending: _Ending) -> None:
         tell_times_again(connection, *ending.time)
     for fact in (*ending.totals.items(), ("closed", "recovered")):
         connection.execute(SET_META, fact)
-
-
-def _salvaged(path: Path, reason: str) -> _Told:
-    """Copy what can still be read beside the file, which stays as it is."""
-    try:
-        found = salvage(path)
-    except DAMAGE as error:
-        text = one_line(error)
-        return _Told(
-            "failed", f"{reason}; nothing could be read ({text}); the file is kept as it is"
-        )
-    text = f"{reason}; the file is kept, {found.rows} rows are in {salvaged_name(path).name}"
-    if found.stray:
-        strays = ", ".join(f"{name} {count}" for name, count in found.stray.items())
-        text += f", of these from pages that nothing leads to: {strays}"
-    if found.lost_tables:
-        text += f"; not all of {', '.join(found.lost_tables)}"
-    return _Told("salvaged", text)

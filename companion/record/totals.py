@@ -10,30 +10,20 @@ from companion.record.read_only import one_line
 
 # Behind the name of a table: how many rows it has.
 _COUNTED = {"rows_applied": "applied", "rows_valve_changes": "valve_changes"}
-_LITRES = "applied_l"
+LITRES_KEY = "applied_l"
 _GAP_MAX_S = 1.0
 
 
 def totals_of(connection: sqlite3.Connection) -> dict[str, str]:
     """Return what `meta` says of the tables as they are now."""
     found = {key: str(_count(connection, table)) for key, table in _COUNTED.items()}
-    return {**found, _LITRES: repr(_summed_l(connection))}
-
-
-def tell_litres_again(connection: sqlite3.Connection) -> None:
-    """Have `meta` say what the rows come to that are there: a part of what was told before."""
-    connection.execute("DELETE FROM meta WHERE key = ?", (_LITRES,))
-    try:
-        found_l = _summed_l(connection)
-    except (TypeError, ValueError):  # rows that are none
-        return
-    connection.execute("INSERT INTO meta (key, value) VALUES (?, ?)", (_LITRES, repr(found_l)))
+    return {**found, LITRES_KEY: repr(_summed_l(connection))}
 
 
 def applied_l(connection: sqlite3.Connection, meta: Mapping[str, str]) -> float:
     """Return what the ordered duties stand for in litres: not a measurement."""
     try:
-        told_l = float(meta[_LITRES])
+        told_l = float(meta[LITRES_KEY])
     except (KeyError, TypeError, ValueError):
         return _summed_l(connection)
     return told_l if math.isfinite(told_l) else _summed_l(connection)

@@ -7,13 +7,11 @@
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from datetime import datetime
 from importlib import metadata
 
 from companion.errors import UnreadableError
-from companion.record.blocks import Entry, read_blocks
 from companion.record.refusals import check_kind
 
 JOURNAL_VERSION = "2"
@@ -133,24 +131,3 @@ def migrated(meta: Mapping[str, str]) -> dict[str, str]:
         found["utc_offset_s"] = repr(utc_s - started_s)
     found.setdefault("utc_source", "computer")
     return found
-
-
-def read_entries(
-    connection: sqlite3.Connection,
-    version: str,
-    *,
-    kinds: Collection[str] | None = None,
-    unread: list[str] | None = None,
-) -> Iterator[Entry]:
-    """Yield inputs and decisions in their order, or those of some kinds.
-
-    What is damaged is a ValueError; with `unread` it is said there, and left out.
-    """
-    if version != "1":
-        yield from read_blocks(connection, kinds=kinds, unread=unread)
-        return
-    rows = connection.execute("SELECT sequence, kind, body FROM records ORDER BY sequence")
-    for row in rows:
-        entry = Entry(*row)
-        if kinds is None or entry.kind in kinds:
-            yield entry

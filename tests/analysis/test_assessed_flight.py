@@ -20,11 +20,11 @@ from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import record_of
 from analysis.flown.modelled_flow import ordered_s
 from analysis.flown.read_applied import read_applied
+from analysis.journals.content import read_journal
 from analysis.replay import replay
 from companion.cli.app import execute
 from companion.errors import JournalError
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
 from sitl.flight import FlightOptions
 from sitl.flight import fly as simulate
 from sitl.fly import FlyOptions, prepare

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from numpy._core import _multiarray_umath
 
+from analysis.journals.blocks import Entry
 from analysis.replay import FlownCore, first_difference, override, replay
 from companion.cli.app import execute
 from companion.core.setup import Setup
@@ -35,7 +36,6 @@ from companion.core.types import (
 )
 from companion.errors import ConfigError, JournalError
 from companion.record.journal import Journal
-from companion.record.reader import Entry
 from tests.builders import setup
 from tests.companion.journal_edit import edit_rows, with_body
 

@@ -11,6 +11,7 @@ import pytest
 
 from analysis.evaluation import evaluate
 from analysis.flown.read_applied import read_applied
+from analysis.journals.content import read_journal
 from analysis.replay import replay
 from analysis.report import contents
 from companion.cli import ground_doing
@@ -20,7 +21,6 @@ from companion.cli.sensor_parts import TankSensor
 from companion.config import load
 from companion.link.component import Component, ComponentOptions
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
 from tests import builders
 from tests.analysis import report_flight
 from tests.analysis.test_evaluation_flights import Flight, record_of

@@ -28,13 +28,13 @@ from typing import Any
 import pyogrio
 
 from analysis.flown.read_applied import read_applied
+from analysis.journals.content import read_journal
+from analysis.journals.salvage import recover
 from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.record.codec import encode
 from companion.record.journal import Journal
 from companion.record.new_file import open_for_flight
-from companion.record.reader import read_journal
-from companion.record.recovery import recover
 from companion.record.writer import LinkSample, Writer
 from companion.runtime import SWITCH_S
 from tests.bench.journal_flight import START_S, Flight, Turn, example_setup, open_setup

@@ -6,7 +6,8 @@ import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
-from companion.record.blocks import Block, Entry, read_blocks
+from analysis.journals.blocks import Entry, read_blocks
+from companion.record.blocks import Block
 
 
 def edit_rows(path: Path, edit: Callable[[list[Entry]], list[Entry]]) -> None:

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from pyproj import CRS
 
+from analysis.journals.content import read_journal
 from companion.core.cells import NO_RATE, CellGrid, Warp, exponents, rectangles
 from companion.core.crossings import find_routes
 from companion.core.prescription import FIELD, Prescription, Zone
 from companion.errors import MapError
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.cells import cell_areas_m2, cell_size_m
 from missions.maps.model import Affine, MapCells, MapFile

@@ -54,6 +54,18 @@ def test_help_lists_every_command_without_importing_any(capsys: Captured) -> Non
         assert place.help in done.stdout
 
 
+def test_a_run_loads_nothing_of_the_office_and_no_forensics() -> None:
+    script = (
+        "import sys; import companion.cli.run; ours = {'analysis', 'missions', 'sitl'};"
+        "print(sorted(ours & {name.partition('.')[0] for name in sys.modules}),"
+        "[name for name in sys.modules if 'log_damage' in name or 'leaf_page' in name])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "[] []\n"
+
+
 def test_module_runs_as_the_program() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "companion", "--version"],

@@ -18,6 +18,7 @@ import pytest
 import shapely
 
 from analysis.flown.read_applied import read_applied
+from analysis.journals.content import read_journal
 from analysis.replay import replay
 from companion.cli.app import execute
 from companion.cli.run import unfinished
@@ -54,7 +55,6 @@ from companion.record.coverage_table import (
     write_treated,
 )
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
 from companion.runtime import coverage_ahead_s
 from tests.builders import setup
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import shapely
 
+from analysis.journals.content import read_journal
 from analysis.replay import FlownCore, replay
 from companion.config import load
 from companion.core.controller import Memory, step
@@ -30,7 +31,6 @@ from companion.core.types import (
     OperatorCommand,
 )
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
 from missions.maps.compiling import compiled_setup
 from tests.builders import CURVE, flying, plots, position, setup
 from tests.companion.trim_bench import STEP_S, TrimBench, tracking

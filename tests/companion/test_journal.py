@@ -21,6 +21,7 @@ import pyproj
 import pytest
 import shapely
 
+from analysis.journals.content import read_journal
 from companion.core.controller import Memory, step
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
@@ -54,7 +55,6 @@ from companion.errors import JournalError
 from companion.record.codec import decode, encode
 from companion.record.journal import Journal
 from companion.record.new_file import open_for_flight
-from companion.record.reader import read_journal
 from companion.record.writer import Event, Writer
 from tests.builders import flying, setup
 from tests.companion.journal_edit import with_body

@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 
 from analysis.flown.read_applied import read_applied
+from analysis.journals.content import read_journal
+from analysis.journals.salvage import recover, salvage
 from companion.cli.app import execute
 from companion.errors import VrsprayError
 from companion.record.continuing import is_journal, read_treated_ground
 from companion.record.distrust import distrust, known_tables
 from companion.record.folder import look_at
 from companion.record.geopackage import PAGE_BYTES
-from companion.record.reader import read_journal
-from companion.record.recovery import recover
-from companion.record.salvage import salvage, salvaged_name
+from companion.record.read_only import salvaged_name
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import example_setup
 

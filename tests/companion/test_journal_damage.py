@@ -13,18 +13,18 @@ from typing import Any
 
 import pytest
 
+from analysis.journals.content import read_journal
+from analysis.journals.salvage import recover, recover_folder
+from analysis.journals.show import content_of
 from companion.cli.app import execute
-from companion.cli.flights_show import content_of
 from companion.cli.record_parts import made_ready
 from companion.config.tables import JournalTable
 from companion.core.types import UtcReport
 from companion.errors import JournalError, NoMapError
-from companion.record.content_hash import log_of
 from companion.record.folder import journals, look_at
 from companion.record.new_file import open_for_flight
-from companion.record.reader import opened, read_journal
-from companion.record.recovery import recover, recover_folder
-from companion.record.salvage import salvaged_name
+from companion.record.read_only import log_of, salvaged_name
+from companion.record.reader import opened
 from companion.record.valve_rows import ValveOrder
 from companion.record.writer import Writer
 from tests.bench.journal import crashed
@@ -86,6 +86,20 @@ def test_no_old_journal_keeps_from_flying(case: str, is_cut: bool, path: Path) -
     assert any(line.startswith("journal: flight-0002.gpkg: ") for line in lines)
     assert not any("Traceback" in line for line in lines)
     assert path.exists()
+
+
+def test_before_a_flight_a_damaged_journal_is_left_as_it_is(path: Path) -> None:
+    change(path, "UPDATE meta SET value = 'no' WHERE key = 'closed'")
+    os.truncate(path, path.stat().st_size - 100)
+    before = everything(path.parent)
+    lines = list(made_ready(path.parent, JournalTable()))
+    (line,) = (line for line in lines if path.name in line)
+    assert line.startswith(f"journal: {path.name}: damaged: the file was cut off within a page; ")
+    assert line.endswith("vrspray flights recover copies what can be read of it")
+    assert everything(path.parent) == before
+    # Once its copy is there, nothing is left to be said.
+    recover_folder(path.parent)
+    assert not [line for line in made_ready(path.parent, JournalTable()) if path.name in line]
 
 
 def test_an_old_journal_with_a_time_that_is_none_is_damaged(path: Path) -> None:

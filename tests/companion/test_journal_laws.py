@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from analysis.journals.content import read_journal
 from companion.core.controller import Memory, step
 from companion.core.schedule import LagModel
 from companion.core.types import (
@@ -30,7 +31,6 @@ from companion.errors import JournalError
 from companion.record.codec import FIELD_NAMES, decode, encode
 from companion.record.journal import Journal
 from companion.record.new_file import open_for_flight
-from companion.record.reader import read_journal
 from companion.record.writer import Writer
 from tests.builders import flying, setup
 

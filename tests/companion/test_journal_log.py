@@ -10,14 +10,16 @@ from pathlib import Path
 
 import pytest
 
+from analysis.journals.content import read_journal
+from analysis.journals.salvage import recover, recover_folder
 from companion.cli.app import execute
-from companion.record.content_hash import log_of
+from companion.cli.record_parts import made_ready
+from companion.config.tables import JournalTable
 from companion.record.geopackage import PAGE_BYTES
-from companion.record.log_damage import EVENT_KIND, META_KEY, kept_log_of, log_damage
+from companion.record.log_damage import EVENT_KIND, META_KEY, log_damage
 from companion.record.log_frames import log_from
 from companion.record.new_file import open_for_flight
-from companion.record.reader import read_journal
-from companion.record.recovery import recover, recover_folder
+from companion.record.read_only import kept_log_of, log_of
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import START_S, example_setup
 from tests.companion.test_journal import query
@@ -150,6 +152,17 @@ def test_what_is_lost_behind_damage_is_said(
     assert content.lost == 0
     assert kept_log_of(left).read_bytes() == log
     assert recover_folder(left.parent) == []
+
+
+def test_what_is_lost_is_said_before_the_next_flight_too(left: Path, ends: list[int]) -> None:
+    damage, _, lost_s = DAMAGED["a hole"]
+    log = damaged(left, ends, damage)
+    lines = list(made_ready(left.parent, JournalTable()))
+    (line,) = (line for line in lines if left.name in line)
+    assert "recovered: the log is damaged at byte " in line
+    assert f"at most about {lost_s} s, is lost" in line
+    assert META_KEY in read_journal(left).meta
+    assert kept_log_of(left).read_bytes() == log
 
 
 def test_the_time_of_the_loss_is_utc(left: Path, ends: list[int]) -> None:

@@ -11,10 +11,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from analysis.journals.kept_pages import kept_pages
+from analysis.journals.stray_rows import stray_rows
 from companion.record.geopackage import PAGE_BYTES, SCHEMA
-from companion.record.kept_pages import kept_pages
-from companion.record.leaf_page import cells_of, local_bytes, values_of, varint, width
-from companion.record.stray_rows import COLUMNS, stray_rows, tables_of
+from companion.record.leaf_page import (
+    COLUMNS,
+    cells_of,
+    local_bytes,
+    tables_of,
+    values_of,
+    varint,
+    width,
+)
 from tests.companion.test_journal import closed_journal
 
 VALUES = st.one_of(

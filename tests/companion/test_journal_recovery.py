@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from companion.record.content_hash import content_sha256, log_of
+from analysis.journals.content import content_sha256, read_journal
+from analysis.journals.salvage import recover, recover_folder
 from companion.record.folder import look_at
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
-from companion.record.recovery import recover, recover_folder
-from companion.record.salvage import salvaged_name
+from companion.record.read_only import log_of, salvaged_name
 from tests.bench.journal import crashed, kills, torn
 from tests.bench.journal_flight import example_setup
 from tests.builders import setup

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
+from analysis.journals.content import damages
 from companion.cli.app import execute
 from companion.errors import JournalError, UnreadableError
 from companion.record.geopackage import PAGE_BYTES
 from companion.record.reader import opened
 from companion.record.refusals import refused
-from companion.record.whole_file import damages
 from tests.builders import setup
 from tests.companion.test_coverage_journal import journal
 from tests.companion.test_journal import change

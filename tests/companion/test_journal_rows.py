@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from analysis.journals.content import read_journal
 from companion.core.types import SprayPlan, TimedChange, UtcReport
 from companion.link.codec import FROM_VEHICLE
 from companion.output.engine.wire import Issued
@@ -16,7 +17,6 @@ from companion.output.gpio import GpioExecutor
 from companion.output.timed import DryRunExecutor
 from companion.record.folder import look_at
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
 from companion.record.valve_rows import ValveOrder, ValveRows
 from companion.record.writer import FlightClock
 from tests.analysis.test_replay import fly

@@ -12,15 +12,13 @@ from pathlib import Path
 import pyogrio
 import pytest
 
+from analysis.journals.content import read_journal
+from analysis.journals.salvage import recover, salvage
 from companion.cli.app import execute
-from companion.record.content_hash import log_of
 from companion.record.folder import look_at
 from companion.record.geopackage import PAGE_BYTES
-from companion.record.leaf_page import cells_of
-from companion.record.reader import read_journal
-from companion.record.recovery import recover
-from companion.record.salvage import salvage, salvaged_name
-from companion.record.stray_rows import tables_of
+from companion.record.leaf_page import cells_of, tables_of
+from companion.record.read_only import log_of, salvaged_name
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import example_setup
 from tests.companion.test_journal import change, query

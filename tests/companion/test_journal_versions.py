@@ -8,14 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from analysis.journals.content import read_entries, read_journal
 from analysis.replay import replay
 from companion.core.types import Decision, Telemetry
 from companion.errors import JournalError
 from companion.record.blocks import Block
 from companion.record.codec import decode, encode
 from companion.record.journal import Journal
-from companion.record.reader import opened, read_journal
-from companion.record.versions import OtherVersionError, read_entries
+from companion.record.reader import opened
+from companion.record.versions import OtherVersionError
 from tests.builders import setup
 from tests.companion.test_journal import INPUTS, change, closed_journal
 

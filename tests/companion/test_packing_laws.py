@@ -10,8 +10,8 @@ from contextlib import suppress
 from hypothesis import given
 from hypothesis import strategies as st
 
+from analysis.journals.unpacking import part_of, unpack
 from companion.record.packing import Packer, pack
-from companion.record.unpacking import part_of, unpack
 
 NUMBERS = st.one_of(
     st.floats(),

@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
+from analysis.journals.content import read_journal
 from companion.cli.record_parts import follow
 from companion.config import load
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
 from missions.maps.compiling import compiled_setup
 from sitl.serve import ServeOptions
 from tests.bench.wire import RTK, example

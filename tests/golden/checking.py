@@ -18,11 +18,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from analysis.journals.content import read_journal
 from analysis.replay import FlownCore
 from companion.core.setup import Setup
 from companion.core.types import Decision
 from companion.record.coverage_table import read_coverage
-from companion.record.reader import opened, read_journal
+from companion.record.reader import opened
 
 FOLDER = Path(__file__).parent / "journals"
 TIME_WITHIN_S = 1e-6

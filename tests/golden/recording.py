@@ -8,13 +8,13 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+from analysis.journals.content import read_journal
 from companion.cli.record_parts import follow
 from companion.config import load
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.record.continuing import continued
 from companion.record.journal import Journal
-from companion.record.reader import read_journal
 from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions
 from sitl.flight import fly as fly_twin

@@ -13,9 +13,9 @@ from typing import Any, get_args
 
 import pytest
 
+from analysis.journals.content import read_journal
 from analysis.replay import FlownCore
 from companion.core.types import Decision, Input
-from companion.record.reader import read_journal
 from tests.golden.checking import difference, names, unpacked
 
 OURS = {

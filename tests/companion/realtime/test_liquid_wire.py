@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.journals.content import read_journal
 from companion.core.options.coverage import Coverage
 from companion.core.types import Decision, Input
-from companion.record.reader import read_journal
 from sitl.serve import ServeOptions
 from tests.bench.wire import example
 from tests.bench.wire_clock import START_S, Holds, fly

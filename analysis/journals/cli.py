@@ -8,15 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
+from analysis.journals.remaining import remaining
+from analysis.journals.salvage import recover_folder
+from analysis.journals.show import content_lines, content_of
 from companion.cli.answer import AsJson, answer, note
-from companion.cli.flights_remaining import remaining
-from companion.cli.flights_show import content_lines, content_of
 from companion.cli.record_parts import rules_of
 from companion.config.load import load
 from companion.errors import ConfigError, JournalError
 from companion.record.folder import Flight, journals, look_at, set_pinned
 from companion.record.geopackage import time_text
-from companion.record.recovery import recover_folder
 from companion.record.retention import Rules, prune, space_of
 
 app = typer.Typer(

@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
-from functools import cache
+from contextlib import suppress
 
 from companion.core.frame import LocalFrame
-from companion.record.geopackage import LOCAL_ID, SCHEMA, WGS84_ID
+from companion.record.distrust import empty_tables
+from companion.record.geopackage import LOCAL_ID, WGS84_ID
 from companion.record.layers import box_of_points, set_box
 
-# SQL of SQLite's own and of GeoPackage's registers comes with the tables; order as they depend.
-TABLES = (
-    "SELECT name, sql FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%' "
-    "AND sql IS NOT NULL ORDER BY rowid"
-)
 # Layers: geometry, and the system that they lie in.
 _LAYERS = {
     "applied": ("POINT", WGS84_ID),
@@ -31,33 +25,12 @@ _GEOMETRY = "INSERT OR IGNORE INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?
 _ORIGIN = "SELECT value FROM meta WHERE key = 'origin_{}_deg'"
 
 
-@contextmanager
-def _empty() -> Iterator[sqlite3.Connection]:
-    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
-        connection.executescript(SCHEMA)
-        yield connection
-
-
-@cache
-def own_tables() -> dict[str, tuple[str, tuple[str, ...]]]:
-    """Return the tables of a journal of today, by their names: SQL, and columns."""
-    with _empty() as empty:
-        tables = empty.execute(TABLES).fetchall()
-        return {name: (sql, columns_of(empty, name)) for name, sql in tables}
-
-
-def columns_of(connection: sqlite3.Connection, table: str) -> tuple[str, ...]:
-    """Return the names of a table's columns."""
-    rows = connection.execute("SELECT name FROM pragma_table_info(?)", (table,))
-    return tuple(row[0] for row in rows)
-
-
 def register_again(connection: sqlite3.Connection) -> None:
     """Fill in what is missing of the registers, and the extent of what there is now.
 
     Without them no map viewer opens the file; what cannot be told is left out.
     """
-    with _empty() as empty:
+    with empty_tables() as empty:
         systems = empty.execute("SELECT * FROM gpkg_spatial_ref_sys").fetchall()
         sql = "SELECT table_name, data_type, identifier, description, srs_id FROM gpkg_contents"
         contents = empty.execute(sql).fetchall()

@@ -6,37 +6,39 @@ import os
 import re
 import sqlite3
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from analysis.journals.kept_pages import KeptPages, kept_pages
+from analysis.journals.registers import register_again
+from analysis.journals.stray_rows import stray_rows, torn_rows
 from companion.atomic_write import sync_folder
-from companion.record.distrust import check_beside, known_tables
+from companion.record import recovery
+from companion.record.distrust import TABLES, check_beside, columns_of, known_tables, own_tables
 from companion.record.geopackage import APPLICATION_ID, USER_VERSION
-from companion.record.kept_pages import KeptPages, kept_pages
-from companion.record.read_only import read_only, tolerate_damage
-from companion.record.registers import TABLES, columns_of, own_tables, register_again
-from companion.record.stray_rows import COLUMNS, Row, is_of, stray_rows, torn_rows
-from companion.record.totals import tell_litres_again
+from companion.record.leaf_page import COLUMNS, Row, is_of
+from companion.record.read_only import (
+    DAMAGE,
+    one_line,
+    read_only,
+    readable_rows,
+    salvaged_name,
+    tolerate_damage,
+)
+from companion.record.recovery import Recovery, Told
+from companion.record.totals import LITRES_KEY, applied_l
 from companion.record.versions import JOURNAL_VERSION, missing_tables
 from companion.record.writer import SET_META
 
 # Without a row of any of these a file is no journal, or nothing of one.
 _OF_A_FLIGHT = ("meta", "applied", "blocks", "valve_changes")
 _TELL_VERSION = "INSERT OR IGNORE INTO meta (key, value) VALUES ('journal_version', ?)"
-# Behind a damaged page the search goes on after so many rows, each time twice as many.
-_SKIPS = 24
-_UNKNOWN_BYTES = 1 << 30
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 _KINDS = frozenset(
     {"BLOB", "DATETIME", "DOUBLE", "GEOMETRY", "INTEGER", "POINT", "TEXT", "TINYINT"}
 )
-
-
-def salvaged_name(path: Path) -> Path:
-    """Return where the copy of a damaged journal is."""
-    return path.with_name(path.stem + ".salvaged.gpkg")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,44 +215,39 @@ def _copy(
     return count, whole[0]
 
 
-def _bytes_of(source: sqlite3.Connection) -> int:
+def tell_litres_again(connection: sqlite3.Connection) -> None:
+    """Have `meta` say what the rows come to that are there: a part of what was told before."""
+    connection.execute("DELETE FROM meta WHERE key = ?", (LITRES_KEY,))
     try:
-        ((pages,), (page_bytes,)) = (
-            source.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "page_size")
-        )
-    except sqlite3.DatabaseError:
-        return _UNKNOWN_BYTES
-    return int(pages) * int(page_bytes)
-
-
-def readable_rows(source: sqlite3.Connection, name: str, whole: list[bool]) -> Iterator[Row]:
-    """Yield rowid and row of all that can be read; `whole[0]` becomes False where that is less."""
-    last = -(2**62)
-    # Pages that lead to each other would go on for ever: a row takes five bytes and more.
-    rows_max = _bytes_of(source) // 5
-    try:
-        for count, row in enumerate(
-            source.execute(f'SELECT rowid, * FROM "{name}" ORDER BY rowid')
-        ):
-            if count > rows_max:
-                raise sqlite3.DatabaseError("its pages lead to each other")
-            last = row[0]
-            yield row
-    except sqlite3.DatabaseError:
-        whole[0] = False
-    if whole[0]:
+        found_l = applied_l(connection, {})
+    except (TypeError, ValueError):  # rows that are none
         return
-    for power in range(_SKIPS):
-        if last < 0:
-            last = 0
-        beyond = last + 2**power
-        try:
-            sql = f'SELECT rowid, * FROM "{name}" WHERE rowid >= ? ORDER BY rowid'
-            for count, row in enumerate(source.execute(sql, (beyond,))):
-                if count > rows_max:
-                    return
-                last = row[0]
-                yield row
-        except sqlite3.DatabaseError:
-            continue
-        break
+    connection.execute("INSERT INTO meta (key, value) VALUES (?, ?)", (LITRES_KEY, repr(found_l)))
+
+
+def salvaged(path: Path, reason: str) -> Told:
+    """Copy what can still be read beside the file, which stays as it is; say what came of it."""
+    try:
+        found = salvage(path)
+    except DAMAGE as error:
+        text = one_line(error)
+        return Told(
+            "failed", f"{reason}; nothing could be read ({text}); the file is kept as it is"
+        )
+    text = f"{reason}; the file is kept, {found.rows} rows are in {salvaged_name(path).name}"
+    if found.stray:
+        strays = ", ".join(f"{name} {count}" for name, count in found.stray.items())
+        text += f", of these from pages that nothing leads to: {strays}"
+    if found.lost_tables:
+        text += f"; not all of {', '.join(found.lost_tables)}"
+    return Told("salvaged", text)
+
+
+def recover_folder(folder: Path) -> list[Recovery]:
+    """Recover every journal that was cut, and copy what can be read of a damaged one."""
+    return recovery.recover_folder(folder, salvaged)
+
+
+def recover(path: Path) -> Recovery | None:
+    """Recover one journal, or copy what can be read of it; None where there is nothing to do."""
+    return recovery.recover(path, salvaged)

@@ -52,7 +52,12 @@ class Part:
 
 
 def unpack(packed: bytes, dictionary: bytes = b"") -> list[str]:
-    """Return the lines that were packed; ValueError for what is no block."""
+    """Return the lines that were packed; ValueError for what is no block.
+
+    >>> from companion.record.packing import pack
+    >>> unpack(pack(['{"A":[1.5,2]}', '{"A":[1.75,3]}']))
+    ['{"A":[1.5,2]}', '{"A":[1.75,3]}']
+    """
     return part_of(inflated(packed, dictionary)).lines
 
 

@@ -9,14 +9,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from analysis.journals.content import read_entries
 from companion.errors import UnreadableError
-from companion.record.read_only import DAMAGE, one_line
+from companion.record.read_only import DAMAGE, damaged_pages, one_line, readable_rows
 from companion.record.reader import OpenJournal, opened
 from companion.record.refusals import SEE_SHOW
-from companion.record.salvage import readable_rows
 from companion.record.totals import missing_rows
-from companion.record.versions import OtherVersionError, read_entries
-from companion.record.whole_file import damaged_pages
+from companion.record.versions import OtherVersionError
 from companion.wording import counted
 
 # In `meta` for programs, or shown elsewhere.

@@ -13,6 +13,7 @@ import shapely
 import typer
 from shapely import MultiPolygon
 
+from analysis.journals.content import damages
 from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note
 from companion.core.frame import LocalFrame
@@ -20,8 +21,10 @@ from companion.core.options.coverage import Coverage
 from companion.core.prescription import Prescription
 from companion.errors import VrsprayError
 from companion.flight_map import flight_map_of_file
-from companion.record.continuing import Treated, read_treated_ground, rest_of
+from companion.record.continuing import Treated, rest_of, treated_ground_of
 from companion.record.coverage_area import moved
+from companion.record.reader import opened
+from companion.record.totals import missing_rows
 
 M2_PER_HA = 10_000.0
 # The mean rate of the rest is taken at so many places of it.
@@ -50,9 +53,7 @@ def remaining(
     Exit 0: all was read; 1: a journal is damaged or of another version, and what of it could not be
     read is said; 2: no journal, or none that keeps treated ground.
     """
-    flights = sorted(
-        (read_treated_ground(path, is_lenient=True) for path in journals), key=_started
-    )
+    flights = sorted((_treated(path) for path in journals), key=_started)
     last = flights[-1]
     for line in _training(flights):
         note(line)
@@ -73,6 +74,14 @@ def remaining(
         note(f"not read: {text}")
     if result["unread"]:
         raise typer.Exit(1)
+
+
+def _treated(path: Path) -> Treated:
+    """Return what a flight treated, as far as it can be read; JournalError where it is none."""
+    with opened(path, is_lenient=True) as journal:
+        unread = [*journal.unread, *damages(journal.connection)]
+        unread += missing_rows(journal.connection, journal.meta)
+        return treated_ground_of(journal, unread)
 
 
 def _training(flights: Sequence[Treated]) -> Iterator[str]:

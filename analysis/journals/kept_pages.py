@@ -7,13 +7,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from companion.record.content_hash import log_of
-from companion.record.geopackage import PAGE_BYTES
-from companion.record.log_frames import Frame, Log, newest, read_log
-
-_MAGIC = b"SQLite format 3\x00"
-# SQLite knows no less room in a page.
-_USABLE_MIN = 480
+from companion.record.log_frames import (
+    FILE_MAGIC,
+    Frame,
+    Log,
+    head_of,
+    newest,
+    page_bytes_in,
+    read_log,
+)
+from companion.record.read_only import log_of
 
 
 class KeptPages:
@@ -64,7 +67,7 @@ class KeptPages:
         """
         found: set[int] = set()
         head = self.page(1) or b""
-        number = int.from_bytes(head[32:36], "big") if head.startswith(_MAGIC) else 0
+        number = int.from_bytes(head[32:36], "big") if head.startswith(FILE_MAGIC) else 0
         while number and number not in found:
             found.add(number)
             trunk = self.page(number)
@@ -78,32 +81,9 @@ class KeptPages:
         return found
 
 
-def page_bytes_of(path: Path) -> int:
-    """Return how large the pages of a journal are: as its head says, or as this program has them.
-
-    Not of a journal that this process writes: closing a file gives up the locks on it (POSIX).
-    """
-    with path.open("rb") as file:
-        return _page_bytes(_head(file))
-
-
 @contextmanager
 def kept_pages(path: Path) -> Iterator[KeptPages]:
     """Open a file for its pages; to be left later than a connection to the same file."""
     with path.open("rb") as file:
-        head = _head(file)
-        yield KeptPages(file, head, read_log(log_of(path), _page_bytes(head)))
-
-
-def _head(file: BinaryIO) -> bytes:
-    """Return the first bytes of a database; nothing where they are damaged."""
-    head = file.read(100)
-    if len(head) < 100 or not head.startswith(_MAGIC):
-        return b""
-    size = int.from_bytes(head[16:18], "big")
-    is_sound = 512 <= size <= 32768 and not size & (size - 1) and size - head[20] >= _USABLE_MIN
-    return head if is_sound else b""
-
-
-def _page_bytes(head: bytes) -> int:
-    return int.from_bytes(head[16:18], "big") if head else PAGE_BYTES
+        head = head_of(file)
+        yield KeptPages(file, head, read_log(log_of(path), page_bytes_in(head)))
