@@ -7,17 +7,25 @@ import re
 import sqlite3
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from analysis.journals.kept_pages import KeptPages, kept_pages
-from analysis.journals.registers import register_again
 from analysis.journals.stray_rows import stray_rows, torn_rows
 from companion.atomic_write import sync_folder
+from companion.core.frame import LocalFrame
 from companion.record import recovery
-from companion.record.distrust import TABLES, check_beside, columns_of, known_tables, own_tables
-from companion.record.geopackage import APPLICATION_ID, USER_VERSION
+from companion.record.distrust import (
+    TABLES,
+    check_beside,
+    columns_of,
+    empty_tables,
+    known_tables,
+    own_tables,
+)
+from companion.record.geopackage import APPLICATION_ID, LOCAL_ID, USER_VERSION, WGS84_ID
+from companion.record.layers import box_of_points, set_box
 from companion.record.leaf_page import COLUMNS, Row, is_of
 from companion.record.read_only import (
     DAMAGE,
@@ -251,3 +259,56 @@ def recover_folder(folder: Path) -> list[Recovery]:
 def recover(path: Path) -> Recovery | None:
     """Recover one journal, or copy what can be read of it; None where there is nothing to do."""
     return recovery.recover(path, salvaged)
+
+
+# What a GeoPackage must have besides the flight's rows, written again where damage took it.
+
+# Layers: geometry, and the system that they lie in.
+_LAYERS = {
+    "applied": ("POINT", WGS84_ID),
+    "zones": ("GEOMETRY", LOCAL_ID),
+    "field": ("GEOMETRY", LOCAL_ID),
+}
+_SYSTEM = "INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, ?)"
+_CONTENT = (
+    "INSERT OR IGNORE INTO gpkg_contents (table_name, data_type, identifier, description, srs_id) "
+    "VALUES (?, ?, ?, ?, ?)"
+)
+_GEOMETRY = "INSERT OR IGNORE INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)"
+_ORIGIN = "SELECT value FROM meta WHERE key = 'origin_{}_deg'"
+
+
+def register_again(connection: sqlite3.Connection) -> None:
+    """Fill in what is missing of the registers, and the extent of what there is now.
+
+    Without them no map viewer opens the file; what cannot be told is left out.
+    """
+    with empty_tables() as empty:
+        systems = empty.execute("SELECT * FROM gpkg_spatial_ref_sys").fetchall()
+        sql = "SELECT table_name, data_type, identifier, description, srs_id FROM gpkg_contents"
+        contents = empty.execute(sql).fetchall()
+    contents += [(name, "features", name, "", system) for name, (_, system) in _LAYERS.items()]
+    contents.append(("coverage_tiles", "attributes", "coverage_tiles", "treated ground", None))
+    with suppress(sqlite3.Error):
+        connection.executemany(_SYSTEM, systems)
+        connection.executemany(_CONTENT, contents)
+        connection.executemany(
+            _GEOMETRY, [(name, kind, system) for name, (kind, system) in _LAYERS.items()]
+        )
+    with suppress(sqlite3.Error, ValueError):
+        set_box(connection, "applied", box_of_points(connection, "applied"))
+    with suppress(sqlite3.Error, ValueError, TypeError, LookupError):
+        _register_frame(connection)
+
+
+def _register_frame(connection: sqlite3.Connection) -> None:
+    """Fill in the flight's own system from its origin, which is in `meta`."""
+    latitude_deg, longitude_deg = (
+        float(connection.execute(_ORIGIN.format(name)).fetchone()[0])
+        for name in ("latitude", "longitude")
+    )
+    if not (abs(latitude_deg) <= 90.0 and abs(longitude_deg) <= 180.0):
+        return
+    definition = LocalFrame(latitude_deg, longitude_deg).crs.to_wkt("WKT1_GDAL")
+    what = "metres east and north of the flight's origin"
+    connection.execute(_SYSTEM, ("Flight", LOCAL_ID, "NONE", LOCAL_ID, definition, what))

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
+from analysis.journals.content import read_journal
 from analysis.replay import FlownCore
 from companion.core.setup import Setup
 from companion.core.types import Decision, Inhibit
-from companion.record.reader import read_journal
 from tests.builders import setup
 from tests.golden.checking import (
     difference,
