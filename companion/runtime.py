@@ -176,8 +176,8 @@ class ControlLoop:
             return
         gap_s = boot_s - before_s
         self._deaf_until_s = boot_s + DEAF_S
-        text = f"stood still for {gap_s:.1f} s"
-        _logger.warning("%s; positions have to be confirmed anew", text)
+        text = f"companion paused for {gap_s:.1f} s"
+        _logger.warning("%s; positions must be confirmed again", text)
         self._link.tell_fault(text)
         self._recorder.record_event(self._clock(), "standstill", text)
         yield StandstillReport(received_s=self._clock(), gap_s=gap_s)

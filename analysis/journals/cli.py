@@ -28,7 +28,8 @@ app = typer.Typer(
 FAILED = 1
 _SLOW_S = 1.0
 Folder = Annotated[
-    Path | None, typer.Option("--folder", metavar="DIR", help="Of the journals; default: flights.")
+    Path | None,
+    typer.Option("--folder", metavar="DIR", help="Folder of the journals; default: flights."),
 ]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="Take the folder from here.")
@@ -102,7 +103,7 @@ def prune_flights(
     folder: Folder = None,
     config_file: ConfigFile = None,
     is_dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would go, and remove nothing.")
+        bool, typer.Option("--dry-run", help="Show what would be removed; remove nothing.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

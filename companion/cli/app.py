@@ -8,8 +8,13 @@ a map that is refused, with the list of problems that `map check` prints.
 from __future__ import annotations
 
 import json
+import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -25,36 +30,36 @@ if TYPE_CHECKING:
     from typer._click.formatting import HelpFormatter
 
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
-from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
-from types import ModuleType
-
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
 
 
 # The companion's own. Those of others are found by their entry points, and cannot replace these.
 COMMANDS = {
     "run": Command(
-        target="companion.cli.run:run", help="Spray: the companion beside the flight controller."
+        target="companion.cli.run:run",
+        help="Run the companion: follow the vehicle and control the valves.",
     ),
     "ground": Command(
         target="companion.cli.ground:app",
-        help="Prime, flush, rinse, catch, click: on the ground, key held.",
+        help="Prime, flush, rinse, catch test, click valves, on the ground.",
     ),
     "doctor": Command(
-        target="companion.cli.doctor:app", help="Check all that must hold before a flight."
+        target="companion.cli.doctor:app", help="Check everything that must hold before a flight."
     ),
     "service": Command(
-        target="companion.cli.service:app", help="Run as a service, with systemd's watchdog."
+        target="companion.cli.service:app", help="Install the companion as a systemd service."
     ),
     "config": Command(
         target="companion.cli.config:app",
-        help="Check or show a configuration; print its schema.",
+        help="Check or show a configuration, or print its schema.",
         haste="patient",
         hastes={"check": "quick", "show": "quick", "schema": "quick"},
+    ),
+    "flights": Command(
+        target="companion.cli.flights:app",
+        help="List, show, pin, prune or recover journals.",
+        haste="patient",
+        hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
     ),
 }
 
@@ -103,7 +108,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    help="Variable-rate spraying companion: every change of rate falls on its boundary.",
+    help="Variable-rate spraying: change the rate exactly on the zone boundary.",
     epilog="Example: vrspray config check examples/anyang/config.toml",
 )
 
@@ -162,7 +167,7 @@ def execute(arguments: Sequence[str]) -> int:
         more = {"ok": False, "problems": [refusal(error)]} if isinstance(error, MapError) else {}
         return _fail(str(error), code, as_json=as_json, more=more)
     except MemoryError:
-        text = "there is not enough memory for this; use a smaller file, or another computer"
+        text = "not enough memory; use a smaller file or another computer"
         return _fail(text, REFUSED, as_json=as_json)
     except (KeyboardInterrupt, typer.Abort):
         return _fail("interrupted", INTERRUPTED, as_json=as_json)

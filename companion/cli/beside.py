@@ -54,4 +54,7 @@ def give_way(arguments: Sequence[str], haste: Haste) -> None:
     flying = () if haste == "quick" or "--help" in arguments else running()
     if flying:
         numbers = ", ".join(str(number) for number in flying)
-        note(f"note: vrspray run flies on this computer (process {numbers}); this gives way to it")
+        note(
+            f"note: vrspray run is active on this computer (process {numbers}); this command "
+            "gives way to it"
+        )

@@ -20,7 +20,7 @@ from companion.problem import Problem
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
-    help="Check or show a configuration; print its schema.",
+    help="Check or show a configuration, or print its schema.",
     epilog="Example: vrspray config check examples/anyang/config.toml",
 )
 File = Annotated[Path, typer.Argument(metavar="FILE", help="Configuration, a TOML file.")]
@@ -86,7 +86,7 @@ def _toml(value: Any) -> str:
 def schema(
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="FILE", help="Not read: the schema is the same for all files."),
+        typer.Argument(metavar="FILE", help="Ignored: the schema is the same for all files."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

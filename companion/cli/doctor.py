@@ -65,19 +65,19 @@ def doctor(
         Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
     ],
     no_vehicle: Annotated[
-        bool, typer.Option("--no-link", help="Leave out what needs the vehicle.")
+        bool, typer.Option("--no-link", help="Skip the checks that need the vehicle.")
     ] = False,
     wait_s: Annotated[
-        float, typer.Option(min=1.0, max=120.0, help="Listen to the vehicle for at most this long.")
+        float, typer.Option(min=1.0, max=120.0, help="Longest time to listen to the vehicle.")
     ] = 10.0,
     is_click: Annotated[
-        bool, typer.Option("--click", help="Guided: let each valve click; nothing else is checked.")
+        bool, typer.Option("--click", help="Click each valve, guided; check nothing else.")
     ] = False,
     is_watchdogs: Annotated[
-        bool, typer.Option("--watchdogs", help="Try the watchdogs; nothing else is checked.")
+        bool, typer.Option("--watchdogs", help="Test the watchdogs; check nothing else.")
     ] = False,
     is_wet: Annotated[
-        bool, typer.Option("--wet", help="With --click: with water, judged by the flow meter.")
+        bool, typer.Option("--wet", help="With --click: use water, and judge by the flow meter.")
     ] = False,
     overrides: Overrides = None,
     as_json: AsJson = False,
@@ -157,14 +157,14 @@ def _vehicle(
     """Yield the checks that need the vehicle."""
     options = servo_options(config)
     if wait_s is None:
-        yield from no_link("left out: --no-link")
+        yield from no_link("skipped (--no-link)")
         yield from output_checks(None, options)
         return
     try:
         link = build_link(config, given, component_options(config))
     except LinkError as error:
         yield fail("link", *split_advice(str(error), "correct link.signing_key_file"))
-        rest = no_link("the link is not open")
+        rest = no_link("the link did not open")
         yield from (check for check in rest if check.name != "link")
         yield from output_checks(None, options)
         return
@@ -200,7 +200,7 @@ def _summary(checks: list[Check]) -> str:
     counts = {status: sum(check.status is status for check in checks) for status in Status}
     verdict = "ready" if is_ready(checks) else "not ready"
     return (
-        f"{verdict}: {counts[Status.OK]} ok, {counts[Status.WARN]} to be seen to, "
+        f"{verdict}: {counts[Status.OK]} ok, {counts[Status.WARN]} to check, "
         f"{counts[Status.FAIL]} failed, {counts[Status.NOT_APPLICABLE]} not applicable"
     )
 
@@ -232,18 +232,20 @@ def _agreement(config: Config) -> Check:
     name = "configuration"
     wrong = [*mismatches(config)]
     if wrong:
-        return fail(name, f"{wrong[0].key}: {wrong[0].text}", "correct it in the file")
+        return fail(name, f"{wrong[0].key}: {wrong[0].text}", "correct the configuration")
     idle = [*without_effect(config)]
     if idle:
         keys = ", ".join(found.key for found in idle)
-        return warn(name, f"without effect in this version: {keys}", "leave the keys out")
+        return warn(name, f"these keys have no effect in this version: {keys}", "remove them")
     return ok(name, f"{config.path} is valid")
 
 
 def _output(config: Config) -> Check:
     kind = config.output.kind
     if kind == "none":
-        return warn("output", "a dry run: no valve opens", 'write output.kind = "servo" or "gpio"')
+        return warn(
+            "output", "dry run: no valve will open", 'write output.kind = "servo" or "gpio"'
+        )
     what = "servo outputs" if kind == "servo" else f"GPIO lines of {config.output.chip}"
     channels = ", ".join(str(valve.channel) for valve in config.valve)
     return ok("output", f"{len(config.valve)} valves on {what} {channels}")
@@ -252,13 +254,16 @@ def _output(config: Config) -> Check:
 def _dead_man(config: Config) -> Check:
     name = "pump-cutoff"
     if config.output.kind == "none":
-        return not_applicable(name, "a dry run")
+        return not_applicable(name, "dry run")
     if config.safety.pump_cutoff:
-        return ok(name, "declared: a relay cuts the pump when this computer fails; try it")
+        return ok(
+            name,
+            "configured: a relay cuts the pump when this computer fails; test it before the flight",
+        )
     return warn(
         name,
-        "none declared: a valve that sticks, or a computer that stands still, sprays on",
-        "fit a relay that cuts the pump and write safety.pump_cutoff = true",
+        "none configured: a stuck valve or a stopped computer would keep spraying",
+        "fit a relay that cuts the pump, then write safety.pump_cutoff = true",
     )
 
 
@@ -267,14 +272,14 @@ def _lags(config: Config) -> Check:
     if (lag.on_s, lag.off_s, lag.up_s, lag.down_s) in _EXAMPLE_LAGS:
         return warn(
             "lags",
-            "those of an example, measured on a simulated sprayer",
-            "measure yours: vrspray calibrate lag",
+            "these are an example's lags, measured on a simulated sprayer",
+            "measure your own: vrspray calibrate lag",
         )
     if config.settings()["lag.position_s"][1] == "default":
         return warn(
             "lags",
-            "lag.position_s is not set: 0 s is taken for the age of a position",
-            "measure it: vrspray calibrate lag-marks, then write it",
+            "lag.position_s is not set: positions are treated as 0 s old",
+            "measure it (vrspray calibrate lag-marks) and write it into the configuration",
         )
     return ok("lags", f"on {lag.on_s:g}, off {lag.off_s:g}, position {lag.position_s:g} s")
 
@@ -284,16 +289,16 @@ def _age(measured_on: str | None, today: date) -> Check:
     if measured_on is None:
         return warn(
             name,
-            "lag.measured_on is not set: nothing says when flows and lags were measured",
-            'write the day, such as measured_on = "2026-05-01", under [lag]',
+            "lag.measured_on is not set, so the age of flows and lags is unknown",
+            'write the date under [lag], such as measured_on = "2026-05-01"',
         )
     fix = "correct lag.measured_on, or the clock of this computer"
     try:
         days = (today - date.fromisoformat(measured_on)).days
     except ValueError:
-        return warn(name, f"{measured_on} is no day", fix)
+        return warn(name, f"{measured_on} is not a date", fix)
     if not days >= 0:
-        return warn(name, f"measured on {measured_on}, which is to come", fix)
+        return warn(name, f"measured on {measured_on}, which is in the future", fix)
     if not days <= CALIBRATION_MAX_DAYS:
         fix = "measure again: vrspray calibrate flow, vrspray calibrate lag"
         return warn(name, f"measured {days} days ago", fix)
@@ -336,7 +341,7 @@ def map_checks(
 
 
 def _no_map() -> list[Check]:
-    return [not_applicable(name, "there is no map") for name in ("flight-map", "rates")]
+    return [not_applicable(name, "no map") for name in ("flight-map", "rates")]
 
 
 def _flight_map(flight_map: FlightMap, now: datetime) -> Check:
@@ -346,7 +351,7 @@ def _flight_map(flight_map: FlightMap, now: datetime) -> Check:
     age = "on an unknown day" if days is None else f"{counted(int(days), 'day')} ago"
     text = f"{flight_map.sha256[:8]} of {flight_map.source}, compiled {age}"
     if not flight_map.findings:
-        return ok(name, f"{text}; nothing found wrong with the map")
+        return ok(name, f"{text}; no problems found in the map")
     first = flight_map.findings[0]
     return warn(
         name,
@@ -358,12 +363,12 @@ def _flight_map(flight_map: FlightMap, now: datetime) -> Check:
 def _rates(config: Config, setup: Setup) -> Check:
     """Check the prescribed rates against what the nozzle sets deliver at the planned speed."""
     if config.mission is None:
-        return not_applicable("rates", "no mission.speed_m_s to compare the rates with")
+        return not_applicable("rates", "mission.speed_m_s is not set")
     speed_m_s = config.mission.speed_m_s
     problems = deliverable(setup, speed_m_s)
     if problems:
         return warn("rates", problems[0].text, problems[0].fix)
-    return ok("rates", f"the nozzle sets deliver all of them at {speed_m_s:g} m/s")
+    return ok("rates", f"the nozzle sets can deliver all rates at {speed_m_s:g} m/s")
 
 
 # Can the autopilot's outputs be trusted: parameters, watchdog script, what the outputs read.
@@ -371,7 +376,7 @@ def _rates(config: Config, setup: Setup) -> Check:
 _NAMES = ("output-parameters", "disarmed-values", "watchdog-script", "closed-order")
 _MASK_OUTPUTS = 16
 _BOARD = (
-    "fit a driver board that closes when its orders stand still (output.dither_us = 8, "
+    "fit a driver board that closes when its signal stops changing (output.dither_us = 8, "
     "docs/driver-board.md)"
 )
 _RELAY = "fit a relay that cuts the pump when this computer fails (docs/pump.md)"
@@ -384,7 +389,7 @@ def output_checks(heard: Heard | None, options: ServoOptions | None) -> Iterator
         yield from (not_applicable(name, "no servo outputs are used") for name in _NAMES)
         return
     if heard is None or heard.system_id is None:
-        yield from (not_applicable(name, "no vehicle is heard") for name in _NAMES)
+        yield from (not_applicable(name, "no vehicle heard") for name in _NAMES)
         return
     yield from _parameters(heard, options)
     yield _watchdog(heard, options)
@@ -397,16 +402,16 @@ def _parameters(heard: Heard, options: ServoOptions) -> Iterator[Check]:
     if wiring is not None:
         text, _, fix = wiring.rpartition(": ")
         yield fail(name, text, fix)
-        yield not_applicable(rest, "the outputs cannot be had")
+        yield not_applicable(rest, "the outputs cannot be read")
         return
     if heard.parameters is None:
-        fix = "ask again with a longer --wait-s; see that nothing else loads the link"
+        fix = "try again with a longer --wait-s, and check that nothing else loads the link"
         yield warn(name, "the autopilot's parameters were not read in time", fix)
         yield not_applicable(rest, "not read")
         return
     found = findings(options, heard.parameters, is_px4=heard.is_px4)
     at_rest = [one for one in found if heard.is_px4 and _is_at_rest(one)]
-    yield _of([one for one in found if one not in at_rest], name, "as they must be")
+    yield _of([one for one in found if one not in at_rest], name, "set correctly")
     if heard.is_px4:
         yield _of(at_rest, rest, "closed while disarmed")
     else:
@@ -438,24 +443,26 @@ def _watchdog(heard: Heard, options: ServoOptions) -> Check:
         return _board_alone(name, options)
     known = heard.parameters
     if known is None:
-        return warn(name, "its parameters were not read in time", "ask again, longer: --wait-s")
+        return warn(
+            name, "its parameters were not read in time", "try again with a longer --wait-s"
+        )
     trouble = watchdog_trouble(known, options)
     if trouble is None:
-        return ok(name, "runs, and knows these outputs")
+        return ok(name, "runs and guards these outputs")
     text, fix = trouble
     # A board closes valves only: orders to motors are not dithered.
     if options.dither_us and not options.drives:
-        return warn(name, f"{text}: only the driver board's alive dither closes", fix)
+        return warn(name, f"{text}: only the driver board's alive dither closes the valves", fix)
     return fail(name, text, fix)
 
 
 def _board_alone(name: str, options: ServoOptions) -> Check:
     """Check what PX4 leaves, which has no script: a board closes valves, and no motor."""
     if not options.dither_us:
-        text = "PX4 holds the last order of a dead companion until disarmed"
+        text = "if the companion fails, PX4 keeps its last order until disarmed"
         return fail(name, text, _BOARD)
     if options.drives:
-        text = f"nothing stops the motor at output {options.drives[0].channel} but disarming"
+        text = f"only disarming stops the motor at output {options.drives[0].channel}"
         return warn(name, f"PX4 has none: {text}", _RELAY)
     return not_applicable(name, "PX4 has none: the driver board is the watchdog")
 
@@ -478,9 +485,10 @@ def watchdog_trouble(known: Known, options: ServoOptions) -> tuple[str, str] | N
     missing = [channel for channel in guarded if not _guards(known, channel)]
     if missing:
         return (
-            f"output {missing[0]} is not among those that it closes",
-            "set SPRW_FIRST and SPRW_LAST to the outputs of valves and motors, SPRW_MASK to those "
-            "besides",
+            f"the script does not close output {missing[0]}",
+            "set SPRW_FIRST and SPRW_LAST to the range of valve and motor outputs, and SPRW_MASK "
+            "to "
+            "the others",
         )
     wrong = _closed_pulse_trouble(known.get("SPRW_CLOSED_US"), options)
     if wrong is not None:
@@ -495,7 +503,7 @@ def _closed_pulse_trouble(closed_us: float | None, options: ServoOptions) -> tup
     """Return what is wrong with the script's one pulse: it closes valves and stops motors."""
     fix = f"set SPRW_CLOSED_US to {options.closed_us}"
     if closed_us is None:
-        return "SPRW_CLOSED_US does not answer", "ask again, longer: --wait-s"
+        return "SPRW_CLOSED_US does not answer", "try again with a longer --wait-s"
     # NaN is not equal to anything, nor at most anything.
     if closed_us != options.closed_us:
         return f"SPRW_CLOSED_US is {closed_us:g}, not output.closed_us", fix
@@ -523,7 +531,9 @@ def _closed(heard: Heard, options: ServoOptions) -> Check:
     """Check that the outputs followed the order to close."""
     name = "closed-order"
     if heard.is_px4:
-        return not_applicable(name, "not on PX4: its outputs follow orders only while armed")
+        return not_applicable(
+            name, "not possible on PX4: its outputs follow orders only while armed"
+        )
     if not heard.is_closed_ordered:
         return not_applicable(name, "tried on a disarmed vehicle only")
     refused = [result for result in heard.order_results if result in REFUSALS]
@@ -534,18 +544,18 @@ def _closed(heard: Heard, options: ServoOptions) -> Check:
         wrong = _reading(name, channel, heard.outputs_us.get(channel), pulse_us)
         if wrong is not None:
             return wrong
-    return ok(name, f"{len(options.outputs)} outputs read as ordered")
+    return ok(name, f"{len(options.outputs)} outputs follow their orders")
 
 
 def _reading(name: str, channel: int, read: int | None, pulse_us: int) -> Check | None:
     """Return what is wrong with what an output reads; None if it reads as ordered."""
     if read is None:
-        fix = "see that SERVO_OUTPUT_RAW is streamed (docs/link.md)"
-        return warn(name, f"nothing tells what output {channel} does", fix)
+        fix = "make sure that SERVO_OUTPUT_RAW is streamed (docs/link.md)"
+        return warn(name, f"the autopilot does not report output {channel}", fix)
     if read == 0:
         fix = "press the safety switch, or set BRD_SAFETY_MASK"
         return fail(name, f"output {channel} gives no pulse", fix)
     if not abs(read - pulse_us) <= TOLERANCE_US:
-        fix = f"set SERVO{channel}_FUNCTION to 0, and see who else orders it"
-        return fail(name, f"output {channel} reads {read} us, ordered {pulse_us}", fix)
+        fix = f"set SERVO{channel}_FUNCTION to 0, and find out what else drives it"
+        return fail(name, f"output {channel} reads {read} us, but {pulse_us} us were ordered", fix)
     return None

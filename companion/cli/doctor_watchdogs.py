@@ -60,7 +60,7 @@ def _script(config: Config, given: tuple[str, ...], wait_s: float | None) -> Che
     if options is None or not options.channels:
         return script_check(None, why="no servo outputs are used")
     if wait_s is None:
-        return script_check(None, why="left out: --no-link")
+        return script_check(None, why="skipped (--no-link)")
     link = build_link(config, given, component_options(config, watch_mission=True))
     trial = asyncio.run(try_script(link, options, wait_s=wait_s, setup=ground_setup(config)))
     return script_check(trial, words=in_words(trial.reasons))
@@ -205,7 +205,7 @@ def systemd_checks(found: Systemd) -> Iterator[Check]:
     elif found.has_closer:
         yield ok(name, "ExecStopPost closes the lines after every end")
     else:
-        fix = "vrspray service install writes it anew"
+        fix = "run vrspray service install again"
         yield warn(name, "the unit has no ExecStopPost that closes", fix)
 
 
@@ -213,7 +213,7 @@ def _runtime(value: str | None) -> Check:
     name = "system-watchdog"
     fix = f"write RuntimeWatchdogSec={WATCHDOG_MAX_S} into /etc/systemd/system.conf, then restart"
     if value is None:
-        return not_applicable(name, "there is no systemd on this computer")
+        return not_applicable(name, "no systemd on this computer")
     seconds = seconds_of(value)
     if seconds is None or not seconds > 0.0:
         return warn(name, "systemd feeds no hardware watchdog: a hung kernel stays hung", fix)
@@ -228,7 +228,7 @@ def _fed(found: Systemd) -> Check:
         return not_applicable(name, "the service is not installed")
     limit_s = seconds_of(unit.get("WatchdogUSec", ""))
     if limit_s is None or not limit_s > 0.0:
-        return warn(name, "the unit has no WatchdogSec", "vrspray service install writes it anew")
+        return warn(name, "the unit has no WatchdogSec", "run vrspray service install again")
     if unit.get("ActiveState") != "active":
         why = "the service does not run: start it, and ask again with --watchdogs"
         return not_applicable(name, why)

@@ -13,7 +13,7 @@ from companion.ground.work import GroundKind
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
-    help="Work on the ground with valves open: the vehicle disarmed, a key held.",
+    help="Open valves on the ground, with the vehicle disarmed, while you hold a key.",
     epilog="Example: vrspray ground prime --config config.toml",
 )
 Valves = Annotated[
@@ -21,10 +21,10 @@ Valves = Annotated[
     typer.Option("--valve", metavar="NAME", help="Only this valve; may be repeated."),
 ]
 Seconds = Annotated[
-    float | None, typer.Option(min=0.2, max=30.0, help="In all; 30 at most in one piece.")
+    float | None, typer.Option(min=0.2, max=30.0, help="Total time; at most 30 s in one go.")
 ]
 Together = Annotated[bool, typer.Option("--together", help="All valves at once, not in turn.")]
-Water = Annotated[bool, typer.Option("--water", help="With water: marked so in the record.")]
+Water = Annotated[bool, typer.Option("--water", help="With water: marks the record.")]
 
 
 @app.command(epilog="Example: vrspray ground prime --config config.toml")
@@ -64,7 +64,7 @@ def flush(
 def rinse(
     asked: Asked,
     litres: Annotated[
-        float | None, typer.Option(min=0.01, max=1000.0, help="Of clean water.")
+        float | None, typer.Option(min=0.01, max=1000.0, help="Volume of clean water.")
     ] = None,
     valves: Valves = None,
     seconds: Seconds = None,
@@ -86,7 +86,7 @@ def rinse(
 @asked_options
 def catch(
     asked: Asked,
-    duty: Annotated[float | None, typer.Option(help="Of the valves, 0 to 1.")] = None,
+    duty: Annotated[float | None, typer.Option(help="Duty cycle of the valves, 0 to 1.")] = None,
     valves: Valves = None,
     seconds: Seconds = None,
     is_water: Water = False,

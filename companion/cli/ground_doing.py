@@ -240,7 +240,7 @@ def append(path: Path, entry: Mapping[str, Any]) -> str | None:
 # What is said of the reasons for which ground work was not done, or ended.
 
 _WORDS: dict[str, str] = {
-    GroundReason.NO_HEARTBEAT: "no vehicle is heard; check link.url and power",
+    GroundReason.NO_HEARTBEAT: "no vehicle heard; check link.url and power",
     GroundReason.STALE_HEARTBEAT: "the vehicle is heard no more",
     GroundReason.ARMED: "the vehicle is armed; disarm it",
     GroundReason.MISSION_MODE: "the vehicle is in a mode that flies missions or may spray; choose "

@@ -54,21 +54,22 @@ def run_companion(
         Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
     ],
     duration_s: Annotated[
-        float | None, typer.Option(min=0.0, max=1e7, help="Stop by itself after this time.")
+        float | None, typer.Option(min=0.0, max=1e7, help="Stop after this time.")
     ] = None,
     is_water: Annotated[
-        bool, typer.Option("--water", help="Training with water: marked in every record.")
+        bool, typer.Option("--water", help="Training with water: marks every record.")
     ] = False,
     continue_from: Annotated[
         list[Path] | None,
         typer.Option(
-            "--continue", metavar="JOURNAL", help="Go on: its ground is not sprayed again."
+            "--continue", metavar="JOURNAL", help="Resume: do not spray its treated ground again."
         ),
     ] = None,
     takes_unmarked: Annotated[
         bool,
         typer.Option(
-            "--continue-unmarked", help="A journal of --continue that does not say it: a product."
+            "--continue-unmarked",
+            help="The journal of --continue does not record water or product: it was product.",
         ),
     ] = False,
     overrides: Overrides = None,
@@ -151,8 +152,9 @@ def _continued_lines(setup: Setup) -> list[str]:
     if setup.treated is None or setup.overlap is None:
         return []
     return [
-        f"going on: {setup.treated.area_m2 / 10_000.0:.3f} ha are treated; valves close where "
-        f"{setup.overlap.switch_off_percent:g} % of their strip is"
+        f"resuming: {setup.treated.area_m2 / 10_000.0:.3f} ha are already treated; a valve closes "
+        "where "
+        f"{setup.overlap.switch_off_percent:g} % of its strip is treated"
     ]
 
 
@@ -235,7 +237,7 @@ def _application_notes(config: Config, training: str) -> list[str]:
     if not absent:
         return []
     return [
-        f"note: the {profile} record of this application will be incomplete: missing "
+        f"note: the {profile} application record will be incomplete; missing: "
         f"{', '.join(absent)}; write them now, or give them to `vrspray report`"
     ]
 

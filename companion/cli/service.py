@@ -36,10 +36,10 @@ _GROUPS = ("dialout", "gpio", "spi")
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
-    help="Install, remove or look at the service of systemd.",
+    help="Install, remove or show the systemd service.",
     epilog="Example: sudo vrspray service install --config /etc/vrspray/config.toml",
 )
-OfUser = Annotated[bool, typer.Option("--user", help="A service of this user, without root.")]
+OfUser = Annotated[bool, typer.Option("--user", help="A service for this user only, without root.")]
 
 
 @app.command(epilog="Example: vrspray service install --config field.toml --dry-run")
@@ -50,7 +50,7 @@ def install(
     user: OfUser = False,
     account: Annotated[
         str | None,
-        typer.Option("--run-as", metavar="USER", help="Who it runs as; default: who calls."),
+        typer.Option("--run-as", metavar="USER", help="User it runs as; default: you."),
     ] = None,
     realtime: Annotated[
         bool,
@@ -58,7 +58,7 @@ def install(
             "--realtime", help="Real-time priority for the control loop too (not --user)."
         ),
     ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the unit, write nothing.")] = (
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the unit; write nothing.")] = (
         False
     ),
     as_json: AsJson = False,

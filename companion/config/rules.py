@@ -63,7 +63,8 @@ def _prescription(config: Document) -> Rule:
             here, missing = missing, here
         yield Contradiction(
             key=f"prescription.{here}",
-            text=f"without prescription.{missing}; give the mark in the map and as surveyed",
+            text=f"needs prescription.{missing} as well; write the position of the mark on the "
+            "map and as surveyed",
         )
 
 
@@ -82,7 +83,7 @@ def mismatches(config: Document) -> Rule:
     if not _near(sum_m, width_m):
         yield Contradiction(
             key="boom.width_m",
-            text=f"the strips of the valves add up to {sum_m:g} m; correct valve[...].width_m",
+            text=f"the valve widths add up to {sum_m:g} m; correct valve[...].width_m",
         )
 
 
@@ -91,13 +92,13 @@ def without_effect(config: Document) -> Rule:
     if config.flow_trim.enabled and config.flow_meter.source == "none":
         yield Contradiction(
             key="flow_trim.enabled",
-            text="no flow meter is configured (flow_meter.source): the trim stays 1",
+            text="has no effect without a flow meter; set flow_meter.source",
         )
     for number, table in enumerate(config.nozzle_set):
         if table.preset is not None:
             yield Contradiction(
                 key=f"nozzle_set[{number}].preset",
-                text="a published law: its own authors measured up to 22 % more flow than it says; "
+                text="a published curve: its own authors measured up to 22 % more flow; "
                 "measure yours (vrspray calibrate flow)",
             )
     for key, text in chain(line_warnings(config), motor_warnings(config)):
@@ -107,7 +108,9 @@ def without_effect(config: Document) -> Rule:
     }
     for key, is_set in settings.items():
         if is_set:
-            yield Contradiction(key=key, text="not part of this version, without effect")
+            yield Contradiction(
+                key=key, text="not part of this version and has no effect; remove it"
+            )
 
 
 def unbounded(config: Document) -> Rule:
@@ -115,8 +118,8 @@ def unbounded(config: Document) -> Rule:
     if config.mission is None or config.mission.lines is None:
         yield Contradiction(
             key="mission.lines",
-            text="not set: the whole map is sprayed wherever the aircraft flies, ferries too; "
-            "name the GeoJSON of the plan",
+            text="not set: the drone sprays the whole map wherever it flies, ferries included; "
+            "name the plan's .lines.geojson",
         )
 
 
@@ -129,7 +132,9 @@ def _link(config: Document) -> Rule:
     port = int(rest.rpartition(":")[2])
     least = 0 if kind == "udpin" else 1  # 0 lets the system choose the port to listen on
     if kind != "serial" and not least <= port <= 65535:
-        yield Contradiction(key="link.url", text="no port; write one from 1 to 65535 at the end")
+        yield Contradiction(
+            key="link.url", text="has no valid port; end it with a port from 1 to 65535"
+        )
 
 
 def _valves(config: Document) -> Rule:
@@ -166,11 +171,13 @@ def _channels(config: Document) -> Rule:
     if kind == "gpio":
         channels |= _alive(config)
         if len(channels) > LINES_MAX:
-            yield Contradiction(key="valve", text=f"more than {LINES_MAX} lines; write fewer")
+            yield Contradiction(
+                key="valve", text=f"too many valves; at most {LINES_MAX} lines are possible"
+            )
     counts = Counter(channels.values())
     for key, channel in channels.items():
         if channel is not None and not first <= channel <= last:
-            yield Contradiction(key=key, text=f"no {what}; write one from {first} to {last}")
+            yield Contradiction(key=key, text=f"not a {what}; write one from {first} to {last}")
         if channel is not None and counts[channel] > 1:
             yield Contradiction(key=key, text=f"used twice; give each valve its own {what}")
 
@@ -193,7 +200,7 @@ def _nozzle_sets(config: Document) -> Rule:
                 + ", ".join(f'"{name}"' for name in names),
             )
         if len(set(table.valves)) != len(table.valves):
-            yield Contradiction(key=f"{key}.valves", text="a valve stands twice; name it once")
+            yield Contradiction(key=f"{key}.valves", text="names a valve twice; name each once")
         used.update(table.valves)
         if table.preset is not None and not unknown:
             yield from _preset(config, table, key)
@@ -203,7 +210,8 @@ def _nozzle_sets(config: Document) -> Rule:
         if name not in used:
             yield Contradiction(
                 key=f"valve[{number}].name",
-                text="in no nozzle_set.valves, so it would never open; add it or remove the valve",
+                text="not in any nozzle_set.valves, so it would never open; add it there, or "
+                "remove the valve",
             )
 
 
@@ -211,7 +219,7 @@ def _preset(config: Document, table: NozzleSetTable, key: str) -> Rule:
     if table.duty or table.flow_l_min or makes_flow(config):
         other = "the curve of the pump" if makes_flow(config) else "a row of measured points"
         yield Contradiction(
-            key=f"{key}.preset", text=f"{other} says the flow already; remove one of the two"
+            key=f"{key}.preset", text=f"{other} already gives the flow; remove one of the two"
         )
         return
     if table.points(config.valve) == ((), ()):
@@ -219,8 +227,9 @@ def _preset(config: Document, table: NozzleSetTable, key: str) -> Rule:
         has = table.nozzles(config.valve)
         yield Contradiction(
             key=f"{key}.preset",
-            text=f'"{table.preset}" is of {counts} nozzles, this set has '
-            f"{'no valve.nozzles for each' if has is None else has}; correct valve[...].nozzles, "
+            text=f'"{table.preset}" is for {counts} nozzles, but this set has '
+            f"{'valves without valve.nozzles' if has is None else has}; correct "
+            "valve[...].nozzles, "
             "or write measured points",
         )
 
@@ -230,8 +239,7 @@ def _curve(duty: tuple[float, ...], flow_l_min: tuple[float, ...], key: str) -> 
         if not values:
             yield Contradiction(
                 key=f"{key}.{name}",
-                text="missing, and required but behind a pump that makes the flow; write the "
-                "measured points",
+                text="missing and required, unless a pump sets the flow; write the measured points",
             )
             return
     if len(duty) != len(flow_l_min):
@@ -265,8 +273,8 @@ def _pwm(config: Document) -> Rule:
     if pwm.valve == "normally-open" and not config.safety.pump_cutoff:
         yield Contradiction(
             key="pwm.valve",
-            text="such valves spray when the power fails; spraying needs a relay that cuts the "
-            "pump: fit it and write safety.pump_cutoff = true",
+            text="normally open valves spray when power fails; fit a relay that cuts the "
+            "pump, then write safety.pump_cutoff = true",
         )
 
 
@@ -275,12 +283,12 @@ def _lags(config: Document) -> Rule:
     if not lag.on_start_s <= lag.on_s:
         yield Contradiction(
             key="lag.on_start_s",
-            text=f"first flow after lag.on_s = {lag.on_s:g}; write at most that",
+            text=f"the first flow cannot come after lag.on_s = {lag.on_s:g}; write at most that",
         )
     if not lag.off_end_s >= lag.off_s:
         yield Contradiction(
             key="lag.off_end_s",
-            text=f"last flow before lag.off_s = {lag.off_s:g}; write at least that",
+            text=f"the flow cannot end before lag.off_s = {lag.off_s:g}; write at least that",
         )
     for key, time_s, whole_s in (
         ("up", lag.up_time_s, lag.up_s),
@@ -289,7 +297,8 @@ def _lags(config: Document) -> Rule:
         if not time_s <= whole_s:
             yield Contradiction(
                 key=f"lag.{key}_time_s",
-                text=f"a part of lag.{key}_s = {whole_s:g}; write at most that",
+                text=f"cannot be longer than lag.{key}_s = {whole_s:g}, which includes it; write "
+                "at most that",
             )
 
 
@@ -298,15 +307,16 @@ def _output(config: Document) -> Rule:
     if not abs(output.full_us - output.closed_us) >= SPAN_MIN_US:
         yield Contradiction(
             key="output.full_us",
-            text=f"within {SPAN_MIN_US} us of output.closed_us = {output.closed_us}; "
+            text=f"less than {SPAN_MIN_US} us from output.closed_us = {output.closed_us}; "
             "write the two ends of the driver's range, such as 1000 and 2000",
         )
     # A driver board begins a new period when the width moves by 2 % of its span.
     elif not output.dither_us < 0.02 * abs(output.full_us - output.closed_us):
         yield Contradiction(
             key="output.dither_us",
-            text="2 % of full_us - closed_us or more: each move would begin a period of the "
-            "driver board anew; write 8",
+            text="2 % or more of full_us - closed_us: each change would restart the PWM period of "
+            "the "
+            "driver board; write 8",
         )
 
 
@@ -330,7 +340,8 @@ def _safety(config: Document) -> Rule:
     if not usable:
         yield Contradiction(
             key="safety.enable_by",
-            text='leaves no way to enable; add "command", or for "rc" set safety.rc_channel, '
+            text='leaves no way to enable spraying; add "command", or for "rc" set '
+            "safety.rc_channel, "
             'or for "web" set web.enabled',
         )
 
@@ -353,7 +364,7 @@ def _mission(config: Document) -> Rule:
         if not mission.lines_aside_m <= half_m:
             yield Contradiction(
                 key="mission.lines_aside_m",
-                text=f"the next line is nearer; write at most half a swath, {half_m:g}",
+                text=f"reaches the next line; write at most half a swath, {half_m:g}",
             )
 
 
@@ -379,7 +390,7 @@ def line_contradictions(config: Document) -> Found:
     """Yield (key, what is wrong) of a line that is claimed a second time on one chip."""
     for first, second in _shared(config):
         if first.chip == second.chip:
-            yield second.key, f"{first.key} has this line; give each its own"
+            yield second.key, f"{first.key} uses the same line; give each its own"
 
 
 def line_warnings(config: Document) -> Found:
@@ -432,7 +443,7 @@ def sensor_contradictions(config: Document) -> Found:
     if config.detection.enabled and config.flow_meter.source == "none":
         yield (
             "detection.enabled",
-            'without a flow meter nothing is detected; set flow_meter.source = "gpio", or false',
+            'needs a flow meter to detect faults; set flow_meter.source = "gpio", or write false',
         )
 
 
@@ -445,7 +456,7 @@ def _meter(config: Document) -> Found:
     if table.pulses_per_l is None:
         yield (
             "flow_meter.pulses_per_l",
-            "missing; write the pulses of a litre, measured with a bucket",
+            "missing; write the pulses per litre, measured with a bucket",
         )
 
 

@@ -21,9 +21,9 @@ WRONG = {
     "float_parsing": "not a number",
     "int_type": "not a whole number",
     "int_from_float": "not a whole number",
-    "bool_type": "neither true nor false",
+    "bool_type": "not true or false",
     "string_type": "not text in quotes",
-    "string_pattern_mismatch": "not of this form",
+    "string_pattern_mismatch": "not in the right form",
     "string_too_short": "empty",
     "string_too_long": "too long",
     "literal_error": "not known",
@@ -47,14 +47,15 @@ def show_value(value: Any, *, length_max: int = VALUE_LENGTH_MAX) -> str:
 
 
 def say_syntax(path: Path, text: str, message: str) -> str:
-    """Return one line on a file that is no TOML: where, what, and the line itself."""
+    """Return one line on a file that is not valid TOML: where, what, and the line itself."""
     match = LINE.search(message)
     if match is None:
-        return f"{path}: no TOML: {message}; something is not closed at the end of the file"
+        advice = "a quote or bracket is not closed at the end of the file"
+        return f"{path}: not valid TOML: {message}; {advice}"
     number = int(match[1])
     lines = text.splitlines()
     line = show_value(lines[number - 1].strip()) if number <= len(lines) else "the end"
-    return f"{path}: line {number}: {line}: {message}; write key = value, text in quotes"
+    return f"{path}: line {number}: {line}: {message}; write key = value, with text in quotes"
 
 
 def say(errors: Sequence[ErrorDetails], raw: dict[str, Any], model: type[BaseModel]) -> str:
@@ -158,7 +159,7 @@ def _nearest(steps: Sequence[str | int], schema: dict[str, Any]) -> str:
     if near:
         return f"did you mean {dotted([*steps[:-1], near[0]])}?"
     table = dotted(steps[:-1])
-    return f"{f'[{table}]' if table else 'the file'} knows {', '.join(known)}"
+    return f"{f'[{table}]' if table else 'the file'} can have: {', '.join(known)}"
 
 
 def allowed_text(node: dict[str, Any], schema: dict[str, Any], name: str = "key") -> str:

@@ -47,7 +47,7 @@ def _python(found: Computer) -> Check:
     if not found.python >= (3, 11, 0):
         return fail("system", text, "install Python 3.11 or newer")
     if found.system != "Linux":
-        return warn("system", text, "fly with Linux: nothing else is tested")
+        return warn("system", text, "use Linux: nothing else is tested")
     return ok("system", text)
 
 
@@ -55,34 +55,34 @@ def _sqlite(found: Computer) -> Check:
     version = ".".join(map(str, found.sqlite))
     if not found.sqlite >= (3, 22, 0):
         fix = "install a newer SQLite"
-        return fail("sqlite", f"SQLite {version} cannot read a journal that a crash left", fix)
-    return ok("sqlite", f"SQLite {version}; a journal has one connection, so its WAL is safe")
+        return fail("sqlite", f"SQLite {version} cannot read the journal of a crashed flight", fix)
+    return ok("sqlite", f"SQLite {version}; safe for journals")
 
 
 def _folder(folder: Folder) -> Check:
     name = folder.name
     if folder.problem is not None or folder.free_bytes is None:
         text = folder.problem or f"{folder.path}: free space unknown"
-        return fail(name, text, "give this user the right to write there, or name another folder")
+        return fail(name, text, "give this user write access, or choose another folder")
     free = f"{folder.path}: {folder.free_bytes / 1e9:.1f} GB free"
     if not folder.free_bytes >= FREE_MIN_BYTES:
         return fail(name, free, "move old flights away")
     if not folder.free_bytes >= FREE_WARN_BYTES:
-        return warn(name, free, "a flight takes 200 MB an hour: move old ones away")
+        return warn(name, free, "a flight takes 200 MB per hour: move old ones away")
     if folder.sync_s is not None and not folder.sync_s <= SYNC_MAX_S:
         text = f"{folder.path}: a write takes {folder.sync_s:.1f} s to reach the disk"
-        return warn(name, text, "use a faster card, or see what else writes to it")
+        return warn(name, text, "use a faster card, or find out what else writes to it")
     return ok(name, free)
 
 
 def _clock(found: Computer) -> Check:
     if found.is_clock_synchronised is None:
-        return not_applicable("clock", "this kernel does not say whether it is synchronised")
+        return not_applicable("clock", "this kernel does not report whether it is synchronised")
     if not found.is_clock_synchronised:
         return warn(
             "clock",
-            "not synchronised: records carry a wrong time of day (valves do not use it)",
-            "connect to a time server before the flight, or fit a clock with a battery",
+            "not synchronised: records will have the wrong time of day (valves do not use it)",
+            "connect to a time server before the flight, or fit a battery-backed clock",
         )
     return ok("clock", "synchronised")
 
@@ -90,12 +90,12 @@ def _clock(found: Computer) -> Check:
 def _real_time(found: Computer, *, needs_engine: bool) -> Check:
     name = "real-time"
     if not needs_engine:
-        return not_applicable(name, "no valve engine is asked to be in real time")
+        return not_applicable(name, "no real-time valve engine is configured")
     if not found.may_fifo:
         return warn(
             name,
-            "no real-time priority for this user: edges may be some ms late",
-            "vrspray service install allows it for the service; or rtprio 50 in limits.conf",
+            "this user has no real-time priority: valves may switch some ms late",
+            "for the service: vrspray service install; else set rtprio 50 in limits.conf",
         )
     return ok(name, "SCHED_FIFO is permitted")
 
@@ -103,33 +103,35 @@ def _real_time(found: Computer, *, needs_engine: bool) -> Check:
 def _memory(found: Computer, *, needs_engine: bool) -> Check:
     name = "memory-lock"
     if not needs_engine:
-        return not_applicable(name, "no valve engine is asked to be in real time")
+        return not_applicable(name, "no real-time valve engine is configured")
     if not found.may_lock_memory:
         return warn(
             name,
-            "the valve engine's memory may be swapped out",
-            "vrspray service install allows it for the service; or memlock in limits.conf",
+            "the valve engine's memory can be swapped out",
+            "for the service: vrspray service install; else set memlock in limits.conf",
         )
     return ok(name, "permitted")
 
 
 def _governor(found: Computer) -> Check:
     if not found.governors:
-        return not_applicable("cpu-governor", "this computer shows no clock frequencies")
+        return not_applicable("cpu-governor", "this computer does not report clock frequencies")
     names = ", ".join(found.governors)
     if found.governors != ("performance",):
         fix = "set it to performance: cpupower frequency-set -g performance"
-        return warn("cpu-governor", f"{names}: the clock follows the load, after it", fix)
+        return warn(
+            "cpu-governor", f"{names}: the clock speeds up only after the load has come", fix
+        )
     return ok("cpu-governor", names)
 
 
 def _throttling(found: Computer) -> Check:
     name, bits = "throttling", found.throttled
     if bits is None:
-        return not_applicable(name, "not a Raspberry Pi, or its firmware does not say")
+        return not_applicable(name, "not a Raspberry Pi, or its firmware does not report it")
     now = [text for bit, text in _THROTTLED.items() if bits >> bit & 1]
     before = [text for bit, text in _THROTTLED.items() if bits >> bit + 16 & 1]
-    fix = "give it 5.1 V by a short thick cable, and air"
+    fix = "supply 5.1 V through a short, thick cable, and cool it"
     if now:
         return fail(name, f"now: {', '.join(now)}", fix)
     if before:
@@ -142,12 +144,12 @@ def hardware_watchdog_check(found: Computer) -> Check:
     name, dog = "hardware-watchdog", found.watchdog
     fix = "write RuntimeWatchdogSec=15 into /etc/systemd/system.conf"
     if dog is None:
-        return not_applicable(name, "this computer shows none")
+        return not_applicable(name, "this computer has none")
     if not dog.is_active:
-        return warn(name, f"{dog.identity} does not run: a hung kernel stays hung", fix)
+        return warn(name, f"{dog.identity} does not run: nothing restarts a hung kernel", fix)
     is_pi = "bcm2835" in dog.identity.lower() or "broadcom" in dog.identity.lower()
     if is_pi and dog.timeout_s is not None and not dog.timeout_s <= WATCHDOG_MAX_S:
-        return warn(name, f"{dog.timeout_s} s is more than its counter holds", fix)
+        return warn(name, f"{dog.timeout_s} s is longer than its counter allows", fix)
     return ok(name, f"{dog.identity} runs")
 
 
@@ -326,14 +328,14 @@ def serial_check(device: Device | None) -> Check:
     """Return whether the device can be used."""
     name = "serial-port"
     if device is None:
-        return not_applicable(name, "the link is no serial one")
+        return not_applicable(name, "the link is not serial")
     if not device.exists:
         fix = "plug it in, or correct link.url; on a Raspberry Pi: enable_uart=1 in config.txt"
         return fail(name, f"{device.path} does not exist", fix)
     if not device.is_permitted:
         fix = f"sudo usermod -aG {device.group} $USER, then log in again"
         return fail(name, f"{device.path}: permission denied", fix)
-    return ok(name, f"{device.path} may be opened")
+    return ok(name, f"{device.path} can be opened")
 
 
 # Is the service installed, started with the computer, and watched: facts in, checks out.
@@ -355,7 +357,7 @@ def service_checks(found: Service) -> Iterator[Check]:
     """Yield the checks of the service and of its watchdog."""
     rest = ("service-watchdog",)
     if found.state is None and not found.is_installed:
-        why = "there is no systemd on this computer"
+        why = "no systemd on this computer"
         yield from (not_applicable(name, why) for name in ("service", *rest))
         return
     if not found.is_installed:
@@ -368,7 +370,7 @@ def service_checks(found: Service) -> Iterator[Check]:
         return
     yield _enabled(found)
     if not found.is_watched:
-        fix = "vrspray service install writes it anew"
+        fix = "run vrspray service install again"
         yield warn("service-watchdog", "the unit has no WatchdogSec", fix)
     else:
         yield ok("service-watchdog", "fed by the control loop")
@@ -378,18 +380,18 @@ def _enabled(found: Service) -> Check:
     call = "systemctl --user" if found.is_user else "sudo systemctl"
     if not found.uses_config:
         fix = f"vrspray service install --config {found.config}"
-        return warn("service", "it uses another configuration than this one", fix)
+        return warn("service", "it uses a different configuration", fix)
     if found.state is None:
-        fix = "ask again where systemd runs"
+        fix = "try again on a computer where systemd runs"
         return warn("service", "installed; systemd does not answer", fix)
     if not found.state.get("UnitFileState", "").startswith("enabled"):
         fix = f"{call} enable vrspray"
-        return warn("service", "installed, and not started with the computer", fix)
+        return warn("service", "installed, but does not start with the computer", fix)
     active = found.state.get("ActiveState", "unknown")
     if active == "failed":
         result = found.state.get("Result", "unknown")
         return warn("service", f"its last run failed ({result})", "see journalctl -u vrspray")
     if active == "active":
-        fix = f"{call} stop vrspray, to have link and lines checked"
-        return warn("service", "it runs now, and has the link and the lines", fix)
+        fix = f"{call} stop vrspray, so that link and GPIO lines can be checked"
+        return warn("service", "it is running, and uses the link and the GPIO lines", fix)
     return ok("service", f"installed and enabled, {active} now")

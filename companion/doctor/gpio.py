@@ -43,7 +43,8 @@ def read_chip(name: str, numbers: tuple[int, ...]) -> Chip:
         lines = _lines(load_gpiod(), name, numbers)
     except ActuatorError as error:
         text, found, package = str(error).partition(": pip install ")
-        fix = f"pip install {package}" if found else "correct output.chip; gpiodetect lists chips"
+        correct = "correct output.chip; gpiodetect lists the chips"
+        fix = f"pip install {package}" if found else correct
         return Chip(name=name, problem=text, fix=fix)
     except PermissionError:
         return Chip(name=name, problem=f"{name}: permission denied", fix=_group_fix("gpio"))
@@ -51,7 +52,7 @@ def read_chip(name: str, numbers: tuple[int, ...]) -> Chip:
         return Chip(
             name=name,
             problem=f"{name}: {error}",
-            fix="see gpioinfo for the lines that it has, and correct valve.channel",
+            fix="look up its lines with gpioinfo, and correct valve.channel",
         )
     return Chip(name=name, lines=lines, keeps_levels=keeps_levels())
 
@@ -80,9 +81,9 @@ def _group_fix(group: str) -> str:
     try:
         mine = grp.getgrnam(group).gr_gid in (*os.getgroups(), os.getegid())
     except KeyError:
-        return "run as a user who may open the device"
+        return "run as a user who can open the device"
     if mine:
-        return "see the mode of the device: ls -l /dev"
+        return "check the permissions of the device: ls -l /dev"
     return f"sudo usermod -aG {group} $USER, then log in again"
 
 
@@ -96,7 +97,7 @@ def gpio_checks(chip: Chip | None, wiring: Wiring | None) -> Iterator[Check]:
         yield not_applicable("gpio-lines", "the chip cannot be opened")
     elif not chip.lines:
         yield ok("gpio-chip", chip.name)
-        yield not_applicable("gpio-lines", "all outputs of a shift register are its own")
+        yield not_applicable("gpio-lines", "a shift register has its own outputs")
     else:
         yield ok("gpio-chip", chip.name)
         yield _free(chip)
@@ -110,13 +111,13 @@ def _free(chip: Chip) -> Check:
     first = taken[0]
     text = f"line {first.number} is held by {first.consumer or 'the kernel'}"
     if first.consumer == CONSUMER:
-        return warn("gpio-lines", text, "stop the running vrspray to have all checks made")
+        return warn("gpio-lines", text, "stop the running vrspray so that all checks can run")
     return fail("gpio-lines", text, "stop that program, or move the valve to a free line")
 
 
 def _wiring(wiring: Wiring, chip: Chip) -> Check:
     found = hazards(wiring, keeps_levels=chip.keeps_levels)
     if not found:
-        return ok("gpio-wiring", "a killed program leaves the valves closed")
+        return ok("gpio-wiring", "if the program is killed, the valves close")
     more = f" (and {len(found) - 1} more)" if found[1:] else ""
-    return warn("gpio-wiring", f"{found[0]}{more}", "docs/gpio.md says what to fit and to set")
+    return warn("gpio-wiring", f"{found[0]}{more}", "see docs/gpio.md for wiring and settings")

@@ -51,14 +51,14 @@ async def read_sensors(
 def sensor_check(count: int, found: Read) -> Check:
     """Return how the sensors are; `count` of them are configured on this computer."""
     if not count:
-        return not_applicable(_NAME, "none is configured on this computer")
+        return not_applicable(_NAME, "none configured on this computer")
     if found.refused is not None:
         return fail(_NAME, *split_advice(found.refused, "see docs/configuration.md"))
     faults = [fault for report in found.reports if (fault := _fault(report))]
     if faults:
-        return fail(_NAME, faults[0], "see its wiring and supply, then ask again")
+        return fail(_NAME, faults[0], "check its wiring and supply, then try again")
     if not found.reports:
-        return warn(_NAME, "no report within a second", "see its wiring and supply")
+        return warn(_NAME, "no reading within a second", "check its wiring and supply")
     return ok(_NAME, ", ".join(_words(report) for report in found.reports))
 
 

@@ -25,11 +25,11 @@ def link_checks(heard: Heard, config: Config, setup: Setup | None) -> Iterator[C
     """Yield the checks of link and vehicle, but for its outputs."""
     if heard.refused is not None:
         yield fail("link", *split_advice(heard.refused, "correct link.url"))
-        yield from (not_applicable(name, "the link is not open") for name in _VEHICLE)
+        yield from (not_applicable(name, "the link did not open") for name in _VEHICLE)
         return
     if heard.system_id is None:
         yield _unheard(heard)
-        yield from (not_applicable(name, "no vehicle is heard") for name in _VEHICLE)
+        yield from (not_applicable(name, "no vehicle heard") for name in _VEHICLE)
         return
     if heard.troubles:
         yield warn("link", *split_advice(heard.troubles[-1], "see docs/link.md"))
@@ -56,8 +56,8 @@ def _unheard(heard: Heard) -> Check:
         return fail("link", *split_advice(heard.troubles[-1], "see docs/link.md"))
     return fail(
         "link",
-        f"{heard.url}: no heartbeat of an autopilot within {heard.waited_s:.0f} s",
-        "see that the flight controller is on, and that link.url is the way to it",
+        f"{heard.url}: no heartbeat from an autopilot within {heard.waited_s:.0f} s",
+        "check that the flight controller is on, and that link.url leads to it",
     )
 
 
@@ -70,23 +70,25 @@ def _heartbeat(heard: Heard) -> Check:
 
 def _disarmed(heard: Heard) -> Check:
     if heard.is_armed is None:
-        return warn("disarmed", "no heartbeat says it", "see that heartbeats come once a second")
+        return warn(
+            "disarmed", "not known: no heartbeat", "check that heartbeats arrive once a second"
+        )
     if heard.is_armed:
-        fix = "disarm and ask again: outputs are tried on a disarmed vehicle only"
+        fix = "disarm and try again: outputs are tested on a disarmed vehicle only"
         return warn("disarmed", "the vehicle is armed", fix)
     return ok("disarmed", "the vehicle is disarmed")
 
 
 def _streams(heard: Heard) -> Check:
     if not heard.rates:
-        fix = "ask again with a longer --wait-s"
-        return warn("streams", "not listened to for long enough", fix)
+        fix = "try again with a longer --wait-s"
+        return warn("streams", "not observed for long enough", fix)
     slow = [rate for rate in heard.rates if not rate.is_enough]
     if not slow:
         rates = ", ".join(f"{rate.name} {rate.rate_hz:.0f} Hz" for rate in heard.rates[:3])
-        return ok("streams", f"{rates}, all as asked for")
-    texts = [f"{one.name} {one.rate_hz:.1f} of {one.wanted_hz:g} Hz" for one in slow]
-    fix = "look for another station that sets rates, or a link too slow (docs/link.md)"
+        return ok("streams", f"{rates}, all as requested")
+    texts = [f"{one.name} {one.rate_hz:.1f} Hz instead of {one.wanted_hz:g} Hz" for one in slow]
+    fix = "check whether another station sets stream rates, or the link is too slow (docs/link.md)"
     # Without a position there is no spraying at all; the rest closes, or costs accuracy.
     is_blind = any(one.name == "position" and not one.rate_hz >= 2.0 for one in slow)
     return (fail if is_blind else warn)("streams", ", ".join(texts), fix)
@@ -94,37 +96,39 @@ def _streams(heard: Heard) -> Check:
 
 def _clock(heard: Heard) -> Check:
     if not heard.is_clock_known:
-        fix = "see that the link passes TIMESYNC both ways; positions count as fresh until then"
+        fix = "let the link pass TIMESYNC both ways; until then positions count as fresh"
         return warn("vehicle-clock", "no answer to TIMESYNC", fix)
     return ok("vehicle-clock", "the autopilot answers TIMESYNC")
 
 
 def _fix(heard: Heard, least: Fix) -> Check:
     if heard.fix is None:
-        return fail("fix", "no report of the receiver", "see the receiver's cable and GPS_TYPE")
+        return fail("fix", "the GNSS receiver does not report", "check its cable and GPS_TYPE")
     accuracy = "" if heard.accuracy_m is None else f", {heard.accuracy_m:.2f} m"
     text = f"{heard.fix.name.lower().replace('_', '-')}{accuracy}"
     if not heard.fix >= least:
         wanted = least.name.lower().replace("_", "-")
-        fix = "wait for it outdoors, and see that corrections arrive"
-        return fail("fix", f"{text}, and {wanted} is the least", fix)
+        fix = "wait for it outdoors, and check that corrections arrive"
+        return fail("fix", f"{text}, but at least {wanted} is needed", fix)
     return ok("fix", text)
 
 
 def _estimator(heard: Heard) -> Check:
     if heard.is_estimator_healthy is None:
-        return warn("estimator", "no report of it", "see that its stream comes (docs/link.md)")
+        return warn(
+            "estimator", "the autopilot does not report it", "check its stream (docs/link.md)"
+        )
     if not heard.is_estimator_healthy:
-        fix = "wait for it to settle; else calibrate compass and accelerometers"
+        fix = "wait for it to settle, or calibrate compass and accelerometers"
         return fail("estimator", "the autopilot does not trust its own position", fix)
     return ok("estimator", "healthy")
 
 
 def _place(heard: Heard, setup: Setup | None) -> Check:
     if setup is None:
-        return not_applicable("place", "there is no map to compare it with")
+        return not_applicable("place", "no map to compare it with")
     if heard.position is None:
-        return fail("place", "no position", "wait for a fix, and see that positions are streamed")
+        return fail("place", "no position", "wait for a fix, and check that positions are streamed")
     place = heard.position
     east_m, north_m = setup.frame.to_local(place.latitude_deg, place.longitude_deg)
     west_m, south_m, to_east_m, to_north_m = setup.prescription.bounds_m
@@ -145,8 +149,8 @@ def _rc_switch(heard: Heard, config: Config) -> Check:
     pulses = heard.rc_pulse_us
     pulse_us = pulses[channel - 1] if channel <= len(pulses) else 0
     if not 800 <= pulse_us <= 2200:
-        fix = "switch the transmitter on, and see that it sends this channel"
-        return fail(name, f"RC channel {channel} is not heard", fix)
+        fix = "turn the transmitter on, and check that it sends this channel"
+        return fail(name, f"no signal on RC channel {channel}", fix)
     return ok(name, f"RC channel {channel} reads {pulse_us} us")
 
 

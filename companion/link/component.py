@@ -303,7 +303,7 @@ class Component:
             self._meet(item.received_s)
             self._news.begin_anew(item.received_s)
         elif place is Arrival.AGAIN and self.meter.copied(item.received_s):
-            self.warn("positions come twice or late")
+            self.warn("positions arrive twice or late")
             text = (
                 f"{self.meter.copied_positions} positions came twice or too late and were dropped"
             )

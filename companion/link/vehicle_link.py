@@ -83,7 +83,7 @@ class VehicleLink:
         if self._transport is None or not self._transport.is_up:
             return "link is down"
         if not (self._heard and self._told):
-            return "link is coming back"
+            return "link is reconnecting"
         finding = blocking(self.component.codec.census, self._clock())
         return None if finding is None else finding.text
 
@@ -145,7 +145,7 @@ class VehicleLink:
         address = self.component.address
         if not self.component.codec.census.is_heard(*address, self._clock()):
             return None
-        return f"another companion speaks as {address[0]}/{address[1]}"
+        return f"another companion is using {address[0]}/{address[1]}"
 
     def order(self, channel: int, pulse_us: int) -> bool:
         """Order a servo output; False where the order could not leave."""
@@ -334,7 +334,7 @@ class Watch:
         ):
             return
         self._is_twin_told = True
-        text = f"another component speaks as {system_id}/{component_id}, or our own bytes come back"
+        text = f"another component uses {system_id}/{component_id}, or our own messages come back"
         _logger.warning("%s: set link.component_id to a number that nobody has", text)
         self._component.warn(f"{system_id}/{component_id} twice: set link.component_id")
         self._tell(now_s, "link", text)
@@ -413,8 +413,8 @@ def blocking(census: Census, now_s: float) -> Finding | None:
         systems = ", ".join(map(str, numbers))
         first = ",".join(map(str, numbers[:2])) + (".." if len(numbers) > 2 else "")
         return Finding(
-            text=f"two autopilots or more on this link, systems {systems}: set link.system_id to "
-            "the one that carries this sprayer and restart",
+            text=f"more than one autopilot on this link (systems {systems}): set link.system_id to "
+            "the one with this sprayer, and restart",
             short=f"autopilots {first}: set link.system_id",
         )
     if not (vehicle.is_ardupilot or vehicle.is_px4):
@@ -422,7 +422,7 @@ def blocking(census: Census, now_s: float) -> Finding | None:
         return Finding(
             text=f"system {vehicle.system_id} runs firmware {vehicle.autopilot} ({name}), neither "
             "ArduPilot nor PX4: set link.system_id to another vehicle, or change the firmware",
-            short=f"firmware {vehicle.autopilot}: no ArduPilot or PX4",
+            short=f"firmware {vehicle.autopilot}: not ArduPilot or PX4",
         )
     return None
 
@@ -443,37 +443,40 @@ def _vehicle_quiet(url: LinkUrl, census: Census, vehicle: Vehicle, seen: Seen) -
     if heard_s is None or not seen.now_s - heard_s <= QUIET_S:
         number = vehicle.system_id
         return Finding(
-            text=f"{url.text}: no heartbeat of system {number} any more: is it on, and is the "
+            text=f"{url.text}: system {number} has stopped sending heartbeats: is it on, and is "
+            "the "
             "cable or the radio still connected?",
-            short=f"no heartbeat of system {number}",
+            short=f"no heartbeat from system {number}",
         )
     if seen.asked_s is not None and seen.asked_s >= QUIET_S:
         return Finding(
-            text=f"{url.text}: the autopilot is heard but answers nothing: our bytes do not reach "
+            text=f"{url.text}: the autopilot is heard but does not answer: our messages do not "
+            "reach "
             "it; check the wire from our TX to its RX, or the router's way back",
-            short="autopilot heard but answers nothing",
+            short="autopilot heard but does not answer",
         )
     return None
 
 
 def _nothing_usable(url: LinkUrl, seen: Seen) -> Finding | None:
     if seen.byte_count == 0:
-        return Finding(text=_silence(url), short="link is silent")
+        return Finding(text=_silence(url), short="link: nothing received")
     if seen.refused_count == 0:
         return _no_frames(url, seen.byte_count)
     return Finding(
-        text=f"{url.text}: {seen.refused_count} frames arrive, none signed with our key: give the "
-        "autopilot and the companion the same one (link.signing_key_file)",
+        text=f"{url.text}: {seen.refused_count} frames arrived, none signed with our key: give the "
+        "autopilot and the companion the same key (link.signing_key_file)",
         short="frames are not signed with our key",
     )
 
 
 def _silence(url: LinkUrl) -> str:
     advice = {
-        "udpin": f"let the autopilot or its router send to port {url.number} of this computer",
+        "udpin": f"make the autopilot or its router send to port {url.number} of this computer",
         "udpout": f"is anything listening at {url.place} port {url.number}, and does it answer?",
-        "tcp": "the other end accepted and says nothing: is it MAVLink that listens there?",
-        "serial": "check that TX goes to RX and ground to ground, that the autopilot is on and "
+        "tcp": "the other end accepts the connection but sends nothing: is it a MAVLink program?",
+        "serial": "check that TX is wired to RX and ground to ground, that the autopilot is on, "
+        "and "
         "that its port speaks MAVLink 2 (ArduPilot SERIALn_PROTOCOL = 2, PX4 MAV_n_CONFIG)",
     }[url.kind]
     return f"{url.text}: nothing arrives; {advice}"
@@ -482,15 +485,15 @@ def _silence(url: LinkUrl) -> str:
 def _no_frames(url: LinkUrl, count: int) -> Finding | None:
     if url.kind == "serial":
         if count < _NOISE_BYTES:
-            return Finding(text=_silence(url), short="link is silent")
+            return Finding(text=_silence(url), short="link: nothing received")
         return Finding(
-            text=f"{url.text}: {count} bytes arrive but no MAVLink: most likely the autopilot has "
-            f"another baud rate than {url.number}; write its own (ArduPilot SERIALn_BAUD, PX4 "
+            text=f"{url.text}: {count} bytes arrive but no MAVLink: the autopilot probably uses "
+            f"a baud rate other than {url.number}; write its rate (ArduPilot SERIALn_BAUD, PX4 "
             "SER_TELn_BAUD) at the end of link.url",
             short=f"no MAVLink at {url.number} baud: wrong baud?",
         )
     return Finding(
-        text=f"{url.text}: {count} bytes arrive but no MAVLink: another program talks to this "
+        text=f"{url.text}: {count} bytes arrive but no MAVLink: another program sends to this "
         "port; stop it, or write another port in link.url",
         short="bytes arrive but no MAVLink",
     )
@@ -501,16 +504,16 @@ def _no_vehicle(url: LinkUrl, census: Census, now_s: float) -> Finding:
     if wanted and others:
         there = ", ".join(map(str, others[:5]))
         return Finding(
-            text=f"{url.text}: no autopilot of system {wanted}, but of {there}: set "
+            text=f"{url.text}: no autopilot with system {wanted}, but one with {there}: set "
             f"link.system_id = {others[0]}, or 0 for the only one there is",
-            short=f"system {wanted} silent, {there[:12]} is there",
+            short=f"system {wanted} silent, heard {there[:12]}",
         )
     who = census.who(now_s)
-    heard = f"heard are {who}" if who else "no heartbeat at all"
+    heard = f"heard: {who}" if who else "no heartbeat at all"
     return Finding(
         text=f"{url.text}: MAVLink arrives but no autopilot ({heard}): is the autopilot connected "
         "to this router, and do its heartbeats come through?",
-        short="no autopilot is heard",
+        short="no autopilot heard",
     )
 
 

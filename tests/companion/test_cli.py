@@ -174,7 +174,7 @@ def test_config_check_accepts_the_example(capsys: Captured) -> None:
     code, found = run_json(capsys, "config", "check", CONFIG)
     (everywhere,) = found.pop("notes")
     assert (code, found) == (0, {"ok": True, "path": CONFIG, "problems": []})
-    assert "the whole map is sprayed" in everywhere
+    assert "the drone sprays the whole map" in everywhere
 
 
 def test_config_check_refuses_a_swath_that_is_not_the_boom(capsys: Captured) -> None:

@@ -365,7 +365,7 @@ def test_positions_that_come_twice_are_counted_and_told_once(peer: Peer, met: Co
         met.tick(None, 1.0 + number / 20)
     assert met.meter.copied_positions == 200
     assert [text for text in peer.texts() if "twice" in text] == [
-        "Spray: positions come twice or late"
+        "Spray: positions arrive twice or late"
     ]
     assert len(told) == 1
     assert "positions twice or too late 200" in met.meter.read(met.codec, 6.0).line()

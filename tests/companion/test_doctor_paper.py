@@ -162,7 +162,10 @@ def test_a_person_reads_one_line_a_check_and_the_verdict(config: Path, capsys: C
 def test_the_unit_of_this_configuration_is_recognised(config: Path, capsys: Captured) -> None:
     execute(["service", "install", "--user", "--config", str(config), "--json"])
     capsys.readouterr()
-    for file, fix in ((config, "ask again where systemd runs"), (config.with_name("b.toml"), "")):
+    for file, fix in (
+        (config, "try again on a computer where systemd runs"),
+        (config.with_name("b.toml"), ""),
+    ):
         if not file.exists():
             shutil.copy(config, file)
         _, found = doctor(capsys, file, "--no-link")

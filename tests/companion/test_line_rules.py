@@ -42,9 +42,9 @@ def test_the_emergency_stop_on_a_valves_line_is_refused_in_words(chip: str) -> N
     given = (*GPIO, "safety.estop_line=11", f"output.chip={chip}")
     with pytest.raises(ConfigError) as refused:
         load(EXAMPLE, overrides=given)
-    assert "safety.estop_line = 11: valve[2].channel has this line" in str(refused.value)
+    assert "safety.estop_line = 11: valve[2].channel uses the same line" in str(refused.value)
     path_and_name = (*GPIO, *METER, "flow_meter.line=11", f"flow_meter.chip={chip}")
-    with pytest.raises(ConfigError, match=r"valve\[2\]\.channel has this line"):
+    with pytest.raises(ConfigError, match=r"valve\[2\]\.channel uses the same line"):
         load(EXAMPLE, overrides=path_and_name)
 
 
@@ -59,7 +59,7 @@ def test_one_number_on_chips_of_two_names_is_a_warning() -> None:
 
 def test_the_stop_and_the_meter_share_no_line_on_servo_outputs_either() -> None:
     given = (*METER, "flow_meter.line=17", "safety.estop_line=17")
-    with pytest.raises(ConfigError, match=r"safety\.estop_line has this line"):
+    with pytest.raises(ConfigError, match=r"safety\.estop_line uses the same line"):
         load(EXAMPLE, overrides=given)
 
 

@@ -101,7 +101,7 @@ async def test_silence_is_said_once_within_five_seconds(
     assert not bench.said(caplog)
     bench.pass_time(20.0)
     (said,) = bench.said(caplog)
-    assert "nothing arrives; let the autopilot or its router send to port" in said
+    assert "nothing arrives; make the autopilot or its router send to port" in said
     assert bench.events == [said]
     bench.pass_time(50.0)
     assert len(bench.said(caplog)) == 2  # again after a minute

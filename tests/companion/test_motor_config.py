@@ -118,7 +118,7 @@ REFUSED = [
     (['pump.control="variable"'], 'write one of "modulates", "constant"'),
     (['pump.control="constant"', "nozzle_set[0].duty=[0.2, 1.0]",
       "nozzle_set[0].flow_l_min=[1.0, 2.0]"], "pump.run_us: missing"),
-    (['pump.control="constant"', "pump.run_us=1500"], "nozzle_set[0].duty: missing, and required"),
+    (['pump.control="constant"', "pump.run_us=1500"], "nozzle_set[0].duty: missing and required"),
 ]  # fmt: skip
 
 

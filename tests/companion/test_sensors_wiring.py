@@ -61,11 +61,11 @@ def test_detection_reaches_the_core_with_what_was_measured() -> None:
         (["flow_meter.source=gpio", "flow_meter.pulses_per_l=1.0"], "flow_meter.line"),
         (
             [*METER, "output.kind=gpio", "flow_meter.line=9"],
-            "flow_meter.line = 9: valve[0].channel has this line",
+            "flow_meter.line = 9: valve[0].channel uses the same line",
         ),
         (
             [*METER, "output.kind=gpio", "valve[0].channel=0", "flow_meter.line=0"],
-            "flow_meter.line = 0: valve[0].channel has this line",
+            "flow_meter.line = 0: valve[0].channel uses the same line",
         ),
         (["pressure.at_20_ma_kpa=0.0"], "pressure.at_20_ma_kpa"),
         (["pressure.duty=[0.5]", "pressure.kpa=[1.0]"], "two or more"),

@@ -124,7 +124,7 @@ def test_positions_that_waited_open_nothing(gap_s: float, by_sleep: bool) -> Non
         bench.waiting += bench.messages(east_m + 0.25 * count, began_s + 0.05 * count)
         bench.loop.turn()
         assert not bench.is_open
-    assert f"stood still for {gap_s:.1f} s" in bench.texts
+    assert f"companion paused for {gap_s:.1f} s" in bench.texts
 
 
 def test_it_goes_on_by_itself_after_a_short_one_and_asks_after_a_long_one() -> None:

@@ -177,7 +177,7 @@ def be_on_time(*, realtime: bool) -> list[str]:
         )
     if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
         refused.append(
-            "the valve engine's memory may be swapped out: allow LimitMEMLOCK=infinity in the "
+            "the valve engine's memory can be swapped out: allow LimitMEMLOCK=infinity in the "
             "service"
         )
     return refused

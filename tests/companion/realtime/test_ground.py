@@ -137,7 +137,7 @@ class Bench:
         ("landed-unknown", {"is_landed_told": False}),
         ("mission-active", {"mission_state": 3}),
         ("outputs-need-arming", {"autopilot": 12, "mode": 1 << 16}),
-        ("another companion speaks as 1/191", {"twin": True}),
+        ("another companion is using 1/191", {"twin": True}),
     ],
 )
 async def test_beside_a_vehicle_that_may_not_nothing_is_opened(
