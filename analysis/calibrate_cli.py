@@ -43,7 +43,7 @@ class Commands(TyperGroup):
 
 app = typer.Typer(
     cls=Commands,
-    help="Measure a sprayer: lags from a flight's flow, from marks; flow curves.",
+    help="Measure a sprayer: lags (from flow or marks) and flow curves.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -53,14 +53,14 @@ app = typer.Typer(
 
 @app.command(epilog="Example: vrspray calibrate lag flights/flight-0001.gpkg")
 def lag(
-    journal: Annotated[Path, typer.Argument(help="File of a flight, such as flight-0001.gpkg.")],
+    journal: Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")],
     meter_lag_s: Annotated[
-        float, typer.Option(help="The meter's own delay, its message's way included, in seconds.")
+        float, typer.Option(help="Delay of the meter, including its message, in seconds.")
     ] = 0.001,
     plot: Annotated[Path | None, typer.Option(help="Picture of all steps (PNG).")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find on, off, up and down lags from what a flight ordered and its flow meter counted.
+    """Measure on, off, up and down lags from a flight's orders and flow meter.
 
     Exit 0: all lags; 1: too few good steps of a kind; 2: the file or an option cannot be used.
     """
@@ -82,7 +82,7 @@ def lag(
     record = record_of(content.items(), content.setup)
     if not len(record.time_s):
         raise JournalError(
-            f"{journal}: holds no flow meter's readings; fly with a meter that [flow_meter] in the "
+            f"{journal}: has no flow meter readings; fly with a meter that [flow_meter] in the "
             "configuration names, or on the twin with `vrspray sitl fly --meter-rate-hz 50`"
         )
     found = identify(record, meter_lag_s=meter_lag_s)
@@ -117,14 +117,14 @@ def mission(
     out: Annotated[Path, typer.Option(help="Mission to write: .plan or .waypoints.")],
     origin: Annotated[
         str | None,
-        typer.Option(metavar="LAT,LON", help="Begin here; default: first depot, or the map."),
+        typer.Option(metavar="LAT,LON", help="Start here; default: first depot, or the map."),
     ] = None,
     heading_deg: Annotated[
-        float | None, typer.Option(help="Of the first pass; default: mission.angle_deg.")
+        float | None, typer.Option(help="Course of the first pass; default: mission.angle_deg.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the flight that `calibrate lag` needs: twelve changes of each kind, with its map.
+    """Write the mission and map that `calibrate lag` needs: twelve changes of each kind.
 
     Beside the mission lie its map and a copy of the configuration that flies it.
     """
@@ -145,7 +145,7 @@ def _origin(text: str | None) -> tuple[float, float] | None:
     except ValueError:
         raise ConfigError(f"--origin {text}: give LATITUDE,LONGITUDE in degrees") from None
     if not (abs(latitude_deg) <= 85.0 and abs(longitude_deg) <= 180.0):
-        raise ConfigError(f"--origin {text}: is no place on a map")
+        raise ConfigError(f"--origin {text}: is not a position on Earth")
     return latitude_deg, longitude_deg
 
 

@@ -44,7 +44,7 @@ def flow(
     plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of the curve.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make the flow curve of valves or pump from a bucket test.
+    """Fit the flow curve of valves or pump to a bucket test.
 
     Catch what all nozzles of a set give in a measured time, at five duties or more, twice each.
     The curve is fitted through the scatter of the repeats, where there are four repeats or more.

@@ -54,7 +54,7 @@ def lag_marks(
     plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of the fit.")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find position_s, boom.forward_m and the map's offset from marks measured on the ground.
+    """Measure position_s, boom.forward_m and the map offset from marks on the ground.
 
     Fly one boundary inside the field to and fro at two speeds, and measure how far beyond it each
     change of rate fell. What the marks cannot tell apart is refused (exit 1).

@@ -22,14 +22,14 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command(epilog="Example: vrspray replay flights/flight-0001.gpkg --set lag.up_s=0.12")
 def replay_journal(
-    journal: Annotated[Path, typer.Argument(help="File of a flight, such as flight-0001.gpkg.")],
+    journal: Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")],
     changes: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change the set-up first: a what-if."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a setting first, to ask what if."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Feed a flight's recorded inputs to the core and compare every decision.
+    """Replay a flight's recorded inputs and compare every decision.
 
     With --set: what would have been sprayed. The ground cannot react: the aircraft flies as it
     flew, and the sprayer stays what the recorded set-up says of it.

@@ -4,28 +4,28 @@ from companion.commands import Command
 
 CALIBRATE = Command(
     target="analysis.calibrate_cli:app",
-    help="Measure lags and flow curves; plan the flight for it.",
+    help="Measure lags and flow curves; plan the flight for that.",
     haste="patient",
     hastes={"mission": "quick"},
 )
 REPORT = Command(
     target="analysis.report.cli:report",
-    help="Evaluate a flight: page, figures, record of application.",
+    help="Evaluate a flight: page, figures, application record.",
     haste="patient",
 )
 REPLAY = Command(
     target="analysis.cli:replay",
-    help="Feed a journal to the core and compare decisions.",
+    help="Replay a journal and compare every decision.",
     haste="patient",
 )
 EXPORT = Command(
     target="analysis.exports.cli:export",
-    help="Write a flight as CSV, KML, shapefile, ISOXML and others.",
+    help="Export a flight as CSV, KML, shapefile, ISOXML and others.",
     haste="patient",
 )
 WSP = Command(
     target="analysis.wsp.cli:wsp",
-    help="Coverage and drop sizes on water-sensitive paper.",
+    help="Measure coverage and drop sizes on water-sensitive paper.",
     haste="patient",
 )
 FLIGHTS = Command(

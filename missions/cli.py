@@ -52,62 +52,74 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 @reading_options
 def plan(
     field: Annotated[
-        Path, typer.Argument(metavar="FIELD", help="Outline, with holes, in any map format.")
+        Path, typer.Argument(metavar="FIELD", help="Field outline, in any map format.")
     ],
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE", help=".plan, .waypoints, .geojson or .kml.")
     ],
     reading: Reading,
     prescription: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Map of rates, for the litres.")
+        Path | None, typer.Option(metavar="FILE", help="Prescription map, to plan the volume.")
     ] = None,
     obstacle: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="Not to be flown over; repeat it.")
+        list[Path] | None, typer.Option(metavar="FILE", help="Obstacles to fly around; repeatable.")
     ] = None,
     obstacle_radius_m: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Of points without radius_m.", min=0.1, max=RADIUS_MAX_M),
+        typer.Option(
+            metavar="M",
+            help="Radius of point obstacles without radius_m.",
+            min=0.1,
+            max=RADIUS_MAX_M,
+        ),
     ] = None,
     corridor_m: Annotated[
         float | None,
         typer.Option(
             metavar="M",
-            help="Whole width, of lines without corridor_m.",
+            help="Full width of line obstacles without corridor_m.",
             min=0.1,
             max=CORRIDOR_MAX_M,
         ),
     ] = None,
     no_spray: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="Not to be sprayed; repeat it.")
+        list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
     ] = None,
     no_spray_buffer_m: Annotated[
-        float, typer.Option(metavar="M", help="Kept from it.", min=0.0, max=1000.0)
+        float, typer.Option(metavar="M", help="Distance to keep from it.", min=0.0, max=1000.0)
     ] = 0.0,
     depot: Annotated[
-        list[str] | None, typer.Option(metavar="LAT,LON", help="Refill place; repeat it.")
+        list[str] | None, typer.Option(metavar="LAT,LON", help="Refill place; repeatable.")
     ] = None,
     swath_m: Annotated[float | None, typer.Option(metavar="M", help="Spacing of passes.")] = None,
-    speed_m_s: Annotated[float | None, typer.Option(metavar="V", help="In the passes.")] = None,
+    speed_m_s: Annotated[
+        float | None, typer.Option(metavar="V", help="Speed in the passes.")
+    ] = None,
     speed_max_m_s: Annotated[
         float | None,
-        typer.Option(metavar="V", help="Where rates are too low for the valves, up to this."),
+        typer.Option(metavar="V", help="Speed up to this where rates are too low for the valves."),
     ] = None,
     border_m: Annotated[
         float,
-        typer.Option(metavar="M", help="Passes keep so far from every border.", min=0.0, max=50.0),
+        typer.Option(metavar="M", help="Distance of passes from every border.", min=0.0, max=50.0),
     ] = 0.0,
     ends_over: Annotated[
-        bool, typer.Option("--ends-over", help="Small fields: boom ends beyond it, valves closed.")
+        bool,
+        typer.Option(
+            "--ends-over", help="Small fields: boom may overhang the border, valves closed."
+        ),
     ] = False,
     angle_deg: Annotated[
-        float | None, typer.Option(metavar="DEG", help="Course of the passes; else the best.")
+        float | None, typer.Option(metavar="DEG", help="Course of the passes; default: the best.")
     ] = None,
     rate_l_ha: Annotated[
-        float | None, typer.Option(metavar="R", help="One rate for all, in place of a map.")
+        float | None, typer.Option(metavar="R", help="One rate in L/ha instead of a map.")
     ] = None,
-    tank_l: Annotated[float | None, typer.Option(metavar="L", help="Full tank.")] = None,
+    tank_l: Annotated[
+        float | None, typer.Option(metavar="L", help="Volume of a full tank.")
+    ] = None,
     effort: Annotated[
-        Literal["quick", "good", "best"], typer.Option(help="How long to look for short ferries.")
+        Literal["quick", "good", "best"], typer.Option(help="How long to search for short ferries.")
     ] = "quick",
     sprayer: Annotated[
         bool, typer.Option("--sprayer", help="Add DO_SPRAYER at every line; ArduPilot only.")
@@ -116,53 +128,66 @@ def plan(
         Path | None, typer.Option(metavar="FILE", help="Elevation model to follow: .tif or .hgt.")
     ] = None,
     autopilot: Annotated[
-        Autopilot | None, typer.Option(help="That flies the plan; else mission.autopilot.")
+        Autopilot | None,
+        typer.Option(help="Autopilot that flies the plan; default: mission.autopilot."),
     ] = None,
     wind: Annotated[
-        str | None, typer.Option(metavar="SPEED,FROM", help="For no-spray buffers: m/s, degrees.")
+        str | None,
+        typer.Option(metavar="SPEED,FROM", help="Wind for no-spray buffers: m/s, degrees."),
     ] = None,
     run_in_m: Annotated[
-        str | None, typer.Option(metavar="M|auto", help="Before and behind passes, at speed.")
+        str | None,
+        typer.Option(metavar="M|auto", help="Run-in and run-out of passes at full speed."),
     ] = None,
     png: Annotated[
         Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
     ] = None,
     pilot_sheet: Annotated[
-        Path | None, typer.Option("--sheet", metavar="FILE", help="To print: .html or .txt.")
+        Path | None,
+        typer.Option("--sheet", metavar="FILE", help="Tank filling sheet to print: .html or .txt."),
     ] = None,
     first: Annotated[
         str | None, typer.Option("--start", metavar="HH:MM", help="First take-off, for --sheet.")
     ] = None,
     ferry_height_m: Annotated[
-        float | None, typer.Option(metavar="M", help="Of ferries and long transits.")
+        float | None, typer.Option(metavar="M", help="Height of ferries and long transits.")
     ] = None,
     leave_max: Annotated[
         float,
         typer.Option(
-            metavar="PCT", help="Of the field, left where it saves time.", min=0.0, max=50.0
+            metavar="PCT",
+            help="Share of the field to leave where it saves time.",
+            min=0.0,
+            max=50.0,
         ),
     ] = LEAVE_PERCENT,
     overlap_max: Annotated[
         float | None,
-        typer.Option(metavar="PCT", help="Of the litres, sprayed twice.", min=0.0, max=100.0),
+        typer.Option(
+            metavar="PCT", help="Largest share of the volume to spray twice.", min=0.0, max=100.0
+        ),
     ] = None,
     choices_too: Annotated[
-        bool, typer.Option("--choices", help="Small fields: what leaving and overlap would change.")
+        bool,
+        typer.Option(
+            "--choices", help="Small fields: show what --leave-max and --overlap-max would change."
+        ),
     ] = False,
     aircraft: Annotated[
-        int | None, typer.Option(metavar="N", help="That share the field.", min=1, max=20)
+        int | None,
+        typer.Option(metavar="N", help="Number of aircraft that share the field.", min=1, max=20),
     ] = None,
     done: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Treated ground: only the rest is planned.")
+        Path | None, typer.Option(metavar="FILE", help="Treated ground; plan only the rest.")
     ] = None,
     resume: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Plan (.geojson) to go on with.")
+        Path | None, typer.Option(metavar="FILE", help="Plan (.geojson) to continue.")
     ] = None,
     stop: Annotated[
-        str | None, typer.Option("--from", metavar="LAT,LON", help="Where the spraying stopped.")
+        str | None, typer.Option("--from", metavar="LAT,LON", help="Place where spraying stopped.")
     ] = None,
     sortie: Annotated[
-        int | None, typer.Option(metavar="N", help="In which sortie it stopped.", min=1)
+        int | None, typer.Option(metavar="N", help="Sortie in which spraying stopped.", min=1)
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -264,7 +289,7 @@ def plan(
     for warning in warnings:
         note(f"warning: {warning}")
     if watch.stopped:
-        note(f"stopped after {took_s:.0f} s: the best plan so far is written")
+        note(f"stopped after {took_s:.0f} s; wrote the best plan so far")
 
 
 def _fenced(task: Task, *, with_sprayer: bool, looks: bool) -> tuple[Plan, Fences]:

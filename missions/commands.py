@@ -15,5 +15,5 @@ PLAN = Command(
     haste="patient",
 )
 UPLOAD = Command(
-    target="missions.upload.cli:app", help="Put a mission on the vehicle; read it back."
+    target="missions.upload.cli:app", help="Upload a mission to the vehicle and verify it."
 )

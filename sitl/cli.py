@@ -65,60 +65,59 @@ def serve(
         Path | None, typer.Option(help="Mission, .plan or .waypoints; default: the example field.")
     ] = None,
     wait_mission: Annotated[
-        bool, typer.Option("--wait-mission", help="Wait for a mission to be uploaded, and fly it.")
+        bool, typer.Option("--wait-mission", help="Wait for a mission to be uploaded, then fly it.")
     ] = False,
     home: Annotated[
         str | None,
         typer.Option(
             metavar="FILE|LAT,LON",
-            help="With --wait-mission: where the vehicle stands; of a mission file its home.",
+            help="With --wait-mission: position of the vehicle, or a mission file with its home.",
         ),
     ] = None,
     lines: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Lines of the plan, as `run` has mission.lines: judge by them."
+            metavar="FILE",
+            help="Lines of the plan (mission.lines of `run`), to judge the flight by.",
         ),
     ] = None,
     scenario: Annotated[
-        Path | None, typer.Option(help="Faults by the clock, and how the vehicle is (TOML).")
+        Path | None, typer.Option(help="Scenario: timed faults and vehicle settings (TOML).")
     ] = None,
     speed: Annotated[float, typer.Option(help="Speed of the flight in m/s.")] = 5.0,
     field_config: Annotated[
         Path | None,
-        typer.Option(
-            help="Configuration that says how the valves are wired; default: the example."
-        ),
+        typer.Option(help="Configuration with the wiring of the valves; default: the example."),
     ] = None,
     profile: Annotated[str, typer.Option(help="Sprayer profile.")] = "wang-2024",
-    board: Annotated[Board, typer.Option(help="restarting or free-running.")] = Board.RESTARTING,
+    board: Annotated[
+        Board, typer.Option(help="Driver board: restarting or free-running.")
+    ] = Board.RESTARTING,
     flow_law: Annotated[
         FlowLaw | None,
-        typer.Option(help="The true flow between measured points; default: the profile's own."),
+        typer.Option(help="True flow between measured points; default: the profile's."),
     ] = None,
     gust: Annotated[float, typer.Option(help="Gusts in m/s.")] = 1.0,
     corners: Annotated[
         Corners | None,
-        typer.Option(help="How corners are flown; default: as the autopilot flies them."),
+        typer.Option(help="How to fly corners; default: as the autopilot does."),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 0,
-    out: Annotated[Path | None, typer.Option(help="Folder for the truth.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="Folder for the true result.")] = None,
     sensors: Annotated[
         Path | None,
-        typer.Option(help="Folder for a pressure sensor that `run` reads as iio device."),
+        typer.Option(help="Folder of a simulated pressure sensor (iio) for `run`."),
     ] = None,
     wait_s: Annotated[
-        float | None, typer.Option(help="How long to wait for a companion; default: for ever.")
+        float | None, typer.Option(help="How long to wait for a companion; default: no limit.")
     ] = None,
-    no_enable: Annotated[
-        bool, typer.Option("--no-enable", help="Leave the enabling of the spraying out.")
-    ] = False,
+    no_enable: Annotated[bool, typer.Option("--no-enable", help="Do not enable spraying.")] = False,
     ground: Annotated[
-        bool, typer.Option("--ground", help="Stay on the ground, disarmed: for ground work.")
+        bool, typer.Option("--ground", help="Stay on the ground, disarmed, for ground work.")
     ] = False,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Fly a simulated autopilot that `vrspray run` connects to.
+    """Serve a simulated autopilot for `vrspray run` to connect to.
 
     Example: vrspray sitl serve --speed 5 --out truth
     """
@@ -166,10 +165,10 @@ def serve(
 def fly(
     config: Annotated[Path, typer.Option(help="Configuration of the companion.")],
     mission: Annotated[Path, typer.Option(help="Mission, .plan or .waypoints.")],
-    scenario: Annotated[Path | None, typer.Option(help="Faults by the clock (TOML).")] = None,
+    scenario: Annotated[Path | None, typer.Option(help="Scenario: timed faults (TOML).")] = None,
     plant: Annotated[
         str | None,
-        typer.Option(help="Sprayer profile, a name or a .toml; default: that of the nearest flow."),
+        typer.Option(help="Sprayer profile, a name or .toml; default: the nearest in flow."),
     ] = None,
     fidelity: Annotated[
         Fidelity | None,
@@ -178,27 +177,27 @@ def fly(
     output: Annotated[
         OutputPath | None, typer.Option(help="gpio or servo; default: as the configuration says.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of everything that is drawn.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     speed: Annotated[
         float | None, typer.Option(help="m/s on every leg; default: the mission's.")
     ] = None,
     corners: Annotated[
         Corners | None,
-        typer.Option(help="How corners are flown; default: as the configuration's autopilot does."),
+        typer.Option(help="How to fly corners; default: as the configured autopilot does."),
     ] = None,
     meter_rate_hz: Annotated[
-        float, typer.Option(help="How often the flow meter reports; 0: there is none.")
+        float, typer.Option(help="How often the flow meter reports; 0: no meter.")
     ] = 50.0,
     flow_law: Annotated[
         FlowLaw | None,
-        typer.Option(help="The true flow between measured points; default: the profile's own."),
+        typer.Option(help="True flow between measured points; default: the profile's."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for truth, result, picture and journal.")
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Fly a mission in the closed loop, faster than real time, and evaluate it.
+    """Simulate a mission in closed loop, faster than real time, and evaluate it.
 
     Example: vrspray sitl fly --config examples/anyang/config.toml --mission
     examples/anyang/mission.waypoints

@@ -4,11 +4,11 @@ from companion.commands import Command
 
 DEMO = Command(
     target="sitl.demo_cli:demo",
-    help="Fly the field of Wang et al. 2024 by all methods; compare them.",
+    help="Simulate the field of Wang et al. 2024 with all methods; compare.",
     haste="patient",
 )
 SITL = Command(
     target="sitl.cli:app",
-    help="Simulated flight controller and sprayer.",
+    help="Simulate a flight controller and sprayer.",
     hastes={"fly": "patient"},
 )

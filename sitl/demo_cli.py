@@ -67,14 +67,14 @@ def demo_flights(
         list[float] | None,
         typer.Option(metavar="V", help="Speed [m/s], 1 to 15; may be repeated. Default: 4, 5, 6."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
     fidelity: Annotated[Fidelity, typer.Option(help="Pulses, or their mean.")] = Fidelity.PULSED,
     output: Annotated[
         Output, typer.Option(help="Lines of this computer, or servo outputs of the autopilot.")
     ] = Output.GPIO,
     flow_law: Annotated[
         FlowLaw | None,
-        typer.Option(help="The true flow between measured points; default: the profile's own."),
+        typer.Option(help="True flow between measured points; default: the profile's."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

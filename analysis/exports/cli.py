@@ -22,8 +22,8 @@ RATE_HZ_MAX = 1000.0
 
 @app.command(epilog="Example: vrspray export flights/flight-0001.gpkg --out flight-0001.geojson")
 def export_journal(
-    journal: Annotated[Path, typer.Argument(help="File of a flight, such as flight-0001.gpkg.")],
-    out: Annotated[Path, typer.Option(help="What to write; its end says the format.")],
+    journal: Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")],
+    out: Annotated[Path, typer.Option(help="File to write; the suffix sets the format.")],
     name: Annotated[
         str | None,
         typer.Option(
@@ -34,19 +34,21 @@ def export_journal(
     ] = None,
     shape: Annotated[
         str | None,
-        typer.Option("--geometry", help="points (of the path) or swaths (ground, a valve each)."),
+        typer.Option(
+            "--geometry", help="points (of the path) or swaths (ground treated by each valve)."
+        ),
     ] = None,
     rate_hz: Annotated[
         float | None,
-        typer.Option("--rate-hz", help="Points a second; default: all of the journal."),
+        typer.Option("--rate-hz", help="Points per second; default: all of the journal."),
     ] = None,
-    units: Annotated[str, typer.Option(help="metric or us; not for formats with their own.")] = (
-        "metric"
-    ),
-    force: Annotated[bool, typer.Option("--force", help="Replace what is there.")] = False,
+    units: Annotated[
+        str, typer.Option(help="metric or us; not for formats with their own units.")
+    ] = ("metric"),
+    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write what was applied for farms, maps and other programs.
+    """Export what was applied, for farm software and map programs.
 
     Exit 0: all of the flight; 1: the journal was cut, is damaged, lacks rows or is of another
     version, and what can be read was written; 2: no journal, or an option or OUT cannot be used.
@@ -100,7 +102,7 @@ def _read(journal: Path, unread: list[str]) -> AppliedFlight:
         return flight
     if unread or flight.lost:
         raise _too_little(flight, unread)
-    raise ExportError(f"{journal}: the flight never had a position; there is nothing to export")
+    raise ExportError(f"{journal}: the flight has no position, so there is nothing to export")
 
 
 def _too_little(flight: AppliedFlight, unread: list[str]) -> UnreadableError:

@@ -45,7 +45,7 @@ app.command(
 def list_flights(
     folder: Folder = None, config_file: ConfigFile = None, as_json: AsJson = False
 ) -> None:
-    """One line a flight: file, start, duration, state, litres, size."""
+    """List flights: file, start, duration, state, litres, size."""
     where, _ = _place(folder, config_file)
     flights = []
     told_s = time.monotonic()
@@ -71,7 +71,7 @@ def show(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A journal, a .gpkg file.")],
     as_json: AsJson = False,
 ) -> None:
-    """Show what a journal says of itself, and how much of what is in it.
+    """Show what a journal records about its flight, and how much it holds.
 
     Exit 0: all can be read; 1: it is damaged or of another version, and what could not be read is
     said; 2: no journal, or its flight still writes it.
@@ -88,13 +88,13 @@ def show(
 
 @app.command(epilog="Example: vrspray flights pin flights/flight-0001.gpkg")
 def pin(paths: Files, as_json: AsJson = False) -> None:
-    """Keep flights for ever: a pinned one is never pruned."""
+    """Pin flights, so that they are never pruned."""
     _pin(paths, is_pinned=True, as_json=as_json)
 
 
 @app.command(epilog="Example: vrspray flights unpin flights/flight-0001.gpkg")
 def unpin(paths: Files, as_json: AsJson = False) -> None:
-    """Take the pin away: retention counts again."""
+    """Unpin flights, so that they can be pruned again."""
     _pin(paths, is_pinned=False, as_json=as_json)
 
 
@@ -107,7 +107,7 @@ def prune_flights(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Remove old flights by the rules of [journal]: whole ones, closed, not pinned."""
+    """Remove old flights by the rules of [journal]; never open or pinned ones."""
     where, rules = _place(folder, config_file)
     removals = prune(where, rules, now_utc_s=time.time(), is_dry_run=is_dry_run)
     verb = "would go" if is_dry_run else "removed"
@@ -131,7 +131,7 @@ def prune_flights(
 
 @app.command(epilog="Example: vrspray flights recover --folder flights")
 def recover(folder: Folder = None, config_file: ConfigFile = None, as_json: AsJson = False) -> None:
-    """Make whole files of what a crash or a cut of power left; exit 1 where one is damaged."""
+    """Repair journals after a crash or power cut; exit 1 if one stays damaged."""
     where, _ = _place(folder, config_file)
     found = recover_folder(where)
     result = {

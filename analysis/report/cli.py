@@ -24,7 +24,7 @@ class Law(StrEnum):
 
 @app.command(epilog="Example: vrspray report flights/flight-0001.gpkg --out report --profile eu")
 def report_flight(
-    journal: Annotated[Path, typer.Argument(help="File of a flight, such as flight-0001.gpkg.")],
+    journal: Annotated[Path, typer.Argument(help="Journal of a flight, such as flight-0001.gpkg.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files of the report.")],
     profile: Annotated[
         list[Law] | None,
@@ -34,25 +34,25 @@ def report_flight(
     ] = None,
     time_zone: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="Of all times, such as Europe/Madrid. Default: UTC."),
+        typer.Option(metavar="NAME", help="Time zone, such as Europe/Madrid. Default: UTC."),
     ] = None,
     application: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="TOML with [application] and [product], said after the flight."
+            metavar="FILE", help="TOML with [application] and [product], added after the flight."
         ),
     ] = None,
     changes: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="KEY=VALUE", help="An entry of the record, said after the flight."
+            "--set", metavar="KEY=VALUE", help="Entry of the record, added after the flight."
         ),
     ] = None,
-    is_pdf: Annotated[bool, typer.Option("--pdf", help="Also report.pdf.")] = False,
+    is_pdf: Annotated[bool, typer.Option("--pdf", help="Write report.pdf as well.")] = False,
     is_plain: Annotated[bool, typer.Option("--no-figures", help="Leave out all figures.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate a flight and write its report, with every number and the record of the application.
+    """Evaluate a flight and write its report, with all figures and the application record.
 
     Exit 0: written; 1: of a journal that was cut, is damaged, lacks rows or is of another version:
     what can be read is written; 2: no journal, an option is wrong, or DIR cannot be written.

@@ -64,10 +64,11 @@ def measure_cards(
     images: Annotated[list[Path], typer.Argument(help="Scans: PNG, TIFF, JPEG, BMP, WebP.")],
     out: Annotated[Path, typer.Option(help="Folder for wsp.json, wsp.csv and the pictures.")],
     dpi: Annotated[
-        float | None, typer.Option(help="Resolution; without it the file's, or the card's width.")
+        float | None,
+        typer.Option(help="Resolution; default: from the file, or from the card's width."),
     ] = None,
     whole: Annotated[
-        bool, typer.Option("--whole", help="Each image is one card, nothing is looked for.")
+        bool, typer.Option("--whole", help="Each image is one card; do not search for cards.")
     ] = False,
     spread: Annotated[
         str, typer.Option(help=f"Spread factor: {', '.join(SPREADS)}, user:A,B (D = A d^B).")
@@ -76,20 +77,21 @@ def measure_cards(
         str, typer.Option(help="Grey level of the darkest paper, 1 to 254, or auto.")
     ] = str(THRESHOLD),
     inset_mm: Annotated[
-        float | None, typer.Option(help=f"Edge left out; {INSET_MM:g}, with --whole 0.")
+        float | None,
+        typer.Option(help=f"Edge to leave out; default: {INSET_MM:g}, with --whole 0."),
     ] = None,
     card_width_mm: Annotated[
-        float, typer.Option(help="Short side of the cards, where it has to tell the resolution.")
+        float, typer.Option(help="Short side of the cards, if it sets the resolution.")
     ] = CARD_WIDTH_MM,
     positions: Annotated[
         Path | None, typer.Option(help="CSV: card, latitude, longitude[, height, note].")
     ] = None,
     journal: Annotated[
-        Path | None, typer.Option(help="Flight that sprayed the cards; needs --positions.")
+        Path | None, typer.Option(help="Journal of the flight over the cards; needs --positions.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure coverage, deposits and drop sizes on scans of water-sensitive paper.
+    """Measure coverage, deposit and drop size on scans of water-sensitive paper.
 
     Exit 0: measured; 1: no card found, an image could not be read, or the journal was cut, is
     damaged or lacks rows; 2: wrong options or input.
@@ -162,7 +164,7 @@ def _read_all(
             refused.append({"file": str(path), "error": str(error)})
             note(f"error: {error}")
     if not sheets:
-        raise ImageError(f"none of the {len(images)} files is an image that can be read")
+        raise ImageError(f"none of the {len(images)} files is a readable image")
     return sheets, pictures, refused
 
 

@@ -28,7 +28,7 @@ File = Annotated[Path, typer.Argument(metavar="FILE", help="Configuration, a TOM
 
 @app.command(epilog="Example: vrspray config check examples/anyang/config.toml")
 def check(file: File, overrides: Overrides = None, as_json: AsJson = False) -> None:
-    """Validate a configuration and the files that it names.
+    """Check a configuration and the files that it names.
 
     Exit 0: it can be used; 2: it cannot.
     """

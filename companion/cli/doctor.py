@@ -82,7 +82,7 @@ def doctor(
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check all that must hold before a flight; say of each how it is and what to do.
+    """Check everything that must hold before a flight, with a fix for each problem.
 
     A disarmed ArduPilot is ordered to close its valves; nothing is opened without --click.
     Exit 0: no check failed; 1: one did; 2: the configuration cannot be used.

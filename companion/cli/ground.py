@@ -35,7 +35,7 @@ def prime(
     seconds: Seconds = None,
     is_water: Water = False,
 ) -> None:
-    """Fill the lines: valves fully open until liquid comes."""
+    """Fill the lines: open the valves fully until liquid arrives."""
     wish = Wish(kind=GroundKind.PRIME, valves=tuple(valves or ()), seconds=seconds)
     do(asked, wish, is_water=is_water)
 
@@ -49,7 +49,7 @@ def flush(
     is_together: Together = False,
     is_water: Water = False,
 ) -> None:
-    """Push out what is in the lines: valves in turn, or all together."""
+    """Flush the lines, valve by valve or all together."""
     wish = Wish(
         kind=GroundKind.FLUSH,
         valves=tuple(valves or ()),
@@ -71,7 +71,7 @@ def rinse(
     is_together: Together = False,
     is_water: Water = True,
 ) -> None:
-    """Rinse with so much clean water, valves in turn or all together."""
+    """Rinse with a volume of clean water, valve by valve or all together."""
     wish = Wish(
         kind=GroundKind.RINSE,
         valves=tuple(valves or ()),
@@ -91,7 +91,7 @@ def catch(
     seconds: Seconds = None,
     is_water: Water = False,
 ) -> None:
-    """Open valves at one duty for an exact time over cups; say what the curve expects."""
+    """Catch test: open valves at one duty for an exact time; print the expected volume."""
     wish = Wish(kind=GroundKind.CATCH, valves=tuple(valves or ()), duty=duty, seconds=seconds)
     do(asked, wish, is_water=is_water)
 
@@ -102,6 +102,6 @@ def click(
     asked: Asked,
     valves: Valves = None,
 ) -> None:
-    """Let each valve click in turn, dry: which one is which, and which one is dumb."""
+    """Click each valve in turn, dry, to find swapped or dead valves."""
     wish = Wish(kind=GroundKind.CLICK, valves=tuple(valves or ()))
     do(asked, wish)

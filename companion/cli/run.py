@@ -75,10 +75,10 @@ def run_companion(
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Spray: follow the vehicle, change the valves on the boundaries, until SIGINT or SIGTERM.
+    """Run the companion: follow the vehicle and switch the valves on zone boundaries.
 
-    Spraying is disabled until the operator enables it. All valves are closed at the end,
-    whatever ends it.
+    Runs until SIGINT or SIGTERM. Spraying is disabled until the operator enables it. All valves
+    are closed at the end, whatever ends it.
     """
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
     wanted = (*(overrides or ()), *(["journal.training=true"] if is_water else []))

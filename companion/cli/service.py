@@ -63,7 +63,7 @@ def install(
     ),
     as_json: AsJson = False,
 ) -> None:
-    """Write the unit and have it started with the computer; it is not started now."""
+    """Install the service to start with the computer; does not start it now."""
     config = load(config_file)
     who = account or os.environ.get("SUDO_USER") or getpass.getuser()
     unit = build_unit(config, is_user=user, account=who, is_realtime=realtime)
@@ -90,7 +90,7 @@ def install(
 
 @app.command(epilog="Example: sudo vrspray service uninstall")
 def uninstall(user: OfUser = False, as_json: AsJson = False) -> None:
-    """Stop the service and remove its unit; flights and configuration stay."""
+    """Stop and remove the service; keep flights and configuration."""
     path = unit_path(is_user=user)
     was_there = read_unit(path) is not None
     if was_there:
@@ -104,7 +104,7 @@ def uninstall(user: OfUser = False, as_json: AsJson = False) -> None:
 
 @app.command(epilog="Example: vrspray service status --json")
 def status(user: OfUser = False, as_json: AsJson = False) -> None:
-    """Tell whether it is installed, starts with the computer, and runs.
+    """Show whether the service is installed, enabled and running.
 
     Exit 0: it runs; 1: it does not.
     """

@@ -59,7 +59,7 @@ class ActuatorOrders:
 def px4_parameter_value(value: float, kind: int) -> float:
     """Return the value of a parameter: PX4 puts a whole number's bytes where the float would be.
 
-    >>> parameter_value(struct.unpack("<f", struct.pack("<i", 301))[0], 6)
+    >>> px4_parameter_value(struct.unpack("<f", struct.pack("<i", 301))[0], 6)
     301.0
     """
     layout = _FORMATS.get(kind)

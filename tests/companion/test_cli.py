@@ -326,8 +326,8 @@ def test_map_rate_answers_a_file_of_points_in_its_order(capsys: Captured, tmp_pa
         (b"lat,lon\n1,2\n3\n", "line 3"),
         (b"lat,lon\n91,2\n", "line 2"),
         (b"lat,lon\nnan,2\n", "line 2"),
-        (b"\xff\xfel\x00", "save it as that"),
-        (b'lat,lon\n"1,2\n' + b"x" * 200_000, "no CSV text"),
+        (b"\xff\xfel\x00", "save it as UTF-8"),
+        (b'lat,lon\n"1,2\n' + b"x" * 200_000, "not CSV text"),
     ],
     ids=["names", "empty", "short", "range", "nan", "utf-16", "quotes"],
 )

@@ -40,7 +40,7 @@ class FakeSensor:
         ((TankReport(received_s=1.0, level_l=7.0),), Status.OK, "tank 7.0 L"),
         ((BROKEN,), Status.FAIL, "wire broken"),
         ((FlowReport(received_s=1.0, volume_ml=0.0, fault="pulses lost"),), Status.FAIL, "lost"),
-        ((), Status.WARN, "no report"),
+        ((), Status.WARN, "no reading"),
     ],
 )
 async def test_what_they_say(reports: tuple[Input, ...], status: Status, text: str) -> None:

@@ -32,7 +32,7 @@ def test_lines_of_their_own_are_good_and_all_are_known() -> None:
 @pytest.mark.parametrize(("first", "second"), [*combinations(KEYS, 2)])
 def test_no_two_keys_may_name_one_line(first: str, second: str) -> None:
     given = (*GPIO, *METER, *APART, f"{first}=30", f"{second}=30")
-    with pytest.raises(ConfigError, match=r"(has this line|used twice); give each") as refused:
+    with pytest.raises(ConfigError, match=r"(uses the same line|used twice); give each") as refused:
         load(EXAMPLE, overrides=given)
     assert "\n" not in str(refused.value)
 

@@ -117,7 +117,7 @@ async def test_wrong_baud_is_bytes_without_frames(
     bench.pass_time(4.0)
     (said,) = bench.said(caplog)
     assert "400 bytes arrive but no MAVLink" in said
-    assert "another baud rate than 57600" in said
+    assert "a baud rate other than 57600" in said
     os.write(far, heartbeat())
     await bench.until(lambda: bench.link.component.is_vehicle_known)
 
@@ -131,7 +131,7 @@ async def test_a_wire_with_some_noise_is_called_silent(
     await bench.until(lambda: bench.link.component.codec.byte_count == 3)
     bench.pass_time(4.0)
     (said,) = bench.said(caplog)
-    assert "nothing arrives; check that TX goes to RX" in said
+    assert "nothing arrives; check that TX is wired to RX" in said
 
 
 async def test_bytes_of_another_program_are_named(
@@ -139,7 +139,7 @@ async def test_bytes_of_another_program_are_named(
 ) -> None:
     bench = await opened()
     bench.pass_time(4.0, b"GET / HTTP/1.1\r\n")
-    assert "no MAVLink: another program talks to this port" in bench.said(caplog)[0]
+    assert "no MAVLink: another program sends to this port" in bench.said(caplog)[0]
 
 
 async def test_without_an_autopilot_those_who_speak_are_named(
@@ -161,7 +161,7 @@ async def test_a_configured_system_that_is_not_there_is_said_with_the_one_that_i
     bench = await opened(system_id=7)
     bench.pass_time(4.5, heartbeat(3))
     (said,) = bench.said(caplog)
-    assert "no autopilot of system 7, but of 3: set link.system_id = 3" in said
+    assert "no autopilot with system 7, but one with 3: set link.system_id = 3" in said
     assert not bench.link.component.is_vehicle_known
 
 
@@ -171,7 +171,7 @@ async def test_two_autopilots_keep_everything_closed_until_one_is_gone(opened: O
     assert bench.link.fault is None
     bench.pass_time(0.1, heartbeat(2))
     assert bench.link.fault is not None
-    assert "systems 1, 2: set link.system_id" in bench.link.fault
+    assert "systems 1, 2): set link.system_id" in bench.link.fault
     bench.pass_time(5.0, heartbeat(1) + heartbeat(2))
     assert bench.link.fault is not None
     bench.pass_time(12.0, heartbeat(1))
@@ -240,7 +240,7 @@ async def test_a_heartbeat_that_ends_is_said_and_so_is_its_return(
     assert "system 1, ardupilot" in bench.events[0]
     bench.link.component.is_answered = True
     bench.pass_time(5.0, heartbeat(255, 190, 6, 8))
-    assert any("no heartbeat of system 1 any more" in text for text in bench.said(caplog))
+    assert any("system 1 has stopped sending heartbeats" in text for text in bench.said(caplog))
 
 
 async def test_a_heartbeat_that_comes_and_goes_is_said_every_ten_seconds_at_most(
@@ -251,7 +251,7 @@ async def test_a_heartbeat_that_comes_and_goes_is_said_every_ten_seconds_at_most
         bench.link.component.is_answered = True
         bench.pass_time(1.0, heartbeat())
         bench.pass_time(4.0)
-    told = [text for text in bench.said(caplog) if "no heartbeat of system 1" in text]
+    told = [text for text in bench.said(caplog) if "has stopped sending heartbeats" in text]
     assert 5 <= len(told) <= 6
 
 
@@ -261,7 +261,7 @@ async def test_an_autopilot_that_never_answers_points_to_our_wire(
     bench = await opened()
     bench.pass_time(5.0, heartbeat())
     (said,) = bench.said(caplog)
-    assert "heard but answers nothing: our bytes do not reach it" in said
+    assert "heard but does not answer: our messages do not reach it" in said
 
 
 async def test_frames_that_are_not_signed_with_our_key_are_said_so(

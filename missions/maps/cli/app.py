@@ -52,19 +52,23 @@ def compile_(
     ] = None,
     overlap: Annotated[
         str | None,
-        typer.Option("--overlap", metavar="P", help="Where zones overlap, without --config."),
+        typer.Option(
+            "--overlap", metavar="P", help="Rule where zones overlap, if there is no --config."
+        ),
     ] = None,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compile a map, its boundary, exclusions and planned lines into what the vehicle opens.
+    """Compile a map, its boundary, exclusions and planned lines into a flight map.
 
     Exit 0: compiled; 1: compiled, and the check of the map found errors; 2: it cannot be flown.
     """
     if not is_flight_map(out):
-        raise typer.BadParameter(f"--out has to end in {SUFFIX}")
+        raise typer.BadParameter(f"--out must end in {SUFFIX}")
     if is_flight_map(file):
-        raise map_error(file, "this is a flight map already", fix="name the map it is made of")
+        raise map_error(
+            file, "this is already a flight map", fix="name the map that it was compiled from"
+        )
     check_folder(out)
     config = None if config_file is None else load(config_file, overrides=overrides or ())
     order = _order(file, config, overlap)
@@ -147,14 +151,17 @@ PLAUSIBLE_M = 10.0
 
 def offset(
     in_map: Annotated[
-        str, typer.Option("--map", metavar="LAT,LON", help="The mark, as the map has it.")
+        str, typer.Option("--map", metavar="LAT,LON", help="Position of the mark on the map.")
     ],
     surveyed: Annotated[
-        str, typer.Option(metavar="LAT,LON", help="The same mark, by the receiver that will fly.")
+        str,
+        typer.Option(
+            metavar="LAT,LON", help="Position of the same mark, measured by the drone's receiver."
+        ),
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Say by how much a map has to move, from one mark that map and receiver both know.
+    """Measure the offset between map and receiver from one mark that both know.
 
     Read the mark (a corner of the field, a pole) out of the map, survey it with the receiver and
     the base that will fly, and paste the two lines into [prescription].
@@ -204,7 +211,7 @@ POINTS_MAX = 1_000_000
 app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
-    help="Check, show, convert and make prescription maps; look up rates in them.",
+    help="Check, show, convert, compile and make prescription maps.",
     epilog="Example: vrspray map check examples/anyang/prescription.shp",
 )
 
@@ -217,13 +224,13 @@ def check(
     home: Annotated[
         str | None,
         typer.Option(
-            metavar="LAT,LON", help="Where the sprayer stands; else mission.depots of --config."
+            metavar="LAT,LON", help="Place of the sprayer; default: mission.depots of --config."
         ),
     ] = None,
     overlap: OverlapPolicy = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say what is in a map and what is wrong with it.
+    """Show what is in a map and what is wrong with it.
 
     With --config also whether its sprayer can deliver the rates and settle in every zone, and
     whether the map lies in its field. Exit 0: usable; 1: readable, with errors; 2: unreadable.
@@ -249,12 +256,14 @@ def rate(
     longitude: Annotated[float | None, typer.Argument(metavar="LON", help="Degrees.")] = None,
     points: Annotated[
         Path | None,
-        typer.Option("--points", metavar="CSV", help="File with columns lat and lon instead."),
+        typer.Option(
+            "--points", metavar="CSV", help="Look up all points of a file with columns lat and lon."
+        ),
     ] = None,
     overlap: OverlapPolicy = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say the rate at a place, or at all places of a file.
+    """Look up the rate at one position, or at all positions in a file.
 
     As the map has it; with --config as it will be flown: boundary, exclusions, default rate and
     offset applied.
@@ -305,7 +314,7 @@ def _read_points(path: Path) -> list[tuple[float, float]]:
             f"{path}: {reason}", "give a CSV file with columns lat and lon"
         ) from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise _bad_points(f"{path}: no CSV text in UTF-8 ({error})", "save it as that") from error
+        raise _bad_points(f"{path}: not CSV text in UTF-8 ({error})", "save it as UTF-8") from error
     return places
 
 
@@ -325,7 +334,7 @@ def _place(
         place = (999.0, 999.0)
     if not (abs(place[0]) <= 90.0 and abs(place[1]) <= 180.0):
         raise _bad_points(
-            f"{where}: {latitude!r}, {longitude!r}: no place", "write degrees, the latitude first"
+            f"{where}: {latitude!r}, {longitude!r}: not a position", "write degrees, latitude first"
         )
     return place
 

@@ -31,23 +31,29 @@ MOVED_MAX_PERCENT = 5.0
 _OF_CELLS = ("geotiff", "dji", "text-map")
 _OVERLAPS = ("max", "min", "mean", "last")
 
-_Out = Annotated[Path, typer.Argument(metavar="OUT", help="File to write; its suffix counts.")]
+_Out = Annotated[
+    Path, typer.Argument(metavar="OUT", help="File to write; the suffix sets the format.")
+]
 _Format = Annotated[
     str | None,
-    typer.Option("--format", metavar="F", help="Where the suffix leaves it open, as for .zip."),
+    typer.Option("--format", metavar="F", help="Format, if the suffix does not tell, as for .zip."),
 ]
 _CellM = Annotated[
-    float | None, typer.Option("--cell-m", metavar="M", help="Width of cells, 1 unless given.")
+    float | None, typer.Option("--cell-m", metavar="M", help="Cell width; default: 1.")
 ]
 _Overlap = Annotated[
     str | None,
-    typer.Option("--overlap", metavar="P", help="For cells: max, min, mean or last zone holds."),
+    typer.Option(
+        "--overlap", metavar="P", help="For cells where zones overlap: max, min, mean or last."
+    ),
 ]
 _Round = Annotated[
-    float | None, typer.Option("--round", metavar="L_HA", help="Round rates to multiples of it.")
+    float | None, typer.Option("--round", metavar="L_HA", help="Round rates to multiples of this.")
 ]
-_Force = Annotated[bool, typer.Option("--force", help="Replace files that are there.")]
-_Picture = Annotated[Path, typer.Option("--out", metavar="PNG", help="Or .svg or .pdf.")]
+_Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+_Picture = Annotated[
+    Path, typer.Option("--out", metavar="PNG", help="Picture to write: .png, .svg or .pdf.")
+]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -39,7 +39,7 @@ def grid(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Say which cells a text map makes, by P2's equations; write them as points of a CSV file."""
+    """Show the cells of a text map, by P2's equations; write them as points of a CSV file."""
     if merge not in MERGES:
         raise typer.BadParameter(f"--merge is {merge!r}; take one of {', '.join(MERGES)}")
     place = None if origin is None else parse_place(origin, "--origin")
