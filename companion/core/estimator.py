@@ -460,9 +460,6 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
     known = motion.velocity_known
     if not known and checked is not None:
         velocity_east, velocity_north, known = _reported_velocity(east, north, checked)
-    heading = motion.heading_deg
-    if heading is not None:
-        heading = (heading + motion.yaw_rate_deg_s * dt_s) % 360.0
     heartbeat = track.heartbeat
     gnss = track.gnss if track.gnss is not None and _young(track.gnss, now_s) else None
     return VehicleState(
@@ -476,7 +473,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         acceleration_fade_s=motion.acceleration_fade_s,
         outrun_east_m_s=east.outrun_m_s,
         outrun_north_m_s=north.outrun_m_s,
-        heading_deg=heading,
+        heading_deg=_heading(motion, dt_s),
         yaw_rate_deg_s=motion.yaw_rate_deg_s,
         height_m=_height(track, motion, now_s),
         velocity_known=known,
@@ -487,9 +484,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         checked_speed_m_s=checked,
         fix=None if gnss is None else gnss.fix,
         horizontal_accuracy_m=None if gnss is None else gnss.horizontal_accuracy_m,
-        estimator_healthy=(
-            track.estimator.healthy if track.estimator and _young(track.estimator, now_s) else None
-        ),
+        estimator_healthy=_is_healthy(track, now_s),
         heartbeat_received_s=None if heartbeat is None else heartbeat.received_s,
         armed=heartbeat is not None and heartbeat.armed,
         active=heartbeat is not None and heartbeat.active,
@@ -512,6 +507,19 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         mission_leg=track.mission_leg,
         mission_leg_before=track.mission_leg_before,
     )
+
+
+def _heading(motion: Motion, dt_s: float) -> float | None:
+    """Return where the nose will point."""
+    if motion.heading_deg is None:
+        return None
+    return (motion.heading_deg + motion.yaw_rate_deg_s * dt_s) % 360.0
+
+
+def _is_healthy(track: Track, now_s: float) -> bool | None:
+    """Return whether the autopilot trusts its own position; None where it has not said lately."""
+    report = track.estimator
+    return report.healthy if report is not None and _young(report, now_s) else None
 
 
 def _clock_agrees(track: Track, now_s: float) -> bool:
