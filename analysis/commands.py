@@ -28,9 +28,15 @@ WSP = Command(
     help="Measure coverage and drop sizes on water-sensitive paper.",
     haste="patient",
 )
-FLIGHTS = Command(
-    target="analysis.journals.cli:app",
-    help="List, show, pin, prune, recover journals.",
-    haste="patient",
-    hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
+FLIGHTS_SHOW = Command(
+    target="analysis.journals.cli:SHOW",
+    help="Show what a journal records about its flight, and how much it holds.",
+)
+FLIGHTS_REMAINING = Command(
+    target="analysis.journals.cli:REMAINING",
+    help="Tell what is treated, what is left in hectares and litres, and where to go on.",
+)
+FLIGHTS_RECOVER = Command(
+    target="analysis.journals.cli:RECOVER",
+    help="Repair journals after a crash or power cut.",
 )

@@ -42,13 +42,17 @@ class Command:
         return self.hastes.get(name, self.haste)
 
 
-def registered(group: str = GROUP) -> dict[str, EntryPoint]:
-    """Return the commands of all installed distributions by their names; none is imported."""
+def registered(under: str = "") -> dict[str, EntryPoint]:
+    """Return the commands of all installed distributions by their names; none is imported.
+
+    With `under` those that stand below a command of ours: `flights.show` is `show` of `flights`.
+    """
     found: dict[str, EntryPoint] = {}
-    for point in entry_points(group=group):
+    for point in entry_points(group=GROUP):
+        group, _, name = point.name.rpartition(".")
         is_ours = point.dist is not None and point.dist.name == _OURS
-        if is_ours or point.name not in found:
-            found[point.name] = point
+        if group == under and (is_ours or name not in found):
+            found[name] = point
     return dict(sorted(found.items()))
 
 
@@ -83,9 +87,9 @@ def load(name: str, target: str | EntryPoint) -> Any:
         ) from error
 
 
-def command_named(name: str) -> Command | None:
+def command_named(name: str, under: str = "") -> Command | None:
     """Return what a registered command says of itself; None where nothing of this name is."""
-    point = registered().get(name)
+    point = registered(under).get(name)
     return None if point is None else _announced(name, point)
 
 
@@ -101,13 +105,13 @@ def _announced(name: str, point: EntryPoint) -> Command:
     return Command(target=point.value, help=text.strip().partition("\n")[0])
 
 
-def all_registered() -> dict[str, Command]:
+def all_registered(under: str = "") -> dict[str, Command]:
     """Return all registered commands by their names, for a list of them.
 
     One that cannot be loaded stands in it all the same.
     """
     found = {}
-    for name, point in registered().items():
+    for name, point in registered(under).items():
         try:
             found[name] = _announced(name, point)
         except VrsprayError as error:

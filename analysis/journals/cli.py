@@ -1,72 +1,29 @@
-"""`vrspray flights`: the journals of a folder, what is in one, which are kept."""
+"""Those commands of `vrspray flights` that look into a damaged file, or at a whole one."""
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from analysis.journals.remaining import remaining
 from analysis.journals.salvage import recover_folder
 from analysis.journals.show import content_lines, content_of
-from companion.cli.answer import AsJson, answer, note
-from companion.cli.record_parts import rules_of
-from companion.config.load import load
-from companion.errors import ConfigError, JournalError
-from companion.record.folder import Flight, journals, look_at, set_pinned
-from companion.record.geopackage import time_text
-from companion.record.retention import Rules, prune, space_of
+from companion.cli.answer import AsJson, answer
+from companion.cli.flights import FAILED, ConfigFile, Folder, as_object, line_of, place_of
+from companion.errors import JournalError
+from companion.record.folder import look_at
 
-app = typer.Typer(
-    add_completion=False,
-    rich_markup_mode=None,
-    help="Journals of flights: list, show, remaining, pin, unpin, prune, recover.",
-    epilog="Example: vrspray flights list --folder flights",
+SHOW, REMAINING, RECOVER = (
+    typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(3)
 )
-FAILED = 1
-_SLOW_S = 1.0
-Folder = Annotated[
-    Path | None,
-    typer.Option("--folder", metavar="DIR", help="Folder of the journals; default: flights."),
-]
-ConfigFile = Annotated[
-    Path | None, typer.Option("--config", metavar="FILE", help="Take the folder from here.")
-]
-Files = Annotated[list[Path], typer.Argument(metavar="FILE...", help="Journals, .gpkg files.")]
-
-app.command(
+REMAINING.command(
     epilog="Example: vrspray flights remaining flights/flight-0001.gpkg --out rest.geojson"
 )(remaining)
 
 
-@app.command("list", epilog="Example: vrspray flights list --config config.toml")
-def list_flights(
-    folder: Folder = None, config_file: ConfigFile = None, as_json: AsJson = False
-) -> None:
-    """List flights: file, start, duration, state, litres, size."""
-    where, _ = _place(folder, config_file)
-    flights = []
-    told_s = time.monotonic()
-    paths = journals(where)
-    for number, path in enumerate(paths, 1):
-        flights.append(look_at(path))
-        if time.monotonic() - told_s > _SLOW_S:
-            told_s = time.monotonic()
-            note(f"{number} of {len(paths)} journals read")
-    space = space_of(where)
-    result = {
-        "folder": str(where),
-        "flights": [_object(flight) for flight in flights],
-        "free_bytes": space.free_bytes,
-        "free_percent": space.free_percent,
-    }
-    lines = [_line(flight) for flight in flights] or [f"no flights in {where}"]
-    answer(result, lines, as_json=as_json)
-
-
-@app.command(epilog="Example: vrspray flights show flights/flight-0001.gpkg")
+@SHOW.command(epilog="Example: vrspray flights show flights/flight-0001.gpkg")
 def show(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="A journal, a .gpkg file.")],
     as_json: AsJson = False,
@@ -80,59 +37,16 @@ def show(
     if flight.state == "open" or not path.is_file():
         raise JournalError(flight.problem or f"{path}: its flight still writes it")
     content = content_of(path)
-    result = {**_object(flight), **content}
-    answer(result, [_line(flight), *content_lines(content)], as_json=as_json)
+    result = {**as_object(flight), **content}
+    answer(result, [line_of(flight), *content_lines(content)], as_json=as_json)
     if content["unread"]:
         raise typer.Exit(FAILED)
 
 
-@app.command(epilog="Example: vrspray flights pin flights/flight-0001.gpkg")
-def pin(paths: Files, as_json: AsJson = False) -> None:
-    """Pin flights, so that they are never pruned."""
-    _pin(paths, is_pinned=True, as_json=as_json)
-
-
-@app.command(epilog="Example: vrspray flights unpin flights/flight-0001.gpkg")
-def unpin(paths: Files, as_json: AsJson = False) -> None:
-    """Unpin flights, so that they can be pruned again."""
-    _pin(paths, is_pinned=False, as_json=as_json)
-
-
-@app.command("prune", epilog="Example: vrspray flights prune --config config.toml --dry-run")
-def prune_flights(
-    folder: Folder = None,
-    config_file: ConfigFile = None,
-    is_dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be removed; remove nothing.")
-    ] = False,
-    as_json: AsJson = False,
-) -> None:
-    """Remove old flights by the rules of [journal]; never open or pinned ones."""
-    where, rules = _place(folder, config_file)
-    removals = prune(where, rules, now_utc_s=time.time(), is_dry_run=is_dry_run)
-    verb = "would go" if is_dry_run else "removed"
-    failed = [each for each in removals if each.problem is not None]
-    result = {
-        "folder": str(where),
-        "is_dry_run": is_dry_run,
-        "removed": [
-            {"file": str(each.flight.path), "size_bytes": each.flight.size_bytes}
-            | {"reason": each.reason}
-            for each in removals
-            if each.problem is None
-        ],
-        "failed": [{"file": str(each.flight.path), "problem": each.problem} for each in failed],
-    }
-    lines = [f"{each.flight.path.name}: {each.problem or verb}: {each.reason}" for each in removals]
-    answer(result, lines or ["nothing to remove"], as_json=as_json)
-    if failed:
-        raise typer.Exit(FAILED)
-
-
-@app.command(epilog="Example: vrspray flights recover --folder flights")
+@RECOVER.command(epilog="Example: vrspray flights recover --folder flights")
 def recover(folder: Folder = None, config_file: ConfigFile = None, as_json: AsJson = False) -> None:
     """Repair journals after a crash or power cut; exit 1 if one stays damaged."""
-    where, _ = _place(folder, config_file)
+    where, _ = place_of(folder, config_file)
     found = recover_folder(where)
     result = {
         "folder": str(where),
@@ -146,57 +60,3 @@ def recover(folder: Folder = None, config_file: ConfigFile = None, as_json: AsJs
     answer(result, lines or ["nothing to recover"], as_json=as_json)
     if not all(each.is_good for each in found):
         raise typer.Exit(FAILED)
-
-
-def _pin(paths: list[Path], *, is_pinned: bool, as_json: bool) -> None:
-    changed = [path for path in paths if set_pinned(path, is_pinned=is_pinned)]
-    word = "pinned" if is_pinned else "not pinned"
-    result = {"pinned": is_pinned, "files": [str(path) for path in paths], "changed": len(changed)}
-    answer(result, [f"{path.name}: {word}" for path in paths], as_json=as_json)
-
-
-def _place(folder: Path | None, config_file: Path | None) -> tuple[Path, Rules]:
-    """Return folder and rules of retention."""
-    if folder is not None and config_file is not None:
-        raise ConfigError("--folder and --config: give one of them; the configuration names one")
-    if config_file is None:
-        return folder or Path("flights"), Rules()
-    config = load(config_file)
-    return config.resolve(config.journal.folder), rules_of(config.journal)
-
-
-def _object(flight: Flight) -> dict[str, Any]:
-    started_s = flight.started_utc_s
-    return {
-        "file": str(flight.path),
-        "started_utc": None if started_s is None else time_text(started_s),
-        "utc_source": flight.utc_source,
-        "duration_s": flight.duration_s,
-        "state": flight.state,
-        "applied_l": flight.applied_l,
-        "size_bytes": flight.size_bytes,
-        "pinned": flight.is_pinned,
-        "training": flight.training,
-        "problem": flight.problem,
-    }
-
-
-def _line(flight: Flight) -> str:
-    shown = _object(flight)
-    started = shown["started_utc"]
-    date = "date unknown" if started is None else f"{started[:19].replace('T', ' ')} UTC"
-    if flight.utc_source == "computer":
-        date += " (by this computer)"
-    parts = [flight.path.name, date]
-    if flight.duration_s is not None:
-        parts.append(f"{flight.duration_s / 60.0:.1f} min")
-    if flight.applied_l is not None:
-        parts.append(f"{flight.applied_l:.2f} L ordered")
-    parts += [flight.state, f"{flight.size_bytes / 1e6:.1f} MB"]
-    if flight.is_pinned:
-        parts.append("pinned")
-    if flight.training not in (None, "no"):
-        parts.append(f"training: {flight.training}")
-    if flight.problem is not None:
-        parts.append(flight.problem)
-    return ", ".join(parts)

@@ -146,7 +146,11 @@ def test_a_vehicle_without_the_office_flies_a_compiled_map(vehicle: Path, tmp_pa
         "--set", "link.url=udpin:127.0.0.1:0", "--set", "output.kind=none",
     )  # fmt: skip
     assert flown.returncode == 0, flown.stderr
-    shown = vrspray(vehicle, "flights", "show", json.loads(flown.stdout)["journal"])
+    listed = vrspray(vehicle, "flights", "list", "--folder", str(tmp_path / "flights"))
+    assert "flight-0001.gpkg" in listed.stdout
+    absent = vrspray(vehicle, "flights", "show", json.loads(flown.stdout)["journal"])
+    assert "is not part of this installation" in absent.stderr
+    shown = vrspray(tmp_path, "flights", "show", json.loads(flown.stdout)["journal"])
     assert f"flight map: {flight_map.sha256[:8]} of prescription.shp, compiled " in shown.stdout
 
 

@@ -159,7 +159,7 @@ def test_what_cannot_be_removed_is_said_and_the_others_go(
         unlink(path, missing_ok=missing_ok)
 
     monkeypatch.setattr(Path, "unlink", stuck)
-    monkeypatch.setattr("analysis.journals.cli.Rules", lambda: Rules(count=1, free_percent=None))
+    monkeypatch.setattr("companion.cli.flights.Rules", lambda: Rules(count=1, free_percent=None))
     found = told(capsys, "prune", "--folder", str(folder), code=1)
     assert [Path(each["file"]).name for each in found["removed"]] == ["flight-0002.gpkg"]
     assert found["failed"][0]["problem"] == "cannot be removed (Operation not permitted)"
