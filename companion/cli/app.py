@@ -49,12 +49,6 @@ COMMANDS = {
     "service": Command(
         target="companion.cli.service:app", help="Install the companion as a systemd service."
     ),
-    "flights": Command(
-        target="companion.cli.flights:app",
-        help="List, show, pin, prune, recover journals.",
-        haste="patient",
-        hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
-    ),
     "config": Command(
         target="companion.cli.config:app",
         help="Check or show a configuration, or print its schema.",
