@@ -241,21 +241,21 @@ def append(path: Path, entry: Mapping[str, Any]) -> str | None:
 
 _WORDS: dict[str, str] = {
     GroundReason.NO_HEARTBEAT: "no vehicle heard; check link.url and power",
-    GroundReason.STALE_HEARTBEAT: "the vehicle is heard no more",
+    GroundReason.STALE_HEARTBEAT: "the vehicle has stopped sending heartbeats",
     GroundReason.ARMED: "the vehicle is armed; disarm it",
     GroundReason.MISSION_MODE: "the vehicle is in a mode that flies missions or may spray; choose "
     "another, such as LOITER",
     GroundReason.MISSION_ACTIVE: "the vehicle's mission is active; end it",
-    GroundReason.LANDED_UNKNOWN: "the vehicle does not say whether it stands (EXTENDED_SYS_STATE)",
-    GroundReason.NOT_LANDED: "the vehicle does not say that it stands on the ground",
-    GroundReason.OUTPUT_FAULT: "the outputs are not sound",
+    GroundReason.LANDED_UNKNOWN: "the vehicle does not report whether it has landed (EXTENDED_SYS_STATE)",
+    GroundReason.NOT_LANDED: "the vehicle does not report that it is on the ground",
+    GroundReason.OUTPUT_FAULT: "the outputs have a fault",
     GroundReason.OUTPUTS_NEED_ARMING: "servo outputs of this autopilot follow orders only while it "
     'is armed (PX4), and ground work needs it disarmed; use valves on GPIO (output.kind = "gpio")',
     GroundReason.STOPPED: "stopped by MAVLink or by the emergency stop",
     GroundReason.ESTOP_UNKNOWN: "the emergency stop is pressed or cannot be read",
-    GroundReason.NOT_HELD: "the key was let go",
-    GroundReason.STALLED: "this computer stood still for a moment",
-    GroundReason.TIME_OVER: "the time of one piece is over; start anew",
+    GroundReason.NOT_HELD: "the key was released",
+    GroundReason.STALLED: "this computer paused for a moment",
+    GroundReason.TIME_OVER: "the time limit is over; start again",
     GroundReason.DONE: "done",
     KEY: "another key was pressed",
     ENDED: "stdin ended",

@@ -298,7 +298,7 @@ def test_the_mission_can_be_flown_where_it_was_asked_for(tmp_path: Path, suffix:
     [
         (("--out", "x.txt"), "name it .plan or .waypoints"),
         (("--out", "x.plan", "--origin", "here"), "LATITUDE,LONGITUDE"),
-        (("--out", "x.plan", "--origin", "95,10"), "no place"),
+        (("--out", "x.plan", "--origin", "95,10"), "not a position"),
         (("--out", "no/such/folder/x.plan"), "cannot be written"),
         (("--out", "x.plan", "--heading-deg", "nan"), "degrees clockwise"),
     ],
