@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from typer._click.formatting import HelpFormatter
 
 
+
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
 
 
@@ -49,17 +50,17 @@ COMMANDS = {
     "service": Command(
         target="companion.cli.service:app", help="Install the companion as a systemd service."
     ),
-    "config": Command(
-        target="companion.cli.config:app",
-        help="Check or show a configuration, or print its schema.",
-        haste="patient",
-        hastes={"check": "quick", "show": "quick", "schema": "quick"},
-    ),
     "flights": Command(
         target="companion.cli.flights:app",
         help="List, show, pin, prune or recover journals.",
         haste="patient",
         hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
+    ),
+    "config": Command(
+        target="companion.cli.config:app",
+        help="Check or show a configuration, or print its schema.",
+        haste="patient",
+        hastes={"check": "quick", "show": "quick", "schema": "quick"},
     ),
 }
 

@@ -246,7 +246,7 @@ _WORDS: dict[str, str] = {
     GroundReason.MISSION_MODE: "the vehicle is in a mode that flies missions or may spray; choose "
     "another, such as LOITER",
     GroundReason.MISSION_ACTIVE: "the vehicle's mission is active; end it",
-    GroundReason.LANDED_UNKNOWN: "the vehicle does not report whether it has landed (EXTENDED_SYS_STATE)",
+    GroundReason.LANDED_UNKNOWN: "landed or flying is not reported (EXTENDED_SYS_STATE)",
     GroundReason.NOT_LANDED: "the vehicle does not report that it is on the ground",
     GroundReason.OUTPUT_FAULT: "the outputs have a fault",
     GroundReason.OUTPUTS_NEED_ARMING: "servo outputs of this autopilot follow orders only while it "
