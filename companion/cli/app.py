@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from typer._click.formatting import HelpFormatter
 
 
-
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
 
 
