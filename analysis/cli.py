@@ -89,7 +89,7 @@ def _what_if(result: ReplayResult) -> Iterator[str]:
         )
     if moved.mean is not None:
         yield (
-            f"{moved.count} changes moved by {moved.mean:+.3f} m in the mean, "
+            f"{moved.count} changes moved by {moved.mean:+.3f} m on average, "
             f"{moved.max_abs:.3f} m at most (+ is later)"
         )
     zones = sorted(was.zones.keys() | now.zones.keys())

@@ -197,7 +197,7 @@ def least_idle_m(
 
     Let h be a height that is 0 at the depots, rises by 1 a metre at most, and by s at most along
     the passes. A sortie that sprays S metres and flies I without is at most I / 2 + s S / 4 high
-    in the mean: it climbed there, and will climb down. So I is at least twice its mean height less
+    on average: it climbed there, and will climb down. So I is at least twice its mean height less
     s S / 2, and S is what a tank or a battery lets it spray. With s = 0 this is the bound of
     Haimovich and Rinnooy Kan (1985) across the passes; s = 1 allows for sorties out and back. The
     s that gives most is taken. Passes in other courses than most count as ways that cost nothing;

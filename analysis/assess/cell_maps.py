@@ -94,7 +94,7 @@ class CellMaps:
 
     `corner_east_m` and `corner_north_m` are (rows + 1, columns + 1), in the flight's frame: what
     `pcolormesh` takes. `commanded_l_ha` is what was prescribed where the strips passed, `passes`
-    how often the ground was passed in the mean, `duty` that of the orders in force. All are means
+    how often the ground was passed on average, `duty` that of the orders in force. All are means
     over the field's ground: a cell that it has half of is judged by that half.
     """
 

@@ -240,7 +240,7 @@ def lag_distances(
         title="Lag distance by rate and by speed",
         caption="One point for each change of rate and valve inside the field; diamonds are means "
         "with their 95 % interval, from three crossings on. 0: the change lies on its boundary. "
-        "Wang et al. 2024 drew such a figure (Fig. 8) of the settled distance, 3.87 m in the mean "
+        "Wang et al. 2024 drew such a figure (Fig. 8) of the settled distance, 3.87 m on average "
         "without compensation and 0.32 m with it, at 5 m/s.",
         alt="Two scatter charts of the distance from each boundary to where the flow changed, by "
         "the rate that the change leads to and by speed, with means and 95 % intervals.",

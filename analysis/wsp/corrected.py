@@ -26,7 +26,7 @@ from analysis.wsp.stains import LEAST_CONTRAST, Stains, drops_px, segment
 # coarser than a pixel, adds and takes a pixel and more of darkness. So such stains are looked for
 # by a lighter threshold too, and sized by the height of their peak of darkness, over which
 # texture hardly changes: by as much darkness as single stains of the same card with the same peak
-# hold in the mean.
+# hold on average.
 
 Indices = NDArray[np.intp]
 
@@ -289,13 +289,13 @@ def _paper_around(grey: Bytes, paper: Mask, usual: float) -> Paper:
 # look like. But how many drops of a few hundred hit each other is chance, which it cannot see. An
 # outline can: two drops that hit each other make one patch with two notches, so that patches plus
 # half of the notches are the drops but for those that hide in others and for notches that are not
-# seen. How many crossings there are in the mean follows from the length of the outlines
-# (`notches`); of n patches, V notches seen of a share q of crossings and B crossings in the mean
+# seen. How many crossings there are on average follows from the length of the outlines
+# (`notches`); of n patches, V notches seen of a share q of crossings and B crossings on average
 # that is
 #
 #     drops = (n + V / 2 + B (1 / 4 - q / 2)) / (1 - covered),
 #
-# since n + B / 4 is what overlap leaves of the drops in the mean and V has the mean q B. The two
+# since n + B / 4 is what overlap leaves of the drops on average and V has the mean q B. The two
 # counts are joined by their variances. A drop at the edge of the region counts where its middle
 # lies inside, which it does if more than half of it is to be seen.
 

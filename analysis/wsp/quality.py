@@ -74,7 +74,7 @@ def _wet(seen: Seen) -> Iterator[tuple[str, str]]:
 def _light(seen: Seen) -> Iterator[tuple[str, str]]:
     greys = list(block_greys(seen.grey, seen.roi & (seen.stains.labels == 0)))
     if not greys:
-        yield "no-paper", "no unstained paper is to be seen; is this a card?"
+        yield "no-paper", "no unstained paper is visible: is this a card?"
         return
     if not _has_yellow(seen):
         yield "no-paper", "nothing on it is yellow; is this a card, and scanned in colour?"

@@ -35,7 +35,7 @@ CLOCK_RESET_S = 1.0
 # Answers come five times a second, or once; after so long without one the arrivals alone count.
 REPORT_AGE_MAX_S = 5.0
 # A position takes no longer on its way than a question and its answer, and what the autopilot
-# and the routers make it wait. More in the mean says that the two clocks disagree.
+# and the routers make it wait. More on average says that the two clocks disagree.
 WAIT_MAX_S = 0.1
 # No position arrives before it was sent; the autopilot's time has whole milliseconds.
 EARLY_MAX_S = 0.005

@@ -23,7 +23,7 @@ from companion.core.types import Method, VehicleState
 # Below this share of its width across the motion, a boom that flies askew is dosed as at it: the
 # flow that the law asks for would fall towards nothing while the strip is a blur.
 SKEW_MIN = 0.3
-# A trim stands until the next one, 50 ms later: in the mean it is half of that old.
+# A trim stands until the next one, 50 ms later: on average it is half of that old.
 TRIM_AGE_S = 0.025
 
 

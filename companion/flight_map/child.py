@@ -176,7 +176,9 @@ def _run(named: str, order: Sequence[str], out: Path) -> None:
             check=False,
             stdin=subprocess.DEVNULL,
         )
-    except (OSError, subprocess.TimeoutExpired) as error:
+    except subprocess.TimeoutExpired as error:
+        raise _failed(named, f"it took longer than {_TIMEOUT_S:.0f} s") from error
+    except OSError as error:
         raise _failed(named, str(error)[:200]) from error
     if done.returncode in _WRITTEN and out.exists():
         return

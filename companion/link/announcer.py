@@ -82,7 +82,7 @@ _MAV_STATE = {
 
 
 class _Beat:
-    """Is due every `period_s` in the mean, however unevenly it is asked."""
+    """Is due every `period_s` on average, however unevenly it is asked."""
 
     def __init__(self, period_s: float) -> None:
         self.period_s = period_s

@@ -125,7 +125,7 @@ class PulseTrain:
             self.duty = duty
             # A pulse less than half done goes on into the new period, one more than half done
             # ends: so the number of closings, each of which costs the valve's overrun, is
-            # right in the mean.
+            # right on average.
             self._begin(at_s, carried_debt(debt_s, self._period_s), keep=young, out=out)
         else:
             self._pending = duty

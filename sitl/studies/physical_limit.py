@@ -26,7 +26,7 @@ GUST_M_S, GUST_TIME_S = 1.0, 1.5
 POSITION_SD_M, VELOCITY_SD_M_S = 0.014, 0.03
 RATE_HZ = 20.0
 ESTIMATOR_LAG_S, MESSAGE_DELAY_S, JITTER_S = 0.031, 0.005, 0.003
-# From an order to where its trim acts in the mean: a valve's lag and half a period of 11 Hz.
+# From an order to where its trim acts on average: a valve's lag and half a period of 11 Hz.
 ACTS_S = 0.145
 # The mean of absolute values of a normal error, over its standard deviation.
 MEAN_ABS = math.sqrt(2.0 / math.pi)

@@ -23,7 +23,7 @@ from tests.bench.gate_frames import STEP_S, Loop, Vehicle, long_setup
 
 BEGIN_S = 100.0
 # One round: a healthy vehicle, then now and then a bad frame (so that each reason is met alone),
-# then a flood of them. Bad frames for each healthy one, in the mean, and for how many steps.
+# then a flood of them. Bad frames for each healthy one, on average, and for how many steps.
 ROUND = ((30, 0.0), (100, 0.1), (60, 8.0))
 ENABLE_STEPS = 10
 

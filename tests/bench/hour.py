@@ -47,7 +47,7 @@ from tests.bench.fields import PROFILE, example
 from tests.bench.oracle import Oracle, open_under
 
 SPEED_M_S = 5.0
-EVERY_S = 8.0  # between the starts of two faults, in the mean
+EVERY_S = 8.0  # between the starts of two faults, on average
 LONGEST_S = 6.0
 ENABLE_S = 3.0
 # A flight's own arrays come and go; what stays of each flight would add up to more than this.

@@ -80,7 +80,7 @@ def test_what_is_no_entry_is_refused(key: str, value: str) -> None:
 def test_run_names_what_will_be_missing_unless_it_is_training() -> None:
     config = load(EXAMPLE, overrides=EU[:-1])
     (line,) = _application_notes(config, "no")
-    assert "eu record" in line and "product.registration" in line
+    assert "eu application record" in line and "product.registration" in line
     assert _application_notes(config, "water") == []
     assert _application_notes(load(EXAMPLE, overrides=EU), "no") == []
     assert _application_notes(load(EXAMPLE), "no") == []

@@ -93,7 +93,7 @@ def test_a_surveyed_mark_has_to_lie_where_the_offset_puts_it() -> None:
 
 
 def test_half_a_mark_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"check_map.*without prescription\.check_surveyed"):
+    with pytest.raises(ConfigError, match=r"check_map.*needs prescription\.check_surveyed"):
         setup_with(MARK)
 
 

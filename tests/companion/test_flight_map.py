@@ -508,3 +508,11 @@ def test_a_flight_map_can_be_looked_at_and_planned_over(
     boundary.write_bytes((EXAMPLES / "anyang" / "boundary.geojson").read_bytes())
     order = ["plan", str(boundary), "--config", str(config), "--out", str(tmp_path / "a.plan")]
     assert execute(order) == 0, capsys.readouterr().err
+
+
+def test_a_compiler_that_takes_too_long_is_refused_in_words(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(child_module, "_TIMEOUT_S", 0.001)
+    with pytest.raises(MapError, match=r"took longer than 0 s\); compile it in the office"):
+        child_module.flight_map_of_file(Path("examples/anyang/prescription.shp"), overlap="refuse")

@@ -44,7 +44,7 @@ class Sprayer:
     right_m: tuple[float, ...] = (-2.5, -1.5, -0.5, 0.5, 1.5, 2.5)
     outputs: tuple[int, ...] = (9, 10, 11, 12, 13, 14)
     width_m: float = 1.0
-    # An order waits for the next frame of 20 ms: drawn for each output, 10 ms in the mean.
+    # An order waits for the next frame of 20 ms: drawn for each output, 10 ms on average.
     frame_s: float = 0.020
     dead_s: float = 0.069
     rise_s: float = 0.070

@@ -41,7 +41,7 @@ MEAN_MAX_M, WORST_MAX_M, OFF_TARGET_MAX_ML = 0.05, 0.25, 0.1
 # What is asked for is printed as met or missed; a flight fails by more than the bounds below. The
 # place that PX4 tells goes by 2 to 3 % faster and slower than the velocity it tells, for seconds,
 # and near a step of 17 % that moves the place where two doses meet: on 13 flights by 0.04 to 0.07 m
-# in the mean and 0.34 m at most, were the changes on time to the millimetre and the dose by the
+# on average and 0.34 m at most, were the changes on time to the millimetre and the dose by the
 # velocity (`judge_perfect`). Ours were 0.044 to 0.085 m, 0.29 m at most, and change by change 0.030
 # to 0.053 m and 0.18 m apart from that. (docs/px4.md, what PX4 is off by)
 OURS_MEAN_BOUND_M, OURS_WORST_BOUND_M = 0.08, 0.30

@@ -200,7 +200,7 @@ def test_the_report_of_zones_has_all_that_a_grower_asks() -> None:
         "rx.geojson: geojson, EPSG:4326",
         "2 zones with 1 hole, 0.0900 ha",
         "rates [L/ha] from 'rate' in L/ha: 0 10",
-        "0.8 L in all, 8.889 L/ha in the mean; 0.010 ha at rate 0",
+        "0.8 L in all, 8.889 L/ha on average; 0.010 ha at rate 0",
         "from 35.99600, 114.54300 to 35.99630, 114.54330",
         "boundary: 0.0900 ha, from the map",
         "default rate: none",

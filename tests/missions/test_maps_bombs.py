@@ -227,4 +227,4 @@ def test_running_out_of_memory_is_one_line(
 
     monkeypatch.setattr("missions.maps.cli.options.read_map", no_memory)
     assert execute(["map", "check", str(folder / "any.csv")]) == 2
-    assert capsys.readouterr().err.startswith("error: there is not enough memory")
+    assert capsys.readouterr().err.startswith("error: not enough memory")

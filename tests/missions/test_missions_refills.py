@@ -188,7 +188,7 @@ def test_sorties_out_and_back_are_found_where_passes_are_longer_than_a_tank() ->
     assert plain is not None
     found = regrouped(passes, limits, plain, (0.0, 1.0), trials=1500)
     saved_s = seconds_of(passes, limits, plain) - seconds_of(passes, limits, found)
-    # Of every tank's two ferries, 1,600 m in the mean, a quarter is flown spraying.
+    # Of every tank's two ferries, 1,600 m on average, a quarter is flown spraying.
     assert saved_s > 12 * 0.15 * 1600.0 / 6.0
 
 

@@ -97,7 +97,7 @@ def test_half_of_the_room_gives_its_speed() -> None:
     field = field_of()
     room_m = 3.0
     plan = plan_of(field, RunIn(ground=field.outline.buffer(room_m, join_style="mitre")))
-    # 1.94 m/s is reached in 2 sqrt(1.94) + 0.3 s, with half of it in the mean.
+    # 1.94 m/s is reached in 2 sqrt(1.94) + 0.3 s, with half of it on average.
     assert 1.94 * (2.0 * math.sqrt(1.94) + 0.3) / 2.0 == pytest.approx(room_m, rel=0.01)
     assert "the slowest at 1.9 instead of 6 m/s" in plan.warnings[0]
 

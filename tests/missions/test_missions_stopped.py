@@ -20,7 +20,7 @@ from missions.plan import Settings
 from missions.searching import Watch, lines_are_drawn, steps, watched
 from tests.mission_fields import degrees
 
-SAID = "the best plan so far is written"
+SAID = "wrote the best plan so far"
 
 
 def press_ctrl_c() -> None:

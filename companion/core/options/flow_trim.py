@@ -82,7 +82,7 @@ class Trimming:
     def of(cls, settings: FlowTrim, lag: LagModel, pwm: PwmLimits) -> Trimming:
         """Return the times for a sprayer's lags.
 
-        A small change waits half a period in the mean. Three volume-equivalent lags are what a
+        A small change waits half a period on average. Three volume-equivalent lags are what a
         first-order response needs to 95 %; dead time and ramp are over sooner.
         """
         window_s = max(round(WINDOW_S / pwm.period_s), 1) * pwm.period_s

@@ -272,7 +272,7 @@ SLACK_SPREADS = 3.2
 ALARM_SPREADS_S = 7.0
 # Of one bin: a single wrong one, such as at an edge that came late, is no alarm.
 EVIDENCE_MAX = 0.25
-# The meter's own gain is learnt in the mean of this time, and within this: it is no fault.
+# The meter's own gain is learnt on average of this time, and within this: it is no fault.
 LEARN_S = 20.0
 GAIN_SPREADS = 4.0
 BINS_KEPT = 64

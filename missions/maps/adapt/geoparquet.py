@@ -316,7 +316,7 @@ def _check_names(names: list[str], geometry: str, path: Path) -> None:
     if geometry not in names:
         raise map_error(
             path,
-            f"the column {geometry[:60]!r}, which is to be its geometry, is not there",
+            f"its geometry column {geometry[:60]!r} is missing",
             fix=EXPORT_AGAIN,
             code="truncated",
         )

@@ -406,7 +406,7 @@ def _rates(result: Mapping[str, Any]) -> str:
 def _amount(result: Mapping[str, Any]) -> str:
     mean = result["mean_rate_l_ha"]
     text = f"{result['litres']:.1f} L in all"
-    text += "" if mean is None else f", {mean:.4g} L/ha in the mean"
+    text += "" if mean is None else f", {mean:.4g} L/ha on average"
     text += f"; {result['zero_ha']:.3f} ha at rate 0" if result["zero_ha"] else ""
     return text + (
         f"; {result['no_rate_ha']:.3f} ha without a rate" if result["no_rate_ha"] else ""

@@ -30,7 +30,7 @@ from missions.maps.text.text_points import TextMap
 Ints = NDArray[np.int64]
 
 # A point may stand this much of a cell beside its place: 10 m cells with five decimals of a
-# degree are rounded by 0.06. Points at random are off by 0.25 in the mean.
+# degree are rounded by 0.06. Points at random are off by 0.25 on average.
 OFF_MAX = 0.12
 # Rows and columns stand at right angles, to 10 degrees (the sine): a lattice in one projection is
 # a little skewed in another.

@@ -76,6 +76,6 @@ def test_ctrl_c_ends_the_search_and_the_best_plan_so_far_is_written(tmp_path: Pa
     told = json.loads((tmp_path / "told.json").read_text(encoding="utf-8"))
     assert told["stopped"] is True
     assert told["coverage_percent"] > 99.8
-    assert re.search(r"stopped after \d+ s: the best plan so far is written", rest.decode())
+    assert re.search(r"stopped after \d+ s; wrote the best plan so far", rest.decode())
     written = json.loads((tmp_path / "out.geojson").read_text(encoding="utf-8"))
     assert {each["properties"]["kind"] for each in written["features"]} >= {"spray", "ferry"}
