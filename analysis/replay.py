@@ -3,7 +3,7 @@
 The core is a function of set-up, inputs and times, and the journal has all three; so the same
 program must decide the same, to the last bit. A difference means that the core has changed, that
 rows are missing, or, with overrides, what would have been decided otherwise. What that would have
-put on the ground is in `what_if.py`; whether the same ground is treated, `replayed_ground.py` says.
+put on the ground, and whether the same ground is treated, is below.
 """
 
 from __future__ import annotations

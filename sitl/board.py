@@ -1,6 +1,6 @@
 """The servo path: from an order to the autopilot to the edges at the valves.
 
-The board of docs/driver-board.md: widths here (rules 9 to 11), pulses in `board_pulses.py`.
+The board of docs/driver-board.md: widths here (rules 9 to 11), its pulses below.
 """
 
 from __future__ import annotations

@@ -283,7 +283,7 @@ def _write(path: Path, text: str) -> None:
 
 # Mission files for simulated flights: QGC WPL 110 and QGroundControl's plan.
 #
-# What `stub/mission_file.py` reads; home comes first, as ArduPilot numbers it.
+# What `stub/mission_items.py` reads; home comes first, as ArduPilot numbers it.
 
 CRUISE_M_S, HOVER_M_S = 5.0, 5.0
 ARDUPILOT, COPTER = 3, 2  # MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_TYPE_QUADROTOR

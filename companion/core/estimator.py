@@ -114,7 +114,7 @@ class Motion:
         """Return the motion to the east and to the north `dt_s` later: the place as it is told.
 
         The velocity is the told one too, not that of the place, but for what has begun to draw the
-        place just now, as far as the velocity is doubted at all (`drawn.py`).
+        place just now, as far as the velocity is doubted at all (`motion.py`).
         """
         cruise, manoeuvre, share = self.agreed.cruise, self.agreed.manoeuvre, self.agreed.share
         calm, nimble = stretch(CRUISE.fade_s, dt_s), stretch(MANOEUVRE.fade_s, dt_s)

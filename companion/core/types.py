@@ -288,7 +288,7 @@ class Inhibit(StrEnum):
 
 
 class SprayerState(StrEnum):
-    """What the sprayer may do; see `sprayer_state.py`. Their order is that of `SPR_STATE`."""
+    """What the sprayer may do; see `safety.py`. Their order is that of `SPR_STATE`."""
 
     BOOT = "boot"  # vehicle and position were not heard yet
     SAFE = "safe"  # closed, something is missing
@@ -300,7 +300,7 @@ class SprayerState(StrEnum):
 
 
 class FlowTrimState(StrEnum):
-    """What the slow trim of the flow does, and what has to be said of it; see `flow_trim.py`."""
+    """What the slow trim of the flow does and has to say; see `options/flow_trim.py`."""
 
     TRACKING = "tracking"
     FROZEN = "frozen"  # as it has to be: closed, a change, an end of the range, too little flow
@@ -346,7 +346,7 @@ class MissionLeg:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StopAhead:
-    """The vehicle comes to a stop so far ahead along its course, braking so hard; see `leg.py`."""
+    """The vehicle will stop so far ahead along its course, braking so hard; see `braking.py`."""
 
     distance_m: float
     braking_m_s2: float

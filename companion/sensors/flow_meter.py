@@ -1,6 +1,6 @@
 """A pulse flow meter as a sensor: edges from a line, counts to the core.
 
-Where the edges come from is behind `EdgeSource`: the kernel's GPIO (`gpiod_edges.py`), or a list.
+Edges come through `EdgeSource`: from the kernel's GPIO (`cli/sensor_parts.py`) or from a list.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The messages that a peer can ask for, each built from the state at one moment.
 
-What both firmwares send alike; `ardupilot_streams.py` and `px4_streams.py` hold the rest.
+What both firmwares send alike; `ardupilot.py` and `px4.py` hold the rest.
 """
 
 from __future__ import annotations

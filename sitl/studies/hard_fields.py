@@ -1,6 +1,6 @@
 """Fields for hard flights: bands or plots whose edges lie askew to the path, along any line.
 
-Places are given along and across the centre line of `hard_paths.py`, so that one map serves a
+Places are given along and across the centre line of a `CentreLine`, so that one map serves a
 straight pass and an arc.
 """
 

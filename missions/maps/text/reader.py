@@ -1,6 +1,6 @@
 """P2's open text map: read into its grid of square cells.
 
-The format is in `text_points.py`, the grid in `point_grid.py`, the way back from any other map in
+The format is in `text_points.py`, the grid in `text_lattice.py`, the way back from any other map in
 `text_lattice.py`. Here the cells, which lie in the tangent plane of an origin, are tied to the
 ground, and what a grower should know about the map is said.
 """
