@@ -215,7 +215,7 @@ def fitted_lines(ground: BaseGeometry, width_m: float, angle_deg: float, motion:
     """Return lines that begin anew at the edges where that is quickest."""
     turned_by = axes(angle_deg)
     turned = shapely.transform(ground, lambda points: points @ turned_by.T)
-    lines = joined([_fitted_of_part(part, width_m, motion) for part in shapely.get_parts(turned)])
+    lines = joined([_fitted_in_part(part, width_m, motion) for part in shapely.get_parts(turned)])
     return np.column_stack([lines[:, :2] @ turned_by, lines[:, 2:] @ turned_by])
 
 
@@ -244,7 +244,7 @@ def edges_along(part: Polygon, width_m: float) -> Floats:
     return np.array([low, *sorted(places), high])
 
 
-def _fitted_of_part(part: Polygon, width_m: float, motion: Motion) -> Floats:
+def _fitted_in_part(part: Polygon, width_m: float, motion: Motion) -> Floats:
     edges = edges_along(part, width_m)
     last = len(edges) - 1
     best = [0.0] + [np.inf] * last

@@ -196,7 +196,7 @@ def _timed(sortie: Sortie, settings: Settings) -> Sortie:
     ways, motion = _ways(sortie, settings.height_m), settings.motion
     seconds = [0.0] * len(sortie.legs)
     sprays = [leg.kind == "spray" for leg in sortie.legs]
-    for some in (_legs_without_runs(ways[:-1], sprays), ways[-1:]):
+    for some in (_ways_without_runs(ways[:-1], sprays), ways[-1:]):
         found = parts_s(
             [way.length_m for way in some],
             [_bend_deg(before, after) for before, after in pairwise(some)],
@@ -272,7 +272,7 @@ def _is_no_way(sortie: Sortie, number: int) -> bool:
     return [other.kind for other in around] == ["spray", "spray"]
 
 
-def _legs_without_runs(ways: list[_Way], sprays: Sequence[bool]) -> list[_Way]:
+def _ways_without_runs(ways: list[_Way], sprays: Sequence[bool]) -> list[_Way]:
     """Return the ways between waypoints: those that lead straight on are one.
 
     `sprays` says of which legs are lines.

@@ -61,10 +61,10 @@ def read_adapt(path: Path, layer: str | None = None) -> Layer | Grid:
         )
     operation = chosen([one for one, _ in places], layer, path)
     description = next(name for one, name in places if one is operation)
-    return _reader_read(bundle, operation, description)
+    return _read_adapt(bundle, operation, description)
 
 
-def _reader_read(bundle: Bundle, operation: Operation, description: str) -> Layer | Grid:
+def _read_adapt(bundle: Bundle, operation: Operation, description: str) -> Layer | Grid:
     """Return the map that an operation names, which lies beside its description."""
     wanted = str(PurePosixPath(description).parent / operation.file).casefold()
     name = next((one for one in bundle.names if one.casefold() == wanted), None)
