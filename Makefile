@@ -20,7 +20,7 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs lock clean bench-missions
+.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs reference lock clean bench-missions
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z -]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -95,8 +95,17 @@ test-gpio: $(INSTALLED) ## the valve engine on the kernel's simulated chip (buil
 test-firmware: $(INSTALLED) ## flights beside the real firmwares of VRSPRAY_FIRMWARE (ARGS="-m short" for one of each)
 	$(BIN)/pytest -m firmware $(ARGS) tests/firmware
 
-docs: $(INSTALLED) ## every link in the documents leads somewhere
-	$(BIN)/pytest --quiet tests/project/test_foundation.py -k link
+docs: $(INSTALLED) $(BIN)/mkdocs ## the documentation site, in site/; a broken link fails
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@$(BIN)/python -m tests.reference --words
+
+# Not in the development lock: who does not build the site need not wait for its tools.
+$(BIN)/mkdocs: requirements/docs.txt | $(INSTALLED)
+	$(PIP) install --quiet --require-hashes --requirement $<
+	@touch $@
+
+reference: $(INSTALLED) ## write docs/reference anew, from the code
+	$(BIN)/python -m tests.reference
 
 lock: | $(BIN)/python ## choose and pin versions anew (ARGS=--upgrade for the newest)
 	[ -x $(BIN)/uv ] || $(PIP) install --quiet uv
@@ -105,9 +114,11 @@ lock: | $(BIN)/python ## choose and pin versions anew (ARGS=--upgrade for the ne
 	$(COMPILE) pyproject.toml --extra dev --output-file requirements/dev.txt >/dev/null
 	$(COMPILE) pyproject.toml --extra plot --constraint requirements/dev.txt --output-file requirements/plot.txt >/dev/null
 	$(COMPILE) pyproject.toml --constraint requirements/dev.txt --output-file requirements/run.txt >/dev/null
+	$(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['docs'], sep='\n')" \
+		| $(COMPILE) - --constraint requirements/dev.txt --output-file requirements/docs.txt >/dev/null
 
 clean: ## everything that was made, but for the environment and recorded flights
-	rm -rf demo-out build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf demo-out site build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -not -path './.venv*/*' -prune -exec rm -rf {} +
 
 $(BIN)/python:

@@ -53,7 +53,7 @@ def sensor_check(count: int, found: Read) -> Check:
     if not count:
         return not_applicable(_NAME, "none configured on this computer")
     if found.refused is not None:
-        return fail(_NAME, *split_advice(found.refused, "see docs/configuration.md"))
+        return fail(_NAME, *split_advice(found.refused, "see docs/reference/configuration.md"))
     faults = [fault for report in found.reports if (fault := _fault(report))]
     if faults:
         return fail(_NAME, faults[0], "check its wiring and supply, then try again")

@@ -9,7 +9,6 @@ import pytest
 
 from companion.config import Config, load
 from companion.config.rules import mismatches, without_effect
-from companion.config.wording import allowed_text
 from companion.core.nozzle import choose_set
 from companion.core.types import Fix, Method
 from companion.errors import ConfigError
@@ -389,28 +388,3 @@ def test_number_is_bounded_on_both_sides() -> None:
         )
     ]
     assert not unbounded
-
-
-def documented_rows() -> list[str]:
-    """One row a key for docs/configuration.md."""
-    schema = Config.model_json_schema(by_alias=True)
-    rows = []
-    for table, node in schema["properties"].items():
-        branch = next((b for b in node.get("anyOf", [node]) if b.get("type") != "null"), node)
-        reference = branch.get("$ref") or branch.get("items", {}).get("$ref")
-        if reference is None:
-            continue
-        definition = schema["$defs"][reference.rpartition("/")[2]]
-        for key, leaf in definition["properties"].items():
-            if key in definition.get("required", []):
-                default = "**required**"
-            else:
-                default = "-" if leaf["default"] is None else f"`{json.dumps(leaf['default'])}`"
-            allowed = allowed_text(leaf, schema, key)
-            rows.append(f"| `{table}.{key}` | {allowed} | {default} | {leaf['description']} |")
-    return rows
-
-
-@pytest.mark.parametrize("row", documented_rows())
-def test_every_key_is_documented_as_it_is(row: str) -> None:
-    assert row in (ROOT / "docs" / "configuration.md").read_text()

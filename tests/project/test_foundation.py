@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-LOCKS = ("build", "run", "plot", "dev")
+LOCKS = ("build", "run", "plot", "dev", "docs")
 EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
 needs_make = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 
@@ -50,7 +50,14 @@ def is_pinned(requirement: Requirement, lock: str) -> bool:
 
 @pytest.mark.parametrize(
     ("lock", "extra"),
-    [("run", None), ("plot", None), ("plot", "plot"), ("dev", None), ("dev", "dev")],
+    [
+        ("run", None),
+        ("plot", None),
+        ("plot", "plot"),
+        ("dev", None),
+        ("dev", "dev"),
+        ("docs", "docs"),
+    ],
 )
 def test_lock_file_holds_every_dependency_of_the_project(lock: str, extra: str | None) -> None:
     assert [str(one) for one in wanted(extra) if not is_pinned(one, lock)] == []
@@ -127,10 +134,12 @@ def test_a_link_to_nothing_is_found(tmp_path: Path) -> None:
     assert broken_links(page) == ["gone.md", "#no-head"]
 
 
-def test_index_links_every_document() -> None:
-    linked = set(re.findall(r"\]\(([^)#\s]+)", (ROOT / "docs/index.md").read_text()))
-    pages = {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
-    assert pages - linked == {"index.md"}
+def test_every_document_has_its_place_in_the_navigation() -> None:
+    listed = re.findall(
+        r"^ +- (?:[^:\n]+: )?(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE
+    )
+    pages = [str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")]
+    assert sorted(listed) == sorted(pages)
 
 
 def test_project_package_and_changelog_agree_on_the_version() -> None:

@@ -1,0 +1,20 @@
+"""Which page is written by what."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.reference import commands, configuration
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "reference"
+HEAD = "<!-- Written by `make reference` from the code; do not edit. -->\n\n"
+PAGES: dict[str, Callable[[], str]] = {
+    "commands.md": commands.page,
+    "configuration.md": configuration.page,
+}
+
+
+def written(name: str) -> str:
+    """Return the text of a page, from the code as it is now."""
+    return HEAD + PAGES[name]().rstrip() + "\n"
