@@ -31,9 +31,10 @@ class Config(Document):
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
-        for found in contradictions(self):
+        found = [(each.key, each.text) for each in contradictions(self)]
+        if found:
             raise PydanticCustomError(
-                "contradiction", "{text}", {"key": found.key, "text": found.text}
+                "contradiction", "{text}", {"text": found[0][1], "all": found}
             )
         return self
 
