@@ -9,14 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.assembly import build_setup, deliverable
+from companion.assembly import build_setup, deliverable, flight_map_of
 from companion.cli.answer import AsJson, Overrides, answer, problem_line, problem_object
 from companion.cli.app import refusal
 from companion.config import Config, load
 from companion.config.rules import mismatches, remarks, without_effect
 from companion.config.wording import show_value
 from companion.errors import ConfigError, MapError
-from companion.flight_map import flight_map_of
 from companion.problem import Problem
 
 app = typer.Typer(

@@ -7,7 +7,6 @@ from typing import Self
 from pydantic import model_validator
 from pydantic_core import PydanticCustomError
 
-from companion.config import motor_rules
 from companion.config.document import Document
 from companion.config.rules import contradictions
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
@@ -40,9 +39,10 @@ class Config(Document):
 
     def nozzle_sets(self) -> tuple[NozzleSet, ...]:
         """Return the sets, from the smallest to the largest flow."""
-        of_pump = motor_rules.pump_set(self)
-        if of_pump is not None:
-            return (of_pump,)
+        if self.pump is not None and self.makes_flow:
+            from companion.config.motor_rules import pump_set
+
+            return (pump_set(self, self.pump),)
         index = {valve.name: number for number, valve in enumerate(self.valve)}
         sets = []
         for table in self.nozzle_set:
@@ -57,11 +57,12 @@ class Config(Document):
 
     def pwm_limits(self) -> PwmLimits:
         """Return what the valves can follow, or the pump that makes their flow."""
-        least = motor_rules.fraction_min(self)
-        if least is not None:
+        if self.pump is not None and self.makes_flow:
+            from companion.config.motor_rules import fraction_min
+
             return PwmLimits(
                 frequency_hz=self.pwm.frequency_hz,
-                duty_min=least,
+                duty_min=fraction_min(self.pump),
                 duty_max=1.0,
                 min_on_s=0.0,
                 min_off_s=0.0,

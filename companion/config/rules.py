@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import chain, combinations, pairwise
 from typing import TYPE_CHECKING
 
-from companion.config.motor_rules import makes_flow, motor_contradictions, motor_warnings
 from companion.core.nozzle import FLOW_LAWS, FlowCurve
 from companion.flight_modes import is_mode, known_modes
 
@@ -48,7 +47,7 @@ def contradictions(config: Document) -> list[Contradiction]:
     """Return all that makes the configuration unusable."""
     rules: tuple[Callable[[Document], Rule], ...] = (
         _link, _prescription, _valves, _channels, _nozzle_sets, _pwm, _lags, _output, _safety,
-        _mission, _keyed(line_contradictions), _keyed(motor_contradictions),
+        _mission, _keyed(line_contradictions), _keyed(_motors),
         _keyed(sensor_contradictions),
     )  # fmt: skip
     found: list[Contradiction] = []
@@ -68,6 +67,20 @@ def _keyed(rule: Callable[[Document], Found]) -> Callable[[Document], Rule]:
         return (Contradiction(key=key, text=text) for key, text in rule(config))
 
     return keyed
+
+
+def _motors(config: Document) -> Found:
+    if config.has_motors:
+        from companion.config.motor_rules import motor_contradictions
+
+        yield from motor_contradictions(config)
+
+
+def _motor_warnings(config: Document) -> Found:
+    if config.has_motors:
+        from companion.config.motor_rules import motor_warnings
+
+        yield from motor_warnings(config)
 
 
 def _prescription(config: Document) -> Rule:
@@ -157,7 +170,7 @@ def without_effect(config: Document) -> Rule:
                 text="a published curve: its own authors measured up to 22 % more flow; "
                 "measure yours (vrspray calibrate flow)",
             )
-    for key, text in chain(line_warnings(config), motor_warnings(config)):
+    for key, text in chain(line_warnings(config), _motor_warnings(config)):
         yield Contradiction(key=key, text=text)
     settings = {
         "web.enabled": config.web.enabled,
@@ -247,7 +260,7 @@ def _channels(config: Document) -> Rule:
     last = SERVO_OUTPUTS if kind == "servo" else GPIO_LAST[config.gpio.driver]
     what = "servo output" if kind == "servo" else "GPIO line"
     for key, channel in channels.items():
-        if channel is None and not makes_flow(config):
+        if channel is None and not config.makes_flow:
             yield Contradiction(key=key, text=f"missing; write the {what}, {first} to {last}")
     if config.output.return_channel is not None:
         channels["output.return_channel"] = config.output.return_channel
@@ -287,7 +300,7 @@ def _nozzle_sets(config: Document) -> Rule:
         used.update(table.valves)
         if table.preset is not None and not unknown:
             yield from _preset(config, table, key)
-        elif not makes_flow(config):
+        elif not config.makes_flow:
             yield from _curve(table.duty, table.flow_l_min, key)
     for number, name in enumerate(names):
         if name not in used:
@@ -299,8 +312,8 @@ def _nozzle_sets(config: Document) -> Rule:
 
 
 def _preset(config: Document, table: NozzleSetTable, key: str) -> Rule:
-    if table.duty or table.flow_l_min or makes_flow(config):
-        other = "the curve of the pump" if makes_flow(config) else "a row of measured points"
+    if table.duty or table.flow_l_min or config.makes_flow:
+        other = "the curve of the pump" if config.makes_flow else "a row of measured points"
         yield Contradiction(
             key=f"{key}.preset", text=f"{other} already gives the flow; remove one of the two"
         )

@@ -5,7 +5,6 @@ metres of the flight's frame, rates in L/ha, boundary, exclusions and planned li
 it was made with, and what was found on the way.
 """
 
-from companion.flight_map.child import flight_map_of, flight_map_of_file
 from companion.flight_map.file import read_flight_map, write_flight_map
 from companion.flight_map.model import (
     SUFFIX,
@@ -15,6 +14,8 @@ from companion.flight_map.model import (
     frozen_settings,
     is_flight_map,
     moved,
+    named_files,
+    sources_of,
 )
 
 __all__ = [
@@ -22,11 +23,11 @@ __all__ = [
     "FlightMap",
     "SourceFile",
     "difference",
-    "flight_map_of",
-    "flight_map_of_file",
     "frozen_settings",
     "is_flight_map",
     "moved",
+    "named_files",
     "read_flight_map",
+    "sources_of",
     "write_flight_map",
 ]

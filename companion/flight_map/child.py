@@ -45,54 +45,15 @@ _WRITTEN = (0, 1)
 _COMPILER = ("map", "compile")
 
 
-def flight_map_of(config: Config, overrides: Sequence[str] = ()) -> FlightMap:
-    """Return the flight map that the configuration names, or that of the map that it names.
+def compiled(config: Config, table: PrescriptionTable, overrides: Sequence[str] = ()) -> FlightMap:
+    """Return what was compiled of these very files with these settings, now or before.
 
     `overrides` are those that the configuration was read with.
 
     Raises:
-        ConfigError: where it names none, or files that are not those of the flight map.
-        MapError: where a file cannot be used.
+        ConfigError, MapError: where a file cannot be used.
     """
-    table = config.prescription
-    if table is None:
-        raise ConfigError(
-            f"{config.path}: prescription.file: missing; write the path of the map under "
-            "[prescription]"
-        )
-    path = config.resolve(table.file)
-    if not is_flight_map(path):
-        return _compiled(config, table, overrides)
-    try:
-        found = read_flight_map(path)
-    except MapError as error:
-        text = f"{config.path}: prescription.file = {show_value(table.file)}: {error}"
-        raise MapError(text, code=error.code, fix=error.fix) from error
-    _refuse_changed(config, table, found)
-    return found
-
-
-def _refuse_changed(config: Config, table: PrescriptionTable, flight_map: FlightMap) -> None:
-    """Refuse a boundary, an exclusion or a plan that lies here and is not the compiled one."""
-    for key, path in named_files(table, _lines(config), config.path.parent).items():
-        if key == "prescription.file" or not path.exists():
-            continue
-        here = {each.sha256 for each in sources_of({key: path})}
-        if not here & {each.sha256 for each in flight_map.sources if each.key == key}:
-            raise ConfigError(
-                f"{config.path}: {key}: {path.name} was changed after {flight_map.path.name} was "
-                f"compiled; compile the map again: vrspray map compile {flight_map.source} "
-                f"--config {config.path} --out {flight_map.path.name}"
-            )
-
-
-def _lines(config: Config) -> str | None:
-    return None if config.mission is None else config.mission.lines
-
-
-def _compiled(config: Config, table: PrescriptionTable, overrides: Sequence[str]) -> FlightMap:
-    """Return what was compiled of these very files with these settings, now or before."""
-    settings = frozen_settings(table, _lines(config))
+    settings = frozen_settings(table, config.planned_lines)
     known_by = json.dumps(
         [VERSION, version("vrspray"), str(config.resolve(table.file)), settings], sort_keys=True
     )
@@ -125,7 +86,7 @@ def _still_good(kept: Path, config: Config, table: PrescriptionTable) -> FlightM
         found = read_flight_map(kept)
     except MapError:
         return None
-    here = sources_of(named_files(table, _lines(config), config.path.parent))
+    here = sources_of(named_files(table, config.planned_lines, config.path.parent))
     return found if here == found.sources else None
 
 

@@ -193,8 +193,7 @@ def difference(flight_map: FlightMap, config: Config) -> tuple[str, object, obje
     """
     if config.prescription is None:
         return None
-    lines = None if config.mission is None else config.mission.lines
-    for key, wanted in frozen_settings(config.prescription, lines).items():
+    for key, wanted in frozen_settings(config.prescription, config.planned_lines).items():
         compiled = flight_map.frozen.get(key)
         is_hint = key.removeprefix("prescription.") in _READING
         if is_hint and wanted is None:

@@ -17,7 +17,7 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from companion.assembly import build_setup
+from companion.assembly import build_setup, flight_map_of
 from companion.cli.app import execute
 from companion.config import load
 from companion.config.tables import PrescriptionTable
@@ -26,7 +26,6 @@ from companion.errors import ConfigError, MapError
 from companion.flight_map import (
     FlightMap,
     difference,
-    flight_map_of,
     read_flight_map,
     write_flight_map,
 )
