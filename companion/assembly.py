@@ -31,7 +31,6 @@ from companion.flight_map import (
     is_flight_map,
     named_files,
     read_flight_map,
-    sources_of,
 )
 from companion.problem import Problem
 
@@ -78,6 +77,8 @@ def _refuse_changed(config: Config, table: PrescriptionTable, flight_map: Flight
     for key, path in named_files(table, config.planned_lines, config.path.parent).items():
         if key == "prescription.file" or not path.exists():
             continue
+        from companion.flight_map.child import sources_of
+
         here = {each.sha256 for each in sources_of({key: path})}
         if not here & {each.sha256 for each in flight_map.sources if each.key == key}:
             raise ConfigError(

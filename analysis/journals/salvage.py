@@ -37,10 +37,9 @@ from companion.record.read_only import (
     DAMAGE,
     one_line,
     read_only,
-    readable_rows,
     salvaged_name,
-    tolerate_damage,
 )
+from companion.record.reader import readable_rows, tolerate_damage
 from companion.record.recovery import Recovery, Told
 from companion.record.totals import LITRES_KEY, applied_l
 from companion.record.versions import missing_tables

@@ -5,7 +5,7 @@ metres of the flight's frame, rates in L/ha, boundary, exclusions and planned li
 it was made with, and what was found on the way.
 """
 
-from companion.flight_map.file import read_flight_map, write_flight_map
+from companion.flight_map.file import read_flight_map
 from companion.flight_map.model import (
     SUFFIX,
     FlightMap,
@@ -15,7 +15,6 @@ from companion.flight_map.model import (
     is_flight_map,
     moved,
     named_files,
-    sources_of,
 )
 
 __all__ = [
@@ -28,6 +27,4 @@ __all__ = [
     "moved",
     "named_files",
     "read_flight_map",
-    "sources_of",
-    "write_flight_map",
 ]
