@@ -1,8 +1,8 @@
 """How well a flight put the prescription on the ground: every metric, in one call.
 
 Used by the demo, the report and the benchmarks, so that a figure means the same everywhere. Signs:
-+ is too late, further along the track. docs/metrics.md has the definitions; the modules beside
-this one have one metric each.
++ is too late, further along the track. docs/explanation/metrics.md has the definitions; the modules
+beside this one have one metric each.
 """
 
 from __future__ import annotations

@@ -232,7 +232,7 @@ def _too_short(
     pump = profile.makes_flow
     if pump is None:
         return
-    # Until an exponential is within 10 % of its step: Koo's 2.6 to 3.8 s, as docs/plants.md has it.
+    # Until an exponential is within 10 % of its step: Koo's 2.6 to 3.8 s.
     needed_s = pump.dead_s + math.log(10.0) * max(pump.up_s, pump.down_s)
     passed = [
         (rate, length_m / leg.speed_m_s, leg.speed_m_s)

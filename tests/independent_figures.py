@@ -3,9 +3,9 @@
 `python tests/independent_figures.py samples.csv flight-0001.gpkg` reads what
 `vrspray export flight-0001.gpkg --out samples.csv --format csv-samples` wrote, and the zones of
 the map from the journal (a GeoPackage: SQLite with well-known binary). It was written from
-docs/metrics.md with nothing but numpy and the standard library, so that an error in the program's
-evaluation does not cancel out. Of a flight whose changes are all measured: it knows no verdicts
-but `small` and `missed`.
+docs/explanation/metrics.md with nothing but numpy and the standard library, so that an error in
+the program's evaluation does not cancel out. Of a flight whose changes are all
+measured: it knows no verdicts but `small` and `missed`.
 """
 
 from __future__ import annotations

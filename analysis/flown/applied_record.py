@@ -1,8 +1,8 @@
 """A flown journal as a `FlightRecord`, so that every metric can be had of a real flight.
 
 The path is the autopilot's, the volume is the modelled one of the executed changes: what position,
-lags and curves are wrong by nobody can see from here. docs/evaluation.md says how far that is from
-the truth of simulated flights.
+lags and curves are wrong by nobody can see from here. docs/explanation/flight-figures.md says how
+far that is from the truth of simulated flights.
 """
 
 from __future__ import annotations

@@ -483,7 +483,7 @@ def _records(records: Sequence[LegalRecord]) -> Iterator[Caution]:
             )
 
 
-# What each figure means, in one line, with its unit; the whole is in docs/metrics.md.
+# What each figure means, in one line, with its unit; the whole is in docs/explanation/metrics.md.
 
 DEFINITIONS: dict[str, tuple[str, str, str]] = {
     "lag_distance_m": (

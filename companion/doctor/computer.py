@@ -17,7 +17,7 @@ from pathlib import Path
 from companion.doctor.check import Check, fail, not_applicable, ok, warn
 from companion.link.transport import parse_url
 
-# A journal takes about 200 MB an hour with six valves (docs/flight-record.md).
+# A journal takes about 200 MB an hour with six valves (docs/explanation/flight-record.md).
 FREE_WARN_BYTES, FREE_MIN_BYTES = 1_000_000_000, 100_000_000
 # It is written once a second by a thread of its own; slower than this it falls behind.
 SYNC_MAX_S = 1.0

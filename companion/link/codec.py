@@ -26,7 +26,6 @@ from companion.core.types import (
 from companion.link.census import AUTOPILOT_COMPONENT, Census, Vehicle, autopilot_name, mode_name
 from companion.link.messages import (
     CURRENT,
-    RADIO_STATUS,
     TRANSFERS,
     AckReceived,
     CommandReceived,
@@ -40,6 +39,7 @@ from companion.link.messages import (
     TimesyncReceived,
     finite,
 )
+from companion.link.signing import RADIO_STATUS
 
 __all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]
 

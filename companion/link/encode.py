@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.link.census import AUTOPILOT_COMPONENT
-
-if TYPE_CHECKING:
-    from companion.link.signing import Signing
+from companion.link.signing import Signing
 
 _ONBOARD_CONTROLLER = 18
 _AUTOPILOT_INVALID = 8

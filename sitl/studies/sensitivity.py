@@ -1,6 +1,6 @@
 """What an error that nobody knows of costs: of lag, of position, of its rate, of wind.
 
-    python -m sitl.studies.sensitivity --page docs/sensitivity.md --plot docs/images/sensitivity.png
+    python -m sitl.studies.sensitivity --page docs/measurements/sensitivity.md
 
 flies the field of Wang et al. 2024 (P1) with `scheduled`, once undisturbed and once with each
 disturbance, and compares flights of the same seed. Wind is not flown: where the undisturbed
@@ -253,50 +253,14 @@ HEAD = (
 )  # fmt: skip
 
 INTRODUCTION = """\
+<!-- Written by `python -m sitl.studies.sensitivity`; do not edit. -->
+
 # Sensitivity
 
-What an error costs that nobody knows of. Each row is a flight over the field of Wang et al. 2024
-(four passes, 216 changes of rate) with one disturbance and the method `scheduled`. *Cost* is
-disturbed minus undisturbed, seed by seed, and then the mean of the seeds. The figures are those of
-[metrics](metrics.md): + is too late; *Abs* is the mean of absolute lag distances, *Worst* the
-largest of all seeds, *Outside* what fell outside the border.
-"""
-
-READING = """\
-## How to read it
-
-- **Time costs speed times time**: an error of 20 ms is 0.10 m at 5 m/s and 0.20 m at 10 m/s, the
-  same for every change of its kind. *Lag mean* shows the whole shift; *Abs* rises by less, because
-  noise and the scatter between valves are in it already.
-- **A position 10 cm behind is the same as 20 ms at 5 m/s**, but does not grow with speed. It is an
-  offset of the body (the place of the antenna, `forward_m` of the valves).
-- **A constant ground offset along the passes** (datum, base station, map) changes its sign with the
-  direction of flight: the mean stays, the mean of absolute values does not. `vrspray calibrate
-  lag-marks` tells the three apart ([calibration](calibration.md)).
-- **Across the passes** nothing moves along the track. The metrics, and the controller by default,
-  take the rate under the *centre* of a strip, here 1 m wide and 0.5 m from the next plot: what is
-  less than 0.5 m across costs nothing in these figures, and what is more counts as a whole strip.
-  Only *Outside* is exact to 0.1 m. An autopilot with the same offset also flies beside its line;
-  here the vehicle holds its path, and only what the controller is told is wrong.
-- **Up and down alone**: the changes of that kind only. On and off are at this field's border only,
-  where no lag distance is measured: their cost is in *Misapplied* and *Outside*.
-- **The rate of positions**: between two messages the controller predicts, so fewer of them cost the
-  mean little on a straight pass at a steady speed, and single changes (*Worst*) more. Braking and
-  turning are not in this. Each rate draws other errors of position: differences of millimetres
-  between two rates are noise.
-- **Wind** blows on droplets only; the vehicle holds its path. Model: shift = wind x time of fall,
-  from 3.5 m. 0.80 s are droplets of 250 um in a downwash of 8 m/s that fades to the ground, from
-  a ballistic calculation with Schiller and Naumann's drag; 0.45 s is 3.5 m at the downwash's full
-  speed, about the least that is to expect. Droplets of 100 um take 1.45 s, and several times that
-  where no downwash reaches. The undisturbed flight's liquid is moved by the shift as one piece,
-  and the ground under it judged again; spreading is left out. The wind comes from one side of the
-  field, so a shift along the passes is late one way and early the other. What is blown over the
-  border is in *Outside* and no longer in *Misapplied*; beside the passes the field ends 0.5 m
-  beyond the plots.
-
-A light wind costs more than any of the other errors here, and it is the one that the controller
-does not measure. Lags and the places of antenna and map are worth calibrating to 20 ms and 10 cm;
-beyond that, the weather decides where the drops fall.
+What an error costs that nobody knows of: flights over the field of Wang et al. 2024 (216 changes)
+with one disturbance each, method `scheduled`. *Cost* is disturbed minus undisturbed, the mean over
+seeds; + is too late; *Abs* is the mean of absolute lag distances, *Worst* the largest of all seeds,
+*Outside* what fell outside the border. [Accuracy](../explanation/accuracy.md) reads it for you.
 """
 
 
@@ -328,7 +292,7 @@ def write_page(result: Result, path: Path, *, plot: Path | None, command: str = 
         link = Path(os.path.relpath(plot, path.parent)).as_posix()
         parts.append(f"![What each disturbance costs]({link})\n")
     try:
-        path.write_text("\n".join([*parts, table + "\n", READING]), encoding="utf-8")
+        path.write_text("\n".join([*parts, table + "\n"]), encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from None
 

@@ -1,6 +1,6 @@
 """The twin against what Wang et al. 2024 (P1) measured with a real sprayer, as a command.
 
-    python -m sitl.studies.validation --out docs
+    python -m sitl.studies.validation --out docs/measurements
 
 `validation_flights` flies, `validation_page` and `validation_pictures` show.
 """
@@ -40,7 +40,7 @@ class _Told:
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m sitl.studies.validation --seeds 20 --out docs")
+@app.command(epilog="Example: python -m sitl.studies.validation --seeds 20 --out docs/measurements")
 def validation(
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds 1 to N.")] = 20,
     out: Annotated[

@@ -1,6 +1,6 @@
 """The twin against what Wang et al. 2024 (P1) measured with a real sprayer.
 
-    python -m sitl.studies.validation --out docs
+    python -m sitl.studies.validation --out docs/measurements
 
 flies P1's controller (`sitl/wang.py`, which doses by P1's Eq. 2) over P1's field at P1's speeds,
 without compensation and with both look-aheads, and then the same flights with `scheduled`. The

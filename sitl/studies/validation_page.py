@@ -33,105 +33,40 @@ SET_CHANGE_L_MIN = 4.0
 Table = list[tuple[str, ...]]
 
 INTRODUCTION = """\
+<!-- Written by `python -m sitl.studies.validation`; do not edit. -->
+
 # Validation against Wang et al. 2024
 
-Does the [simulated sprayer](sitl.md) behave as the real one of Wang et al. 2024 (P1, Journal of
-Agricultural Engineering LV:1547) did? P1's own controller, emulated (`sitl/wang.py`: positions
-polled at 5 Hz, 0.42 s of program time, duties by P1's Eq. 2 with eight nozzles below 4 L/min and
-twelve above, valves that take a new duty with their next period and stay open above 90 %), flies
-P1's field on the plant `wang-2024` with P1's ten rates at P1's three speeds: without compensation
-(`none`), with the look-ahead of 0.71 s that P1's distances speak for, and with the 0.97 s that P1
-states. `look-ahead, by Table 2` is the first of them with duties from P1's measured table and all
-twelve nozzles: what differs between the two is what Eq. 2 costs. Then `scheduled` flies the same
-paths, by GPIO and by servo output through the restarting [driver board](driver-board.md). Pulses,
-noise, scatter between valves and gusts are on.
+The emulated controller of the paper (P1) and ours fly P1's field on the simulated sprayer, beside
+P1's published figures; [accuracy](../explanation/accuracy.md) says what agrees and what does not.
 """
 
 LAG_TEXT = """\
 ## Lag distance
 
-P1's, *settled*: from the boundary to where the total flow has come within 10 % of the step of its
-new target and stays ([metrics](metrics.md)). + is too late. *Range* is over all changes, *by rate*
-over the means of changes to one rate, *by flight* over the means of single flights. P1's Figure 8a
-has one distance for each rate, from three flights of four plots a rate: its range belongs between
-our first, of single changes, and our second, of many more changes to a rate.
+*Settled*, as P1 measures it: from the boundary to where the total flow stays within 10 % of the
+step at its new target; + is too late.
 """
 
 OURS_TEXT = """\
-A sharp step at the boundary itself scores 0.4 of a period's distance, 0.18 m at 5 m/s: the mean
-over one period needs that to arrive. So `scheduled` cannot have 0 above. This is its distance to
-the volume-equivalent step, which has none of it: valve by valve, and of P1's controller that of the
-whole boom, because a change of nozzles closes valves. A distance longer than a plot
-(12 m) is none: there the measurement failed, its two lines met far away. It is left in, and in the
-means, as it came.
+Distance to the volume-equivalent step. More than a plot (12 m) is a failed measurement, left in.
 """
 
 CLOSE_TEXT = """\
-## P1's figures do not close
-
-P1 states a look-ahead of T1 + T2 + T3 = 0.97 s, 4.85 m at 5 m/s. But compensation took away
-3.87 - 0.32 = 3.55 m, and that is 0.71 s. Nor is its distance without compensation one time: 3.87 m
-at 5 m/s is 0.77 s, 4.2 m at 6 m/s is 0.70 s (P1 prints the latter as "4.2 m s-1"; metres must be
-meant). On the twin, look-aheads take away what they say:
+## What a look-ahead takes away
 """
 
 ACCURACY_TEXT = """\
 ## Spraying accuracy by speed and rate
 
-P1's Table 5, and the same from the twin: Eqs. 18 and 19 over all data points on the ground of one
-rate [L/ha], transitions included. P1 does not say whether its table is with compensation; without,
-the twin's means are 12 to 14 points below it. *All* is the mean over the ten rates, *by flight* the
-lowest and the highest mean over all data points of a flight.
+P1's Table 5 and the simulated sprayer: Eqs. 18 and 19 for each rate [L/ha], transitions included.
 """
 
 EQ_2_TEXT = """\
 ### What P1's Eq. 2 explains of it
 
-What is missing to 100 %, in points: of P1; of the look-ahead of 0.71 s on the twin, whose valves
-deliver P1's Table 2, with duties from that table; and of the same with duties from Eq. 2. *Low* are
-the rates that Eq. 2 sprays with eight nozzles (below 4 L/min), *high* the others.
+What is missing to 100 %, in points; *low* are the rates below 4 L/min, *high* the others.
 """
-
-READING = """\
-## What agrees and what does not
-
-- **Distances agree** at 5 m/s, where P1 has means with and without compensation: the bound is
-  0.3 m, and the test suite holds it. Other speeds and ranges are shown, not bound. The twin is a
-  little later: its valves take a new duty one after the other over a whole period, and the total
-  is complete only with the last. At 6 m/s it is later by more: P1's distance grew less than its
-  speed did, and no constant delay does that.
-- **Eq. 2 explains more than P1's loss, and P1's trends.** With duties from its measured table P1's
-  controller loses half to two thirds of what P1 lost, much the same at every rate. With those of
-  Eq. 2 accuracy rises with rate and with speed, as in P1's Table 5: eight nozzles give too much, by
-  Table 2 up to 22 % at 2 L/min, and the slower the flight, the more rates they spray. But it loses
-  more than P1 did, at 4 m/s twice as much, at 6 m/s half a point, by the rates of eight nozzles:
-  P1's sprayer in the field cannot have been both Table 2's and Eq. 2's. With twelve nozzles its
-  loss is near P1's. P1 itself gives its flow meter as the probable reason for the trend, better at
-  a higher flow; the twin is judged by its true flow and position, and no noise was added to come
-  nearer.
-- **`scheduled` loses most at the lowest rates, by the flow between the measured points.** The
-  twin's flow runs smoothly through Table 2, the program reads the table straight: at duties between
-  0.2 and 0.4 that is up to 4 % too much (2.1 to 3.0 L/min, the six lowest rates at 4 m/s, three at
-  5). While the twin had the program's own curve, these rates scored 98 % as well: 98.3 to 98.4 % in
-  all at each speed, where it is now 96.9, 97.7 and 98.0 %.
-- **At Eq. 2's jumps a change may not settle at all.** At 4 L/min the duty goes from 92.5 % of eight
-  nozzles, which stay open, to 60.8 % of twelve, and P1 states no hysteresis: in gusts a flow near 4
-  L/min goes back and forth. Some 1 % of the changes are missed for it, and some settle late. P1
-  reports none. With duties by Table 2 every change settles.
-- **The twin with 0.97 s is not P1's way**: its changes come too early by more than P1's were too
-  late, and the distances are what P1 measured on the ground.
-- **At 6 m/s the highest rate is at the valves' limit**: 27.8 L/ha are 6.0 of 6.1 L/min. Where a
-  gust asks for more, the flow falls short, and a change may count as settled only metres later.
-- **Where eight nozzles spray, the boom is judged as one strip**, as P1 judged it; it found that
-  closing valves 5 and 6 did little to the evenness across. By single valves that ground would be
-  bare.
-- **Rates are the same at all speeds here**, as in P1's Table 5 (at 4 to 6 m/s they fill the 2 to
-  6 L/min of its valves). [Demo](demo.md) and [performance](performance.md) scale them by speed:
-  their figures at 4 and 6 m/s are of other flows.
-- **What is not in the twin**: droplets on their way down, wind on them, tilt. All figures are at
-  the nozzle.
-"""
-
 
 # What the two pictures show, for those who cannot see them.
 PICTURES_SHOW = (
@@ -180,7 +115,6 @@ def write_page(result: Validation, folder: Path, *, pictures: Sequence[str], com
         _markdown(_accuracy_table(result)),
         EQ_2_TEXT,
         _markdown(_eq_2_table(result)),
-        READING,
     ]
     try:
         path.write_text("\n".join(parts), encoding="utf-8")

@@ -1,7 +1,8 @@
-"""Measure everything: one JSON object on stdout, a table and the progress on stderr.
+r"""Measure everything: one JSON object on stdout, a table and the progress on stderr.
 
     python -m tests.bench [SEED] [--only 'arc-*'] [--quick] > results.json
-    python -m tests.bench --from times.json --from results.json --page docs/performance.md
+    python -m tests.bench --from times.json --from results.json \
+        --page docs/measurements/performance.md
 
 Parts may be measured at different times; the page says when each one was.
 """

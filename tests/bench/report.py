@@ -1,4 +1,4 @@
-"""The figures as a page of Markdown, docs/performance.md: a summary, then every section."""
+"""The figures as docs/measurements/performance.md: a summary, then every section."""
 
 from __future__ import annotations
 
@@ -7,27 +7,25 @@ from typing import Any
 
 from tests.bench.figures import Figure, short
 
-_HEAD = """# Performance and accuracy, measured
+_HEAD = """<!-- Written by `python -m tests.bench --page`; do not edit. -->
 
-Written by `make bench`'s own program from the runs below, each figure from the newest run that has
-it. `make bench` prints the same figures as JSON; `make bench SEED=N` draws other seeds.
+# Performance and accuracy, measured
+
+Made of the runs below, each figure from the newest run that has it. `make bench` prints the same
+figures as JSON; `make bench SEED=N` draws other seeds.
 
 {runs}
 
-On a machine that does other work meanwhile, times are upper bounds; accuracy is the same.
+On a computer that does other work meanwhile, times are upper bounds; accuracy is the same.
 
-How it is measured: times with `time.perf_counter`, after a warm-up, with the garbage collector as
-`vrspray run` has it. *n* is the number of samples behind a figure: steps, look-ups, messages,
-changes of rate, flights. The alternative is another way to do the same, measured in the same run.
-Accuracy is that of the twin (pulsed, with noise and scatter) at the nozzle, judged by
-`analysis/evaluation.py` ([metrics](metrics.md)). *Nominal* lags are those measured beforehand on
-other sprayers of the make; *identified* ones come from one calibration mission that the same
-sprayer flew before, by its own meter. Perfect knowledge is the same path and the same
-scattered sprayer with the true position and each valve's own lag and flow known, with no driver
-board in between, for every output. Where nothing else is said the sprayer's flow runs smoothly
-between the measured points, which is not how the program reads them ([plants](plants.md)). The
-board of `servo` restarts its period at a change of zone, `free-running` does not. Where the
-deposit lands also depends on wind, tilt and droplets.
+- *n* is the number of samples behind a figure: steps, look-ups, messages, changes of rate, flights.
+- *Alternative* is another way to do the same, measured in the same run.
+- Accuracy is that of the simulated sprayer at the nozzle, with pulses, noise and scatter
+  ([accuracy](../explanation/accuracy.md)).
+- *Nominal* lags were measured on other sprayers of the same make; *identified* lags by one
+  calibration flight of the same sprayer, with its own meter.
+- *Perfect knowledge* flies the same path and sprayer with the true position and each valve's own
+  lag and flow known, and no driver board.
 
 ## Summary
 

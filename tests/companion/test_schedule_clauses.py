@@ -1,4 +1,4 @@
-"""What the schedule promises, one test a promise; docs/schedule.md has the table."""
+"""What the schedule promises, one test a promise; docs/explanation/timing.md has the table."""
 
 from __future__ import annotations
 

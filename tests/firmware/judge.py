@@ -4,8 +4,8 @@ Imports nothing of the program. The sprayer is the simplest that has a sprayer's
 that obeys the pulses of a servo frame, valves with a dead time and a straight rise, flow by the
 published table with straight lines between its points, one tank, no PWM ripple, no scatter.
 
-The definitions are those of docs/metrics.md, written anew: a change lies where a sharp step of the
-same volume would lie; + is too late, in metres along the track.
+The definitions are those of docs/explanation/metrics.md, written anew: a change lies where a
+sharp step of the same volume would lie; + is too late, in metres along the track.
 """
 
 from __future__ import annotations

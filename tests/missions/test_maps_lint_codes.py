@@ -1,10 +1,13 @@
-"""Every code that a problem of a map can have is explained in docs/map-check.md."""
+"""Every code that a problem of a map can have is explained in docs/reference/map-problems.md."""
 
 from __future__ import annotations
 
 import ast
 import re
 from pathlib import Path
+from typing import Any
+
+from tests.reference.map_problems import problems
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = [
@@ -34,16 +37,14 @@ def codes_in(source: str) -> set[str]:
     return found
 
 
-def documented() -> dict[str, list[str]]:
-    """Return the cells of the row of every code."""
-    rows: dict[str, list[str]] = {}
-    for line in (ROOT / "docs" / "map-check.md").read_text(encoding="utf-8").splitlines():
-        columns = [column.strip() for column in line.strip("| ").split(" | ")]
-        if line.startswith("| `") and len(columns) == 5:
-            for code in re.findall(r"`([a-z0-9-]+)`", columns[0]):
-                assert code not in rows, f"{code} is explained twice"
-                rows[code] = columns
-    return rows
+def documented() -> dict[str, dict[str, Any]]:
+    """Return the entry of every code."""
+    entries: dict[str, dict[str, Any]] = {}
+    for entry in problems():
+        for code in entry["codes"]:
+            assert code not in entries, f"{code} is explained twice"
+            entries[code] = entry
+    return entries
 
 
 def test_codes_are_found_however_they_are_given() -> None:
@@ -62,4 +63,4 @@ def test_every_code_is_explained_with_meaning_example_and_fix() -> None:
 def test_nothing_is_explained_that_no_longer_exists() -> None:
     text = "".join(path.read_text(encoding="utf-8") for path in SOURCES)
     assert [code for code in documented() if f'"{code}' not in text] == []
-    assert all(all(columns[:1] + columns[2:3]) for columns in documented().values())
+    assert all(entry["meaning"] and entry["severity"] for entry in documented().values())

@@ -29,7 +29,7 @@ from tests.bench.faults.levels import (
 )
 from tests.bench.faults.place import ORIGIN, SPEED_M_S, Pass
 from tests.bench.faults.record import Opening, Record, Struck
-from tests.bench.faults.report import BEGIN, END, page, result, write_page
+from tests.bench.faults.report import page, result, write_page
 from tests.bench.faults.wire import COMMAND, HEARTBEAT, LANDED, POSITION, Sent, fields_of, moved
 
 FAULT_S, UNTIL_S = 104.0, 106.0
@@ -451,7 +451,7 @@ def test_a_campaign_has_every_kind_and_signals_as_often_as_the_rest() -> None:
     assert list(campaign(5, 1, only="nothing like it")) == []
 
 
-def test_the_table_is_written_between_its_markers(tmp_path: Path) -> None:
+def test_the_table_is_written_as_a_page(tmp_path: Path) -> None:
     verdict = judge(record(Kind.DISABLED, (), sent=told(COMMAND, 216.0, 0.0)))
     about = {"command": "it", "seed": 1, "lanes": 1, "wall_s": 60.0, "repeated": 3}
     found = result([verdict, _worse(verdict)], ["flight 9: no"], about)
@@ -461,13 +461,9 @@ def test_the_table_is_written_between_its_markers(tmp_path: Path) -> None:
     assert "3 flown again" in text
     assert "| STOP of the operator | GPIO | 2 | 0 | 0.100 s | 0.200 s | 0.15 s | 1.5 mL |" in text
     path = tmp_path / "page.md"
-    path.write_text(f"a\n{BEGIN}\nold\n{END}\nb\n")
     write_page(found, path)
-    write_page(found, path)
-    assert path.read_text() == f"a\n{BEGIN}\n\n{text}\n\n{END}\nb\n"
-    path.write_text("a\n")
-    with pytest.raises(ValueError, match="not in it"):
-        write_page(found, path)
+    assert path.read_text() == text
+    assert text.startswith("<!-- Written by `make faults")
 
 
 def _worse(verdict: Verdict) -> Verdict:

@@ -1,4 +1,4 @@
-"""Who imports what: the rules of docs/architecture.md that import-linter does not know."""
+"""Who imports what: rules of docs/explanation/architecture.md that import-linter lacks."""
 
 from __future__ import annotations
 

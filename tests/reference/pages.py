@@ -5,13 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from tests.reference import commands, configuration
+from tests.reference import (
+    commands,
+    configuration,
+    journal,
+    map_problems,
+    mavlink,
+    metrics,
+    reasons,
+    scenarios,
+)
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "reference"
 HEAD = "<!-- Written by `make reference` from the code; do not edit. -->\n\n"
 PAGES: dict[str, Callable[[], str]] = {
     "commands.md": commands.page,
     "configuration.md": configuration.page,
+    "reasons.md": reasons.page,
+    "map-problems.md": map_problems.page,
+    "mavlink.md": mavlink.page,
+    "metrics.md": metrics.page,
+    "journal.md": journal.page,
+    "scenarios.md": scenarios.page,
 }
 
 

@@ -1,7 +1,7 @@
 """What is wrong or remarkable about a map that can be read.
 
 `read_map` refuses what cannot be used; here is what the operator should look at before a flight.
-docs/map-check.md lists every code.
+docs/reference/map-problems.md lists every code.
 """
 
 from missions.maps.lint.check import check_map, summary

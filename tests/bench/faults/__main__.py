@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--only", default="", metavar="TEXT", help="kinds or outputs with TEXT")
     parser.add_argument("--lanes", type=int, default=1, help="flights at a time")
     parser.add_argument("--json", action="store_true", help="the result as one JSON object")
-    parser.add_argument("--page", action="store_true", help="write the table into docs/safety.md")
+    parser.add_argument("--page", action="store_true", help="write docs/measurements/faults.md")
     return parser
 
 

@@ -1,4 +1,4 @@
-"""The table of a campaign, as JSON and as Markdown between the markers of docs/safety.md."""
+"""The table of a campaign, as JSON and as a page of Markdown, docs/measurements/faults.md."""
 
 from __future__ import annotations
 
@@ -11,8 +11,23 @@ from tests.bench.faults.cases import Kind
 from tests.bench.faults.judge import Verdict
 from tests.bench.faults.place import ROOT
 
-PAGE = ROOT / "docs" / "safety.md"
-BEGIN, END = "<!-- fault campaign: begin -->", "<!-- fault campaign: end -->"
+PAGE = ROOT / "docs" / "measurements" / "faults.md"
+HEAD = """<!-- Written by `make faults ARGS=--page`; do not edit. -->
+
+# Fault campaign
+
+Short passes of the real `vrspray run` in real time, one fault each at a random moment.
+
+- *GPIO*: the lines of a simulated chip, which release when their process dies, as a Raspberry Pi's
+  do with `dtparam=strict_gpiod`. A chip that has gone is closed by the ALIVE line's monostable.
+  *Servo, script*: an autopilot with the watchdog script. *Servo, dither*: a driver board that
+  closes when its signal stops changing. Add one servo frame and the valve's own closing time.
+- *Closed after* counts from the message that reports the fault, from the signal or the loss of the
+  link, or from the moment at which the limit of age is reached; 0: all were closed by then.
+- *Ordered outside* is what orders put outside the border, at the true position; *held outside* is
+  what flowed there because a dead or stopped process could not close before its limit.
+- A flight in which the valve engine refuses to start on a busy computer is flown again.
+"""
 PROSE_WIDTH = 120
 _OUTPUTS = {"gpio": "GPIO", "script": "servo, script", "dither": "servo, dither"}
 
@@ -71,7 +86,7 @@ def result(
 
 
 def page(found: dict[str, Any]) -> str:
-    """Return the text between the markers."""
+    """Return the page."""
     table = "\n".join(_lines(found["rows"]))
     wrong, not_flown = len(found["wrong"]), len(found["not_flown"])
     words = (
@@ -88,7 +103,7 @@ def page(found: dict[str, Any]) -> str:
     )
     # Hyphens and the command stay whole.
     prose = textwrap.fill(words, PROSE_WIDTH, break_on_hyphens=False, break_long_words=False)
-    return f"{prose}\n\n{table}"
+    return f"{HEAD}\n{prose}\n\n{table}\n"
 
 
 def _ms(time_s: float) -> str:
@@ -112,10 +127,5 @@ def _lines(found: Iterable[dict[str, Any]]) -> Iterable[str]:
 
 
 def write_page(found: dict[str, Any], path: Path = PAGE) -> None:
-    """Put the table between the markers of a page; ValueError where there are none."""
-    text = path.read_text(encoding="utf-8")
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not begin or not end:
-        raise ValueError(f"{path}: {BEGIN} and {END} are not in it")
-    path.write_text(f"{before}{BEGIN}\n\n{page(found)}\n\n{END}{after}", encoding="utf-8")
+    """Write the page."""
+    path.write_text(page(found), encoding="utf-8")

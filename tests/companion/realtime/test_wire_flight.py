@@ -80,8 +80,9 @@ def check_pass(result: dict[str, Any]) -> None:
     lag = metrics["lag_distance_m"]
     assert lag["count"] == (len(RATES) - 1) * 6
     assert (metrics["missed"], metrics["off_target_ml"]) == (0, 0.0)
-    # The whole example field is measured against 0.05 m and 0.20 m (docs/performance.md). The
-    # thirty changes of this one pass share one error of the position, 2 cm (1 sd).
+    # The whole example field is measured against 0.05 m and 0.20 m in
+    # docs/measurements/performance.md. The thirty changes of this one pass share one error of the
+    # position, 2 cm (1 sd).
     assert abs(lag["mean"]) <= 0.06
     assert lag["mean_abs"] <= 0.08
     assert lag["max_abs"] <= 0.30
