@@ -11,20 +11,27 @@ import math
 from collections.abc import Iterable, Sequence
 
 from companion.config import Config
-from companion.config.motor_rules import atomisers_of, pump_of
 from companion.config.rules import mismatches, tank_capacity_l
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
 from companion.core.frame import LocalFrame
 from companion.core.inputs import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits, flow_for_rate
+from companion.core.options.atomisers import Atomiser
 from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.lines import Lines
 from companion.core.options.liquid_evidence import BIN_S, UNSTEADY_SHARE, Detection
 from companion.core.options.overlap import OverlapGuard
+from companion.core.options.pump import Pump
 from companion.core.setup import Setup
-from companion.errors import ConfigError
-from companion.flight_map import FlightMap, difference
+from companion.errors import ConfigError, MapError
+from companion.flight_map import (
+    FlightMap,
+    difference,
+    is_flight_map,
+    named_files,
+    read_flight_map,
+)
 from companion.problem import Problem
 
 # The autopilot tells whole millilitres ten times a second, up to a tenth of a second old: over half
@@ -33,6 +40,52 @@ AUTOPILOT_BIN_S = 0.55
 AUTOPILOT_UNSTEADY_SHARE = 0.25
 # More rates than these are named by their range: the line must stay readable.
 RATES_NAMED_MAX = 6
+
+
+def flight_map_of(config: Config, overrides: Sequence[str] = ()) -> FlightMap:
+    """Return the flight map that the configuration names, or that of the map that it names.
+
+    `overrides` are those that the configuration was read with.
+
+    Raises:
+        ConfigError: where it names none, or files that are not those of the flight map.
+        MapError: where a file cannot be used.
+    """
+    table = config.prescription
+    if table is None:
+        raise ConfigError(
+            f"{config.path}: prescription.file: missing; write the path of the map under "
+            "[prescription]"
+        )
+    path = config.resolve(table.file)
+    if not is_flight_map(path):
+        from companion.flight_map.child import compiled
+
+        return compiled(config, table, overrides)
+    try:
+        found = read_flight_map(path)
+    except MapError as error:
+        reason = str(error).removeprefix(f"{path}: ")
+        text = f"{config.path}: prescription.file = {show_value(table.file)}: {reason}"
+        raise MapError(text, code=error.code, fix=error.fix) from error
+    _refuse_changed(config, table, found)
+    return found
+
+
+def _refuse_changed(config: Config, table: PrescriptionTable, flight_map: FlightMap) -> None:
+    """Refuse a boundary, an exclusion or a plan that lies here and is not the compiled one."""
+    for key, path in named_files(table, config.planned_lines, config.path.parent).items():
+        if key == "prescription.file" or not path.exists():
+            continue
+        from companion.flight_map.child import sources_of
+
+        here = {each.sha256 for each in sources_of({key: path})}
+        if not here & {each.sha256 for each in flight_map.sources if each.key == key}:
+            raise ConfigError(
+                f"{config.path}: {key}: {path.name} was changed after {flight_map.path.name} was "
+                f"compiled; compile the map again: vrspray map compile {flight_map.source} "
+                f"--config {config.path} --out {flight_map.path.name}"
+            )
 
 
 def build_setup(config: Config, flight_map: FlightMap) -> Setup:
@@ -58,6 +111,7 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
         raise ConfigError(f"{config.path}: {label.text}; {label.fix}")
     check_mark(config, table)
     prescription = flight_map.moved(table.offset_east_m, table.offset_north_m)
+    pump, atomisers = _motors(config)
     return Setup(
         frame=flight_map.frame,
         prescription=prescription,
@@ -80,13 +134,22 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
         mission_braking_m_s2=(
             config.prediction.braking_m_s2 if config.prediction.use_mission else None
         ),
-        pump=pump_of(config),
-        atomisers=atomisers_of(config),
+        pump=pump,
+        atomisers=atomisers,
         lines=_lines(config, flight_map),
         # Without an output nothing is sprayed, whatever the plans say.
         record_coverage=config.coverage.record and config.output.kind != "none",
         overlap=_overlap(config),
     )
+
+
+def _motors(config: Config) -> tuple[Pump | None, tuple[Atomiser, ...]]:
+    """Return the pump and the atomisers; without any, nothing of theirs is loaded."""
+    if not config.has_motors:
+        return None, ()
+    from companion.config.motor_rules import atomisers_of, pump_of
+
+    return pump_of(config), atomisers_of(config)
 
 
 def refuse_mismatch(config: Config) -> None:

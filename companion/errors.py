@@ -16,13 +16,24 @@ A wrong argument inside our own code is a `ValueError`: a bug, not a condition.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from companion.problem import Problem
+
 
 class VrsprayError(Exception):
     """Base of all errors that the command line reports in one line, without a traceback."""
 
 
 class ConfigError(VrsprayError):
-    """The configuration file cannot be used."""
+    """The configuration file cannot be used.
+
+    `problems` is all that is wrong with its settings, where more than one thing may be.
+    """
+
+    def __init__(self, text: str, *, problems: Sequence[Problem] = ()) -> None:
+        super().__init__(text)
+        self.problems = tuple(problems)
 
 
 class MapError(VrsprayError):

@@ -15,8 +15,8 @@ from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import UnreadableError
 from companion.record.codec import FieldNames, decode
-from companion.record.read_only import damaged_pages, log_of, one_line
-from companion.record.reader import OpenJournal, opened
+from companion.record.read_only import log_of, one_line
+from companion.record.reader import OpenJournal, damaged_pages, opened
 from companion.record.setup_json import field_names_of
 from companion.record.totals import missing_rows
 from companion.record.writer import Event

@@ -20,7 +20,7 @@ from companion.core.frame import LocalFrame
 from companion.core.options.coverage import Coverage
 from companion.core.prescription import Prescription
 from companion.errors import VrsprayError
-from companion.flight_map import flight_map_of_file
+from companion.flight_map.child import flight_map_of_file
 from companion.record.continuing import Treated, rest_of, treated_ground_of
 from companion.record.coverage_area import moved
 from companion.record.reader import opened

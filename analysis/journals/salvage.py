@@ -24,20 +24,25 @@ from companion.record.distrust import (
     known_tables,
     own_tables,
 )
-from companion.record.geopackage import APPLICATION_ID, LOCAL_ID, USER_VERSION, WGS84_ID
+from companion.record.geopackage import (
+    APPLICATION_ID,
+    JOURNAL_VERSION,
+    LOCAL_ID,
+    USER_VERSION,
+    WGS84_ID,
+)
 from companion.record.layers import box_of_points, set_box
 from companion.record.leaf_page import COLUMNS, Row, is_of
 from companion.record.read_only import (
     DAMAGE,
     one_line,
     read_only,
-    readable_rows,
     salvaged_name,
-    tolerate_damage,
 )
+from companion.record.reader import readable_rows, tolerate_damage
 from companion.record.recovery import Recovery, Told
 from companion.record.totals import LITRES_KEY, applied_l
-from companion.record.versions import JOURNAL_VERSION, missing_tables
+from companion.record.versions import missing_tables
 from companion.record.writer import SET_META
 
 # Without a row of any of these a file is no journal, or nothing of one.

@@ -11,8 +11,8 @@ from typing import Any
 
 from analysis.journals.content import read_entries
 from companion.errors import UnreadableError
-from companion.record.read_only import DAMAGE, damaged_pages, one_line, readable_rows
-from companion.record.reader import OpenJournal, opened
+from companion.record.read_only import DAMAGE, one_line
+from companion.record.reader import OpenJournal, damaged_pages, opened, readable_rows
 from companion.record.refusals import SEE_SHOW
 from companion.record.totals import missing_rows
 from companion.record.versions import OtherVersionError

@@ -7,18 +7,21 @@ a map that is refused, with the list of problems that `map check` prints.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer.core import TyperGroup
+from typer._click.exceptions import NoArgsIsHelpError
+from typer.core import TyperCommand, TyperGroup
 
 from companion.cli.beside import give_way
 from companion.commands import Command, Haste, all_registered, command_named, load, registered
@@ -28,9 +31,13 @@ if TYPE_CHECKING:
     from typer._click.core import Command as ClickCommand
     from typer._click.core import Context
     from typer._click.formatting import HelpFormatter
+    from typer._click.shell_completion import CompletionItem
 
 
 FAILED, REFUSED, INTERRUPTED = 1, 2, 130
+# What the place that is written to may lack.
+NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+_ROOM_FIX = "no space left; free some, or write elsewhere"
 
 
 # The companion's own. Those of others are found by their entry points, and cannot replace these.
@@ -81,6 +88,19 @@ class CommandTable(TyperGroup):
         found = find_command(cmd_name)
         return None if found is None else load_command(cmd_name, found)
 
+    def shell_complete(self, ctx: Context, incomplete: str) -> list[CompletionItem]:
+        """Return what a word of the shell may become; no command is imported for that."""
+        from typer._click.shell_completion import CompletionItem
+
+        names = [name for name in self.list_commands(ctx) if name.startswith(incomplete)]
+        # The options of the program itself are completed by what every command does.
+        options = TyperCommand.shell_complete(self, ctx, incomplete)
+        return [*(CompletionItem(name, help=self._help_of(name)) for name in names), *options]
+
+    def _help_of(self, name: str) -> str:
+        found = find_command(name)
+        return "" if found is None else found.help
+
     def format_commands(self, ctx: Context, formatter: HelpFormatter) -> None:  # noqa: ARG002 - click's
         """Write the list of commands from what they announce."""
         with formatter.section("Commands"):
@@ -99,13 +119,27 @@ def load_command(name: str, command: Command) -> ClickCommand:
     ):
         function, found = found, typer.Typer(add_completion=False, rich_markup_mode=None)
         found.command()(function)
-    return typer.main.get_command(found) if isinstance(found, typer.Typer) else found
+    command_itself = typer.main.get_command(found) if isinstance(found, typer.Typer) else found
+    return _in_our_style(command_itself)
+
+
+def _in_our_style(command: ClickCommand) -> ClickCommand:
+    """Return a command whose help looks as that of all others, and that shows it when alone."""
+    if isinstance(command, TyperCommand | TyperGroup):
+        command.rich_markup_mode = None
+    if isinstance(command, TyperGroup):
+        command.no_args_is_help = not command.invoke_without_command
+        for each in command.commands.values():
+            _in_our_style(each)
+    return command
 
 
 app = typer.Typer(
     name="vrspray",
     cls=CommandTable,
-    add_completion=False,
+    # Commands take the names of the help option from here.
+    context_settings={"help_option_names": ["-h", "--help"]},
+    no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     help="Variable-rate spraying: change the rate exactly on the zone boundary.",
@@ -140,7 +174,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     if arguments is None:
         arguments = sys.argv[1:]
-        give_way(arguments, _haste(arguments))
+        try:
+            give_way(arguments, _haste(arguments))
+        except KeyboardInterrupt:
+            sys.exit(_fail("interrupted", INTERRUPTED, as_json="--json" in arguments))
         ignore_the_folders_own()
     sys.exit(execute(arguments))
 
@@ -160,20 +197,43 @@ def execute(arguments: Sequence[str]) -> int:
         result = typer.main.get_command(app).main(
             list(arguments), prog_name="vrspray", standalone_mode=False
         )
-    except typer.TyperException as error:
-        return _fail(f"{error.format_message()} (see --help)", error.exit_code, as_json=as_json)
-    except VrsprayError as error:
-        code = FAILED if isinstance(error, ActuatorError | UnreadableError) else REFUSED
-        more = {"ok": False, "problems": [refusal(error)]} if isinstance(error, MapError) else {}
-        return _fail(str(error), code, as_json=as_json, more=more)
-    except MemoryError:
-        text = "not enough memory; use a smaller file or another computer"
-        return _fail(text, REFUSED, as_json=as_json)
-    except (KeyboardInterrupt, typer.Abort):
-        return _fail("interrupted", INTERRUPTED, as_json=as_json)
+    except NoArgsIsHelpError as error:
+        typer.echo(error.format_message())
+        return REFUSED
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        _close_stdout()
+        return _fail(f"{_place_of(error)}: {_ROOM_FIX}", FAILED, as_json=False)
+    except (typer.TyperException, VrsprayError, MemoryError, KeyboardInterrupt, typer.Abort) as end:
+        return _ended(end, as_json=as_json)
     if result == INTERRUPTED:  # Typer makes an exit of an interrupt
         return _fail("interrupted", INTERRUPTED, as_json=as_json)
     return result if isinstance(result, int) else 0
+
+
+def _ended(error: BaseException, *, as_json: bool) -> int:
+    """Say what ended a command, in one line, and return the exit code."""
+    if isinstance(error, typer.TyperException):
+        return _fail(f"{error.format_message()} (see --help)", error.exit_code, as_json=as_json)
+    if isinstance(error, VrsprayError):
+        code = FAILED if isinstance(error, ActuatorError | UnreadableError) else REFUSED
+        more = {"ok": False, "problems": [refusal(error)]} if isinstance(error, MapError) else {}
+        return _fail(str(error), code, as_json=as_json, more=more)
+    if isinstance(error, MemoryError):
+        text = "not enough memory; use a smaller file or another computer"
+        return _fail(text, REFUSED, as_json=as_json)
+    return _fail("interrupted", INTERRUPTED, as_json=as_json)
+
+
+def _place_of(error: OSError) -> str:
+    return "output" if error.filename is None else str(error.filename)
+
+
+def _close_stdout() -> None:
+    """Send what is left for stdout nowhere: at its exit Python would try, and fail, once more."""
+    with suppress(OSError, ValueError), Path(os.devnull).open("w") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def refusal(error: MapError) -> dict[str, str]:

@@ -9,12 +9,13 @@ from typing import Annotated, Any
 
 import typer
 
-from companion.assembly import build_setup, deliverable
+from companion.assembly import build_setup, deliverable, flight_map_of
 from companion.cli.answer import AsJson, Overrides, answer, problem_line, problem_object
+from companion.cli.app import refusal
 from companion.config import Config, load
-from companion.config.rules import mismatches, unbounded, without_effect
+from companion.config.rules import mismatches, remarks, without_effect
 from companion.config.wording import show_value
-from companion.flight_map import flight_map_of
+from companion.errors import ConfigError, MapError
 from companion.problem import Problem
 
 app = typer.Typer(
@@ -32,14 +33,26 @@ def check(file: File, overrides: Overrides = None, as_json: AsJson = False) -> N
 
     Exit 0: it can be used; 2: it cannot.
     """
-    config = load(file, overrides=overrides or ())
-    problems = [problem_object(problem) for problem in problems_of(config, overrides or ())]
-    ok = not any(problem["severity"] == "error" for problem in problems)
+    notes: list[str] = []
+    try:
+        config = load(file, overrides=overrides or ())
+    except ConfigError as error:
+        if not error.problems:
+            raise  # no configuration at all
+        problems = list(error.problems)
+    else:
+        problems = problems_of(config, overrides or ())
+        notes = [f"{found.key}: {found.text}" for found in remarks(config)]
+    first = next((problem for problem in problems if problem.severity == "error"), None)
+    ok = first is None
+    objects = [problem_object(problem) for problem in problems]
+    found: dict[str, Any] = {"ok": ok, "path": str(file), "problems": objects, "notes": notes}
+    if first is not None:
+        found["error"] = f"{file}: {problem_line(problem_object(first)).removeprefix('error: ')}"
     verdict = f"{file}: ok" if ok else f"{file}: refused"
-    notes = [f"{found.key}: {found.text}" for found in unbounded(config)]
     answer(
-        {"ok": ok, "path": str(file), "problems": problems, "notes": notes},
-        [*map(problem_line, problems), *(f"note: {text}" for text in notes), verdict],
+        found,
+        [*map(problem_line, objects), *(f"note: {text}" for text in notes), verdict],
         as_json=as_json,
     )
     raise typer.Exit(0 if ok else 2)
@@ -56,10 +69,20 @@ def problems_of(config: Config, overrides: Sequence[str] = ()) -> list[Problem]:
         for found in without_effect(config)
     ]
     if config.prescription is not None:
-        setup = build_setup(config, flight_map_of(config, overrides))
-        if config.mission is not None:
-            problems += deliverable(setup, config.mission.speed_m_s)
+        problems += _map_problems(config, overrides)
     return problems
+
+
+def _map_problems(config: Config, overrides: Sequence[str]) -> list[Problem]:
+    """Return what keeps the map from being flown, and what the sprayer cannot deliver on it."""
+    try:
+        setup = build_setup(config, flight_map_of(config, overrides))
+    except MapError as error:
+        return [Problem(**refusal(error))]  # type: ignore[arg-type] # the severity is "error"
+    except ConfigError as error:
+        text, _, fix = str(error).removeprefix(f"{config.path}: ").partition("; ")
+        return [Problem(severity="error", code="map", text=text, fix=fix)]
+    return [] if config.mission is None else deliverable(setup, config.mission.speed_m_s)
 
 
 @app.command(epilog="Example: vrspray config show field.toml --set lag.on_s=0.12")

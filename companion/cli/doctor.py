@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from companion.assembly import build_setup, deliverable
+from companion.assembly import build_setup, deliverable, flight_map_of
 from companion.cli.answer import AsJson, Overrides, answer
 from companion.cli.doctor_click import guided_click
 from companion.cli.doctor_watchdogs import watchdog_checks
@@ -49,7 +49,7 @@ from companion.doctor.listen import listen, rest_pulses
 from companion.doctor.sensors import Read, read_sensors, sensor_check
 from companion.doctor.vehicle import Heard, link_checks, no_link
 from companion.errors import ConfigError, LinkError, MapError
-from companion.flight_map import FlightMap, flight_map_of
+from companion.flight_map import FlightMap
 from companion.link.signing import read_key
 from companion.output.autopilot_findings import Finding, findings, px4_wiring
 from companion.output.autopilot_guard import REFUSALS

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from companion.config import Config
-from companion.config.motor_rules import atomisers_of, makes_flow, pump_of
+from companion.config.motor_rules import atomisers_of, pump_of
 from companion.core.nozzle import allowed_duty
 from companion.errors import VrsprayError
 from companion.ground.work import (
@@ -94,7 +94,7 @@ def _task(config: Config, wish: Wish, count: int, valves: Sequence[int], duty: f
     if wish.kind is GroundKind.CLICK:
         return clicks(count, valves)
     seconds = _seconds(config, wish, valves)
-    if makes_flow(config):
+    if config.makes_flow:
         duty = 1.0  # the duty is the pump's; the valves are its sections
     if wish.kind in (GroundKind.FLUSH, GroundKind.RINSE) and not wish.is_together:
         return in_turn(wish.kind, count, valves, duty=duty, seconds=seconds)

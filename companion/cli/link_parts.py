@@ -10,8 +10,13 @@ from companion.config import Config, load
 from companion.config.rules import tank_capacity_l
 from companion.errors import ConfigError
 from companion.link.component import ComponentOptions
-from companion.link.parameters import SETTINGS, Parameters, known_parameters
-from companion.link.signing import Signing, read_key, read_state, write_state
+from companion.link.parameters import (
+    SETTINGS,
+    Parameters,
+    known_parameters,
+    read_state,
+    write_state,
+)
 from companion.link.vehicle_link import VehicleLink
 
 PARAMETERS_NAME = "parameters.json"
@@ -61,6 +66,8 @@ def build_link(config: Config, given: Sequence[str], options: ComponentOptions) 
     )
     signing = None
     if config.link.signing_key_file is not None:
+        from companion.link.signing import Signing, read_key
+
         key = read_key(config.resolve(config.link.signing_key_file))
         signing = Signing(key, state_folder=state.parent)
     return VehicleLink(config.link.url, options, parameters=parameters, signing=signing)

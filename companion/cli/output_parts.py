@@ -1,22 +1,29 @@
-"""From the configuration to what carries plans out: one executor, or several that share."""
+"""From the configuration to what carries plans out: one executor, or several that share.
+
+What drives lines of this computer is loaded by a configuration that has such, when it is put
+together.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 from companion.config import Config
 from companion.core.types import SprayPlan
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.autopilot_options import DriveOutput
-from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.gpio import GpioExecutor
-from companion.output.hardware_pwm import HardwarePwmExecutor, PwmDrive
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.output.timed import DryRunExecutor
 from companion.ports import PlanExecutor
+
+if TYPE_CHECKING:
+    from companion.output.engine.setup import EngineSetup
+    from companion.output.gpio import GpioExecutor
+    from companion.output.hardware_pwm import PwmDrive
 
 
 def build_outputs(config: Config, link: VehicleLink) -> PlanExecutor:
@@ -34,6 +41,8 @@ def build_outputs(config: Config, link: VehicleLink) -> PlanExecutor:
         parts.append(Part(executor=servo, has_valves=bool(options.channels), drives=numbers))
     local = pwm_drives(config)
     if local:
+        from companion.output.hardware_pwm import HardwarePwmExecutor
+
         numbers = drive_numbers(config, is_pwm=True)
         parts.append(Part(executor=HardwarePwmExecutor(local), drives=numbers))
     if len(parts) == 1 and parts[0].has_valves:
@@ -125,6 +134,8 @@ class CompositeExecutor:
 
 def engine_setup(config: Config) -> EngineSetup:
     """Return the wiring and limits of a configuration with `output.kind = "gpio"`."""
+    from companion.output.engine.setup import EngineSetup, Wiring
+
     output, gpio = config.output, config.gpio
     wiring = Wiring(
         valves=tuple(valve.channel or 0 for valve in config.valve),
@@ -147,6 +158,8 @@ def engine_setup(config: Config) -> EngineSetup:
 
 def build_gpio(config: Config) -> GpioExecutor:
     """Return the executor of a configuration with `output.kind = "gpio"`."""
+    from companion.output.gpio import GpioExecutor
+
     return GpioExecutor(engine_setup(config))
 
 
@@ -178,11 +191,12 @@ def motors(config: Config) -> tuple[Motor, ...]:
 
 def pwm_drives(config: Config) -> tuple[PwmDrive, ...]:
     """Return the motors on this computer's hardware PWM."""
-    return tuple(
-        PwmDrive(chip=motor.chip, drive=motor.drive)
-        for motor in motors(config)
-        if motor.chip is not None
-    )
+    local = [(motor.chip, motor.drive) for motor in motors(config) if motor.chip is not None]
+    if not local:
+        return ()
+    from companion.output.hardware_pwm import PwmDrive
+
+    return tuple(PwmDrive(chip=chip, drive=drive) for chip, drive in local)
 
 
 def drive_numbers(config: Config, *, is_pwm: bool) -> tuple[int, ...]:

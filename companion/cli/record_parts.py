@@ -5,18 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from companion.cli.output_parts import parts_of
 from companion.config.tables import JournalTable
 from companion.errors import JournalError
 from companion.link.vehicle_link import VehicleLink
-from companion.output.gpio import GpioExecutor
 from companion.output.timed import DryRunExecutor, TimedExecutor
 from companion.ports import PlanExecutor
 from companion.record.journal import Journal
 from companion.record.read_only import DAMAGE, one_line
-from companion.record.recovery import recover_folder
-from companion.record.retention import WARN_FREE_PERCENT, Rules, prune, space_of
+
+if TYPE_CHECKING:
+    from companion.record.retention import Rules
 
 # Three hours of a journal; with less a flight does not begin.
 FREE_MIN_BYTES = 100_000_000
@@ -24,6 +25,8 @@ FREE_MIN_BYTES = 100_000_000
 
 def rules_of(journal: JournalTable) -> Rules:
     """Return the rules of retention as they are configured."""
+    from companion.record.retention import Rules
+
     return Rules(
         free_percent=journal.keep_free_percent or None,
         count=journal.keep_count,
@@ -39,6 +42,10 @@ def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
     """
     if not folder.is_dir():
         return
+    # Who has not flown yet has nothing to look after.
+    from companion.record.recovery import recover_folder
+    from companion.record.retention import WARN_FREE_PERCENT, prune, space_of
+
     try:
         for found in recover_folder(folder):
             yield f"journal: {found.path.name}: {found.outcome}: {found.text}"
@@ -66,13 +73,18 @@ def follow(journal: Journal, link: VehicleLink, executor: PlanExecutor) -> None:
     link.on_event(journal.record_event)
     link.on_statistics(journal.record_link)
     for part in parts_of(executor):
-        if isinstance(part, GpioExecutor):
-            part.on_event = journal.record_event
+        if not isinstance(part, TimedExecutor):
+            _follow_engine(journal, part)
         # A dry run orders nothing: there the plans say what would have been.
-        if isinstance(part, GpioExecutor) or (
-            isinstance(part, TimedExecutor)
-            and part.valve_count
-            and not isinstance(part, DryRunExecutor)
-        ):
+        elif part.valve_count and not isinstance(part, DryRunExecutor):
             part.on_order = journal.record_order
             journal.expect_orders()
+
+
+def _follow_engine(journal: Journal, executor: PlanExecutor) -> None:
+    from companion.output.gpio import GpioExecutor
+
+    if isinstance(executor, GpioExecutor):
+        executor.on_event = journal.record_event
+        executor.on_order = journal.record_order
+        journal.expect_orders()

@@ -11,39 +11,31 @@ import sys
 import time
 from collections.abc import Callable, MutableMapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib.metadata import version
-from itertools import islice
 from pathlib import Path
 from typing import Annotated, Self
 
 import typer
-from shapely.errors import ShapelyError
 
 from companion import runtime
-from companion.assembly import build_setup, deliverable, refuse_mismatch
+from companion.assembly import build_setup, deliverable, flight_map_of, refuse_mismatch
 from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.beside import shown
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.output_parts import build_outputs
 from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
-from companion.cli.sensor_parts import build_sensors, follow_refills
 from companion.config import Config
 from companion.config.application_table import missing, told
 from companion.config.rules import unbounded, without_effect
 from companion.core.setup import Setup
-from companion.errors import ActuatorError, LinkError, SensorError, VrsprayError
-from companion.flight_map import FlightMap, flight_map_of
+from companion.errors import ActuatorError, LinkError, SensorError
+from companion.flight_map import FlightMap
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import DITHER_S, dither_too_much
-from companion.ports import COMMIT_EVERY_S, PlanExecutor
-from companion.record.continuing import Treated, continued, read_treated_ground, rest_of
-from companion.record.folder import journals
+from companion.ports import COMMIT_EVERY_S, PlanExecutor, Sensor
 from companion.record.journal import Journal
-from companion.record.read_only import DAMAGE
-from companion.record.reader import is_empty, opened
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -86,18 +78,16 @@ def run_companion(
     training = training_mark(config)
     refuse_mismatch(config)
     flight_map = flight_map_of(config, given)
-    setup = continued(
-        build_setup(config, flight_map),
-        continue_from or (),
-        training=training,
-        takes_unmarked=takes_unmarked,
-    )
+    setup = build_setup(config, flight_map)
+    if continue_from:
+        from companion.record.continuing import continued
+
+        setup = continued(setup, continue_from, training=training, takes_unmarked=takes_unmarked)
     for line in _continued_lines(setup):
         note(line)
     link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
-    sensors = build_sensors(config)
-    follow_refills(sensors, link)
+    sensors = _sensors(config, link)
     for line in (*_warnings(config), *_application_notes(config, training)):
         note(line)
     if config.mission is not None:
@@ -138,6 +128,8 @@ def run_companion(
             )
     except (ActuatorError, LinkError, SensorError):
         # Without link, outputs or sensors the run ends before its first step: no flight to keep.
+        from companion.record.reader import is_empty
+
         if is_empty(journal.path):
             journal.path.unlink()
         raise
@@ -160,8 +152,10 @@ def _continued_lines(setup: Setup) -> list[str]:
 
 def _left_lines(folder: Path, setup: Setup, training: str) -> list[str]:
     """Return that an earlier flight left ground of this map, where nobody goes on from any."""
-    if setup.treated is not None or not setup.records_coverage:
+    if setup.treated is not None or not setup.records_coverage or not folder.is_dir():
         return []
+    from companion.record.continuing import unfinished
+
     left = unfinished(folder, setup, training=training)
     if left is None:
         return []
@@ -205,6 +199,17 @@ def component_options(
 def build_executor(config: Config, link: VehicleLink) -> PlanExecutor:
     """Return what carries plans out: servo outputs, lines of this computer, or nothing."""
     return build_outputs(config, link)
+
+
+def _sensors(config: Config, link: VehicleLink) -> list[Sensor]:
+    """Return the sensors that this computer reads; without any, nothing of theirs is loaded."""
+    if not config.reads_sensors:
+        return []
+    from companion.cli.sensor_parts import build_sensors, follow_refills
+
+    sensors = build_sensors(config)
+    follow_refills(sensors, link)
+    return sensors
 
 
 def _warnings(config: Config) -> list[str]:
@@ -318,66 +323,6 @@ def _sender(address: str) -> Callable[[bytes], None]:
             channel.sendto(message, address)
 
     return send
-
-
-# Which earlier flight left ground of this map untreated: for whoever forgets to go on with it.
-
-# As far back as a day of flights goes; each costs a look at its `meta`.
-FLIGHTS_LOOKED_AT = 20
-# Less than this of a field is its edge.
-LEFT_MIN_SHARE = 0.01
-# A raster of more tiles (80 ha) takes too long to outline before a flight: nothing is said then.
-TILES_MAX = 5000
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Unfinished:
-    """A journal, and how much of the field it leaves."""
-
-    path: Path
-    left_share: float
-    left_ha: float
-
-
-def unfinished(folder: Path, setup: Setup, *, training: str = "no") -> Unfinished | None:
-    """Return the newest flight over the same map that treated some of it, if it left the rest.
-
-    It says something or nothing, and never hinders a start.
-    """
-    try:
-        for path in islice(reversed(journals(folder)), FLIGHTS_LOOKED_AT):
-            if not _is_of(path, setup, training):
-                continue
-            found = read_treated_ground(path)
-            if found.coverage.tiles:
-                return _left(found)
-    except (VrsprayError, ShapelyError, *DAMAGE):
-        return None
-    return None
-
-
-def _is_of(path: Path, setup: Setup, training: str) -> bool:
-    """Return whether a flight that has ended sprayed the same over the same map."""
-    try:
-        with opened(path, is_lenient=True) as journal:
-            meta = journal.meta
-    except VrsprayError:
-        return False
-    return (
-        meta.get("closed") in ("yes", "recovered")
-        and meta.get("training") == training
-        and meta.get("map_sha256") == setup.prescription.sha256 != ""
-    )
-
-
-def _left(found: Treated) -> Unfinished | None:
-    if len(found.coverage.tiles) > TILES_MAX:
-        return None
-    field = found.setup.prescription.field
-    left_m2 = rest_of(field, found.coverage, found.strip_m).area
-    if not left_m2 > LEFT_MIN_SHARE * field.area:
-        return None
-    return Unfinished(path=found.path, left_share=left_m2 / field.area, left_ha=left_m2 / 10_000.0)
 
 
 # How often a flight is committed: once a second, sooner where that is too much of the field.

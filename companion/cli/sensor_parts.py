@@ -52,7 +52,7 @@ def follow_refills(sensors: Sequence[Sensor], link: VehicleLink) -> None:
 
 def _flow_meter(config: Config) -> FlowMeter | None:
     table = config.flow_meter
-    if table.source != "gpio" or table.line is None or table.pulses_per_l is None:
+    if not table.is_read_here or table.line is None or table.pulses_per_l is None:
         return None
     largest_l_min = max(nozzles.flow_max_l_min for nozzles in config.nozzle_sets())
     meter = Meter(
@@ -71,7 +71,7 @@ def _voltage(table: ConverterTable, source: str) -> VoltageSource:
 
 def _pressure(config: Config) -> PressureSensor | None:
     table = config.pressure
-    if table.source == "none":
+    if not table.is_read_here:
         return None
     loop = CurrentLoop(
         name="pressure",
@@ -86,7 +86,7 @@ def _pressure(config: Config) -> PressureSensor | None:
 
 def _tank(config: Config, meter: FlowMeter | None) -> TankSensor | None:
     table, capacity_l = config.tank, tank_capacity_l(config)
-    if table.source in ("none", "autopilot") or capacity_l is None:
+    if not table.is_read_here or capacity_l is None:
         return None
     gauge = None
     if table.source in ("iio", "i2c"):

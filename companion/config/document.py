@@ -69,6 +69,27 @@ class Document(tables.Table):
         """Return the text of that file, for the record of a flight."""
         return self._source_text
 
+    @property
+    def has_motors(self) -> bool:
+        """Whether there is a pump or an atomiser whose speed is ordered."""
+        return self.pump is not None or bool(self.atomiser)
+
+    @property
+    def makes_flow(self) -> bool:
+        """Whether a pump's speed makes the flow, and valves are on-off sections."""
+        return self.pump is not None and self.pump.control == "modulates"
+
+    @property
+    def planned_lines(self) -> str | None:
+        """Return the file of the lines that alone are sprayed, as it is named."""
+        return None if self.mission is None else self.mission.lines
+
+    @property
+    def reads_sensors(self) -> bool:
+        """Whether this computer reads any sensor."""
+        tables_read = (self.flow_meter, self.pressure, self.tank)
+        return self.safety.estop_line is not None or any(each.is_read_here for each in tables_read)
+
     def resolve(self, name: str) -> Path:
         """Return the path of a file that the configuration names, relative to its own folder."""
         return self._path.parent / name

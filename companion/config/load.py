@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from companion.config.document import Origin, leaves
 from companion.config.model import Config
-from companion.config.wording import say, say_syntax, show_value
+from companion.config.wording import findings, one_line, say_syntax, show_value
 from companion.errors import ConfigError
 
 # A configuration is a page of text; whatever is larger is another file, given by mistake.
@@ -39,7 +39,10 @@ def load(path: Path, *, overrides: Sequence[str] = ()) -> Config:
     try:
         config = Config.model_validate(raw)
     except ValidationError as error:
-        raise ConfigError(f"{path}: {say(error.errors(), raw, Config)}") from error
+        found = findings(error.errors(), raw, Config)
+        raise ConfigError(
+            f"{path}: {one_line(found)}", problems=[each.problem() for each in found]
+        ) from error
     return config.came_from(path, source_text=text, origins=origins)
 
 

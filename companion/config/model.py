@@ -7,7 +7,6 @@ from typing import Self
 from pydantic import model_validator
 from pydantic_core import PydanticCustomError
 
-from companion.config import motor_rules
 from companion.config.document import Document
 from companion.config.rules import contradictions
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
@@ -31,17 +30,19 @@ class Config(Document):
 
     @model_validator(mode="after")
     def _agree(self) -> Self:
-        for found in contradictions(self):
+        found = [(each.key, each.text) for each in contradictions(self)]
+        if found:
             raise PydanticCustomError(
-                "contradiction", "{text}", {"key": found.key, "text": found.text}
+                "contradiction", "{text}", {"text": found[0][1], "all": found}
             )
         return self
 
     def nozzle_sets(self) -> tuple[NozzleSet, ...]:
         """Return the sets, from the smallest to the largest flow."""
-        of_pump = motor_rules.pump_set(self)
-        if of_pump is not None:
-            return (of_pump,)
+        if self.pump is not None and self.makes_flow:
+            from companion.config.motor_rules import pump_set
+
+            return (pump_set(self, self.pump),)
         index = {valve.name: number for number, valve in enumerate(self.valve)}
         sets = []
         for table in self.nozzle_set:
@@ -56,11 +57,12 @@ class Config(Document):
 
     def pwm_limits(self) -> PwmLimits:
         """Return what the valves can follow, or the pump that makes their flow."""
-        least = motor_rules.fraction_min(self)
-        if least is not None:
+        if self.pump is not None and self.makes_flow:
+            from companion.config.motor_rules import fraction_min
+
             return PwmLimits(
                 frequency_hz=self.pwm.frequency_hz,
-                duty_min=least,
+                duty_min=fraction_min(self.pump),
                 duty_max=1.0,
                 min_on_s=0.0,
                 min_off_s=0.0,

@@ -25,7 +25,7 @@ def motor_contradictions(config: Document) -> Found:
     """Yield (key, what is wrong and what to write instead)."""
     if config.pump is not None:
         yield from _pulses(config.pump)
-        if makes_flow(config):
+        if config.makes_flow:
             yield from _modulating(config, config.pump)
         else:
             yield from _constant(config.pump)
@@ -44,7 +44,7 @@ def motor_warnings(config: Document) -> Found:
             "without output.return_channel the pump stops with the last valve and starts with the "
             "first: the flow comes late at each of them",
         )
-    if makes_flow(config) and len(config.valve) > 1:
+    if config.makes_flow and len(config.valve) > 1:
         yield (
             "pump.control",
             "one pump gives all sections one rate: where the map asks them for different ones, "
@@ -191,7 +191,7 @@ def _atomiser(config: Document, table: AtomiserTable, key: str) -> Found:
 def _flows(config: Document) -> tuple[float, float]:
     """Return the least and the largest flow of the boom; 0 where no curve says it."""
     pump = config.pump
-    if pump is not None and makes_flow(config):
+    if pump is not None and config.makes_flow:
         flows = [pump_curve(pump).flow_l_min] if pump.us and pump.flow_l_min else []
     else:
         each_set = [table.points(config.valve)[1] for table in config.nozzle_set]
@@ -277,11 +277,6 @@ DROPLET_UM = {
 }
 
 
-def makes_flow(config: Document) -> bool:
-    """Return whether a pump's speed makes the flow, and valves are on-off sections."""
-    return config.pump is not None and config.pump.control == "modulates"
-
-
 def has_valve_outputs(config: Document) -> bool:
     """Return whether valves hang on outputs; without any the nozzles are always open."""
     return any(valve.channel is not None for valve in config.valve)
@@ -289,7 +284,7 @@ def has_valve_outputs(config: Document) -> bool:
 
 def outlet_of(config: Document) -> PumpOutlet:
     """Return what lets out what is pumped."""
-    if makes_flow(config) and not has_valve_outputs(config):
+    if config.makes_flow and not has_valve_outputs(config):
         return "always"
     return "valves" if config.output.return_channel is None else "return"
 
@@ -320,15 +315,12 @@ def pump_of(config: Document) -> Pump | None:
         outlet=outlet_of(config),
         lag=_lag(config, table),
         curve=pump_curve(table),
-        fraction_min=fraction_min(config) or 0.0,
+        fraction_min=fraction_min(table),
     )
 
 
-def fraction_min(config: Document) -> float | None:
-    """Return the least fraction at which a pump that makes the flow runs; None without one."""
-    table = config.pump
-    if table is None or not makes_flow(config):
-        return None
+def fraction_min(table: PumpTable) -> float:
+    """Return the least fraction at which a pump that makes the flow runs."""
     least_us = table.us[0] if table.min_us is None else table.min_us
     return (least_us - table.stop_us) / (table.max_us - table.stop_us)
 
@@ -394,12 +386,10 @@ def atomisers_of(config: Document) -> tuple[Atomiser, ...]:
     return tuple(atomiser_of(config, table) for table in config.atomiser)
 
 
-def pump_set(config: Document) -> NozzleSet | None:
-    """Return all valves with the pump's curve; None where the valves' own curves count."""
-    if config.pump is None or not makes_flow(config):
-        return None
+def pump_set(config: Document, pump: PumpTable) -> NozzleSet:
+    """Return all valves with the curve of the pump that makes their flow."""
     index = {valve.name: number for number, valve in enumerate(config.valve)}
     (table,) = config.nozzle_set
     return NozzleSet(
-        valves=tuple(sorted(index[name] for name in table.valves)), curve=pump_curve(config.pump)
+        valves=tuple(sorted(index[name] for name in table.valves)), curve=pump_curve(pump)
     )

@@ -1,18 +1,19 @@
 """What the tables must say together: rules that no single key can break.
 
-The first contradiction refuses the file: a sprayer that is half right is wrong.
+One contradiction refuses the file: a sprayer that is half right is wrong.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, combinations, pairwise
 from typing import TYPE_CHECKING
 
-from companion.config.motor_rules import makes_flow, motor_contradictions, motor_warnings
 from companion.core.nozzle import FLOW_LAWS, FlowCurve
+from companion.flight_modes import is_mode, known_modes
 
 if TYPE_CHECKING:
     from companion.config.document import Document
@@ -39,20 +40,47 @@ class Contradiction:
 
 
 Rule = Iterator[Contradiction]
+Found = Iterator[tuple[str, str]]
 
 
-def contradictions(config: Document) -> Rule:
-    """Yield what makes the configuration unusable."""
+def contradictions(config: Document) -> list[Contradiction]:
+    """Return all that makes the configuration unusable."""
     rules: tuple[Callable[[Document], Rule], ...] = (
         _link, _prescription, _valves, _channels, _nozzle_sets, _pwm, _lags, _output, _safety,
-        _mission,
+        _mission, _keyed(line_contradictions), _keyed(_motors),
+        _keyed(sensor_contradictions),
     )  # fmt: skip
+    found: list[Contradiction] = []
     for rule in rules:
-        yield from rule(config)
-    for key, text in chain(
-        line_contradictions(config), motor_contradictions(config), sensor_contradictions(config)
-    ):
-        yield Contradiction(key=key, text=text)
+        try:
+            for each in rule(config):
+                found.append(each)
+        except (ValueError, LookupError, ArithmeticError):
+            # A rule works with what those before it have found wrong.
+            if not found:
+                raise
+    return found
+
+
+def _keyed(rule: Callable[[Document], Found]) -> Callable[[Document], Rule]:
+    def keyed(config: Document) -> Rule:
+        return (Contradiction(key=key, text=text) for key, text in rule(config))
+
+    return keyed
+
+
+def _motors(config: Document) -> Found:
+    if config.has_motors:
+        from companion.config.motor_rules import motor_contradictions
+
+        yield from motor_contradictions(config)
+
+
+def _motor_warnings(config: Document) -> Found:
+    if config.has_motors:
+        from companion.config.motor_rules import motor_warnings
+
+        yield from motor_warnings(config)
 
 
 def _prescription(config: Document) -> Rule:
@@ -85,6 +113,46 @@ def mismatches(config: Document) -> Rule:
             key="boom.width_m",
             text=f"the valve widths add up to {sum_m:g} m; correct valve[...].width_m",
         )
+    else:
+        yield from _untiled(config)
+    yield from _no_modes(config)
+
+
+def _untiled(config: Document) -> Rule:
+    """Yield strips that leave ground between them or lie over each other, set by set."""
+    tolerance_m = SWATH_TOLERANCE * config.boom_table.width_m
+    most = max(len(table.valves) for table in config.nozzle_set)
+    for table in config.nozzle_set:
+        if len(table.valves) < most:
+            continue  # a smaller set's strips are wider than the valves' own
+        strips = [
+            (number, valve)
+            for number, valve in enumerate(config.boom().valves)
+            if valve.name in table.valves
+        ]
+        for (_, left), (number, right) in pairwise(strips):
+            gap_m = (right.right_m - 0.5 * right.width_m) - (left.right_m + 0.5 * left.width_m)
+            if abs(gap_m) <= tolerance_m + 1e-9:
+                continue
+            what = (
+                f"leaves {gap_m:.2f} m between its strip and that"
+                if gap_m > 0.0
+                else f"has its strip {-gap_m:.2f} m over that"
+            )
+            yield Contradiction(
+                key=f"valve[{number}].right_m",
+                text=f'{what} of valve "{left.name}"; correct valve[...].right_m, or width_m',
+            )
+
+
+def _no_modes(config: Document) -> Rule:
+    """Yield modes in which no vehicle ever is: with none but those, nothing would be sprayed."""
+    for mode in config.safety.modes:
+        if is_mode(mode):
+            continue
+        near = difflib.get_close_matches(mode.upper(), sorted(known_modes()), n=1, cutoff=0.5)
+        advice = f'did you mean "{near[0]}"?' if near else 'write "AUTO", or "MISSION" for PX4'
+        yield Contradiction(key="safety.modes", text=f'no flight mode is named "{mode}"; {advice}')
 
 
 def without_effect(config: Document) -> Rule:
@@ -94,6 +162,7 @@ def without_effect(config: Document) -> Rule:
             key="flow_trim.enabled",
             text="has no effect without a flow meter; set flow_meter.source",
         )
+    yield from _off_centre(config)
     for number, table in enumerate(config.nozzle_set):
         if table.preset is not None:
             yield Contradiction(
@@ -101,7 +170,7 @@ def without_effect(config: Document) -> Rule:
                 text="a published curve: its own authors measured up to 22 % more flow; "
                 "measure yours (vrspray calibrate flow)",
             )
-    for key, text in chain(line_warnings(config), motor_warnings(config)):
+    for key, text in chain(line_warnings(config), _motor_warnings(config)):
         yield Contradiction(key=key, text=text)
     settings = {
         "web.enabled": config.web.enabled,
@@ -111,6 +180,33 @@ def without_effect(config: Document) -> Rule:
             yield Contradiction(
                 key=key, text="not part of this version and has no effect; remove it"
             )
+
+
+def _off_centre(config: Document) -> Rule:
+    """Yield a boom that is not under the aircraft: passes that alternate then do not adjoin."""
+    valves = config.boom().valves
+    left_m = min(valve.right_m - 0.5 * valve.width_m for valve in valves)
+    right_m = max(valve.right_m + 0.5 * valve.width_m for valve in valves)
+    aside_m = 0.5 * (left_m + right_m)
+    if abs(aside_m) > SWATH_TOLERANCE * config.boom_table.width_m + 1e-9:
+        side = "right" if aside_m > 0.0 else "left"
+        yield Contradiction(
+            key="valve[0].right_m",
+            text=f"the middle of all strips is {abs(aside_m):.2f} m {side} of the aircraft, so "
+            f"passes in opposite directions lie {2.0 * abs(aside_m):.2f} m too near or too far; "
+            "correct valve[...].right_m",
+        )
+
+
+def remarks(config: Document) -> Rule:
+    """Yield what a reader should know of a configuration in which nothing is wrong."""
+    yield from unbounded(config)
+    if config.flow_meter.source == "none" and config.lag.measured_on is None:
+        yield Contradiction(
+            key="flow_meter.source",
+            text="not set: `vrspray calibrate lag` needs a flow meter; without one, measure the "
+            "lags with marks on the ground (`vrspray calibrate lag-marks`)",
+        )
 
 
 def unbounded(config: Document) -> Rule:
@@ -164,7 +260,7 @@ def _channels(config: Document) -> Rule:
     last = SERVO_OUTPUTS if kind == "servo" else GPIO_LAST[config.gpio.driver]
     what = "servo output" if kind == "servo" else "GPIO line"
     for key, channel in channels.items():
-        if channel is None and not makes_flow(config):
+        if channel is None and not config.makes_flow:
             yield Contradiction(key=key, text=f"missing; write the {what}, {first} to {last}")
     if config.output.return_channel is not None:
         channels["output.return_channel"] = config.output.return_channel
@@ -204,7 +300,7 @@ def _nozzle_sets(config: Document) -> Rule:
         used.update(table.valves)
         if table.preset is not None and not unknown:
             yield from _preset(config, table, key)
-        elif not makes_flow(config):
+        elif not config.makes_flow:
             yield from _curve(table.duty, table.flow_l_min, key)
     for number, name in enumerate(names):
         if name not in used:
@@ -216,8 +312,8 @@ def _nozzle_sets(config: Document) -> Rule:
 
 
 def _preset(config: Document, table: NozzleSetTable, key: str) -> Rule:
-    if table.duty or table.flow_l_min or makes_flow(config):
-        other = "the curve of the pump" if makes_flow(config) else "a row of measured points"
+    if table.duty or table.flow_l_min or config.makes_flow:
+        other = "the curve of the pump" if config.makes_flow else "a row of measured points"
         yield Contradiction(
             key=f"{key}.preset", text=f"{other} already gives the flow; remove one of the two"
         )
@@ -372,8 +468,6 @@ def _mission(config: Document) -> Rule:
 #
 # The second who asks the kernel for a line is refused, so that a line claimed twice is a start that
 # fails in the field. Hardware PWM and the outputs of shift registers count from 0 on their own.
-
-Found = Iterator[tuple[str, str]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

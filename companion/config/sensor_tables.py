@@ -38,6 +38,11 @@ class FlowMeterTable(Table):
         default=1, ge=0, le=15, description="autopilot only: its battery monitor, counted from 0"
     )
 
+    @property
+    def is_read_here(self) -> bool:
+        """Whether this computer reads it."""
+        return self.source == "gpio"
+
 
 class ConverterTable(Table):
     """A 4 to 20 mA transmitter on a channel of an ADS1115."""
@@ -65,6 +70,11 @@ class PressureTable(ConverterTable):
     )
     kpa: Points = Field(default=(), description="pressure at these duties")
 
+    @property
+    def is_read_here(self) -> bool:
+        """Whether this computer reads it."""
+        return self.source != "none"
+
 
 class TankTable(ConverterTable):
     """What is left in the tank."""
@@ -87,6 +97,11 @@ class TankTable(ConverterTable):
     tolerance_l: float = Field(
         default=2.0, gt=0, le=1000, description="between level and count; more is a fault"
     )
+
+    @property
+    def is_read_here(self) -> bool:
+        """Whether this computer works it out, by a level or from its flow meter."""
+        return self.source not in ("none", "autopilot")
 
 
 class DetectionTable(Table):

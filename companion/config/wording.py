@@ -5,12 +5,14 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
+
+from companion.problem import Problem
 
 VALUE_LENGTH_MAX = 60
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
@@ -63,30 +65,74 @@ def say(errors: Sequence[ErrorDetails], raw: dict[str, Any], model: type[BaseMod
 
     An unknown key comes before a missing one: the typing error explains the gap.
     """
-    schema = model.model_json_schema(by_alias=True)
-    first = min(errors, key=lambda error: error["type"] != "extra_forbidden")
-    others = len({dotted(_locate(error["loc"], raw)[0]) for error in errors}) - 1
+    return one_line(findings(errors, raw, model))
+
+
+class Found(NamedTuple):
+    """One thing that is wrong: the key, its value as text, what is wrong, what to write."""
+
+    key: str
+    value: str | None
+    code: str
+    wrong: str
+    fix: str
+
+    def line(self) -> str:
+        """Return it as one piece of text."""
+        value = "" if self.value is None else f" = {self.value}"
+        return f"{self.key}{value}: {self.wrong}" + (f"; {self.fix}" if self.fix else "")
+
+    def problem(self) -> Problem:
+        """Return it as `config check` lists it."""
+        got = "" if self.value is None else f": {self.value}"
+        text = self.wrong if self.code == "contradiction" else f"{self.wrong}{got}"
+        return Problem(severity="error", code=self.code, text=text, where=self.key, fix=self.fix)
+
+
+def one_line(found: Sequence[Found]) -> str:
+    """Return the first finding, and how many more there are."""
+    others = len(found) - 1
     more = "" if others == 0 else f" (and {others} more problem{'s' if others > 1 else ''})"
-    return _say_one(first, raw, schema) + more
+    return found[0].line() + more
 
 
-def _say_one(error: ErrorDetails, raw: dict[str, Any], schema: dict[str, Any]) -> str:
+def findings(
+    errors: Sequence[ErrorDetails], raw: dict[str, Any], model: type[BaseModel]
+) -> list[Found]:
+    """Return all that is wrong, one finding a key, unknown keys first."""
+    schema = model.model_json_schema(by_alias=True)
+    ordered = sorted(errors, key=lambda error: error["type"] != "extra_forbidden")
+    found: dict[tuple[str, str], Found] = {}
+    for error in ordered:
+        for each in _of_error(error, raw, schema):
+            # Every branch of a union complains; two rules may complain of one key.
+            rule = each.wrong if each.code == "contradiction" else ""
+            found.setdefault((each.key, rule), each)
+    return list(found.values())
+
+
+def _of_error(error: ErrorDetails, raw: dict[str, Any], schema: dict[str, Any]) -> Iterator[Found]:
     if error["type"] == "contradiction":
-        key, text = error["ctx"]["key"], error["ctx"]["text"]
-        value = _lookup(raw, key)
-        return f"{key}: {text}" if value is None else f"{key} = {show_value(value)}: {text}"
+        for key, text in error["ctx"]["all"]:
+            value = _lookup(raw, key)
+            shown = None if value is None else show_value(value)
+            wrong, _, fix = text.partition("; ")
+            yield Found(key, shown, "contradiction", wrong, fix)
+        return
     steps, value = _locate(error["loc"], raw)
     key = dotted(steps)
     if error["type"] == "extra_forbidden":
-        return f"{key} = {show_value(value)}: unknown key; {_nearest(steps, schema)}"
+        yield Found(key, show_value(value), "unknown-key", "unknown key", _nearest(steps, schema))
+        return
     node = _schema_at(steps, schema)
     allowed = f"write {allowed_text(node, schema, str(steps[-1]))}"
     if node.get("description"):
         allowed += f" ({node['description']})"
     wrong = WRONG.get(error["type"], error["msg"])
     if error["type"] == "missing":
-        return f"{key}: missing; {allowed}"
-    return f"{key} = {show_value(value)}: {wrong}; {allowed}"
+        yield Found(key, None, "missing", "missing", allowed)
+    else:
+        yield Found(key, show_value(value), "wrong-value", wrong, allowed)
 
 
 def dotted(steps: Sequence[str | int]) -> str:

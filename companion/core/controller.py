@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from companion.core.boom import Paths
 from companion.core.border import Intervals
@@ -27,13 +27,12 @@ from companion.core.dose import (
 )
 from companion.core.frame import Offset
 from companion.core.nozzle import flow_for_rate, overridden
-from companion.core.options import flow_trim, liquid_faults, treated_area
+from companion.core.options import flow_trim, treated_area
 from companion.core.options.atomisers import flows_ahead, spinning
 from companion.core.options.coverage import Coverage
 from companion.core.options.drift import is_same, landed, offset
 from companion.core.options.flow_trim import TrimMemory
 from companion.core.options.lines import add_off_lines
-from companion.core.options.liquid_faults import WatchMemory
 from companion.core.options.overlap import guarded, treated_before
 from companion.core.options.pump import constant_drive, liquid_of, modulated, on_off, sections
 from companion.core.options.treated_area import TreatedArea
@@ -44,10 +43,14 @@ from companion.core.types import (
     Decision,
     DrivePlan,
     Finding,
+    Inhibit,
     SprayPlan,
     TimedChange,
     VehicleState,
 )
+
+if TYPE_CHECKING:
+    from companion.core.options.liquid_faults import WatchMemory
 
 
 class Watched(NamedTuple):
@@ -72,6 +75,7 @@ class Ordering(NamedTuple):
 
 NOTHING_WATCHED = Watched()
 NOTHING_ORDERED = Ordering()
+_NO_FAULTS = frozenset[Inhibit]()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +113,7 @@ def step(
         memory.permission,
         state,
         setup.limits,
-        faults=liquid_faults.inhibits_of(watched.watch),
+        faults=_NO_FAULTS if watched.watch is None else watched.watch.latched,
         field_bounds_m=setup.prescription.bounds_m,
         now_s=now_s,
     )
@@ -156,9 +160,10 @@ def _watch(
     """Return what flow, pressure and tank say of the plan until now, and what it treated."""
     watch, area, ran_s = before
     if setup.watching is not None:
-        watch = liquid_faults.follow(
-            setup.watching, watch or WatchMemory(), liquid, state, index=set_index, now_s=now_s
-        )
+        # With the set-up it was loaded: here it is only looked up.
+        from companion.core.options.liquid_faults import follow
+
+        watch = follow(setup.watching, watch, liquid, state, index=set_index, now_s=now_s)
     if setup.recording is not None:
         area = treated_area.follow(
             setup.recording, area, plan, state,

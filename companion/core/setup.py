@@ -86,6 +86,9 @@ class Setup:
         object.__setattr__(self, "trimming", trimming)
         watching = None
         if self.detection is not None:
+            # What a step needs is loaded now: in flight nothing is.
+            from companion.core.options import liquid_faults  # noqa: F401
+
             watching = Watching.of(self.detection, doses.nozzle_sets, doses.lag, doses.pwm)
         object.__setattr__(self, "watching", watching)
         object.__setattr__(self, "recording", self._recording() if self.records_coverage else None)

@@ -5,8 +5,7 @@ metres of the flight's frame, rates in L/ha, boundary, exclusions and planned li
 it was made with, and what was found on the way.
 """
 
-from companion.flight_map.child import flight_map_of, flight_map_of_file
-from companion.flight_map.file import read_flight_map, write_flight_map
+from companion.flight_map.file import read_flight_map
 from companion.flight_map.model import (
     SUFFIX,
     FlightMap,
@@ -15,6 +14,7 @@ from companion.flight_map.model import (
     frozen_settings,
     is_flight_map,
     moved,
+    named_files,
 )
 
 __all__ = [
@@ -22,11 +22,9 @@ __all__ = [
     "FlightMap",
     "SourceFile",
     "difference",
-    "flight_map_of",
-    "flight_map_of_file",
     "frozen_settings",
     "is_flight_map",
     "moved",
+    "named_files",
     "read_flight_map",
-    "write_flight_map",
 ]

@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -29,10 +29,10 @@ from companion.flight_map.file import VERSION, read_flight_map
 from companion.flight_map.model import (
     SUFFIX,
     FlightMap,
+    SourceFile,
     frozen_settings,
     is_flight_map,
     named_files,
-    sources_of,
 )
 
 _logger = logging.getLogger(__name__)
@@ -45,54 +45,15 @@ _WRITTEN = (0, 1)
 _COMPILER = ("map", "compile")
 
 
-def flight_map_of(config: Config, overrides: Sequence[str] = ()) -> FlightMap:
-    """Return the flight map that the configuration names, or that of the map that it names.
+def compiled(config: Config, table: PrescriptionTable, overrides: Sequence[str] = ()) -> FlightMap:
+    """Return what was compiled of these very files with these settings, now or before.
 
     `overrides` are those that the configuration was read with.
 
     Raises:
-        ConfigError: where it names none, or files that are not those of the flight map.
-        MapError: where a file cannot be used.
+        ConfigError, MapError: where a file cannot be used.
     """
-    table = config.prescription
-    if table is None:
-        raise ConfigError(
-            f"{config.path}: prescription.file: missing; write the path of the map under "
-            "[prescription]"
-        )
-    path = config.resolve(table.file)
-    if not is_flight_map(path):
-        return _compiled(config, table, overrides)
-    try:
-        found = read_flight_map(path)
-    except MapError as error:
-        text = f"{config.path}: prescription.file = {show_value(table.file)}: {error}"
-        raise MapError(text, code=error.code, fix=error.fix) from error
-    _refuse_changed(config, table, found)
-    return found
-
-
-def _refuse_changed(config: Config, table: PrescriptionTable, flight_map: FlightMap) -> None:
-    """Refuse a boundary, an exclusion or a plan that lies here and is not the compiled one."""
-    for key, path in named_files(table, _lines(config), config.path.parent).items():
-        if key == "prescription.file" or not path.exists():
-            continue
-        here = {each.sha256 for each in sources_of({key: path})}
-        if not here & {each.sha256 for each in flight_map.sources if each.key == key}:
-            raise ConfigError(
-                f"{config.path}: {key}: {path.name} was changed after {flight_map.path.name} was "
-                f"compiled; compile the map again: vrspray map compile {flight_map.source} "
-                f"--config {config.path} --out {flight_map.path.name}"
-            )
-
-
-def _lines(config: Config) -> str | None:
-    return None if config.mission is None else config.mission.lines
-
-
-def _compiled(config: Config, table: PrescriptionTable, overrides: Sequence[str]) -> FlightMap:
-    """Return what was compiled of these very files with these settings, now or before."""
-    settings = frozen_settings(table, _lines(config))
+    settings = frozen_settings(table, config.planned_lines)
     known_by = json.dumps(
         [VERSION, version("vrspray"), str(config.resolve(table.file)), settings], sort_keys=True
     )
@@ -125,7 +86,7 @@ def _still_good(kept: Path, config: Config, table: PrescriptionTable) -> FlightM
         found = read_flight_map(kept)
     except MapError:
         return None
-    here = sources_of(named_files(table, _lines(config), config.path.parent))
+    here = sources_of(named_files(table, config.planned_lines, config.path.parent))
     return found if here == found.sources else None
 
 
@@ -217,3 +178,62 @@ def _said(stdout: bytes) -> dict[str, Any]:
 def _failed(named: str, reason: str) -> MapError:
     fix = "compile it in the office: vrspray map compile"
     return MapError(f"{named}: cannot be compiled ({reason}); {fix}", code="not-compiled", fix=fix)
+
+
+# Which files a map consists of, by their bytes alone: nothing here looks into one.
+
+# As for any folder or file of a map (missions/maps/bundle.py, layer.py).
+_FILES_MAX = 2_000
+_BYTES_MAX = 1024 * 1024 * 1024
+_CHUNK_BYTES = 1 << 20
+# Formats whose files name others beside them as they like.
+_WITH_FOLDER = (".xml", "adapt.json")
+
+
+def sources_of(named: Mapping[str, Path]) -> tuple[SourceFile, ...]:
+    """Return every file of the maps, boundaries and plans that the settings name, with its hash.
+
+    Raises:
+        MapError: where one cannot be read, or there are too many.
+    """
+    found = []
+    for key, path in named.items():
+        try:
+            for name, file in _files(path):
+                found.append(SourceFile(key=key, name=name, sha256=_sha256(file)))
+        except (OSError, ValueError) as error:
+            raise MapError(
+                f"{path}: cannot be read ({error}); check path and rights",
+                code="no-file",
+                fix="check path and rights",
+            ) from None
+    return tuple(found)
+
+
+def _files(path: Path) -> Iterator[tuple[str, Path]]:
+    """Yield the files that belong to one path, by their names: a set beside it, or a folder."""
+    if path.is_dir():
+        start = path
+        places = [Path(folder) / name for folder, _, names in os.walk(path) for name in names]
+    else:
+        start = path.parent
+        has_folder = path.name.casefold().endswith(_WITH_FOLDER)
+        begin = "" if has_folder else path.stem.casefold()
+        places = [file for file in start.iterdir() if file.name.casefold().startswith(begin)]
+        places.append(path)
+    # What this program writes beside a map is none of its parts.
+    files = sorted({file for file in places if file.is_file() and not is_flight_map(file)})
+    if len(files) > _FILES_MAX:
+        raise ValueError(f"more than {_FILES_MAX} files")
+    if sum(file.stat().st_size for file in files) > _BYTES_MAX:
+        raise ValueError(f"more than {_BYTES_MAX // 1024**2} MB")
+    for file in files:
+        yield file.relative_to(start).as_posix(), file
+
+
+def _sha256(path: Path) -> str:
+    found = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            found.update(chunk)
+    return found.hexdigest()

@@ -1,23 +1,19 @@
 """A flight map as a file: a GeoPackage with the tables in which a journal keeps the ground.
 
+Here it is read; the office writes it (`missions/maps/compiling.py`).
 Whoever reads one does not know who made it: a hash is no signature. So it is read as a stranger's
 database is (`record/distrust.py`), and everything in it is looked at before it is used.
 """
 
 from __future__ import annotations
 
-import getpass
 import hashlib
 import json
 import math
-import platform
 import sqlite3
 import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import replace
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, get_args
 
@@ -25,7 +21,6 @@ import numpy as np
 import shapely
 from shapely import Geometry, LineString, MultiPolygon, Polygon
 
-from companion.atomic_write import write_atomically
 from companion.core.cells import CellGrid
 from companion.core.frame import LocalFrame
 from companion.core.options.lines import Polyline
@@ -37,14 +32,11 @@ from companion.record.distrust import check_programs, distrust
 from companion.record.geopackage import (
     APPLICATION_ID,
     GROUND_TABLES,
-    LOCAL_ID,
     META_TABLE,
     REGISTERS,
-    geometry_blob,
-    layer_sql,
     wkb_of,
 )
-from companion.record.layers import Ground, read_ground, register_frame, write_ground
+from companion.record.layers import Ground, read_ground
 from companion.record.read_only import DAMAGE, one_line
 
 VERSION = "1"
@@ -56,7 +48,7 @@ ZONES_MAX = 1_000_000
 EXTENT_MAX_M = 200_000.0
 _TEXT_MAX = 10_000
 _ROWS_MAX = 100_000
-_SCHEMA = f"""{REGISTERS}{GROUND_TABLES}
+SCHEMA = f"""{REGISTERS}{GROUND_TABLES}
 CREATE TABLE exclusions (id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY);
 CREATE TABLE lines (id INTEGER PRIMARY KEY NOT NULL, geom LINESTRING);
 CREATE TABLE source_rates (id INTEGER PRIMARY KEY NOT NULL, rate_l_ha DOUBLE NOT NULL);
@@ -84,97 +76,7 @@ _TABLES = frozenset({*_HASHED, *_REGISTERS})
 _UNHASHED = frozenset({"sha256", "compiled_utc", "compiled_by", "compiled_with"})
 
 
-def write_flight_map(path: Path, flight_map: FlightMap) -> FlightMap:
-    """Write a flight map, whole or not at all, and return it with its hash and who made it.
-
-    Raises:
-        OSError: where it cannot be written; what was there before stays.
-    """
-    stamped = replace(
-        flight_map,
-        path=path,
-        compiled_utc=datetime.now(tz=UTC).isoformat(timespec="seconds"),
-        compiled_by=_compiled_by(),
-        compiled_with=f"vrspray {version('vrspray')}",
-    )
-    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
-        _fill(connection, stamped)
-        sha256 = _content_sha256(connection)
-        _insert_meta(connection, {"sha256": sha256})
-        write_atomically(path, connection.serialize())
-    return replace(stamped, sha256=sha256)
-
-
-def _compiled_by() -> str:
-    try:
-        user = getpass.getuser()
-    except (OSError, KeyError):  # a user without a name, as in some containers
-        user = "unknown"
-    return f"{user}@{platform.node()}"
-
-
-def _fill(connection: sqlite3.Connection, flight_map: FlightMap) -> None:
-    connection.executescript(_SCHEMA)
-    register_frame(connection, flight_map.frame)
-    for table, what, kind in (
-        ("exclusions", "where nothing is sprayed; the field is without them", "GEOMETRY"),
-        ("lines", "planned lines: alone these are sprayed", "LINESTRING"),
-    ):
-        connection.executescript(layer_sql(table, what, geometry=kind, srs_id=LOCAL_ID))
-    write_ground(connection, flight_map.prescription)
-    lines = [LineString(line) for line in flight_map.polylines]
-    for table, shapes in (("exclusions", list(flight_map.exclusions)), ("lines", lines)):
-        connection.executemany(f"INSERT INTO {table} (geom) VALUES (?)", _blobs(shapes))
-    connection.executemany(
-        "INSERT INTO source_rates (rate_l_ha) VALUES (?)",
-        [(rate,) for rate in flight_map.source_rates_l_ha],
-    )
-    connection.executemany(
-        "INSERT INTO sources (key, name, sha256) VALUES (?, ?, ?)",
-        [(each.key, each.name, each.sha256) for each in flight_map.sources],
-    )
-    connection.executemany(
-        "INSERT INTO findings (severity, code, text, place, fix) VALUES (?, ?, ?, ?, ?)",
-        [
-            (found.severity, found.code, found.text, found.where, found.fix)
-            for found in flight_map.findings
-        ],
-    )
-    _insert_meta(connection, _meta_of(flight_map))
-
-
-def _meta_of(flight_map: FlightMap) -> dict[str, str]:
-    prescription = flight_map.prescription
-    return {
-        "flight_map_version": VERSION,
-        "origin_latitude_deg": repr(flight_map.frame.latitude_deg),
-        "origin_longitude_deg": repr(flight_map.frame.longitude_deg),
-        "overlap": prescription.overlap,
-        "default_rate_l_ha": json.dumps(prescription.default_rate_l_ha),
-        "is_bounded": json.dumps(flight_map.is_bounded),
-        "map_sha256": prescription.sha256,
-        "source": flight_map.source,
-        "frozen": json.dumps(dict(flight_map.frozen), sort_keys=True),
-        "compiled_utc": flight_map.compiled_utc,
-        "compiled_by": flight_map.compiled_by,
-        "compiled_with": flight_map.compiled_with,
-    }
-
-
-def _insert_meta(connection: sqlite3.Connection, meta: dict[str, str]) -> None:
-    connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", meta.items())
-
-
-def _blobs(shapes: Sequence[Geometry]) -> list[tuple[bytes]]:
-    array = np.array(shapes, dtype=object)
-    binaries = shapely.to_wkb(array, byte_order=1, flavor="iso", output_dimension=2)
-    return [
-        (geometry_blob(wkb, srs_id=LOCAL_ID, is_empty=bool(shapely.is_empty(shape))),)
-        for wkb, shape in zip(binaries, shapes, strict=True)
-    ]
-
-
-def _content_sha256(connection: sqlite3.Connection) -> str:
+def content_sha256(connection: sqlite3.Connection) -> str:
     """Return the hash of all rows, each value with its kind and its length."""
     found = hashlib.sha256()
     there = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
@@ -245,7 +147,7 @@ def _read(path: Path, connection: sqlite3.Connection) -> FlightMap:
         raise ValueError(
             f"its version is {meta.get('flight_map_version', 'not told')[:20]}, not {VERSION}"
         )
-    if _content_sha256(connection) != meta["sha256"]:
+    if content_sha256(connection) != meta["sha256"]:
         raise ValueError("its content is not what its hash says: it was changed or damaged")
     frame = LocalFrame(
         latitude_deg=float(meta["origin_latitude_deg"]),

@@ -26,6 +26,7 @@ from companion.core.types import (
 from companion.link.census import AUTOPILOT_COMPONENT, Census, Vehicle, autopilot_name, mode_name
 from companion.link.messages import (
     CURRENT,
+    RADIO_STATUS,
     TRANSFERS,
     AckReceived,
     CommandReceived,
@@ -39,7 +40,6 @@ from companion.link.messages import (
     TimesyncReceived,
     finite,
 )
-from companion.link.signing import RADIO_STATUS
 
 __all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]
 

@@ -9,7 +9,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import TypeGuard, get_args
+from typing import TYPE_CHECKING, TypeGuard, get_args
 
 from companion.core.inputs import MISSION_MODES
 from companion.core.positions import (
@@ -52,8 +52,10 @@ from companion.link.mission_reader import MissionReader
 from companion.link.outputs import ORDERS, Outputs
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent, Service
-from companion.link.signing import Signing
 from companion.link.streams import Meter, Stream, StreamRequest, StreamSupervisor, wanted_streams
+
+if TYPE_CHECKING:
+    from companion.link.signing import Signing
 
 _POSITION = 33
 # How often the time is asked for, in seconds; where answers are slow, bytes are dear.

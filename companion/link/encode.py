@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from companion.link.census import AUTOPILOT_COMPONENT
-from companion.link.signing import Signing
+
+if TYPE_CHECKING:
+    from companion.link.signing import Signing
 
 _ONBOARD_CONTROLLER = 18
 _AUTOPILOT_INVALID = 8

@@ -11,6 +11,8 @@ from typing import Any
 from companion.core.types import Input
 from companion.link.census import AUTOPILOT_COMPONENT
 
+RADIO_STATUS = 109  # a radio's own report: never signed, and no word of the vehicle
+
 # The mission protocol as far as we read along: one MAVLink message to one of our types.
 
 _UNKNOWN_STATE, _ACTIVE_STATE = 0, 3  # MISSION_STATE

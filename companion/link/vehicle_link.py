@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from companion.core.types import Decision, Input, OperatorCommand, RateOverride
 from companion.link.census import Census, Vehicle, autopilot_name
@@ -15,7 +15,6 @@ from companion.link.component import Component, ComponentOptions
 from companion.link.outputs import OutputListener
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent
-from companion.link.signing import Signing
 from companion.link.streams import LinkStatistics
 from companion.link.transport import (
     LinkUrl,
@@ -26,6 +25,9 @@ from companion.link.transport import (
     Transport,
     parse_url,
 )
+
+if TYPE_CHECKING:
+    from companion.link.signing import Signing
 
 OnStatistics = Callable[[float, Mapping[str, float | None]], None]
 

@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 
 APPLICATION_ID = 0x47504B47  # "GPKG"
 USER_VERSION = 10400
+JOURNAL_VERSION = "2"  # what journals of each version have where: `versions.py`
 # Part of each page stays empty. Measured, a journal is 27.2 MB an hour with these, 27.5 with 2048,
 # and 28.2 with 512: two rows of `applied` fill such a page, a third does not go in.
 PAGE_BYTES = 1024

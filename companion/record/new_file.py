@@ -15,10 +15,9 @@ from pathlib import Path
 
 from companion.core.setup import Setup
 from companion.record.coverage_table import write_treated
-from companion.record.geopackage import SCHEMA
+from companion.record.geopackage import JOURNAL_VERSION, SCHEMA
 from companion.record.layers import write_layers
 from companion.record.setup_json import calibration_sha256, setup_to_json
-from companion.record.versions import JOURNAL_VERSION
 
 _LIBRARIES = ("vrspray", "numpy", "shapely", "pyproj")
 

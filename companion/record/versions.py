@@ -12,9 +12,9 @@ from datetime import datetime
 from importlib import metadata
 
 from companion.errors import UnreadableError
+from companion.record.geopackage import JOURNAL_VERSION
 from companion.record.refusals import check_kind
 
-JOURNAL_VERSION = "2"
 _BOTH = {"meta", "events", "zones", "field", "applied"}
 _TABLES = {
     "1": frozenset({*_BOTH, "records"}),

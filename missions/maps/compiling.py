@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import getpass
 import json
 import math
+import platform
+import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from shapely import LineString, MultiPolygon
+import numpy as np
+import shapely
+from shapely import Geometry, LineString, MultiPolygon
 
 from companion.assembly import build_setup, check_mark
+from companion.atomic_write import write_atomically
 from companion.config import Config
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
@@ -22,8 +30,12 @@ from companion.core.prescription import FIELD, Prescription
 from companion.core.setup import Setup
 from companion.errors import ConfigError, MapError
 from companion.flight_map import FlightMap, frozen_settings, is_flight_map, read_flight_map
-from companion.flight_map.model import named_files, sources_of
+from companion.flight_map.child import sources_of
+from companion.flight_map.file import SCHEMA, VERSION, content_sha256
+from companion.flight_map.model import named_files
 from companion.problem import Problem
+from companion.record.geopackage import LOCAL_ID, geometry_blob, layer_sql
+from companion.record.layers import register_frame, write_ground
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.layer import read_bytes
 from missions.maps.local import make_valid, project
@@ -338,3 +350,96 @@ def _goes_on(before: list[Place], after: list[Place]) -> bool:
 
 def _refused(path: Path, text: str) -> MapError:
     return map_error(path, text, fix=_FIX, code="no-lines")
+
+
+# The flight map as a file, written whole or not at all.
+
+
+def write_flight_map(path: Path, flight_map: FlightMap) -> FlightMap:
+    """Write a flight map, whole or not at all, and return it with its hash and who made it.
+
+    Raises:
+        OSError: where it cannot be written; what was there before stays.
+    """
+    stamped = replace(
+        flight_map,
+        path=path,
+        compiled_utc=datetime.now(tz=UTC).isoformat(timespec="seconds"),
+        compiled_by=_compiled_by(),
+        compiled_with=f"vrspray {version('vrspray')}",
+    )
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        _fill(connection, stamped)
+        sha256 = content_sha256(connection)
+        _insert_meta(connection, {"sha256": sha256})
+        write_atomically(path, connection.serialize())
+    return replace(stamped, sha256=sha256)
+
+
+def _compiled_by() -> str:
+    try:
+        user = getpass.getuser()
+    except (OSError, KeyError):  # a user without a name, as in some containers
+        user = "unknown"
+    return f"{user}@{platform.node()}"
+
+
+def _fill(connection: sqlite3.Connection, flight_map: FlightMap) -> None:
+    connection.executescript(SCHEMA)
+    register_frame(connection, flight_map.frame)
+    for table, what, kind in (
+        ("exclusions", "where nothing is sprayed; the field is without them", "GEOMETRY"),
+        ("lines", "planned lines: alone these are sprayed", "LINESTRING"),
+    ):
+        connection.executescript(layer_sql(table, what, geometry=kind, srs_id=LOCAL_ID))
+    write_ground(connection, flight_map.prescription)
+    lines = [LineString(line) for line in flight_map.polylines]
+    for table, shapes in (("exclusions", list(flight_map.exclusions)), ("lines", lines)):
+        connection.executemany(f"INSERT INTO {table} (geom) VALUES (?)", _blobs(shapes))
+    connection.executemany(
+        "INSERT INTO source_rates (rate_l_ha) VALUES (?)",
+        [(rate,) for rate in flight_map.source_rates_l_ha],
+    )
+    connection.executemany(
+        "INSERT INTO sources (key, name, sha256) VALUES (?, ?, ?)",
+        [(each.key, each.name, each.sha256) for each in flight_map.sources],
+    )
+    connection.executemany(
+        "INSERT INTO findings (severity, code, text, place, fix) VALUES (?, ?, ?, ?, ?)",
+        [
+            (found.severity, found.code, found.text, found.where, found.fix)
+            for found in flight_map.findings
+        ],
+    )
+    _insert_meta(connection, _meta_of(flight_map))
+
+
+def _meta_of(flight_map: FlightMap) -> dict[str, str]:
+    prescription = flight_map.prescription
+    return {
+        "flight_map_version": VERSION,
+        "origin_latitude_deg": repr(flight_map.frame.latitude_deg),
+        "origin_longitude_deg": repr(flight_map.frame.longitude_deg),
+        "overlap": prescription.overlap,
+        "default_rate_l_ha": json.dumps(prescription.default_rate_l_ha),
+        "is_bounded": json.dumps(flight_map.is_bounded),
+        "map_sha256": prescription.sha256,
+        "source": flight_map.source,
+        "frozen": json.dumps(dict(flight_map.frozen), sort_keys=True),
+        "compiled_utc": flight_map.compiled_utc,
+        "compiled_by": flight_map.compiled_by,
+        "compiled_with": flight_map.compiled_with,
+    }
+
+
+def _insert_meta(connection: sqlite3.Connection, meta: dict[str, str]) -> None:
+    connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", meta.items())
+
+
+def _blobs(shapes: Sequence[Geometry]) -> list[tuple[bytes]]:
+    array = np.array(shapes, dtype=object)
+    binaries = shapely.to_wkb(array, byte_order=1, flavor="iso", output_dimension=2)
+    return [
+        (geometry_blob(wkb, srs_id=LOCAL_ID, is_empty=bool(shapely.is_empty(shape))),)
+        for wkb, shape in zip(binaries, shapes, strict=True)
+    ]

@@ -1,12 +1,16 @@
 """In every Python that a test starts: what it leaves open is written down for the test to see.
 
-`tests/conftest.py` puts this folder on the path of child processes and names the place.
+So is what is imported for the first time while the control loop turns: that holds the loop up,
+maybe with valves open. `tests/conftest.py` puts this folder on the path of child processes and
+names the place.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
+import threading
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,14 +21,39 @@ if TYPE_CHECKING:
 _folder = os.environ.get("VRSPRAY_LEFT_OPEN")
 
 
-def _note(found: UnraisableHookArgs) -> None:
-    if isinstance(found.exc_value, ResourceWarning) and _folder is not None:
+def _tell(text: str) -> None:
+    if _folder is not None:
         with (Path(_folder) / str(os.getpid())).open("a") as file:
-            file.write(f"{' '.join(sys.orig_argv[1:])[:200]}: {found.exc_value}\n")
+            file.write(f"{' '.join(sys.orig_argv[1:])[:200]}: {text}\n")
+
+
+def _note(found: UnraisableHookArgs) -> None:
+    if isinstance(found.exc_value, ResourceWarning):
+        _tell(str(found.exc_value))
     sys.__unraisablehook__(found)
+
+
+def _hear(event: str, details: tuple[object, ...]) -> None:
+    """Tell of an import that finds its module not loaded, between first step and end of a run."""
+    if event == "import" and "companion.runtime" in sys.modules and _is_turning():
+        _tell(f"{details[0]} was imported in flight")
+
+
+def _is_turning() -> bool:
+    frame = sys._current_frames().get(threading.main_thread().ident or 0)
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == "execute" and code.co_filename.endswith("companion/runtime.py"):
+            return any(
+                type(each).__name__ == "ControlLoop" and each._stepped_s > 0.0
+                for each in gc.get_objects()
+            )
+        frame = frame.f_back
+    return False
 
 
 # Not where pytest looks through the modules for doctests.
 if _folder is not None and __name__ == "sitecustomize":
     warnings.simplefilter("error", ResourceWarning)
     sys.unraisablehook = _note
+    sys.addaudithook(_hear)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -54,11 +55,22 @@ def test_help_lists_every_command_without_importing_any(capsys: Captured) -> Non
         assert place.help in done.stdout
 
 
-def test_a_run_loads_nothing_of_the_office_and_no_forensics() -> None:
+# What most flights do without; each is loaded when a flight that has it is put together.
+NOT_OF_EVERY_FLIGHT = (
+    "companion.cli.sensor_parts", "companion.config.motor_rules",
+    "companion.core.options.liquid_faults", "companion.flight_map.child",
+    "companion.link.signing", "companion.output.engine",
+    "companion.output.gpio", "companion.output.hardware_pwm", "companion.record.continuing",
+    "companion.record.leaf_page", "companion.record.log_damage", "companion.record.reader",
+    "companion.record.recovery", "companion.record.retention", "companion.sensors",
+)  # fmt: skip
+
+
+def test_a_run_loads_nothing_of_the_office_and_of_options_what_it_has() -> None:
     script = (
         "import sys; import companion.cli.run; ours = {'analysis', 'missions', 'sitl'};"
         "print(sorted(ours & {name.partition('.')[0] for name in sys.modules}),"
-        "[name for name in sys.modules if 'log_damage' in name or 'leaf_page' in name])"
+        f"sorted(set({NOT_OF_EVERY_FLIGHT!r}) & set(sys.modules)))"
     )
     done = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60
@@ -85,7 +97,7 @@ def test_main_leaves_with_the_exit_code(capsys: Captured) -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["fly"], ["map"], ["map", "rate"], ["config", "check"], ["run"], ["--nope"]],
+    [["fly"], ["map", "rate"], ["config", "check"], ["run"], ["--nope"]],
     ids=" ".join,
 )
 def test_wrong_usage_is_one_line_and_exit_2(arguments: list[str], capsys: Captured) -> None:
@@ -94,6 +106,100 @@ def test_wrong_usage_is_one_line_and_exit_2(arguments: list[str], capsys: Captur
     assert captured.out == ""
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["", "map", "sitl", "calibrate", "flights", "config", "service"])
+def test_command_alone_shows_its_help_and_is_wrong_usage(name: str, capsys: Captured) -> None:
+    assert execute(name.split()) == 2
+    captured = capsys.readouterr()
+    assert captured.out.startswith(f"Usage: vrspray {name}".rstrip())
+    assert "Commands:" in captured.out
+    assert captured.err == ""
+
+
+# A frame around its options is Typer's other style.
+@pytest.mark.parametrize("name", ["", "sitl", "sitl serve", "map check", "calibrate flow", "run"])
+def test_short_help_is_the_help_and_has_one_style(name: str, capsys: Captured) -> None:
+    assert execute([*name.split(), "-h"]) == 0
+    short = capsys.readouterr().out
+    assert execute([*name.split(), "--help"]) == 0
+    assert capsys.readouterr().out == short
+    assert short.startswith("Usage: vrspray")
+    assert "\nOptions:\n" in short
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [("vrspray ca", ["calibrate"]), ("vrspray map conv", ["convert"]), ("vrspray ru", ["run"])],
+)
+def test_shell_completes_commands(words: str, offered: list[str]) -> None:
+    asked = {
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split()) - 1),
+        "_VRSPRAY_COMPLETE": "complete_bash",
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "companion"],
+        env={**os.environ, **asked},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert done.stdout.split() == offered
+    assert done.stderr == ""
+
+
+def test_completion_is_installed_for_a_shell(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "companion", "--install-completion", "bash"],
+        env={
+            **os.environ,
+            "HOME": str(tmp_path),
+            "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1",
+        },
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    script = tmp_path / ".bash_completions" / "vrspray.sh"
+    assert "_VRSPRAY_COMPLETE=complete_bash" in script.read_text()
+    assert str(script) in (tmp_path / ".bashrc").read_text()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["config", "show", CONFIG]], ids=" ".join)
+def test_full_disk_is_one_line(arguments: list[str]) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "companion", *arguments],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            timeout=60,
+        )
+    assert (done.returncode, done.stderr) == (
+        1,
+        "error: output: no space left; free some, or write elsewhere\n",
+    )
+
+
+def test_interrupt_while_the_program_loads_is_one_line() -> None:
+    script = (
+        "import os, signal, sys\n"
+        "class Press:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'typer': os.kill(os.getpid(), signal.SIGINT)\n"
+        "sys.meta_path.insert(0, Press())\n"
+        "from companion.__main__ import main\n"
+        "main()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
 
 
 def test_wrong_usage_with_json_is_one_object(capsys: Captured) -> None:
@@ -172,9 +278,36 @@ def test_command_of_config_has_json_and_an_example(
 
 def test_config_check_accepts_the_example(capsys: Captured) -> None:
     code, found = run_json(capsys, "config", "check", CONFIG)
-    (everywhere,) = found.pop("notes")
+    everywhere, unmetered = found.pop("notes")
     assert (code, found) == (0, {"ok": True, "path": CONFIG, "problems": []})
     assert "the drone sprays the whole map" in everywhere
+    assert "calibrate lag` needs a flow meter" in unmetered
+
+
+def test_config_check_prints_every_problem(capsys: Captured) -> None:
+    given = ["lag.on_s=-1", "valve[0].channel=0.5", "boom.widht_m=6"]
+    overrides = [part for one in given for part in ("--set", one)]
+    code, found = run_json(capsys, "config", "check", CONFIG, *overrides)
+    assert (code, found["ok"]) == (2, False)
+    keys = ["boom.widht_m", "valve[0].channel", "lag.on_s"]
+    assert [problem["where"] for problem in found["problems"]] == keys
+    assert "did you mean boom.width_m?" in found["problems"][0]["fix"]
+    assert execute(["config", "check", CONFIG, *overrides]) == 2
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(": ")[0] for line in lines] == ["error"] * 3 + [CONFIG]
+    assert all(key in line for key, line in zip(keys, lines, strict=False))
+
+
+def test_config_check_lists_a_map_that_is_missing_beside_all_else(capsys: Captured) -> None:
+    given = ["prescription.file=none.shp", "mission.swath_width_m=9", 'safety.modes=["ATUO"]']
+    overrides = [part for one in given for part in ("--set", one)]
+    code, found = run_json(capsys, "config", "check", CONFIG, *overrides)
+    assert code == 2
+    assert [problem["where"] for problem in found["problems"][:2]] == [
+        "mission.swath_width_m",
+        "safety.modes",
+    ]
+    assert "none.shp" in str(found["problems"][2])
 
 
 def test_config_check_refuses_a_swath_that_is_not_the_boom(capsys: Captured) -> None:

@@ -360,6 +360,87 @@ def test_strips_that_do_not_add_up_to_the_boom_are_a_mismatch() -> None:
     assert [mismatch.key for mismatch in mismatches(config)] == ["boom.width_m"]
 
 
+def problems_of(path: Path, *overrides: str) -> dict[str, str]:
+    with pytest.raises(ConfigError) as refused:
+        load(path, overrides=overrides)
+    return {problem.where: problem.code for problem in refused.value.problems}
+
+
+def test_a_refusal_carries_all_that_is_wrong_with_the_keys() -> None:
+    given = ["lag.onn_s=1", "lag.off_s=-1", "boom.width_m=wide", "valve[2].nozzles=0"]
+    assert problems_of(EXAMPLE, *given) == {
+        "lag.onn_s": "unknown-key",
+        "boom.width_m": "wrong-value",
+        "valve[2].nozzles": "wrong-value",
+        "lag.off_s": "wrong-value",
+    }
+    assert "(and 3 more problems)" in refusal(EXAMPLE, *given)
+
+
+def test_a_refusal_carries_all_contradictions() -> None:
+    given = {
+        "link.url=tcp:host:0": "link.url",
+        'valve[1].name="1"': "valve[1].name",
+        "valve[2].right_m=-2.0": "valve[2].right_m",
+        "valve[3].channel=13": "valve[3].channel",
+        "nozzle_set[0].duty=[0.2, 0.1]": "nozzle_set[0].flow_l_min",
+        "pwm.duty_min=0.95": "pwm.duty_min",
+        "lag.on_start_s=0.5": "lag.on_start_s",
+        "lag.off_end_s=0.0": "lag.off_end_s",
+        "output.full_us=1010": "output.full_us",
+        "safety.speed_min_m_s=12.5": "safety.speed_min_m_s",
+        "mission.reserve_l=900": "mission.reserve_l",
+        "tank.source=flow": "tank.source",
+    }
+    found = problems_of(EXAMPLE, *given)
+    assert set(given.values()) <= set(found)
+    assert set(found.values()) == {"contradiction"}
+
+
+# One contradiction must not make a rule behind it fail: each pair is refused in words.
+@pytest.mark.parametrize("first", range(10))
+def test_any_two_contradictions_are_refused_in_words(first: int) -> None:
+    wrong = [
+        'valve[1].name="1"', "nozzle_set[0].valves=[]", 'nozzle_set[0].valves=["9"]',
+        "nozzle_set[0].duty=[]", "nozzle_set[0].flow_l_min=[]", "pwm.frequency_hz=0.1",
+        "output.kind=gpio", "safety.height_min_m=400", "flow_meter.source=gpio", "pwm.duty_min=1",
+        "gpio.alive_line=9", "lag.up_time_s=9",
+    ]  # fmt: skip
+    for second in wrong[first + 1 :]:
+        if wrong[first].startswith(("output", "pwm.freq")) or second.startswith(("out", "pwm.f")):
+            continue
+        assert refusal(EXAMPLE, wrong[first], second)
+
+
+@pytest.mark.parametrize(
+    ("given", "key", "text"),
+    [
+        (
+            'safety.modes=["ATUO"]',
+            "safety.modes",
+            'no flight mode is named "ATUO"; did you mean "AUTO"?',
+        ),
+        ('safety.modes=["AUTO", "x"]', "safety.modes", 'no flight mode is named "x"'),
+        ("valve[2].right_m=-0.3", "valve[2].right_m", "leaves 0.20 m between its strip"),
+        ("valve[3].right_m=0.3", "valve[3].right_m", "has its strip 0.20 m over that"),
+    ],
+)
+def test_what_would_spray_nothing_or_stripes_is_a_mismatch(given: str, key: str, text: str) -> None:
+    found = {each.key: each.text for each in mismatches(load(EXAMPLE, overrides=[given]))}
+    assert text in found[key]
+
+
+def test_modes_and_strips_that_are_right_are_no_mismatch() -> None:
+    for given in ('safety.modes=["auto"]', 'safety.modes=["MISSION"]', "valve[2].right_m=-0.45"):
+        assert not list(mismatches(load(EXAMPLE, overrides=[given])))
+
+
+def test_boom_beside_the_aircraft_is_named() -> None:
+    given = [f"valve[{number}].right_m={number - 2.0}" for number in range(6)]
+    (found,) = without_effect(load(EXAMPLE, overrides=given))
+    assert "0.50 m right of the aircraft" in found.text
+
+
 def test_accepted_settings_without_effect_are_named() -> None:
     overrides = ["web.enabled=true", "flow_trim.enabled=true"]
     config = load(EXAMPLE, overrides=overrides)

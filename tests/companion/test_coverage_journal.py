@@ -21,7 +21,6 @@ from analysis.flown.read_applied import read_applied
 from analysis.journals.content import read_journal
 from analysis.replay import replay
 from companion.cli.app import execute
-from companion.cli.run import unfinished
 from companion.core.controller import Memory, expected_coverage, step
 from companion.core.estimator import Track, estimate, observe
 from companion.core.frame import LocalFrame
@@ -46,6 +45,7 @@ from companion.record.continuing import (
     read_treated_ground,
     rest_of,
     treated_by,
+    unfinished,
 )
 from companion.record.coverage_area import moved, polygons
 from companion.record.coverage_table import (

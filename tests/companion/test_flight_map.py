@@ -17,7 +17,7 @@ import pytest
 import shapely
 from pyproj import CRS
 
-from companion.assembly import build_setup
+from companion.assembly import build_setup, flight_map_of
 from companion.cli.app import execute
 from companion.config import load
 from companion.config.tables import PrescriptionTable
@@ -26,9 +26,7 @@ from companion.errors import ConfigError, MapError
 from companion.flight_map import (
     FlightMap,
     difference,
-    flight_map_of,
     read_flight_map,
-    write_flight_map,
 )
 from companion.flight_map import child as child_module
 from companion.flight_map import file as file_module
@@ -41,6 +39,7 @@ from missions.maps.compiling import (
     compiled_setup,
     read_configured_map,
     read_ordered_map,
+    write_flight_map,
 )
 from missions.maps.model import MapCells, MapFile
 from missions.maps.registry import read_map
@@ -445,7 +444,7 @@ def changed_with_hash(path: Path, sql: str, value: object) -> None:
     """Change a flight map as somebody would who works out its hash anew."""
     with closing(sqlite3.connect(path, isolation_level=None)) as connection:
         connection.execute(sql, (value,))
-        sha256 = file_module._content_sha256(connection)
+        sha256 = file_module.content_sha256(connection)
         connection.execute("UPDATE meta SET value = ? WHERE key = 'sha256'", (sha256,))
 
 

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from companion.config import load
 from companion.errors import MapError
-from companion.flight_map import file, read_flight_map, write_flight_map
-from missions.maps.compiling import MapOrder, compile_map
+from companion.flight_map import file, read_flight_map
+from missions.maps.compiling import MapOrder, compile_map, write_flight_map
 from tests.companion.test_flight_map import map_of_cells
 
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang" / "config.toml"
@@ -115,7 +115,7 @@ def test_any_content_with_the_right_hash_is_read_or_refused(
             connection.execute(sql, (value, row[0]))
         except (sqlite3.Error, OverflowError, UnicodeEncodeError):
             return
-        sha256 = file._content_sha256(connection)
+        sha256 = file.content_sha256(connection)
         connection.execute("UPDATE meta SET value = ? WHERE key = 'sha256'", (sha256,))
     read_or_refused(path)
 

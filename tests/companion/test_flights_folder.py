@@ -268,6 +268,6 @@ def test_a_full_disk_is_refused_before_the_flight(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = Space(total_bytes=10**12, free_bytes=10**6)
-    monkeypatch.setattr("companion.cli.record_parts.space_of", lambda _folder: full)
+    monkeypatch.setattr("companion.record.retention.space_of", lambda _folder: full)
     with pytest.raises(JournalError, match="only 1 MB are free"):
         list(made_ready(folder, JournalTable()))

@@ -16,7 +16,8 @@ from companion.errors import LinkError
 from companion.link.codec import Codec
 from companion.link.component import ComponentOptions
 from companion.link.encode import Encoder
-from companion.link.signing import STATE_NAME, Signing, read_key, read_state
+from companion.link.parameters import read_state
+from companion.link.signing import STATE_NAME, Signing, read_key
 from companion.link.vehicle_link import VehicleLink
 from tests.companion.wire_peer import free_port
 

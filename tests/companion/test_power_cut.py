@@ -12,7 +12,8 @@ import pytest
 
 from companion.atomic_write import write_atomically
 from companion.cli.systemd import write_unit
-from companion.link.signing import STATE_NAME, Signing, read_state, write_state
+from companion.link.parameters import read_state, write_state
+from companion.link.signing import STATE_NAME, Signing
 from missions.maps.whole_file import write_whole
 
 KEY = bytes(range(32))

@@ -238,7 +238,7 @@ def test_the_configuration_refuses_it_too_and_otherwise_sets_it(
 ) -> None:
     wrong = config_of(tmp_path, "height_m = 4.0\nferry_height_m = 4.0\n")
     assert execute(["config", "check", str(wrong)]) == 2
-    assert "mission.ferry_height_m" in capsys.readouterr().err
+    assert "mission.ferry_height_m" in capsys.readouterr().out
     right = config_of(tmp_path, "ferry_height_m = 12.0\n")
     out = tmp_path / "m.plan"
     planned(capsys, tmp_path, out, "--config", right)

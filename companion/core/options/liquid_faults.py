@@ -306,14 +306,18 @@ class WatchMemory(NamedTuple):
 
 def follow(
     watching: Watching,
-    memory: WatchMemory,
+    memory: WatchMemory | None,
     plan: SprayPlan | None,
     state: VehicleState | None,
     *,
     index: int,
     now_s: float,
 ) -> WatchMemory:
-    """Return the memory after what came by `now_s`; `plan` was in force until now."""
+    """Return the memory after what came by `now_s`; `plan` was in force until now.
+
+    Its `latched` are the reasons not to spray that flow, pressure and tank give.
+    """
+    memory = memory or WatchMemory()
     if state is None:
         return memory
     memory = _enabled(memory, state)
@@ -454,8 +458,3 @@ def _learnt(watching: Watching, memory: WatchMemory, filled: Bin) -> WatchMemory
         pressure_gain=min(max(pressure_gain, 1.0 - room), 1.0 + room),
         learnt_s=learnt_s,
     )
-
-
-def inhibits_of(memory: WatchMemory | None) -> frozenset[Inhibit]:
-    """Return the reasons not to spray that flow, pressure and tank give."""
-    return frozenset() if memory is None else memory.latched

@@ -20,7 +20,7 @@ from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
-from companion.flight_map import SUFFIX, FlightMap, is_flight_map, write_flight_map
+from companion.flight_map import SUFFIX, FlightMap, is_flight_map
 from companion.problem import Problem
 from companion.wording import counted
 from missions.maps.cli.convert import convert, show
@@ -28,7 +28,13 @@ from missions.maps.cli.grid import GRID_EXAMPLE, grid, parse_mark
 from missions.maps.cli.new import NEW_EXAMPLE, new
 from missions.maps.cli.options import File, OverlapPolicy, Reading, reading_options
 from missions.maps.cli.plan import plan_of, sprayer_problems
-from missions.maps.compiling import MapOrder, compile_map, flown_at, read_ordered_map
+from missions.maps.compiling import (
+    MapOrder,
+    compile_map,
+    flown_at,
+    read_ordered_map,
+    write_flight_map,
+)
 from missions.maps.layer import cut_off
 from missions.maps.lint import check_map, point_rates, summary
 from missions.maps.model import MapFile, map_error
