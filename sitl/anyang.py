@@ -10,6 +10,7 @@ import json
 import math
 import tomllib
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
@@ -20,7 +21,8 @@ from sitl.stub.mission_items import MissionItem, landing, speed, waypoint
 from sitl.stub.protocol import dialect
 from sitl.vehicle import Leg, Route
 
-EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "anyang"
+# Part of the package: what is installed without the source tree has it too.
+EXAMPLE = Path(str(files("sitl").joinpath("examples", "anyang")))
 PASS_COUNT = 4
 PASS_SPACING_M = 6.0
 RUN_OUT_M = 15.0  # so that no turn happens over the field

@@ -12,3 +12,8 @@ SITL = Command(
     help="Simulate a flight controller and sprayer.",
     hastes={"fly": "patient"},
 )
+EXAMPLES = Command(
+    target="sitl.examples_cli:app",
+    help="List the examples, or copy one into a folder of yours.",
+    haste="quick",
+)
