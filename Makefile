@@ -20,7 +20,7 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware docs reference lock clean bench-missions
+.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware test-wheel wheel docs reference lock clean bench-missions
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z -]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -95,6 +95,13 @@ test-gpio: $(INSTALLED) ## the valve engine on the kernel's simulated chip (buil
 test-firmware: $(INSTALLED) ## flights beside the real firmwares of VRSPRAY_FIRMWARE (ARGS="-m short" for one of each)
 	$(BIN)/pytest -m firmware $(ARGS) tests/firmware
 
+wheel: $(INSTALLED) ## the wheel, in dist
+	rm -rf build
+	$(PIP) wheel --quiet --no-deps --no-build-isolation --no-index --wheel-dir dist .
+
+test-wheel: wheel ## the wheel in an empty environment and an empty folder (ARGS=office for reports too)
+	@tests/try_wheel.sh $(BIN)/python dist/vrspray-*.whl $(ARGS)
+
 docs: $(INSTALLED) $(BIN)/mkdocs ## the documentation site, in site/; a broken link fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@$(BIN)/python -m tests.reference --words
@@ -112,8 +119,9 @@ lock: | $(BIN)/python ## choose and pin versions anew (ARGS=--upgrade for the ne
 	$(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['build-system']['requires'], sep='\n')" \
 		| $(COMPILE) - --output-file requirements/build.txt >/dev/null
 	$(COMPILE) pyproject.toml --extra dev --output-file requirements/dev.txt >/dev/null
-	$(COMPILE) pyproject.toml --extra plot --constraint requirements/dev.txt --output-file requirements/plot.txt >/dev/null
-	$(COMPILE) pyproject.toml --constraint requirements/dev.txt --output-file requirements/run.txt >/dev/null
+	for role in vehicle office; do \
+		$(COMPILE) pyproject.toml --extra $$role --constraint requirements/dev.txt --output-file requirements/$$role.txt >/dev/null || exit; \
+	done
 	$(BIN)/python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['docs'], sep='\n')" \
 		| $(COMPILE) - --constraint requirements/dev.txt --output-file requirements/docs.txt >/dev/null
 

@@ -13,6 +13,7 @@ from companion.cli.answer import AsJson, answer, note
 from companion.cli.app import load_command
 from companion.commands import Command
 from companion.errors import ConfigError, JournalError
+from companion.wording import install_command
 
 if TYPE_CHECKING:
     from typer._click.core import Command as ClickCommand
@@ -93,7 +94,7 @@ def lag(
         try:
             draw(found, plot)
         except ImportError:
-            note("no picture: matplotlib is not installed (pip install vrspray[plot])")
+            note(f"no picture: matplotlib is missing; {install_command('office')}")
         except (OSError, ValueError) as error:
             raise ConfigError(f"--plot {plot}: cannot be written ({error})") from error
     answer(shape(found), table_lines(found), as_json=as_json)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.csv_rows import TableError
+from companion.wording import install_command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -116,7 +117,7 @@ def plot_flow(
 def _axes(path: Path) -> Iterator[Axes]:
     """Give axes to draw on, and write them to `path` at the end."""
     if importlib.util.find_spec("matplotlib") is None:
-        raise TableError("no picture without matplotlib; pip install vrspray[plot]")
+        raise TableError(f"no picture without matplotlib; {install_command('office')}")
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from typing import Any, Literal
 
 from companion.errors import VrsprayError
+from companion.wording import install_command
 
 GROUP = "vrspray.commands"
 # Whose commands come first where two distributions name the same one.
@@ -79,7 +80,7 @@ def load(name: str, target: str | EntryPoint) -> Any:
     except ModuleNotFoundError as error:
         raise VrsprayError(
             f"vrspray {name}: the module {error.name} is not part of this installation; "
-            "install all of vrspray (pip install vrspray[report,mcap,maps,mavsdk])"
+            f"add what the office needs: {install_command('office')}"
         ) from error
     except (ImportError, AttributeError) as error:
         raise VrsprayError(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from companion.errors import VrsprayError
+from companion.wording import install_command
 
 DEV = Path("/dev")
 
@@ -17,12 +18,12 @@ def load_gpiod(error_type: type[VrsprayError]) -> Any:
         gpiod = importlib.import_module("gpiod")
     except ImportError as error:
         raise error_type(
-            "the Python package gpiod is missing: pip install 'vrspray[gpio]'"
+            f"the Python package gpiod is missing: {install_command('vehicle')}"
         ) from error
     version = str(getattr(gpiod, "__version__", "1"))
     if not version.partition(".")[0].isdigit() or int(version.partition(".")[0]) < 2:
         # Debian 12's own package is version 1 under the same name, with another interface.
-        raise error_type(f"gpiod {version} is too old: pip install 'gpiod>=2.1'")
+        raise error_type(f"gpiod {version} is too old: {install_command('vehicle')}")
     return gpiod
 
 

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import PurePath
+from typing import Literal
+
+# What a computer is for: the extras of pyproject.toml.
+Role = Literal["vehicle", "office"]
+
 
 def counted(count: int, name: str) -> str:
     """Return a number with its noun.
@@ -10,3 +17,23 @@ def counted(count: int, name: str) -> str:
     ('1 hole', '2 holes')
     """
     return f"{count} {name}{'' if count == 1 else 's'}"
+
+
+def install_command(role: Role, prefix: str = sys.prefix) -> str:
+    """Return the command that adds what a role needs, by what installed this program.
+
+    `pipx` and `uv tool` keep an environment of their own, in which no `pip` on the path installs.
+
+    >>> install_command("office", "/usr")
+    "pip install 'vrspray[office]'"
+    >>> install_command("office", "/opt/pipx/venvs/vrspray")
+    "pipx runpip vrspray install 'vrspray[office]'"
+    >>> install_command("vehicle", "/opt/uv/tools/vrspray")
+    "uv pip install --python /opt/uv/tools/vrspray/bin/python 'vrspray[vehicle]'"
+    """
+    wanted, (*_, above, folder, _) = f"'vrspray[{role}]'", ("", "", *PurePath(prefix).parts)
+    if (above, folder) == ("pipx", "venvs"):
+        return f"pipx runpip vrspray install {wanted}"
+    if (above, folder) == ("uv", "tools"):
+        return f"uv pip install --python {prefix}/bin/python {wanted}"
+    return f"pip install {wanted}"

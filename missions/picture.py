@@ -17,7 +17,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from companion.wording import counted
+from companion.wording import counted, install_command
 from missions.boom import boom_of
 from missions.errors import PlanError
 from missions.maps.local import polygons_of
@@ -46,7 +46,7 @@ def check_picture(out: Path) -> None:
     if out.suffix.casefold() not in SUFFIXES:
         raise PlanError(f"--png {out}: pictures are written as {', '.join(SUFFIXES)}")
     if importlib.util.find_spec("matplotlib") is None:
-        raise PlanError("no picture without matplotlib; install it: pip install 'vrspray[plot]'")
+        raise PlanError(f"no picture without matplotlib; {install_command('office')}")
 
 
 def draw_plan(plan: Plan, out: Path, *, title: str) -> None:

@@ -24,6 +24,7 @@ from rich.table import Table
 
 from companion.cli.answer import AsJson, answer, note, progress
 from companion.errors import ConfigError
+from companion.wording import install_command
 from sitl.cli import FlowLaw
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ def _write(result: DemoResult, found: dict[str, Any], stage: Path) -> list[str]:
 
     pictures: Sequence[str] = ()
     if importlib.util.find_spec("matplotlib") is None:
-        note("no pictures: matplotlib is missing; pip install vrspray[plot]")
+        note(f"no pictures: matplotlib is missing; {install_command('office')}")
     else:
         from sitl.demo_pictures import draw_pictures
 
@@ -156,7 +157,8 @@ def _write(result: DemoResult, found: dict[str, Any], stage: Path) -> list[str]:
     if can_report():
         write_report(stage / JOURNAL, stage / FLIGHT_REPORT)
     else:
-        note("no report of the flight: pip install vrspray[report]")
+        missing = "jinja2 or matplotlib is missing"
+        note(f"no report of the flight: {missing}; {install_command('office')}")
     return [name for name in FILES if (stage / name).exists()]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from companion.core.types import Decision
 from companion.errors import ConfigError
 from companion.record.journal import Journal
+from companion.wording import install_command
 from sitl.deposit import Deposit
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ def write_files(flown: Flown, folder: Path, say: Callable[[str], None]) -> list[
         _draw(flown, picture)
         files.append(picture)
     except ImportError:
-        say("no picture: matplotlib is not installed (pip install vrspray[plot])")
+        say(f"no picture: matplotlib is missing; {install_command('office')}")
     return files
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from analysis.exports.output import ExportError
 from analysis.exports.source import Shape
+from companion.wording import install_command
 
 if TYPE_CHECKING:
     from analysis.exports.output import Content
@@ -24,8 +25,7 @@ class Format:
     """A format; `make` is `module:function`, `shapes` what a row may be, the usual one first.
 
     `suffixes` choose it without its name, `also` only with it. With `has_units` it can be had in
-    other units than the recorded ones; others have units of their own. `extra` is what must be
-    installed for it.
+    other units than the recorded ones; others have units of their own.
     """
 
     name: str
@@ -36,7 +36,6 @@ class Format:
     shapes: tuple[Shape, ...] = ("points",)
     has_units: bool = False
     has_rate: bool = True
-    extra: str | None = None
 
     def maker(self) -> Make:
         """Return the function that makes it, imported now."""
@@ -46,7 +45,7 @@ class Format:
         except ModuleNotFoundError as error:
             raise ExportError(
                 f"{self.name}: the module {error.name} is not installed; "
-                f"pip install vrspray[{self.extra or 'report'}]"
+                f"{install_command('office')}"
             ) from error
         return found
 
@@ -83,16 +82,16 @@ FORMATS = (
     ),
     Format(
         name="geoparquet", description="swaths or points", make="geoparquet:make",
-        suffixes=(".parquet", ".geoparquet"), shapes=("swaths", "points"), extra="maps",
+        suffixes=(".parquet", ".geoparquet"), shapes=("swaths", "points"),
     ),
     Format(
         name="adapt", description="ADAPT standard: adapt.json and GeoParquet",
         make="geoparquet:make_adapt", suffixes=(), also=("", ".zip"), shapes=("swaths",),
-        has_rate=False, extra="maps",
+        has_rate=False,
     ),
     Format(
         name="mcap", description="messages for Foxglove and its kin", make="mcap_file:make",
-        suffixes=(".mcap",), extra="mcap",
+        suffixes=(".mcap",),
     ),
 )  # fmt: skip
 # A terminal looks for a folder of this name.

@@ -46,6 +46,9 @@ def _python(found: Computer) -> Check:
     text = f"Python {version}, {found.system} {found.machine}"
     if not found.python >= (3, 11, 0):
         return fail("system", text, "install Python 3.11 or newer")
+    if not found.is_64_bit:
+        fix = "install the 64-bit system: nothing else is tested, and libraries are missing"
+        return warn("system", f"{text}, 32-bit", fix)
     if found.system != "Linux":
         return warn("system", text, "use Linux: nothing else is tested")
     return ok("system", text)
@@ -195,6 +198,7 @@ class Computer:
     governors: tuple[str, ...] = ()
     throttled: int | None = None
     watchdog: HardwareWatchdog | None = None
+    is_64_bit: bool = True
 
 
 def read_computer(folders: dict[str, Path], *, root: Path = Path("/")) -> Computer:
@@ -211,6 +215,8 @@ def read_computer(folders: dict[str, Path], *, root: Path = Path("/")) -> Comput
         governors=_governors(root),
         throttled=_throttled(root),
         watchdog=_watchdog(root),
+        # Of Python itself: a 64-bit kernel may run a 32-bit system.
+        is_64_bit=sys.maxsize > 2**32,
     )
 
 

@@ -13,6 +13,7 @@ from companion.doctor.check import Check, fail, not_applicable, ok, warn
 from companion.errors import ActuatorError
 from companion.output.engine.gpiod_lines import CONSUMER, find_chip, keeps_levels, load_gpiod
 from companion.output.engine.setup import Wiring, hazards
+from companion.wording import install_command
 
 _NAMES = ("gpio-chip", "gpio-lines", "gpio-wiring")
 
@@ -42,9 +43,9 @@ def read_chip(name: str, numbers: tuple[int, ...]) -> Chip:
     try:
         lines = _lines(load_gpiod(), name, numbers)
     except ActuatorError as error:
-        text, found, package = str(error).partition(": pip install ")
+        text, found, _ = str(error).partition(f": {install_command('vehicle')}")
         correct = "correct output.chip; gpiodetect lists the chips"
-        fix = f"pip install {package}" if found else correct
+        fix = install_command("vehicle") if found else correct
         return Chip(name=name, problem=text, fix=fix)
     except PermissionError:
         return Chip(name=name, problem=f"{name}: permission denied", fix=_group_fix("gpio"))

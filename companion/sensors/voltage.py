@@ -20,6 +20,7 @@ from statistics import fmean
 from typing import Any, Protocol
 
 from companion.errors import SensorError
+from companion.wording import install_command
 
 IIO = Path("/sys/bus/iio/devices")
 DRIVERS = ("ads1115", "ads1015", "ads1115@48")
@@ -115,7 +116,7 @@ class I2cVoltage:
             import smbus2  # type: ignore[import-not-found, unused-ignore]
         except ImportError as error:
             raise SensorError(
-                'source = "i2c" needs the module smbus2: pip install smbus2'
+                f'source = "i2c" needs the module smbus2: {install_command("vehicle")}'
             ) from error
         bus, address = self._where
         try:

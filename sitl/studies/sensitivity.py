@@ -27,6 +27,7 @@ from analysis.evaluation import Evaluation, evaluate
 from analysis.flight_record import Fidelity, FlightRecord
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError, VrsprayError
+from companion.wording import install_command
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.disturbances import (
     UNDISTURBED,
@@ -304,7 +305,7 @@ def write_plot(result: Result, path: Path) -> None:
         ConfigError: without matplotlib, or when the picture cannot be written.
     """
     if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError("no picture without matplotlib; pip install vrspray[plot]")
+        raise ConfigError(f"no picture without matplotlib; {install_command('office')}")
     from matplotlib import rc_context
 
     from sitl.demo_style import COLOURS, DPI, INK, STYLE, new_figure

@@ -17,6 +17,7 @@ import typer
 
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError, VrsprayError
+from companion.wording import install_command
 from sitl.studies.validation_flights import EVERY_WAY, SPEEDS_M_S, Validation, validate
 from sitl.studies.validation_page import COMMAND, summary_lines, write_page
 
@@ -86,7 +87,7 @@ def check_folder(folder: Path) -> None:
         ConfigError: without matplotlib, or where the folder cannot be made.
     """
     if importlib.util.find_spec("matplotlib") is None:
-        raise ConfigError("no pictures without matplotlib; pip install vrspray[plot]")
+        raise ConfigError(f"no pictures without matplotlib; {install_command('office')}")
     try:
         (folder / IMAGES).mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -262,7 +262,7 @@ def test_a_format_whose_module_is_missing_says_what_to_install(
 
     monkeypatch.setitem(sys.modules, "analysis.exports.mcap_file", None)
     assert execute(["export", str(journal), "--out", str(out / "f.mcap")]) == 2
-    assert "pip install vrspray[mcap]" in capsys.readouterr().err
+    assert "pip install 'vrspray[office]'" in capsys.readouterr().err
 
 
 def test_nothing_prescribed_is_nothing_and_not_zero(journal: Path, out: Path) -> None:

@@ -52,6 +52,7 @@ def of_folder(**facts: object) -> Computer:
     [
         (replace(GOOD, python=(3, 10, 9)), "system", Status.FAIL),
         (replace(GOOD, system="Darwin"), "system", Status.WARN),
+        (replace(GOOD, is_64_bit=False), "system", Status.WARN),
         (replace(GOOD, sqlite=(3, 21, 0)), "sqlite", Status.FAIL),
         (of_folder(problem="read-only"), "journal-folder", Status.FAIL),
         (of_folder(free_bytes=None), "journal-folder", Status.FAIL),

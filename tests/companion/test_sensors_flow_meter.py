@@ -236,7 +236,7 @@ def test_line_is_asked_for_with_the_clock_of_the_control_loop(
 @pytest.mark.parametrize(
     ("module", "words"),
     [
-        (None, "pip install 'vrspray[gpio]'"),
+        (None, "pip install 'vrspray[vehicle]'"),
         (fake_gpiod(FakeRequest([]), version="1.6.3"), "1.6.3 is too old"),
         (fake_gpiod(OSError(16, "Device or resource busy")), "flow_meter.line = 24"),
         (fake_gpiod(FileNotFoundError(2, "No such file")), "gpiochip0: [Errno 2]"),

@@ -266,7 +266,7 @@ def test_bus_without_a_converter_is_said_in_one_line(monkeypatch: pytest.MonkeyP
     with pytest.raises(SensorError, match="no ADS1115 at address 0x49 of /dev/i2c-1"):
         I2cVoltage(1, 0x49, 0).open()
     monkeypatch.setitem(sys.modules, "smbus2", None)
-    with pytest.raises(SensorError, match="pip install smbus2"):
+    with pytest.raises(SensorError, match=r"pip install 'vrspray\[vehicle\]'"):
         I2cVoltage(1, 0x49, 0).open()
 
 

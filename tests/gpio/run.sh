@@ -10,7 +10,7 @@ python=$root/.venv/bin/python
 
 skip() { echo "make test-gpio: skipped: $1"; exit 0; }
 
-"$python" -c 'import gpiod' 2>/dev/null || skip "the package gpiod is missing: pip install 'vrspray[gpio]'"
+"$python" -c 'import gpiod' 2>/dev/null || skip "the package gpiod is missing: pip install 'vrspray[vehicle]'"
 if [ "$(id -u)" = 0 ]; then
     modprobe gpio-sim 2>/dev/null || true
     mountpoint -q /sys/kernel/config || mount -t configfs configfs /sys/kernel/config 2>/dev/null || true

@@ -226,7 +226,7 @@ def test_without_pyarrow_the_extra_is_named(
 ) -> None:
     path = write(tmp_path / "rx.parquet")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    assert "vrspray[maps]" in refused("missing-library", path)
+    assert "vrspray[office]" in refused("missing-library", path)
 
 
 def test_the_refusal_of_a_caller_is_passed_on(tmp_path: Path) -> None:

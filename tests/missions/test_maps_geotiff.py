@@ -555,7 +555,7 @@ def test_without_rasterio_the_extra_is_named(
 ) -> None:
     path = write(tmp_path / "rx.tif")
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    assert "vrspray[maps]" in refused("missing-library", path)
+    assert "vrspray[office]" in refused("missing-library", path)
 
 
 # --- DJI's package ---

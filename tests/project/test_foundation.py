@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-LOCKS = ("build", "run", "plot", "dev", "docs")
+LOCKS = ("build", "vehicle", "office", "dev", "docs")
 EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
 needs_make = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 
@@ -51,11 +51,13 @@ def is_pinned(requirement: Requirement, lock: str) -> bool:
 @pytest.mark.parametrize(
     ("lock", "extra"),
     [
-        ("run", None),
-        ("plot", None),
-        ("plot", "plot"),
+        ("vehicle", None),
+        ("vehicle", "vehicle"),
+        ("office", None),
+        ("office", "office"),
         ("dev", None),
         ("dev", "dev"),
+        ("dev", "all"),
         ("docs", "docs"),
     ],
 )
@@ -91,9 +93,18 @@ def test_lock_file_names_no_package_index(lock: str) -> None:
     assert not re.search(r"^\s*-(-index|-extra|-find|i\b|f\b)", text, re.MULTILINE)
 
 
-@pytest.mark.parametrize(("small", "large"), [("run", "plot"), ("plot", "dev")])
+@pytest.mark.parametrize(("small", "large"), [("vehicle", "dev"), ("office", "dev")])
 def test_the_same_versions_fly_that_were_tested(small: str, large: str) -> None:
     assert {str(one) for one in pins(small)} <= {str(one) for one in pins(large)}
+
+
+def test_a_vehicle_gets_nothing_heavy_and_earlier_names_of_extras_still_install() -> None:
+    heavy = {"matplotlib", "scipy", "pillow", "rasterio", "pyarrow", "mavsdk", "jinja2"}
+    assert {pin.name for pin in pins("vehicle")} & heavy == set()
+    assert heavy <= {pin.name for pin in pins("office")}
+    assert [one.name for one in wanted("plot")] == ["matplotlib"]
+    assert [one.name for one in wanted("mavsdk")] == ["mavsdk"]
+    assert {one.name for one in wanted("all")} >= heavy | {"gpiod", "smbus2"}
 
 
 # ------------------------------------------------------------------------------------- documents
@@ -247,7 +258,13 @@ def test_ci_runs_lint_and_tests() -> None:
     assert os.access(script, os.X_OK)
     text = script.read_text()
     # What it does with them: test_ci_run.py.
-    for step in ("--keep-going lint", "test-computing", "test-flights", "test-firmware"):
+    for step in (
+        "--keep-going lint",
+        "test-computing",
+        "test-flights",
+        "test-wheel",
+        "test-firmware",
+    ):
         assert f" on_oldest {step}" in text
 
 

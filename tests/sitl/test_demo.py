@@ -316,7 +316,7 @@ def test_without_matplotlib_there_is_all_but_the_pictures(
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.splitlines() == [
-        "no pictures: matplotlib is missing; pip install vrspray[plot]",
-        "no report of the flight: pip install vrspray[report]",
+        "no pictures: matplotlib is missing; pip install 'vrspray[office]'",
+        "no report of the flight: jinja2 or matplotlib is missing; pip install 'vrspray[office]'",
     ]
     assert "scheduled" in (tmp_path / "report.html").read_text()

@@ -16,6 +16,7 @@ from typing import Any
 from pyproj import CRS
 
 from companion.errors import MapError
+from companion.wording import install_command
 from missions.maps.adapt.catalogue import Operation, Variable, described_beside
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.crs import WGS84, parse_crs
@@ -232,7 +233,7 @@ def read_table(content: bytes, path: Path, *, geometry_of: Callable[[bytes | Non
         raise map_error(
             path,
             "reading GeoParquet takes the library pyarrow, which is not installed",
-            fix="install it with: pip install 'vrspray[maps]'",
+            fix=f"install it with: {install_command('office')}",
             code="missing-library",
         ) from None
     broken = (

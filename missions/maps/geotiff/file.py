@@ -18,6 +18,7 @@ from typing import Any
 from pyproj import CRS
 
 from companion.errors import MapError
+from companion.wording import install_command
 from missions.maps.crs import parse_crs
 from missions.maps.geotiff.bands import RawBand, ReadBand, read_band
 from missions.maps.model import Affine, map_error
@@ -65,7 +66,7 @@ def gdal(path: Path) -> Any:
         raise map_error(
             path,
             "reading and writing GeoTIFF takes the library rasterio, which is not installed",
-            fix="install it with: pip install 'vrspray[maps]'",
+            fix=f"install it with: {install_command('office')}",
             code="missing-library",
         ) from None
     return rasterio

@@ -17,6 +17,7 @@ import shapely
 from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
+from companion.wording import install_command
 from missions.maps.build import frame_for
 from missions.maps.cells import bounds_deg
 from missions.maps.local import project_all
@@ -78,7 +79,7 @@ def draw(map_file: MapFile, out: Path, *, title: str) -> Totals:
         raise map_error(
             out,
             "no picture without matplotlib",
-            fix="install it with: pip install 'vrspray[plot]'",
+            fix=f"install it with: {install_command('office')}",
             code="missing-library",
         )
     if not map_file.zones and map_file.cells is None:
