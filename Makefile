@@ -20,7 +20,7 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware test-wheel wheel docs reference lock clean bench-missions
+.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware test-image test-wheel wheel docs reference lock clean bench-missions
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z -]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -101,6 +101,10 @@ wheel: $(INSTALLED) ## the wheel, in dist
 
 test-wheel: wheel ## the wheel in an empty environment and an empty folder (ARGS=office for reports too)
 	@tests/try_wheel.sh $(BIN)/python dist/vrspray-*.whl $(ARGS)
+
+test-image: $(INSTALLED) ## the steps of the Dockerfile, without a container engine (ARGS=office for that role)
+	$(BIN)/python -m tests.try_image $(ARGS)
+	@! command -v hadolint >/dev/null || hadolint Dockerfile
 
 docs: $(INSTALLED) $(BIN)/mkdocs ## the documentation site, in site/; a broken link fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -28,7 +28,7 @@ ABOUT = {
     "pump-sections": "one pump, six on-off sections, a return valve",
     "atomiser": "two rotary atomisers fed by one pump",
     "profiles": "wirings of valves on this computer's own lines",
-    DEPLOY: "for the vehicle: ArduPilot's watchdog script, a systemd unit",
+    DEPLOY: "for the vehicle: ArduPilot's watchdog script, a systemd unit, containers",
 }
 # Of a file in another example: `file = "../anyang/prescription.shp"`.
 _BESIDE = re.compile(r'"\.\./([\w-]+)/')

@@ -252,10 +252,14 @@ run = typer.main.get_command(app)
 
 # Tells systemd that the control loop makes its steps; without systemd it does nothing.
 #
-# The protocol is a datagram of `KEY=VALUE` lines to the socket in NOTIFY_SOCKET (sd_notify(3)).
+# The protocol is a datagram of `KEY=VALUE` lines to the socket in NOTIFY_SOCKET (sd_notify(3)). In
+# a container, where there is no systemd, the same steps touch the file in VRSPRAY_ALIVE_FILE, whose
+# age the image's health check looks at.
 
 # A journal takes up to 30 s to close; the valves are closed by then, and no step follows.
 CLOSING_MAX_S = 35.0
+# The file of a container is touched half as often as this says.
+ALIVE_S = 2.0
 
 
 class Notifier:
@@ -282,8 +286,9 @@ class Notifier:
         address = environment.pop("NOTIFY_SOCKET", "")
         watchdog_us = environment.pop("WATCHDOG_USEC", "")
         meant = environment.pop("WATCHDOG_PID", str(pid))
+        alive = environment.pop("VRSPRAY_ALIVE_FILE", "")
         if not address.startswith(("/", "@")):
-            return cls()
+            return cls(_toucher(Path(alive)), watchdog_s=ALIVE_S) if alive else cls()
         is_watched = watchdog_us.isdecimal() and int(watchdog_us) > 0 and meant == str(pid)
         return cls(
             _sender(address.replace("@", "\0", 1) if address[0] == "@" else address),
@@ -310,6 +315,14 @@ class Notifier:
         """Take that the loop has ended and all is closed: the journal may take its time."""
         if self._send is not None:
             self._send(f"STOPPING=1\nWATCHDOG_USEC={round(CLOSING_MAX_S * 1e6)}".encode())
+
+
+def _toucher(file: Path) -> Callable[[bytes], None]:
+    def send(_: bytes) -> None:
+        with suppress(OSError):
+            file.touch()
+
+    return send
 
 
 def _sender(address: str) -> Callable[[bytes], None]:

@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -89,6 +90,27 @@ def test_an_abstract_socket_is_found() -> None:
         given = {"NOTIFY_SOCKET": f"@vrspray-test-{os.getpid()}"}
         Notifier.from_environment(given, pid=7).stepped()
         assert channel.recv(100) == b"READY=1\nWATCHDOG=1"
+
+
+def test_without_systemd_the_steps_touch_the_file_of_a_container(tmp_path: Path) -> None:
+    alive = tmp_path / "alive"
+    environment = {"VRSPRAY_ALIVE_FILE": str(alive)}
+    notifier = Notifier.from_environment(environment, pid=7)
+    assert environment == {}
+    assert not alive.exists()
+    notifier.stepped()
+    assert alive.exists()
+    os.utime(alive, (0.0, 0.0))
+    notifier.stepped()
+    assert alive.stat().st_mtime == 0.0  # once a second at most
+    notifier._clock = lambda: time.monotonic() + 1.1
+    notifier.stepped()
+    assert alive.stat().st_mtime > 0.0
+
+
+def test_a_file_that_cannot_be_touched_harms_nobody(tmp_path: Path) -> None:
+    given = {"VRSPRAY_ALIVE_FILE": str(tmp_path / "gone" / "alive")}
+    Notifier.from_environment(given, pid=7).stepped()
 
 
 @pytest.mark.parametrize("address", ["", "relative", "/nowhere/notify"])

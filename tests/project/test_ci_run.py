@@ -126,4 +126,4 @@ def test_whatever_fails_fails_the_run_and_the_rest_goes_on(
     result = computer.run()
     assert result.returncode == 1
     assert result.stderr == f"FAILED: {name}\n"
-    assert len(computer.made()) == 9
+    assert len(computer.made()) == 10

@@ -15,6 +15,8 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+from tests.try_image import instructions, labels
+
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -268,15 +270,45 @@ def test_ci_runs_lint_and_tests() -> None:
         assert f" on_oldest {step}" in text
 
 
+IMAGE = (ROOT / "Dockerfile").read_text()
+
+
 def test_image_copies_only_what_exists_and_is_not_ignored() -> None:
-    lines = re.findall(
-        r"^COPY (?!--from)(.+) \S+$", (ROOT / "Dockerfile").read_text(), re.MULTILINE
-    )
-    copied = [name for line in lines for name in line.split()]
+    lines = [one.argument for one in instructions(IMAGE) if one.word == "COPY"]
+    copied = [name for line in lines if "--from" not in line for name in line.split()[:-1]]
     allowed = re.findall(r"^!(\S+)$", (ROOT / ".dockerignore").read_text(), re.MULTILINE)
-    assert {"companion", "examples"} <= set(copied)
+    assert {"companion", "examples", "deploy"} <= set(copied)
     assert [name for name in copied if not (ROOT / name).exists()] == []
     assert {name.split("/")[0] for name in copied} == set(allowed)
+
+
+def test_image_says_what_it_is_and_blueos_can_read_it() -> None:
+    said = labels(IMAGE)
+    newest = PROJECT["project"]["version"]
+    assert said["version"] == said["org.opencontainers.image.version"] == newest
+    for name in ("authors", "company", "links", "permissions", "tags"):
+        json.loads(said[name])
+    assert json.loads(said["permissions"])["HostConfig"]["Binds"] == [
+        "/usr/blueos/extensions/vrspray:/data"
+    ]
+
+
+def test_image_can_be_had_for_each_role_and_is_watched() -> None:
+    words = [one.word for one in instructions(IMAGE)]
+    assert {"HEALTHCHECK", "STOPSIGNAL", "USER", "VOLUME"} <= set(words)
+    for role in ("vehicle", "office"):
+        assert f"requirements/{role}.txt" in IMAGE
+    alive = [one for one in instructions(IMAGE) if "VRSPRAY_ALIVE_FILE" in one.argument]
+    assert [one.word for one in alive] == ["ENV", "HEALTHCHECK"]
+
+
+def test_compose_file_names_commands_that_there_are() -> None:
+    text = (ROOT / "deploy/compose.yaml").read_text()
+    config = re.search(r"--config=(\S+)", text)
+    assert config is not None
+    assert (ROOT / config[1]).exists()
+    given = re.findall(r"--set=(\S+?)=", text)
+    assert given == ["link.url", "journal.folder"]
 
 
 # ------------------------------------------------------------------------------- nothing is left
