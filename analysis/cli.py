@@ -105,6 +105,8 @@ def _notes(result: ReplayResult) -> list[str]:
     notes = []
     if result.training not in (None, "no"):
         notes.append(f"training: {result.training}")
+    if result.simulated == "yes":
+        notes.append("simulated: nothing was flown")
     if result.first_difference:
         notes.append(f"first difference: {result.first_difference}")
     if result.differences and result.elsewhere and not result.is_what_if:

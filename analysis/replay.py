@@ -51,6 +51,7 @@ from companion.record.new_file import computing
 from companion.record.reader import opened
 from companion.record.valve_rows import Row, ValveRows
 from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
+from companion.simulated import Word
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
@@ -337,6 +338,7 @@ class ReplayResult:
     is_closed: bool
     is_what_if: bool
     training: str | None = None
+    simulated: Word = "unknown"
     recorded: Sprayed | None = None
     what_if: Sprayed | None = None
     moved_m: Moved | None = None
@@ -395,6 +397,7 @@ def replay(
         is_closed=content.is_closed,
         is_what_if=bool(overrides),
         training=content.training,
+        simulated=content.simulated.word,
         recorded=None if what_if is None else what_if.recorded,
         what_if=None if what_if is None else what_if.what_if,
         moved_m=None if what_if is None else what_if.moved_m,

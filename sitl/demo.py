@@ -25,6 +25,7 @@ from companion.core.nozzle import flow_for_rate
 from companion.core.setup import Setup
 from companion.errors import ConfigError
 from companion.record.journal import Journal
+from companion.simulated import SIMULATED, Simulated
 from sitl.anyang import anyang_passes
 from sitl.demo_field import (
     MAP_SPEED_M_S,
@@ -381,7 +382,8 @@ def fly_one(job: Job) -> Flown:
             setup_text=text,
             started_s=START_S,
             waits=True,
-            training="simulated",
+            training=SIMULATED,
+            simulated=Simulated(word="yes", because="flown by vrspray demo"),
         ) as journal:
             result = _fly(job, setup, profile, journal)
     # P1's controller closes valves where it changes its nozzle set: one strip, as P1 judged it.

@@ -12,6 +12,7 @@ import numpy as np
 from companion.core.types import Decision
 from companion.errors import ConfigError
 from companion.record.journal import Journal
+from companion.simulated import SIMULATED, Simulated
 from companion.wording import install_command
 from sitl.deposit import Deposit
 
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
     from sitl.fly import Flown
 
-# What was sprayed, as a journal says it: no flight goes on from there.
-SIMULATED = "simulated"
 RASTER_CELLS_MAX = 4_000_000
 MARGIN_M = 5.0
 
@@ -89,6 +88,7 @@ def write_journal(flown: Flown, folder: Path) -> Path:
         started_s=float(flown.trajectory.time_s[0]),
         waits=True,
         training=SIMULATED,
+        simulated=Simulated(word="yes", because="flown by vrspray sitl fly"),
     ) as journal:
         for item in flown.trace:
             if isinstance(item, Decision):

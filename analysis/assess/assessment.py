@@ -160,6 +160,8 @@ class Assessment:
             "is_closed": flight.is_closed,
             "lost": flight.lost,
             "training": flight.training,
+            "simulated": flight.simulated.word,
+            "simulated_because": flight.simulated.because,
             "source": self.source,
             "utc_source": flight.utc_source,
             **self.evaluation.as_json(),

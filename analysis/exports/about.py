@@ -20,18 +20,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 UNKNOWN = "unknown"
+# Of a journal that is older than the mark; its exports stay as they were but for this.
+UNMARKED = "unknown: an old journal"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class About:
     """The facts of a flight that stand in its exports; `training` is `unknown` if nobody said.
 
+    `simulated` is yes, no, or unknown.
     `operator`, `product` and `field_name` are what was asked for before the flight; None without.
     """
 
     flight: str
     journal: str
     training: str
+    simulated: str
     started_utc: str
     ended_utc: str
     utc_source: str
@@ -51,9 +55,18 @@ class About:
         return self.training not in ("no", UNKNOWN)
 
     @property
+    def mark(self) -> str:
+        """Return what stands in the column `training`: that a flight was simulated goes first."""
+        if self.simulated == "yes":
+            return "simulated"
+        unsure = ", not known whether simulated" if self.simulated == UNKNOWN else ""
+        return f"{self.training}{unsure}"
+
+    @property
     def title(self) -> str:
-        """Return the name of the flight, with the mark of a training."""
-        return f"{self.flight} (training: {self.training})" if self.is_training else self.flight
+        """Return the name of the flight, with the marks of a simulation and of a training."""
+        mark = f" (training: {self.training})" if self.is_training else ""
+        return f"{'SIMULATED ' if self.simulated == 'yes' else ''}{self.flight}{mark}"
 
     def as_json(self) -> dict[str, object]:
         """Return all facts by their names."""
@@ -76,6 +89,7 @@ def about(flight: AppliedFlight) -> About:
         flight=meta.get("flight_id") or flight.path.stem,
         journal=flight.path.name,
         training=flight.training or UNKNOWN,
+        simulated=UNMARKED if flight.simulated.is_unmarked else flight.simulated.word,
         started_utc=utc_text(flight.time_s[:1] + flight.utc_offset_s)[0],
         ended_utc=utc_text(flight.time_s[-1:] + flight.utc_offset_s)[0],
         utc_source=flight.utc_source,

@@ -176,6 +176,7 @@ def _warnings(flight: AppliedFlight) -> list[str]:
 def _sentence(result: dict[str, object]) -> str:
     rows = {"points": "points", "swaths": "polygons", "steps": "rows"}[str(result["geometry"])]
     mark = "" if result["training"] in ("no", "unknown") else f", training: {result['training']}"
+    mark += ", SIMULATED" if result["simulated"] == "yes" else ""
     return (
         f"{result['out']}: {result['rows']} {rows}, {result['volume_l']:.3f} L, "
         f"{result['bytes']} bytes{mark}"

@@ -243,7 +243,12 @@ def _facts(about: About, count: int) -> list[Column]:
         text_column(name, short, description, [value] * count)
         for name, short, description, value in (
             ("flight", "Flight", "name of the record", about.flight),
-            ("training", "Training", "water, dry, no (a product) or unknown", about.training),
+            (
+                "training",
+                "Training",
+                "water, dry, simulated, no (a product) or unknown",
+                about.mark,
+            ),
             ("utc_source", "UtcSource", "whose clock", about.utc_source),
             ("map", "MapHash", "begin of the map's SHA-256", about.map_sha256[:_HASH_DIGITS]),
         )

@@ -227,12 +227,19 @@ def _adapt_json(source: Source, fields: Sequence[_Field], table: str) -> bytes:
     return json.dumps(document, indent=2, allow_nan=False).encode() + b"\n"
 
 
+def _product_name(source: Source) -> str:
+    about = source.about
+    if about.simulated == "yes":
+        return "SIMULATED: nothing was applied"
+    return "Water" if about.training == "water" else about.product or "Not stated"
+
+
 def _product(source: Source) -> dict[str, object]:
     about = source.about
     is_water = about.training == "water"
     return {
         "id": {"referenceId": _PRODUCT},
-        "name": "Water" if is_water else about.product or "Not stated",
+        "name": _product_name(source),
         "productTypeCode": "WATER" if is_water else "NOT_SPECIFIED",
         "productFormCode": "LIQUID",
         "productStatusCode": "ACTIVE",

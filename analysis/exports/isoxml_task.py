@@ -243,6 +243,8 @@ def _totals(samples: Samples) -> dict[int, int]:
 
 def _product(source: Source) -> str:
     about = source.about
+    if about.simulated == "yes":
+        return "SIMULATED: nothing was applied"
     if about.is_training:
         return f"training: {about.training}"
     return about.product or "not stated"
@@ -254,6 +256,7 @@ def _comments(source: Source) -> list[str]:
     lines = [
         f"flight: {about.flight}",
         f"training: {about.training}",
+        f"simulated: {about.simulated}",
         f"clock: {about.utc_source}, times are UTC",
         f"map: {about.map_sha256[:_HASH_DIGITS]}",
     ]

@@ -112,7 +112,7 @@ def _metadata(source: Source, columns: Sequence[Column]) -> bytes:
         "FarmName": "",
         "FieldName": about.field_name or "",
         "Operation": "Application",
-        "Product": about.product or "",
+        "Product": "SIMULATED" if about.simulated == "yes" else about.product or "",
         "DataAttributes": [
             {
                 "Name": each.short,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from analysis.flight_record import Spans
 from companion.core.setup import Setup
 from companion.record.writer import Event
+from companion.simulated import Simulated, simulated_in
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -88,6 +89,11 @@ class AppliedFlight:
     def training(self) -> str | None:
         """What of this flight was no spraying of a product: `water`, `dry`, `no`; None: unknown."""
         return self.meta.get("training")
+
+    @property
+    def simulated(self) -> Simulated:
+        """Whether the flight was simulated, and what told."""
+        return simulated_in(self.meta)
 
     @property
     def duration_s(self) -> float:

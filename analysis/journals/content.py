@@ -20,6 +20,7 @@ from companion.record.reader import OpenJournal, damaged_pages, opened
 from companion.record.setup_json import field_names_of
 from companion.record.totals import missing_rows
 from companion.record.writer import Event
+from companion.simulated import Simulated, simulated_in
 
 _BLOCKS = (
     "SELECT first_sequence, from_s, until_s, dictionary, body, decisions FROM blocks "
@@ -53,6 +54,11 @@ class JournalContent:
     def training(self) -> str | None:
         """What of this flight was no spraying of a product: `water`, `dry`, `no`; None: unknown."""
         return self.meta.get("training")
+
+    @property
+    def simulated(self) -> Simulated:
+        """Whether the flight was simulated, and what told."""
+        return simulated_in(self.meta)
 
     def value(self, entry: Entry) -> Input | Decision:
         """Return the input or the decision itself, exact to the last bit."""

@@ -319,6 +319,7 @@ def record_csv(record: LegalRecord) -> bytes:
     row: dict[str, object] = {
         "profile": record.profile,
         "complete": "yes" if record.is_complete else "no",
+        "simulated": record.simulated.word,
         "missing": "; ".join(record.missing),
     }
     for entry in record.entries:

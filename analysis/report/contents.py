@@ -17,6 +17,7 @@ from analysis.published import P1_RESULTS
 from analysis.report.facts import wind_note
 from analysis.report.treated import duration_text
 from companion.core.types import Inhibit
+from companion.simulated import SIMULATED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -150,6 +151,9 @@ def _flight(
         "is_closed": flight.is_closed,
         "lost": flight.lost,
         "training": flight.training,
+        "simulated": flight.simulated.word,
+        "simulated_because": flight.simulated.because,
+        "simulated_label": flight.simulated.label,
         "started": clock.text(float(flight.time_s[0])) if has_samples else None,
         "ended": clock.text(float(flight.time_s[-1])) if has_samples else None,
         "spraying_from": clock.text(treated.first_s),
@@ -277,7 +281,9 @@ def verdict_of(
         "worst_lag_distance_m": evaluation.lag_distance_m.max_abs,
         "outside_ml": evaluation.off_target_ml,
     }
-    sentence = _sentence(figures, assessment.flight.training)
+    flight = assessment.flight
+    training = SIMULATED if flight.simulated.is_simulated else flight.training
+    sentence = _sentence(figures, training)
     return {"sentence": sentence if is_whole else f"By what could be read: {sentence}", **figures}
 
 
@@ -286,7 +292,7 @@ def _sentence(figures: Mapping[str, Any], training: str | None) -> str:
     what = {
         "water": "L of water applied",
         "dry": "L would have been applied",
-        "simulated": "L applied in a simulation",
+        SIMULATED: "L applied in a simulation",
     }
     done = what.get(training or "", "L applied")
     parts = [f"{applied_l:.2f} {done} on {figures['area_ha']:.2f} ha"]
@@ -315,6 +321,7 @@ def warnings_of(
 ) -> list[Caution]:
     """Return what must be known, the gravest first."""
     found = [
+        *_simulated(flight),
         *_training(flight),
         *_journal(flight, clock),
         *(_warning("unread", f"Of the journal could not be read: {each}.") for each in unread),
@@ -341,13 +348,24 @@ def _note(code: str, text: str) -> Caution:
     return Caution(severity="note", code=code, text=text)
 
 
+def _simulated(flight: AppliedFlight) -> Iterator[Caution]:
+    simulated = flight.simulated
+    if simulated.is_simulated:
+        yield _mark(
+            "simulated",
+            f"SIMULATED FLIGHT: nothing was flown, nothing was applied ({simulated.because})",
+        )
+    elif simulated.is_unmarked:
+        yield _note("simulated-unknown", f"Not known whether simulated: {simulated.because}.")
+    elif not simulated.is_known:
+        yield _warning("simulated-unknown", f"Not known whether simulated: {simulated.because}.")
+
+
 def _training(flight: AppliedFlight) -> Iterator[Caution]:
     if flight.training == "water":
         yield _mark("training", "TRAINING WITH WATER: no product was applied")
     elif flight.training == "dry":
         yield _mark("training", "DRY RUN: no valve was opened, nothing was applied")
-    elif flight.training == "simulated":
-        yield _mark("training", "SIMULATION: nothing was flown, nothing was applied")
     elif flight.training is None:
         yield _note(
             "training-unknown",

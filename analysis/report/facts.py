@@ -57,6 +57,7 @@ def facts_of(
         wind_m_s=_wind(flight, treated),
         wind_note=wind_note(flight),
         training=flight.training,
+        simulated=flight.simulated,
         is_closed=flight.is_closed,
         lost_rows=flight.lost + unread,
         ends_spraying=ends_spraying(flight, treated),

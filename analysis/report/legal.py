@@ -9,13 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from analysis.report.legal_fields import FIELDS, LABELS, Facts, label_of
+from analysis.report.legal_fields import FIELDS, LABELS, REAL_FLIGHT, Facts, label_of
 from companion.config.application_table import ASKED, Profile, is_told, missing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from analysis.report.legal_fields import Told
+    from companion.simulated import Simulated
 
 LAWS: dict[Profile, str] = {
     "eu": "Commission Implementing Regulation (EU) 2023/564, with Article 67(1) of Regulation (EC) "
@@ -57,6 +58,7 @@ class LegalRecord:
     entries: tuple[Entry, ...]
     why_not: tuple[str, ...]
     remarks: tuple[str, ...]
+    simulated: Simulated
     treated_area: dict[str, Any]
 
     @property
@@ -81,6 +83,8 @@ class LegalRecord:
             "law": LAWS[self.profile],
             "retention": KEEP[self.profile],
             "complete": self.is_complete,
+            "simulated": self.simulated.word,
+            "simulated_because": self.simulated.because,
             "missing": list(self.missing),
             "added_after_flight": list(self.added_after_flight),
             "fields": {
@@ -110,6 +114,7 @@ def legal_record(profile: Profile, told: Told, facts: Facts) -> LegalRecord:
         entries=entries,
         why_not=tuple(_why_not(profile, told, facts)),
         remarks=tuple(_remarks(told, facts)),
+        simulated=facts.simulated,
         treated_area=facts.treated_area,
     )
 
@@ -171,6 +176,7 @@ def _why_not(profile: Profile, told: Told, facts: Facts) -> Iterator[str]:
     skills_date = told.values.get("application.pilot_skills_date")
     if profile == "us" and skills_date and facts.date and str(skills_date) > facts.date:
         yield f"pilot_skills_date: {skills_date} is after the flight"
+    yield from _why_not_real(told, facts)
     if facts.training in ("water", "dry", "simulated"):
         what = "a simulation" if facts.training == "simulated" else f"training ({facts.training})"
         yield f"a product: this was {what}"
@@ -187,6 +193,21 @@ def _why_not(profile: Profile, told: Told, facts: Facts) -> Iterator[str]:
         yield f"{facts.lost_rows} lost or unreadable rows of the journal"
 
 
+def _why_not_real(told: Told, facts: Facts) -> Iterator[str]:
+    """Yield that nothing was flown, or that nobody knows; the operator may vouch for the latter.
+
+    Only after the flight: a configuration that says so would vouch for every simulation too.
+    """
+    simulated = facts.simulated
+    if simulated.is_simulated:
+        yield f"a real flight: this one was SIMULATED ({simulated.because})"
+    elif not (simulated.is_known or simulated.is_unmarked or REAL_FLIGHT in told.after):
+        yield (
+            f"whether the flight was real: not known whether simulated ({simulated.because}); "
+            f"if it was flown, say so with --set {REAL_FLIGHT}=yes"
+        )
+
+
 def _remarks(told: Told, facts: Facts) -> Iterator[str]:
     if facts.has_area:
         yield f"quantities are by the {facts.volume_by}"
@@ -198,6 +219,10 @@ def _remarks(told: Told, facts: Facts) -> Iterator[str]:
         yield "the journal was cut; up to its last second may be missing"
     if facts.wind_note:
         yield facts.wind_note
+    if facts.simulated.is_simulated:
+        yield f"SIMULATED: {facts.simulated.because}"
+    elif not facts.simulated.is_known:
+        yield f"not known whether simulated: {facts.simulated.because}"
     if facts.training is None:
         yield "whether product or water was sprayed is not in the journal"
     if is_told(told.values.get("application.remarks")):

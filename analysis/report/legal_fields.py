@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from companion.config.application_table import Profile, check, is_number, is_told, known
 from companion.errors import ConfigError
+from companion.simulated import Simulated
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 # flight and which are not.
 
 TABLES = ("application", "product")
+# Counts only after the flight: in a configuration it would vouch for every simulation too.
+REAL_FLIGHT = "application.real_flight"
 SIZE_MAX_BYTES = 1_000_000
 
 
@@ -48,7 +51,11 @@ def told_in(meta: Mapping[str, str]) -> dict[str, Any]:
         return {}
     if not isinstance(found, dict):
         return {}
-    return {key: value for key, value in found.items() if is_told(value) and _is_entry(key, value)}
+    return {
+        key: value
+        for key, value in found.items()
+        if key != REAL_FLIGHT and is_told(value) and _is_entry(key, value)
+    }
 
 
 def _is_entry(key: str, value: Any) -> bool:
@@ -161,6 +168,7 @@ class Facts:
     wind_m_s: float | None
     wind_note: str
     training: str | None
+    simulated: Simulated
     is_closed: bool
     lost_rows: int
     ends_spraying: bool
@@ -354,6 +362,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "product.name": ("Product", ""),
     "product.registration": ("Authorisation or registration number", ""),
     "product.droplet_class": ("Droplet class", ""),
+    "application.real_flight": ("A real flight, as the operator says", ""),
 }
 
 

@@ -190,6 +190,8 @@ def _ties(
 
     if flight.training not in (None, "no"):
         notes.append(f"{flight.path.name}: training: {flight.training}")
+    if flight.simulated.label:
+        notes.append(f"{flight.path.name}: {flight.simulated.label}")
     return tie(flight, cards, by_number), notes
 
 

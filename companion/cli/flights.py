@@ -168,6 +168,7 @@ def as_object(flight: Flight) -> dict[str, Any]:
         "size_bytes": flight.size_bytes,
         "pinned": flight.is_pinned,
         "training": flight.training,
+        "simulated": None if flight.simulated is None else flight.simulated.word,
         "problem": flight.problem,
     }
 
@@ -189,6 +190,8 @@ def line_of(flight: Flight) -> str:
         parts.append("pinned")
     if flight.training not in (None, "no"):
         parts.append(f"training: {flight.training}")
+    if flight.simulated is not None and flight.simulated.label and not flight.simulated.is_unmarked:
+        parts.append(flight.simulated.label)
     if flight.problem is not None:
         parts.append(flight.problem)
     return ", ".join(parts)

@@ -79,11 +79,13 @@ def run_companion(
     refuse_mismatch(config)
     flight_map = flight_map_of(config, given)
     setup = build_setup(config, flight_map)
+    simulated: list[str] = []
     if continue_from:
-        from companion.record.continuing import continued
+        from companion.record.continuing import continued, simulated_lines
 
+        simulated = simulated_lines(continue_from)
         setup = continued(setup, continue_from, training=training, takes_unmarked=takes_unmarked)
-    for line in _continued_lines(setup):
+    for line in (*_continued_lines(setup), *simulated):
         note(line)
     link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
@@ -160,7 +162,7 @@ def _left_lines(folder: Path, setup: Setup, training: str) -> list[str]:
     if left is None:
         return []
     return [
-        f"note: {left.path.name} left {left.left_ha:.2f} ha of this map "
+        f"note: {left.path.name}{left.mark} left {left.left_ha:.2f} ha of this map "
         f"({100.0 * left.left_share:.0f} %); to spray only what is left: "
         f"vrspray run ... --continue {left.path}"
     ]

@@ -128,6 +128,10 @@ class ApplicationTable(Table):
         pattern=_MOMENT,
         description="only where no clock was right: start of spraying, 2026-05-01T06:30:00+02:00",
     )
+    real_flight: Literal["yes"] | None = Field(
+        default=None,
+        description="only after the flight, where nothing told whether it was simulated: yes",
+    )
     remarks: Text | None = Field(default=None, description="for the record")
 
 

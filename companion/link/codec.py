@@ -45,6 +45,7 @@ __all__ = ["AUTOPILOT_COMPONENT", "Codec", "Vehicle"]
 
 
 _HEARTBEAT = 0
+_HIL_ENABLED = 32  # MAV_MODE_FLAG_HIL_ENABLED
 _SENDERS_MAX = 64
 # So many frames in a row that seem overtaken, and their sender has begun to count anew.
 _ANEW = 32
@@ -92,6 +93,8 @@ class Codec:
         self.named_frame_count = 0
         self.vehicle_frame_count = 0
         self.byte_count = 0
+        # Whether the vehicle's last heartbeat spoke of hardware in the loop of a simulation.
+        self.is_hil = False
 
     @property
     def vehicle(self) -> Vehicle | None:
@@ -166,6 +169,8 @@ class Codec:
             self.ignored_count += 1
             return None
         self.vehicle_counts[message_id] = self.vehicle_counts.get(message_id, 0) + 1
+        if message_id == _HEARTBEAT:
+            self.is_hil = bool(raw.base_mode & _HIL_ENABLED)
         decoder = FROM_VEHICLE.get(message_id)
         return None if decoder is None else decoder(raw, received_s)
 

@@ -52,7 +52,9 @@ from companion.link.mission_reader import MissionReader
 from companion.link.outputs import ORDERS, Outputs
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent, Service
+from companion.link.simulation import SimulationWatch
 from companion.link.streams import Meter, Stream, StreamRequest, StreamSupervisor, wanted_streams
+from companion.simulated import SIMULATED
 
 if TYPE_CHECKING:
     from companion.link.signing import Signing
@@ -125,6 +127,7 @@ class Component:
             is_needed=options.need_mission,
         )
         self._wind = WindWatch()
+        self.simulation = SimulationWatch()
         self._flies_mission = False
         self._supervisor: StreamSupervisor | None = None
         self.streams: tuple[Stream, ...] = ()
@@ -230,6 +233,7 @@ class Component:
         self._service.tick(now_s)
         self.outputs.tick(now_s)
         self._mission.tick(now_s, is_armed=self._desk.is_armed, flies_mission=self._flies_mission)
+        self._ask_what_it_is(now_s)
         if self._supervisor is None:
             return
         for request in self._supervisor.due(self.codec.vehicle_counts, now_s):
@@ -251,6 +255,16 @@ class Component:
 
     # ------------------------------------------------------------------------------- inside
 
+    def _ask_what_it_is(self, now_s: float) -> None:
+        """Ask whether the vehicle is simulated, and have it in the record when that is known."""
+        is_armed = self._desk.is_armed
+        name = None if is_armed else self.simulation.next_name(now_s)
+        if name is not None:
+            self._send(self._encoder.param_request_read(name))
+        found = self.simulation.news(self.codec.vehicle_counts, is_armed=is_armed)
+        if found is not None:
+            self._service.tell_event(now_s, SIMULATED, found.text)
+
     def _send(self, frame: bytes) -> bool:
         has_left = self._transport_send(frame)
         self.meter.sent(len(frame), has_left=has_left)
@@ -263,6 +277,7 @@ class Component:
             return
         self._encoder.system_id = vehicle.system_id
         self.outputs.meet(vehicle)
+        self.simulation.meet(vehicle)
         self._mission.meet(vehicle.system_id, is_streamed=not vehicle.is_px4)
         self.met_s, self.is_answered = now_s, False
         self.mission_active = None
@@ -293,6 +308,7 @@ class Component:
             self._desk.is_armed = item.armed
             self._flies_mission = item.mode in MISSION_MODES
             self.outputs.armed(item.armed)
+            self.simulation.heartbeat(is_hil=self.codec.is_hil)
         if isinstance(item, Telemetry):
             self._watch_boot(item)
         else:
@@ -322,6 +338,7 @@ class Component:
             self.outputs.report(message)
         elif isinstance(message, ParamValue):
             self.outputs.parameter(message)
+            self.simulation.parameter(message)
 
     def _take_ack(self, ack: AckReceived) -> None:
         # 0, 0 is an acknowledgement in the old form, which named nobody.

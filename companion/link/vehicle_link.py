@@ -25,6 +25,7 @@ from companion.link.transport import (
     Transport,
     parse_url,
 )
+from companion.simulated import SIMULATED
 
 if TYPE_CHECKING:
     from companion.link.signing import Signing
@@ -223,6 +224,8 @@ class VehicleLink:
         self._event(self._clock(), "link", text)
 
     def _event(self, at_s: float, kind: str, text: str) -> None:
+        if kind == SIMULATED:
+            _logger.info("simulated vehicle: %s", text)
         if self._on_event is not None:
             self._on_event(at_s, kind, text)
 

@@ -26,6 +26,7 @@ from companion.record.folder import journals
 from companion.record.geopackage import wkb_of
 from companion.record.read_only import DAMAGE, one_line
 from companion.record.reader import OpenJournal, opened
+from companion.simulated import UNMARKED, Simulated, simulated_in
 
 # Where nothing else is configured, whoever goes on closes a valve that is more over treated ground
 # than over bare: misses and doubles come out even.
@@ -47,6 +48,7 @@ class Treated:
     started_utc: str
     is_closed: bool
     training: str | None
+    simulated: Simulated = UNMARKED
     unread: tuple[str, ...] = ()
 
     @property
@@ -89,6 +91,7 @@ def treated_ground_of(journal: OpenJournal, unread: list[str] | None = None) -> 
         started_utc=journal.meta.get("started_utc", ""),
         is_closed=journal.meta.get("closed") == "yes",
         training=journal.meta.get("training"),
+        simulated=simulated_in(journal.meta),
         unread=tuple(unread or ()),
     )
 
@@ -170,6 +173,19 @@ def treated_by(
     return replace(whole, ahead_s=0.0)
 
 
+def simulated_lines(paths: Sequence[Path]) -> list[str]:
+    """Return which of the flights that another goes on from were no flights."""
+    found = []
+    for path in paths:
+        with opened(path) as journal:
+            if simulated_in(journal.meta).is_simulated:
+                found.append(
+                    f"WARNING: {path} was SIMULATED: its ground was never treated, and the valves "
+                    "close over it all the same; leave it out unless this is a simulation too"
+                )
+    return found
+
+
 def continued(
     setup: Setup, paths: Sequence[Path], *, training: str = "no", takes_unmarked: bool = False
 ) -> Setup:
@@ -198,6 +214,7 @@ class Unfinished:
     path: Path
     left_share: float
     left_ha: float
+    mark: str = ""
 
 
 def unfinished(folder: Path, setup: Setup, *, training: str = "no") -> Unfinished | None:
@@ -238,4 +255,9 @@ def _left(found: Treated) -> Unfinished | None:
     left_m2 = rest_of(field, found.coverage, found.strip_m).area
     if not left_m2 > LEFT_MIN_SHARE * field.area:
         return None
-    return Unfinished(path=found.path, left_share=left_m2 / field.area, left_ha=left_m2 / 10_000.0)
+    return Unfinished(
+        path=found.path,
+        left_share=left_m2 / field.area,
+        left_ha=left_m2 / 10_000.0,
+        mark=" (SIMULATED)" if found.simulated.is_simulated else "",
+    )

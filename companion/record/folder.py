@@ -14,6 +14,7 @@ from companion.record.read_only import DAMAGE, log_of, one_line
 from companion.record.reader import OpenJournal, opened
 from companion.record.totals import applied_l
 from companion.record.versions import OtherVersionError
+from companion.simulated import Simulated, simulated_in
 
 _NAME = re.compile(r"flight-\d+(\.salvaged)?\.gpkg")
 _STATES = {"yes": "closed", "no": "cut", "recovered": "recovered", "salvaged": "salvaged"}
@@ -40,6 +41,7 @@ class Flight:
     duration_s: float | None = None
     applied_l: float | None = None
     training: str | None = None
+    simulated: Simulated | None = None
     problem: str | None = None
 
     @property
@@ -118,6 +120,7 @@ def _flight(journal: OpenJournal, *, size_bytes: int, is_pinned: bool) -> Flight
         duration_s=duration_s,
         applied_l=litres,
         training=meta.get("training"),
+        simulated=simulated_in(meta),
         problem=f"{journal.path}: is damaged: {'; '.join(problems)}" if problems else None,
     )
 

@@ -27,6 +27,7 @@ from companion.ports import COMMIT_EVERY_S
 from companion.record.new_file import about, new_file, open_for_flight
 from companion.record.valve_rows import ValveOrder
 from companion.record.writer import Event, Item, LinkSample, Writer
+from companion.simulated import BECAUSE, NOT_ASKED, SIMULATED, Simulated
 
 if TYPE_CHECKING:
     from companion.core.options.coverage import Coverage
@@ -87,6 +88,7 @@ class Journal:
         queue_rows: int = QUEUE_ROWS,
         waits: bool = False,
         training: str | None = None,
+        simulated: Simulated = NOT_ASKED,
         free_min_bytes: int = 0,
         commit_every_s: float = COMMIT_EVERY_S,
     ) -> Journal:
@@ -104,10 +106,12 @@ class Journal:
             free_min_bytes: with less room on the disk the journal has a fault.
             commit_every_s: what a cut of power may lose.
             training: `no` for a product, else what it is: `water`, `dry`. None: nobody says.
+            simulated: what is known at the start; an event of that kind says it later.
         """
         now_s = time.monotonic() if started_s is None else started_s
         started = datetime.now(UTC)
         meta = {**(setup_text or {}), **about(setup, started, now_s)}
+        meta |= {SIMULATED: simulated.word, BECAUSE: simulated.because}
         if training is not None:
             meta["training"] = training
         try:

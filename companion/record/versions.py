@@ -23,7 +23,13 @@ _TABLES = {
 # Without these `meta` says too little of a flight.
 _NEEDED = frozenset({"closed", "lost", "setup", "started_s", "started_utc"})
 # Of a journal of another version, what its refusal says: the rest is for `flights show`.
-_SHOWN = {"started_utc": "begun", "closed": "closed", "training": "training", "method": "method"}
+_SHOWN = {
+    "started_utc": "begun",
+    "closed": "closed",
+    "training": "training",
+    "simulated": "simulated",
+    "method": "method",
+}
 
 
 class OtherVersionError(UnreadableError):

@@ -21,6 +21,7 @@ from companion.record.coverage_table import write_coverage
 from companion.record.layers import set_box
 from companion.record.totals import totals_of
 from companion.record.valve_rows import Row, ValveOrder, ValveRows
+from companion.simulated import BECAUSE, SIMULATED, Simulated, parsed
 
 if TYPE_CHECKING:
     from companion.core.options.coverage import Coverage
@@ -119,6 +120,7 @@ class Writer:
         self._clock = FlightClock(utc_offset_s)
         self._told_offset_s = utc_offset_s
         self._told_orders = False
+        self._simulated: Simulated | None = None
         self._applied = AppliedRows(frame, self._clock.text)
         self._block = Block()
         self.valves = ValveRows()
@@ -184,6 +186,7 @@ class Writer:
             # Once more: the second in which it was first told may be lost.
             if self.valves.from_orders:
                 execute(SET_META, _FROM_ORDERS)
+            self._keep_simulated()
             execute(SET_META, ("utc_source", self._clock.source))
             execute(SET_META, ("utc_offset_s", repr(self._clock.offset_s)))
             for fact in totals_of(self._connection).items():
@@ -250,6 +253,9 @@ class Writer:
         elif isinstance(item, Event):
             self._insert_event(sequence, item)
             self._pending += 1
+            if item.kind == SIMULATED:
+                self._simulated = parsed(item.text)
+                self._keep_simulated()
         elif isinstance(item, Decision):
             body = encode(item)
             row = self._applied.take(sequence, item)
@@ -275,6 +281,13 @@ class Writer:
     def _insert_event(self, sequence: int, event: Event) -> None:
         time = self._clock.text(event.at_s)
         self._connection.execute(_EVENT, (sequence, time, event.at_s, event.kind, event.text))
+
+    def _keep_simulated(self) -> None:
+        """Keep in `meta` whether the flight is simulated; at the end once more."""
+        if self._simulated is not None:
+            self._begin()
+            self._connection.execute(SET_META, (SIMULATED, self._simulated.word))
+            self._connection.execute(SET_META, (BECAUSE, self._simulated.because))
 
     def _take_time(self, report: UtcReport) -> None:
         """Keep the autopilot's time of day in `meta`; a jump is an event."""

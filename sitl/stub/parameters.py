@@ -45,6 +45,11 @@ def ardupilot_table() -> dict[str, tuple[float, int]]:
         "BRD_SAFETY_MASK": (0, INT32),
         "EK3_DRAG_BCOEF_X": (0, REAL32),
         "SERVO_32_ENABLE": (0, INT8),
+        # What ArduCopter's own simulation says of itself (measured, 4.7-dev): the stub announces
+        # in the same way that its sensors are simulated.
+        "INS_ACC_ID": (2_753_028, INT32),
+        "INS_GYR_ID": (2_752_772, INT32),
+        "SIM_SPEEDUP": (1, REAL32),
     }
     for number in range(1, OUTPUT_COUNT_MAX + 1):
         motor = number <= len(MOTOR_FUNCTIONS)

@@ -84,6 +84,11 @@ def px4_parameters() -> Parameters:
         "MPC_XY_CRUISE": (5, REAL32),
         "MPC_Z_V_AUTO_UP": (2.5, REAL32),
         "MPC_LAND_SPEED": (0.5, REAL32),
+        # What PX4's own simulation says of itself (measured, 1.16-alpha in SIH): the stub
+        # announces in the same way that its sensors are simulated.
+        "CAL_ACC0_ID": (1_310_988, INT32),
+        "CAL_GYRO0_ID": (1_310_988, INT32),
+        "SYS_HITL": (0, INT32),
     }
     for number in range(1, OUTPUT_COUNT + 1):
         table[f"PWM_MAIN_FUNC{number}"] = (_function(number), INT32)

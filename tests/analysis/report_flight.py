@@ -8,9 +8,11 @@ from pathlib import Path
 
 from analysis.replay import FlownCore
 from companion.record.journal import Journal
+from companion.simulated import Simulated
 from tests.analysis.test_replay import inputs_of
 from tests.builders import setup
 
+REAL = Simulated(word="no", because="INS_ACC_ID 3408394 is a real sensor")
 # All that the profile `eu` asks the operator for.
 EU_TOLD: dict[str, object] = {
     "application.profile": "eu",
@@ -32,6 +34,7 @@ def fly(
     steps: int = 260,
     told: dict[str, object] | None = None,
     training: str | None = "no",
+    simulated: Simulated = REAL,
     event: tuple[str, str] | None = None,
     enabled: bool = True,
 ) -> Path:
@@ -40,7 +43,13 @@ def fly(
     core = FlownCore(given)
     about = {} if told is None else {"application_json": json.dumps(told)}
     with Journal.create(
-        folder, setup=given, setup_text=about, started_s=100.0, waits=True, training=training
+        folder,
+        setup=given,
+        setup_text=about,
+        started_s=100.0,
+        waits=True,
+        training=training,
+        simulated=simulated,
     ) as journal:
         for number in range(steps):
             for item in inputs_of(number, given, chance):

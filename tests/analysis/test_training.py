@@ -152,7 +152,8 @@ def test_a_filling_that_the_sensor_refuses_is_denied_and_not_shown() -> None:
 def test_a_simulated_flight_is_marked_and_its_report_says_so(tmp_path: Path) -> None:
     path = report_flight.fly(tmp_path, training="simulated")
     flight = read_applied(path)
-    assert [each.code for each in contents._training(flight)] == ["training"]
+    assert [each.code for each in contents._simulated(flight)] == ["simulated"]
+    assert flight.simulated.is_simulated
 
 
 def test_run_refuses_widths_that_config_check_refuses(

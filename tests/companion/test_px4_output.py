@@ -380,7 +380,8 @@ def test_px4_gets_its_own_orders_and_is_asked_for_its_own_parameters() -> None:
     assert peer.component.outputs.flush()
     assert [m.command for m in peer.of("COMMAND_LONG") if m.command in (183, 187)] == [187]
     peer.component.tick(None, 1.1)
-    (asked,) = peer.of("PARAM_REQUEST_READ")
+    # One question of the outputs, and one whether the vehicle is simulated.
+    (asked, _) = peer.of("PARAM_REQUEST_READ")
     assert (asked.param_id, asked.param_index, asked.target_component) == (
         "PWM_MAIN_FUNC1",
         -1,

@@ -19,6 +19,10 @@ import pytest
 import shapely
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from analysis.report.build import ReportOptions, build_report
+from analysis.report.legal_fields import REAL_FLIGHT
+from companion.config.application_table import PROFILES
+from tests.analysis.report_flight import EU_TOLD
 from tests.firmware import firmware
 from tests.firmware.fields import HOME_DEG, copy_example
 from tests.firmware.judge import Zone, geojson_area, geojson_lines, shapefile_zones
@@ -332,3 +336,17 @@ class Radio:
         else:
             frame = struct.pack(f"<{RADIO_CHANNELS}H", *self._us)
             self._socket.sendto(frame, ("127.0.0.1", RADIO_PORT))
+
+
+def check_simulated(field: Path) -> None:
+    """Hold the journals of a flight to it: a simulation, and no record of it is complete."""
+    journals = sorted((field / "flights").glob("flight-*.gpkg"))
+    assert journals
+    for journal in journals:
+        told = [f"{key}={value}" for key, value in {**EU_TOLD, REAL_FLIGHT: "yes"}.items()]
+        options = ReportOptions(profiles=PROFILES, with_figures=False, changes=tuple(told))
+        contents = build_report(journal, options).contents
+        assert contents["flight"]["simulated"] == "yes", contents["flight"]["simulated_because"]
+        for record in contents["application"].values():
+            assert not record["complete"]
+            assert any("SIMULATED" in each for each in record["missing"])

@@ -12,6 +12,7 @@ from tests.firmware.firmware import companion
 from tests.firmware.flights import (
     COPTER,
     OFF_LINES_MAX_ML,
+    check_simulated,
     fly_field,
     ready,
     start,
@@ -37,6 +38,7 @@ def fly_pass(
             start(vehicle, pass_items(speed_m_s))
             until_landed(vehicle, 150.0)
         log = vehicle.station.log
+    check_simulated(config.parent)
     return judge(
         log.places,
         log.pulses,

@@ -16,6 +16,7 @@ from tests.firmware.firmware import companion
 from tests.firmware.flights import (
     OFF_LINES_MAX_ML,
     PX4,
+    check_simulated,
     fly_field,
     ready_px4,
     start,
@@ -145,6 +146,7 @@ def fly_pass(
             until_landed(vehicle, 150.0)
         log = vehicle.station.log
         (folder / "log.pkl").write_bytes(pickle.dumps((log.places, log.pulses, log.told)))
+    check_simulated(config.parent)
     zones = geojson_zones(config.parent / "zones.geojson")
     return told_of(
         log, verdicts(log, zones, geojson_area(config.parent / "boundary.geojson")), tell

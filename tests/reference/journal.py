@@ -61,6 +61,7 @@ META: dict[str, str] = {
     "started_utc, started_s": "start of the flight, by UTC and by `time_s`",
     "utc_source, utc_offset_s": "`autopilot` or `computer`; what to add to `time_s` for seconds since 1970",
     "training": "what was sprayed: `no` a product, `water`, `dry` nothing, `simulated` nothing",
+    "simulated, simulated_because": "whether the flight was simulated: `yes`, `no` or `unknown`, and what told; absent in older journals",
     "applied_l": "litres that the ordered duties stand for",
     "rows_applied, rows_valve_changes": "how many rows these tables have, from the end of the flight on",
     "setup": "all that is constant in the flight, as JSON, with the names of the fields of every type",
