@@ -13,7 +13,7 @@ from collections.abc import Callable, MutableMapping, Sequence
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
@@ -34,8 +34,11 @@ from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import DITHER_S, dither_too_much
-from companion.ports import COMMIT_EVERY_S, PlanExecutor, Sensor
+from companion.ports import COMMIT_EVERY_S, PlanExecutor, Recorder, Sensor
 from companion.record.journal import Journal
+
+if TYPE_CHECKING:
+    from companion.web import OperatorPage
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -90,6 +93,7 @@ def run_companion(
     link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
     sensors = _sensors(config, link)
+    page = _page(config, setup, link, training=training)
     for line in (*_warnings(config), *_application_notes(config, training)):
         note(line)
     if config.mission is not None:
@@ -112,6 +116,7 @@ def run_companion(
         commit_every_s=commit_s,
     )
     follow(journal, link, executor)
+    recorder = _recorder(page, journal, link)
     notifier = Notifier.from_environment(os.environ, pid=os.getpid())
     try:
         with journal, notifier, shown():
@@ -120,8 +125,8 @@ def run_companion(
                     setup,
                     link=link,
                     executor=executor,
-                    recorder=journal,
-                    sensors=sensors,
+                    recorder=recorder,
+                    sensors=sensors if page is None else [*sensors, page],
                     duration_s=duration_s,
                     on_step=notifier.stepped,
                     record_fault=(lambda: journal.fault) if config.journal.required else None,
@@ -194,6 +199,7 @@ def component_options(
         use_battery="autopilot" in (config.flow_meter.source, config.tank.source),
         watch_mission=watch_mission,
         may_enable="command" in config.safety.enable_by,
+        page_may_enable=config.web.enabled and "web" in config.safety.enable_by,
         training="" if training == "no" else training,
     )
 
@@ -212,6 +218,24 @@ def _sensors(config: Config, link: VehicleLink) -> list[Sensor]:
     sensors = build_sensors(config)
     follow_refills(sensors, link)
     return sensors
+
+
+def _page(config: Config, setup: Setup, link: VehicleLink, *, training: str) -> OperatorPage | None:
+    """Return the operator's page; where it is not enabled, nothing of it is loaded."""
+    if not config.web.enabled:
+        return None
+    from companion.cli.web_parts import build_page
+
+    return build_page(config, setup, link, training=training)
+
+
+def _recorder(page: OperatorPage | None, journal: Journal, link: VehicleLink) -> Recorder:
+    """Return what the run is recorded by: the journal, with the page looking on."""
+    if page is None:
+        return journal
+    from companion.cli.web_parts import watched
+
+    return watched(page, journal, link)
 
 
 def _warnings(config: Config) -> list[str]:

@@ -172,14 +172,6 @@ def without_effect(config: Document) -> Rule:
             )
     for key, text in chain(line_warnings(config), _motor_warnings(config)):
         yield Contradiction(key=key, text=text)
-    settings = {
-        "web.enabled": config.web.enabled,
-    }
-    for key, is_set in settings.items():
-        if is_set:
-            yield Contradiction(
-                key=key, text="not part of this version and has no effect; remove it"
-            )
 
 
 def _off_centre(config: Document) -> Rule:

@@ -377,9 +377,22 @@ class JournalTable(Table):
 class WebTable(Table):
     """The operator's page."""
 
-    enabled: bool = Field(default=False, description="not part of this version")
-    host: Text = Field(default="127.0.0.1", description="address to listen on")
+    enabled: bool = Field(default=False, description="true: needs vrspray[web]")
+    host: Text = Field(
+        default="127.0.0.1", description="address to listen on; 0.0.0.0 for phones, with a token"
+    )
     port: int = Field(default=8880, ge=1, le=65535, description="port to listen on")
+    names: Annotated[tuple[Text, ...], Field(strict=False, max_length=20)] = Field(
+        default=(), description="other names of this computer by which browsers may call it"
+    )
+    frame_ancestors: Annotated[tuple[Text, ...], Field(strict=False, max_length=20)] = Field(
+        default=(), description="origins that may show the page in a frame, such as BlueOS"
+    )
+    session_hours: float = Field(
+        default=12.0, ge=0.1, le=720, description="how long a phone stays logged in"
+    )
+    tls_certificate: Text | None = Field(default=None, description="PEM file; with tls_key: https")
+    tls_key: Text | None = Field(default=None, description="PEM file of its private key")
 
 
 def out_of_bounds(table: type[Table], key: str, value: float) -> str | None:

@@ -286,6 +286,39 @@ class Inhibit(StrEnum):
     TANK_EMPTY = "tank-empty"
     FLOW_FAULT = "flow-fault"
 
+    @property
+    def words(self) -> str:
+        """Return what it is called on every screen.
+
+        >>> Inhibit.NOT_ARMED.words, Inhibit.SPEED_BELOW_MIN.words
+        ('not armed', 'too slow')
+        """
+        return _WORDS.get(self, self.value.replace("-", " "))
+
+
+# What a reason is called on the operator's screen, where its own name does not say it.
+_WORDS = {
+    Inhibit.ESTOP: "emergency stop",
+    Inhibit.REARM_NEEDED: "disable, then enable again",
+    Inhibit.STALE_POSITION: "position too old",
+    Inhibit.INVALID_POSITION: "position not confirmed",
+    Inhibit.STALE_HEARTBEAT: "heartbeat lost",
+    Inhibit.NOT_ACTIVE: "vehicle not active",
+    Inhibit.WRONG_MODE: "wrong flight mode",
+    Inhibit.NOT_IN_AIR: "not flying",
+    Inhibit.FIX_TOO_LOW: "GNSS fix too poor",
+    Inhibit.ACCURACY_TOO_LOW: "GNSS accuracy too poor",
+    Inhibit.ESTIMATOR_UNHEALTHY: "EKF unhealthy",
+    Inhibit.SPEED_BELOW_MIN: "too slow",
+    Inhibit.SPEED_ABOVE_MAX: "too fast",
+    Inhibit.SPEED_DISAGREES: "speeds disagree",
+    Inhibit.SPEED_UNCHECKED: "speed not checked",
+    Inhibit.HEIGHT_BELOW_MIN: "too low",
+    Inhibit.HEIGHT_ABOVE_MAX: "too high",
+    Inhibit.WIND_ABOVE_MAX: "too much wind",
+    Inhibit.RC_SWITCH: "RC switch off",
+}
+
 
 class SprayerState(StrEnum):
     """What the sprayer may do; see `safety.py`. Their order is that of `SPR_STATE`."""

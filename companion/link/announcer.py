@@ -45,29 +45,6 @@ _LOUD = frozenset(
     }
 )
 
-# What a reason is called on the operator's screen, where its own name does not say it.
-_WORDS = {
-    Inhibit.ESTOP: "emergency stop",
-    Inhibit.REARM_NEEDED: "disable, then enable again",
-    Inhibit.STALE_POSITION: "position too old",
-    Inhibit.INVALID_POSITION: "position not confirmed",
-    Inhibit.STALE_HEARTBEAT: "heartbeat lost",
-    Inhibit.NOT_ACTIVE: "vehicle not active",
-    Inhibit.WRONG_MODE: "wrong flight mode",
-    Inhibit.NOT_IN_AIR: "not flying",
-    Inhibit.FIX_TOO_LOW: "GNSS fix too poor",
-    Inhibit.ACCURACY_TOO_LOW: "GNSS accuracy too poor",
-    Inhibit.ESTIMATOR_UNHEALTHY: "EKF unhealthy",
-    Inhibit.SPEED_BELOW_MIN: "too slow",
-    Inhibit.SPEED_ABOVE_MAX: "too fast",
-    Inhibit.SPEED_DISAGREES: "speeds disagree",
-    Inhibit.SPEED_UNCHECKED: "speed not checked",
-    Inhibit.HEIGHT_BELOW_MIN: "too low",
-    Inhibit.HEIGHT_ABOVE_MAX: "too high",
-    Inhibit.WIND_ABOVE_MAX: "too much wind",
-    Inhibit.RC_SWITCH: "RC switch off",
-}
-
 # As numbers for ground stations: 0 boot, 1 safe, 2 ready, 3 armed, 4 spraying, 5 fault, 6 estop.
 _NUMBER = {state: float(number) for number, state in enumerate(SprayerState)}
 _MAV_STATE = {
@@ -242,7 +219,7 @@ def reasons(inhibits: frozenset[Inhibit]) -> list[str]:
     """
     if not inhibits:
         return [f"{_PREFIX}ready"]
-    words = [_WORDS.get(one, one.replace("-", " ")) for one in Inhibit if one in inhibits]
+    words = [one.words for one in Inhibit if one in inhibits]
     found = [f"{_OFF}{words[0]}"]
     for number, word in enumerate(words[1:], start=1):
         more = f" +{len(words) - number}"

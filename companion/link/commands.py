@@ -17,6 +17,13 @@ REQUEST_MESSAGE = 512
 REQUEST_CAPABILITIES = 520
 USER_RATE, USER_REFILLED, USER_NEXT_MAP = 31010, 31011, 31012
 USER_ESTOP = 31014
+# The orders of the operator's page, as commands and their first parameter.
+PAGE_ORDERS: dict[str, tuple[int, float | None]] = {
+    "stop": (USER_ESTOP, None),
+    "enable": (DO_SPRAYER, 1.0),
+    "disable": (DO_SPRAYER, 0.0),
+    "refilled": (USER_REFILLED, None),
+}
 # MAV_RESULT
 ACCEPTED, REJECTED_FOR_NOW, DENIED, UNSUPPORTED = 0, 1, 2, 3
 
@@ -53,7 +60,8 @@ class Desk:
     values_hz: float = 1.0
     is_armed: bool = False
     is_open: bool = False
-    may_enable: bool = True
+    may_enable: bool = True  # a command may; below, the page may
+    page_may_enable: bool = False
     is_enabled: bool = False
     # When the consent last went, by whatever took it; None: it was given anew since.
     stopped_s: float | None = None
@@ -102,7 +110,9 @@ def _sprayer(desk: Desk, command: CommandReceived) -> Answer:
     if command.param1 not in (0.0, 1.0):
         return Answer(result=DENIED, text="DO_SPRAYER takes 0 or 1")
     enable = command.param1 == 1.0
-    if enable and not desk.may_enable:
+    if enable and command.source == "web" and not desk.page_may_enable:
+        return Answer(result=DENIED, text="enable by page: see safety.enable_by")
+    if enable and command.source == "command" and not desk.may_enable:
         return Answer(result=DENIED, text="enable by command: see safety.enable_by")
     if enable and command.target_system == 0:
         return Answer(result=DENIED, text="enable: name this vehicle's system, not 0")
@@ -111,7 +121,7 @@ def _sprayer(desk: Desk, command: CommandReceived) -> Answer:
     desk.stopped_s = None if enable else command.received_s
     if enable:
         desk.enabled_by = (command.sender, command.sequence)
-    wish = OperatorCommand(received_s=command.received_s, enable=enable, source="command")
+    wish = OperatorCommand(received_s=command.received_s, enable=enable, source=command.source)
     return Answer(result=ACCEPTED, inputs=(wish,))
 
 

@@ -32,7 +32,7 @@ from companion.core.types import (
 )
 from companion.link.announcer import Announcer
 from companion.link.codec import Codec
-from companion.link.commands import REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, Desk
+from companion.link.commands import REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, Answer, Desk
 from companion.link.encode import Encoder
 from companion.link.messages import (
     AckReceived,
@@ -70,7 +70,8 @@ class ComponentOptions:
     """Who we are on the link, what we want to know how often, and the ends of the pulses.
 
     `need_mission`: all stays closed where the mission is flown and its leg is not known.
-    `may_enable`: a command may enable; one may always stop.
+    `may_enable`: a command may enable; `page_may_enable`: so may the operator's page. Both may
+    always stop.
     """
 
     system_id: int = 0
@@ -85,6 +86,7 @@ class ComponentOptions:
     use_switch: bool = True
     watch_mission: bool = False
     may_enable: bool = True
+    page_may_enable: bool = False
     training: str = ""
 
 
@@ -115,6 +117,7 @@ class Component:
             parameters=parameters if parameters is not None else Parameters(),
             tank=Tank(),
             may_enable=options.may_enable,
+            page_may_enable=options.page_may_enable,
         )
         self._service = Service(
             self._desk, self._encoder, self._announcer, self._send, version=options.version
@@ -165,6 +168,11 @@ class Component:
         return self.codec.vehicle is not None
 
     @property
+    def tank_l(self) -> float | None:
+        """Return what is left in the tank, counted down from the last filling that was told."""
+        return self._desk.tank.level_l
+
+    @property
     def address(self) -> tuple[int, int]:
         """Return system and component that we speak as."""
         return (self._encoder.system_id, self._encoder.component_id)
@@ -177,6 +185,10 @@ class Component:
     def order(self, channel: int, pulse_us: int) -> bool:
         """PositionStream a servo output; False where nobody is there to take it."""
         return self.outputs.order(channel, pulse_us)
+
+    def obey_page(self, name: str, value: float | None, received_s: float) -> Answer:
+        """Carry out an order of the operator's page."""
+        return self._service.obey_page(name, value, received_s)
 
     def fault(self, text: str) -> None:
         """Tell the operator once of something that does not work."""

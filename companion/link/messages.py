@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Literal
 
 from companion.core.types import Input
 from companion.link.census import AUTOPILOT_COMPONENT
@@ -183,7 +183,8 @@ class CommandReceived:
     """COMMAND_LONG or COMMAND_INT, whoever it is for; parameters 3 to 7 are not kept.
 
     `confirmation` counts retransmissions; COMMAND_INT has none: None. `sequence` is the frame's
-    number; `is_late`: its sender has said something newer, or the same, before.
+    number; `is_late`: its sender has said something newer, or the same, before. `source` is `web`
+    for an order of the operator's page, which goes the same way and has no frame.
     """
 
     received_s: float
@@ -196,6 +197,7 @@ class CommandReceived:
     confirmation: int | None = 0
     sequence: int = 0
     is_late: bool = False
+    source: Literal["command", "web"] = "command"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,7 +10,7 @@ from companion.link import commands
 from companion.link.announcer import Announcer
 from companion.link.commands import Answer, Desk, rate_override
 from companion.link.encode import REAL32, Encoder
-from companion.link.messages import CommandReceived, ParamAsked, ParamSet
+from companion.link.messages import CommandReceived, ParamAsked, ParamSet, Sender
 from companion.link.parameters import RATE_PERCENT, TANK_L, VALUES_HZ
 
 OnEvent = Callable[[float, str, str], None]
@@ -68,6 +68,26 @@ class Service:
         if command.command == commands.USER_RATE and index is not None and answer.inputs:
             self._tell_value(index)
         return answer.inputs
+
+    def obey_page(self, name: str, value: float | None, received_s: float) -> Answer:
+        """Carry out an order of the operator's page as a command of the ground station is.
+
+        Only the acknowledgement is missing; the ground station is told what was done.
+        """
+        number, param1 = commands.PAGE_ORDERS[name]
+        command = CommandReceived(
+            received_s=received_s,
+            sender=Sender(system_id=self._encoder.system_id, component_id=0),
+            target_system=self._encoder.system_id,
+            target_component=self._encoder.component_id,
+            command=number,
+            param1=value if param1 is None else param1,
+            param2=None,
+            source="web",
+        )
+        answer = self._desk.obey(command)
+        self._tell(answer, received_s)
+        return answer
 
     def serve(self, message: ParamAsked | ParamSet) -> tuple[Input, ...]:
         """Answer the parameter protocol; only a list may be asked of everyone."""

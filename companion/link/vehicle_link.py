@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from companion.core.types import Decision, Input, OperatorCommand, RateOverride
 from companion.link.census import Census, Vehicle, autopilot_name
+from companion.link.commands import Answer
 from companion.link.component import Component, ComponentOptions
 from companion.link.outputs import OutputListener
 from companion.link.parameters import Parameters
@@ -132,6 +133,15 @@ class VehicleLink:
     def on_refilled(self, take: Callable[[float], bool]) -> None:
         """Have the operator's fillings given to `take(litres)`, which says whether it can be."""
         self.component.on_refilled = take
+
+    def obey_page(self, name: str, value: float | None, received_s: float) -> Answer:
+        """Carry out an order of the operator's page as if the ground station had commanded it."""
+        return self.component.obey_page(name, value, received_s)
+
+    @property
+    def tank_l(self) -> float | None:
+        """Return what is left in the tank, counted down from the last filling that was told."""
+        return self.component.tank_l
 
     def announce(self, text: str) -> None:
         """Tell the operator of something that is as it should be."""

@@ -57,7 +57,8 @@ def test_help_lists_every_command_without_importing_any(capsys: Captured) -> Non
 
 # What most flights do without; each is loaded when a flight that has it is put together.
 NOT_OF_EVERY_FLIGHT = (
-    "companion.cli.sensor_parts", "companion.config.motor_rules",
+    "companion.cli.sensor_parts", "companion.cli.web_parts", "companion.web",
+    "companion.config.motor_rules",
     "companion.core.options.liquid_faults", "companion.flight_map.child",
     "companion.link.signing", "companion.output.engine",
     "companion.output.gpio", "companion.output.hardware_pwm", "companion.record.continuing",
@@ -319,7 +320,7 @@ def test_config_check_refuses_a_swath_that_is_not_the_boom(capsys: Captured) -> 
 
 
 def test_config_check_warns_of_what_it_cannot_deliver_or_do(capsys: Captured) -> None:
-    overrides = ["--set", "mission.speed_m_s=8", "--set", "web.enabled=true"]
+    overrides = ["--set", "mission.speed_m_s=8", "--set", "flow_trim.enabled=true"]
     code, found = run_json(capsys, "config", "check", CONFIG, *overrides)
     assert code == 0
     assert [problem["code"] for problem in found["problems"]] == ["no-effect", "rate-too-high"]

@@ -1,0 +1,207 @@
+"""The operator's page of a run: put together from the configuration, and told what happens."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from importlib.metadata import version
+from importlib.util import find_spec
+from typing import Any
+
+from companion.cli.answer import note
+from companion.config import Config
+from companion.config.rules import tank_capacity_l
+from companion.core.options.coverage import Coverage
+from companion.core.setup import Setup
+from companion.core.types import Decision, Input
+from companion.errors import ConfigError
+from companion.link.vehicle_link import VehicleLink
+from companion.ports import Recorder
+from companion.record.journal import Journal
+from companion.web import OperatorPage, Order, Outcome, listen, map_object
+from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens
+from companion.wording import install_command
+
+TOKENS_NAME = "page-tokens.json"
+WAY_NAME = "page-track.jsonl"
+_LIBRARIES = ("fastapi", "uvicorn")
+_DONE = {
+    "stop": "stopped: all valves closed",
+    "enable": "enabled",
+    "disable": "disabled: all valves closed",
+    "refilled": "tank noted",
+}
+
+
+def build_page(config: Config, setup: Setup, link: VehicleLink, *, training: str) -> OperatorPage:
+    """Return the page, listening but not yet started."""
+    web = config.web
+    missing = [name for name in _LIBRARIES if find_spec(name) is None]
+    if missing:
+        raise ConfigError(
+            f"{config.path}: web.enabled: the Python package {missing[0]} is missing: "
+            f"{install_command('vehicle')}"
+        )
+    doors = Doors(is_local=is_loopback(web.host), names=tuple(map(str.lower, web.names)))
+    tokens = kept_tokens(config.resolve(config.link.state_folder) / TOKENS_NAME)
+    certificate, key = _tls_files(config)
+    listener = listen(web.host, web.port)
+    about = {
+        "map": map_object(setup),
+        "facts": _facts(config, setup, training),
+        "is_local": doors.is_local,
+        "names": doors.names,
+        "frame_ancestors": web.frame_ancestors,
+        "login_s": round(web.session_hours * 3600.0),
+        "tokens": {"view": tokens.view, "operate": tokens.operate},
+        "is_tls": bool(certificate),
+        "tls_certificate": certificate,
+        "tls_key": key,
+        "way_file": str(config.resolve(config.journal.folder).resolve() / WAY_NAME),
+        "version": version("vrspray"),
+    }
+    for line in invitation(config, doors, tokens):
+        note(line)
+    return OperatorPage(listener, about, obey=_obeying(link), horizon_s=setup.longest_s)
+
+
+def _tls_files(config: Config) -> tuple[str, str]:
+    """Return certificate and key; nothing where there is no TLS."""
+    web = config.web
+    if (web.tls_certificate is None) != (web.tls_key is None):
+        raise ConfigError(f"{config.path}: web.tls_certificate and web.tls_key go together")
+    if web.tls_certificate is None or web.tls_key is None:
+        return "", ""
+    files = (config.resolve(web.tls_certificate), config.resolve(web.tls_key))
+    for key, path in zip(("tls_certificate", "tls_key"), files, strict=True):
+        if not path.is_file():
+            raise ConfigError(f"{config.path}: web.{key}: {path} is not there; give a PEM file")
+    return str(files[0]), str(files[1])
+
+
+def _facts(config: Config, setup: Setup, training: str) -> dict[str, Any]:
+    limits, tank = setup.limits, tank_capacity_l(config)
+    return {
+        "training": training,
+        "product": config.product.name,
+        "tank_l": tank,
+        "reserve_l": config.tank.reserve_l,
+        "rate_max_l_ha": setup.rate_max_l_ha,
+        "may_enable": "web" in config.safety.enable_by,
+        "enable_by": sorted(limits.enable_by),
+        "speed_m_s": [limits.speed_min_m_s, limits.speed_max_m_s],
+        "height_m": [limits.height_min_m, limits.height_max_m],
+        "wind_max_m_s": limits.wind_max_m_s,
+        "position_age_max_s": limits.position_age_max_s,
+        "heartbeat_age_max_s": limits.heartbeat_age_max_s,
+        "fix": int(limits.fix),
+        "modes": sorted(limits.modes),
+        "has_meter": config.flow_meter.source != "none",
+        "has_pressure": config.pressure.source != "none",
+        "has_tank_sensor": config.tank.source != "none",
+        "output": config.output.kind,
+        "pwm_hz": config.pwm.frequency_hz,
+    }
+
+
+def _obeying(link: VehicleLink) -> Any:
+    def obey(order: Order, now_s: float) -> Outcome:
+        answer = link.obey_page(order.name, order.value, now_s)
+        accepted = answer.result == 0
+        text = answer.text or (_DONE[order.name] if accepted else "refused")
+        if accepted and order.name in _DONE and order.name != "refilled":
+            text = _DONE[order.name]
+        return Outcome(accepted=accepted, text=text, inputs=answer.inputs)
+
+    return obey
+
+
+def invitation(config: Config, doors: Doors, tokens: Tokens) -> list[str]:
+    """Return where the page is, a line each, and for phones its QR code."""
+    web = config.web
+    scheme = "http" if web.tls_certificate is None else "https"
+    host = (
+        "127.0.0.1" if doors.is_local else (web.names[0] if web.names else _own_address(web.host))
+    )
+    bare = f"[{host}]" if ":" in host else host
+    place = f"{scheme}://{bare}:{web.port}/"
+    if not doors.needs_token:
+        return [f"operator's page: {place}"]
+    operate = f"{place}#token={tokens.operate}"
+    lines = [
+        f"operator's page, to operate: {operate}",
+        f"operator's page, to look:    {place}#token={tokens.view}",
+    ]
+    if find_spec("segno") is not None:
+        lines += _qr_lines(operate)
+    return lines
+
+
+def _qr_lines(text: str) -> list[str]:
+    import io
+
+    import segno
+
+    out = io.StringIO()
+    segno.make(text, error="l").terminal(out, compact=True)
+    return out.getvalue().splitlines()
+
+
+def _own_address(host: str) -> str:
+    """Return an address at which phones find this computer; the configured one if it is one."""
+    if not ipaddress.ip_address(host).is_unspecified:
+        return host
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # sends nothing: it asks for the route
+        except OSError:
+            return "127.0.0.1"
+        return str(probe.getsockname()[0])
+
+
+class Watched:
+    """The journal, with the page looking on."""
+
+    def __init__(self, journal: Recorder, page: OperatorPage) -> None:
+        self._journal, self._page = journal, page
+
+    def record_input(self, item: Input) -> None:
+        """Take down one input."""
+        self._journal.record_input(item)
+
+    def record_coverage(self, coverage: Coverage) -> None:
+        """Keep which ground is treated."""
+        self._journal.record_coverage(coverage)
+
+    def record_decision(self, decision: Decision) -> None:
+        """Take down one decision, and show it."""
+        self._journal.record_decision(decision)
+        self._page.show(decision)
+
+    def record_event(self, at_s: float, kind: str, text: str) -> None:
+        """Take down what happened besides, and show it."""
+        self._journal.record_event(at_s, kind, text)
+        self._page.note(at_s, kind, text)
+
+
+def watched(page: OperatorPage, journal: Journal, link: VehicleLink) -> Recorder:
+    """Return what the run records with: both."""
+    both = Watched(journal, page)
+    link.on_event(both.record_event)
+
+    def extras() -> dict[str, Any]:
+        statistics = link.statistics
+        found: dict[str, Any] = {
+            "journal": {"fault": journal.fault, "lost": journal.lost, "name": journal.path.name},
+            "tank_counted_l": None if link.tank_l is None else round(link.tank_l, 2),
+        }
+        if statistics is not None:
+            found["link"] = {
+                "lost_percent": statistics.lost_percent,
+                "position_hz": statistics.position_hz,
+                "round_trip_s": statistics.round_trip_s,
+            }
+        return found
+
+    page.extras = extras
+    return both

@@ -1,0 +1,12 @@
+"""The operator's page: the spraying seen, and stopped, from a phone at the field's edge.
+
+Here is what the companion itself uses of it; the web libraries are loaded in the page's own process
+only (`python -m companion.web`, started by `OperatorPage`).
+"""
+
+from __future__ import annotations
+
+from companion.web.frames import map_object
+from companion.web.page import OperatorPage, Order, Outcome, listen
+
+__all__ = ["OperatorPage", "Order", "Outcome", "listen", "map_object"]

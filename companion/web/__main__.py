@@ -1,0 +1,87 @@
+"""`python -m companion.web`: the page's process, as `OperatorPage` starts it.
+
+It ends when the companion does: the socket between them closes then.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+
+from companion.web.guard import Doors, Guard, Tokens
+from companion.web.live import Live
+from companion.web.ring import RingReader
+from companion.web.server import Guarded, Orders, Site, build_app
+
+# The control loop comes first.
+NICENESS = 5
+
+
+def main(arguments: list[str]) -> int:
+    """Serve until the companion ends."""
+    memory, wake, orders_fd, listener_fd, about_fd, parent = map(int, arguments)
+    if os.getppid() != parent:
+        return 0
+    os.nice(NICENESS)
+    with os.fdopen(about_fd, "rb") as file:
+        file.seek(0)
+        about: dict[str, Any] = json.load(file)
+    ring = RingReader(memory)
+    asyncio.run(_serve(about, ring, wake, orders_fd, listener_fd))
+    return 0
+
+
+async def _serve(
+    about: dict[str, Any], ring: RingReader, wake: int, orders_fd: int, listener_fd: int
+) -> None:
+    way = about["way_file"]
+    live = Live(about, way_file=Path(way) if way else None, utc_s=time.time())
+    orders = Orders(socket.socket(fileno=orders_fd))
+    doors = Doors(is_local=about["is_local"], names=tuple(about["names"]))
+    guard = Guard(doors=doors, tokens=Tokens(**about["tokens"]))
+    site = Site(live, orders, guard, about)
+    app = Guarded(build_app(site), guard, ancestors=tuple(about["frame_ancestors"]))
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http="h11",
+            ws="none",
+            lifespan="off",
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            limit_concurrency=200,
+            timeout_keep_alive=15,
+            h11_max_incomplete_event_size=16_384,
+            ssl_certfile=about["tls_certificate"] or None,
+            ssl_keyfile=about["tls_key"] or None,
+        )
+    )
+
+    def read() -> None:
+        os.eventfd_read(wake)
+        for payload in ring.news():
+            live.take(payload)
+        site.told()
+
+    def end() -> None:
+        # Streams never end by themselves: nothing here is worth waiting for.
+        os._exit(0)
+
+    os.set_blocking(wake, False)
+    asyncio.get_running_loop().add_reader(wake, read)
+    orders.attach(end)
+    await server.serve(sockets=[socket.socket(fileno=listener_fd)])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

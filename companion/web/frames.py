@@ -1,0 +1,157 @@
+"""What the page is told by the control loop: a frame for each decision worth showing, and the map.
+
+Pure. A frame is one small JSON object; what is no number is null in it. Places are metres in the
+flight's frame.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import shapely
+from shapely import Geometry
+
+from companion.core.setup import Setup
+from companion.core.types import Decision, VehicleState
+
+# A frame that does not fit its slot goes without what stands for each valve.
+_LONG = ("duty", "rates_l_ha")
+
+
+def number(value: float | None, digits: int = 2) -> float | None:
+    """Return a number for JSON; None for what is none.
+
+    >>> number(1.2345), number(math.nan), number(None)
+    (1.23, None, None)
+    """
+    if value is None or not math.isfinite(value):
+        return None
+    return round(value, digits)
+
+
+def shown_key(decision: Decision) -> tuple[object, ...]:
+    """Return what the operator sees at once when it changes: valves, state and reasons."""
+    state = decision.state
+    return (
+        tuple(duty > 0.0 for duty in decision.plan.duty),
+        decision.sprayer,
+        decision.inhibits,
+        state is not None and (state.enabled, state.estop, state.armed),
+        len(decision.findings),
+    )
+
+
+def frame_of(decision: Decision, *, horizon_s: float) -> dict[str, Any]:
+    """Return what the page shows of a decision; `horizon_s` is how far the orders look ahead."""
+    state = decision.state
+    found: dict[str, Any] = {
+        "now_s": round(decision.now_s, 3),
+        "state": decision.sprayer.value,
+        "inhibits": sorted(reason.value for reason in decision.inhibits),
+        "duty": [round(duty, 3) for duty in decision.plan.duty],
+        "rates_l_ha": [number(rate) for rate in decision.rate_l_ha],
+        "target_l_min": number(decision.target_flow_l_min, 3),
+        "flow_l_min": number(decision.flow_l_min, 3),
+        "out_of_range": decision.out_of_range_count,
+        "findings": [
+            {"kind": finding.kind.value, "text": finding.text, "valve": finding.valve}
+            for finding in decision.findings[:8]
+        ],
+    }
+    if state is not None:
+        found["vehicle"] = _vehicle(state, decision.now_s, horizon_s)
+        found["liquid"] = _liquid(state)
+    return found
+
+
+def _vehicle(state: VehicleState, now_s: float, horizon_s: float) -> dict[str, Any]:
+    heard_s = state.heartbeat_received_s
+    return {
+        "east_m": number(state.east_m),
+        "north_m": number(state.north_m),
+        "ahead_east_m": number(state.east_m + state.velocity_east_m_s * horizon_s),
+        "ahead_north_m": number(state.north_m + state.velocity_north_m_s * horizon_s),
+        "heading_deg": number(state.heading_deg, 1),
+        "speed_m_s": number(math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)),
+        "height_m": number(state.height_m),
+        "armed": state.armed,
+        "mode": state.mode,
+        "in_air": state.in_air,
+        "enabled": state.enabled,
+        "estop": state.estop,
+        "fix": None if state.fix is None else int(state.fix),
+        "accuracy_m": number(state.horizontal_accuracy_m, 3),
+        "wind_m_s": number(state.wind_m_s, 1),
+        "position_age_s": number(now_s - state.position_received_s),
+        "heartbeat_age_s": None if heard_s is None else number(now_s - heard_s),
+        "link_up": state.link_up,
+        "rate_percent": number(state.rate_percent, 1),
+    }
+
+
+def _liquid(state: VehicleState) -> dict[str, Any]:
+    flow, pressure, tank = state.flow, state.pressure, state.tank
+    return {
+        "meter_ml": None if flow is None else number(flow.volume_ml, 1),
+        "meter_s": None if flow is None else number(flow.received_s, 3),
+        "meter_fault": "" if flow is None else flow.fault,
+        "pressure_kpa": None if pressure is None else number(pressure.pressure_kpa, 1),
+        "pressure_fault": "" if pressure is None else pressure.fault,
+        "tank_l": None if tank is None else number(tank.level_l),
+        "tank_fault": "" if tank is None else tank.fault,
+    }
+
+
+def packed(frame: dict[str, Any], most_bytes: int) -> bytes:
+    """Return a frame as JSON of at most `most_bytes`, without the valves where it needs be."""
+    data = json.dumps(frame, separators=(",", ":"), allow_nan=False).encode()
+    if len(data) <= most_bytes:
+        return data
+    return packed({key: value for key, value in frame.items() if key not in _LONG}, most_bytes)
+
+
+def map_object(setup: Setup) -> dict[str, Any]:
+    """Return the ground and the boom as the page draws them, in metres of the flight's frame."""
+    prescription, boom = setup.prescription, setup.boom
+    return {
+        "origin": {
+            "latitude_deg": setup.frame.latitude_deg,
+            "longitude_deg": setup.frame.longitude_deg,
+        },
+        "bounds_m": [round(side, 2) for side in prescription.bounds_m],
+        "sha256": prescription.sha256,
+        "field": _rings(prescription.field),
+        "field_m2": round(prescription.field.area, 1),
+        "zones": [
+            {
+                "name": zone.name,
+                "rate_l_ha": round(zone.rate_l_ha, 3),
+                "areas": _rings(zone.polygon),
+            }
+            for zone in prescription.zones
+        ],
+        "default_rate_l_ha": prescription.default_rate_l_ha,
+        "boom": {
+            "width_m": boom.width_m,
+            "valves": [
+                {
+                    "name": valve.name,
+                    "right_m": round(valve.right_m, 3),
+                    "forward_m": round(valve.forward_m, 3),
+                    "width_m": round(valve.width_m, 3),
+                }
+                for valve in boom.valves
+            ],
+        },
+    }
+
+
+def _rings(geometry: Geometry) -> list[list[list[float]]]:
+    """Return polygons as lists of rings, a ring as east, north, east, north, ... in metres."""
+    found = []
+    for part in shapely.get_parts(geometry):
+        rings = [part.exterior, *part.interiors]
+        found.append([shapely.get_coordinates(ring).round(2).ravel().tolist() for ring in rings])
+    return found

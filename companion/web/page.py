@@ -1,0 +1,311 @@
+"""The control loop's end of the operator's page: it writes the newest state, and takes orders.
+
+The page is a process of its own. What it shows goes through shared memory (`ring.py`), which is
+never full and never waited for; what it orders comes back in small packets, of which a few are
+read in each step. So nothing that a browser does, or the page's own end, can delay a valve. A page
+that ends is started again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from companion.core.types import Decision, Input
+from companion.errors import ConfigError
+from companion.web.frames import frame_of, packed, shown_key
+from companion.web.ring import PAYLOAD_MAX, RingWriter, new_memory
+
+_logger = logging.getLogger(__name__)
+
+# Steps come up to a step too early or too late for it.
+FRAME_S, _STEP_S = 0.1, 0.01
+# The state of the journal and the like: looked up once a second.
+EXTRA_S = 1.0
+ORDER_BYTES_MAX = 512
+ORDERS_AT_ONCE = 4
+ORDERS_PER_S = 20
+# An order to open that waited for longer, in a companion that stood still, is not carried out.
+ENABLE_AGE_MAX_S = 1.0
+# A page that ends at once is not started more often than this.
+RESTART_S = 3.0
+END_S = 2.0
+EVENTS_KEPT = 40
+BIND_TRIES_S = 3.0
+
+OrderName = Literal["stop", "enable", "disable", "refilled"]
+ORDERS: tuple[OrderName, ...] = ("stop", "enable", "disable", "refilled")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """What the operator wants, taken at `boot_s`; `value` is litres for `refilled`."""
+
+    number: int
+    name: OrderName
+    boot_s: float
+    value: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What came of an order: inputs for the core, and a line for the operator."""
+
+    accepted: bool
+    text: str
+    inputs: tuple[Input, ...] = ()
+
+
+Obey = Callable[[Order, float], Outcome]
+
+
+def parse_order(packet: bytes) -> Order | None:
+    """Return the order in a packet of the page; None for anything else.
+
+    >>> parse_order(b'{"number": 1, "name": "stop", "boot_s": 5.0}')
+    Order(number=1, name='stop', boot_s=5.0, value=None)
+    >>> parse_order(b'{"name": "open"}') is None
+    True
+    """
+    try:
+        found = json.loads(packet)
+        name, value = found["name"], found.get("value")
+        if name not in ORDERS:
+            return None
+        return Order(
+            number=int(found["number"]),
+            name=name,
+            boot_s=float(found["boot_s"]),
+            value=None if value is None else float(value),
+        )
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return None
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """Return a socket that listens at the page's address; a `ConfigError` where it cannot be had.
+
+    A companion that was killed leaves its page to end by itself: the port is free a moment later.
+    """
+    until_s = time.monotonic() + BIND_TRIES_S
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    while True:
+        found = socket.socket(family, socket.SOCK_STREAM)
+        try:
+            found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            found.bind((host, port))
+            found.listen(64)
+        except OSError as error:
+            found.close()
+            if time.monotonic() >= until_s:
+                raise ConfigError(
+                    f"web.port: cannot listen on {host} port {port}: "
+                    f"{(error.strerror or str(error)).lower()}; write another web.port or web.host"
+                ) from error
+            time.sleep(0.1)
+        else:
+            return found
+
+
+class OperatorPage:
+    """Implements `companion.ports.Sensor`: what it reads are the operator's orders.
+
+    Args:
+        listener: the socket that the page serves; closed at the end.
+        about: what the page has to know, as JSON has it: the map, the tokens, limits.
+        obey: carries an order out as the link does with a command, and says what came of it.
+        horizon_s: how far ahead orders are given, for the look-ahead point.
+    """
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        about: dict[str, Any],
+        *,
+        obey: Obey,
+        horizon_s: float,
+        clock: Callable[[], float] = time.monotonic,
+        boot_clock: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
+    ) -> None:
+        self._listener = listener
+        self._about = json.dumps(about, allow_nan=False).encode()
+        self._obey = obey
+        self._horizon_s = horizon_s
+        self._clock, self._boot_clock = clock, boot_clock
+        self._memory = new_memory()
+        self._ring = RingWriter(self._memory)
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._told_s = self._extras_s = float("-inf")
+        self._key: tuple[object, ...] | None = None
+        self._extra: dict[str, Any] = {}
+        self._events: deque[tuple[float, str, str]] = deque(maxlen=EVENTS_KEPT)
+        self._event_count = 0
+        self._taken_s: deque[float] = deque(maxlen=ORDERS_PER_S)
+        self._orders: socket.socket | None = None
+        self._child: subprocess.Popen[bytes] | None = None
+        self._started_s = float("-inf")
+        self._is_starting = False
+        self._is_open = False
+        # What else is shown, such as the state of the journal; asked once a second.
+        self.extras: Callable[[], dict[str, Any]] = dict
+
+    # ------------------------------------------------------------------- what the page is told
+
+    def note(self, at_s: float, kind: str, text: str) -> None:
+        """Take an event for the page's list."""
+        self._events.append((round(at_s, 2), kind[:40], text[:200]))
+        self._event_count += 1
+
+    def show(self, decision: Decision) -> None:
+        """Show a decision: at once where valves, state or reasons changed, else at 10 Hz."""
+        key, now_s = shown_key(decision), decision.now_s
+        is_news = key != self._key
+        if not is_news and now_s - self._told_s < FRAME_S - _STEP_S:
+            return
+        self._key, self._told_s = key, now_s
+        if now_s - self._extras_s >= EXTRA_S:
+            self._extras_s, self._extra = now_s, self.extras()
+        frame = frame_of(decision, horizon_s=self._horizon_s)
+        frame |= self._extra
+        frame["urgent"] = is_news
+        frame["event_count"] = self._event_count
+        if self._events:
+            frame["events"] = list(self._events)[-6:]
+        self._ring.put(packed(frame, PAYLOAD_MAX))
+        with suppress(BlockingIOError):
+            os.eventfd_write(self._wake, 1)
+
+    # --------------------------------------------------------------------------- what it orders
+
+    async def open(self, wake: Callable[[], None]) -> None:  # noqa: ARG002 - steps come anyway
+        """Start the page."""
+        self._is_open = True
+        self._start()
+
+    def read(self, now_s: float) -> Sequence[Input]:
+        """Return what the operator ordered; a few packets at most, however many were sent."""
+        if self._orders is None:
+            self._restart(now_s)
+            return ()
+        inputs: list[Input] = []
+        for _ in range(ORDERS_AT_ONCE):
+            try:
+                packet = self._orders.recv(ORDER_BYTES_MAX)
+            except BlockingIOError:
+                break
+            except OSError:
+                packet = b""
+            if not packet:
+                self._ended()
+                break
+            inputs.extend(self._take(packet, now_s))
+        return inputs
+
+    def _take(self, packet: bytes, now_s: float) -> tuple[Input, ...]:
+        order = parse_order(packet)
+        if order is None:
+            return ()
+        full = len(self._taken_s) == ORDERS_PER_S and now_s - self._taken_s[0] < 1.0
+        if full and order.name != "stop":
+            outcome = Outcome(accepted=False, text="too many orders: wait a second")
+        elif order.name == "enable" and not 0.0 <= self._boot_clock() - order.boot_s <= (
+            ENABLE_AGE_MAX_S
+        ):
+            outcome = Outcome(accepted=False, text="late enable not taken: enable again")
+        else:
+            self._taken_s.append(now_s)
+            outcome = self._obey(order, now_s)
+        self._reply(order, outcome)
+        return outcome.inputs
+
+    def _reply(self, order: Order, outcome: Outcome) -> None:
+        answer = {"number": order.number, "accepted": outcome.accepted, "text": outcome.text}
+        if self._orders is not None:
+            with suppress(OSError):
+                self._orders.send(json.dumps(answer).encode())
+
+    # ------------------------------------------------------------------------------ its process
+
+    def _start(self) -> None:
+        """Start the page's process; quick, and its work is its own."""
+        self._started_s = self._clock()
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        about = os.memfd_create("vrspray-page-about", os.MFD_CLOEXEC)
+        try:
+            with os.fdopen(os.dup(about), "wb") as file:
+                file.write(self._about)
+            passed = (self._memory, self._wake, theirs.fileno(), self._listener.fileno(), about)
+            self._child = subprocess.Popen(
+                [sys.executable, "-m", "companion.web", *map(str, passed), str(os.getpid())],
+                pass_fds=passed,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C is for the companion, which closes the valves
+            )
+        except OSError as error:
+            _logger.warning("operator's page: %s", error.strerror or error)
+            ours.close()
+            return
+        finally:
+            os.close(about)
+            theirs.close()
+        ours.setblocking(False)
+        self._orders = ours
+
+    def _ended(self) -> None:
+        """Let go of a page that ended."""
+        if self._orders is not None:
+            self._orders.close()
+            self._orders = None
+        if self._is_open:
+            _logger.warning("the operator's page ended; it is started again")
+
+    def _restart(self, now_s: float) -> None:
+        """Start a page anew, in a thread: the loop does not wait for the system's fork."""
+        if not self._is_open or self._is_starting or now_s - self._started_s < RESTART_S:
+            return
+        self._is_starting = True
+        if self._child is not None:
+            self._child.poll()
+
+        def start() -> None:
+            try:
+                self._start()
+            finally:
+                self._is_starting = False
+
+        asyncio.get_running_loop().run_in_executor(None, start)
+
+    async def close(self) -> None:
+        """End the page; may be called twice and before `open`."""
+        self._is_open = False
+        self._ended()
+        child, self._child = self._child, None
+        if child is not None:
+            await _ended_within(child, END_S)
+        if self._wake >= 0:
+            self._ring.close()
+            for descriptor in (self._memory, self._wake):
+                os.close(descriptor)
+            self._wake = -1
+            self._listener.close()
+
+
+async def _ended_within(child: subprocess.Popen[bytes], wait_s: float) -> None:
+    """Wait for a process that has been told to end; kill it when it does not."""
+    try:
+        await asyncio.to_thread(child.wait, wait_s)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        await asyncio.to_thread(child.wait)

@@ -1,0 +1,515 @@
+"""The page's own web server: state by server-sent events, orders by POST, nothing else.
+
+It runs in a process of its own and holds no valve: it reads shared memory, and passes orders on to
+the control loop, which decides. Every request passes `Guarded` first.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import json
+import secrets
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import FastAPI, HTTPException, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.types import Message, Receive, Send
+from starlette.types import Scope as Connection
+
+from companion.web.guard import API, COOKIE, Asked, Failures, Guard, Scope, session
+from companion.web.live import Live
+
+STATIC = Path(__file__).parent / "static"
+STATE_S = 0.2  # 5 Hz
+SILENT_S = 1.0  # with nothing new a browser is told so, and how old the newest is
+POINTS_AT_ONCE = 500
+CLIENTS_MAX = 32
+BODY_BYTES_MAX = 4096
+SEND_WITHIN_S = 20.0
+# Pressing Enable takes this long; a press that is older has been forgotten.
+HOLD_S, HOLD_MAX_S = 0.9, 6.0
+HOLDS_MAX = 64
+ANSWER_WITHIN_S = 1.0
+_CSP = (
+    "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; "
+    "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors "
+)
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".mjs": "text/javascript; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".svg": "image/svg+xml",
+    ".txt": "text/plain; charset=utf-8",
+}
+
+
+class Body(BaseModel):
+    """A request's own small JSON: nothing unknown is in it."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class Login(Body):
+    """The token of the link or QR code that `run` prints."""
+
+    token: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class Press(Body):
+    """The ticket that `hold` gave when the press began."""
+
+    ticket: Annotated[str, Field(min_length=1, max_length=100)]
+
+
+class Refilled(Body):
+    """What is in the tank now, in litres; 0 is a full tank."""
+
+    litres: Annotated[float, Field(ge=0.0, le=10_000.0)]
+
+
+class Done(BaseModel):
+    """What came of an order, in words for the operator."""
+
+    accepted: bool
+    text: str
+
+
+class Ticket(BaseModel):
+    """To give back when the button has been held for `hold_s` seconds."""
+
+    ticket: str
+    hold_s: float
+
+
+class Access(BaseModel):
+    """What one may do here."""
+
+    scope: Scope
+    needs_token: bool
+
+
+class Orders:
+    """Passes orders to the control loop and waits for what it says of them."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        connection.setblocking(False)
+        self._connection = connection
+        self._count = 0
+        self._waiting: dict[int, asyncio.Future[Done]] = {}
+
+    def attach(self, on_end: Callable[[], None]) -> None:
+        """Begin to read answers; `on_end` is called when the companion has ended."""
+        asyncio.get_running_loop().add_reader(self._connection, self._read, on_end)
+
+    async def give(self, name: str, value: float | None = None) -> Done:
+        """Pass an order on; a 503 where the companion does not answer."""
+        self._count += 1
+        number = self._count
+        boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+        order = {"number": number, "name": name, "value": value, "boot_s": boot_s}
+        waiting = asyncio.get_running_loop().create_future()
+        self._waiting[number] = waiting
+        try:
+            self._connection.send(json.dumps(order).encode())
+            return await asyncio.wait_for(waiting, ANSWER_WITHIN_S)
+        except (OSError, TimeoutError) as error:
+            text = "the companion does not answer: use the transmitter's switch"
+            raise HTTPException(503, text) from error
+        finally:
+            del self._waiting[number]
+
+    def _read(self, on_end: Callable[[], None]) -> None:
+        packet = b""
+        with suppress(ConnectionError):
+            try:
+                packet = self._connection.recv(4096)
+            except BlockingIOError:
+                return
+        if not packet:
+            asyncio.get_running_loop().remove_reader(self._connection)
+            on_end()
+            return
+        answer = json.loads(packet)
+        waiting = self._waiting.get(answer["number"])
+        if waiting is not None and not waiting.done():
+            waiting.set_result(Done(accepted=answer["accepted"], text=answer["text"]))
+
+
+class Holds:
+    """Buttons that are being pressed: enabling takes a ticket that was given a second before."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._since: dict[str, float] = {}
+
+    def begin(self) -> str:
+        """Return a ticket for a press that begins now."""
+        while len(self._since) >= HOLDS_MAX:
+            self._since.pop(next(iter(self._since)))
+        ticket = secrets.token_urlsafe(16)
+        self._since[ticket] = self._clock()
+        return ticket
+
+    def take(self, ticket: str) -> bool:
+        """Return whether the press lasted long enough and is not over; a ticket is good once."""
+        since_s = self._since.pop(ticket, None)
+        return since_s is not None and HOLD_S <= self._clock() - since_s <= HOLD_MAX_S
+
+    def clear(self) -> None:
+        """Forget all presses: after a stop none of them enables."""
+        self._since.clear()
+
+
+class Guarded:
+    """Refuses what comes from elsewhere, and adds the headers that keep a page to itself."""
+
+    def __init__(self, app: FastAPI, guard: Guard, *, ancestors: tuple[str, ...] = ()) -> None:
+        self._app = app
+        self._guard = guard
+        self._headers = {
+            b"content-security-policy": (_CSP + " ".join(("'self'", *ancestors))).encode(),
+            b"x-content-type-options": b"nosniff",
+            b"referrer-policy": b"no-referrer",
+            b"cross-origin-resource-policy": b"same-origin",
+            b"cache-control": b"no-store",
+        }
+
+    async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:
+        """Serve one request, or refuse it."""
+        if scope["type"] != "http":
+            return
+
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                have = {name.lower() for name, _ in message["headers"]}
+                extra = [item for item in self._headers.items() if item[0] not in have]
+                message = {**message, "headers": [*message["headers"], *extra]}
+            # A browser that does not read is let go; until then it costs one message.
+            await asyncio.wait_for(send(message), SEND_WITHIN_S)
+
+        asked = asked_of(scope)
+        refusal = self._guard.refusal(asked, time.time())
+        if refusal is None and asked.method == "POST":
+            body = await _body(receive)
+            if body is None:
+                refusal = 413, f"a request has at most {BODY_BYTES_MAX} bytes"
+            else:
+                receive = _replay(body, receive)
+        with suppress(TimeoutError, ConnectionError):
+            if refusal is not None:
+                await JSONResponse({"detail": refusal[1]}, refusal[0])(scope, receive, sent)
+            else:
+                await self._app(scope, receive, sent)
+
+
+def asked_of(scope: Connection) -> Asked:
+    """Return what of a request the guard looks at."""
+    headers = tuple((k.decode("latin-1").lower(), v.decode("latin-1")) for k, v in scope["headers"])
+    return Asked(method=scope["method"], path=scope["path"], headers=headers)
+
+
+async def _body(receive: Receive) -> bytes | None:
+    """Return a request's body; None where it is too large."""
+    body = b""
+    while True:
+        message = await receive()
+        body += bytes(message.get("body", b""))
+        if len(body) > BODY_BYTES_MAX:
+            return None
+        if message["type"] == "http.disconnect" or not message.get("more_body"):
+            return body
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    given = False
+
+    async def replayed() -> Message:
+        nonlocal given
+        if given:
+            return await receive()
+        given = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return replayed
+
+
+class EventStream(Response):
+    """The state for one browser: at most 5 Hz, a change at once, never a backlog."""
+
+    media_type = "text/event-stream"
+
+    def __init__(self, site: Site, since: int) -> None:
+        super().__init__(headers={"X-Accel-Buffering": "no"})
+        self._site, self._since = site, since
+
+    async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:  # noqa: ARG002
+        """Send until the browser goes."""
+        headers = [item for item in self.raw_headers if item[0] != b"content-length"]
+        start = {"type": "http.response.start", "status": 200, "headers": headers}
+        self._site.clients += 1
+        gone = asyncio.ensure_future(_gone(receive))
+        try:
+            await send(start)
+            async for data in self._site.events(self._since, gone):
+                await send({"type": "http.response.body", "body": data, "more_body": True})
+        finally:
+            self._site.clients -= 1
+            gone.cancel()
+
+
+async def _gone(receive: Receive) -> None:
+    while (await receive())["type"] != "http.disconnect":
+        pass
+
+
+class Site:
+    """What all requests share: the newest state, the way to the control loop, who may what."""
+
+    def __init__(self, live: Live, orders: Orders, guard: Guard, about: dict[str, Any]) -> None:
+        self.live, self.orders, self.guard = live, orders, guard
+        self.holds, self.failures = Holds(), Failures()
+        self.clients = 0
+        self.login_s = int(about["login_s"])
+        self.is_tls = bool(about["is_tls"])
+        ground = json.dumps(about["map"], separators=(",", ":"), allow_nan=False)
+        self.map_gzip = gzip.compress(ground.encode(), 5)
+        self.facts: dict[str, Any] = about["facts"]
+        self.version = str(about["version"])
+        self._files: dict[str, tuple[bytes, str]] = {}
+        self._news = asyncio.Event()
+
+    def told(self) -> None:
+        """Take that there is a newer state."""
+        news, self._news = self._news, asyncio.Event()
+        news.set()
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the newest state with its age; without any, only that there is none."""
+        state = self.live.state
+        if not state:
+            return {"age_s": None}
+        return {**state, "age_s": round(time.monotonic() - state["now_s"], 2)}
+
+    async def events(self, since: int, gone: asyncio.Future[None]) -> Any:
+        """Yield events: the state, and the points of the way that this browser has not had."""
+        sent_version, sent_s = -1, float("-inf")
+        while not gone.done():
+            live, now_s = self.live, time.monotonic()
+            is_urgent = live.urgent > sent_version
+            wait_s = 0.0 if is_urgent else sent_s + STATE_S - now_s
+            if wait_s > 0.0 or live.version == sent_version:
+                news = self._news
+                left_s = SILENT_S - (now_s - sent_s)
+                limit_s = wait_s if live.version != sent_version else max(left_s, 0.0)
+                if limit_s > 0.0:
+                    with suppress(TimeoutError):
+                        await asyncio.wait_for(_either(news, gone), limit_s)
+                    continue
+            points = live.way.points
+            if since > len(points):
+                since = 0
+            until = min(len(points), since + POINTS_AT_ONCE)
+            event = {"state": self.snapshot(), "since": since, "points": points[since:until]}
+            event["way"] = live.way_id
+            since, sent_version, sent_s = until, live.version, now_s
+            yield f"id: {since}\ndata: {json.dumps(event, separators=(',', ':'))}\n\n".encode()
+
+    def file(self, name: str) -> tuple[bytes, str] | None:
+        """Return a file of the page, compressed, and its type; read once and kept."""
+        if name not in self._files:
+            path = (STATIC / name).resolve()
+            kind = _TYPES.get(path.suffix)
+            if kind is None or not path.is_relative_to(STATIC.resolve()) or not path.is_file():
+                return None
+            self._files[name] = (gzip.compress(path.read_bytes(), 6), kind)
+        return self._files[name]
+
+
+async def _either(news: asyncio.Event, gone: asyncio.Future[None]) -> None:
+    """Wait for news, or for the browser to go."""
+    waiting = asyncio.ensure_future(news.wait())
+    try:
+        await asyncio.wait((waiting, gone), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        waiting.cancel()
+
+
+def _compressed(request: Request, data: bytes, kind: str) -> Response:
+    """Return what is kept compressed; plain for who cannot read that."""
+    headers = {"Vary": "Accept-Encoding", "Cache-Control": "no-cache"}
+    if "gzip" not in request.headers.get("accept-encoding", ""):
+        return Response(gzip.decompress(data), media_type=kind, headers=headers)
+    return Response(data, media_type=kind, headers=headers | {"Content-Encoding": "gzip"})
+
+
+async def _unusable(_request: Request, error: Exception) -> Response:
+    """Say what is wrong with a request, without repeating what was in it."""
+    found = error.errors() if isinstance(error, RequestValidationError) else []
+    where = ".".join(str(part) for part in found[0]["loc"]) if found else "request"
+    text = str(found[0]["msg"]) if found else "cannot be used"
+    return JSONResponse({"detail": f"{where[:80]}: {text[:200]}"}, 422)
+
+
+def build_app(site: Site) -> FastAPI:
+    """Return the application; `Guarded` belongs around it."""
+    app = FastAPI(
+        title="vrspray operator's page",
+        version=site.version,
+        summary="The state of a running companion, and the operator's orders.",
+        docs_url=None,
+        redoc_url=None,
+        openapi_url=f"{API}openapi.json",
+    )
+    app.add_exception_handler(RequestValidationError, _unusable)
+    _add_reading(app, site)
+    _add_sessions(app, site)
+    _add_orders(app, site)
+    _add_files(app, site)
+    return app
+
+
+def _add_reading(app: FastAPI, site: Site) -> None:
+    @app.get(f"{API}state", tags=["state"])
+    async def state() -> dict[str, Any]:
+        """Return the newest state."""
+        return site.snapshot()
+
+    @app.get(f"{API}events", tags=["state"], response_class=Response)
+    async def events(
+        request: Request, since: Annotated[int, Query(ge=0, le=10**9)] = 0
+    ) -> Response:
+        """Stream the state at 5 Hz and each change at once, as server-sent events."""
+        if site.clients >= CLIENTS_MAX:
+            raise HTTPException(503, f"{CLIENTS_MAX} browsers are looking already")
+        last = request.headers.get("last-event-id", "")
+        begin = int(last) if last.isascii() and last.isdecimal() and len(last) < 10 else since
+        return EventStream(site, begin)
+
+    @app.get(f"{API}map", tags=["state"], response_class=Response)
+    async def ground(request: Request) -> Response:
+        """Return zones, field and boom, in metres from the origin."""
+        return _compressed(request, site.map_gzip, "application/json")
+
+    @app.get(f"{API}facts", tags=["state"])
+    async def facts() -> dict[str, Any]:
+        """Return what does not change in a flight: limits, product, tank, training."""
+        return site.facts
+
+    @app.get(f"{API}track", tags=["state"])
+    async def track(since: Annotated[int, Query(ge=0, le=10**9)] = 0) -> dict[str, Any]:
+        """Return the points of the way since a number."""
+        points = site.live.way.points
+        return {"since": since, "count": len(points), "points": points[since : since + 20_000]}
+
+
+_REFUSED: dict[int | str, dict[str, Any]] = {
+    401: {"description": "no session"},
+    403: {"description": "not from the page, or the session may only look"},
+    413: {"description": "too large"},
+    415: {"description": "no JSON"},
+    503: {"description": "the companion does not answer"},
+}
+
+
+def _add_sessions(app: FastAPI, site: Site) -> None:
+    @app.get(f"{API}session", tags=["session"])
+    async def access(request: Request) -> Access:
+        """Return what one may do."""
+        scope = site.guard.scope_of(asked_of(request.scope), time.time())
+        return Access(scope=scope, needs_token=site.guard.doors.needs_token)
+
+    @app.post(
+        f"{API}session", tags=["session"], responses=_REFUSED | {429: {"description": "wait"}}
+    )
+    async def log_in(login: Login, request: Request, response: Response) -> Access:
+        """Open a session by a token; the session is a cookie that scripts cannot read."""
+        address = "" if request.client is None else request.client.host
+        now_s = time.monotonic()
+        if site.failures.is_blocked(address, now_s):
+            raise HTTPException(429, "too many wrong tokens: wait a minute")
+        scope = site.guard.tokens.scope_of(login.token)
+        if scope == "none":
+            site.failures.failed(address, now_s)
+            raise HTTPException(401, "this token is not valid; take the newest link")
+        value = session(site.guard.tokens, scope, int(time.time()) + site.login_s)
+        response.set_cookie(
+            COOKIE,
+            value,
+            max_age=site.login_s,
+            httponly=True,
+            samesite="strict",
+            secure=site.is_tls,
+        )
+        return Access(scope=scope, needs_token=site.guard.doors.needs_token)
+
+
+def _add_orders(app: FastAPI, site: Site) -> None:
+    @app.post(f"{API}stop", tags=["orders"], responses=_REFUSED)
+    async def stop() -> Done:
+        """Close all valves and latch; no session is needed."""
+        site.holds.clear()
+        return await site.orders.give("stop")
+
+    @app.post(f"{API}hold", tags=["orders"], responses=_REFUSED)
+    async def hold() -> Ticket:
+        """Begin to press a button that has to be held."""
+        return Ticket(ticket=site.holds.begin(), hold_s=HOLD_S)
+
+    @app.post(f"{API}enable", tags=["orders"], responses=_REFUSED)
+    async def enable(press: Press) -> Done:
+        """Allow spraying, after the button was held."""
+        if not site.holds.take(press.ticket):
+            return Done(accepted=False, text=f"hold the button for {HOLD_S:g} s")
+        return await site.orders.give("enable")
+
+    @app.post(f"{API}disable", tags=["orders"], responses=_REFUSED)
+    async def disable() -> Done:
+        """Close all valves; also releases a stop that was commanded."""
+        site.holds.clear()
+        return await site.orders.give("disable")
+
+    @app.post(f"{API}refilled", tags=["orders"], responses=_REFUSED)
+    async def refilled(filling: Refilled) -> Done:
+        """Take what is in the tank now."""
+        return await site.orders.give("refilled", filling.litres)
+
+
+def _add_files(app: FastAPI, site: Site) -> None:
+    @app.get("/register_service", tags=["integration"])
+    async def register_service() -> dict[str, Any]:
+        """Tell BlueOS who we are."""
+        return {
+            "name": "Variable-rate spraying",
+            "description": "State of the sprayer, stop and enable",
+            "icon": "mdi-spray",
+            "company": "vrspray",
+            "version": site.version,
+            "webpage": "",
+            "api": f"{API}openapi.json",
+            "new_page": False,
+            "works_in_relative_paths": True,
+        }
+
+    @app.get("/", include_in_schema=False)
+    async def index(request: Request) -> Response:
+        found = site.file("index.html")
+        if found is None:
+            raise HTTPException(404, "not found")
+        return _compressed(request, *found)
+
+    @app.get("/static/{name:path}", include_in_schema=False)
+    async def static(name: str, request: Request) -> Response:
+        found = None if "\0" in name else site.file(name)
+        if found is None:
+            raise HTTPException(404, "not found")
+        return _compressed(request, *found)

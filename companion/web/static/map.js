@@ -1,0 +1,123 @@
+// The map: by WebGL where the browser has it, on a plain canvas elsewhere. The rest works without.
+
+import { Scale, ZoneIndex } from "./geo.js";
+import { unitOf, value } from "./units.js";
+
+const LEGEND_MAX = 7;
+
+function hasWebGl() {
+  try {
+    return Boolean(document.createElement("canvas").getContext("webgl2"));
+  } catch {
+    return false;
+  }
+}
+
+export class FieldMap {
+  constructor() {
+    this.element = document.getElementById("map");
+    this.back = null;
+    this.points = [];
+    this.vehicle = null;
+    this.theme = "day";
+  }
+
+  async load(ground, theme) {
+    this.ground = ground;
+    this.theme = theme;
+    this.zones = new ZoneIndex(ground.zones);
+    this.rates = [...new Set(ground.zones.map((zone) => zone.rate_l_ha))].sort((a, b) => a - b);
+    if (ground.default_rate_l_ha) this.rates.push(ground.default_rate_l_ha);
+    this.scale = new Scale(this.rates, theme);
+    this.legend();
+    const onView = (metersPerPixel, follows) => this.viewed(metersPerPixel, follows);
+    const wantsPlain = new URLSearchParams(location.search).has("plain");
+    if (!wantsPlain && hasWebGl()) {
+      try {
+        const { create } = await import("./map-gl.js");
+        this.back = await create(this.element, ground, this.scale, theme, onView);
+      } catch (error) {
+        console.warn("map without WebGL:", error);
+        this.element.replaceChildren();
+      }
+    }
+    if (!this.back) {
+      const { create } = await import("./map-plain.js");
+      this.back = create(this.element, ground, this.scale, theme, onView);
+    }
+    this.element.dataset.kind = this.back.kind;
+    if (this.theme !== theme) this.setTheme(this.theme);
+    this.back.setWay(this.points);
+    this.buttons();
+  }
+
+  buttons() {
+    const follow = document.getElementById("map-follow");
+    follow.addEventListener("click", () => {
+      const yes = follow.getAttribute("aria-pressed") !== "true";
+      follow.setAttribute("aria-pressed", String(yes));
+      this.back.follow(yes);
+    });
+    document.getElementById("map-fit").addEventListener("click", () => { follow.setAttribute("aria-pressed", "false"); this.back.fit(); });
+    document.getElementById("map-in").addEventListener("click", () => this.back.zoom(1));
+    document.getElementById("map-out").addEventListener("click", () => this.back.zoom(-1));
+  }
+
+  viewed(metersPerPixel, follows) {
+    if (follows === false) document.getElementById("map-follow").setAttribute("aria-pressed", "false");
+    if (metersPerPixel) { this.metersPerPixel = metersPerPixel; this.scaleBar(); }
+  }
+
+  scaleBar() {
+    if (!this.metersPerPixel) return;
+    const isUs = unitOf("length") === "ft";
+    const perPixel = this.metersPerPixel * (isUs ? 3.28084 : 1);
+    const most = 110 * perPixel;
+    const base = 10 ** Math.floor(Math.log10(most));
+    const length = [5, 2, 1].map((k) => k * base).find((one) => one <= most);
+    const bar = document.getElementById("scale");
+    bar.style.width = `${Math.round(length / perPixel)}px`;
+    bar.firstElementChild.textContent = `${length >= 1 ? length : length.toFixed(1)} ${unitOf("length")}`;
+  }
+
+  legend() {
+    const box = document.getElementById("legend");
+    const rows = this.rates.length <= LEGEND_MAX ? this.rates
+      : Array.from({ length: 5 }, (_, k) => this.scale.low + ((this.scale.high - this.scale.low) * k) / 4);
+    const title = document.createElement("b");
+    title.textContent = unitOf("rate");
+    box.replaceChildren(title, ...rows.map((rate) => {
+      const row = document.createElement("div");
+      const swatch = document.createElement("canvas");
+      swatch.width = 26; swatch.height = 13;
+      const pen = swatch.getContext("2d");
+      pen.fillStyle = this.scale.color(rate);
+      pen.globalAlpha = 0.3; pen.fillRect(0, 0, 13, 13);
+      pen.globalAlpha = 0.92; pen.fillRect(13, 0, 13, 13);
+      row.append(swatch, value("rate", rate));
+      return row;
+    }));
+    const note = document.createElement("b");
+    note.textContent = "map · done";
+    box.append(note);
+    this.scaleBar();
+  }
+
+  setWay(points) { this.points = points; this.back?.setWay(points); }
+
+  addPoints(points, from) { this.points = points; this.back?.addPoints(points, from); }
+
+  setVehicle(vehicle, duty) {
+    if (!this.back || !vehicle) return;
+    const zone = vehicle.ahead_east_m === null || !vehicle.in_air ? -1 : this.zones.at(vehicle.ahead_east_m, vehicle.ahead_north_m);
+    this.back.setVehicle(vehicle, duty, zone);
+  }
+
+  setTheme(theme) {
+    this.theme = theme;
+    if (!this.back) return;
+    this.scale = new Scale(this.rates, theme);
+    this.legend();
+    this.back.setTheme(theme, this.scale);
+  }
+}

@@ -1,0 +1,123 @@
+// The operator's page, put together.
+
+import { FlowChart } from "./chart.js";
+import { Feed } from "./feed.js";
+import { FieldMap } from "./map.js";
+import { Orders, logIn } from "./orders.js";
+import * as panels from "./panels.js";
+import { toSi, useUnits } from "./units.js";
+
+const byId = (id) => document.getElementById(id);
+const kept = {
+  get(name, otherwise) { try { return localStorage.getItem(`vrspray-${name}`) ?? otherwise; } catch { return otherwise; } },
+  set(name, value) { try { localStorage.setItem(`vrspray-${name}`, value); } catch { /* private mode */ } },
+};
+
+let facts = {}, ground = null, state = null, scope = "none", checks = [];
+const map = new FieldMap();
+const chart = new FlowChart(byId("chart"));
+
+let saying = 0;
+function say(what, isTrouble = false) {
+  const box = byId("answer");
+  box.textContent = what;
+  box.hidden = false;
+  clearTimeout(saying);
+  saying = setTimeout(() => { box.hidden = true; }, isTrouble ? 6000 : 3000);
+}
+
+const orders = new Orders(say);
+
+function show() {
+  if (!state || !ground) return;
+  panels.showState(state);
+  panels.showRates(state);
+  panels.showNumbers(state, facts, ground);
+  panels.showAlarms(state);
+  panels.showLinks(state, facts, feed.age());
+  panels.showChecklist(state, facts, ground, checks);
+  panels.showTank(state, facts);
+  panels.showEvents(state);
+  orders.show(state, facts, scope);
+  map.setVehicle(state.vehicle, state.duty);
+  // For tests: which state the pixels show, once the browser has drawn them.
+  const shown = state.now_s;
+  requestAnimationFrame(() => { document.body.dataset.shown = String(shown); });
+}
+
+const feed = new Feed({
+  onState(next) { state = next; chart.add(next); if (!document.hidden) show(); },
+  onWay(points, from) { if (from === 0) map.setWay(points); else map.addPoints(points, from); },
+  onLost(age) {
+    const hasSession = scope !== "none";
+    panels.showLost(age, hasSession && begun && performance.now() - begun > 2000);
+    if (state && ground) panels.showLinks(state, facts, age);
+  },
+});
+
+let begun = 0;
+document.addEventListener("visibilitychange", () => { if (!document.hidden) show(); });
+
+function theme() {
+  const wanted = byId("theme").value;
+  const isNight = wanted === "night" || (wanted === "auto" && matchMedia("(prefers-color-scheme: dark)").matches);
+  const name = isNight ? "night" : "day";
+  document.documentElement.dataset.theme = name;
+  map.setTheme(name);
+  chart.restyle();
+}
+
+function settings() {
+  byId("units").value = kept.get("units", "si");
+  byId("theme").value = kept.get("theme", "auto");
+  useUnits(byId("units").value);
+  byId("units").addEventListener("change", (event) => {
+    kept.set("units", event.target.value);
+    useUnits(event.target.value);
+    panels.showUnits(); map.legend(); chart.restyle(); show();
+  });
+  byId("theme").addEventListener("change", (event) => { kept.set("theme", event.target.value); theme(); });
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", theme);
+  panels.showUnits();
+  byId("refill").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const litres = Number(byId("litres").value);
+    if (litres >= 0 && (await orders.give("refilled", { litres: toSi("volume", litres) }))) byId("litres").value = "";
+  });
+}
+
+async function json(path) {
+  const response = await fetch(path, { credentials: "same-origin" });
+  if (!response.ok) throw new Error(`${path}: ${response.status}`);
+  return response.json();
+}
+
+async function begin() {
+  const access = await logIn();
+  scope = access.scope;
+  byId("session-note").textContent = !access.needs_token ? "This computer only: no login is needed."
+    : scope === "none" ? "" : scope === "operate" ? "Logged in to operate." : "Logged in to look, and to stop.";
+  if (scope === "none") {
+    byId("state-word").textContent = "LOG IN";
+    byId("state-line").textContent = "Open the link, or scan the QR code, that vrspray run printed. STOP works without.";
+    addEventListener("hashchange", () => location.reload());
+    return;
+  }
+  begun = performance.now();
+  feed.open();
+  [facts, ground] = await Promise.all([json("api/v1/facts"), json("api/v1/map")]);
+  if (facts.training !== "no") {
+    byId("training").hidden = false;
+    byId("training").textContent = facts.training === "water" ? "TRAINING WITH WATER" : "DRY RUN: nothing is sprayed";
+  }
+  show();
+  await map.load(ground, document.documentElement.dataset.theme);
+  document.body.dataset.map = "ready";
+  show();
+  checks = await json("api/v1/checks").then((found) => found.checks, () => []);
+}
+
+settings();
+theme();
+navigator.wakeLock?.request("screen").catch(() => {});
+begin().catch((error) => say(`${error.message}. Reload the page.`, true));
