@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.assess.zone_lookup import PIECE, lookup_of
 from analysis.track import Bools, Floats, Places, Track, in_field
+from analysis.zone_lookup import PIECE, lookup_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

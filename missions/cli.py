@@ -17,7 +17,13 @@ import typer
 from companion.cli.answer import AsJson, Tell, answer, note, progress
 from companion.wording import counted
 from missions.files.fence import Fences, fence_warnings
-from missions.files.pilot_sheet import check_sheet, parse_start, product_of, write_sheet
+from missions.files.pilot_sheet import (
+    check_sheet,
+    ground_text,
+    parse_start,
+    product_of,
+    write_sheet,
+)
 from missions.files.write import check_suffix, older_sorties, write_fleet
 from missions.maps.cli.grid import parse_mark
 from missions.maps.cli.options import Reading, reading_options
@@ -31,7 +37,7 @@ from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
 from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.searching import Watch, watched
-from missions.sheet import ground_text, sheet, sortie_lines
+from missions.sheet import sheet, sortie_lines
 from missions.treated_rates import UntreatedRates
 
 # Attempted moves of the search: about one second, ten, and a minute on an old laptop.

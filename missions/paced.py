@@ -11,11 +11,11 @@ import numpy as np
 from companion.core.frame import LocalFrame
 from missions.demand import Rates
 from missions.errors import PlanError
+from missions.heights import capped, slowed
 from missions.plan import Leg, Settings, Sortie
 from missions.speeds import Miss, Stretches, between, choices, chosen, misses_of, stretches_of
 from missions.strips import Floats
-from missions.terrain.ground import Terrain
-from missions.terrain.heights import capped, slowed
+from missions.terrain import Terrain
 from missions.ways import Ways
 
 # A part of a line shorter than this is no leg of its own.

@@ -16,7 +16,7 @@ from missions.coverage import Coverage
 from missions.energy import J_WH, STRAIGHT_DEG, VERTICALS, Battery, Vertical
 from missions.field import Field
 from missions.strips import Floats
-from missions.terrain.ground import Terrain
+from missions.terrain import Terrain
 
 Place = tuple[float, float]
 Kind = Literal["spray", "transit", "ferry"]

@@ -19,7 +19,7 @@ from missions.field import Field, WindBuffer, local_area
 from missions.maps.registry import read_area
 from missions.reading_outline import told
 from missions.run_in import RunIn
-from missions.terrain.ground import Terrain, read_dem
+from missions.terrain import Terrain, read_dem
 
 Autopilot = Literal["ardupilot", "px4"]
 # The companion doses for the strips of its valves: passes spaced otherwise get another rate.

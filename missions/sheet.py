@@ -44,19 +44,6 @@ def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict
     return found
 
 
-def ground_text(found: dict[str, Any]) -> str:
-    """Return the ground that is to be covered; what has no rate is none of it.
-
-    >>> ground_text({"area_ha": 2.0, "without_rate_ha": 0.5})
-    '1.50 ha (another 0.50 ha have no rate)'
-    >>> ground_text({"area_ha": 2.0, "without_rate_ha": 0.0})
-    '2.00 ha'
-    """
-    bare_ha = found["without_rate_ha"]
-    text = f"{found['area_ha'] - bare_ha:.2f} ha"
-    return text if bare_ha == 0.0 else f"{text} (another {bare_ha:.2f} ha have no rate)"
-
-
 class _Aboard:
     """What is in tank and battery of each aircraft, sortie after sortie."""
 

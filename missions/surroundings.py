@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 from companion.core.frame import LocalFrame
 from missions.demand import Rates
 from missions.field import Field
+from missions.heights import return_warnings, slowed
 from missions.paced import Paced, paced
 from missions.plan import Settings, Sortie, at_ferry_height
 from missions.run_in import RunIn, slow_starts, with_run_ins
 from missions.spacing import Spacing
 from missions.stops import timed
 from missions.strips import Floats
-from missions.terrain.ground import Terrain
-from missions.terrain.heights import return_warnings, slowed
+from missions.terrain import Terrain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,14 +1,15 @@
-"""Find circles of imports: `python -m tests.import_circles`, part of `make imports`.
+"""Find circles and arrows back up: `python -m tests.import_circles`, part of `make imports`.
 
 Every import of the four packages counts, those for type checking and those inside functions too:
-a file that cannot be understood without another one, and the other way round, is one file.
+a file that cannot be understood without another one, and the other way round, is one file. An
+arrow back up makes a circle of a folder: what its files build upon imports from the folder itself.
 """
 
 from __future__ import annotations
 
 import ast
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -82,13 +83,34 @@ def circles(graph: Graph) -> list[list[str]]:
     return found
 
 
+def arrows_up(graph: Graph, folders: Collection[str]) -> list[tuple[str, str]]:
+    """Return (module, folder) where a folder's files import a module that imports from the folder.
+
+    >>> graph = {"a.b.one": {"a.plan"}, "a.plan": {"a.b.two"}, "a.b.two": set(), "a.cli": {"a.b"}}
+    >>> arrows_up(graph, ["a.b"])
+    [('a.plan', 'a.b')]
+    """
+    found = []
+    for folder in sorted(folders):
+        inside = {name for name in graph if name == folder or name.startswith(f"{folder}.")}
+        built_upon = {other for name in inside for other in graph[name]} - inside
+        found += [(name, folder) for name in sorted(built_upon) if graph[name] & inside]
+    return found
+
+
 def main() -> int:
-    """Name every circle that is not known, and fail where there is one."""
-    found = circles(imports())
+    """Name every circle that is not known, and every arrow back up; fail where there is one."""
+    graph = imports()
+    found = circles(graph)
     wrong = [
         f"circle of imports: {', '.join(members)}"
         for members in found
         if not set(members) & set(LEFT)
+    ]
+    folders = [name for name in graph if "." in name and (ROOT / name.replace(".", "/")).is_dir()]
+    wrong += [
+        f"arrow back up: {folder} builds upon {name}, which imports from {folder}"
+        for name, folder in arrows_up(graph, folders)
     ]
     for line in wrong:
         sys.stderr.write(f"{line}\n")

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from analysis.assess.ground_elements import SquareGrid, slices_of, summed
-from analysis.assess.zone_lookup import ground_rates
 from analysis.changes import SPEED_MIN_M_S
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.holds import CLEAR_M
 from analysis.lag import Verdict
 from analysis.smoothing import rise_over
 from analysis.transitions import ML_M_PER_L_HA_M
+from analysis.zone_lookup import ground_rates
 from companion.core.nozzle import is_override
 
 if TYPE_CHECKING:

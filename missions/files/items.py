@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from missions.files.plan_rules import check_sprayer
+from missions.heights import raised
 from missions.plan import Place, Plan, Settings, Sortie
 from missions.stops import Stop, waypoints_of
-from missions.terrain.ground import Terrain
-from missions.terrain.heights import raised
+from missions.terrain import Terrain
 
 WAYPOINT, RETURN_TO_LAUNCH, TAKEOFF, CHANGE_SPEED, SPRAYER = 16, 20, 22, 178, 216
 # MAV_FRAME_GLOBAL_RELATIVE_ALT: metres above home; MAV_FRAME_MISSION: no place at all.

@@ -17,7 +17,6 @@ from companion.config import Config
 from missions.errors import PlanError
 from missions.maps.whole_file import write_whole
 from missions.plan import Plan
-from missions.sheet import ground_text
 
 SUFFIXES = (".html", ".txt")
 PICTURES = {".png": "image/png", ".svg": "image/svg+xml"}
@@ -304,3 +303,16 @@ def _cells(row: list[str], fill: int | None = None) -> str:
         f'<td class="fill">{escape(cell)}</td>' if at == fill else f"<td>{escape(cell)}</td>"
         for at, cell in enumerate(row)
     )
+
+
+def ground_text(found: dict[str, Any]) -> str:
+    """Return the ground that is to be covered; what has no rate is none of it.
+
+    >>> ground_text({"area_ha": 2.0, "without_rate_ha": 0.5})
+    '1.50 ha (another 0.50 ha have no rate)'
+    >>> ground_text({"area_ha": 2.0, "without_rate_ha": 0.0})
+    '2.00 ha'
+    """
+    bare_ha = found["without_rate_ha"]
+    text = f"{found['area_ha'] - bare_ha:.2f} ha"
+    return text if bare_ha == 0.0 else f"{text} (another {bare_ha:.2f} ha have no rate)"

@@ -78,6 +78,7 @@ def main() -> int:
     files = [path for package in PACKAGES for path in sorted((root / package).rglob("*.py"))]
     took_s, memory_mb, run_files = loaded(root)
     graph = import_circles.imports(root)
+    folders = [name for name in graph if "." in name and (root / name.replace(".", "/")).is_dir()]
     kernel = list((root / "companion" / "core").glob("*.py"))
     rows = (
         ("product files", f"{len(files)}"),
@@ -87,6 +88,7 @@ def main() -> int:
         ("importing `run`, processor", f"{took_s:.2f} s"),
         ("importing `run`, memory", f"{memory_mb:.0f} MB"),
         ("files of companion/core itself", f"{len(kernel)}"),
+        ("arrows back up", f"{len(import_circles.arrows_up(graph, folders))}"),
         ("circles of imports", f"{len(import_circles.circles(graph))}"),
     )
     for name, figure in rows:

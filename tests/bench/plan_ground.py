@@ -19,7 +19,7 @@ from missions.plan import Plan
 from missions.planner import plan_mission
 from missions.run_in import RunIn
 from missions.surroundings import NOTHING_AROUND, Surroundings
-from missions.terrain.ground import Dem, Terrain
+from missions.terrain import Dem, Terrain
 from tests.bench.missions import RATE_L_HA, fields, settings
 
 CELL_M, AROUND_M = 10.0, 600.0

@@ -24,7 +24,7 @@ from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.strips import Floats
 from missions.surroundings import Surroundings
-from missions.terrain.ground import WGS84_CRS, Dem, Terrain, kept_points, read_dem
+from missions.terrain import WGS84_CRS, Dem, Terrain, kept_points, read_dem
 from tests.bench.missions import FRAME, to_degrees
 from tests.missions.test_missions_cli import run, written
 

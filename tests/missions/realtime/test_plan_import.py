@@ -16,7 +16,7 @@ from missions.files.write import write_plan
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.surroundings import Surroundings
-from missions.terrain.ground import Terrain
+from missions.terrain import Terrain
 from sitl.stub.mission_items import read_mission
 from tests.bench.missions import FRAME, to_degrees
 from tests.missions.realtime.upload_bench import stub_on_a_port

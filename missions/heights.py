@@ -13,7 +13,7 @@ from missions.plan import Leg, Place, Settings, Sortie
 from missions.speeds import ROUND_M_S, Stretches
 from missions.stops import Stop
 from missions.strips import Floats
-from missions.terrain.ground import Profile, Terrain
+from missions.terrain import Profile, Terrain
 
 # The return that an autopilot flies unless told otherwise is 15 m above home (ArduPilot's RTL_ALT)
 # or higher; ground that comes nearer to it than half of that is warned of.

@@ -1,1 +1,0 @@
-"""Height above the ground: elevation models, profiles of ways over them, and limits of climb."""
