@@ -93,7 +93,7 @@ def run_companion(
     link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
     sensors = _sensors(config, link)
-    page = _page(config, setup, link, training=training)
+    page = _page(config, given, setup, link, training=training)
     for line in (*_warnings(config), *_application_notes(config, training)):
         note(line)
     if config.mission is not None:
@@ -220,13 +220,15 @@ def _sensors(config: Config, link: VehicleLink) -> list[Sensor]:
     return sensors
 
 
-def _page(config: Config, setup: Setup, link: VehicleLink, *, training: str) -> OperatorPage | None:
+def _page(
+    config: Config, given: Sequence[str], setup: Setup, link: VehicleLink, *, training: str
+) -> OperatorPage | None:
     """Return the operator's page; where it is not enabled, nothing of it is loaded."""
     if not config.web.enabled:
         return None
     from companion.cli.web_parts import build_page
 
-    return build_page(config, setup, link, training=training)
+    return build_page(config, given, setup, link, training=training)
 
 
 def _recorder(page: OperatorPage | None, journal: Journal, link: VehicleLink) -> Recorder:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ipaddress
 import socket
+import sys
+from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any
@@ -18,7 +20,7 @@ from companion.errors import ConfigError
 from companion.link.vehicle_link import VehicleLink
 from companion.ports import Recorder
 from companion.record.journal import Journal
-from companion.web import OperatorPage, Order, Outcome, listen, map_object
+from companion.web import Obey, OperatorPage, Order, Outcome, listen, map_object
 from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens
 from companion.wording import install_command
 
@@ -33,7 +35,9 @@ _DONE = {
 }
 
 
-def build_page(config: Config, setup: Setup, link: VehicleLink, *, training: str) -> OperatorPage:
+def build_page(
+    config: Config, given: Sequence[str], setup: Setup, link: VehicleLink, *, training: str
+) -> OperatorPage:
     """Return the page, listening but not yet started."""
     web = config.web
     missing = [name for name in _LIBRARIES if find_spec(name) is None]
@@ -58,11 +62,22 @@ def build_page(config: Config, setup: Setup, link: VehicleLink, *, training: str
         "tls_certificate": certificate,
         "tls_key": key,
         "way_file": str(config.resolve(config.journal.folder).resolve() / WAY_NAME),
+        "doctor": _doctor(config, given),
         "version": version("vrspray"),
     }
     for line in invitation(config, doors, tokens):
         note(line)
-    return OperatorPage(listener, about, obey=_obeying(link), horizon_s=setup.longest_s)
+    return OperatorPage(listener, about, obey=obeying(link), horizon_s=setup.longest_s)
+
+
+def _doctor(config: Config, given: Sequence[str]) -> list[str]:
+    """Return the command whose checks the page shows; none where it would want our own lines."""
+    if config.output.kind == "gpio" or config.reads_sensors:
+        return []
+    overrides = [word for item in given for word in ("--set", item)]
+    file = str(config.path.resolve())
+    command = [sys.executable, "-m", "companion", "doctor", "--no-link", "--json"]
+    return [*command, "--config", file, *overrides]
 
 
 def _tls_files(config: Config) -> tuple[str, str]:
@@ -104,7 +119,9 @@ def _facts(config: Config, setup: Setup, training: str) -> dict[str, Any]:
     }
 
 
-def _obeying(link: VehicleLink) -> Any:
+def obeying(link: VehicleLink) -> Obey:
+    """Return what carries the page's orders out: as commands of the ground station are."""
+
     def obey(order: Order, now_s: float) -> Outcome:
         answer = link.obey_page(order.name, order.value, now_s)
         accepted = answer.result == 0

@@ -24,6 +24,7 @@ from typing import Any, Literal
 
 from companion.core.types import Decision, Input
 from companion.errors import ConfigError
+from companion.simulated import SIMULATED
 from companion.web.frames import frame_of, packed, shown_key
 from companion.web.ring import PAYLOAD_MAX, RingWriter, new_memory
 
@@ -151,6 +152,7 @@ class OperatorPage:
         self._extra: dict[str, Any] = {}
         self._events: deque[tuple[float, str, str]] = deque(maxlen=EVENTS_KEPT)
         self._event_count = 0
+        self._is_simulated = False
         self._taken_s: deque[float] = deque(maxlen=ORDERS_PER_S)
         self._orders: socket.socket | None = None
         self._child: subprocess.Popen[bytes] | None = None
@@ -164,6 +166,9 @@ class OperatorPage:
 
     def note(self, at_s: float, kind: str, text: str) -> None:
         """Take an event for the page's list."""
+        if kind == SIMULATED:
+            self._is_simulated = text.startswith("yes")
+            return
         self._events.append((round(at_s, 2), kind[:40], text[:200]))
         self._event_count += 1
 
@@ -179,6 +184,7 @@ class OperatorPage:
         frame = frame_of(decision, horizon_s=self._horizon_s)
         frame |= self._extra
         frame["urgent"] = is_news
+        frame["simulated"] = self._is_simulated
         frame["event_count"] = self._event_count
         if self._events:
             frame["events"] = list(self._events)[-6:]

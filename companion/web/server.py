@@ -9,9 +9,11 @@ from __future__ import annotations
 import asyncio
 import gzip
 import json
+import os
 import secrets
 import socket
 import time
+from asyncio.subprocess import DEVNULL, PIPE
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -38,6 +40,7 @@ SEND_WITHIN_S = 20.0
 HOLD_S, HOLD_MAX_S = 0.9, 6.0
 HOLDS_MAX = 64
 ANSWER_WITHIN_S = 1.0
+CHECKS_S, CHECKS_WITHIN_S = 60.0, 60.0
 _CSP = (
     "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; "
     "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
@@ -287,6 +290,23 @@ class Site:
         self.version = str(about["version"])
         self._files: dict[str, tuple[bytes, str]] = {}
         self._news = asyncio.Event()
+        self._doctor: list[str] = about["doctor"]
+        self._checks: list[dict[str, Any]] = []
+        self._checked_s = float("-inf")
+        self._checking = asyncio.Lock()
+
+    async def checks(self) -> list[dict[str, Any]]:
+        """Return what `vrspray doctor --no-link` finds; while the vehicle is armed nothing new.
+
+        It computes for a second or two: once in `CHECKS_S` at most, at the lowest priority.
+        """
+        is_armed = (self.live.state.get("vehicle") or {}).get("armed") is not False
+        async with self._checking:
+            is_old = time.monotonic() - self._checked_s > CHECKS_S
+            if is_old and self._doctor and not is_armed:
+                self._checks = await _output_of(self._doctor)
+                self._checked_s = time.monotonic()
+        return self._checks
 
     def told(self) -> None:
         """Take that there is a newer state."""
@@ -333,6 +353,25 @@ class Site:
                 return None
             self._files[name] = (gzip.compress(path.read_bytes(), 6), kind)
         return self._files[name]
+
+
+async def _output_of(command: list[str]) -> list[dict[str, Any]]:
+    """Return the checks that a doctor prints; none where it does not answer."""
+    try:
+        child = await asyncio.create_subprocess_exec(
+            *command, stdin=DEVNULL, stdout=PIPE, stderr=DEVNULL, preexec_fn=lambda: os.nice(19)
+        )
+    except OSError:
+        return []
+    try:
+        out, _ = await asyncio.wait_for(child.communicate(), CHECKS_WITHIN_S)
+        found: list[dict[str, Any]] = json.loads(out)["checks"]
+    except (TimeoutError, ValueError, KeyError):
+        with suppress(ProcessLookupError):
+            child.kill()
+        await child.wait()
+        return []
+    return found
 
 
 async def _either(news: asyncio.Event, gone: asyncio.Future[None]) -> None:
@@ -404,6 +443,11 @@ def _add_reading(app: FastAPI, site: Site) -> None:
     async def facts() -> dict[str, Any]:
         """Return what does not change in a flight: limits, product, tank, training."""
         return site.facts
+
+    @app.get(f"{API}checks", tags=["state"])
+    async def checks() -> dict[str, Any]:
+        """Return what the doctor finds on this computer; run while the vehicle is disarmed."""
+        return {"checks": await site.checks()}
 
     @app.get(f"{API}track", tags=["state"])
     async def track(since: Annotated[int, Query(ge=0, le=10**9)] = 0) -> dict[str, Any]:

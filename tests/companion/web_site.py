@@ -111,6 +111,7 @@ def about(folder: Path | None = None, **change: object) -> dict[str, Any]:
         "tls_certificate": "",
         "tls_key": "",
         "way_file": "" if folder is None else str(folder / "page-track.jsonl"),
+        "doctor": [],
         "version": "1.2.3",
     }
     return found | change

@@ -28,6 +28,17 @@ function say(what, isTrouble = false) {
 
 const orders = new Orders(say);
 
+function showMark() {
+  const marks = [];
+  if (state.simulated) marks.push("SIMULATED VEHICLE");
+  if (facts.training === "water") marks.push("TRAINING WITH WATER");
+  if (facts.training === "dry") marks.push("DRY RUN: nothing is sprayed");
+  const box = byId("training");
+  const text = marks.join(" · ");
+  box.hidden = !text;
+  if (box.textContent !== text) box.textContent = text;
+}
+
 function show() {
   if (!state || !ground) return;
   panels.showState(state);
@@ -39,6 +50,7 @@ function show() {
   panels.showTank(state, facts);
   panels.showEvents(state);
   orders.show(state, facts, scope);
+  showMark();
   map.setVehicle(state.vehicle, state.duty);
   // For tests: which state the pixels show, once the browser has drawn them.
   const shown = state.now_s;
@@ -106,15 +118,12 @@ async function begin() {
   begun = performance.now();
   feed.open();
   [facts, ground] = await Promise.all([json("api/v1/facts"), json("api/v1/map")]);
-  if (facts.training !== "no") {
-    byId("training").hidden = false;
-    byId("training").textContent = facts.training === "water" ? "TRAINING WITH WATER" : "DRY RUN: nothing is sprayed";
-  }
   show();
   await map.load(ground, document.documentElement.dataset.theme);
   document.body.dataset.map = "ready";
   show();
   checks = await json("api/v1/checks").then((found) => found.checks, () => []);
+  show();
 }
 
 settings();

@@ -53,6 +53,7 @@ export function showRates(state) {
   const box = byId("valves");
   if (box.children.length !== duty.length) box.replaceChildren(...duty.map(() => { const one = make("div"); one.append(make("span")); return one; }));
   duty.forEach((share, k) => { const height = `${Math.round(share * 100)}%`; const bar = box.children[k].firstElementChild; if (bar.style.height !== height) bar.style.height = height; });
+  byId("key-metered").hidden = state.meter_l_min === null || state.meter_l_min === undefined;
   const open = duty.filter((share) => share > 0);
   box.setAttribute("aria-label", `${open.length} of ${duty.length} valves open`);
 }

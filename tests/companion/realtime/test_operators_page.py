@@ -1,0 +1,210 @@
+"""The operator's page in a real browser, beside a companion that flies over a socket.
+
+Needs Chromium (`apt-get install chromium`); without it these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.async_api import Browser, Page, async_playwright
+
+from companion.cli.web_parts import Watched, obeying
+from companion.link.component import ComponentOptions
+from companion.link.vehicle_link import VehicleLink
+from companion.output.servo import ServoExecutor, ServoOptions
+from companion.runtime import run
+from companion.web import OperatorPage, listen
+from tests.companion.test_run_flight import CHANNELS, SETUP, Notes
+from tests.companion.web_site import about
+from tests.companion.wire_peer import WirePeer, free_port, over_udp
+from tests.quickest import quickest
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.sitl,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+]
+ARGUMENTS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+WITHOUT_WEBGL = [*ARGUMENTS, "--disable-gpu", "--disable-3d-apis", "--disable-software-rasterizer"]
+# From the touch to the last valve's order on the wire.
+STOP_WITHIN_S = 0.3
+
+
+@dataclass
+class Flight:
+    """A companion with its page, and the autopilot that it flies with."""
+
+    peer: WirePeer
+    url: str
+    notes: Notes
+    page: OperatorPage
+    requests: list[str] = field(default_factory=list)
+    troubles: list[str] = field(default_factory=list)
+
+    async def open(self, browser: Browser, **options: Any) -> Page:
+        context = await browser.new_context(**options)
+        page = await context.new_page()
+        page.set_default_timeout(30_000)
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.on("pageerror", lambda error: self.troubles.append(str(error)))
+        page.on("console", lambda said: said.type == "error" and self.troubles.append(said.text))
+        await page.goto(self.url)
+        await page.wait_for_function("() => document.body.dataset.map === 'ready'")
+        return page
+
+    async def until(self, page: Page, state: str) -> None:
+        await page.wait_for_function(
+            "(state) => document.getElementById('state').dataset.state === state", arg=state
+        )
+
+    @property
+    def child(self) -> subprocess.Popen[bytes]:
+        assert self.page._child is not None
+        return self.page._child
+
+    async def until_spraying(self) -> None:
+        self.peer.place(east_m=2.0)
+        await self.peer.until(lambda: len(self.peer.open_channels) == len(CHANNELS))
+
+
+@pytest.fixture
+async def flight(tmp_path: Path) -> AsyncIterator[Flight]:
+    """Yield a companion, its page, and a vehicle that flies over the field."""
+    port, notes = free_port(), Notes()
+    listener = listen("127.0.0.1", 0)
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}/"
+    link = VehicleLink(f"udpin:127.0.0.1:{port}", ComponentOptions(page_may_enable=True))
+    executor = ServoExecutor(ServoOptions(channels=CHANNELS), link.order)
+    link.on_order_ack(executor.acknowledge)
+    page = OperatorPage(listener, about(tmp_path), obey=obeying(link), horizon_s=SETUP.longest_s)
+    task = asyncio.create_task(
+        run(SETUP, link=link, executor=executor, recorder=Watched(notes, page), sensors=[page])
+    )
+    async with over_udp(WirePeer(SETUP.frame, east_m=2.0), port) as peer:
+        await peer.until(lambda: bool(peer.outputs), within_s=30.0)
+        yield Flight(peer, url, notes, page)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+@contextlib.asynccontextmanager
+async def chromium(arguments: list[str] = ARGUMENTS) -> AsyncIterator[Browser]:
+    async with async_playwright() as playwright:
+        browser = await playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        try:
+            yield browser
+        finally:
+            await browser.close()
+
+
+async def _press(page: Page, name: str) -> None:
+    """Hold a button for as long as it wants."""
+    await page.locator(name).hover()
+    await page.mouse.down()
+    await page.wait_for_function(
+        "(name) => !document.querySelector(name).classList.contains('pressed')", arg=name
+    )
+    await page.mouse.up()
+
+
+@pytest.mark.timeout(180)
+async def test_a_flight_is_watched_stopped_released_and_enabled_from_the_page(
+    flight: Flight,
+) -> None:
+    peer = flight.peer
+    async with chromium() as browser:
+        page = await flight.open(browser, viewport={"width": 390, "height": 844}, has_touch=True)
+        second = await flight.open(browser, viewport={"width": 1280, "height": 800})
+        peer.place(east_m=2.0)
+        await flight.until(page, "ready")
+        await _press(page, "#enable")
+
+        async def closing_s() -> float:
+            if not peer.is_spraying:
+                await flight.until_spraying()
+            await flight.until(page, "spraying")
+            await page.locator("#stop").hover()
+            pressed_s = time.monotonic()
+            await page.mouse.down()
+            await peer.until(lambda: peer.is_all_closed)
+            closed = len(peer.orders)
+            took_s = peer.orders[-1].at_s - pressed_s
+            await page.mouse.up()
+            await flight.until(page, "estop")
+            await flight.until(second, "estop")
+            peer.enable()  # latched: enabling by another way opens nothing
+            await _press(page, "#enable")  # releases
+            peer.place(east_m=2.0)
+            await flight.until(page, "ready")
+            assert all(order.pulse_us == 1000 for order in peer.orders[closed:])
+            await _press(page, "#enable")
+            return took_s
+
+        assert await quickest(closing_s, within_s=STOP_WITHIN_S, tries=3) <= STOP_WITHIN_S
+        await flight.until_spraying()
+        await page.wait_for_function(
+            "() => /Applied in all0[.][1-9]/.test(document.getElementById('numbers').textContent)"
+        )
+        await page.wait_for_function("() => document.getElementById('n-target').textContent > '10'")
+        hosts = {urlsplit(url).netloc for url in flight.requests}
+        assert hosts == {urlsplit(flight.url).netloc}
+        assert not flight.troubles
+
+
+@pytest.mark.timeout(120)
+async def test_without_webgl_the_page_draws_on_a_canvas_and_keyboard_alone_stops(
+    flight: Flight,
+) -> None:
+    async with chromium(WITHOUT_WEBGL) as browser:
+        page = await flight.open(browser, viewport={"width": 360, "height": 740})
+        assert await page.evaluate("() => document.getElementById('map').dataset.kind") == "canvas"
+        width = await page.evaluate("() => document.documentElement.scrollWidth")
+        assert width == 360
+        flight.peer.enable()
+        await flight.until_spraying()
+        await flight.until(page, "spraying")
+        await page.locator("#stop").focus()
+        await page.keyboard.press("Enter")
+        await flight.peer.until(lambda: flight.peer.is_all_closed)
+        await flight.until(page, "estop")
+        await page.locator("#units").select_option("us")
+        assert "gal/ac" in await page.locator("#rates").inner_text()
+        await page.locator("#theme").select_option("night")
+        assert await page.evaluate("() => document.documentElement.dataset.theme") == "night"
+        assert not flight.troubles
+
+
+@pytest.mark.timeout(120)
+async def test_a_page_without_news_says_so_and_greys_what_is_old(flight: Flight) -> None:
+    async with chromium(WITHOUT_WEBGL) as browser:
+        page = await flight.open(browser)
+        await flight.until(page, "ready")
+        flight.child.send_signal(signal.SIGSTOP)
+        await page.wait_for_function("() => document.body.classList.contains('stale')")
+        assert await page.locator("#lost").is_visible()
+        assert await page.locator("#state-word").inner_text() == "LINK LOST"
+        await page.locator("#stop").click()
+        await page.wait_for_function(
+            "() => document.getElementById('answer').textContent.includes('NOT CONFIRMED')"
+        )
+        flight.child.send_signal(signal.SIGCONT)
+        await page.wait_for_function("() => !document.body.classList.contains('stale')")
