@@ -20,6 +20,9 @@ from collections.abc import Sequence
 
 from companion.problem import Problem
 
+# What the command line says of a `MemoryError`.
+NOT_ENOUGH_MEMORY = "not enough memory; use a smaller file or another computer"
+
 
 class VrsprayError(Exception):
     """Base of all errors that the command line reports in one line, without a traceback."""

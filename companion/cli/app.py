@@ -25,7 +25,13 @@ from typer.core import TyperCommand, TyperGroup
 
 from companion.cli.beside import give_way
 from companion.commands import Command, Haste, all_registered, command_named, load, registered
-from companion.errors import ActuatorError, MapError, UnreadableError, VrsprayError
+from companion.errors import (
+    NOT_ENOUGH_MEMORY,
+    ActuatorError,
+    MapError,
+    UnreadableError,
+    VrsprayError,
+)
 
 if TYPE_CHECKING:
     from typer._click.core import Command as ClickCommand
@@ -221,8 +227,7 @@ def _ended(error: BaseException, *, as_json: bool) -> int:
         more = {"ok": False, "problems": [refusal(error)]} if isinstance(error, MapError) else {}
         return _fail(str(error), code, as_json=as_json, more=more)
     if isinstance(error, MemoryError):
-        text = "not enough memory; use a smaller file or another computer"
-        return _fail(text, REFUSED, as_json=as_json)
+        return _fail(NOT_ENOUGH_MEMORY, REFUSED, as_json=as_json)
     return _fail("interrupted", INTERRUPTED, as_json=as_json)
 
 

@@ -11,6 +11,7 @@ import hashlib
 import json
 import logging
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -24,7 +25,7 @@ from companion.commands import is_there
 from companion.config import Config
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
-from companion.errors import ConfigError, MapError
+from companion.errors import NOT_ENOUGH_MEMORY, ConfigError, MapError
 from companion.flight_map.file import VERSION, read_flight_map
 from companion.flight_map.model import (
     SUFFIX,
@@ -41,6 +42,7 @@ _FOLDER = "flightmaps"
 _KEPT_MAX = 8
 # systemd waits 120 s for a start (companion/cli/vrspray.service).
 _TIMEOUT_S = 100.0
+_MEMORY_MAX_BYTES = 2 * 1024**3
 _WRITTEN = (0, 1)
 _COMPILER = ("map", "compile")
 
@@ -129,29 +131,51 @@ def _run(named: str, order: Sequence[str], out: Path) -> None:
     Raises:
         ConfigError, MapError: what it refused, in its words.
     """
+    memory_max = _memory_max_bytes()
     try:
-        done = subprocess.run(
+        with subprocess.Popen(
             [sys.executable, "-P", "-m", "companion", *_COMPILER, *order, "--json"],
-            capture_output=True,
-            timeout=_TIMEOUT_S,
-            check=False,
             stdin=subprocess.DEVNULL,
-        )
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        ) as compiler:
+            try:
+                _limit_memory(compiler.pid, memory_max)
+                stdout, _ = compiler.communicate(timeout=_TIMEOUT_S)
+            except BaseException:
+                compiler.kill()
+                raise
     except subprocess.TimeoutExpired as error:
         raise _failed(named, f"it took longer than {_TIMEOUT_S:.0f} s") from error
     except OSError as error:
         raise _failed(named, str(error)[:200]) from error
-    if done.returncode in _WRITTEN and out.exists():
+    if compiler.returncode in _WRITTEN and out.exists():
         return
-    said = _said(done.stdout)
+    said = _said(stdout)
     problems = said.get("problems")
     text = said.get("error")
+    if text == NOT_ENOUGH_MEMORY:
+        raise _failed(named, f"it needs more than {memory_max // 1024**2} MB of memory")
     if not isinstance(text, str):
-        raise _failed(named, f"the compiler ended with {done.returncode}")
+        raise _failed(named, f"the compiler ended with {compiler.returncode}")
     if isinstance(problems, list) and problems:
         reason, fix = (str(problems[0][key]) for key in ("code", "fix"))
         raise MapError(text, code=reason, fix=fix)
     raise ConfigError(text)
+
+
+def _memory_max_bytes() -> int:
+    """Return what the compiler may take: half of this computer's memory, and 2 GB at most."""
+    return min(_MEMORY_MAX_BYTES, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2)
+
+
+def _limit_memory(pid: int, most_bytes: int) -> None:
+    """Have the kernel refuse a process more memory of its own; programs and files do not count.
+
+    The address space is no measure: threads and libraries reserve far more than they use.
+    """
+    with suppress(ProcessLookupError):  # it has ended already
+        resource.prlimit(pid, resource.RLIMIT_DATA, (most_bytes, most_bytes))
 
 
 def _not_here(named: str, path: Path, config: Path | None) -> MapError:

@@ -243,7 +243,7 @@ def test_any_other_map_is_compiled_by_a_child_and_once_only(
         raise AssertionError("compiled again")
 
     with monkeypatch.context() as patch:
-        patch.setattr(child_module.subprocess, "run", refuse)
+        patch.setattr(child_module.subprocess, "Popen", refuse)
         assert flight_map_of(config).as_object() == first.as_object()
         with pytest.raises(AssertionError, match="compiled again"):
             flight_map_of(load(config.path, overrides=["prescription.overlap=max"]))
@@ -514,4 +514,33 @@ def test_a_compiler_that_takes_too_long_is_refused_in_words(
 ) -> None:
     monkeypatch.setattr(child_module, "_TIMEOUT_S", 0.001)
     with pytest.raises(MapError, match=r"took longer than 0 s\); compile it in the office"):
-        child_module.flight_map_of_file(Path("examples/anyang/prescription.shp"), overlap="refuse")
+        child_module.flight_map_of_file(Path("examples/anyang/prescription.shp"), overlap="max")
+
+
+def test_a_compiler_that_takes_too_much_memory_is_refused_in_words(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    teeth = [(114.0 + number * 1e-8, 36.0 + number % 2 * 1e-3) for number in range(400_000)]
+    ring = [*teeth, (114.02, 35.9), teeth[0]]
+    corners = ",".join(f"{x:.8f} {y:.3f}" for x, y in ring)
+    path = tmp_path / "teeth.csv"
+    path.write_text(f'wkt,rate\n"POLYGON(({corners}))",10\n', "ascii")
+    monkeypatch.setattr(child_module, "_MEMORY_MAX_BYTES", 200 * 1024**2)
+    with pytest.raises(
+        MapError, match=r"teeth.csv: cannot be compiled \(it needs more than 200 MB"
+    ):
+        child_module.flight_map_of_file(path, overlap="max")
+    # A map of a usual size has room there.
+    small = child_module.flight_map_of_file(Path("examples/anyang/prescription.shp"), overlap="max")
+    assert small.source == "prescription.shp"
+
+
+def test_an_overlap_rule_that_is_none_is_refused_in_words(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    out = str(tmp_path / "a.flightmap.gpkg")
+    order = ["map", "compile", "examples/anyang/prescription.shp", "--out", out]
+    assert execute([*order, "--overlap", "refuse"]) == 2
+    assert (
+        "--overlap is one of error, max, min, mean, last, not 'refuse'" in capsys.readouterr().err
+    )

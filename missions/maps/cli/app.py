@@ -26,7 +26,7 @@ from companion.wording import counted
 from missions.maps.cli.convert import convert, show
 from missions.maps.cli.grid import GRID_EXAMPLE, grid, parse_mark
 from missions.maps.cli.new import NEW_EXAMPLE, new
-from missions.maps.cli.options import File, OverlapPolicy, Reading, reading_options
+from missions.maps.cli.options import File, OverlapPolicy, Reading, check_overlap, reading_options
 from missions.maps.cli.plan import plan_of, sprayer_problems
 from missions.maps.compiling import (
     MapOrder,
@@ -100,6 +100,7 @@ def _order(file: Path, config: Config | None, overlap: str | None) -> MapOrder:
     is_own = config is not None and own is not None and _is_same(config.resolve(own), file)
     changes: dict[str, object] = {"file": own if is_own else str(file.absolute())}
     if overlap is not None:
+        check_overlap(overlap)
         changes["overlap"] = overlap
     if config is None or config.prescription is None:
         table = PrescriptionTable.model_validate(changes)

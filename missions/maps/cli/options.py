@@ -55,6 +55,16 @@ OverlapPolicy = Annotated[
         help="Where zones overlap: max, min, mean or last holds; error refuses.",
     ),
 ]
+
+
+def check_overlap(policy: str) -> None:
+    """Refuse what is no rule for places where zones overlap."""
+    if policy not in get_args(Overlap):
+        raise typer.BadParameter(
+            f"--overlap is one of {', '.join(get_args(Overlap))}, not {policy!r}"
+        )
+
+
 _ConfigFile = Annotated[
     Path | None,
     typer.Option(
@@ -95,10 +105,7 @@ class Reading:
         """Return the same with another policy where zones overlap, if one is given."""
         if policy is None:
             return self
-        if policy not in get_args(Overlap):
-            raise typer.BadParameter(
-                f"--overlap is one of {', '.join(get_args(Overlap))}, not {policy!r}"
-            )
+        check_overlap(policy)
         table = None if self.config is None else self.config.prescription
         if self.config is None or table is None:
             return replace(self, policy=policy)
