@@ -292,13 +292,15 @@ async def run(
     clock: Callable[[], float] = time.monotonic,
     boot_clock: Callable[[], float] | None = None,
     on_step: Callable[[], None] | None = None,
+    watch: Callable[[Decision], None] | None = None,
     record_fault: Callable[[], str | None] | None = None,
     commit_every_s: float = COMMIT_EVERY_S,
 ) -> int:
     """Spray until a signal comes or `duration_s` is over; return 0 then.
 
     `on_step` is called after each step that was carried out, and at no other time: a watchdog that
-    it feeds sees a loop that stands still. `boot_clock`, the computer's if not given, shows that
+    it feeds sees a loop that stands still. `watch` gets the decision then; it must not wait.
+    `boot_clock`, the computer's if not given, shows that
     this process itself stood still. `record_fault`, if given, says why the record cannot be kept:
     a flight then does not begin to spray; one that has begun goes on. `commit_every_s` is how
     often the recorder commits.
@@ -336,7 +338,7 @@ async def run(
                         record_fault=record_fault,
                         commit_every_s=commit_every_s,
                     )
-                    await _turn_until_the_end(control, ending, duration_s, on_step)
+                    await _turn_until_the_end(control, ending, duration_s, on_step, watch)
                 finally:
                     await executor.stop()
                     if control is not None:
@@ -365,6 +367,7 @@ async def _turn_until_the_end(
     ending: _Ending,
     duration_s: float | None,
     on_step: Callable[[], None] | None,
+    watch: Callable[[Decision], None] | None,
 ) -> None:
     loop = asyncio.get_running_loop()
     timers = []
@@ -376,6 +379,8 @@ async def _turn_until_the_end(
             decision = control.turn()
             if decision is not None and on_step is not None:
                 on_step()
+            if decision is not None and watch is not None:
+                watch(decision)
             step_timer = loop.call_at(control.next_step_s, ending.wake.set)
             await ending.wake.wait()
             ending.wake.clear()

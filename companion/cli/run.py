@@ -7,7 +7,6 @@ import logging
 import os
 import re
 import socket
-import sys
 import time
 from collections.abc import Callable, MutableMapping, Sequence
 from contextlib import suppress
@@ -22,6 +21,7 @@ from companion.assembly import build_setup, deliverable, flight_map_of, refuse_m
 from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.beside import shown
 from companion.cli.link_parts import build_link, load_with_kept
+from companion.cli.live import Screen, Watcher
 from companion.cli.output_parts import build_outputs
 from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
 from companion.config import Config
@@ -75,7 +75,9 @@ def run_companion(
     Runs until SIGINT or SIGTERM. Spraying is disabled until the operator enables it. All valves
     are closed at the end, whatever ends it.
     """
-    logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
+    screen = Screen()
+    if not logging.root.handlers:
+        logging.basicConfig(handlers=[screen.log_handler()], level=logging.INFO)
     wanted = (*(overrides or ()), *(["journal.training=true"] if is_water else []))
     config, given = load_with_kept(config_file, wanted)
     training = training_mark(config)
@@ -119,7 +121,13 @@ def run_companion(
     recorder = _recorder(page, journal, link)
     notifier = Notifier.from_environment(os.environ, pid=os.getpid())
     try:
-        with journal, notifier, shown():
+        screen.watcher = Watcher(
+            width_m=config.boom_table.width_m,
+            training=training,
+            faults=lambda: (executor.fault, link.fault, journal.fault),
+            rates_at=setup.prescription.rates_at,
+        )
+        with journal, notifier, shown(), screen:
             runtime.execute(
                 lambda: runtime.run(
                     setup,
@@ -129,6 +137,7 @@ def run_companion(
                     sensors=sensors if page is None else [*sensors, page],
                     duration_s=duration_s,
                     on_step=notifier.stepped,
+                    watch=screen.take,
                     record_fault=(lambda: journal.fault) if config.journal.required else None,
                     commit_every_s=commit_s,
                 )
@@ -201,6 +210,7 @@ def component_options(
         may_enable="command" in config.safety.enable_by,
         page_may_enable=config.web.enabled and "web" in config.safety.enable_by,
         training="" if training == "no" else training,
+        width_m=config.boom_table.width_m,
     )
 
 

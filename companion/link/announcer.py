@@ -15,6 +15,7 @@ from companion.link.encode import (
     STATE_STANDBY,
     Encoder,
 )
+from companion.tally import Tally, next_change_s, wanted_l_ha
 
 HEARTBEAT_S = 1.0
 LIVE_S = 0.1
@@ -84,8 +85,11 @@ class Announcer:
     So the heartbeat and SPR_LIVE prove that decisions are being made, not that a process exists.
     """
 
-    def __init__(self, encoder: Encoder, *, training: str = "") -> None:
+    def __init__(
+        self, encoder: Encoder, *, training: str = "", width_m: float | None = None
+    ) -> None:
         self._encoder = encoder
+        self._tally = Tally(width_m)
         self._training = TRAINING.get(training)
         self._heartbeat, self._live = _Beat(HEARTBEAT_S), _Beat(LIVE_S)
         self._values = _Beat(VALUES_S)
@@ -128,6 +132,7 @@ class Announcer:
         yield from self._notes(now_s)
         if decision is None:
             return
+        self._tally.take(decision)
         yield from self._text(decision, now_s)
         if self._values.is_due(now_s):
             yield from self.named_values(decision, now_s)
@@ -171,15 +176,20 @@ class Announcer:
     def named_values(self, decision: Decision, now_s: float) -> Iterator[bytes]:
         """Yield what any ground station can show or plot."""
         percent = 100.0 if decision.state is None else decision.state.rate_percent
-        rates = [rate for rate in decision.rate_l_ha if rate is not None]
+        given_l_ha, next_s = self._tally.given_l_ha(decision), next_change_s(decision)
         duty = decision.plan.duty
         values = {
-            "SPR_RATE": sum(rates) / len(rates) if rates else 0.0,
+            "SPR_RATE": wanted_l_ha(decision),
             "SPR_FLOW": decision.flow_l_min,
             "SPR_DUTY": sum(duty) / len(duty) if duty else 0.0,
             "SPR_STATE": _NUMBER[decision.sprayer],
             "SPR_PCT": percent,
+            "SPR_LITRE": self._tally.volume_l,
         }
+        if given_l_ha is not None:
+            values["SPR_GIVEN"] = given_l_ha
+        if next_s is not None:
+            values["SPR_NEXT"] = next_s
         if self.tank_l is not None:
             values["SPR_TANK"] = self.tank_l
         if self._training is not None:

@@ -71,7 +71,7 @@ class ComponentOptions:
 
     `need_mission`: all stays closed where the mission is flown and its leg is not known.
     `may_enable`: a command may enable; `page_may_enable`: so may the operator's page. Both may
-    always stop.
+    always stop. `width_m` is the boom's, for the rate that is told.
     """
 
     system_id: int = 0
@@ -88,6 +88,7 @@ class ComponentOptions:
     may_enable: bool = True
     page_may_enable: bool = False
     training: str = ""
+    width_m: float | None = None
 
 
 class Component:
@@ -112,7 +113,9 @@ class Component:
         self.outputs = Outputs(
             self._encoder, self._send, closed_us=options.closed_us, full_us=options.full_us
         )
-        self._announcer = Announcer(self._encoder, training=options.training)
+        self._announcer = Announcer(
+            self._encoder, training=options.training, width_m=options.width_m
+        )
         self._desk = Desk(
             parameters=parameters if parameters is not None else Parameters(),
             tank=Tank(),
