@@ -250,9 +250,10 @@ class Screen:
         self._due_s = now_s + DRAWN_EVERY_S
         self._sink.show(self.watcher.shown(decision), now_s)
 
-    def log_handler(self) -> logging.Handler:
-        """Return what takes the program's log."""
-        return _Handler(self._sink)
+    def take_log(self, level: int) -> None:
+        """Take the program's log, unless somebody else has it."""
+        if not logging.root.handlers:
+            logging.basicConfig(handlers=[_Handler(self._sink)], level=level)
 
 
 class _Handler(logging.Handler):

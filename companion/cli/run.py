@@ -76,8 +76,7 @@ def run_companion(
     are closed at the end, whatever ends it.
     """
     screen = Screen()
-    if not logging.root.handlers:
-        logging.basicConfig(handlers=[screen.log_handler()], level=logging.INFO)
+    screen.take_log(logging.INFO)
     wanted = (*(overrides or ()), *(["journal.training=true"] if is_water else []))
     config, given = load_with_kept(config_file, wanted)
     training = training_mark(config)
