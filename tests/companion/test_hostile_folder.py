@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.cli.app import _in_root
 from companion.core.nozzle import PwmLimits
 from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack
@@ -130,3 +131,16 @@ def test_the_unit_in_the_repository_is_started_so_too() -> None:
     unit = Path(__file__).parents[2] / "deploy" / "systemd" / "vrspray.service"
     for command in re.findall(r"^Exec\w+=(.*)$", unit.read_text(), re.MULTILINE):
         assert shlex.split(command)[1] == "-P"
+
+
+def test_whatever_an_import_does_the_command_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    files = len(list(Path("/proc/self/fd").iterdir()))
+    with _in_root():
+        assert Path.cwd() == Path("/")
+    with pytest.raises(ImportError), _in_root():
+        raise ImportError
+    assert Path.cwd() == tmp_path
+    assert len(list(Path("/proc/self/fd").iterdir())) == files
