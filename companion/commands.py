@@ -1,7 +1,7 @@
 """Sub-commands of `vrspray`: those of other packages announce themselves by entry points.
 
 Nobody here knows who they are: a distribution names its commands in the group `vrspray.commands`
-of its entry points, and each is imported when it is asked for (docs/commands.md).
+of its entry points, and each is imported when it is asked for (docs/contributing/commands.md).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 `python -m tests.mutations [--check] [part of a name ...]`, or `make mutants`. The mutations are in
 `mutants.toml`; those of the interlock and of every `finally` are made from the code itself. All
-happens in copies of the repository; docs/testing.md says how to read the result.
+happens in copies of the repository; docs/contributing/testing.md says how to read the result.
 """
 
 from __future__ import annotations

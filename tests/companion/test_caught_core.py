@@ -1,6 +1,6 @@
 """What the other tests of interlock, estimator and schedule let pass.
 
-Each of these fails for a mutation of its own (docs/testing.md).
+Each of these fails for a mutation of its own (docs/contributing/testing.md).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import pytest
 from companion.commands import registered
 from tests.companion.test_flight_map import config_naming, office_files, written
 
-# What the README of a distribution of somebody else would say (docs/commands.md).
+# What the README of a distribution of somebody else would say (docs/contributing/commands.md).
 METADATA = "Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n"
 HELLO = '''
 import typer

@@ -1,6 +1,7 @@
 """Clients written by others, as tests drive them: MAVProxy by its console, items for MAVSDK.
 
-MAVProxy is no part of the development environment: docs/testing.md says how to have it.
+MAVProxy is no part of the development environment; docs/contributing/testing.md says how to
+have it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """MAVProxy, written by others, on one link with the companion and the autopilot.
 
-Skipped where it is not installed: see docs/testing.md.
+Skipped where it is not installed: see docs/contributing/testing.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """MAVProxy, written by others, takes the stub for a vehicle: headless, driven by its own console.
 
-Skipped where it is not installed: see docs/testing.md.
+Skipped where it is not installed: see docs/contributing/testing.md.
 """
 
 from __future__ import annotations
