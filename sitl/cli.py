@@ -192,6 +192,10 @@ def fly(
         FlowLaw | None,
         typer.Option(help="True flow between measured points; default: the profile's."),
     ] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(metavar="MODULE:CLASS", help="A method of your own in place of vrspray's."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for truth, result, picture and journal.")
     ] = None,
@@ -218,6 +222,7 @@ def fly(
         corners=None if corners is None else corners.value,
         meter_rate_hz=meter_rate_hz,
         flow_law=None if flow_law is None else flow_law.value,
+        controller=controller,
         out=out,
     )
     flown = fly_mission(options, note)

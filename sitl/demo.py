@@ -39,6 +39,7 @@ from sitl.demo_field import (
 from sitl.deposit import L_HA_PER_ML_M2
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.knowledge import perfect_setup
+from sitl.own_method import load_controller
 from sitl.profile import FlowLaw, PlantProfile, load_profile
 from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
 
@@ -246,6 +247,12 @@ class DemoOptions:
     fidelity: Fidelity = "pulsed"
     output: Literal["gpio", "servo"] = "gpio"
     flow_law: FlowLaw | None = None
+    controller: str | None = None
+
+    @property
+    def own_method(self) -> str | None:
+        """Return what the flights of one's own controller are called: its class."""
+        return None if self.controller is None else self.controller.rpartition(":")[2]
 
     @property
     def shown_m_s(self) -> float:
@@ -265,6 +272,7 @@ class Job:
     flow_law: FlowLaw | None = None
     traced: bool = False
     journal_folder: Path | None = None
+    controller: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -344,6 +352,13 @@ def check(options: DemoOptions) -> None:
             "--output servo: the averaged twin has no pulses and so no board that makes them; "
             "give --fidelity pulsed"
         )
+    if options.controller is not None:
+        load_controller(options.controller)
+        if options.own_method in (*METHODS, PERFECT):
+            raise ConfigError(
+                f"--controller {options.controller}: {options.own_method} is one of the demo's own "
+                "methods; give the class another name"
+            )
 
 
 def jobs_of(options: DemoOptions, journal_folder: Path | None) -> list[Job]:
@@ -351,7 +366,8 @@ def jobs_of(options: DemoOptions, journal_folder: Path | None) -> list[Job]:
     jobs = []
     for speed_m_s in options.speeds_m_s:
         shown = speed_m_s == options.shown_m_s
-        for method in (*METHODS, PERFECT):
+        own = () if options.own_method is None else (options.own_method,)
+        for method in (*METHODS, *own, PERFECT):
             jobs.append(
                 Job(
                     method=method,
@@ -360,8 +376,9 @@ def jobs_of(options: DemoOptions, journal_folder: Path | None) -> list[Job]:
                     fidelity=options.fidelity,
                     output=options.output,
                     flow_law=options.flow_law,
-                    traced=shown and method != PERFECT,
+                    traced=shown and method in METHODS,
                     journal_folder=journal_folder if shown and method == SCHEDULED else None,
+                    controller=options.controller if method in own else None,
                 )
             )
     return jobs
@@ -423,6 +440,7 @@ def _fly(
         speed_m_s=job.speed_m_s,
         wang=wang,
         method=job.method,
+        own=None if job.controller is None else load_controller(job.controller),
         observer=None if journal is None else journal.record_decision,
         on_input=None if journal is None else journal.record_input,
     )

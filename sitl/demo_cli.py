@@ -77,6 +77,10 @@ def demo_flights(
         FlowLaw | None,
         typer.Option(help="True flow between measured points; default: the profile's."),
     ] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(metavar="MODULE:CLASS", help="A method of your own beside the others."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Fly the field of Wang et al. 2024 with all methods and compare them.
@@ -93,6 +97,7 @@ def demo_flights(
         fidelity=fidelity.value,
         output=output.value,
         flow_law=None if flow_law is None else flow_law.value,
+        controller=controller,
     )
     check(options)
     with _termination_as_interrupt(), _staging(out) as stage:

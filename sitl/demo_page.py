@@ -97,7 +97,8 @@ def _text(value: float | None, digits: int) -> str:
 def sentence(result: DemoResult) -> str:
     """Return what the figures say, in one sentence."""
     parts = []
-    for method in (SCHEDULED, "look-ahead", "none"):
+    own = result.options.own_method
+    for method in (SCHEDULED, *([] if own is None else [own]), "look-ahead", "none"):
         found = [f.evaluation for f in result.flights if f.job.method == method]
         lag = _over([one.lag_distance_m for one in found])
         wrong = [one.misapplied_percent for one in found if one.misapplied_percent is not None]

@@ -73,7 +73,7 @@ def lags_figure(result: DemoResult) -> Figure:
     left, right = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
     figure.subplots_adjust(left=0.06, right=0.985, top=0.755, bottom=0.075, wspace=0.17)
     jitter = np.random.default_rng(0)
-    for flown in result.flights:
+    for flown in (each for each in result.flights if each.job.method in METHODS):
         place, method = float(speeds.index(flown.job.speed_m_s)), flown.job.method
         lags_m = _lags_m(flown)
         spread = jitter.uniform(-0.07, 0.07, len(lags_m))

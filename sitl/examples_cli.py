@@ -27,6 +27,7 @@ ABOUT = {
     "pump": "one pump whose speed makes the flow, and one valve",
     "pump-sections": "one pump, six on-off sections, a return valve",
     "atomiser": "two rotary atomisers fed by one pump",
+    "own-method": "controllers of one's own, for --controller",
     "profiles": "wirings of valves on this computer's own lines",
     DEPLOY: "for the vehicle: ArduPilot's watchdog script, a systemd unit, containers",
 }

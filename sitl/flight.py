@@ -46,6 +46,7 @@ from sitl.knowledge import KnowingOutput, WaitingForDuties, WaitingForEdges, pwm
 from sitl.liquid_faults import LiquidFault, LiquidSensors
 from sitl.navigation import Navigation
 from sitl.outputs import WIRE_S, AveragedOutput, Output, PlanFollower, ServoOutput, TakesEdges
+from sitl.own_method import MakeController, OwnFlight, Sprayer, made
 from sitl.plants import duty_plant, edge_plant
 from sitl.trajectory import Route
 from sitl.vehicle import STRAIGHT_DEG
@@ -125,8 +126,9 @@ def fly(
     disturb: Callable[[Iterator[Input]], Iterator[Input]] | None = None,
     mission: Route | None = None,
     on_step: OnStep | None = None,
+    own: MakeController | None = None,
 ) -> FlightResult:
-    """Fly `trajectory` with our controller, or with P1's where `wang` is given.
+    """Fly `trajectory` with our controller, with P1's where `wang` is given, or with one's `own`.
 
     With `mission`, the route that the trajectory flies, the controller hears which leg it is.
     `on_step` gets what each step has left, the state that it was given, and its time.
@@ -140,7 +142,9 @@ def fly(
         inputs = heapq.merge(inputs, said_legs, key=lambda item: item.received_s)
     if disturb is not None:
         inputs = disturb(inputs)
-    if wang is not None:
+    if own is not None:
+        said = _fly_own(own, method or own.__name__, setup, inputs, output, start_s)
+    elif wang is not None:
         said = _fly_wang(wang, inputs, output, start_s)
     else:
         meter = LiquidSensors(
@@ -177,7 +181,7 @@ def fly(
         orders=tuple(output.orders),
         meta=FlightMeta(
             speed_m_s=speed_m_s,
-            method=method or setup.method.value,
+            method=method or (setup.method.value if own is None else own.__name__),
             fidelity=options.fidelity,
             output=options.output,
             seed=options.seed,
@@ -404,6 +408,22 @@ def _fly_wang(
     for plan in pending:
         output.submit(plan, now_s=plan.issued_s)
     return said
+
+
+def _fly_own(
+    own: MakeController,
+    name: str,
+    setup: Setup,
+    inputs: Iterator[Input],
+    output: Output,
+    start_s: float,
+) -> _Said:
+    """Run a method of one's own inside the companion's interlock."""
+    flight = OwnFlight(
+        controller=made(own, name, Sprayer(setup)), name=name, setup=setup, output=output
+    )
+    flight.fly(inputs, start_s=start_s)
+    return _Said(flight.inhibits, steps=flight.steps)
 
 
 # What is read from an autopilot of the legs of a simulated flight, without the wire.

@@ -45,6 +45,7 @@ from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.knowledge import perfect_setup
 from sitl.motor_parts import check_motors, droplet_figures, fits, ranges_us
 from sitl.outputs import WIRE_S
+from sitl.own_method import MakeController, load_controller
 from sitl.profile import PROFILES, PlantProfile, load_profile
 from sitl.routes import SPEED_MAX_M_S, SPEED_MIN_M_S, legs_over, read_route
 from sitl.stub.faults import Fault, FaultClock, FaultKind, read_scenario
@@ -86,6 +87,7 @@ class FlyOptions:
     speed_m_s: float | None = None
     meter_rate_hz: float = 50.0
     flow_law: FlowLaw | None = None
+    controller: str | None = None
     out: Path | None = None
 
 
@@ -100,6 +102,7 @@ class Task:
     speed_m_s: float
     warnings: tuple[Problem, ...]
     faults: tuple[Fault, ...]
+    own: MakeController | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -212,6 +215,7 @@ def prepare(options: FlyOptions) -> Task:
             *_too_short(setup, profile, over),
         ),
         faults=faults,
+        own=None if options.controller is None else load_controller(options.controller),
     )
 
 
@@ -368,6 +372,7 @@ def _flight(
         on_input=None if trace is None else trace.append,
         disturb=disturb if task.faults else None,
         mission=_mission(task),
+        own=task.own,
     )
 
 

@@ -36,7 +36,10 @@ def write_files(flown: Flown, folder: Path, say: Callable[[str], None]) -> list[
     except OSError as error:
         reason = error.strerror or str(error)
         raise ConfigError(f"--out {folder}: cannot be written ({reason})") from error
-    files = [truth, result, write_journal(flown, folder)]
+    files = [truth, result]
+    # A journal is the record of the companion's own decisions, which replay makes again.
+    if flown.task.own is None:
+        files.append(write_journal(flown, folder))
     picture = folder / "flight.png"
     try:
         _draw(flown, picture)
