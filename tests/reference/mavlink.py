@@ -44,6 +44,9 @@ VALUES: dict[str, str] = {
     "SPR_FLOW": "flow that the orders in force stand for, L/min; not measured",
     "SPR_DUTY": "mean duty cycle, 0 to 1",
     "SPR_TRAIN": "only where no product is sprayed: 1 water, 2 dry run, 3 ground work",
+    "SPR_GIVEN": "rate that the orders in force give at this speed, L/ha; not measured",
+    "SPR_NEXT": "seconds to the next change of a valve, where the plan has one",
+    "SPR_LITRE": "litres that the orders stand for since the start; not measured",
     "SPR_TANK": "litres left by the ordered flow, once a filling was reported; an estimate",
     "SPR_LIVE": "1, at 10 Hz, only while a plan may open a valve: the watchdog's sign of life",
 }
