@@ -58,6 +58,10 @@ def serve(
     link: Annotated[
         str, typer.Option(help="udpout:, udpin:, tcp: or tcpin:HOST:PORT.")
     ] = "udpout:127.0.0.1:14550",
+    station: Annotated[
+        list[str] | None,
+        typer.Option(metavar="URL", help="One more link, as of a ground station; repeatable."),
+    ] = None,
     autopilot: Annotated[str, typer.Option(help="Firmware to behave like: ardupilot or px4.")] = (
         "ardupilot"
     ),
@@ -130,6 +134,7 @@ def serve(
 
     options = ServeOptions(
         link=link,
+        stations=tuple(station or ()),
         autopilot=autopilot,
         mission=mission,
         wait_mission=wait_mission,

@@ -202,6 +202,7 @@ class ServeOptions:
     """What the command line says."""
 
     link: str = DEFAULT_LINK
+    stations: tuple[str, ...] = ()
     autopilot: str = "ardupilot"
     mission: Path | None = None
     wait_mission: bool = False
@@ -228,7 +229,7 @@ async def serve(options: ServeOptions, say: Say) -> dict[str, Any]:
     run = _Run(options, say)
     cancelled = False
     try:
-        async with StubServer(run.autopilot, [options.link]) as server:
+        async with StubServer(run.autopilot, [options.link, *options.stations]) as server:
             run.late_s = server.late_s
             say(f"{options.link}: {run.operator.step.value}")
             server.ticked = run.tick

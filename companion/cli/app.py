@@ -52,6 +52,10 @@ COMMANDS = {
         target="companion.cli.run:run",
         help="Run the companion: follow the vehicle and control the valves.",
     ),
+    "top": Command(
+        target="companion.cli.top:app",
+        help="Show the live state of a running companion, from its MAVLink alone.",
+    ),
     "ground": Command(
         target="companion.cli.ground:app",
         help="Prime, flush, rinse, catch test, click valves, on the ground.",
@@ -72,7 +76,7 @@ COMMANDS = {
         target="companion.cli.config:app",
         help="Check or show a configuration, or print its schema.",
         haste="patient",
-        hastes={"check": "quick", "show": "quick", "schema": "quick"},
+        hastes={"check": "quick", "show": "quick", "schema": "quick", "new": "quick"},
     ),
 }
 

@@ -85,6 +85,71 @@ def _map_problems(config: Config, overrides: Sequence[str]) -> list[Problem]:
     return [] if config.mission is None else deliverable(setup, config.mission.speed_m_s)
 
 
+@app.command(epilog="Example: vrspray config new --out field.toml")
+def new(
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Configuration to write.")],
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Ask nothing; what is not given has its default.")
+    ] = False,
+    profile: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Begin with a sprayer of the examples; or a .toml file."),
+    ] = None,
+    autopilot: Annotated[str, typer.Option(metavar="NAME", help="ardupilot or px4.")] = "ardupilot",
+    link: Annotated[
+        str, typer.Option(metavar="URL", help="Link to the flight controller.")
+    ] = "serial:/dev/serial0:921600",
+    output: Annotated[str, typer.Option(metavar="KIND", help="servo or gpio.")] = "servo",
+    valves: Annotated[int, typer.Option(metavar="N", help="Number of valves.")] = 6,
+    spacing_m: Annotated[float, typer.Option(metavar="M", help="Between valves.")] = 1.0,
+    nozzle: Annotated[
+        str, typer.Option(metavar="FLOW", help="Of one valve: L/min, or '03 at 3 bar' (ISO size).")
+    ] = "0.8",
+    map_file: Annotated[
+        str, typer.Option("--map", metavar="FILE", help="Prescription map; default: none.")
+    ] = "",
+    swath_m: Annotated[
+        float | None, typer.Option(metavar="M", help="Swath; default: valves times spacing.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Write a first configuration: six questions, or --yes.
+
+    What it cannot know is marked MEASURE in the file. Exit 0: `config check` accepts it.
+    """
+    from companion.cli import new_config
+
+    if out.exists() and not force:
+        raise ConfigError(f"{out}: is there already; give another --out, or --force to replace it")
+    if profile is not None:
+        text = new_config.profile_text(
+            new_config.read_profile(profile), map_name=new_config.map_seen_from(out, map_file)
+        )
+    else:
+        given = new_config.answers_of(
+            f"{autopilot} {link}", output, f"{valves} {spacing_m}", nozzle, map_file, swath_m
+        )
+        answers = given if yes else new_config.ask_all(given, _ask)
+        text = new_config.text_of(answers, map_name=new_config.map_seen_from(out, answers.map_file))
+    new_config.write_checked(out, text)
+    problems = [problem_object(problem) for problem in problems_of(load(out))]
+    ok = not any(problem["severity"] == "error" for problem in problems)
+    measure = [line[2:] for line in text.splitlines() if line.startswith("# MEASURE")]
+    answer(
+        {"ok": ok, "path": str(out), "problems": problems, "measure": measure},
+        [f"written: {out}", *map(problem_line, problems), f"next: vrspray doctor --config {out}"],
+        as_json=as_json,
+    )
+    raise typer.Exit(0 if ok else 2)
+
+
+def _ask(question: str, default: str) -> str:
+    """Return what the operator types; nothing typed is the default."""
+    said = typer.prompt(question, default=default, show_default=bool(default), err=True)
+    return str(said).strip()
+
+
 @app.command(epilog="Example: vrspray config show field.toml --set lag.on_s=0.12")
 def show(file: File, overrides: Overrides = None, as_json: AsJson = False) -> None:
     """Print every effective setting and where it comes from: file, override or default."""

@@ -1,0 +1,340 @@
+"""`vrspray config new`: six questions, and a commented configuration that `config check` passes."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from companion.atomic_write import write_atomically
+from companion.config import load
+from companion.errors import ConfigError
+
+Ask = Callable[[str, str], str]
+AUTOPILOTS = ("ardupilot", "px4")
+OUTPUTS = ("servo", "gpio")
+VALVES_MAX = 64
+# ISO 10625: the size is the flow in tenths of a US gallon a minute at 40 psi (2.76 bar).
+_ISO_L_MIN, _ISO_BAR = 0.37854, 2.758
+_ISO = re.compile(r"(?:iso )?0*(\d{1,2}(?:\.\d)?) at (\d{1,2}(?:\.\d+)?) ?bar")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answers:
+    """What is asked of a sprayer. `nozzle_l_min` is of all nozzles of one valve, fully open."""
+
+    autopilot: Literal["ardupilot", "px4"] = "ardupilot"
+    link: str = "serial:/dev/serial0:921600"
+    output: Literal["servo", "gpio"] = "servo"
+    first_channel: int = 9
+    valves: int = 6
+    spacing_m: float = 1.0
+    nozzle_l_min: float = 0.8
+    map_file: str = ""
+    swath_m: float | None = None
+
+    @property
+    def width_m(self) -> float:
+        """Return the width of a pass."""
+        return self.valves * self.spacing_m if self.swath_m is None else self.swath_m
+
+
+def ask_all(answers: Answers, ask: Ask) -> Answers:
+    """Return the answers after six questions; `ask` gets a question and its default."""
+    words = ask("1. Autopilot and its link", f"{answers.autopilot} {answers.link}").split()
+    answers = _with_autopilot(answers, words)
+    outputs = ask(
+        "2. Valves on: servo or gpio, and the first output",
+        f"{answers.output} {answers.first_channel}",
+    ).split()
+    answers = _with_outputs(answers, outputs)
+    count = ask(
+        "3. How many valves, and metres between them", f"{answers.valves} {answers.spacing_m:g}"
+    ).replace(",", " ")
+    answers = _with_valves(answers, count.split())
+    flow = ask(
+        "4. Flow of one valve, fully open: L/min, or ISO size as in '03 at 3 bar'",
+        f"{answers.nozzle_l_min:g}",
+    )
+    answers = replace(answers, nozzle_l_min=nozzle_flow(flow))
+    answers = replace(answers, map_file=ask("5. Prescription map, if there is one", ""))
+    swath = ask("6. Swath in metres", f"{answers.width_m:g}")
+    return replace(answers, swath_m=_number(swath, "swath", 0.1, 100.0))
+
+
+def answers_of(
+    autopilot: str, output: str, valves: str, nozzle: str, map_file: str, swath_m: float | None
+) -> Answers:
+    """Return the answers of the command line; a ConfigError for one that cannot be."""
+    answers = _with_autopilot(Answers(map_file=map_file), autopilot.split())
+    answers = _with_valves(_with_outputs(answers, output.split()), valves.split())
+    answers = replace(answers, nozzle_l_min=nozzle_flow(nozzle))
+    if swath_m is None:
+        return answers
+    return replace(answers, swath_m=_number(f"{swath_m}", "swath", 0.1, 100.0))
+
+
+def nozzle_flow(text: str) -> float:
+    """Return the flow of a valve, of a figure in L/min or of an ISO size at a pressure.
+
+    >>> nozzle_flow("0.8"), round(nozzle_flow("03 at 3 bar"), 3)
+    (0.8, 1.184)
+    """
+    size = _ISO.fullmatch(" ".join(text.lower().split()))
+    if size is None:
+        return _number(text, "flow of one valve", 0.01, 100.0)
+    flow = float(size[1]) * _ISO_L_MIN * math.sqrt(float(size[2]) / _ISO_BAR)
+    return _number(f"{flow}", "flow of one valve", 0.01, 100.0)
+
+
+def _with_autopilot(answers: Answers, words: list[str]) -> Answers:
+    name, *rest = words or [""]
+    if name not in AUTOPILOTS or len(rest) > 1:
+        raise ConfigError(
+            f"{' '.join(words)!r}: no autopilot; write ardupilot or px4, and then its link, such "
+            "as serial:/dev/serial0:921600"
+        )
+    link = rest[0] if rest else answers.link
+    is_px4 = name == "px4"  # which counts actuators from 1 where ArduPilot counts outputs
+    return replace(
+        answers,
+        autopilot="px4" if is_px4 else "ardupilot",
+        link=link,
+        first_channel=1 if is_px4 else 9,
+    )
+
+
+def _with_outputs(answers: Answers, words: list[str]) -> Answers:
+    kind, *rest = words or [""]
+    if kind not in OUTPUTS or len(rest) > 1:
+        raise ConfigError(f"{' '.join(words)!r}: no output; write servo 9, or gpio 5")
+    default = 5 if kind == "gpio" else 1 if answers.autopilot == "px4" else 9
+    first = int(_number(rest[0], "first output", 0, 1023)) if rest else default
+    return replace(answers, output="gpio" if kind == "gpio" else "servo", first_channel=first)
+
+
+def _with_valves(answers: Answers, words: list[str]) -> Answers:
+    if len(words) != 2:
+        raise ConfigError(f"{' '.join(words)!r}: write two numbers, such as 6 1.0")
+    count = _number(words[0], "number of valves", 1, VALVES_MAX)
+    if count != int(count):
+        raise ConfigError(f"number of valves {words[0]}: not a whole number")
+    spacing_m = _number(words[1], "spacing", 0.05, 50.0)
+    return replace(answers, valves=int(count), spacing_m=spacing_m, swath_m=None)
+
+
+def _number(text: str, what: str, least: float, most: float) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not least <= value <= most:
+        raise ConfigError(f"{what} {text!r}: write a number from {least:g} to {most:g}")
+    return value
+
+
+def text_of(answers: Answers, *, map_name: str = "") -> str:
+    """Return the configuration as text; `map_name` is that of the map, seen from the file."""
+    parts = [_HEAD, _link(answers)]
+    if map_name:
+        parts.append(_PRESCRIPTION.format(file=_quoted(map_name)))
+    parts += [_boom(answers), _flows(answers), _LAG, _output(answers), _safety(answers)]
+    parts += [_mission(answers), _JOURNAL]
+    return "\n".join(part.strip() + "\n" for part in parts)
+
+
+_HEAD = """
+# Written by `vrspray config new`. Check it after every change: vrspray config check FILE
+# All keys: docs/reference/configuration.md. What is marked MEASURE is a guess until you have.
+
+version = 1
+"""
+_PRESCRIPTION = """
+# The map. If it has several columns of rates, or does not say its unit, write rate_field and unit.
+[prescription]
+file = {file}
+"""
+_LAG = """
+# MEASURE: how late the spray is. These are those of an example, and `vrspray doctor` says so until
+# you have measured yours: with a flow meter `vrspray calibrate lag`, without one
+# `vrspray calibrate lag-marks`; add --write to have the figures put in here.
+[lag]
+on_s = 0.10
+off_s = 0.08
+up_s = 0.10
+down_s = 0.10
+on_start_s = 0.05
+off_end_s = 0.15
+output_s = 0.02
+position_s = 0.0
+"""
+_JOURNAL = """
+# One file a flight, in this folder beside the configuration.
+[journal]
+folder = "flights"
+"""
+
+
+def _link(answers: Answers) -> str:
+    return (
+        "# The flight controller: serial:DEVICE:BAUD, udpin:HOST:PORT, udpout:HOST:PORT or\n"
+        f"# tcp:HOST:PORT.\n[link]\nurl = {_quoted(answers.link)}\n"
+    )
+
+
+def _boom(answers: Answers) -> str:
+    lines = [
+        "# Width of a pass, and the height above the crop.",
+        "[boom]",
+        f"width_m = {answers.width_m:g}",
+        "height_m = 3.5",
+        "",
+        "# The valves from left to right; right_m: middle of its strip, right of the aircraft.",
+    ]
+    strip_m = answers.width_m / answers.valves
+    for number in range(answers.valves):
+        right_m = round((number - 0.5 * (answers.valves - 1)) * strip_m, 4)
+        lines += ["[[valve]]", f'name = "{number + 1}"', f"right_m = {right_m or 0.0}"]
+        lines += [f"channel = {answers.first_channel + number}", ""]
+    return "\n".join(lines)
+
+
+def _flows(answers: Answers) -> str:
+    names = ", ".join(f'"{number + 1}"' for number in range(answers.valves))
+    duty = (0.2, 0.4, 0.6, 0.8, 1.0)
+    flows = ", ".join(f"{each * answers.valves * answers.nozzle_l_min:.3f}" for each in duty)
+    return f"""
+[pwm]
+frequency_hz = 11.0
+duty_min = 0.2
+duty_max = 0.9
+valve = "normally-closed"
+
+# MEASURE: flow of all valves together at each duty, here {answers.nozzle_l_min:.3g} L/min a
+# valve in proportion to the duty. A bucket test:
+# vrspray calibrate flow bucket.csv --config FILE --write
+[[nozzle_set]]
+valves = [{names}]
+duty = [{", ".join(f"{each:g}" for each in duty)}]
+flow_l_min = [{flows}]
+"""
+
+
+def _output(answers: Answers) -> str:
+    if answers.output == "gpio":
+        return """
+# Valves on lines of this computer; `chip` is the one that `gpiodetect` names.
+[output]
+kind = "gpio"
+chip = "gpiochip0"
+"""
+    return """
+# Valves on outputs of the flight controller: pulse of closed and of fully open, as the driver
+# board takes them.
+[output]
+kind = "servo"
+closed_us = 1000
+full_us = 2000
+"""
+
+
+def _safety(answers: Answers) -> str:
+    mode = "MISSION" if answers.autopilot == "px4" else "AUTO"
+    return f"""
+# What must hold before a valve opens. To enable by an RC switch too: add "rc", and rc_channel = 7.
+[safety]
+enable_by = ["command"]
+modes = ["{mode}"]
+speed_min_m_s = 1.0
+speed_max_m_s = 12.0
+height_min_m = 1.0
+height_max_m = 10.0
+wind_max_m_s = 6.0
+fix = "rtk-float"
+# True only with a relay that cuts the pump when this computer fails: fit one.
+pump_cutoff = false
+"""
+
+
+def _mission(answers: Answers) -> str:
+    return f"""
+# For `vrspray plan`. After planning, name its lines: lines = "field.lines.geojson"
+[mission]
+autopilot = "{answers.autopilot}"
+swath_width_m = {answers.width_m:g}
+speed_m_s = 5.0
+height_m = 3.5
+tank_l = 40.0
+reserve_l = 1.0
+rate_l_ha = 20.0
+"""
+
+
+def _quoted(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+
+
+def read_profile(name: str) -> str:
+    """Return the text of a profile: a file, or one of the examples where they are installed."""
+    path = Path(name)
+    if path.suffix != ".toml":
+        known = {each.stem: each for folder in _folders() for each in folder.glob("*.toml")}
+        if name not in known:
+            names = ", ".join(sorted(known)) or "none installed here"
+            raise ConfigError(f"--profile {name}: not known; write a .toml file, or one of {names}")
+        path = known[name]
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--profile {path}: cannot be read; give a configuration file") from error
+
+
+def _folders() -> list[Path]:
+    """Return where profiles are: in the wheel beside the simulation, or in the source tree."""
+    found = find_spec("sitl")
+    packages = [] if found is None else list(found.submodule_search_locations or ())
+    places = [Path(each) / "examples" for each in packages]
+    places += [Path(each).parent / "examples" for each in packages]
+    return [place / "profiles" for place in places if (place / "profiles").is_dir()]
+
+
+def profile_text(text: str, *, map_name: str) -> str:
+    """Return a profile with another map; without one, for `plan` and without a map."""
+    table = _PRESCRIPTION.format(file=_quoted(map_name)).strip() + "\n\n" if map_name else ""
+    found = re.sub(
+        r"(?m)(^#[^\n]*\n)*^\[prescription\]\n(?:(?!\[)[^\n]*\n)*", lambda _: table, text, count=1
+    )
+    return found if table == "" or "[prescription]" in found else f"{found}\n{table}"
+
+
+def write_checked(out: Path, text: str) -> None:
+    """Write a configuration that can be read as one; of any other nothing is left.
+
+    Raises:
+        ConfigError: where it cannot be written, or would be refused.
+    """
+    draft = out.with_name(f".{out.name}.{os.getpid()}.toml")
+    try:
+        write_atomically(draft, text.encode())
+        load(draft)
+        draft.replace(out)
+    except OSError as error:
+        reason = (error.strerror or "cannot be written").lower()
+        raise ConfigError(f"{out}: {reason}; give another file") from error
+    except ConfigError as error:
+        text = str(error).replace(str(draft), str(out))
+        raise ConfigError(text, problems=error.problems) from error
+    finally:
+        with suppress(OSError):
+            draft.unlink(missing_ok=True)
+
+
+def map_seen_from(out: Path, map_file: str) -> str:
+    """Return the name of the map as the configuration has it, relative to its own folder."""
+    return os.path.relpath(map_file, out.parent) if map_file else ""
