@@ -11,6 +11,7 @@ from analysis.assess.breakdowns import Breakdowns, breakdowns, ways_between
 from analysis.assess.causes import Causes, causes_of
 from analysis.assess.cell_maps import CellMaps, cell_maps
 from analysis.assess.intervals import Interval, crossings_of, mean_interval, ratio_interval
+from analysis.assess.worst import Worst, worst_of
 from analysis.dose import misapplied_parts
 from analysis.evaluation import Evaluation, evaluate_strips
 from analysis.flow_accuracy import flow_samples
@@ -143,6 +144,7 @@ class Assessment:
     record: FlightRecord
     strips: tuple[Strip, ...]
     evaluation: Evaluation
+    worst: Worst
     intervals: Mapping[str, Interval]
     breakdowns: Breakdowns
     cells: CellMaps | None
@@ -165,6 +167,7 @@ class Assessment:
             "source": self.source,
             "utc_source": flight.utc_source,
             **self.evaluation.as_json(),
+            "worst": self.worst.as_json(),
             "intervals": {name: each.as_json() for name, each in self.intervals.items()},
             "breakdowns": self.breakdowns.as_json(),
             "cells": None if self.cells is None else self.cells.as_json(),
@@ -197,6 +200,7 @@ def assess(
         record=record,
         strips=tuple(strips),
         evaluation=evaluation,
+        worst=worst_of(flight, evaluation.steps),
         intervals=_intervals(evaluation, strips),
         breakdowns=breakdowns(evaluation, strips),
         cells=cell_maps(record, strips, duties_of(flight, record.time_s), cell_m=cell_m),

@@ -13,6 +13,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import shapely
 
 from analysis.assess.ground_elements import SquareGrid, slices_of, summed
 from analysis.changes import SPEED_MIN_M_S
@@ -110,7 +111,8 @@ def causes_of(
         off = _is_off(marks)
         own = [step for step in steps if step.change.valve == strip.track.valve]
         for cause, where in _sorted(flight, marks, off, own):
-            area[cause] += float(marks.area_m2[where].sum())
+            is_edge = cause is Cause.EDGE
+            area[cause] += _edge_m2(marks, where) if is_edge else float(marks.area_m2[where].sum())
             if cause is Cause.INHIBIT:
                 for reason, its in by_inhibit(flight, marks, where).items():
                     inhibits[reason] = inhibits.get(reason, 0.0) + its
@@ -126,6 +128,18 @@ def causes_of(
         skipped_m2=ground.between_m2,
         untreated_m2=ground.untreated_m2,
     )
+
+
+def _edge_m2(marks: Marks, where: Bools) -> float:
+    """Return the ground that the border rule left bare, by its geometry.
+
+    A dose is a mean over a PWM period, which spreads the end of the spray over half a metre, too
+    little on one side and too much on the other: that ground is not all off. What is missing of
+    its volume, at the prescribed dose, is the ground between the end of the spray and the border.
+    """
+    asked, given = marks.asked_ml_m[where], marks.given_ml_m[where]
+    share = np.divide(asked - given, asked, out=np.ones(len(asked)), where=asked > 0.0)
+    return max(float((marks.area_m2[where] * share).sum()), 0.0)
 
 
 def _is_off(marks: Marks) -> Bools:
@@ -285,6 +299,9 @@ CELLS_MAX = 4_000_000
 WET_FROM = 0.10
 DOUBLED_FROM = 1.5
 LEFT_OUT_BELOW = 0.5
+# Less of a square inside the border is nothing; more squares on it than this go by their middle.
+SHARE_MIN = 0.02
+EDGE_CELLS_MAX = 50_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -318,27 +335,59 @@ def treated_ground(record: FlightRecord, strips: Sequence[Strip]) -> TreatedGrou
             total += each
     shape = (grid.rows, grid.columns)
     area = cell_m * cell_m
-    times = covered[:-1].reshape(shape) / area
-    under = passed[:-1].reshape(shape) / area
-    open_ground = _rated(record, grid, times < LEFT_OUT_BELOW)
+    share, east_m, north_m = _shares(record.prescription, grid)
+    # Of a cell that the border goes through, the part inside is the whole.
+    ground_m2 = area * np.maximum(share, SHARE_MIN)
+    times = covered[:-1].reshape(shape) / ground_m2
+    under = passed[:-1].reshape(shape) / ground_m2
+    bare = (times < LEFT_OUT_BELOW) & (share >= SHARE_MIN)
+    open_ground = _rated(record, bare, east_m, north_m)
     # What a strip passed with its valve closed is judged along the strip.
     missed = open_ground & (times + under < LEFT_OUT_BELOW)
     closed = _closed(times + under >= LEFT_OUT_BELOW, record.boom.width_m / cell_m)
     return TreatedGround(
-        treated_m2=float((times >= LEFT_OUT_BELOW).sum()) * area,
-        doubled_m2=float((times[times > DOUBLED_FROM] - 1.0).sum()) * area,
-        between_m2=float((missed & closed).sum()) * area,
-        untreated_m2=float(open_ground.sum()) * area,
+        treated_m2=float(share[times >= LEFT_OUT_BELOW].sum()) * area,
+        doubled_m2=float(((times - 1.0) * share)[times > DOUBLED_FROM].sum()) * area,
+        between_m2=float(share[missed & closed].sum()) * area,
+        untreated_m2=float(share[open_ground].sum()) * area,
     )
 
 
-def _rated(record: FlightRecord, grid: SquareGrid, asked: Bools) -> Bools:
-    """Return which of some squares have something prescribed in their middle."""
-    row, column = np.nonzero(asked)
-    east: Floats = grid.west_m + grid.cell_m * (column.astype(np.float64) + 0.5)
-    north: Floats = grid.south_m + grid.cell_m * (row.astype(np.float64) + 0.5)
+def _shares(prescription: Prescription, grid: SquareGrid) -> tuple[Floats, Floats, Floats]:
+    """Return how much of each square lies in the field, and a place in that part of it.
+
+    A square that the border goes through counts with its geometry: half a square beyond a slanted
+    edge is no ground that was left out. Others are in or out by their middle.
+    """
+    shape = (grid.rows, grid.columns)
+    row, column = np.indices(shape)
+    east_m: Floats = grid.west_m + grid.cell_m * (column.astype(np.float64) + 0.5)
+    north_m: Floats = grid.south_m + grid.cell_m * (row.astype(np.float64) + 0.5)
+    share = prescription.inside(east_m.ravel(), north_m.ravel()).astype(np.float64).reshape(shape)
+    # Steps short enough that no square of any size worth counting is stepped over.
+    edge = shapely.segmentize(prescription.field.boundary, grid.cell_m / 8.0)
+    cells = np.unique(grid.cells_of(*shapely.get_coordinates(edge).T))
+    cells = cells[cells < grid.rows * grid.columns]
+    if len(cells) > EDGE_CELLS_MAX:
+        return share, east_m, north_m
+    at = np.unravel_index(cells, shape)
+    half_m = 0.5 * grid.cell_m
+    boxes = shapely.box(
+        east_m[at] - half_m, north_m[at] - half_m, east_m[at] + half_m, north_m[at] + half_m
+    )
+    inside = shapely.intersection(prescription.field, boxes)
+    share[at] = np.minimum(shapely.area(inside) / grid.cell_m**2, 1.0)
+    middle = shapely.point_on_surface(inside)
+    known = ~shapely.is_empty(middle)
+    where = tuple(each[known] for each in at)
+    east_m[where], north_m[where] = shapely.get_x(middle[known]), shapely.get_y(middle[known])
+    return share, east_m, north_m
+
+
+def _rated(record: FlightRecord, asked: Bools, east_m: Floats, north_m: Floats) -> Bools:
+    """Return which of some squares have something prescribed at their place."""
     found = np.zeros(asked.shape, dtype=np.bool_)
-    found[row, column] = ground_rates(record.prescription, east, north) > 0.0
+    found[asked] = ground_rates(record.prescription, east_m[asked], north_m[asked]) > 0.0
     return found
 
 

@@ -53,8 +53,9 @@ class AppliedFlight:
     one value a decision with a known position; `rate_l_ha` is samples x valves, NaN where nothing
     is prescribed. `inhibits` has the reasons not to spray, sorted, with spaces between; "" without.
     `flow_l_min` is what the ordered duties stand for, all valves together; `meter_ml` what a flow
-    meter has counted since its start. `unknown` has, for each valve, the times of which rows are
-    missing, in order and apart, which may be without end; none at all in a whole journal.
+    meter has counted since its start; `fix` the quality of the position (`core.inputs.Fix`).
+    `unknown` has, for each valve, the times of which rows are missing, in order and apart, which
+    may be without end; none at all in a whole journal.
     """
 
     path: Path
@@ -83,6 +84,7 @@ class AppliedFlight:
     pressure_kpa: Series | None = None
     tank_l: Series | None = None
     wind_m_s: Series | None = None
+    fix: Series | None = None
     unknown: tuple[Spans, ...] = ()
 
     @property

@@ -152,6 +152,7 @@ _SENSORS = {
     "PressureReport": ("pressure_kpa", None),
     "TankReport": ("level_l", None),
     "WindReport": ("speed_m_s", None),
+    "GnssReport": ("fix", None),
 }
 
 
@@ -209,6 +210,7 @@ def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
         pressure_kpa=sensors["PressureReport"],
         tank_l=sensors["TankReport"],
         wind_m_s=sensors["WindReport"],
+        fix=sensors["GnssReport"],
     )
     return _mended(flight, applied.holes, missing, unread)
 
@@ -304,7 +306,8 @@ def _sensors(
         for kind, values in _messages(entries):
             at, value, fault = places[kind]
             is_sound = fault < 0 or not values[fault]
-            pairs[kind].append((values[at], values[value] if is_sound else None))
+            told = values[value] if is_sound else None
+            pairs[kind].append((values[at], told["Fix"] if isinstance(told, dict) else told))
     except sqlite3.DatabaseError as error:
         if unread is None or "locked" in str(error):
             raise

@@ -17,6 +17,7 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from analysis.assess.assessment import Assessment, assess
+from analysis.assess.figures import Figures, figures_of
 from analysis.flown.applied_record import EvaluationError
 from analysis.flown.read_applied import read_applied
 from analysis.report.contents import contents_of
@@ -79,12 +80,14 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
     assessment, why_not = _assessed(flight, is_whole=not (unread or flight.lost))
     treated = treated_of(flight)
     clock = _clock(flight, told, treated, options.time_zone)
-    facts = facts_of(flight, treated, clock, unread=len(unread), **_volumes(assessment))
+    figures = figures_of(assessment, area_ha=treated.area_ha, is_whole=not (unread or flight.lost))
+    facts = facts_of(flight, treated, clock, unread=len(unread), **_volumes(figures))
     records = [legal_record(each, told, facts) for each in _profiles(options, told)]
     contents = contents_of(
         flight,
         assessment,
         treated=treated,
+        figures=figures,
         clock=clock,
         told=told,
         records=records,
@@ -115,16 +118,13 @@ def _clock(flight: AppliedFlight, told: Told, treated: Treated, time_zone: str |
     return clock if start_time is None else clock.moved_to(start_time, treated.first_s)
 
 
-def _volumes(assessment: Assessment | None) -> dict[str, Any]:
-    """Return the litres of the record: counted by a meter where there is one, else modelled."""
-    if assessment is None:
-        return {"volume_l": 0.0, "volume_by": "nothing", "prescribed_l": None}
-    balance = assessment.balance
-    metered = balance.meter_l is not None
+def _volumes(figures: Figures) -> dict[str, Any]:
+    """Return the litres of the record: those of the headline, and what they are known by."""
+    by = {"model": "model of the executed changes"}.get(figures.applied_by, figures.applied_by)
     return {
-        "volume_l": balance.meter_l if metered else balance.model_l,
-        "volume_by": "flow meter" if metered else "model of the executed changes",
-        "prescribed_l": balance.prescribed_l,
+        "volume_l": figures.applied_l or 0.0,
+        "volume_by": by,
+        "prescribed_l": figures.prescribed_l,
     }
 
 

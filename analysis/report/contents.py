@@ -24,13 +24,14 @@ if TYPE_CHECKING:
 
     from analysis.assess.assessment import Assessment
     from analysis.assess.breakdowns import AccuracyGroup
+    from analysis.assess.figures import Figures
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.report.legal import LegalRecord
     from analysis.report.legal_fields import Told
     from analysis.report.treated import Clock, Treated
 
 
-REPORT_VERSION = 1
+REPORT_VERSION = 2
 # Keys of the contract that stand in every report, and are null where nothing could be evaluated.
 METRICS = (
     "lag_distance_m", "settled_lag_distance_m", "spraying_accuracy_percent", "misapplied_percent",
@@ -46,6 +47,7 @@ def contents_of(
     assessment: Assessment | None,
     *,
     treated: Treated,
+    figures: Figures,
     clock: Clock,
     told: Told,
     records: Sequence[LegalRecord],
@@ -72,7 +74,11 @@ def contents_of(
             **_flight(flight, treated, clock, told, is_known=is_known),
             "unread": list(unread),
         },
-        "verdict": verdict_of(assessment, treated, is_whole=is_whole),
+        "verdict": verdict_of(
+            figures,
+            SIMULATED if flight.simulated.is_simulated else flight.training,
+            is_whole=is_whole,
+        ),
         "warnings": [warning.as_json() for warning in warnings],
         **(metrics if assessment is None else assessment.as_json()),
         "table_5": None if assessment is None else table_5(assessment.breakdowns.accuracy),
@@ -255,57 +261,40 @@ class Caution:
         return {"severity": self.severity, "code": self.code, "text": self.text}
 
 
-def verdict_of(
-    assessment: Assessment | None, treated: Treated, *, is_whole: bool = True
-) -> dict[str, Any]:
-    """Return the figures of the verdict, and the verdict in one sentence.
-
-    What was sprayed in a flight of which too little can be read, nobody knows: null, and not zero.
-    """
-    if assessment is None or assessment.evaluation.applied_ml <= 0.0:
-        return {
-            "sentence": "Nothing was sprayed in this flight." if is_whole else UNKNOWN,
-            "applied_l": 0.0 if is_whole else None,
-            "prescribed_l": None,
-            "area_ha": treated.area_ha if is_whole else None,
-            "within_10_percent": None,
-            "worst_lag_distance_m": None,
-            "outside_ml": None,
-        }
-    evaluation, balance = assessment.evaluation, assessment.balance
-    figures = {
-        "applied_l": balance.model_l,
-        "prescribed_l": balance.prescribed_l,
-        "area_ha": treated.area_ha,
-        "within_10_percent": assessment.causes.within_percent,
-        "worst_lag_distance_m": evaluation.lag_distance_m.max_abs,
-        "outside_ml": evaluation.off_target_ml,
-    }
-    flight = assessment.flight
-    training = SIMULATED if flight.simulated.is_simulated else flight.training
-    sentence = _sentence(figures, training)
-    return {"sentence": sentence if is_whole else f"By what could be read: {sentence}", **figures}
+def verdict_of(figures: Figures, training: str | None, *, is_whole: bool = True) -> dict[str, Any]:
+    """Return the figures of the flight, and the verdict in one sentence."""
+    if figures.applied_by == "nothing":
+        sentence = "Nothing was sprayed in this flight." if is_whole else UNKNOWN
+    else:
+        sentence = sentence_of(figures, training)
+        sentence = sentence if is_whole else f"By what could be read: {sentence}"
+    return {"sentence": sentence, **figures.as_json()}
 
 
-def _sentence(figures: Mapping[str, Any], training: str | None) -> str:
-    applied_l, prescribed_l = figures["applied_l"], figures["prescribed_l"]
+def sentence_of(figures: Figures, training: str | None) -> str:
+    """Return what was applied, what of it is known how, and what was missed."""
     what = {
         "water": "L of water applied",
         "dry": "L would have been applied",
         SIMULATED: "L applied in a simulation",
     }
     done = what.get(training or "", "L applied")
-    parts = [f"{applied_l:.2f} {done} on {figures['area_ha']:.2f} ha"]
-    if prescribed_l:
-        off = 100.0 * (applied_l - prescribed_l) / prescribed_l
-        parts[0] += f", where the map asked for {prescribed_l:.2f} L ({off:+.1f} %)"
-    if figures["within_10_percent"] is not None:
-        within = figures["within_10_percent"]
-        parts.append(f"{within:.1f} % of the ground got its rate within 10 %")
-    if figures["worst_lag_distance_m"] is not None:
-        worst_m = figures["worst_lag_distance_m"]
-        parts.append(f"the worst change of rate lay {worst_m:.2f} m from its boundary")
-    parts.append(f"{figures['outside_ml']:.1f} mL fell outside the border")
+    how = "by the flow meter" if figures.applied_by == "flow meter" else "modelled, not metered"
+    parts = [f"{figures.applied_l:.2f} {done} ({how}) on {figures.area_ha:.2f} ha"]
+    if figures.prescribed_l and figures.off_percent is not None:
+        parts[0] += (
+            f", where the map asked for {figures.prescribed_l:.2f} L ({figures.off_percent:+.1f} %)"
+        )
+    if figures.within_10_percent is not None:
+        parts.append(f"{figures.within_10_percent:.1f} % of the ground got its rate within 10 %")
+    if figures.missed_m2 is not None:
+        parts.append(f"{figures.missed_m2:.0f} m2 were flown over and missed")
+    if figures.worst_m is not None:
+        parts.append(
+            f"no change of rate lay more than {figures.worst_m:.2f} m from its boundary (a bound, "
+            "95 %)"
+        )
+    parts.append(f"{figures.outside_ml:.1f} mL fell outside the border")
     return "; ".join(parts) + "."
 
 

@@ -16,6 +16,7 @@ import pytest
 from analysis.assess.assessment import assess
 from analysis.assess.causes import Cause
 from analysis.assess.cell_maps import Histogram
+from analysis.assess.figures import figures_of
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report, embedded, page_of
 from analysis.report.contents import METRICS, contents_of, held_between, held_ground
@@ -108,10 +109,12 @@ def test_the_published_flights_stand_beside_this_one(page: Parsed) -> None:
 
 def test_the_first_screen_speaks_to_a_farmer(report: Report, page: Parsed) -> None:
     contents = report.contents
-    lag = contents["lag_distance_m"]
     text = re.sub(r"\s+", " ", page.text).partition("On the ground")[0]
-    assert f"{lag['mean_abs']:.2f} m" in text
-    assert f"(mean of {lag['count']}; worst {lag['max_abs']:.2f} m)" in text
+    assert f"{contents['verdict']['applied_l']:.2f} L" in text
+    assert "modelled, not metered" in text
+    assert "flown over and missed" in text
+    # The model's largest lag distance is no bound, and no headline.
+    assert "worst" not in text
     # Times as they are read; the zone is named beside them.
     start = contents["flight"]["spraying_from"][:19]
     assert f"sprayed {start.replace('T', ' ')} to" in text
@@ -315,10 +318,12 @@ def test_lost_rows_and_a_cut_are_warnings(journal: Path) -> None:
     flight = read_applied(journal)
     event = Event(at_s=math.nan, kind="odd", text="at no time")
     flight = replace(flight, is_closed=False, lost=7, events=(*flight.events, event))
+    found = assess(flight)
     contents: dict[str, Any] = contents_of(
         flight,
-        assess(flight),
+        found,
         treated=treated_of(flight),
+        figures=figures_of(found, area_ha=treated_of(flight).area_ha),
         clock=clock_of(flight, None),
         told=told_with(flight.meta),
         records=(),
