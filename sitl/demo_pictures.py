@@ -198,7 +198,7 @@ BARE = "#F1F1EE"
 # Less than this share of the least rate on the map is not worth a colour.
 WET_SHARE = 0.1
 # Where the colours are dark, figures on them are white.
-DARK_BELOW = 0.7
+DARK_FROM = 0.3
 PASSES = 4
 # The colours go on a little beyond the map's rates, so that too much can be seen.
 BEYOND_L_HA = 1.0
@@ -211,7 +211,7 @@ def map_figure(result: DemoResult) -> Figure:
     axes = field_axes(setup)
     rates = setup.prescription.rates_l_ha
     norm = Normalize(rates[0] - BEYOND_L_HA, rates[-1] + BEYOND_L_HA)
-    colours = matplotlib.colormaps["viridis"].with_extremes(bad=BARE)
+    colours = matplotlib.colormaps["viridis_r"].with_extremes(bad=BARE)
     figure = new_figure(
         (10.0, 7.2),
         "Prescribed and applied",
@@ -272,7 +272,7 @@ def _fill(
     )
     for rate, ring in rings:
         x_m, y_m = ring[:-1].mean(axis=0)
-        ink = "white" if norm(rate) < DARK_BELOW else INK
+        ink = "white" if norm(rate) > DARK_FROM else INK
         panel.text(x_m, y_m, f"{rate:.1f}", size=8.5, color=ink, ha="center", va="center")
 
 

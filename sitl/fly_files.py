@@ -187,7 +187,7 @@ def _draw_asked(flown: Flown, axes: Axes, most_l_ha: float) -> None:
             outline = Outline.make_compound_path(
                 *(Outline(shapely.get_coordinates(ring), closed=True) for ring in rings)
             )
-            colour = colormaps["viridis"](zone.rate_l_ha / most_l_ha)
+            colour = colormaps["viridis_r"](zone.rate_l_ha / most_l_ha)
             axes.add_patch(PathPatch(outline, facecolor=colour, edgecolor="white", linewidth=0.3))
     record = flown.result.record
     axes.plot(record.east_m, record.north_m, color="tab:red", linewidth=0.7)
@@ -214,7 +214,14 @@ def _draw_applied(flown: Flown, axes: Axes, most_l_ha: float) -> Any:
         south_m,
         south_m + deposit.rows * cell_m,
     )
-    image = axes.imshow(applied, origin="lower", extent=extent, vmin=0.0, vmax=most_l_ha)
+    image = axes.imshow(
+        applied,
+        origin="lower",
+        extent=extent,
+        vmin=0.0,
+        vmax=most_l_ha,
+        cmap="viridis_r",
+    )
     _frame(axes, flown, "applied")
     return image
 

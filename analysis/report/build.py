@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from analysis.flown.applied_flight import AppliedFlight
-    from analysis.report.figures.style import Drawn
     from analysis.report.legal import LegalRecord
 
 
@@ -146,27 +145,23 @@ def _with_files(
     files: dict[str, bytes] = {}
     figures: dict[str, dict[str, str]] = {}
     if options.with_figures and assessment is not None:
-        files, figures = _figures(contents, assessment, clock, treated, with_pdf=options.with_pdf)
-    elif options.with_pdf:
-        from analysis.report.pdf import pdf_of
-
-        files["report.pdf"] = pdf_of(contents, ())
+        files, figures = _figures(assessment, clock, treated)
     contents["figures"] = [name for name in files if name.startswith("figures/")]
     for record in records:
         files[f"application-{record.profile}.json"] = record_json(record)
         files[f"application-{record.profile}.csv"] = record_csv(record)
     files["report.json"] = (json.dumps(contents, indent=1, allow_nan=False) + "\n").encode()
-    files["report.html"] = page_of(contents, figures).encode()
+    page = page_of(contents, figures)
+    files["report.html"] = page.encode()
+    if options.with_pdf:
+        from analysis.report.pdf import pdf_of
+
+        files["report.pdf"] = pdf_of(page)
     return Report(contents=contents, files=files)
 
 
 def _figures(
-    contents: Mapping[str, Any],
-    assessment: Assessment,
-    clock: Clock,
-    treated: Treated,
-    *,
-    with_pdf: bool,
+    assessment: Assessment, clock: Clock, treated: Treated
 ) -> tuple[dict[str, bytes], dict[str, dict[str, str]]]:
     """Return the files of all figures, and how they stand in the page."""
     from analysis.report.drawing import drawn_of
@@ -174,7 +169,6 @@ def _figures(
 
     files: dict[str, bytes] = {}
     figures: dict[str, dict[str, str]] = {}
-    drawn: list[Drawn] = []
     with styled():
         for each in drawn_of(assessment, clock, treated):
             png, svg = png_of(each), svg_of(each)
@@ -186,11 +180,6 @@ def _figures(
                 "caption": each.caption,
                 "markup": picture(png, each.alt, each.width) if is_map else inline_svg(each, svg),
             }
-            drawn.append(each)
-        if with_pdf:
-            from analysis.report.pdf import pdf_of
-
-            files["report.pdf"] = pdf_of(contents, drawn)
     return files, figures
 
 

@@ -48,7 +48,9 @@ def report_flight(
             "--set", metavar="KEY=VALUE", help="Entry of the record, added after the flight."
         ),
     ] = None,
-    is_pdf: Annotated[bool, typer.Option("--pdf", help="Write report.pdf as well.")] = False,
+    is_pdf: Annotated[
+        bool, typer.Option("--pdf", help="Also report.pdf, on A4 (needs Chromium or Chrome).")
+    ] = False,
     is_plain: Annotated[bool, typer.Option("--no-figures", help="Leave out all figures.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -58,12 +60,16 @@ def report_flight(
     what can be read is written; 2: no journal, an option is wrong, or DIR cannot be written.
     """
     from analysis.report.build import ReportOptions, build_report
-    from analysis.report.folder import check_folder, write_files
+    from analysis.report.folder import check_folder, earlier_files, write_files
+    from analysis.report.pdf import browser
     from analysis.report.treated import zone_of
 
     began_s = time.perf_counter()
     check_folder(out)
-    zone_of(time_zone)  # refused before the flight is read
+    # Refused before the flight is read.
+    zone_of(time_zone)
+    if is_pdf:
+        browser()
     options = ReportOptions(
         profiles=tuple(law.value for law in profile or ()),
         time_zone=time_zone,
@@ -73,7 +79,7 @@ def report_flight(
         with_pdf=is_pdf,
     )
     report = build_report(journal, options, say=note)
-    write_files(out, report.files)
+    write_files(out, report.files, without=earlier_files(out, report.files))
     contents = report.contents
     for warning in contents["warnings"]:
         if warning["severity"] != "note":

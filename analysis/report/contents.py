@@ -245,6 +245,8 @@ LATCHED = frozenset(
 METER_OFF_PERCENT = 6.0
 # More of the ground than this is not flown over closed by the way.
 HELD_SHARE = 0.01
+# Of what a record lacks, so much is named above it.
+LABELS_LISTED = 4
 UNKNOWN = "Nothing can be said of what was sprayed: too little of the journal can be read."
 
 
@@ -480,13 +482,24 @@ def _labels(record: LegalRecord) -> Iterator[str]:
     yield from record.why_not
 
 
+def _listed(labels: Sequence[str]) -> str:
+    """Return some of the labels; all of them stand in the record.
+
+    >>> _listed(["crop", "wind"]), _listed(list("abcdefgh"))
+    ('crop, wind', 'a, b, c, d and 4 more')
+    """
+    if len(labels) <= LABELS_LISTED + 1:
+        return ", ".join(labels)
+    return f"{', '.join(labels[:LABELS_LISTED])} and {len(labels) - LABELS_LISTED} more"
+
+
 def _records(records: Sequence[LegalRecord]) -> Iterator[Caution]:
     for record in records:
         if not record.is_complete:
             yield _warning(
                 "record",
                 f"The {record.profile} record of the application is INCOMPLETE; missing: "
-                f"{', '.join(_labels(record))}.",
+                f"{_listed(list(_labels(record)))}.",
             )
 
 

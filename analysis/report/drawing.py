@@ -117,7 +117,7 @@ def prescribed_and_applied(sheet: Sheet) -> Drawn:
     return Drawn(
         name="map",
         title="Prescribed and applied",
-        caption=f"{_cells_text(sheet.cells)} Dark is little, bright is much; grey is rate 0, "
+        caption=f"{_cells_text(sheet.cells)} The darker, the more; grey is rate 0, "
         "white was not flown over. The thin line is the path of the vehicle, the black one "
         "the border.",
         alt="Two maps of the field with one scale of colours: the prescribed rate of each cell, "
@@ -151,9 +151,10 @@ def deviation(sheet: Sheet) -> Drawn:
     return Drawn(
         name="deviation",
         title="Deviation",
-        caption=f"{_cells_text(sheet.cells)} White: as prescribed; cells at the ends of a pass "
-        "get less where nothing may fall outside the border. Grey: not flown over, or prescribed "
-        "less than a tenth of the highest rate.",
+        caption=f"{_cells_text(sheet.cells)} White: as prescribed; red: too little; blue: too "
+        "much; the darker, the further off. Cells at the ends of a pass get less where nothing may "
+        "fall outside the border. Grey: not flown over, or prescribed less than a tenth of the "
+        "highest rate.",
         alt="Map of the relative deviation of each cell from its prescribed rate, red where too "
         "little was applied and blue where too much.",
         kind="map",
@@ -170,7 +171,7 @@ def duty(sheet: Sheet) -> Drawn:
     return Drawn(
         name="duty",
         title="Duty of the valves",
-        caption=f"{_cells_text(sheet.cells)} Mean of the orders in force.",
+        caption=f"{_cells_text(sheet.cells)} Mean of the orders in force. The darker, the more.",
         alt="Map of the mean duty of the valves over each cell.",
         kind="map",
         figure=figure,

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from companion.errors import ConfigError
+
+# The figures of a report, by the names of their files.
+FIGURES = ("map", "deviation", "flow", "lags", "histogram", "causes", "duty", "treated")
 
 
 def check_folder(folder: Path) -> None:
@@ -24,8 +27,23 @@ def check_folder(folder: Path) -> None:
         raise _refused(folder, error) from error
 
 
-def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write every file, in the place of an earlier one; afterwards all are there, or none."""
+def earlier_files(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
+    """Return what an earlier report left in a folder that this one does not write anew.
+
+    Names that a report makes and no others: whatever else lies there is somebody's.
+    """
+    own = ("report.html", "report.json", "report.pdf", "application-*.json", "application-*.csv")
+    drawn = [f"figures/{name}.{kind}" for name in FIGURES for kind in ("png", "svg")]
+    new = {folder / name for name in files}
+    found = (each for pattern in (*own, *drawn) for each in folder.glob(pattern))
+    return sorted(each for each in found if each.is_file() and each not in new)
+
+
+def write_files(folder: Path, files: Mapping[str, bytes], *, without: Sequence[Path] = ()) -> None:
+    """Write every file, in the place of an earlier one; afterwards all are there, or none.
+
+    `without` are files of the folder that go; where anything fails they come back.
+    """
     try:
         with ExitStack() as made:
             _make(folder, made)
@@ -38,6 +56,10 @@ def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
                         target = folder / place
                         _make(target.parent, made)
                         _move(draft, target, Path(name) / f"replaced-{number}", moved)
+                    for number, old in enumerate(without):
+                        kept = Path(name) / f"removed-{number}"
+                        old.rename(kept)
+                        moved.callback(kept.replace, old)
                     moved.pop_all()
                 made.pop_all()
     except OSError as error:

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
+from analysis.report.pdf import BROWSERS, pdf_of
 from companion.cli.app import execute
+from companion.errors import ConfigError
 from tests.analysis.report_flight import EU_TOLD, fly
 
 Captured = pytest.CaptureFixture[str]
@@ -26,18 +28,17 @@ def test_report_writes_its_files_and_one_object(
     flown: Path, tmp_path: Path, capsys: Captured
 ) -> None:
     out = tmp_path / "made" / "report"
-    arguments = ["report", str(flown), "--out", str(out), "--pdf", "--no-figures", "--json"]
+    arguments = ["report", str(flown), "--out", str(out), "--no-figures", "--json"]
     assert execute([*arguments, "--profile", "eu", "--profile", "us"]) == 0
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
     names = {str(path.relative_to(out)) for path in out.rglob("*") if path.is_file()}
     assert names == {str(Path(name).relative_to(out)) for name in found["files"]}
     assert {
-        "report.html", "report.json", "report.pdf", "application-eu.json", "application-eu.csv",
+        "report.html", "report.json", "application-eu.json", "application-eu.csv",
         "application-us.json", "application-us.csv",
     } == names  # fmt: skip
     written = json.loads((out / "report.json").read_text())
     assert {key: found[key] for key in written} == written
-    assert (out / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_report_replaces_an_earlier_one(flown: Path, tmp_path: Path, capsys: Captured) -> None:
@@ -45,6 +46,65 @@ def test_report_replaces_an_earlier_one(flown: Path, tmp_path: Path, capsys: Cap
         assert execute(["report", str(flown), "--out", str(tmp_path), "--no-figures"]) == 0
     assert "report.html" in capsys.readouterr().out
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+def test_a_second_run_leaves_nothing_of_the_first(flown: Path, tmp_path: Path) -> None:
+    first = ["--profile", "eu", "--profile", "us"]
+    assert execute(["report", str(flown), "--out", str(tmp_path), *first]) == 0
+    (tmp_path / "figures" / "mine.png").write_bytes(b"mine")
+    (tmp_path / "notes.txt").write_bytes(b"mine")
+    again = ["--profile", "generic", "--no-figures"]
+    assert execute(["report", str(flown), "--out", str(tmp_path), *again]) == 0
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == {
+        "report.html", "report.json", "application-generic.json", "application-generic.csv",
+        "figures/mine.png", "notes.txt",
+    }  # fmt: skip
+
+
+BROWSER = """#!/bin/sh
+for word in "$@"; do
+  case "$word" in
+    --print-to-pdf=*) printf '%%PDF-1.4 of %s' "$*" > "${word#--print-to-pdf=}" ;;
+  esac
+done
+"""
+
+
+def test_a_pdf_is_the_page_printed_by_a_browser(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "chromium").write_text(BROWSER)
+    (programs / "chromium").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:/usr/bin:/bin")
+    out = tmp_path / "out"
+    assert execute(["report", str(flown), "--out", str(out), "--pdf", "--no-figures"]) == 0
+    printed = (out / "report.pdf").read_text()
+    assert printed.startswith("%PDF")
+    assert "report.html" in printed
+    assert "MAP * ~NOTFOUND" in printed
+
+
+def test_without_a_browser_a_pdf_is_refused_before_any_work(
+    flown: Path, tmp_path: Path, capsys: Captured, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path / "none"))
+    out = tmp_path / "out"
+    assert execute(["report", str(flown), "--out", str(out), "--pdf"]) == 2
+    assert "install chromium" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_browser_that_prints_nothing_is_said(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"did not print the page"):
+        pdf_of("<p>", program="/bin/true")
+
+
+@pytest.mark.skipif(not any(map(shutil.which, BROWSERS)), reason="no browser is installed")
+def test_a_real_browser_prints_the_page(flown: Path, tmp_path: Path) -> None:
+    assert execute(["report", str(flown), "--out", str(tmp_path), "--pdf", "--no-figures"]) == 0
+    assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_the_journal_is_not_touched(flown: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from analysis.report.folder import check_folder, write_files
+from analysis.report.folder import check_folder, earlier_files, write_files
 from companion.errors import ConfigError
 
 FILES = {"report.json": b"new", "figures/map.png": b"new", "figures/map.svg": b"new"}
@@ -46,6 +46,23 @@ def test_a_look_at_the_folder_makes_none(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(ConfigError, match="not a directory; give a folder that can be written"):
         check_folder(tmp_path / "file" / "report")
+
+
+def test_what_goes_comes_back_where_anything_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_files(tmp_path, {**FILES, "report.pdf": b"old", "figures/lags.png": b"old"})
+    before = content(tmp_path)
+    left = earlier_files(tmp_path, FILES)
+    assert {each.name for each in left} == {"report.pdf", "lags.png"}
+    # The last move of all fails: three files are in place, and one is gone already.
+    failing_at(8, OSError(28, "No space left on device"), "rename", monkeypatch)
+    with pytest.raises(ConfigError):
+        write_files(tmp_path, dict.fromkeys(FILES, b"newer"), without=left)
+    monkeypatch.undo()
+    assert content(tmp_path) == before
+    write_files(tmp_path, FILES, without=left)
+    assert content(tmp_path) == {**FILES, "figures": None}
 
 
 FULL = OSError(28, "No space left on device")
