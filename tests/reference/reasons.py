@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+
+from companion.config.tables import SafetyTable
 from companion.core.types import Inhibit
 from companion.link.announcer import reasons
 
@@ -149,4 +152,10 @@ def page() -> str:
         words = reasons(frozenset({one}))[0].removeprefix("Spray off: ")
         cells = (f"`{one.value}`<br>{words}", *CONDITIONS[one])
         rows.append(f"| {' | '.join(cells)} |")
-    return "\n".join(rows)
+    return re.sub(r"`safety\.(\w+)` \((\d[\d.]*)", _with_default, "\n".join(rows))
+
+
+def _with_default(found: re.Match[str]) -> str:
+    """Return the key with the default that the configuration has now."""
+    default = SafetyTable.model_fields[found[1]].default
+    return f"`safety.{found[1]}` ({default:g}"
