@@ -43,7 +43,7 @@ def _section(command: Any, name: str, context: Any) -> Iterator[str]:
         usage = " ".join(command.collect_usage_pieces(context))
         yield f"```text\n{name} {usage}\n```\n"
     if rows:
-        yield "| | What it does |\n|---|---|"
+        yield "| Option or argument | What it does |\n|---|---|"
         yield from rows
         yield ""
     if command.epilog:
@@ -68,9 +68,21 @@ def _example(epilog: str) -> str:
 
 
 def text(given: str) -> str:
-    """Return a help text as Markdown: paragraphs kept, marks that Markdown would eat escaped."""
+    """Return a help text as Markdown: paragraphs kept, marks that Markdown would eat escaped.
+
+    >>> text("Stop after this.  [0.0<=x<=100.0]"), text("How many.  [x>=1]")
+    ('Stop after this.  [0 to 100]', 'How many.  [at least 1]')
+    """
     given = given.replace("\b", "").strip()
-    return re.sub(r"([<>*|])", r"\\\1", re.sub(r"[ \t]*\n[ \t]*", "\n", given))
+    given = re.sub(r"(-?[\d.]+)<=x<=(-?[\d.]+)", _from_to, given)
+    given = re.sub(r"x>=(-?[\d.]+)", r"at least \1", given)
+    given = re.sub(r"[ \t]*\n[ \t]*", "\n", given)
+    return re.sub(r"([*|])", r"\\\1", given.replace("<", "&lt;").replace(">", "&gt;"))
+
+
+def _from_to(found: re.Match[str]) -> str:
+    low, high = (float(word) for word in found.groups())
+    return f"{low:.12g} to {high:.12g}"
 
 
 def cell(given: str) -> str:
