@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from analysis.write_back import Write, check_asked, written_lines
 from companion.cli.answer import AsJson, answer, note
 from companion.cli.app import load_command
 from companion.commands import Command
@@ -59,6 +60,10 @@ def lag(
         float, typer.Option(help="Delay of the meter, including its message, in seconds.")
     ] = 0.001,
     plot: Annotated[Path | None, typer.Option(help="Picture of all steps (PNG).")] = None,
+    config: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Configuration that --write changes.")
+    ] = None,
+    is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure on, off, up and down lags from a flight's orders and flow meter.
@@ -77,6 +82,7 @@ def lag(
     )
     from analysis.journals.content import read_journal
 
+    check_asked(config, is_write=is_write)
     if not 0.0 <= meter_lag_s <= 1.0:
         raise ConfigError(f"--meter-lag-s {meter_lag_s:g}: give 0 to 1 s")
     content = read_journal(journal)
@@ -97,7 +103,9 @@ def lag(
             note(f"no picture: matplotlib is missing; {install_command('office')}")
         except (OSError, ValueError) as error:
             raise ConfigError(f"--plot {plot}: cannot be written ({error})") from error
-    answer(shape(found), table_lines(found), as_json=as_json)
+    result = shape(found)
+    changed = written_lines(config, result, is_write=is_write)
+    answer(result, [*table_lines(found), *changed], as_json=as_json)
 
 
 def _refuse(why: str, *, as_json: bool) -> None:
@@ -135,7 +143,23 @@ def mission(
     written = planner.write_calibration(
         config, out, origin=_origin(origin), heading_deg=heading_deg
     )
-    answer(_mission_json(written), _mission_lines(written), as_json=as_json)
+    warnings = _without_meter(config)
+    result = {**_mission_json(written), "warnings": warnings}
+    answer(result, _mission_lines(written), as_json=as_json)
+    for warning in warnings:
+        note(f"warning: {warning}")
+
+
+def _without_meter(config: Path) -> list[str]:
+    """Return that the flight would measure nothing, where nothing meters its flow."""
+    from companion.config import load
+
+    if load(config).flow_meter.source != "none":
+        return []
+    return [
+        f"{config}: has no [flow_meter], so `calibrate lag` will find no readings in this flight; "
+        "connect a meter and name it, or measure with marks: vrspray calibrate lag-marks"
+    ]
 
 
 def _origin(text: str | None) -> tuple[float, float] | None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from analysis.bucket_table import _cell, heading, point_cells, residuals
+from analysis.write_back import Write, check_asked, written_lines
 from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ def flow(
         typer.Option(metavar="NAME", help=f"Compare with a published sprayer: {PAPER}."),
     ] = None,
     plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of the curve.")] = None,
+    is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
     """Fit the flow curve of valves or pump to a bucket test.
@@ -56,6 +58,7 @@ def flow(
     from analysis.bucket_table import curves_of, is_of_a_pump
     from analysis.csv_rows import TableError
 
+    check_asked(config, is_write=is_write)
     if compare not in (None, PAPER):
         raise TableError(f"--compare {compare}: there is only {PAPER}")
     if is_of_a_pump(csv):
@@ -63,7 +66,7 @@ def flow(
 
         if compare is not None:
             raise TableError(f"--compare {compare}: was measured by duty, {csv} by pulse widths")
-        pump_flow(csv, config=config, times=times, plot=plot, as_json=as_json)
+        pump_flow(csv, config=config, times=times, plot=plot, is_write=is_write, as_json=as_json)
         return
     names, window = _known(config)
     curves = curves_of(csv, window=window, times=times)
@@ -76,7 +79,8 @@ def flow(
 
         plot_flow(curves, plot)
         result["plot"] = str(plot)
-    answer(result, _lines(result), as_json=as_json)
+    changed = written_lines(config, result, is_write=is_write)
+    answer(result, [*_lines(result), *changed], as_json=as_json)
     for warning in result["warnings"]:
         note(f"warning: {warning}")
 

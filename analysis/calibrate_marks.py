@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from analysis.write_back import Write, check_asked, written_lines
 from companion.cli.answer import AsJson, answer, note
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def lag_marks(
         bool, typer.Option("--body-known", help="boom.forward_m was measured: leave it alone.")
     ] = False,
     plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of the fit.")] = None,
+    is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure position_s, boom.forward_m and the map offset from marks on the ground.
@@ -63,6 +65,7 @@ def lag_marks(
     """
     from analysis.marks import fit_marks, missing_in
 
+    check_asked(config, is_write=is_write)
     marks = read_marks(csv)
     present = _present(config)
     missing = missing_in(marks, body_known=body_known)
@@ -75,7 +78,8 @@ def lag_marks(
 
         plot_marks(marks, fit, plot)
         result["plot"] = str(plot)
-    answer(result, _lines(result), as_json=as_json)
+    changed = written_lines(config, result, is_write=is_write)
+    answer(result, [*_lines(result), *changed], as_json=as_json)
     for warning in result["warnings"]:
         note(f"warning: {warning}")
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from analysis.bucket import PULSE_FULL_US
 from analysis.bucket_table import heading, point_cells, pump_curve_of, residuals
+from analysis.write_back import written_lines
 from companion.cli.answer import answer, note
 
 if TYPE_CHECKING:
@@ -19,7 +20,13 @@ STEP_US = 1.0
 
 
 def pump_flow(
-    csv: Path, *, config: Path | None, times: float, plot: Path | None, as_json: bool
+    csv: Path,
+    *,
+    config: Path | None,
+    times: float,
+    plot: Path | None,
+    is_write: bool,
+    as_json: bool,
 ) -> None:
     """Answer `calibrate flow` for a table of pulse widths."""
     curve = pump_curve_of(csv, times=times)
@@ -29,7 +36,8 @@ def pump_flow(
 
         plot_flow((curve,), plot, full=PULSE_FULL_US, what="pulse [us]")
         result["plot"] = str(plot)
-    answer(result, _lines(result), as_json=as_json)
+    changed = written_lines(config, result, is_write=is_write)
+    answer(result, [*_lines(result), *changed], as_json=as_json)
     for warning in result["warnings"]:
         note(f"warning: {warning}")
 
