@@ -29,6 +29,7 @@ from analysis.track import tracks_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from analysis.flight_record import Spans
     from analysis.strips import Strip
 
 
@@ -195,7 +196,7 @@ def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation
     whole = tracks_of(whole_boom(record))[0]
     stretches = stretches_of(find_runs(whole, record.prescription))
     of_boom = measure_settled(whole, stretches, record.orders, record.nozzle_sets)
-    settled = _known(of_boom, stretches, record)
+    settled = _known(of_boom, stretches, [*record.unknown, *map(_spared_spans, strips)])
     accuracy = flow_accuracy(strips)
     volume_error, zone_errors = volume_error_percent(strips, record.prescription)
     all_steps = [step for each in steps for step in each]
@@ -235,34 +236,50 @@ def limit_ratio(flight: Evaluation, perfect: Evaluation) -> float | None:
 
 
 def _steps(strip: Strip, record: FlightRecord) -> list[Step]:
-    """Return the steps of one strip; what the border held back is no change missed."""
-    holds = holds_of(strip.track, record.prescription, strip.stretches, strip.orders)
+    """Return the steps of one strip; what border or treated ground held back is not missed."""
+    holds = holds_of(strip.track, record.prescription, strip.stretches, strip.orders, strip.spared)
     unknown = record.unknown[strip.track.valve] if record.unknown else ()
     holds = with_unknown(holds, unknown)
     steps = measure_steps(strip.track, strip.stretches, strip.orders, record.duty_limits, holds)
-    return [
-        replace(step, verdict=Verdict.UNKNOWN, lag_distance_m=None)
-        if _is_unknown(step.change.time_s, unknown)
-        else step
-        for step in held_by_border(strip, record.prescription, steps)
-    ]
+    spared = _spared_spans(strip)
+    found = []
+    for step in held_by_border(strip, record.prescription, steps):
+        verdict = step.verdict
+        if _is_within(step.change.time_s, unknown):
+            verdict = Verdict.UNKNOWN
+        elif _is_within(step.change.time_s, spared):
+            verdict = Verdict.BORDER
+        lag_m = step.lag_distance_m if verdict is step.verdict else None
+        found.append(replace(step, verdict=verdict, lag_distance_m=lag_m))
+    return found
 
 
 def _known(
-    steps: Sequence[SettledStep], stretches: Sequence[Run], record: FlightRecord
+    steps: Sequence[SettledStep], stretches: Sequence[Run], unknown: Sequence[Spans]
 ) -> list[SettledStep]:
-    """Return the steps on whose two stretches all is known: they are judged by all of both."""
-    if not record.unknown:
+    """Return the steps on whose two stretches all is known: they are judged by all of both.
+
+    `unknown` are times of which it is not, and those in which a valve of the boom was spared.
+    """
+    if not any(unknown):
         return list(steps)
     around_s = {b.start_s: (a.start_s, b.end_s) for a, b in pairwise(stretches)}
     spans = [around_s[step.change.time_s] for step in steps]
     return [
         step
         for step, (from_s, until_s) in zip(steps, spans, strict=True)
-        if not any(a < until_s and from_s < b for own in record.unknown for a, b in own)
+        if not any(a < until_s and from_s < b for own in unknown for a, b in own)
     ]
 
 
-def _is_unknown(time_s: float, unknown: Sequence[tuple[float, float]]) -> bool:
-    """Return whether nothing is known of what was sprayed around a time."""
-    return any(a - BESIDE_S < time_s < b + BESIDE_S for a, b in unknown)
+def _spared_spans(strip: Strip) -> Spans:
+    """Return from when until when one strip was spared."""
+    marks_s = strip.track.time_s[strip.track.marks]
+    edges = np.flatnonzero(np.diff(strip.spared, prepend=False, append=False))
+    ends = np.minimum(edges, len(marks_s) - 1)
+    return tuple(zip(marks_s[ends[::2]].tolist(), marks_s[ends[1::2]].tolist(), strict=True))
+
+
+def _is_within(time_s: float, spans: Sequence[tuple[float, float]]) -> bool:
+    """Return whether a time is in a span, or next to one."""
+    return any(a - BESIDE_S < time_s < b + BESIDE_S for a, b in spans)

@@ -16,7 +16,9 @@ from companion.core.boom import Boom, Valve
 
 if TYPE_CHECKING:
     from companion.core.nozzle import NozzleSet
+    from companion.core.options.coverage import Coverage
     from companion.core.options.lines import Lines
+    from companion.core.options.overlap import OverlapGuard
     from companion.core.prescription import Prescription
     from companion.core.types import TimedChange
 
@@ -72,7 +74,8 @@ class FlightRecord:
     executed at the output, in order of time; they may be empty. `duty_limits` are the lowest and
     the highest duty of the PWM: a valve held there and still beside its dose is saturated.
     `nozzle_sets` are those that the controller took its duties from: they tell what flow an order
-    asked for; none where that is not known. With `lines` only they were to be sprayed. `unknown`
+    asked for; none where that is not known. With `lines` only they were to be sprayed, with
+    a `guard` no ground twice, nor what was `treated` by flights before. `unknown`
     has each valve's times, in order and apart, of which nobody can tell what was sprayed; it is
     empty where all is known.
     """
@@ -90,6 +93,8 @@ class FlightRecord:
     duty_limits: tuple[float, float] = (0.0, 1.0)
     nozzle_sets: tuple[NozzleSet, ...] = ()
     lines: Lines | None = None
+    guard: OverlapGuard | None = None
+    treated: Coverage | None = None
     unknown: tuple[Spans, ...] = ()
 
     def __post_init__(self) -> None:

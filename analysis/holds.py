@@ -1,9 +1,10 @@
-"""Where a valve's flow says nothing of the rate: the border holds it closed, or nobody knows it.
+"""Where a valve's flow says nothing of the rate: it is held closed, or nobody knows it.
 
 A strip that comes too near to the border or to a hole is switched off, by order, until it is clear
-again. A rate that is judged by its flow is judged by what is left of its stretch: else a rate of
-which a pond takes the second half counts as half a rate, and a change that came to the centimetre
-as missed, or as metres late. A time of which the record is missing is no better.
+again; so is one over ground that was treated before. A rate that is judged by its flow is judged by
+what is left of its stretch: else a rate of which a pond takes the second half counts as half a
+rate, and a change that came to the centimetre as missed, or as metres late. A time of which the
+record is missing is no better.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from analysis.flight_record import joined
+from analysis.spared import closed_by_order
 from analysis.transitions import LEVEL_FROM, LEVEL_TO, ML_M_PER_L_HA_M, Sides
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from analysis.changes import Run
-    from analysis.track import Floats, Ints, Track
+    from analysis.track import Bools, Floats, Ints, Track
     from analysis.transitions import SmoothTrack
     from companion.core.prescription import Prescription
     from companion.core.types import TimedChange
@@ -63,16 +65,19 @@ def holds_of(
     prescription: Prescription,
     stretches: Sequence[Run],
     orders: Sequence[TimedChange],
+    spared: Bools,
 ) -> tuple[Hold, ...]:
-    """Return the holds of one valve where something is prescribed; `orders` are that valve's."""
+    """Return the holds of one valve where something is prescribed; `orders` are that valve's.
+
+    `spared` is where, at the marks, its strip was treated before.
+    """
     if not orders:
         return ()
     at_s = np.array([order.at_s for order in orders])
     duty = np.array([order.duty for order in orders])
     marks_s = track.time_s[track.marks]
-    # Before the first order a valve is closed.
     given = np.searchsorted(at_s, marks_s, "right")
-    is_closed = ~(np.concatenate(([0.0], duty))[given] > 0.0)
+    is_closed = closed_by_order(orders, marks_s)
     starts_s = np.array([run.start_s for run in stretches])
     under = np.clip(np.searchsorted(starts_s, marks_s, "right") - 1, 0, None)
     inside = np.array([run.inside for run in stretches])[under]
@@ -81,7 +86,7 @@ def holds_of(
     # Straight up to a border no end of the strip comes near it before its middle is beyond.
     by_border = ~(inside[np.maximum(index - 1, 0)] & inside[np.minimum(index + 1, len(inside) - 1)])
     clear = track.wholly_inside(prescription, track.marked().some(index), widen_m=CLEAR_M)
-    near = index[by_border | ~clear]
+    near = index[by_border | ~clear | spared[index]]
     # Orders of 0 upon orders of 0 open nothing: a closed time is known by the last that opened.
     opened = np.concatenate(([0], np.cumsum(duty > 0.0)))[given]
     return tuple(_spans(marks_s, near, opened, at_s, duty))

@@ -48,7 +48,8 @@ SATURATED_ERROR = 0.05
 class Verdict(StrEnum):
     """What became of a change; all but the first and the last count apart.
 
-    `border`: the strip reaches over the border there, which may rightly hold its valve closed.
+    `border`: the strip reaches over the border there, or over treated ground, which may rightly
+    hold its valve closed.
     `unknown`: the record of that time is missing.
     """
 

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.changes import Run, find_runs, stretches_of
-from analysis.track import Bools, Floats, Track, tracks_of
+from analysis.spared import spared_of
+from analysis.track import Bools, Floats, Ints, Track, tracks_of
 from analysis.transitions import ML_M_PER_L_HA_M
 
 if TYPE_CHECKING:
@@ -27,7 +28,8 @@ class Strip:
     """A track, its runs by zone and by rate, and where it is wholly in the field.
 
     `whole` and `grazing` are at the track's marks: the strip lies in the field; it does so but
-    for `GRAZE_M` at either end. `asked_ml` is the cumulative prescribed volume at every sample.
+    for `GRAZE_M` at either end. `spared` is there, too: nothing is asked for, as the ground was
+    treated before. `asked_ml` is the cumulative prescribed volume at every sample.
     """
 
     track: Track
@@ -36,22 +38,33 @@ class Strip:
     orders: tuple[TimedChange, ...]
     whole: Bools
     grazing: Bools
+    spared: Bools
     asked_ml: Floats
 
     def rates_at(self, time_s: Floats) -> Floats:
-        """Return the prescribed rate under the strip's centre at times that increase."""
+        """Return the prescribed rate under the strip's centre at times that increase.
+
+        0 where the ground is spared.
+        """
         starts_s = np.array([run.start_s for run in self.stretches[1:]])
         rates = np.array([run.rate_l_ha for run in self.stretches])
         # Few stretches are sought among many times, not each time among the stretches.
         edges = np.concatenate(([0], np.searchsorted(time_s, starts_s), [len(time_s)]))
         found: Floats = np.repeat(rates, np.diff(edges))
+        if self.spared.any():
+            before, after = self._marks_around(time_s)
+            found[self.spared[before] & self.spared[after]] = 0.0
         return found
 
     def inside_at(self, time_s: Floats) -> Bools:
         """Return where the strip lies in the field, but for `GRAZE_M`, at any times."""
+        before, after = self._marks_around(time_s)
+        return self.grazing[before] & self.grazing[after]
+
+    def _marks_around(self, time_s: Floats) -> tuple[Ints, Ints]:
         marks_s = self.track.time_s[self.track.marks]
         after = np.clip(np.searchsorted(marks_s, time_s), 1, len(marks_s) - 1)
-        return self.grazing[after - 1] & self.grazing[after]
+        return after - 1, after
 
 
 def strips_of(record: FlightRecord) -> list[Strip]:
@@ -60,12 +73,15 @@ def strips_of(record: FlightRecord) -> list[Strip]:
     for order in record.orders:
         if order.valve < len(orders):
             orders[order.valve].append(order)
+    tracks = tracks_of(record)
+    spared = spared_of(record, tracks, orders)
     return [
-        _strip(track, record, its) for track, its in zip(tracks_of(record), orders, strict=True)
+        _strip(track, record, its, own)
+        for track, its, own in zip(tracks, orders, spared, strict=True)
     ]
 
 
-def _strip(track: Track, record: FlightRecord, orders: list[TimedChange]) -> Strip:
+def _strip(track: Track, record: FlightRecord, orders: list[TimedChange], spared: Bools) -> Strip:
     runs = find_runs(track, record.prescription)
     stretches = stretches_of(runs)
     whole, grazing = _inside(track, record.prescription)
@@ -76,7 +92,8 @@ def _strip(track: Track, record: FlightRecord, orders: list[TimedChange]) -> Str
         orders=tuple(orders),
         whole=whole,
         grazing=grazing,
-        asked_ml=_asked_ml(track, stretches),
+        spared=spared,
+        asked_ml=_asked_ml(track, stretches, spared),
     )
 
 
@@ -89,7 +106,7 @@ def _inside(track: Track, prescription: Prescription) -> tuple[Bools, Bools]:
     return whole, grazing
 
 
-def _asked_ml(track: Track, stretches: list[Run]) -> Floats:
+def _asked_ml(track: Track, stretches: list[Run], spared: Bools) -> Floats:
     """Return the cumulative prescribed volume at every sample; exact across boundaries."""
     starts_s = np.array([run.start_s for run in stretches])
     rates = np.array([run.rate_l_ha for run in stretches])
@@ -101,5 +118,9 @@ def _asked_ml(track: Track, stretches: list[Run]) -> Floats:
     rate = rates[np.clip(np.cumsum(is_start)[:-1] - 1, 0, None)]
     middle_s = 0.5 * (knots_s[1:] + knots_s[:-1])
     drops = rate * ML_M_PER_L_HA_M * track.at(track.across_m, middle_s) * np.diff(distance_m)
+    if spared.any():
+        after = np.searchsorted(track.time_s[track.marks], middle_s)
+        after = np.clip(after, 1, len(track.marks) - 1)
+        drops[spared[after - 1] & spared[after]] = 0.0
     asked: Floats = np.concatenate(([0.0], np.cumsum(drops)))[~is_start]
     return asked

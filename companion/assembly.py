@@ -164,7 +164,9 @@ def refuse_mismatch(config: Config) -> None:
 
 def _overlap(config: Config) -> OverlapGuard | None:
     """Return what closes valves over treated ground, if anything is to."""
-    percent = config.coverage.switch_off_percent
+    mission = config.mission
+    on_lines = mission is not None and mission.lines is not None
+    percent = config.switch_off_percent(on_lines=on_lines)
     if percent is None or config.output.kind == "none":
         return None
     return OverlapGuard(switch_off_percent=percent)

@@ -225,6 +225,7 @@ def plan(
         rate_l_ha=rate_l_ha,
         border_m=border_m,
         ends_over=ends_over,
+        with_sprayer=sprayer,
         pause=BreakAsked(
             done=done,
             resume=resume,
@@ -394,6 +395,14 @@ def _choices(planned: Plan, result: dict[str, Any], prices: list[str], *, asked:
     return prices if asked else list(closing_hint(planned, result["overlap_litres_percent"]))
 
 
+def _once(planned: Plan) -> str:
+    """Return that the litres count on valves that close, where they spare any."""
+    legs = [leg for sortie in planned.sorties for leg in sortie.legs]
+    if all(leg.overlap_l is None for leg in legs):
+        return ""
+    return ", treated ground not again, as the litres count"
+
+
 def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str]:
     """Return the plan in words."""
     coverage = planned.coverage
@@ -413,7 +422,7 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
     if result["lines_file"] is not None:
         lines.append(
             f"lines     {result['lines_file']}: name it as mission.lines in the configuration, and "
-            "only they are sprayed"
+            f"only they are sprayed{_once(planned)}"
         )
     lines += sortie_lines(planned, result)
     return lines

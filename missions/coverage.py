@@ -16,6 +16,7 @@ from missions.strips import (
     Floats,
     Objects,
     joined,
+    lengths_m,
     no_lines,
     rectangles,
     stretched,
@@ -112,6 +113,9 @@ LEFT_SHARE = 0.0005
 PATCH_MIN_M2 = 0.02
 # What margins take of a place that is too narrow for them; at corners it is less than this.
 PLACE_M2 = 2.0
+# A pass there is worth its time where so much of its strip is such ground; what others leave out
+# comes to so much of all ground at most.
+PATCH_WORTH, SLIVERS_SHARE = 0.1, 0.00015
 ROUNDS = 4
 PATCHES_MAX = 200
 ANGLES, ASIDE = 12, 7
@@ -169,7 +173,15 @@ def narrow_patches(
     places = lost[shapely.area(lost) > PLACE_M2]
     if not len(places):
         return no_lines()
-    return patches(lines, ground, width_m, target=shapely.union_all(places))
+    target = shapely.union_all(places)
+    found = patches(lines, ground, width_m, target=target)
+    # Slivers along a border are such places, too, and no pass of its own pays for them.
+    bare = target.difference(united(lines, width_m))
+    gain_m2 = shapely.area(shapely.intersection(rectangles(found, width_m), bare))
+    order = np.argsort(gain_m2, kind="stable")
+    spare = np.cumsum(gain_m2[order]) < SLIVERS_SHARE * whole.area
+    poor = gain_m2[order] < PATCH_WORTH * width_m * np.maximum(lengths_m(found), width_m)[order]
+    return found[np.sort(order[~(spare & poor)])]
 
 
 def _over(patch: BaseGeometry, ground: BaseGeometry, width_m: float) -> Floats:

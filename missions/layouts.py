@@ -24,6 +24,7 @@ from missions.open_lines import LEFT_SHARE, fitted_lines, has_edges_along, neede
 from missions.plan import LEAVE_PERCENT, Settings
 from missions.selection import Aim, chosen, families
 from missions.strips import (
+    Bools,
     Floats,
     border_passes,
     directions,
@@ -49,6 +50,8 @@ LEFT_WORTH = 0.5
 SMALL_SWATHS2 = 300.0
 # Lines as long as each other and along each other.
 EQUAL_M, EQUAL_SINE = 1.0, 1e-3
+# The companion takes legs for one another within half a metre; ends of lines are moved a little.
+SHADOW_M = 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,14 +74,15 @@ class _Covering:
     def value_s(self, tour: Tour) -> float:
         """Return the time of a tour, with what is left out and covered twice."""
         strips = self.boom.strips(tour.lines)
-        covered = whole(strips)
+        covered = whole(strips[~shadowed(tour.lines)])
         doubled_m2 = float(shapely.area(strips).sum()) - covered.area
         left_m2 = self.target.difference(covered).area
         return tour.seconds + self.aim.cost_s(left_m2=left_m2, doubled_m2=max(doubled_m2, 0.0))
 
     def left_m2(self, tour: Tour) -> float:
         """Return what lines leave of what a strip can reach."""
-        return float(self.target.difference(self.boom.united(tour.lines)).area)
+        lines = tour.lines[~shadowed(tour.lines)]
+        return float(self.target.difference(self.boom.united(lines)).area)
 
     def is_block(self, tour: Tour) -> bool:
         """Return whether a tour is nothing but equal lines side by side, as on a rectangle."""
@@ -125,6 +129,26 @@ class _Covering:
                 lines = joined([lines, more])
             if len(lines):
                 yield self.worthwhile(self.tour(lines))
+
+
+def shadowed(lines: Floats) -> Bools:
+    """Return which lines lie whole on a longer one, or nearly: the companion leaves them to it.
+
+    >>> shadowed(np.array([[0.0, 0.0, 50.0, 0.0], [1.0, 0.4, 49.0, 0.4], [1.0, 1.4, 49.0, 1.4]]))
+    array([False,  True, False])
+    """
+    along, length_m = directions(lines), lengths_m(lines)
+    ends = lines.reshape(-1, 2, 2)
+    found = np.zeros(len(lines), dtype=np.bool_)
+    numbers = np.arange(len(lines))
+    for number, (way, start, long_m) in enumerate(zip(along, ends[:, 0], length_m, strict=True)):
+        off = ends - start
+        aside = np.abs(off @ np.array([-way[1], way[0]])).max(axis=1)
+        at = off @ way
+        beyond = np.maximum(-at.min(axis=1), at.max(axis=1) - long_m)
+        is_shorter = (length_m < long_m) | ((length_m == long_m) & (numbers > number))
+        found |= (aside < SHADOW_M) & (beyond < SHADOW_M) & is_shorter
+    return found
 
 
 def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Floats, float]:

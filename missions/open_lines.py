@@ -36,6 +36,9 @@ from missions.strips import (
 LEFT_SHARE = 0.0005
 # Ground to be covered is looked at in parts of so many corners, or this wide.
 TILE_CORNERS, TILE_MIN_M = 100, 1.0
+# The companion is on a line within a metre of it: nearer ones would be taken for each other, and an
+# aircraft that turns back between them is on the next before it has turned.
+APART_M = 2.0
 # A pass that covers less is none.
 LEAST_M2 = 1e-3
 
@@ -64,9 +67,10 @@ def _packed(part: Polygon, width_m: float) -> Floats:
     """
     _, low, _, high = part.bounds
     even = evenly(low, high, width_m)
-    aside = width_m * np.arange(len(even))
-    if len(even) < 3:
+    left_m = float(even[-1] - even[0]) - width_m * (len(even) - 2)
+    if len(even) < 3 or left_m < APART_M:
         return across_part(part, even, width_m)
+    aside = width_m * np.arange(len(even))
     at_end = np.minimum(even[0] + aside, even[-1])
     at_start = np.maximum(even[-1] - aside, even[0])[::-1]
     tried = [across_part(part, middles, width_m) for middles in (at_end, at_start)]

@@ -63,7 +63,7 @@ def overlap_warnings(plan: Plan, overlap_litres_percent: float) -> tuple[str, ..
         f"{cap:g}; "
         + (
             "allow more to be left with --leave-max, or close valves over treated ground with "
-            "coverage.switch_off_percent in the configuration"
+            "coverage.switch_off_percent = 100 in the configuration"
             if closing
             else "allow more to be left with --leave-max"
         ),

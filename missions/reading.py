@@ -97,6 +97,7 @@ class Asked:
     answers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     border_m: float = 0.0
     ends_over: bool = False
+    with_sprayer: bool = False
     ground: GroundAsked = NOTHING_ASKED
     pause: BreakAsked = NO_BREAK
 
@@ -113,6 +114,9 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         PlanError, MapError, ConfigError: in one line, what is wrong and what to do.
     """
     settings = _spaced(_settings(config, changes), asked, config, changes)
+    if asked.with_sprayer:
+        # The autopilot's own sprayer knows no treated ground.
+        settings = replace(settings, switch_off_percent=None)
     map_file = _map(asked, config)
     said: list[str] = []
     boundary = outline_of(asked.field, map_file, said, asked.opens)
@@ -262,7 +266,8 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
             speeds_m_s=(config.safety.speed_min_m_s, 0.0),
             settle_s=_settle_s(config),
             border_buffer_m=_kept_m(config),
-            switch_off_percent=config.coverage.switch_off_percent,
+            # What is planned are lines, and named as such they alone are sprayed.
+            switch_off_percent=config.switch_off_percent(on_lines=True),
             **fleet_settings(mission),
         )
     given: dict[str, Any] = {name: each for name, each in changes.items() if each is not None}

@@ -175,6 +175,8 @@ def fly(
         boom=setup.boom,
         prescription=setup.prescription,
         lines=setup.lines,
+        guard=setup.overlap,
+        treated=setup.treated,
         pwm_period_s=profile.pwm.period_s,
         duty_limits=limits,
         nozzle_sets=() if profile.has_sections else setup.nozzle_sets,

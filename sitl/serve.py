@@ -530,6 +530,8 @@ def evaluate_truth(folder: Path, setup: Setup, *, closed_us: float, full_us: flo
             boom=setup.boom,
             prescription=setup.prescription,
             lines=setup.lines,
+            guard=setup.overlap,
+            treated=setup.treated,
             pwm_period_s=profile.pwm.period_s,
             duty_limits=(profile.pwm.duty_min, profile.pwm.duty_max),
             nozzle_sets=setup.nozzle_sets,

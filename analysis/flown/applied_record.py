@@ -64,6 +64,8 @@ def record_of(
         boom=setup.boom,
         prescription=setup.prescription,
         lines=setup.lines,
+        guard=setup.overlap,
+        treated=setup.treated,
         pwm_period_s=setup.pwm.period_s,
         duty_limits=limits,
         nozzle_sets=() if makes_flow else setup.nozzle_sets,

@@ -88,8 +88,14 @@ def run_companion(
         from companion.record.continuing import continued, simulated_lines
 
         simulated = simulated_lines(continue_from)
-        setup = continued(setup, continue_from, training=training, takes_unmarked=takes_unmarked)
-    for line in (*_continued_lines(setup), *simulated):
+        setup = continued(
+            setup,
+            continue_from,
+            training=training,
+            takes_unmarked=takes_unmarked,
+            by_default=config.coverage.switch_off_percent is None,
+        )
+    for line in (*_guard_lines(setup), *simulated):
         note(line)
     link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
@@ -155,14 +161,15 @@ def run_companion(
     )
 
 
-def _continued_lines(setup: Setup) -> list[str]:
-    if setup.treated is None or setup.overlap is None:
+def _guard_lines(setup: Setup) -> list[str]:
+    """Return from how much treated ground on valves close, and how much is treated already."""
+    if setup.overlap is None:
         return []
-    return [
-        f"resuming: {setup.treated.area_m2 / 10_000.0:.3f} ha are already treated; a valve closes "
-        "where "
-        f"{setup.overlap.switch_off_percent:g} % of its strip is treated"
-    ]
+    closes = f"a valve closes where {setup.overlap.switch_off_percent:g} % of its strip is treated"
+    if setup.treated is None:
+        return [f"note: {closes} (coverage.switch_off_percent)"]
+    area_ha = setup.treated.area_m2 / 10_000.0
+    return [f"resuming: {area_ha:.3f} ha are already treated; {closes}"]
 
 
 def _left_lines(folder: Path, setup: Setup, training: str) -> list[str]:

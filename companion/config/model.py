@@ -23,6 +23,9 @@ FIXES = {
 }
 # Ten times what an RTK receiver says of itself when all is well.
 RTK_ACCURACY_MAX_M = 0.3
+# A plan's lines overlap where the field is no whole number of swaths wide: closed where all of a
+# strip is treated, a valve leaves no bare ground there.
+ON_LINES_PERCENT = 100.0
 
 
 class Config(Document):
@@ -129,6 +132,16 @@ class Config(Document):
         if safety.accuracy_max_m is None and FIXES[safety.fix] >= Fix.RTK_FLOAT:
             return RTK_ACCURACY_MAX_M
         return safety.accuracy_max_m
+
+    def switch_off_percent(self, *, on_lines: bool) -> float | None:
+        """Return from how much treated ground on a valve closes; None where it never does.
+
+        `on_lines` is whether only the lines of a plan are sprayed.
+        """
+        percent = self.coverage.switch_off_percent
+        if percent is None:
+            return ON_LINES_PERCENT if on_lines else None
+        return None if percent == "never" else percent
 
     def drift_law(self) -> Drift | None:
         """Return where droplets are expected to land; None unless it is to be corrected for."""

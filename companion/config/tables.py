@@ -414,6 +414,7 @@ def out_of_bounds(table: type[Table], key: str, value: float) -> str | None:
 
 # The tables of what corrects the plan in flight, each off unless it is asked for.
 
+Percent = Annotated[FiniteFloat, Field(gt=0.0, le=100.0)]
 WindSpeed = Annotated[FiniteFloat, Field(ge=0.0, le=50.0)]
 WindFrom = Annotated[FiniteFloat, Field(ge=0.0, le=360.0)]
 
@@ -489,9 +490,8 @@ class CoverageTable(Table):
     record: bool = Field(
         default=True, description="false: the journal does not keep which ground was treated"
     )
-    switch_off_percent: float | None = Field(
+    switch_off_percent: Percent | Literal["never"] | None = Field(
         default=None,
-        gt=0,
-        le=100,
-        description="a valve closes where so much of its strip is treated; absent: never",
+        description="a valve closes where so much of its strip is treated; "
+        "absent: 100 with mission.lines, else never",
     )

@@ -212,7 +212,9 @@ def allowed_text(node: dict[str, Any], schema: dict[str, Any], name: str = "key"
     """Return in words what a key of the schema may be."""
     node = _resolved(node, schema)
     if "anyOf" in node:
-        return " or ".join(allowed_text(branch, schema, name) for branch in node["anyOf"])
+        # TOML has no null: None is what a key is that is not written.
+        branches = [branch for branch in node["anyOf"] if branch.get("type") != "null"]
+        return " or ".join(allowed_text(branch, schema, name) for branch in branches)
     if "const" in node:
         return show_value(node["const"])
     if "enum" in node:

@@ -187,12 +187,22 @@ def simulated_lines(paths: Sequence[Path]) -> list[str]:
 
 
 def continued(
-    setup: Setup, paths: Sequence[Path], *, training: str = "no", takes_unmarked: bool = False
+    setup: Setup,
+    paths: Sequence[Path],
+    *,
+    training: str = "no",
+    takes_unmarked: bool = False,
+    by_default: bool = False,
 ) -> Setup:
-    """Return the set-up of a flight that goes on where these ended: nothing is sprayed twice."""
+    """Return the set-up of a flight that goes on where these ended: nothing is sprayed twice.
+
+    With `by_default` the guard of the set-up is nobody's choice. That of a plan's lines closes over
+    strips that are treated wholly, and lines that are flown again lie some centimetres aside.
+    """
     if not paths:
         return setup
-    guard = setup.overlap or OverlapGuard(switch_off_percent=SWITCH_OFF_PERCENT)
+    guard = None if by_default else setup.overlap
+    guard = guard or OverlapGuard(switch_off_percent=SWITCH_OFF_PERCENT)
     treated = treated_by(paths, setup.frame, training=training, takes_unmarked=takes_unmarked)
     return replace(setup, overlap=guard, treated=treated)
 

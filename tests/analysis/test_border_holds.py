@@ -132,7 +132,7 @@ def test_a_change_that_never_came_is_missed_with_a_pond_behind_it_too(
 def holds_inside(record: FlightRecord) -> list[Hold]:
     """Return the holds, without the switch at the far end of the row."""
     strip = strips_of(record)[0]
-    found = holds_of(strip.track, record.prescription, strip.stretches, strip.orders)
+    found = holds_of(strip.track, record.prescription, strip.stretches, strip.orders, strip.spared)
     last_s = (4.0 * PLOT_M + RUN_UP_M) / SPEED_M_S - 1.0
     return [hold for hold in found if hold.start_s < last_s]
 

@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import json
 import math
+import shutil
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -64,6 +65,39 @@ def test_setup_has_everything_that_the_configuration_says() -> None:
     assert setup.lease_s == 0.4
     assert len(setup.boom.valves) == 6
     assert len(setup.prescription.sha256) == 64
+
+
+LINES = 'mission.lines="lines.geojson"'
+
+
+@pytest.mark.parametrize(
+    ("overrides", "percent"),
+    [
+        ((), None),
+        ((LINES,), 100.0),
+        ((LINES, "coverage.switch_off_percent=never"), None),
+        ((LINES, "coverage.switch_off_percent=50"), 50.0),
+        (("coverage.switch_off_percent=70",), 70.0),
+        (("coverage.switch_off_percent=never",), None),
+        ((LINES, "output.kind=none"), None),
+    ],
+)
+def test_valves_close_over_treated_ground_on_lines_unless_they_are_told_never_to(
+    overrides: tuple[str, ...], percent: float | None, tmp_path: Path
+) -> None:
+    folder = tmp_path / "field"
+    shutil.copytree(FOLDER, folder)
+    frame = LocalFrame(latitude_deg=35.9965, longitude_deg=114.5437)
+    ends = [frame.to_geographic(0.0, north_m) for north_m in (-40.0, 40.0)]
+    shape = {"type": "LineString", "coordinates": [[lon, lat] for lat, lon in ends]}
+    feature = {"type": "Feature", "properties": {"kind": "spray", "sortie": 1}, "geometry": shape}
+    (folder / "lines.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": [feature]})
+    )
+    setup = compiled_setup(load(folder / "config.toml", overrides=overrides))
+    assert (setup.lines is not None) == (LINES in overrides)
+    guard = setup.overlap
+    assert (None if guard is None else guard.switch_off_percent) == percent
 
 
 def test_offset_moves_the_map_and_its_boundary() -> None:

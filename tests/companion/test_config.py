@@ -238,6 +238,12 @@ REFUSED = [
     ("safety.modes=AUTO", 'safety.modes = "AUTO": not a list'),
     ("safety.modes=[]", "safety.modes = []: too few entries"),
     ("mission.angle_deg=north", 'write a number from -360 to 360 or "auto"'),
+    (
+        "coverage.switch_off_percent=off",
+        'coverage.switch_off_percent = "off": not a number; '
+        'write a number above 0 up to 100 or "never"',
+    ),
+    ("coverage.switch_off_percent=0", "= 0: out of range; write a number above 0 up to 100"),
     ("mission.depots=[[36.0, 114.0], [99.0, 3.0]]", "mission.depots[1][0] = 99.0: out of range"),
     ("boom=3", "boom = 3: not a table; write a table [boom]"),
     ("valve=[]", "valve = []: too few entries; write [[valve]] tables"),

@@ -253,6 +253,9 @@ def test_a_configured_percentage_stays_and_nothing_to_go_on_changes_nothing(firs
     own = setup(overlap=OverlapGuard(switch_off_percent=80.0))
     assert continued(own, []) is own
     assert continued(own, [first]).overlap == own.overlap
+    # Nobody chose that of a plan's lines: lines flown again would stay half open.
+    half = OverlapGuard(switch_off_percent=SWITCH_OFF_PERCENT)
+    assert continued(own, [first], by_default=True).overlap == half
 
 
 def test_a_flight_with_water_treats_nothing_for_one_with_a_product(tmp_path: Path) -> None:

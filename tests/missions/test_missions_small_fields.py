@@ -163,6 +163,45 @@ def test_one_valve_is_the_floor_of_overlap_on_a_ditch() -> None:
     assert not closing_hint(open_, 4.9)
 
 
+@pytest.mark.parametrize(
+    ("percent", "option", "is_closing"),
+    [("", "", True), ('"never"', "", False), ("", "--sprayer", False), ("100", "", True)],
+)
+def test_a_plan_counts_on_valves_that_close_unless_they_never_do(
+    percent: str,
+    option: str,
+    is_closing: bool,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    geometry = json.loads(shapely.to_geojson(degrees(box(0.0, 0.0, 90.0, DITCH_M))))
+    path = tmp_path / "ditch.geojson"
+    path.write_text(json.dumps({"type": "Feature", "properties": {}, "geometry": geometry}))
+    config = tmp_path / "config.toml"
+    text = Path("examples/anyang/config.toml").read_text()
+    if percent:
+        text += f"\n[coverage]\nswitch_off_percent = {percent}\n"
+    config.write_text(text)
+    words = ["--rate-l-ha", "20", "--config", str(config), "--out", str(tmp_path / "m.waypoints")]
+    words += ["--border-m", "0.1", "--json", *filter(None, [option])]
+    assert execute(["plan", str(path), *words]) == 0
+    found = json.loads(capsys.readouterr().out)
+    # 7.4 m of it are sprayed by booms of 6 m: 4.6 of 12 m twice, or 0.6 of 8 m.
+    twice_m, flown_m = (0.6, 8.0) if is_closing else (4.6, 12.0)
+    assert found["overlap_litres_percent"] == pytest.approx(100.0 * twice_m / flown_m, abs=0.6)
+    assert found["volume_l"] == pytest.approx(flown_m * 0.1796, rel=0.01)
+
+
+def test_no_pass_is_flown_for_a_sliver_along_the_border(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    # One of 38 m would add 0.2 m2 of 2,700.
+    words = ["plan", "examples/anyang/boundary.geojson", "--out", str(tmp_path / "m.plan")]
+    words += ["--config", "examples/anyang/config.toml", "--border-m", "0.3", "--json"]
+    assert execute(words) == 0
+    assert json.loads(capsys.readouterr().out)["swaths"] == 5
+
+
 def test_packed_lines_overlap_in_one_place_alone() -> None:
     ground = box(0.0, 0.0, 100.0, 27.5)
     lines = open_lines(ground, WIDTH_M, 90.0, packed=True)
@@ -170,6 +209,16 @@ def test_packed_lines_overlap_in_one_place_alone() -> None:
     gaps = np.diff(np.sort(lines[:, 1]))
     assert sorted(gaps.round(6)) == pytest.approx([3.5, 6.0, 6.0, 6.0])
     assert lengths_m(lines) == pytest.approx([100.0] * 5, abs=0.01)
+
+
+@pytest.mark.parametrize("high_m", [24.1, 25.1, 26.5])
+def test_no_two_packed_lines_are_taken_for_one(high_m: float) -> None:
+    ground = box(0.0, 0.0, 100.0, high_m)
+    lines = open_lines(ground, WIDTH_M, 90.0, packed=True)
+    assert measure(lines, ground, WIDTH_M).percent == pytest.approx(100.0, abs=0.05)
+    gaps = np.diff(np.sort(lines[:, 1]))
+    assert len(gaps) == 4
+    assert gaps.min() >= 2.0 - 1e-6
 
 
 def test_the_course_that_is_asked_for_is_the_only_one_of_the_parallel_lines() -> None:
