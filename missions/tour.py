@@ -114,18 +114,24 @@ class Ring:
 
     def _better(self, end: int) -> tuple[float, tuple[int, ...]] | None:
         """Make the first change that brings `end` and a near one together and shortens."""
-        between, mate = self._between, self.mate(end)
-        row, old_s = between[end], between[end][mate]
+        between, ends, places = self._between, self.ends, self._at
+        mate, piece, count = self.mate(end), end >> 1, len(ends)
+        is_entered = ends[places[piece]] == end
+        row, from_mate = between[end], between[mate]
+        old_s = row[mate]
         for other in self._near[end]:
             gain_s = old_s - row[other]
             if gain_s <= LEAST_S:
                 break
-            if other >> 1 == end >> 1 or other == mate or self._at[other >> 1] < 0:
+            place = places[other >> 1]
+            if other >> 1 == piece or other == mate or place < 0:
                 continue
-            beyond = self.mate(other)
+            # As `mate`, which this is called for far more often than for all else.
+            is_other_entered = ends[place] == other
+            beyond = ends[place - 1] ^ 1 if is_other_entered else ends[place + 1 - count]
             gain_s += between[other][beyond]
-            if self._is_entered(end) == self._is_entered(other):
-                change_s = between[mate][beyond] - gain_s
+            if is_entered == is_other_entered:
+                change_s = from_mate[beyond] - gain_s
                 if change_s < -LEAST_S:
                     self._turn(end, other)
                     return change_s, (mate, other, beyond)
@@ -157,15 +163,20 @@ class Ring:
         between, ends = self._between, self.ends
         count, at = len(ends), self._at[end >> 1]
         step = 1 if ends[at] == end else -1
+        place, one, two, from_mate = at, other >> 1, beyond >> 1, between[mate]
         for more in range(min(RUN_MAX, count - 3)):
-            piece = ends[(at + step * more) % count] >> 1
-            if piece in (other >> 1, beyond >> 1):
+            last = ends[place]
+            if last >> 1 == one or last >> 1 == two:
                 return None
-            last = ends[(at + step * more) % count]
-            tail = last ^ 1 if step > 0 else last
-            follows = self.mate(tail)
-            change_s = between[tail][beyond] + between[mate][follows]
-            change_s -= between[tail][follows] + gain_s
+            if step > 0:
+                tail, place = last ^ 1, place + 1 if place + 1 < count else 0
+                follows = ends[place]
+            else:
+                tail, place = last, place - 1 if place else count - 1
+                follows = ends[place] ^ 1
+            row = between[tail]
+            change_s = row[beyond] + from_mate[follows]
+            change_s -= row[follows] + gain_s
             if change_s < -LEAST_S:
                 self._move(at, step, more, other, end)
                 return change_s, (mate, other, beyond, tail, follows)
