@@ -72,6 +72,11 @@ COMMANDS = {
         haste="patient",
         hastes=dict.fromkeys(("list", "show", "pin", "unpin", "prune"), "quick"),
     ),
+    "token": Command(
+        target="companion.cli.token:app",
+        help="Show the operator's page's links, or make new ones.",
+        haste="quick",
+    ),
     "config": Command(
         target="companion.cli.config:app",
         help="Check or show a configuration, or print its schema.",

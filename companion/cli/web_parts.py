@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 from companion.cli.answer import note
@@ -46,8 +47,8 @@ def build_page(
             f"{config.path}: web.enabled: the Python package {missing[0]} is missing: "
             f"{install_command('vehicle')}"
         )
-    doors = Doors(is_local=is_loopback(web.host), names=tuple(map(str.lower, web.names)))
-    tokens = kept_tokens(config.resolve(config.link.state_folder) / TOKENS_NAME)
+    doors = doors_of(config)
+    tokens = kept_tokens(tokens_file(config))
     certificate, key = _tls_files(config)
     listener = listen(web.host, web.port)
     about = {
@@ -68,6 +69,17 @@ def build_page(
     for line in invitation(config, doors, tokens):
         note(line)
     return OperatorPage(listener, about, obey=obeying(link), horizon_s=setup.longest_s)
+
+
+def tokens_file(config: Config) -> Path:
+    """Return where the page's tokens are kept."""
+    return config.resolve(config.link.state_folder) / TOKENS_NAME
+
+
+def doors_of(config: Config) -> Doors:
+    """Return by which names the page may be called."""
+    web = config.web
+    return Doors(is_local=is_loopback(web.host), names=tuple(map(str.lower, web.names)))
 
 
 def _doctor(config: Config, given: Sequence[str]) -> list[str]:

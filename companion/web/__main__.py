@@ -11,6 +11,7 @@ import os
 import socket
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,9 @@ def main(arguments: list[str]) -> int:
     if os.getppid() != parent:
         return 0
     os.nice(NICENESS)
+    with suppress(OSError):
+        # Waking up, it takes no core from whoever computes: it waits for the next free one.
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     with os.fdopen(about_fd, "rb") as file:
         file.seek(0)
         about: dict[str, Any] = json.load(file)

@@ -110,7 +110,7 @@ class Bench:
 
 
 @asynccontextmanager
-async def flying_bench(autopilot: str, folder: Path) -> AsyncIterator[Bench]:
+async def flying_bench(autopilot: str, folder: Path, *overrides: str) -> AsyncIterator[Bench]:
     """Run the stub and `vrspray run` on one link, to which a client may come."""
     bench = Bench(autopilot, write_field(folder, autopilot))
     async with AsyncExitStack() as stack:
@@ -124,7 +124,7 @@ async def flying_bench(autopilot: str, folder: Path) -> AsyncIterator[Bench]:
         server.ticked = bench.tick
         process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "companion", "run", "--config", str(bench.config)),
-            *("--set", f"link.url={bench.url}"),
+            *(word for one in (f"link.url={bench.url}", *overrides) for word in ("--set", one)),
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
         )

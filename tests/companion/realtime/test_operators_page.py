@@ -9,15 +9,17 @@ import asyncio
 import contextlib
 import shutil
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
 import pytest
+from axe_playwright_python.async_playwright import Axe
 from playwright.async_api import Browser, Page, async_playwright
 
 from companion.cli.web_parts import Watched, obeying
@@ -26,6 +28,7 @@ from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.runtime import run
 from companion.web import OperatorPage, listen
+from tests.companion.realtime.client_bench import flying_bench, passes, prescribed_l
 from tests.companion.test_run_flight import CHANNELS, SETUP, Notes
 from tests.companion.web_site import about
 from tests.companion.wire_peer import WirePeer, free_port, over_udp
@@ -45,6 +48,7 @@ ARGUMENTS = [
     "--disable-sync",
 ]
 WITHOUT_WEBGL = [*ARGUMENTS, "--disable-gpu", "--disable-3d-apis", "--disable-software-rasterizer"]
+SERIOUS = ("serious", "critical")
 # From the touch to the last valve's order on the wire.
 STOP_WITHIN_S = 0.3
 
@@ -71,11 +75,6 @@ class Flight:
         await page.wait_for_function("() => document.body.dataset.map === 'ready'")
         return page
 
-    async def until(self, page: Page, state: str) -> None:
-        await page.wait_for_function(
-            "(state) => document.getElementById('state').dataset.state === state", arg=state
-        )
-
     @property
     def child(self) -> subprocess.Popen[bytes]:
         assert self.page._child is not None
@@ -84,6 +83,13 @@ class Flight:
     async def until_spraying(self) -> None:
         self.peer.place(east_m=2.0)
         await self.peer.until(lambda: len(self.peer.open_channels) == len(CHANNELS))
+
+
+async def shows(page: Page, state: str) -> None:
+    """Wait until the page says so."""
+    await page.wait_for_function(
+        "(state) => document.getElementById('state').dataset.state === state", arg=state
+    )
 
 
 @pytest.fixture
@@ -135,13 +141,13 @@ async def test_a_flight_is_watched_stopped_released_and_enabled_from_the_page(
         page = await flight.open(browser, viewport={"width": 390, "height": 844}, has_touch=True)
         second = await flight.open(browser, viewport={"width": 1280, "height": 800})
         peer.place(east_m=2.0)
-        await flight.until(page, "ready")
+        await shows(page, "ready")
         await _press(page, "#enable")
 
         async def closing_s() -> float:
             if not peer.is_spraying:
                 await flight.until_spraying()
-            await flight.until(page, "spraying")
+            await shows(page, "spraying")
             await page.locator("#stop").hover()
             pressed_s = time.monotonic()
             await page.mouse.down()
@@ -149,12 +155,12 @@ async def test_a_flight_is_watched_stopped_released_and_enabled_from_the_page(
             closed = len(peer.orders)
             took_s = peer.orders[-1].at_s - pressed_s
             await page.mouse.up()
-            await flight.until(page, "estop")
-            await flight.until(second, "estop")
+            await shows(page, "estop")
+            await shows(second, "estop")
             peer.enable()  # latched: enabling by another way opens nothing
             await _press(page, "#enable")  # releases
             peer.place(east_m=2.0)
-            await flight.until(page, "ready")
+            await shows(page, "ready")
             assert all(order.pulse_us == 1000 for order in peer.orders[closed:])
             await _press(page, "#enable")
             return took_s
@@ -181,11 +187,11 @@ async def test_without_webgl_the_page_draws_on_a_canvas_and_keyboard_alone_stops
         assert width == 360
         flight.peer.enable()
         await flight.until_spraying()
-        await flight.until(page, "spraying")
+        await shows(page, "spraying")
         await page.locator("#stop").focus()
         await page.keyboard.press("Enter")
         await flight.peer.until(lambda: flight.peer.is_all_closed)
-        await flight.until(page, "estop")
+        await shows(page, "estop")
         await page.locator("#units").select_option("us")
         assert "gal/ac" in await page.locator("#rates").inner_text()
         await page.locator("#theme").select_option("night")
@@ -197,7 +203,7 @@ async def test_without_webgl_the_page_draws_on_a_canvas_and_keyboard_alone_stops
 async def test_a_page_without_news_says_so_and_greys_what_is_old(flight: Flight) -> None:
     async with chromium(WITHOUT_WEBGL) as browser:
         page = await flight.open(browser)
-        await flight.until(page, "ready")
+        await shows(page, "ready")
         flight.child.send_signal(signal.SIGSTOP)
         await page.wait_for_function("() => document.body.classList.contains('stale')")
         assert await page.locator("#lost").is_visible()
@@ -208,3 +214,65 @@ async def test_a_page_without_news_says_so_and_greys_what_is_old(flight: Flight)
         )
         flight.child.send_signal(signal.SIGCONT)
         await page.wait_for_function("() => !document.body.classList.contains('stale')")
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("theme", ["light", "dark"])
+async def test_the_page_is_accessible_by_day_and_by_night(
+    flight: Flight, theme: Literal["light", "dark"]
+) -> None:
+    async with chromium(WITHOUT_WEBGL) as browser:
+        # The checker is put into the page, which the page's own policy would not let it.
+        page = await flight.open(browser, color_scheme=theme, bypass_csp=True)
+        await shows(page, "ready")
+        for state in ("ready", "estop"):
+            if state == "estop":
+                await page.locator("#stop").click()
+                await shows(page, state)
+            found = await Axe().run(page)
+            bad = [one for one in found.response["violations"] if one["impact"] in SERIOUS]
+            assert not bad, [(one["id"], one["nodes"][0]["html"]) for one in bad]
+
+
+@pytest.mark.timeout(180)
+async def test_a_whole_flight_on_the_stub_is_watched_from_enable_to_landing(
+    tmp_path: Path,
+) -> None:
+    port = free_port(socket.SOCK_STREAM)
+    overrides = (
+        "web.enabled=true",
+        f"web.port={port}",
+        'safety.enable_by=["web"]',
+    )
+    async with (
+        flying_bench("ardupilot", tmp_path, *overrides) as bench,
+        chromium(WITHOUT_WEBGL) as browser,
+    ):
+        page = await browser.new_page()
+        page.set_default_timeout(40_000)
+        await bench.until(lambda: "link up" in bench.said, within_s=30.0)
+        await page.goto(f"http://127.0.0.1:{port}/")
+        await page.wait_for_function("() => document.body.dataset.map === 'ready'")
+        assert "SIMULATED" in await page.locator("#training").inner_text()
+        flight = bench.stub.flight
+        flight.set_items(passes("ardupilot"), time.monotonic())
+        await shows(page, "ready")
+        await _press(page, "#enable")
+        assert flight.arm(time.monotonic())
+        assert flight.start_mission(time.monotonic())
+        await shows(page, "spraying")
+        await bench.until(lambda: bench.has_opened)
+        await bench.until(lambda: bench.has_flown, within_s=40.0)
+        await shows(page, "armed")
+        # Each screen keeps nothing of its own: one that comes now is told the same.
+        second = await browser.new_page()
+        await second.goto(f"http://127.0.0.1:{port}/")
+        await second.wait_for_function("() => document.body.dataset.map === 'ready'")
+        await shows(second, "armed")
+        texts = [await one.locator("#numbers").inner_text() for one in (page, second)]
+        done = [text.partition("Area done")[2].strip()[:4] for text in texts]
+        assert done[0] == done[1]
+        assert float(done[0]) == pytest.approx(0.01, abs=0.005)  # 16 m by 6 m
+        found = bench.judged(tmp_path / "truth")
+    assert found["missed"] == 0
+    assert found["volume_l"] == pytest.approx(prescribed_l(), rel=0.15)
