@@ -15,6 +15,7 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -41,7 +42,7 @@ ORDERS_PER_S = 20
 ENABLE_AGE_MAX_S = 1.0
 # A page that ends at once is not started more often than this.
 RESTART_S = 3.0
-END_S = 2.0
+END_S, END_LOOK_S = 2.0, 0.02
 EVENTS_KEPT = 40
 BIND_TRIES_S = 3.0
 
@@ -291,7 +292,7 @@ class OperatorPage:
             finally:
                 self._is_starting = False
 
-        asyncio.get_running_loop().run_in_executor(None, start)
+        threading.Thread(target=start, name="page", daemon=True).start()
 
     async def close(self) -> None:
         """End the page; may be called twice and before `open`."""
@@ -310,8 +311,9 @@ class OperatorPage:
 
 async def _ended_within(child: subprocess.Popen[bytes], wait_s: float) -> None:
     """Wait for a process that has been told to end; kill it when it does not."""
-    try:
-        await asyncio.to_thread(child.wait, wait_s)
-    except subprocess.TimeoutExpired:
-        child.kill()
-        await asyncio.to_thread(child.wait)
+    for _ in range(round(wait_s / END_LOOK_S)):
+        if child.poll() is not None:
+            return
+        await asyncio.sleep(END_LOOK_S)
+    child.kill()
+    child.wait()
