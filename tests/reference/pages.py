@@ -8,6 +8,7 @@ from pathlib import Path
 from tests.reference import (
     commands,
     configuration,
+    driver_board,
     journal,
     map_problems,
     mavlink,
@@ -27,6 +28,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "metrics.md": metrics.page,
     "journal.md": journal.page,
     "scenarios.md": scenarios.page,
+    "driver-board.md": driver_board.page,
 }
 
 

@@ -263,7 +263,7 @@ def test_a_dither_that_makes_no_sense_is_refused(dither_us: float) -> None:
 
 # ------------------------------------------------------------------ test vectors of the document
 
-PAGE = Path(__file__).parents[2] / "docs" / "driver-board.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "driver-board.md"
 TEN_HZ = Pulsing(frequency_hz=10.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
 ROW = re.compile(r"^\| (\d+) \| ([^|]+) \| ([^|]+) \| ([^|]+) \|$", re.MULTILINE)
 
