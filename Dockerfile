@@ -18,7 +18,7 @@
 #                                   --ulimit rtprio=50 --ulimit memlock=-1 --cap-add SYS_NICE
 #   gauges on an I2C bus            --device /dev/i2c-1 --group-add "$(stat -c %g /dev/i2c-1)"
 # With valves on the computer's lines, prefer `vrspray service install` without a container: there
-# systemd closes the lines after every end of the companion (docs/service.md). Here only the valve
+# systemd closes the lines after every end of the companion (docs/howto/run-as-a-service.md). Here only the valve
 # engine and your hardware do.
 
 FROM python:3.13-slim AS build

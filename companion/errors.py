@@ -42,7 +42,8 @@ class ConfigError(VrsprayError):
 class MapError(VrsprayError):
     """A prescription, boundary or exclusion file cannot be used.
 
-    `code` is the linter's name of the reason (docs/maps.md), `fix` what the operator can do.
+    `code` is the linter's name of the reason (docs/reference/map-problems.md), `fix` what the
+    operator can do.
     """
 
     def __init__(self, text: str, *, code: str = "unusable", fix: str = "") -> None:

@@ -1,6 +1,6 @@
 """The servo path: from an order to the autopilot to the edges at the valves.
 
-The board of docs/driver-board.md: widths here (rules 9 to 11), its pulses below.
+The board of docs/reference/driver-board.md: widths here (rules 9 to 11), its pulses below.
 """
 
 from __future__ import annotations
@@ -175,7 +175,8 @@ class DriverBoard:
             pulses.order(at_s, duty, is_new_period=is_new, out=self._made)
 
 
-# The pulses of one valve as a driver board makes them: rules 1 to 8 of docs/driver-board.md.
+# The pulses of one valve as a driver board makes them: rules 1 to 8 of
+# docs/reference/driver-board.md.
 #
 # Written from that page and from nothing else, so that a board in the twin can be wrong, or right,
 # on its own. An account of on-time is kept: what a valve was due so far, less what it delivered.

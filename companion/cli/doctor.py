@@ -377,9 +377,11 @@ _NAMES = ("output-parameters", "disarmed-values", "watchdog-script", "closed-ord
 _MASK_OUTPUTS = 16
 _BOARD = (
     "fit a driver board that closes when its signal stops changing (output.dither_us = 8, "
-    "docs/driver-board.md)"
+    "docs/howto/build-a-driver-board.md)"
 )
-_RELAY = "fit a relay that cuts the pump when this computer fails (docs/pump.md)"
+_RELAY = (
+    "fit a relay that cuts the pump when this computer fails (docs/howto/pump-instead-of-valves.md)"
+)
 Known = Mapping[str, float | None]
 
 
@@ -550,7 +552,7 @@ def _closed(heard: Heard, options: ServoOptions) -> Check:
 def _reading(name: str, channel: int, read: int | None, pulse_us: int) -> Check | None:
     """Return what is wrong with what an output reads; None if it reads as ordered."""
     if read is None:
-        fix = "make sure that SERVO_OUTPUT_RAW is streamed (docs/link.md)"
+        fix = "make sure that SERVO_OUTPUT_RAW is streamed (docs/howto/links.md)"
         return warn(name, f"the autopilot does not report output {channel}", fix)
     if read == 0:
         fix = "press the safety switch, or set BRD_SAFETY_MASK"

@@ -64,7 +64,9 @@ def guided_click(config: Config, given: tuple[str, ...], *, is_wet: bool) -> Ite
     if config.output.kind == "none":
         raise ClickError('doctor --click: output.kind = "none": there are no valves to click')
     if is_wet and config.flow_meter.source == "none":
-        raise ClickError("doctor --wet: needs a flow meter ([flow_meter], docs/sensors.md)")
+        raise ClickError(
+            "doctor --wet: needs a flow meter ([flow_meter], docs/howto/wire-flow-meter.md)"
+        )
     bench = _Bench(config, given, terminal())
     yield from bench.wet() if is_wet else bench.dry()
 
@@ -203,7 +205,11 @@ class _Bench:
     def _refused(self, outcome: GroundOutcome, names: Sequence[str]) -> Iterator[Check]:
         text = in_words(outcome.reasons, outcome.text)
         what, _, fix = text.partition("; ")
-        yield fail(name_of(names[0]), f"nothing was opened: {what}", fix or "see docs/doctor.md")
+        yield fail(
+            name_of(names[0]),
+            f"nothing was opened: {what}",
+            fix or "see docs/howto/check-before-flight.md",
+        )
         yield from not_clicked(names[1:], "the valve before it could not be opened")
 
     def _warn_of_safety_switch(self) -> None:
@@ -385,7 +391,7 @@ class ShortHand:
 # The guided click: what is asked, and what an answer or a metered flow makes of each valve.
 
 # Twice, as in the dry click; a second each, so that a turbine's pulses or whole millilitres of the
-# autopilot tell a tenth of one valve's flow (docs/sensors.md). Between them the flow has ended.
+# autopilot tell a tenth of one valve's flow. Between them the flow has ended.
 WET_OPEN_S, WET_CLOSED_S, WET_TIMES = 1.0, 0.8, 2
 # Nearer to the others than this one can spray on, and see to it; a loss beyond it closes in flight.
 FAR_SHARE = 0.25

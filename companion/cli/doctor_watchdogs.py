@@ -184,7 +184,7 @@ def script_check(found: ScriptTrial | None, *, why: str = "", words: str = "") -
         return not_applicable(name, why if found is None else px4)
     if found.reasons:
         what, _, fix = words.partition("; ")
-        return fail(name, f"not tried: {what}", fix or "see docs/doctor.md")
+        return fail(name, f"not tried: {what}", fix or "see docs/howto/check-before-flight.md")
     if found.problem is not None:
         return fail(name, f"not tried: {found.problem}", "vrspray doctor says what is wrong")
     if found.closed_s is None or found.open_s is None:
@@ -283,7 +283,7 @@ def questions(
             text="Let a valve run (vrspray ground prime --valve NAME) and pull the cable between "
             "flight controller and driver board's orders, or kill -STOP the companion: did it "
             "close within half a second",
-            fix="do not fly: see output.dither_us and docs/driver-board.md",
+            fix="do not fly: see output.dither_us and docs/howto/build-a-driver-board.md",
             applies=is_servo and has_dither,
             otherwise="output.dither_us is 0, or no servo outputs are used",
         ),
@@ -291,7 +291,7 @@ def questions(
             name="dead-man",
             text="Let a valve run and pull the wire of ALIVE: did pump and master valve drop "
             "within half a second",
-            fix="do not fly: see the monostable and its relay (docs/gpio.md)",
+            fix="do not fly: see the monostable and its relay (docs/howto/wire-gpio.md)",
             applies=has_alive,
             otherwise="gpio.alive_line is not set",
         ),

@@ -1,7 +1,7 @@
 """The table of the legal record: who, for whom, what, on which crop, in which weather.
 
 Nothing of it moves a valve. It is asked for before the flight, because afterwards nobody remembers;
-the journal keeps it, and the report makes the record of it (docs/application-record.md). Which law
+the journal keeps it, and the report makes the record of it (docs/howto/legal-record.md). Which law
 asks for what stands here, so that `run` and `doctor` can name what is missing.
 """
 
@@ -136,7 +136,7 @@ class ApplicationTable(Table):
 
 
 # What each law wants from the operator, as keys of the configuration; what the flight itself tells
-# (area, place, times, quantity) is added by the report. Sources: docs/application-record.md.
+# (area, place, times, quantity) is added by the report. Sources: docs/howto/legal-record.md.
 ASKED: dict[Profile, tuple[str, ...]] = {
     "eu": (
         "application.operator",

@@ -415,7 +415,7 @@ def told(axis: Axis) -> Told:
 # its estimator now has it (PX4: EKF2_TAU_POS, ArduPilot: EK3_TAU_OUTPUT), and not by its
 # velocity. What a valve gives on a metre of ground that is told so follows the speed of the
 # place. What has begun lately goes on for the 0.1 to 0.2 s that an order takes; what has gone on
-# for long is the velocity's own error, and a dose by it wavers more than it gains (docs/px4.md).
+# for long is the velocity's own error, and a dose by it wavers more than it gains.
 # So the one is taken less the other: two means of how much faster the place goes than its
 # velocity, a quick and a slow one.
 #

@@ -130,7 +130,7 @@ def application_check(config: Config) -> Check:
         return warn(
             NAME,
             f"{table.profile}: missing: {', '.join(absent)}",
-            "write them before the flight; docs/application-record.md has all",
+            "write them before the flight; docs/howto/legal-record.md has all",
         )
     if table.time_zone is not None and zone_named(table.time_zone) is None:
         return warn(

@@ -121,4 +121,6 @@ def _wiring(wiring: Wiring, chip: Chip) -> Check:
     if not found:
         return ok("gpio-wiring", "if the program is killed, the valves close")
     more = f" (and {len(found) - 1} more)" if found[1:] else ""
-    return warn("gpio-wiring", f"{found[0]}{more}", "see docs/gpio.md for wiring and settings")
+    return warn(
+        "gpio-wiring", f"{found[0]}{more}", "see docs/howto/wire-gpio.md for wiring and settings"
+    )

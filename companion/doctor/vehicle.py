@@ -32,7 +32,7 @@ def link_checks(heard: Heard, config: Config, setup: Setup | None) -> Iterator[C
         yield from (not_applicable(name, "no vehicle heard") for name in _VEHICLE)
         return
     if heard.troubles:
-        yield warn("link", *split_advice(heard.troubles[-1], "see docs/link.md"))
+        yield warn("link", *split_advice(heard.troubles[-1], "see docs/howto/links.md"))
     else:
         yield ok("link", heard.url)
     yield _heartbeat(heard)
@@ -53,7 +53,7 @@ def no_link(why: str) -> Iterator[Check]:
 
 def _unheard(heard: Heard) -> Check:
     if heard.troubles:
-        return fail("link", *split_advice(heard.troubles[-1], "see docs/link.md"))
+        return fail("link", *split_advice(heard.troubles[-1], "see docs/howto/links.md"))
     return fail(
         "link",
         f"{heard.url}: no heartbeat from an autopilot within {heard.waited_s:.0f} s",
@@ -88,7 +88,10 @@ def _streams(heard: Heard) -> Check:
         rates = ", ".join(f"{rate.name} {rate.rate_hz:.0f} Hz" for rate in heard.rates[:3])
         return ok("streams", f"{rates}, all as requested")
     texts = [f"{one.name} {one.rate_hz:.1f} Hz instead of {one.wanted_hz:g} Hz" for one in slow]
-    fix = "check whether another station sets stream rates, or the link is too slow (docs/link.md)"
+    fix = (
+        "check whether another station sets stream rates, or the link is too slow "
+        "(docs/howto/links.md)"
+    )
     # Without a position there is no spraying at all; the rest closes, or costs accuracy.
     is_blind = any(one.name == "position" and not one.rate_hz >= 2.0 for one in slow)
     return (fail if is_blind else warn)("streams", ", ".join(texts), fix)
@@ -116,7 +119,9 @@ def _fix(heard: Heard, least: Fix) -> Check:
 def _estimator(heard: Heard) -> Check:
     if heard.is_estimator_healthy is None:
         return warn(
-            "estimator", "the autopilot does not report it", "check its stream (docs/link.md)"
+            "estimator",
+            "the autopilot does not report it",
+            "check its stream (docs/howto/links.md)",
         )
     if not heard.is_estimator_healthy:
         fix = "wait for it to settle, or calibrate compass and accelerometers"

@@ -173,7 +173,7 @@ def asked_ml(strips: list[Strip]) -> float:
 
 @dataclass(frozen=True)
 class Overspill:
-    """What fell on rate 0, and the bound of docs/fly.md.
+    """What fell on rate 0, and the bound of docs/howto/fly-in-simulation.md.
 
     bound = ideal + sum over changes of flow * (ramp / 8 + timing error). The ideal is what a
     sharp step on each boundary drops there: strips are as wide as they are.

@@ -118,7 +118,7 @@ def test_one_late_wake_up_in_a_hundred_is_allowed_and_two_are_not() -> None:
     assert once.p99_late_s == pytest.approx(0.0, abs=1e-9)
     clock = Clock(lambda n: 0.0074 * (n % WAKES in (7, 8)))
     twice = outcome(Lines(), clock)
-    assert twice.fault == "wakes up 7.4 ms late; allow rtprio (docs/gpio.md)"
+    assert twice.fault == "wakes up 7.4 ms late; allow rtprio (docs/howto/wire-gpio.md)"
     assert clock.naps == ROUNDS * WAKES
 
 

@@ -275,8 +275,8 @@ def flows_ml_s(pulses: Sequence[Pulses], grid_s: Floats, sprayer: Sprayer, seed:
     return np.array(flows)
 
 
-# docs/driver-board.md, rule 11: a width that has moved by less than half the dither for so long
-# closes its valve.
+# docs/reference/driver-board.md, rule 11: a width that has moved by less than half the dither for
+# so long closes its valve.
 ALIVE_S, MOVE_US = 0.3, 4
 
 

@@ -1,4 +1,4 @@
-"""docs/ardupilot.md and docs/px4.md beside the real firmwares: their commands, typed as they stand.
+"""Pages of the firmwares' own simulations: their commands, typed as they stand.
 
 ArduCopter's into MAVProxy, PX4's into its own shell and into MAVProxy.
 """
@@ -29,7 +29,7 @@ ENDED_WITHIN_S = 10.0
 
 def blocks(page: str, section: str) -> list[tuple[str, list[str]]]:
     """Return a section's blocks: where they are typed, and their lines."""
-    section = (ROOT / "docs" / page).read_text().split(f"## {section}\n")[1]
+    section = (ROOT / "docs" / "howto" / page).read_text().split(f"## {section}\n")[1]
     found = re.findall(r"^```(\w+)\n(.*?)^```$", section, re.MULTILINE | re.DOTALL)
     return [(kind, text.splitlines()) for kind, text in found]
 
@@ -79,7 +79,7 @@ def docs_copter(firmwares: Path, folder: Path, home: str) -> Iterator[None]:
 async def test_the_commands_of_the_page_fly_and_spray(firmwares: Path, tmp_path: Path) -> None:
     here = tmp_path / "here"
     copy_example(here / "examples" / "anyang")
-    section = blocks("ardupilot.md", "ArduCopter's own simulation")
+    section = blocks("simulate-arducopter.md", "ArduCopter's own simulation")
     (_, simulation), (_, setting), (_, run), (_, flying), (_, killed) = section
     home = simulation[0].split("--custom-location=")[1].strip()
     (command,) = run
@@ -138,7 +138,7 @@ async def pxh(
 async def test_the_commands_of_px4s_page_fly_and_spray(firmwares: Path, tmp_path: Path) -> None:
     here = tmp_path / "here"
     copy_example(here / "examples" / "anyang")
-    section = blocks("px4.md", "PX4's own simulation")
+    section = blocks("simulate-px4.md", "PX4's own simulation")
     shells = ["sh", "pxh", "sh", "sh", "pxh", "sh", "mavproxy", "pxh", "mavproxy"]
     assert [kind for kind, _ in section] == shells
     simulation, setting, upload, run, arming, station, enabling, landing, again = (

@@ -101,7 +101,7 @@ async def test_doctor_finds_a_ready_vehicle_ready(
 
 
 def opens_by_its_own_test(station: Station) -> None:
-    """Have PX4 open a disarmed output for half a second, as docs/ground-work.md says."""
+    """Have PX4 open a disarmed output for half a second, as docs/howto/ground-work.md says."""
     station.log.clear_flight()
     assert station.command(ACTUATOR_TEST, 1.0, 0.5, 0.0, 0.0, 1301.0) == 0
     station.for_s(1.5)

@@ -52,7 +52,7 @@ pytestmark = [pytest.mark.firmware, pytest.mark.timeout(1800)]
 SPEED_M_S, RATES_L_HA, ZONE_M = 5.0, (20.0, 28.0, 24.0, 32.0), 20.0
 # Planned beside flown.
 TOO_LONG, TOO_SHORT = 0.05, 0.02
-# docs/plan.md: the companion's buffer and the wander of the aircraft.
+# docs/howto/plan-a-field.md: the companion's buffer and the wander of the aircraft.
 BORDER_M = 0.3
 HURRIED = 10.0
 # At both ends of a line the aircraft is slow, and there the valves deliver too much or nothing:

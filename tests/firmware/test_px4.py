@@ -44,7 +44,7 @@ MEAN_MAX_M, WORST_MAX_M, OFF_TARGET_MAX_ML = 0.05, 0.25, 0.1
 # and near a step of 17 % that moves the place where two doses meet: on 13 flights by 0.04 to 0.07 m
 # on average and 0.34 m at most, were the changes on time to the millimetre and the dose by the
 # velocity (`judge_perfect`). Ours were 0.044 to 0.085 m, 0.29 m at most, and change by change 0.030
-# to 0.053 m and 0.18 m apart from that. (docs/px4.md, what PX4 is off by)
+# to 0.053 m and 0.18 m apart from that. (docs/howto/connect-px4.md, what PX4 is off by)
 OURS_MEAN_BOUND_M, OURS_WORST_BOUND_M = 0.08, 0.30
 MEAN_BOUND_M, WORST_BOUND_M, OFF_TARGET_BOUND_ML = 0.12, 0.45, 0.3
 # So much (sd) is its place off sideways, and with it the column of zones that an outer valve is in.

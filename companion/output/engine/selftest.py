@@ -138,7 +138,7 @@ def _latency(
             best = late_s
         if _p99_s(best) <= late_max_s:
             return best, ""
-    text = f"wakes up {_p99_s(best) * 1e3:.1f} ms late; allow rtprio (docs/gpio.md)"
+    text = f"wakes up {_p99_s(best) * 1e3:.1f} ms late; allow rtprio (docs/howto/wire-gpio.md)"
     return best, text
 
 

@@ -235,7 +235,7 @@ def _count(first: tuple[int, str], path: Path) -> int:
             path,
             f"line {first[0]} is {first[1].strip()[:40]!r}, so this is no open text map, which "
             "begins with the number of its points",
-            fix="name another file, or see docs/text-map.md for the format",
+            fix="name another file, or see docs/howto/text-map.md for the format",
             code="unknown-format",
         )
     count = int(words[0])

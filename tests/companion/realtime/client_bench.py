@@ -177,7 +177,7 @@ def write_field(folder: Path, autopilot: str) -> Path:
         numbers = iter(range(1, 7))
         text = re.sub(r"channel = \d+", lambda _: f"channel = {next(numbers)}", text)
         text = text.replace('modes = ["AUTO"]', 'modes = ["MISSION"]')
-        # Its positions are 10 ms late and not 31 (docs/px4.md).
+        # Its positions are 10 ms late and not 31 (docs/howto/connect-px4.md).
         text = text.replace("position_s = 0.0349", "position_s = 0.0100")
     config.write_text(text)
     return config

@@ -1,0 +1,145 @@
+"""The how-to pages: short, and every command in them is typed.
+
+What needs no vehicle runs in a folder made like a user's, with the example field under the names
+that the pages use. The rest, and what takes long, is only read: the command and its options exist.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from companion.cli.app import app
+
+ROOT = Path(__file__).resolve().parents[2]
+HOWTO = ROOT / "docs" / "howto"
+PAGES = sorted(HOWTO.glob("*.md"))
+MOST_WORDS = 850
+# A block, indented in a list or not: its language, its title if any, its text.
+BLOCK = re.compile(
+    r'^(?P<indent> *)```(?P<kind>\w*)(?: title="(?P<title>[^"]+)")?\n(?P<text>.*?)^(?P=indent)```$',
+    re.MULTILINE | re.DOTALL,
+)
+# Commands that need a vehicle, a second terminal, a person at the keys or the internet.
+NEEDS_MORE = {
+    ("run",), ("upload",), ("doctor",), ("ground",), ("service",), ("sitl", "serve"), ("wsp",),
+    ("demo",), ("examples",), ("calibrate", "lag"),
+}  # fmt: skip
+# Options with which one of these needs nothing else.
+ALONE = ("--no-link", "--dry-run")
+# Pages whose plans or flights would repeat those of others, and take long.
+ONLY_READ = re.compile(r"^vrspray (sitl fly|replay|plan .*(--choices|--aircraft|--terrain))")
+
+
+def blocks(page: Path) -> Iterator[tuple[str, str | None, str]]:
+    """Yield kind, title and text of each block of a page, without its indent."""
+    for found in BLOCK.finditer(page.read_text(encoding="utf-8")):
+        lines = found["text"].splitlines()
+        text = "\n".join(line.removeprefix(found["indent"]) for line in lines)
+        yield found["kind"], found["title"], text + "\n"
+
+
+def commands(page: Path) -> list[str]:
+    """Return each `vrspray` command that a page has its reader type, on one line."""
+    typed = "".join(text for kind, _, text in blocks(page) if kind in {"", "sh", "text"})
+    lines = typed.replace("\\\n", " ").splitlines()
+    return [line.strip() for line in lines if line.strip().startswith("vrspray ")]
+
+
+EVERY = [(page.name, command) for page in PAGES for command in commands(page)]
+
+
+def leaf(words: list[str]) -> tuple[tuple[str, ...], set[str], list[str]]:
+    """Return the names of a command line's command, its options, and what is left for it."""
+    names: list[str] = []
+    found: Any = typer.main.get_command(app)
+    context = found.make_context("vrspray", [], None, resilient_parsing=True)
+    while words and hasattr(found, "list_commands"):
+        below = found.get_command(context, words[0])
+        assert below is not None, f"no command {' '.join([*names, words[0]])}"
+        context = below.make_context(words[0], [], context, resilient_parsing=True)
+        found, words, names = below, words[1:], [*names, words[0]]
+    options = {name for one in found.get_params(context) for name in one.opts}
+    more = {name for one in found.get_params(context) for name in one.secondary_opts}
+    return tuple(names), options | more, words
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_is_short(page: Path) -> None:
+    assert len(page.read_text(encoding="utf-8").split()) <= MOST_WORDS
+
+
+@pytest.mark.parametrize(("page", "command"), EVERY)
+def test_a_command_and_its_options_exist(page: str, command: str) -> None:
+    words = shlex.split(command.split(" #")[0])[1:]
+    _, known, rest = leaf([word for word in words if word != "..."])
+    assert {word.split("=")[0] for word in rest if re.match(r"--[a-z]", word)} <= known
+
+
+def runs(command: str) -> bool:
+    """Return whether a command runs here, by itself and soon."""
+    words = shlex.split(command)[1:]
+    names, _, _ = leaf(words)
+    if ONLY_READ.match(command) or "FILE" in words:
+        return False
+    is_alone = any(option in words for option in ALONE)
+    return is_alone or not any(names[: len(more)] == more for more in NEEDS_MORE)
+
+
+RUNNING = sorted({page for page, command in EVERY if runs(command)})
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder as a reader has it: examples, a configuration, its map, a flight."""
+    folder = tmp_path_factory.mktemp("reader")
+    shutil.copytree(ROOT / "examples", folder / "examples")
+    for one in (ROOT / "examples" / "anyang").iterdir():
+        if one.is_file():
+            shutil.copy(one, folder / one.name)
+    config, mission = "examples/anyang/config.toml", "examples/anyang/mission.waypoints"
+    fly = ["sitl", "fly", "--config", config, "--mission", mission, "--out", "flights"]
+    assert vrspray(folder, *fly).returncode == 0
+    plan = ["plan", "boundary.geojson", "--config", "config.toml", "--out", "field.plan"]
+    assert vrspray(folder, *plan).returncode == 0
+    compiled = ["prescription.shp", "--config", "config.toml", "--out", "field.flightmap.gpkg"]
+    assert vrspray(folder, "map", "compile", *compiled).returncode == 0
+    return folder
+
+
+def vrspray(within: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder."""
+    return subprocess.run(
+        [sys.executable, "-m", "companion", *words],
+        cwd=within,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "COLUMNS": "120"},
+    )
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("page", RUNNING)
+def test_commands_of_a_page_run(page: str, home: Path, tmp_path: Path) -> None:
+    here = shutil.copytree(home, tmp_path / "here")
+    for _, title, text in blocks(HOWTO / page):
+        if title is not None:
+            (here / title).write_text(text, encoding="utf-8")
+    for command in commands(HOWTO / page):
+        if not runs(command):
+            continue
+        done = vrspray(here, *shlex.split(command)[1:])
+        # doctor without a link finds fault with any computer that is not a vehicle's.
+        fine = {0, 1} if "doctor" in command else {0}
+        assert done.returncode in fine, f"{command}\n{done.stdout}{done.stderr}"
