@@ -12,7 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from missions.refills import STUB_M, Part, Passes, turned
+from missions.passes import Part, Passes, turned
+from missions.refills import STUB_M
 from missions.strips import Floats
 
 # What lies behind an obstacle by less than this is flown around; of so many chains the nearest.

@@ -19,20 +19,9 @@ from missions.bands import (
 )
 from missions.corners import Motion
 from missions.demand import Demand
+from missions.passes import NOSE_DEG, TOUCH_M, Part, Passes, Place, Times, joined_parts
 from missions.plan import Settings
-from missions.refills import (
-    NOSE_DEG,
-    TOUCH_M,
-    Limits,
-    Part,
-    Passes,
-    Place,
-    Times,
-    flown_by,
-    joined_parts,
-    plainly,
-    split,
-)
+from missions.refills import Limits, flown_by, plainly, split
 from missions.searching import steps
 from missions.strips import Floats
 from missions.ways import Ways

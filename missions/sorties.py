@@ -23,9 +23,10 @@ from missions.network import (
     build_network,
     rows_of,
 )
+from missions.passes import Part, Passes
 from missions.plan import Kind, Leg, Place, Settings, Sortie, nose_s
 from missions.refill_search import beside, build_limits, build_passes, several
-from missions.refills import Limits, Part, Passes, flown_by
+from missions.refills import Limits, flown_by
 from missions.search import improve
 from missions.stops import timed
 from missions.strips import Floats, lengths_m

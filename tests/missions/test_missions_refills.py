@@ -19,10 +19,11 @@ from missions.energy import Battery
 from missions.field import build_field
 from missions.files.write import geojson_text
 from missions.free_space import free_space
+from missions.passes import Part, Passes, Times
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
 from missions.refill_search import merged, regrouped
-from missions.refills import Limits, Part, Passes, Times, flown_by, plainly, split
+from missions.refills import Limits, flown_by, plainly, split
 from missions.sheet import sheet
 from missions.strips import Floats
 from tests.bench.large_fields import compared, depots_of
