@@ -165,12 +165,15 @@ def _figures(
 ) -> tuple[dict[str, bytes], dict[str, dict[str, str]]]:
     """Return the files of all figures, and how they stand in the page."""
     from analysis.report.drawing import drawn_of
-    from analysis.report.figures.style import inline_svg, png_of, styled, svg_of
+    from analysis.report.figures.style import inline_svg, png_of, stamp, styled, svg_of
 
     files: dict[str, bytes] = {}
     figures: dict[str, dict[str, str]] = {}
+    simulated = assessment.flight.simulated
+    mark = "" if simulated.is_unmarked else simulated.label
     with styled():
         for each in drawn_of(assessment, clock, treated):
+            stamp(each.figure, mark)
             png, svg = png_of(each), svg_of(each)
             files[f"figures/{each.name}.png"] = png
             files[f"figures/{each.name}.svg"] = svg.encode()

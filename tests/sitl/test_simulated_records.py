@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 
 import pytest
 
 from analysis.report.build import Report, ReportOptions, build_report
+from companion.cli.app import execute
 from companion.cli.record_parts import follow
 from companion.config import load
 from companion.config.application_table import PROFILES
@@ -18,6 +20,7 @@ from sitl.serve import ServeOptions
 from tests.analysis.report_flight import EU_TOLD, REAL, fly
 from tests.bench.wire import example
 from tests.bench.wire_clock import fly as fly_by_clock
+from tests.bench.worst import judged
 from tests.companion.realtime.test_wire_flight import write_field, write_mission
 from tests.virtual_time import START_S
 
@@ -119,3 +122,31 @@ def test_only_a_real_flight_makes_a_complete_record(
 ) -> None:
     path = fly(tmp_path, told=EU_TOLD, simulated=simulated)
     assert report_of(path).contents["application"]["eu"]["complete"] is complete
+
+
+@pytest.mark.parametrize(
+    "name", ["a.csv", "a.geojson", "a.geojsonl", "a.kml", "a.shp", "a.parquet", "a.mcap", "a.zip"]
+)
+def test_every_export_of_a_simulated_flight_says_so(tmp_path: Path, name: str) -> None:
+    # Flown as with a product: only what the vehicle is tells.
+    path = fly(tmp_path, simulated=Simulated(word="yes", because="its sensors"))
+    out = tmp_path / "out"
+    out.mkdir()
+    assert execute(["export", str(path), "--out", str(out / name)]) == 0
+    written = b""
+    for file in out.iterdir():
+        written += file.read_bytes()
+        if zipfile.is_zipfile(file):
+            with zipfile.ZipFile(file) as packed:
+                written += b"".join(packed.read(each) for each in packed.namelist())
+    assert b"simulated" in written.lower()
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_a_twin_flight_keeps_its_bound_agrees_with_itself_and_is_no_application(
+    number: int,
+) -> None:
+    found = judged(number)
+    assert found["truth_m"] <= found["bound_m"]
+    assert found["disagrees"] == []
+    assert (found["complete"], found["simulated"]) == ([], "yes")

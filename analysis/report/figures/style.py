@@ -69,6 +69,12 @@ class Drawn:
         return min(float(self.figure.get_figwidth()) / WIDTH_IN, 1.0)
 
 
+def stamp(figure: Figure, mark: str) -> None:
+    """Write a mark into the upper right corner: a figure travels without its page."""
+    if mark:
+        figure.text(0.995, 0.995, mark, ha="right", va="top", size=9, weight="bold", color=RED)
+
+
 @contextmanager
 def styled() -> Iterator[None]:
     """Draw in this style, and leave no setting behind."""
