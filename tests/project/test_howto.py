@@ -6,12 +6,14 @@ that the pages use. The rest, and what takes long, is only read: the command and
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,8 @@ import pytest
 import typer
 
 from companion.cli.app import app
+from companion.config.model import Config
+from companion.link.commands import DO_SPRAYER, USER_ESTOP
 from tests.reference.words import words_in
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -87,6 +91,24 @@ def test_a_command_and_its_options_exist(page: str, command: str) -> None:
     assert {word.split("=")[0] for word in rest if re.match(r"--[a-z]", word)} <= known
 
 
+SETTINGS = [
+    (page.name, text)
+    for page in PAGES
+    for kind, title, text in blocks(page)
+    if kind == "toml" and title is None and "[[fault]]" not in text
+]
+
+
+@pytest.mark.parametrize(("page", "text"), SETTINGS)
+def test_tables_and_keys_of_a_page_exist(page: str, text: str) -> None:
+    schema = Config.model_json_schema(by_alias=True)
+    for table, given in tomllib.loads(text).items():
+        names = re.findall(r"#/\$defs/(\w+)", json.dumps(schema["properties"][table]))
+        known = {key for name in names for key in schema["$defs"][name]["properties"]}
+        for one in given if isinstance(given, list) else [given]:
+            assert set(one) <= known, page
+
+
 def runs(command: str) -> bool:
     """Return whether a command runs here, by itself and soon."""
     words = shlex.split(command)[1:]
@@ -146,3 +168,12 @@ def test_commands_of_a_page_run(page: str, home: Path, tmp_path: Path) -> None:
         # doctor without a link finds fault with any computer that is not a vehicle's.
         fine = {0, 1} if "doctor" in command else {0}
         assert done.returncode in fine, f"{command}\n{done.stdout}{done.stderr}"
+
+
+def test_the_action_file_that_is_shipped_is_that_of_the_page() -> None:
+    shipped = (ROOT / "deploy" / "qgroundcontrol" / "spray.json").read_text(encoding="utf-8")
+    on_page = {title: text for _, title, text in blocks(HOWTO / "enable-spraying.md") if title}
+    assert on_page["spray.json"] == shipped
+    actions = json.loads(shipped)["actions"]
+    assert [one["mavCmd"] for one in actions] == [DO_SPRAYER, DO_SPRAYER, USER_ESTOP]
+    assert {one["compId"] for one in actions} == {191}
