@@ -6,14 +6,45 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pyproj import Transformer
+from numpy.typing import NDArray
 
 from companion.core.frame import LocalFrame
-from missions.maps.text.text_points import TangentPlane, from_ecef, to_ecef
+from missions.maps.text.text_points import TangentPlane
 
 
 def degrees(limit: float) -> st.SearchStrategy[float]:
     return st.floats(-limit, limit, allow_subnormal=False)
+
+
+def earth_centred(
+    latitude_deg: float, longitude_deg: float, altitude_m: float
+) -> NDArray[np.float64]:
+    """Return earth-centred, earth-fixed X, Y, Z [m] on WGS 84 (NIMA TR8350.2, table 3.1)."""
+    latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
+    eccentricity_2 = (2.0 - 1.0 / 298.257223563) / 298.257223563
+    normal_m = 6_378_137.0 / math.sqrt(1.0 - eccentricity_2 * math.sin(latitude) ** 2)
+    across_m = (normal_m + altitude_m) * math.cos(latitude)
+    return np.array(
+        [
+            across_m * math.cos(longitude),
+            across_m * math.sin(longitude),
+            (normal_m * (1.0 - eccentricity_2) + altitude_m) * math.sin(latitude),
+        ]
+    )
+
+
+def turned(latitude_deg: float, longitude_deg: float) -> NDArray[np.float64]:
+    """Return the rotation from X, Y, Z to east, north, up."""
+    latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
+    sin_lat, cos_lat = math.sin(latitude), math.cos(latitude)
+    sin_lon, cos_lon = math.sin(longitude), math.cos(longitude)
+    return np.array(
+        [
+            [-sin_lon, cos_lon, 0.0],
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
+        ]
+    )
 
 
 @given(
@@ -22,19 +53,14 @@ def degrees(limit: float) -> st.SearchStrategy[float]:
     altitude=st.floats(-500.0, 9000.0),
     away=st.tuples(degrees(0.5), degrees(0.5), st.floats(-500.0, 9000.0)),
 )
-def test_plane_is_the_topocentric_one_of_proj(
+def test_plane_is_the_one_of_p2_by_earth_centred_coordinates(
     latitude: float, longitude: float, altitude: float, away: tuple[float, float, float]
 ) -> None:
     place = max(-90.0, min(90.0, latitude + away[0])), longitude + away[1], away[2]
-    proj = Transformer.from_pipeline(
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
-        "+step +proj=cart +ellps=WGS84 +step +proj=topocentric +ellps=WGS84 "
-        f"+lat_0={latitude!r} +lon_0={longitude!r} +h_0={altitude!r}"
-    )
-    expected = proj.transform(place[1], place[0], place[2])
+    ahead = earth_centred(*place) - earth_centred(latitude, longitude, altitude)
     plane = TangentPlane(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
     found = plane.to_local(*(np.array([value]) for value in place))
-    np.testing.assert_allclose(np.ravel(found), expected, atol=1e-6)
+    np.testing.assert_allclose(np.ravel(found), turned(latitude, longitude) @ ahead, atol=1e-7)
 
 
 @given(
@@ -48,7 +74,8 @@ def test_there_and_back_is_the_same_place(
 ) -> None:
     plane = TangentPlane(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
     there = plane.to_geodetic(*(np.array([value]) for value in local))
-    np.testing.assert_allclose(np.ravel(plane.to_local(*there)), local, atol=1e-6)
+    # PROJ's way back is a closed form: 0.1 um near the ground, a few at 20 km of altitude.
+    np.testing.assert_allclose(np.ravel(plane.to_local(*there)), local, atol=1e-5)
 
 
 def test_origin_is_nought() -> None:
@@ -93,14 +120,6 @@ def test_on_ground_finds_what_lies_at_an_altitude_over_the_plane() -> None:
     latitude, longitude = plane.on_ground(east, north, 420.0)
     found = plane.to_local(latitude, longitude, np.full(2, 420.0))
     np.testing.assert_allclose(found[:2], [east, north], atol=1e-6)
-
-
-def test_earth_centred_coordinates_of_the_axes() -> None:
-    latitude, longitude = np.array([0.0, 0.0, 90.0]), np.array([0.0, 90.0, 0.0])
-    found = to_ecef(latitude, longitude, np.array([0.0, 10.0, 0.0]))
-    expected = [[6_378_137.0, 0, 0], [0, 6_378_147.0, 0], [0, 0, 6_356_752.314245]]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-    np.testing.assert_allclose(from_ecef(found)[0], latitude, atol=1e-12)
 
 
 @pytest.mark.parametrize("place", [(91.0, 0.0, 0.0), (0.0, 181.0, 0.0), (0.0, 0.0, math.nan)])
