@@ -20,7 +20,7 @@ COMPILE = $(BIN)/uv pip compile --universal --fork-strategy fewest --python-vers
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware test-image test-wheel wheel docs reference lock clean bench-missions
+.PHONY: help setup demo test test-computing test-flights test-companion test-missions test-analysis test-sitl lint format-check ruff mypy imports bench mutants mutants-safety faults test-gpio test-firmware arm-wheels test-image test-wheel wheel docs reference lock clean bench-missions
 
 help: ## what there is
 	@awk -F ':.*## ' '/^[a-z -]+:.*## /{printf "make %-15s %s\n", $$1, $$2}' Makefile
@@ -101,6 +101,9 @@ wheel: $(INSTALLED) ## the wheel, in dist
 
 test-wheel: wheel ## the wheel in an empty environment and an empty folder (ARGS=office for reports too)
 	@tests/try_wheel.sh $(BIN)/python dist/vrspray-*.whl $(ARGS)
+
+arm-wheels: $(INSTALLED) ## every pinned package has a wheel for a 64-bit Raspberry Pi (downloads them)
+	@tests/arm_wheels.sh $(BIN)/python
 
 test-image: $(INSTALLED) ## the steps of the Dockerfile, without a container engine (ARGS=office for that role)
 	$(BIN)/python -m tests.try_image $(ARGS)

@@ -29,7 +29,7 @@ ABOUT = {
     "atomiser": "two rotary atomisers fed by one pump",
     "own-method": "controllers of one's own, for --controller",
     "profiles": "wirings of valves on this computer's own lines",
-    DEPLOY: "for the vehicle: ArduPilot's watchdog script, a systemd unit, containers",
+    DEPLOY: "for the vehicle: install script, ArduPilot's watchdog script, systemd unit",
 }
 # Of a file in another example: `file = "../anyang/prescription.shp"`.
 _BESIDE = re.compile(r'"\.\./([\w-]+)/')
