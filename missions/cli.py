@@ -15,7 +15,9 @@ from typing import Annotated, Any, Literal
 import typer
 
 from companion.cli.answer import AsJson, Tell, answer, note, progress
+from companion.errors import MapError
 from companion.wording import counted
+from missions.errors import PlanError
 from missions.files.fence import Fences, fence_warnings
 from missions.files.pilot_sheet import (
     check_sheet,
@@ -32,7 +34,7 @@ from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
 from missions.prices import closing_hint, overlap_warnings, prices
-from missions.reading import Asked, Task, names_of, read_task
+from missions.reading import Asked, Task, assumed, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
 from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
@@ -195,6 +197,9 @@ def plan(
     sortie: Annotated[
         int | None, typer.Option(metavar="N", help="Sortie in which spraying stopped.", min=1)
     ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a plan of this name, with all its sorties.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Plan the passes over a field, sortie by sortie, and write the mission.
@@ -202,14 +207,14 @@ def plan(
     A .plan or .waypoints file holds one sortie; the second and later ones are numbered beside it.
     """
     start = perf_counter()
-    _check_outputs(out, png, pilot_sheet, first)
+    _check_outputs(out, png, pilot_sheet, first, force=force)
     if rate_l_ha is not None and prescription is not None:
         raise typer.BadParameter("--rate-l-ha and --prescription exclude each other")
     asked = Asked(
         field=field,
         answers=reading.answers,
         crs=reading.crs,
-        prescription=prescription,
+        prescription=prescription or _own_rates(field, rate_l_ha, reading),
         obstacles=tuple(obstacle or ()),
         no_spray=tuple(no_spray or ()),
         obstacle_radius_m=obstacle_radius_m,
@@ -261,7 +266,7 @@ def plan(
         choices = list(prices(planned, task.rates, depots=task.depots, around=task.around))
     with _undisturbed():
         files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
-    planned = replace(planned, warnings=(*planned.warnings, *_older(older_sorties(out, files))))
+    removed = _removed(older_sorties(out, files))
     if png is not None:
         draw_plan(planned, png, title=field.stem)
     if out.suffix.casefold() == ".plan":
@@ -275,6 +280,8 @@ def plan(
         "lines_file": str(marks[0]) if marks else None,
         "lines_files": [str(path) for path in marks],
         "prices": [asdict(price) for price, _ in choices],
+        "assumed": assumed(task, asked, reading.config, changes),
+        "removed": [str(path) for path in removed],
     }
     if pilot_sheet is not None:
         write_sheet(
@@ -288,15 +295,24 @@ def plan(
         result, [*_lines(planned, result, files), *(f"choice    {text}" for text in said)],
         as_json=as_json,
     )  # fmt: skip
-    if once:
-        note(
-            "note: fly it with `vrspray run --continue`: its guard closes the valves on treated "
-            "ground and on what is covered twice, and the litres count neither"
-        )
-    for warning in warnings:
-        note(f"warning: {warning}")
-    if watch.stopped:
-        note(f"stopped after {took_s:.0f} s; wrote the best plan so far")
+    own = f"{field} itself: it is a prescription too" if asked.prescription == field else ""
+    told = {
+        "assumed, not given: ": ", ".join(result["assumed"].values()),
+        "rates of ": "" if prescription is not None else own,
+        "removed, of the plan that was there: ": names_of(removed) if removed else "",
+        "note: ": _FLOWN_ONCE if once else "",
+        **{f"warning: {warning}": " " for warning in warnings},
+        "stopped after ": f"{took_s:.0f} s; wrote the best plan so far" if watch.stopped else "",
+    }
+    for head, rest in told.items():
+        if rest:
+            note(f"{head}{rest}".rstrip())
+
+
+_FLOWN_ONCE = (
+    "fly it with `vrspray run --continue`: its guard closes the valves on treated ground and on "
+    "what is covered twice, and the litres count neither"
+)
 
 
 def _fenced(task: Task, *, with_sprayer: bool, looks: bool) -> tuple[Plan, Fences]:
@@ -364,17 +380,42 @@ def _undisturbed() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def _older(files: list[Path]) -> tuple[str, ...]:
-    if not files:
-        return ()
-    return (
-        f"{names_of(files)} {'are' if len(files) > 1 else 'is'} not of this plan, though named as "
-        "its sorties are: an earlier plan had more; delete what is not to be flown",
-    )
+def _removed(files: list[Path]) -> list[Path]:
+    """Remove sorties of the plan that was replaced: one of them would be flown for one of these."""
+    for path in files:
+        try:
+            path.unlink()
+        except OSError as error:
+            reason = (error.strerror or "cannot be removed").lower()
+            raise PlanError(f"{path}: a sortie of an earlier plan: {reason}; delete it") from error
+    return files
+
+
+def _refuse_existing(out: Path) -> None:
+    """Refuse to replace a plan, or to leave some of its sorties beside those of another."""
+    there = [*([out] if out.is_file() else []), *older_sorties(out, [out])]
+    if there:
+        verb = "are" if len(there) > 1 else "is"
+        raise PlanError(
+            f"{out.parent}: {names_of(there)} {verb} there already; give another --out, or "
+            "--force to replace this plan with all its sorties"
+        )
+
+
+def _own_rates(field: Path, rate_l_ha: float | None, reading: Reading) -> Path | None:
+    """Return the field's file where it is a prescription too and nothing else gives rates."""
+    named = reading.config is not None and reading.config.prescription is not None
+    if rate_l_ha is not None or named:
+        return None
+    try:
+        found = reading.read(field)
+    except MapError:  # an outline, or rates that it does not explain: as without them
+        return None
+    return field if found.rates_l_ha else None
 
 
 def _check_outputs(
-    out: Path, png: Path | None, pilot_sheet: Path | None, first: str | None
+    out: Path, png: Path | None, pilot_sheet: Path | None, first: str | None, *, force: bool
 ) -> None:
     """Refuse files that cannot be written, before any work."""
     check_suffix(out)
@@ -388,6 +429,8 @@ def _check_outputs(
     for path in (out, png, pilot_sheet):
         if path is not None:
             check_folder(path)
+    if not force:
+        _refuse_existing(out)
 
 
 def _choices(planned: Plan, result: dict[str, Any], prices: list[str], *, asked: bool) -> list[str]:

@@ -292,6 +292,32 @@ def _settings(config: Config | None, changes: dict[str, float | int | None]) -> 
     return replace(settings, speeds_m_s=(settings.speeds_m_s[0], highest))
 
 
+def assumed(
+    task: Task, asked: Asked, config: Config | None, changes: Mapping[str, float | int | None]
+) -> dict[str, str]:
+    """Return what nobody has given, by its key, in words with its value."""
+    origins = {} if config is None else config.settings()
+    settings = task.settings
+
+    def is_open(key: str) -> bool:
+        return origins.get(f"mission.{key}", (None, "default"))[1] == "default"
+
+    found = {
+        "swath_width_m": f"swath {settings.swath_width_m:g} m",
+        "speed_m_s": f"speed {settings.speed_m_s:g} m/s",
+        "height_m": f"height {settings.height_m:g} m",
+        "tank_l": f"tank {settings.tank_l:g} L",
+        "reserve_l": f"reserve {settings.reserve_l:g} L",
+    }
+    found = {key: text for key, text in found.items() if changes.get(key) is None and is_open(key)}
+    has_map = asked.prescription is not None or (
+        config is not None and config.prescription is not None
+    )
+    if not has_map and asked.rate_l_ha is None and is_open("rate_l_ha"):
+        found["rate_l_ha"] = f"rate {RATE_L_HA:g} L/ha"
+    return found
+
+
 def _check_bounds(name: str, value: float) -> None:
     """Refuse an option with a number that its key of the configuration could not have."""
     reason = out_of_bounds(MissionTable, name, value)

@@ -70,7 +70,11 @@ async def connected(url: str, *, wait_s: float) -> AsyncIterator[MavsdkVehicle]:
         try:
             await client.add_any_connection(target)
         except MavsdkError as error:
-            raise LinkError(f"--link {url}: cannot be opened ({error})") from error
+            taken = "BIND" in str(error)
+            fix = (
+                "another program holds this port; end it, or give another" if taken else str(error)
+            )
+            raise LinkError(f"--link {url}: cannot be opened: {fix}") from error
         system = await client.first_autopilot(wait_s)
         if system is None:
             raise LinkError(

@@ -167,7 +167,15 @@ def _planned(outline: Path, obstacles: Path | None, config: Path) -> tuple[Plann
     for suffix in (".plan", ".waypoints"):
         said = io.StringIO()
         begun = process_time()
-        command = ["plan", outline, "--out", outline.with_suffix(suffix), "--config", config]
+        command = [
+            "plan",
+            "--force",
+            outline,
+            "--out",
+            outline.with_suffix(suffix),
+            "--config",
+            config,
+        ]
         command += ["--json"] if obstacles is None else ["--json", "--obstacle", obstacles]
         with redirect_stdout(said), redirect_stderr(io.StringIO()):
             code = execute([str(each) for each in command])

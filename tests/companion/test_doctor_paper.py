@@ -11,9 +11,15 @@ from typing import Any
 import pytest
 
 from companion.cli.app import execute
-from companion.cli.doctor import configuration_checks, map_checks, refused_configuration
+from companion.cli.doctor import (
+    _in_order,
+    _summary,
+    configuration_checks,
+    map_checks,
+    refused_configuration,
+)
 from companion.config import load
-from companion.doctor.check import Check, Status
+from companion.doctor.check import Check, Status, fail, not_applicable, ok, warn
 from companion.errors import ConfigError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"
@@ -37,7 +43,7 @@ def of_map(*overrides: str) -> dict[str, Check]:
     [
         ((), "configuration", Status.OK),
         (("mission.swath_width_m=7.0",), "configuration", Status.FAIL),
-        (("web.enabled=true",), "configuration", Status.WARN),
+        (("flow_trim.enabled=true",), "configuration", Status.WARN),
         ((), "output", Status.OK),
         (("output.kind=none",), "output", Status.WARN),
         ((), "pump-cutoff", Status.WARN),
@@ -156,7 +162,20 @@ def test_a_person_reads_one_line_a_check_and_the_verdict(config: Path, capsys: C
     assert execute(["doctor", "--config", str(config), "--no-link"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("ok    configuration: ")
-    assert lines[-1].startswith("ready: ")
+    assert lines[-1].startswith("nothing failed, no vehicle asked: ")
+
+
+def test_failures_come_last_and_ready_needs_a_vehicle() -> None:
+    found = [fail("map", "none", "write one"), ok("link", "up"), warn("clock", "off", "wait")]
+    assert [line.split()[0].rpartition("m")[2] for line in _in_order(found)] == [
+        "ok",
+        "warn",
+        "fail",
+    ]
+    assert _summary(found).startswith("not ready: ")
+    assert _summary(found[1:]).startswith("ready: ")
+    assert _summary([not_applicable("link", "skipped")]).startswith("nothing failed, no vehicle")
+    assert _summary([ok("click-1", "clicked")]).startswith("passed: ")
 
 
 def test_the_unit_of_this_configuration_is_recognised(config: Path, capsys: Captured) -> None:

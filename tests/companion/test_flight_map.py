@@ -505,7 +505,15 @@ def test_a_flight_map_can_be_looked_at_and_planned_over(
     assert execute(["map", "check", str(flight_map.path), "--config", str(config)]) == 0
     boundary = tmp_path / "boundary.geojson"
     boundary.write_bytes((EXAMPLES / "anyang" / "boundary.geojson").read_bytes())
-    order = ["plan", str(boundary), "--config", str(config), "--out", str(tmp_path / "a.plan")]
+    order = [
+        "plan",
+        "--force",
+        str(boundary),
+        "--config",
+        str(config),
+        "--out",
+        str(tmp_path / "a.plan"),
+    ]
     assert execute(order) == 0, capsys.readouterr().err
 
 

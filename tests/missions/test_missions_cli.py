@@ -36,7 +36,9 @@ def written(ground: Polygon, path: Path) -> Path:
 
 def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any], str]:
     """Return exit code, the JSON object and stderr."""
-    code = execute(["plan", *map(str, words), "--json"])
+    force = () if "--no-force" in words else ("--force",)
+    given = [str(word) for word in words if word != "--no-force"]
+    code = execute(["plan", *force, *given, "--json"])
     out, err = capsys.readouterr()
     return code, json.loads(out), err
 
@@ -236,7 +238,7 @@ def test_answers_on_the_command_line_hold_for_the_configurations_map_too(
 
 def test_one_of_anything_is_singular(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     field = written(box(0, 0, 120, 120), tmp_path / "f.geojson")
-    assert execute(["plan", str(field), "--out", str(tmp_path / "m.kml")]) == 0
+    assert execute(["plan", "--force", str(field), "--out", str(tmp_path / "m.kml")]) == 0
     out, _ = capsys.readouterr()
     assert "1 sortie," in out
     assert not re.search(r"\b1 (sorties|lines|items|passes)\b", out)
@@ -362,19 +364,57 @@ def test_a_folder_that_is_not_there_is_said_before_planning(
     assert re.search(r"no folder .*no.*make the folder first", found["error"])
 
 
-def test_sorties_of_an_earlier_plan_are_said(
+def test_a_plan_that_is_there_is_replaced_with_force_alone_and_as_a_whole(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     field = written(box(0.0, 0.0, 200.0, 100.0), tmp_path / "field.geojson")
     given = ["--swath-m", 6, "--speed-m-s", 6, "--rate-l-ha", 20, "--out", tmp_path / "m.plan"]
     _, three, _ = run(capsys, field, *given, "--tank-l", 16)
+    assert len(three["files"]) > 2
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    code, refused, _ = run(capsys, field, *given, "--tank-l", 60, "--no-force")
+    assert code == 2
+    assert "m.plan, m-2.plan, m-3.plan" in refused["error"]
+    assert "--force" in refused["error"]
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    (tmp_path / "m.plan").unlink()
+    code, refused, _ = run(capsys, field, *given, "--tank-l", 60, "--no-force")
+    assert code == 2
     code, one, err = run(capsys, field, *given, "--tank-l", 60)
     assert code == 0
-    assert len(three["files"]) > 2
     assert len(one["files"]) == 1
-    (said,) = [each for each in one["warnings"] if "not of this plan" in each]
-    assert said.startswith("m-2.plan, m-3.plan")
-    assert said in err
+    assert sorted(path.name for path in tmp_path.glob("m*.plan")) == ["m.plan"]
+    assert "m-2.plan, m-3.plan" in err
+
+
+def test_a_prescription_given_as_the_field_has_the_rates_too(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    field = ANYANG / "prescription.shp"
+    _, own, err = run(capsys, field, "--swath-m", 6, "--out", tmp_path / "a.plan")
+    _, named, _ = run(
+        capsys, field, "--prescription", field, "--swath-m", 6, "--out", tmp_path / "b.plan"
+    )
+    assert own["volume_l"] == pytest.approx(named["volume_l"])
+    assert "it is a prescription too" in err
+    _, flat, _ = run(capsys, field, "--rate-l-ha", 90, "--swath-m", 6, "--out", tmp_path / "c.plan")
+    assert flat["volume_l"] > 3.0 * own["volume_l"]
+
+
+def test_what_was_assumed_is_said(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    field = written(box(0.0, 0.0, 100.0, 60.0), tmp_path / "f.geojson")
+    _, found, err = run(capsys, field, "--speed-m-s", 5, "--out", tmp_path / "m.plan")
+    assert set(found["assumed"]) == {
+        "swath_width_m", "height_m", "tank_l", "reserve_l", "rate_l_ha",
+    }  # fmt: skip
+    assert "swath 6 m" in err
+    assert "rate 20 L/ha" in err
+    config = ANYANG / "config.toml"
+    _, found, err = run(
+        capsys, ANYANG / "boundary.geojson", "--config", config, "--out", tmp_path / "n.plan"
+    )
+    assert set(found["assumed"]) == {"tank_l", "reserve_l"}
+    assert "tank 40 L" in err
 
 
 def test_ctrl_c_while_files_are_written_leaves_all_of_one_plan(
@@ -389,7 +429,7 @@ def test_ctrl_c_while_files_are_written_leaves_all_of_one_plan(
     monkeypatch.setattr(missions.files.write, "write_whole", pressed)
     field = written(box(0.0, 0.0, 200.0, 100.0), tmp_path / "field.geojson")
     given = ["--swath-m", 6, "--speed-m-s", 6, "--rate-l-ha", 20, "--out", tmp_path / "m.plan"]
-    code = execute(["plan", str(field), *map(str, given), "--tank-l", "16"])
+    code = execute(["plan", "--force", str(field), *map(str, given), "--tank-l", "16"])
     assert code == INTERRUPTED
     sorties = sorties_from(tmp_path / "m.plan")
     assert len(sorties) > 2

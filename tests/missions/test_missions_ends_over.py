@@ -126,7 +126,8 @@ def test_its_price_is_offered_where_valves_close_at_the_border(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     anyang = Path("examples/anyang")
-    words = ["plan", str(anyang / "boundary.geojson"), "--config", str(anyang / "config.toml"),
+    words = ["plan", "--force", str(anyang / "boundary.geojson"),
+             "--config", str(anyang / "config.toml"),
              "--border-m", "0.3", "--json", "--choices",
              "--out", str(tmp_path / "m.plan")]  # fmt: skip
     assert execute(words) == 0
@@ -154,7 +155,7 @@ def test_without_a_configuration_it_is_refused(
 ) -> None:
     path = tmp_path / "field.geojson"
     path.write_text(shapely.to_geojson(degrees(box(0.0, 0.0, 90.0, DITCH_M))))
-    words = ["plan", str(path), "--out", str(tmp_path / "m.plan"), "--ends-over"]
+    words = ["plan", "--force", str(path), "--out", str(tmp_path / "m.plan"), "--ends-over"]
     assert execute(words) == 2
     assert 'border = "inside"' in capsys.readouterr().err
     assert execute([*words, "--sprayer"]) == 2
@@ -165,7 +166,8 @@ def test_ends_over_the_border_of_the_configured_map(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     anyang = Path("examples/anyang")
-    words = ["plan", str(anyang / "boundary.geojson"), "--config", str(anyang / "config.toml"),
+    words = ["plan", "--force", str(anyang / "boundary.geojson"),
+             "--config", str(anyang / "config.toml"),
              "--prescription", str(anyang / "prescription.shp"), "--border-m", "0.3", "--json",
              "--png", str(tmp_path / "m.svg")]  # fmt: skip
     found = []

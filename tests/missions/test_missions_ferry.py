@@ -37,7 +37,7 @@ def planned(
     lon, lat = shapely.get_coordinates(degrees(Point(*depot)))[0]
     own = ["--depot", f"{lat},{lon}", "--rate-l-ha", "20", "--out", out]
     own += ["--tank-l", "12"] if ground is FIELD else []
-    code = execute(["plan", *map(str, [field, *own, *words]), "--json"])
+    code = execute(["plan", "--force", *map(str, [field, *own, *words]), "--json"])
     found = dict(json.loads(capsys.readouterr().out))
     assert code == 0, found
     return found
@@ -227,7 +227,7 @@ def test_a_ferry_height_that_is_none_is_refused(
     field = written(FIELD, tmp_path / "f.geojson")
     out = tmp_path / "m.plan"
     words = [str(field), "--ferry-height-m", str(height_m), "--out", str(out)]
-    assert execute(["plan", *words]) == 2
+    assert execute(["plan", "--force", *words]) == 2
     error = capsys.readouterr().err
     assert "ferry height" in error or "--ferry-height-m" in error
     assert not out.exists()

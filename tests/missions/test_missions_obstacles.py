@@ -48,7 +48,7 @@ def by_gdal(path: Path, shapes: Sequence[BaseGeometry], **columns: list[Any]) ->
 
 
 def planned(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
-    code = execute(["plan", *map(str, words)])
+    code = execute(["plan", "--force", *map(str, words)])
     out, err = capsys.readouterr()
     return code, out, err
 

@@ -337,7 +337,7 @@ def test_a_sortie_for_whose_fence_there_is_no_room_is_flown_as_several(
     path = tmp_path / "f.geojson"
     path.write_text(shapely.to_geojson(drawn.outline))
     words = [path, "--rate-l-ha", "20", "--tank-l", "400", "--json", "--out"]
-    code = execute(["plan", *map(str, words), str(tmp_path / "m.plan")])
+    code = execute(["plan", "--force", *map(str, words), str(tmp_path / "m.plan")])
     found = json.loads(capsys.readouterr().out)
     assert code == 0, found
     assert len(found["sorties"]) > 1
@@ -348,7 +348,7 @@ def test_a_sortie_for_whose_fence_there_is_no_room_is_flown_as_several(
         content = json.loads(Path(name).read_text(encoding="utf-8"))
         assert not judge_fence(drawn, content, corners_max=room, outside_max_m=10.0)
     # A file without a fence has one sortie as before.
-    assert execute(["plan", *map(str, words), str(tmp_path / "m.waypoints")]) == 0
+    assert execute(["plan", "--force", *map(str, words), str(tmp_path / "m.waypoints")]) == 0
     assert len(json.loads(capsys.readouterr().out)["sorties"]) == 1
 
 

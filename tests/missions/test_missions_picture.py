@@ -36,7 +36,17 @@ def test_a_plan_is_drawn_with_all_of_its_sorties(
     hole = [(30.0, 30.0), (50.0, 30.0), (50.0, 60.0), (30.0, 60.0)]
     ground = Polygon([(0, 0), (120, 0), (120, 100), (0, 100)], [hole])
     field = written(ground, tmp_path / "f.geojson")
-    words = ["plan", field, "--rate-l-ha", "20", "--tank-l", "9", "--out", tmp_path / "m.geojson"]
+    words = [
+        "plan",
+        "--force",
+        field,
+        "--rate-l-ha",
+        "20",
+        "--tank-l",
+        "9",
+        "--out",
+        tmp_path / "m.geojson",
+    ]
     assert execute([*map(str, words), "--png", str(tmp_path / "m.svg"), "--json"]) == 0
     sorties = len(json.loads(capsys.readouterr().out)["sorties"])
     assert sorties > 2
@@ -50,7 +60,8 @@ def test_wind_speed_heights_and_both_ends_of_every_sortie_are_shown(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     field = written(shapely.box(0, 0, 120, 100), tmp_path / "f.geojson")
-    words = ["plan", field, "--rate-l-ha", "20", "--tank-l", "9", "--out", tmp_path / "m.geojson",
+    words = ["plan", "--force", field, "--rate-l-ha", "20", "--tank-l", "9",
+             "--out", tmp_path / "m.geojson",
              "--wind", "3.5,250", "--ferry-height-m", "18"]  # fmt: skip
     assert execute([*map(str, words), "--png", str(tmp_path / "m.svg"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -70,7 +81,7 @@ def test_wind_speed_heights_and_both_ends_of_every_sortie_are_shown(
 def test_without_a_wind_none_is_drawn(tmp_path: Path) -> None:
     field = written(shapely.box(0, 0, 50, 50), tmp_path / "f.geojson")
     words = [str(field), "--out", str(tmp_path / "m.kml"), "--png", str(tmp_path / "m.svg")]
-    assert execute(["plan", *words]) == 0
+    assert execute(["plan", "--force", *words]) == 0
     assert "<!-- wind" not in (tmp_path / "m.svg").read_text()
 
 
@@ -90,7 +101,7 @@ def test_a_picture_in_no_known_format_is_refused_before_any_work(
 ) -> None:
     field = written(shapely.box(0, 0, 50, 50), tmp_path / "f.geojson")
     words = [str(field), "--out", str(tmp_path / "m.plan"), "--png", str(tmp_path / "m.bmp")]
-    assert execute(["plan", *words]) == 2
+    assert execute(["plan", "--force", *words]) == 2
     assert "pictures are written as .png, .svg, .pdf" in capsys.readouterr().err
     assert not (tmp_path / "m.plan").exists()
 
@@ -98,5 +109,5 @@ def test_a_picture_in_no_known_format_is_refused_before_any_work(
 def test_a_corner_that_no_strip_reaches_is_red(tmp_path: Path) -> None:
     field = written(Polygon([(0, 0), (100, 0), (0, 40)]), tmp_path / "f.geojson")
     words = [str(field), "--rate-l-ha", "9", "--out", str(tmp_path / "m.kml")]
-    assert execute(["plan", *words, "--png", str(tmp_path / "m.svg")]) == 0
+    assert execute(["plan", "--force", *words, "--png", str(tmp_path / "m.svg")]) == 0
     assert "<!-- left unsprayed" in (tmp_path / "m.svg").read_text()

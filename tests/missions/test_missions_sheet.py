@@ -51,7 +51,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def planned(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
-    assert execute(["plan", *map(str, words), "--json"]) == 0
+    assert execute(["plan", "--force", *map(str, words), "--json"]) == 0
     return dict(json.loads(capsys.readouterr().out))
 
 
@@ -212,7 +212,7 @@ def test_what_is_no_sheet_is_refused_before_any_work(
 ) -> None:
     field = written(box(0, 0, 50, 50), tmp_path / "f.geojson")
     words = [str(tmp_path / word) if word.startswith("s.") else word for word in words]
-    assert execute(["plan", str(field), "--out", str(tmp_path / "m.plan"), *words]) == 2
+    assert execute(["plan", "--force", str(field), "--out", str(tmp_path / "m.plan"), *words]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "m.plan").exists()
 

@@ -184,7 +184,7 @@ def test_a_plan_counts_on_valves_that_close_unless_they_never_do(
     config.write_text(text)
     words = ["--rate-l-ha", "20", "--config", str(config), "--out", str(tmp_path / "m.waypoints")]
     words += ["--border-m", "0.1", "--json", *filter(None, [option])]
-    assert execute(["plan", str(path), *words]) == 0
+    assert execute(["plan", "--force", str(path), *words]) == 0
     found = json.loads(capsys.readouterr().out)
     # 7.4 m of it are sprayed by booms of 6 m: 4.6 of 12 m twice, or 0.6 of 8 m.
     twice_m, flown_m = (0.6, 8.0) if is_closing else (4.6, 12.0)
@@ -196,7 +196,13 @@ def test_no_pass_is_flown_for_a_sliver_along_the_border(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     # One of 38 m would add 0.2 m2 of 2,700.
-    words = ["plan", "examples/anyang/boundary.geojson", "--out", str(tmp_path / "m.plan")]
+    words = [
+        "plan",
+        "--force",
+        "examples/anyang/boundary.geojson",
+        "--out",
+        str(tmp_path / "m.plan"),
+    ]
     words += ["--config", "examples/anyang/config.toml", "--border-m", "0.3", "--json"]
     assert execute(words) == 0
     assert json.loads(capsys.readouterr().out)["swaths"] == 5
@@ -232,7 +238,16 @@ def test_choices_are_printed_with_their_price(
     geometry = json.loads(shapely.to_geojson(degrees(made_up("quadrangle", 1000))))
     path = tmp_path / "field.geojson"
     path.write_text(json.dumps({"type": "Feature", "properties": {}, "geometry": geometry}))
-    words = ["plan", str(path), "--out", str(tmp_path / "field.plan"), "--leave-max", "3", "--json"]
+    words = [
+        "plan",
+        "--force",
+        str(path),
+        "--out",
+        str(tmp_path / "field.plan"),
+        "--leave-max",
+        "3",
+        "--json",
+    ]
     assert execute(words) == 0
     found = json.loads(capsys.readouterr().out)
     (price,) = found["prices"]

@@ -32,7 +32,7 @@ def plan(folder: Path) -> tuple[int, Path]:
     field, out = folder / "field.geojson", folder / "out.geojson"
     field.write_text(shapely.to_geojson(degrees(box(0.0, 0.0, 250.0, 200.0))), encoding="utf-8")
     given = ["--swath-m", "6", "--speed-m-s", "6", "--rate-l-ha", "20", "--json"]
-    return app.execute(["plan", str(field), "--out", str(out), *given]), out
+    return app.execute(["plan", "--force", str(field), "--out", str(out), *given]), out
 
 
 def test_nobody_looks_on_any_more_after_an_error() -> None:

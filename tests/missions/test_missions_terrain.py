@@ -293,7 +293,7 @@ def test_a_tile_beside_the_field_writes_no_file(
 def test_nothing_is_kept_of_a_straight_profile_but_its_ends() -> None:
     at = np.linspace(0.0, 100.0, 50)
     assert kept_points(at, 0.3 * at + 7.0, 0.01).tolist() == [0, 49]
-    assert execute(["plan", "--help"]) == 0
+    assert execute(["plan", "--force", "--help"]) == 0
 
 
 def test_kml_follows_the_ground_above_the_sea(tmp_path: Path) -> None:

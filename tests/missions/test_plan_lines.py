@@ -114,7 +114,9 @@ def test_the_papers_field_is_planned_and_flown_with_nothing_off_its_lines(
     out = tmp_path / "field.plan"
     # Passes keep the buffer of the border and the aircraft's wander: no valve stands at its edge.
     kept = ["--border-m", "0.3"]
-    execute(["plan", str(BOUNDARY), "--config", EXAMPLE, "--out", str(out), "--json", *kept])
+    execute(
+        ["plan", "--force", str(BOUNDARY), "--config", EXAMPLE, "--out", str(out), "--json", *kept]
+    )
     planned = json.loads(capsys.readouterr().out)
     lines = tmp_path / "field.lines.geojson"
     assert planned["lines_file"] == str(lines)

@@ -81,7 +81,7 @@ def plan_of(tmp_path: Path, name: str, tank_l: int) -> list[str]:
 
     field = written(box(0, 0, 100, 60), tmp_path / "f.geojson")
     words = ["--rate-l-ha", "20", "--tank-l", str(tank_l), "--out", str(tmp_path / name)]
-    assert execute(["plan", str(field), *words]) == 0
+    assert execute(["plan", "--force", str(field), *words]) == 0
     return sorted(path.name for path in tmp_path.glob("*.plan"))
 
 

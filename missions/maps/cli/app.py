@@ -370,7 +370,7 @@ LINE_MAX = 500
 def report_lines(file: Path, result: Mapping[str, Any]) -> list[str]:
     """Return the lines for a person."""
     return [
-        f"{file}: {result['format']}, {result['crs']}",
+        f"{_judged(file)}: {result['format']}, {result['crs']}",
         _extent(result),
         _rates(result),
         _amount(result),
@@ -378,6 +378,12 @@ def report_lines(file: Path, result: Mapping[str, Any]) -> list[str]:
         *_problems(result["problems"]),
         _verdict(result),
     ]
+
+
+def _judged(file: Path) -> str:
+    """Return the map that is judged: of a folder with one shapefile, that."""
+    found = sorted(file.glob("*.[sS][hH][pP]")) if file.is_dir() else []
+    return str(found[0] if len(found) == 1 else file)
 
 
 def _extent(result: Mapping[str, Any]) -> str:
