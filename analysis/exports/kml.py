@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-# From light yellow to dark blue, red, green and blue: ever darker, for people who do not tell red
-# from green and for prints in grey.
+# Viridis from its light end, as in all maps of the program: the darker, the more, for people who
+# do not tell red from green and for prints in grey.
 _RAMP = (
-    (255, 250, 190), (202, 233, 180), (130, 205, 187), (65, 182, 196),
-    (34, 133, 184), (36, 80, 160), (8, 29, 88),
+    (253, 231, 37), (144, 215, 67), (53, 183, 121), (33, 145, 140),
+    (49, 104, 142), (68, 57, 131), (68, 1, 84),
 )  # fmt: skip
 _OPAQUE = "d8"
 # Rates beyond these shares of all are outliers: they take the colours of the ends.
