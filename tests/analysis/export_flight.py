@@ -9,6 +9,7 @@ from companion.core.controller import Memory, step
 from companion.core.setup import Setup
 from companion.core.types import PressureReport
 from companion.record.journal import Journal
+from tests.analysis.report_flight import REAL
 from tests.builders import along, flying, setup
 
 START_S = 100.0
@@ -31,7 +32,13 @@ def fly(
     used = setup() if given is None else given
     memory = Memory()
     with Journal.create(
-        folder, setup=used, setup_text=facts, started_s=START_S, waits=True, training=training
+        folder,
+        setup=used,
+        setup_text=facts,
+        started_s=START_S,
+        waits=True,
+        simulated=REAL,
+        training=training,
     ) as journal:
         number = 0
         for north_m, course in PASSES_M:
