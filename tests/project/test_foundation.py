@@ -109,6 +109,12 @@ def test_a_vehicle_gets_nothing_heavy_and_earlier_names_of_extras_still_install(
     assert {one.name for one in wanted("all")} >= heavy | {"gpiod", "smbus2"}
 
 
+def test_the_tools_of_the_site_change_no_version_of_development() -> None:
+    tested = {pin.name: str(pin.specifier) for pin in pins("dev")}
+    site = {pin.name: str(pin.specifier) for pin in pins("docs")}
+    assert {name: it for name, it in site.items() if tested.get(name, it) != it} == {}
+
+
 # ------------------------------------------------------------------------------------- documents
 
 
