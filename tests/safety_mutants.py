@@ -2,7 +2,7 @@
 
 `python -m tests.safety_mutants [part of a mutant's name ...]`, or `make mutants-safety`. `mutmut`
 changes one thing at a time in a copy of the repository and runs the tests of these files, quick
-ones first. It prints what survived; docs/contributing/mutation-testing.md says why some do.
+ones first. It prints what survived.
 """
 
 from __future__ import annotations

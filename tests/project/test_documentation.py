@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.reference.pages import FOLDER, PAGES, written
-from tests.reference.words import GENERATED, counts
+from tests.reference.words import GENERATED, WORDS_MAX, counts
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -43,6 +43,11 @@ def test_words_are_counted_by_part_and_generated_pages_apart(tmp_path: Path) -> 
         "README.md": 2, "CONTRIBUTING.md": 1, "docs/page.md": 4, "docs/howto": 3,
     }  # fmt: skip
     assert generated == 7
+
+
+def test_the_documentation_stays_short_enough_to_be_read() -> None:
+    by_hand, _ = counts()
+    assert sum(by_hand.values()) <= WORDS_MAX, f"cut something: {by_hand}"
 
 
 def test_site_builds_without_a_broken_link(tmp_path: Path) -> None:

@@ -19,6 +19,24 @@ Schema for editors.
 instead. A key without a default, marked **required**, has to be given if its table is; `-` means
 that it is not set.
 """
+RULES = """## What the tables must say together
+
+| Rule | Reason |
+|---|---|
+| names and channels of valves are used once | an order is for one valve |
+| every valve is in a nozzle set, and every name in a set is a valve | a valve in no set would never open |
+| `flow_l_min` and `duty` increase strictly | otherwise two duty cycles would give one flow |
+| `lag.on_start_s` ≤ `lag.on_s`, `lag.off_end_s` ≥ `lag.off_s` | the first drop comes before the step, the last drop after it |
+| `lag.up_time_s` ≤ `lag.up_s`, `lag.down_time_s` ≤ `lag.down_s` | a time constant is part of its lag |
+| a pump that makes the flow has one nozzle set, without `duty` and `flow_l_min` | the pump's curve sets the flow; the valves only open and close |
+| `pump.us`, `pump.flow_l_min`, `atomiser.us` and `atomiser.rpm` increase strictly | one pulse for one flow or speed |
+| `pwm.valve = "normally-open"` needs `safety.pump_cutoff = true` | such valves spray when the power fails |
+| `safety.enable_by` leaves a way to enable: `command`, or `rc` with `safety.rc_channel` | otherwise nobody could enable spraying |
+| no rate of the map is above `product.rate_max_l_ha` | the label is the law |
+| `mission.lines_aside_m` is at most half of `mission.swath_width_m` | otherwise the next line could be the nearer one |
+| `mission.swath_width_m` is within 2 % of `boom.width_m`, and so is the sum of the strips, with no gap or overlap above 2 % between them (`config check` and `run`) | otherwise every pass leaves a skip or an overlap |
+| every entry of `safety.modes` is a flight mode of ArduPilot or PX4 (`config check` and `run`) | otherwise nothing is ever sprayed |
+"""
 # What the end of a key's name says about its unit, longest first.
 UNITS = {
     "l_min_m_s": "L/min per m/s", "kg_l": "kg/L", "l_min": "L/min", "l_ha": "L/ha",
@@ -43,7 +61,7 @@ def page() -> str:
         parts.append(_about(table, definition, is_list=is_list) + "\n")
         parts.append("| Key | Unit | Write | Default | Meaning |\n|---|---|---|---|---|")
         parts += [*_rows(table, definition, schema), ""]
-    return "\n".join(parts)
+    return "\n".join([*parts, RULES])
 
 
 def _reference(node: dict[str, Any]) -> tuple[str | None, bool]:
