@@ -154,11 +154,20 @@ def run_companion(
         if is_empty(journal.path):
             journal.path.unlink()
         raise
+    kept, line = _kept(journal.path, link)
     answer(
-        {"journal": str(journal.path), "lost_rows": journal.lost, "training": training},
-        [f"journal: {journal.path}"],
+        {"journal": kept, "lost_rows": journal.lost, "training": training},
+        [line],
         as_json=as_json,
     )
+
+
+def _kept(path: Path, link: VehicleLink) -> tuple[str | None, str]:
+    """Return the journal, and what is said of it; one of a link that never opened is removed."""
+    if link.has_been_up:
+        return str(path), f"journal: {path}"
+    path.unlink(missing_ok=True)
+    return None, "no journal is kept: the link never opened"
 
 
 def _guard_lines(setup: Setup) -> list[str]:

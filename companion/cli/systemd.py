@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -98,9 +100,18 @@ def refuse_foreign(path: Path) -> None:
         raise ServiceError(f"{path}: not written by vrspray service install; move it away first")
 
 
+def typed() -> str:
+    """Return how root calls this very program: by its full path, with what was typed."""
+    program = Path(shutil.which(sys.argv[0]) or sys.argv[0]).absolute()
+    is_module = program.name == "__main__.py"
+    start = [sys.executable, "-m", "companion"] if is_module else [str(program)]
+    return shlex.join([*start, *sys.argv[1:]])
+
+
 def _advice(error: Exception) -> str:
     if isinstance(error, PermissionError):
-        return "use sudo, or --user for a service of your own"
+        # Root's PATH has neither virtual environments nor what pipx installs.
+        return f"use sudo {typed()}, or --user for a service of your own"
     return str(getattr(error, "strerror", None) or error).lower()
 
 

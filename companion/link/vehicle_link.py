@@ -76,6 +76,7 @@ class VehicleLink:
         self.statistics: LinkStatistics | None = None
         self._changed = False
         self._heard, self._told = True, True
+        self.has_been_up = False
 
     @property
     def fault(self) -> str | None:
@@ -98,6 +99,7 @@ class VehicleLink:
             self._url, self._on_bytes, self._on_change, self._on_trouble
         )
         if self._transport.is_up:
+            self.has_been_up = True
             _logger.info("link up: %s", self._url)
             self._watch.link_up(self._clock())
         else:
@@ -223,6 +225,7 @@ class VehicleLink:
     def _on_change(self, is_up: bool) -> None:
         _logger.warning("link %s: %s", "is up" if is_up else "was lost", self._url)
         self._changed = is_up
+        self.has_been_up = self.has_been_up or is_up
         self._heard = self._told = False
         self._chunks.clear()
         if is_up:

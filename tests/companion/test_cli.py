@@ -546,6 +546,13 @@ def run_arguments(folder: Path, port: int) -> list[str]:
     return ["run", "--config", CONFIG, *(part for one in settings for part in ("--set", one))]
 
 
+def test_run_whose_link_never_opened_leaves_no_journal(capsys: Captured, tmp_path: Path) -> None:
+    words = ["--set", "link.url=serial:/dev/none-of-ours:57600", "--duration-s", "0.2"]
+    code, found = run_json(capsys, *run_arguments(tmp_path, 0), *words)
+    assert (code, found["journal"]) == (0, None)
+    assert not list(tmp_path.glob("*.gpkg*"))
+
+
 def test_run_ends_after_its_duration_and_leaves_a_journal(capsys: Captured, tmp_path: Path) -> None:
     code, found = run_json(capsys, *run_arguments(tmp_path, 0), "--duration-s", "0.2")
     assert code == 0

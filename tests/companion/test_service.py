@@ -12,7 +12,7 @@ import pytest
 
 from companion.cli.app import execute
 from companion.cli.service import make_folders
-from companion.cli.systemd import ServiceError
+from companion.cli.systemd import ServiceError, typed
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 Captured = pytest.CaptureFixture[str]
@@ -178,3 +178,10 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ServiceError, match="cannot be made"):
         make_folders((str(tmp_path / "file" / "flights"),), account="")
+
+
+def test_the_line_to_type_names_the_program_by_its_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["/opt/a b/bin/vrspray", "service", "install"])
+    assert typed() == "'/opt/a b/bin/vrspray' service install"
+    monkeypatch.setattr("sys.argv", ["/src/companion/__main__.py", "service", "install"])
+    assert typed().endswith(" -m companion service install")
