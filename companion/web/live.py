@@ -192,6 +192,53 @@ def _end(point: list[Any], right_m: float, forward_m: float) -> tuple[float, flo
     )
 
 
+# WGS84.
+_A_M, _E2 = 6378137.0, 0.00669437999014
+
+
+def map_parts(ground: dict[str, Any]) -> tuple[dict[str, Any], list[Any], dict[str, Any]]:
+    """Return the map without its zones, the zones in metres, and the zones as GeoJSON.
+
+    Places are as the page's own script works them out, good to 0.1 m in a kilometre: all that is
+    drawn lies on each other.
+    """
+    zones = ground["zones"]
+    rates = sorted({zone["rate_l_ha"] for zone in zones})
+    summary = {key: value for key, value in ground.items() if key != "zones"}
+    latitude_deg, longitude_deg = (
+        ground["origin"]["latitude_deg"],
+        ground["origin"]["longitude_deg"],
+    )
+    sin, cos = math.sin(math.radians(latitude_deg)), math.cos(math.radians(latitude_deg))
+    w = math.sqrt(1.0 - _E2 * sin * sin)
+    m_per_latitude = math.radians(_A_M * (1.0 - _E2) / w**3)
+    m_per_longitude = math.radians(_A_M * cos / w)
+
+    def places(ring: list[float]) -> list[list[float]]:
+        found = [
+            [
+                round(longitude_deg + east_m / m_per_longitude, 8),
+                round(latitude_deg + north_m / m_per_latitude, 8),
+            ]
+            for east_m, north_m in zip(ring[::2], ring[1::2], strict=True)
+        ]
+        return found if found[0] == found[-1] else [*found, found[0]]
+
+    features = [
+        {
+            "type": "Feature",
+            "properties": {"zone": number, "rate": zone["rate_l_ha"]},
+            "geometry": {
+                "type": "MultiPolygon",
+                "coordinates": [[places(ring) for ring in area] for area in zone["areas"]],
+            },
+        }
+        for number, zone in enumerate(zones)
+    ]
+    geojson = {"type": "FeatureCollection", "features": features}
+    return summary | {"zone_count": len(zones), "rates_l_ha": rates}, zones, geojson
+
+
 def actual_rate(
     frame: dict[str, Any], valves: Sequence[tuple[float, float, float]]
 ) -> float | None:

@@ -27,7 +27,7 @@ from starlette.types import Message, Receive, Send
 from starlette.types import Scope as Connection
 
 from companion.web.guard import API, COOKIE, Asked, Failures, Guard, Scope, session
-from companion.web.live import Live
+from companion.web.live import Live, map_parts
 
 STATIC = Path(__file__).parent / "static"
 STATE_S = 0.2  # 5 Hz
@@ -284,8 +284,7 @@ class Site:
         self.clients = 0
         self.login_s = int(about["login_s"])
         self.is_tls = bool(about["is_tls"])
-        ground = json.dumps(about["map"], separators=(",", ":"), allow_nan=False)
-        self.map_gzip = gzip.compress(ground.encode(), 5)
+        self.ground_gzip, self.zones_gzip, self.places_gzip = map(_packed, map_parts(about["map"]))
         self.facts: dict[str, Any] = about["facts"]
         self.version = str(about["version"])
         self._files: dict[str, tuple[bytes, str]] = {}
@@ -353,6 +352,10 @@ class Site:
                 return None
             self._files[name] = (gzip.compress(path.read_bytes(), 6), kind)
         return self._files[name]
+
+
+def _packed(item: object) -> bytes:
+    return gzip.compress(json.dumps(item, separators=(",", ":"), allow_nan=False).encode(), 5)
 
 
 async def _output_of(command: list[str]) -> list[dict[str, Any]]:
@@ -436,8 +439,18 @@ def _add_reading(app: FastAPI, site: Site) -> None:
 
     @app.get(f"{API}map", tags=["state"], response_class=Response)
     async def ground(request: Request) -> Response:
-        """Return zones, field and boom, in metres from the origin."""
-        return _compressed(request, site.map_gzip, "application/json")
+        """Return field, rates and boom, in metres from the origin."""
+        return _compressed(request, site.ground_gzip, "application/json")
+
+    @app.get(f"{API}zones", tags=["state"], response_class=Response)
+    async def zones(request: Request) -> Response:
+        """Return the zones, in metres from the origin."""
+        return _compressed(request, site.zones_gzip, "application/json")
+
+    @app.get(f"{API}zones.geojson", tags=["state"], response_class=Response)
+    async def places(request: Request) -> Response:
+        """Return the zones as GeoJSON: a browser's worker reads it, not its main thread."""
+        return _compressed(request, site.places_gzip, "application/geo+json")
 
     @app.get(f"{API}facts", tags=["state"])
     async def facts() -> dict[str, Any]:

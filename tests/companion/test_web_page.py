@@ -24,7 +24,7 @@ from companion.web.frames import frame_of, packed
 from companion.web.live import ADVICE, Live, Way, actual_rate, quads_between, reasons_of
 from companion.web.page import ORDER_BYTES_MAX, parse_order
 from companion.web.ring import PAYLOAD_MAX, SLOTS, RingReader, RingWriter, new_memory
-from tests.companion.web_site import Site, about, aged, served, until
+from tests.companion.web_site import SETUP, Site, about, aged, served, until
 
 IN_LOOP = pytest.mark.asyncio(loop_scope="module")  # one page for all: it starts slowly
 
@@ -191,8 +191,16 @@ async def test_the_state_is_what_was_decided_and_its_age_is_told(site: Site) -> 
 async def test_the_map_comes_in_metres_of_the_frame(site: Site) -> None:
     ground = (await site.asked("GET", "/api/v1/map")).json
     assert ground["origin"] == {"latitude_deg": 36.0, "longitude_deg": 114.5}
-    assert [zone["rate_l_ha"] for zone in ground["zones"]] == [20.0, 25.0, 15.0, 20.0]
-    assert sorted(ground["zones"][0]["areas"][0][0][::2])[0] == 0.0
+    assert (ground["zone_count"], ground["rates_l_ha"]) == (4, [15.0, 20.0, 25.0])
+    zones = (await site.asked("GET", "/api/v1/zones")).json
+    assert [zone["rate_l_ha"] for zone in zones] == [20.0, 25.0, 15.0, 20.0]
+    assert min(zones[0]["areas"][0][0][::2]) == 0.0
+    places = (await site.asked("GET", "/api/v1/zones.geojson")).json["features"]
+    for zone, place in zip(zones, places, strict=True):
+        for ring, there in zip(zone["areas"][0], place["geometry"]["coordinates"][0], strict=True):
+            longitude_deg, latitude_deg = there[2]
+            found = SETUP.frame.to_local(latitude_deg, longitude_deg)
+            assert found == pytest.approx((ring[4], ring[5]), abs=0.01)
     packed_map = await site.asked("GET", "/api/v1/map", headers={"Accept-Encoding": "gzip"})
     assert packed_map.headers["content-encoding"] == "gzip"
 

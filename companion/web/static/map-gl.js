@@ -52,13 +52,15 @@ export async function create(element, ground, scale, theme, onView) {
   await new Promise((resolve, reject) => { map.once("load", resolve); map.once("error", (found) => reject(found.error)); });
 
   const chunks = [];
-  let points = [];
+  let points = [], zone = -1;
   let colors = scale;
-  const zoneFeatures = () => ground.zones.map((zone, index) => ({
-    type: "Feature",
-    properties: { index, color: colors.color(zone.rate_l_ha) },
-    geometry: { type: "MultiPolygon", coordinates: zone.areas.map((area) => area.map((one) => pairs(one).map(([e, n]) => frame.lngLat(e, n)))) },
-  }));
+  // The zones are read, cut and coloured in the worker: a map of 40,000 does not hold up this thread.
+  const zoneColor = () => {
+    const above = ground.rates_l_ha.filter((rate) => rate > 0);
+    const steps = [...new Set(Array.from({ length: 9 }, (_, k) => colors.low + ((colors.high - colors.low) * k) / 8))];
+    const scaled = above.length ? ["interpolate", ["linear"], ["get", "rate"], ...steps.flatMap((rate) => [rate, colors.color(rate)])] : colors.none;
+    return ["case", ["<=", ["get", "rate"], 0], colors.none, scaled];
+  };
   const treatedFeatures = (from, to) => {
     const found = [];
     for (let i = Math.max(from, 1); i < to; i += 1) {
@@ -69,12 +71,12 @@ export async function create(element, ground, scale, theme, onView) {
     return found;
   };
 
-  map.addSource("zones", { type: "geojson", data: collection(zoneFeatures()), tolerance: 0.1, buffer: 8 });
+  map.addSource("zones", { type: "geojson", data: new URL("api/v1/zones.geojson", document.baseURI).href, tolerance: 0.1, buffer: 8 });
   map.addSource("field", { type: "geojson", data: collection(ground.field.map((area) => ({ type: "Feature", properties: {}, geometry: { type: "Polygon", coordinates: area.map((one) => pairs(one).map(([e, n]) => frame.lngLat(e, n))) } }))) });
   for (const name of ["boom", "ahead", "craft"]) map.addSource(name, { type: "geojson", data: collection() });
-  map.addLayer({ id: "zones", type: "fill", source: "zones", paint: { "fill-color": ["get", "color"], "fill-opacity": 0.3, "fill-antialias": false } });
-  if (ground.zones.length <= 3000) map.addLayer({ id: "zone-lines", type: "line", source: "zones", paint: { "line-color": LOOK[theme].zone, "line-width": 1, "line-opacity": 0.7 } });
-  map.addLayer({ id: "zone-ahead", type: "line", source: "zones", filter: ["==", ["get", "index"], -1], paint: { "line-color": LOOK[theme].ahead, "line-width": 3 } });
+  map.addLayer({ id: "zones", type: "fill", source: "zones", paint: { "fill-color": zoneColor(), "fill-opacity": 0.3, "fill-antialias": false } });
+  if (ground.zone_count <= 3000) map.addLayer({ id: "zone-lines", type: "line", source: "zones", paint: { "line-color": LOOK[theme].zone, "line-width": 1, "line-opacity": 0.7 } });
+  map.addLayer({ id: "zone-ahead", type: "line", source: "zones", filter: ["==", ["get", "zone"], -1], paint: { "line-color": LOOK[theme].ahead, "line-width": 3 } });
   map.addLayer({ id: "field", type: "line", source: "field", paint: { "line-color": LOOK[theme].field, "line-width": 2.5 } });
   map.addLayer({ id: "ahead-line", type: "line", source: "ahead", paint: { "line-color": LOOK[theme].ahead, "line-width": 2, "line-dasharray": [2, 2] } });
   map.addLayer({ id: "ahead", type: "circle", source: "ahead", filter: ["==", ["geometry-type"], "Point"], paint: { "circle-radius": 6, "circle-color": LOOK[theme].ahead, "circle-stroke-width": 2, "circle-stroke-color": LOOK[theme].halo } });
@@ -113,7 +115,7 @@ export async function create(element, ground, scale, theme, onView) {
       draw(0);
     },
     addPoints(all, from) { points = all; draw(from); },
-    setVehicle(vehicle, duty, zone) {
+    setVehicle(vehicle, duty) {
       if (vehicle.east_m === null || vehicle.north_m === null) return;
       const here = frame.lngLat(vehicle.east_m, vehicle.north_m);
       const line = (ends) => ({ type: "LineString", coordinates: ends.map(([e, n]) => frame.lngLat(e, n)) });
@@ -124,7 +126,9 @@ export async function create(element, ground, scale, theme, onView) {
         { type: "Feature", properties: {}, geometry: line([[vehicle.east_m, vehicle.north_m], ahead]) },
         { type: "Feature", properties: {}, geometry: { type: "Point", coordinates: frame.lngLat(...ahead) } },
       ]));
-      map.setFilter("zone-ahead", ["==", ["get", "index"], zone]);
+      const found = ahead[0] === null || !vehicle.in_air ? [] : map.queryRenderedFeatures(map.project(frame.lngLat(...ahead)), { layers: ["zones"] });
+      const next = found[0]?.properties.zone ?? -1;
+      if (next !== zone) { zone = next; map.setFilter("zone-ahead", ["==", ["get", "zone"], zone]); }
       if (follows) map.easeTo({ center: here, duration: 180, easing: (t) => t });
     },
     setTheme(name, next) {
@@ -139,7 +143,7 @@ export async function create(element, ground, scale, theme, onView) {
       map.setPaintProperty("boom-halo", "line-color", look.halo);
       map.setPaintProperty("boom", "line-color", ["case", ["get", "isOpen"], look.open, look.closed]);
       map.updateImage("craft", craftImage(look.craft, look.halo));
-      map.getSource("zones").setData(collection(zoneFeatures()));
+      map.setPaintProperty("zones", "fill-color", zoneColor());
       draw(0);
     },
     follow(yes) { follows = yes; },

@@ -1,13 +1,16 @@
 // The map on a plain canvas: for browsers without WebGL 2. The same calls as map-gl.js.
 
-import { boomLines, strips } from "./geo.js";
+import { ZoneIndex, boomLines, strips } from "./geo.js";
 
 const LOOK = {
   day: { ground: "#e2e6df", field: "#10150f", zone: "#3d4a42", ahead: "#c2410c", closed: "#10150f", open: "#0ea5e9", halo: "#ffffff", craft: "#10150f" },
   night: { ground: "#0b1114", field: "#e9efe9", zone: "#6b7a80", ahead: "#ffb04d", closed: "#aab6b0", open: "#7dd3fc", halo: "#05080a", craft: "#ffffff" },
 };
 
-export function create(element, ground, scale, theme, onView) {
+export async function create(element, ground, scale, theme, onView) {
+  const response = await fetch("api/v1/zones", { credentials: "same-origin" });
+  const zones = await response.json();
+  const index = new ZoneIndex(zones);
   const canvas = document.createElement("canvas");
   canvas.className = "plain";
   element.append(canvas);
@@ -50,14 +53,14 @@ export function create(element, ground, scale, theme, onView) {
     under.fillStyle = look.ground;
     under.fillRect(0, 0, back.width, back.height);
     under.lineWidth = view.ratio;
-    for (const zone of ground.zones) {
+    for (const zone of zones) {
       path(under, zone.areas);
       under.globalAlpha = 0.3;
       under.fillStyle = colors.color(zone.rate_l_ha);
       under.fill("evenodd");
       under.globalAlpha = 0.7;
       under.strokeStyle = look.zone;
-      if (ground.zones.length <= 3000) under.stroke();
+      if (zones.length <= 3000) under.stroke();
     }
     under.globalAlpha = 1;
     treated(1);
@@ -72,7 +75,7 @@ export function create(element, ground, scale, theme, onView) {
   function paint() {
     pen.drawImage(back, 0, 0);
     if (ahead >= 0) {
-      path(pen, ground.zones[ahead].areas);
+      path(pen, zones[ahead].areas);
       pen.lineWidth = 3 * view.ratio; pen.strokeStyle = look.ahead; pen.stroke();
     }
     if (!vehicle || vehicle.east_m === null) return;
@@ -142,8 +145,9 @@ export function create(element, ground, scale, theme, onView) {
     kind: "canvas",
     setWay(all) { points = all; redraw(); },
     addPoints(all) { points = all; treated(drawn); paint(); },
-    setVehicle(next, nextDuty, zone) {
-      vehicle = next; duty = nextDuty; ahead = zone;
+    setVehicle(next, nextDuty) {
+      vehicle = next; duty = nextDuty;
+      ahead = next.ahead_east_m === null || !next.in_air ? -1 : index.at(next.ahead_east_m, next.ahead_north_m);
       if (follows && vehicle.east_m !== null) { view.east = vehicle.east_m; view.north = vehicle.north_m; redraw(); } else paint();
     },
     setTheme(name, next) { look = LOOK[name]; colors = next; redraw(); },

@@ -1,6 +1,6 @@
 // The map: by WebGL where the browser has it, on a plain canvas elsewhere. The rest works without.
 
-import { Scale, ZoneIndex } from "./geo.js";
+import { Scale } from "./geo.js";
 import { unitOf, value } from "./units.js";
 
 const LEGEND_MAX = 7;
@@ -25,8 +25,7 @@ export class FieldMap {
   async load(ground, theme) {
     this.ground = ground;
     this.theme = theme;
-    this.zones = new ZoneIndex(ground.zones);
-    this.rates = [...new Set(ground.zones.map((zone) => zone.rate_l_ha))].sort((a, b) => a - b);
+    this.rates = [...ground.rates_l_ha];
     if (ground.default_rate_l_ha) this.rates.push(ground.default_rate_l_ha);
     this.scale = new Scale(this.rates, theme);
     this.legend();
@@ -43,7 +42,7 @@ export class FieldMap {
     }
     if (!this.back) {
       const { create } = await import("./map-plain.js");
-      this.back = create(this.element, ground, this.scale, theme, onView);
+      this.back = await create(this.element, ground, this.scale, theme, onView);
     }
     this.element.dataset.kind = this.back.kind;
     if (this.theme !== theme) this.setTheme(this.theme);
@@ -109,8 +108,7 @@ export class FieldMap {
 
   setVehicle(vehicle, duty) {
     if (!this.back || !vehicle) return;
-    const zone = vehicle.ahead_east_m === null || !vehicle.in_air ? -1 : this.zones.at(vehicle.ahead_east_m, vehicle.ahead_north_m);
-    this.back.setVehicle(vehicle, duty, zone);
+    this.back.setVehicle(vehicle, duty);
   }
 
   setTheme(theme) {

@@ -130,7 +130,7 @@ export function showChecklist(state, facts, ground, checks) {
   const none = (...names) => !names.some((name) => codes.has(name));
   const level = state.liquid?.tank_l ?? state.tank_counted_l;
   const live = [
-    ["Flight map", ground.zones.length > 0, `${ground.zones.length} zones, ${withUnit("area", ground.field_m2 / 10000)}`],
+    ["Flight map", ground.zone_count > 0, `${ground.zone_count} zones, ${withUnit("area", ground.field_m2 / 10000)}`],
     ["Vehicle heard", none("no-heartbeat", "stale-heartbeat", "link-lost", "not-active"), vehicle.mode ?? ""],
     ["Position good enough", none("no-position", "stale-position", "invalid-position", "position-frozen", "clock-disagrees", "fix-too-low", "accuracy-too-low", "estimator-unhealthy", "heading-unknown", "far-from-field"), FIXES[vehicle.fix] ?? ""],
     ["Outputs", none("output-fault", "leak", "valve-stuck-open", "no-flow", "flow-fault"), facts.output === "none" ? "no outputs: dry run" : facts.output],
