@@ -68,7 +68,11 @@ LONGEST = (
     "test_liquid_wire.py",
     "test_ground.py",
     "test_doctor_watchdogs.py",
+    "test_time_shift.py",
     "test_golden.py",
+    "test_missions_outlines.py",
+    "test_cli_map_convert.py",
+    "test_missions_ends_over.py",
 )
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -164,17 +165,32 @@ def difference(
         return f"{name} was {was!r}, is {now!r}"
     if is_dataclass(was):
         pairs: Sequence[tuple[Any, Any, str]] = [
-            (getattr(was, one.name), getattr(now, one.name), f"{name}.{one.name}".strip("."))
-            for one in fields(was)
+            (a, b, f"{name}.{one}".strip("."))
+            for one in _names(type(was))
+            if not _is_one(a := getattr(was, one), b := getattr(now, one))
         ]
     elif isinstance(was, tuple) and len(was) == len(now):
-        pairs = [(a, b, f"{name}[{i}]") for i, (a, b) in enumerate(zip(was, now, strict=True))]
+        pairs = [
+            (a, b, f"{name}[{i}]")
+            for i, (a, b) in enumerate(zip(was, now, strict=True))
+            if not _is_one(a, b)
+        ]
     else:
         is_known = isinstance(was, Enum | str | int | frozenset | tuple) or was is None
         assert is_known, f"{name}: {type(was).__name__} is no value of the core"
         return None if was == now else f"{name} was {was!r}, is {now!r}"
     each = (difference(*one, is_tolerant=is_tolerant, within=within) for one in pairs)
     return next((found for found in each if found), None)
+
+
+@cache
+def _names(kind: type[Any]) -> tuple[str, ...]:
+    return tuple(one.name for one in fields(kind))
+
+
+def _is_one(was: Any, now: Any) -> bool:
+    """Whether two values are the same at the first glance; most are, and need no name."""
+    return was is now or (type(was) is type(now) is float and was == now != 0.0)
 
 
 def _to_the_bit(was: float, now: float) -> bool:

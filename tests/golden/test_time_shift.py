@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
+from functools import cache
 from itertools import cycle
 from typing import Any, get_args
 
@@ -49,18 +50,26 @@ def moved(item: Input, ours_s: float, vehicles_s: float) -> Input:
 
 def back(value: Any, ours_s: float) -> Any:
     """Return a decision with all its times moved back."""
+    if isinstance(value, float | int | str | None):
+        return value
     if isinstance(value, tuple):
-        return tuple(back(one, ours_s) for one in value)
+        changed = tuple(back(one, ours_s) for one in value)
+        return value if all(a is b for a, b in zip(changed, value, strict=True)) else changed
     if not is_dataclass(value) or isinstance(value, type):
         return value
     changes = {}
-    for one in fields(value):
-        is_ours = one.name in OURS
-        found = getattr(value, one.name)
-        changes[one.name] = (
-            found - ours_s if is_ours and isinstance(found, float) else back(found, ours_s)
-        )
-    return replace(value, **changes)
+    for name in _names(type(value)):
+        found = getattr(value, name)
+        is_ours = name in OURS and isinstance(found, float)
+        changed = found - ours_s if is_ours else back(found, ours_s)
+        if changed is not found:
+            changes[name] = changed
+    return replace(value, **changes) if changes else value
+
+
+@cache
+def _names(kind: type[Any]) -> tuple[str, ...]:
+    return tuple(one.name for one in fields(kind))
 
 
 def differences(name: str, ours_s: float, vehicles_s: float) -> Iterator[tuple[float, str]]:
