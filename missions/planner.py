@@ -370,8 +370,8 @@ def _litres(
 # What the search does not know, bends and turns of the nose, is so much that it needs no more.
 ROUNDS = 8
 LESS = 0.995
-# Flights take up to 0.2 % more of a battery than they are planned with.
-MARGIN = 0.9975
+# Flights take up to 0.8 % more of a battery than they are planned with: 383 ha, 230 sorties.
+MARGIN = 0.991
 
 Pace = Callable[[Sequence[Sortie]], Paced]
 
