@@ -27,7 +27,7 @@ class Figures:
     """
 
     applied_l: float | None
-    applied_by: By
+    applied_by: By | None
     prescribed_l: float | None
     off_percent: float | None
     area_ha: float | None
@@ -52,7 +52,7 @@ def nothing_sprayed(area_ha: float | None, *, is_known: bool) -> Figures:
     """Return the figures of a flight without spraying, or of one of which too little is known."""
     return Figures(
         applied_l=0.0 if is_known else None,
-        applied_by="nothing",
+        applied_by="nothing" if is_known else None,
         prescribed_l=None,
         off_percent=None,
         area_ha=area_ha if is_known else None,
@@ -62,7 +62,7 @@ def nothing_sprayed(area_ha: float | None, *, is_known: bool) -> Figures:
         mean_lag_m=None,
         lag_count=0,
         worst_m=None,
-        worst_why_not="nothing was sprayed",
+        worst_why_not="nothing was sprayed" if is_known else "too little can be read",
         outside_ml=None,
         missed_m2=None,
         doubled_m2=None,

@@ -119,10 +119,10 @@ def _clock(flight: AppliedFlight, told: Told, treated: Treated, time_zone: str |
 
 def _volumes(figures: Figures) -> dict[str, Any]:
     """Return the litres of the record: those of the headline, and what they are known by."""
-    by = {"model": "model of the executed changes"}.get(figures.applied_by, figures.applied_by)
+    by = figures.applied_by or "nothing"
     return {
         "volume_l": figures.applied_l or 0.0,
-        "volume_by": by,
+        "volume_by": "model of the executed changes" if by == "model" else by,
         "prescribed_l": figures.prescribed_l,
     }
 

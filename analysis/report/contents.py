@@ -265,7 +265,7 @@ class Caution:
 
 def verdict_of(figures: Figures, training: str | None, *, is_whole: bool = True) -> dict[str, Any]:
     """Return the figures of the flight, and the verdict in one sentence."""
-    if figures.applied_by == "nothing":
+    if figures.applied_by in (None, "nothing"):
         sentence = "Nothing was sprayed in this flight." if is_whole else UNKNOWN
     else:
         sentence = sentence_of(figures, training)

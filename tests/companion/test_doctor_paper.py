@@ -140,7 +140,7 @@ def test_all_checks_are_made_once_and_have_the_keys_of_the_contract(
 
 def test_every_check_is_documented(config: Path, capsys: Captured) -> None:
     _, found = doctor(capsys, config, "--no-link")
-    page = (EXAMPLE.parents[1] / "docs" / "doctor.md").read_text()
+    page = (EXAMPLE.parents[1] / "docs" / "reference" / "checks.md").read_text()
     assert [check["name"] for check in found["checks"] if f"`{check['name']}`" not in page] == []
 
 

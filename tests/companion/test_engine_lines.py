@@ -114,7 +114,7 @@ def test_a_missing_gpiod_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError(name)
 
     monkeypatch.setattr(importlib, "import_module", missing)
-    with pytest.raises(ActuatorError, match=r"vrspray\[gpio\]"):
+    with pytest.raises(ActuatorError, match=r"vrspray\[vehicle\]"):
         load_gpiod()
 
 

@@ -203,6 +203,8 @@ def test_where_too_little_can_be_read_nobody_knows_what_was_sprayed(
     found: dict[str, Any] = json.loads((out / "report.json").read_text())
     verdict = found["verdict"]
     assert verdict.pop("sentence").startswith("Nothing can be said of what was sprayed")
+    assert verdict.pop("worst_why_not") == "too little can be read"
+    assert verdict.pop("lag_count") == 0
     assert set(verdict.values()) == {None}
     assert found["flight"]["treated_area_ha"] is None
     assert found["lag_distance_m"] is None

@@ -26,7 +26,37 @@ from companion.output.servo import ServoExecutor
 from companion.output.timed import DryRunExecutor
 
 ROOT = Path(__file__).parents[2]
-EXAMPLE = re.findall(r"```toml\n(.*?)```", (ROOT / "docs" / "pump.md").read_text(), re.DOTALL)[0]
+PAGE = ROOT / "docs" / "howto" / "pump-instead-of-valves.md"
+EXAMPLE = (
+    """
+[[valve]]
+name = "left"
+right_m = -1.5
+channel = 9
+
+[[valve]]
+name = "right"
+right_m = 1.5
+channel = 10
+
+[[nozzle_set]]
+valves = ["left", "right"]
+
+"""
+    + re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
+    + """
+[[atomiser]]
+name = "left"
+channel = 6
+us = [1100, 1500, 1900]
+rpm = [2000, 8500, 14000]
+droplet_um = 200
+vmd_um = 210
+vmd_rpm = 9000
+vmd_flow_l_min = 1.0
+spin_up_s = 0.8
+"""
+)
 REST = """
 version = 1
 [boom]

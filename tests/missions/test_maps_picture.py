@@ -235,7 +235,7 @@ def test_without_matplotlib_the_extra_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
-    with pytest.raises(MapError, match=r"pip install 'vrspray\[plot\]'") as caught:
+    with pytest.raises(MapError, match=r"pip install 'vrspray\[office\]'") as caught:
         draw(a_map([(HOLED, 20.0)]), tmp_path / "map.png", title="t")
     assert caught.value.code == "missing-library"
 

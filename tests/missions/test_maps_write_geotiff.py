@@ -147,7 +147,7 @@ def test_without_rasterio_the_extra_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(MapError, match=r"vrspray\[maps\]") as caught:
+    with pytest.raises(MapError, match=r"vrspray\[office\]") as caught:
         write_geotiff(CELLS, tmp_path / "rx.tif")
     assert caught.value.code == "missing-library"
     assert list(tmp_path.iterdir()) == []

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.reference import (
+    checks,
     commands,
     configuration,
     driver_board,
@@ -22,6 +23,7 @@ HEAD = "<!-- Written by `make reference` from the code; do not edit. -->\n\n"
 PAGES: dict[str, Callable[[], str]] = {
     "commands.md": commands.page,
     "configuration.md": configuration.page,
+    "checks.md": checks.page,
     "reasons.md": reasons.page,
     "map-problems.md": map_problems.page,
     "mavlink.md": mavlink.page,
