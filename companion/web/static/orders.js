@@ -41,7 +41,7 @@ export class Orders {
   }
 
   stops() {
-    let touched = 0;
+    let touched = -Infinity; // a key in the first second counts, too
     const stop = async () => {
       for (let k = 0; k < STOP_TRIES; k += 1) {
         try {
