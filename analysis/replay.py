@@ -45,11 +45,11 @@ from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import ConfigError, UnreadableError
-from companion.record.codec import FIELD_NAMES, FieldNames, encode
-from companion.record.coverage_table import read_coverage
-from companion.record.new_file import computing
-from companion.record.reader import opened
-from companion.record.valve_rows import Row, ValveRows
+from companion.journal.codec import FIELD_NAMES, FieldNames, encode
+from companion.journal.coverage_table import read_coverage
+from companion.journal.new_file import computing
+from companion.journal.reader import opened
+from companion.journal.valve_rows import Row, ValveRows
 from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
 from companion.simulated import Word
 

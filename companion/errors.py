@@ -9,7 +9,7 @@
      +-- JournalError     a journal cannot be opened, read or written
           +-- UnreadableError  a journal, of which what is asked for cannot be read
                +-- NoMapError  its map is damaged: the rest can be read
-               +-- OtherVersionError  its version is not known (record/versions.py)
+               +-- OtherVersionError  its version is not known (journal/versions.py)
 
 A wrong argument inside our own code is a `ValueError`: a bug, not a condition.
 """

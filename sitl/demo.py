@@ -24,7 +24,7 @@ from companion.assembly import deliverable
 from companion.core.nozzle import flow_for_rate
 from companion.core.setup import Setup
 from companion.errors import ConfigError
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from companion.simulated import SIMULATED, Simulated
 from sitl.anyang import anyang_passes
 from sitl.demo_field import (

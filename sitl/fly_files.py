@@ -11,7 +11,7 @@ import numpy as np
 
 from companion.core.types import Decision
 from companion.errors import ConfigError
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from companion.simulated import SIMULATED, Simulated
 from companion.wording import install_command
 from sitl.deposit import Deposit

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from analysis.flight_record import Spans
 from companion.core.setup import Setup
-from companion.record.writer import Event
+from companion.journal.writer import Event
 from companion.simulated import Simulated, simulated_in
 
 Floats = NDArray[np.float64]

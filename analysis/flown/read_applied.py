@@ -33,12 +33,12 @@ from analysis.journals.blocks import Entry
 from analysis.journals.content import damages, read_entries
 from companion.core.types import Decision
 from companion.errors import UnreadableError
-from companion.record.codec import FieldNames, decode
-from companion.record.reader import OpenJournal, opened
-from companion.record.setup_json import field_names_of
-from companion.record.valve_rows import ValveRows
-from companion.record.versions import migrated
-from companion.record.writer import Event
+from companion.journal.codec import FieldNames, decode
+from companion.journal.reader import OpenJournal, opened
+from companion.journal.setup_json import field_names_of
+from companion.journal.valve_rows import ValveRows
+from companion.journal.versions import migrated
+from companion.journal.writer import Event
 
 # Which rows of a journal's tables can be believed, row by row: the rest is left out and counted.
 #

@@ -13,7 +13,7 @@ from analysis.journals.show import content_lines, content_of
 from companion.cli.answer import AsJson, answer
 from companion.cli.flights import FAILED, ConfigFile, Folder, as_object, line_of, place_of
 from companion.errors import JournalError
-from companion.record.folder import look_at
+from companion.journal.folder import look_at
 
 SHOW, REMAINING, RECOVER = (
     typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(3)

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from companion.record.log_frames import (
+from companion.journal.log_frames import (
     FILE_MAGIC,
     Frame,
     Log,
@@ -16,7 +16,7 @@ from companion.record.log_frames import (
     page_bytes_in,
     read_log,
 )
-from companion.record.read_only import log_of
+from companion.journal.read_only import log_of
 
 
 class KeptPages:

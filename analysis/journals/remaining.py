@@ -21,10 +21,10 @@ from companion.core.options.coverage import Coverage
 from companion.core.prescription import Prescription
 from companion.errors import VrsprayError
 from companion.flight_map.child import flight_map_of_file
-from companion.record.continuing import Treated, rest_of, treated_ground_of
-from companion.record.coverage_area import moved
-from companion.record.reader import opened
-from companion.record.totals import missing_rows
+from companion.journal.continuing import Treated, rest_of, treated_ground_of
+from companion.journal.coverage_area import moved
+from companion.journal.reader import opened
+from companion.journal.totals import missing_rows
 
 M2_PER_HA = 10_000.0
 # The mean rate of the rest is taken at so many places of it.

@@ -15,8 +15,8 @@ from analysis.journals.kept_pages import KeptPages, kept_pages
 from analysis.journals.stray_rows import stray_rows, torn_rows
 from companion.atomic_write import sync_folder
 from companion.core.frame import LocalFrame
-from companion.record import recovery
-from companion.record.distrust import (
+from companion.journal import recovery
+from companion.journal.distrust import (
     TABLES,
     check_beside,
     columns_of,
@@ -24,26 +24,26 @@ from companion.record.distrust import (
     known_tables,
     own_tables,
 )
-from companion.record.geopackage import (
+from companion.journal.geopackage import (
     APPLICATION_ID,
     JOURNAL_VERSION,
     LOCAL_ID,
     USER_VERSION,
     WGS84_ID,
 )
-from companion.record.layers import box_of_points, set_box
-from companion.record.leaf_page import COLUMNS, Row, is_of
-from companion.record.read_only import (
+from companion.journal.layers import box_of_points, set_box
+from companion.journal.leaf_page import COLUMNS, Row, is_of
+from companion.journal.read_only import (
     DAMAGE,
     one_line,
     read_only,
     salvaged_name,
 )
-from companion.record.reader import readable_rows, tolerate_damage
-from companion.record.recovery import Recovery, Told
-from companion.record.totals import LITRES_KEY, applied_l
-from companion.record.versions import missing_tables
-from companion.record.writer import SET_META
+from companion.journal.reader import readable_rows, tolerate_damage
+from companion.journal.recovery import Recovery, Told
+from companion.journal.totals import LITRES_KEY, applied_l
+from companion.journal.versions import missing_tables
+from companion.journal.writer import SET_META
 
 # Without a row of any of these a file is no journal, or nothing of one.
 _OF_A_FLIGHT = ("meta", "applied", "blocks", "valve_changes")

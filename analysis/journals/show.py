@@ -11,11 +11,11 @@ from typing import Any
 
 from analysis.journals.content import read_entries
 from companion.errors import UnreadableError
-from companion.record.read_only import DAMAGE, one_line
-from companion.record.reader import OpenJournal, damaged_pages, opened, readable_rows
-from companion.record.refusals import SEE_SHOW
-from companion.record.totals import missing_rows
-from companion.record.versions import OtherVersionError
+from companion.journal.read_only import DAMAGE, one_line
+from companion.journal.reader import OpenJournal, damaged_pages, opened, readable_rows
+from companion.journal.refusals import SEE_SHOW
+from companion.journal.totals import missing_rows
+from companion.journal.versions import OtherVersionError
 from companion.wording import counted
 
 # In `meta` for programs, or shown elsewhere.

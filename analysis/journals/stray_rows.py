@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 
 from analysis.journals.kept_pages import KeptPages
-from companion.record.leaf_page import Row, cells_of, is_of, tables_of, values_of
+from companion.journal.leaf_page import Row, cells_of, is_of, tables_of, values_of
 
 # Columns with a time of the companion's clock, in seconds; in microseconds.
 _TIMES_S = {"applied": (3,), "blocks": (3, 4), "link_stats": (1,), "events": (2,)}

@@ -12,7 +12,7 @@ from itertools import accumulate
 
 import numpy as np
 
-from companion.record.packing import (
+from companion.journal.packing import (
     ANCHORED,
     BACK,
     BITS,
@@ -54,7 +54,7 @@ class Part:
 def unpack(packed: bytes, dictionary: bytes = b"") -> list[str]:
     """Return the lines that were packed; ValueError for what is no block.
 
-    >>> from companion.record.packing import pack
+    >>> from companion.journal.packing import pack
     >>> unpack(pack(['{"A":[1.5,2]}', '{"A":[1.75,3]}']))
     ['{"A":[1.5,2]}', '{"A":[1.75,3]}']
     """

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 from companion.cli.output_parts import parts_of
 from companion.config.tables import JournalTable
 from companion.errors import JournalError
+from companion.journal.journal import Journal
+from companion.journal.read_only import DAMAGE, one_line
 from companion.link.vehicle_link import VehicleLink
 from companion.output.timed import DryRunExecutor, TimedExecutor
 from companion.ports import PlanExecutor
-from companion.record.journal import Journal
-from companion.record.read_only import DAMAGE, one_line
 
 if TYPE_CHECKING:
-    from companion.record.retention import Rules
+    from companion.journal.retention import Rules
 
 # Three hours of a journal; with less a flight does not begin.
 FREE_MIN_BYTES = 100_000_000
@@ -25,7 +25,7 @@ FREE_MIN_BYTES = 100_000_000
 
 def rules_of(journal: JournalTable) -> Rules:
     """Return the rules of retention as they are configured."""
-    from companion.record.retention import Rules
+    from companion.journal.retention import Rules
 
     return Rules(
         free_percent=journal.keep_free_percent or None,
@@ -43,8 +43,8 @@ def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
     if not folder.is_dir():
         return
     # Who has not flown yet has nothing to look after.
-    from companion.record.recovery import recover_folder
-    from companion.record.retention import WARN_FREE_PERCENT, prune, space_of
+    from companion.journal.recovery import recover_folder
+    from companion.journal.retention import WARN_FREE_PERCENT, prune, space_of
 
     try:
         for found in recover_folder(folder):

@@ -30,12 +30,12 @@ from companion.config.rules import unbounded, without_effect
 from companion.core.setup import Setup
 from companion.errors import ActuatorError, LinkError, SensorError
 from companion.flight_map import FlightMap
+from companion.journal.journal import Journal
 from companion.link.component import ComponentOptions
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import DITHER_S, dither_too_much
 from companion.ports import COMMIT_EVERY_S, PlanExecutor, Recorder, Sensor
-from companion.record.journal import Journal
 
 if TYPE_CHECKING:
     from companion.web import OperatorPage
@@ -85,7 +85,7 @@ def run_companion(
     setup = build_setup(config, flight_map)
     simulated: list[str] = []
     if continue_from:
-        from companion.record.continuing import continued, simulated_lines
+        from companion.journal.continuing import continued, simulated_lines
 
         simulated = simulated_lines(continue_from)
         setup = continued(
@@ -149,7 +149,7 @@ def run_companion(
             )
     except (ActuatorError, LinkError, SensorError):
         # Without link, outputs or sensors the run ends before its first step: no flight to keep.
-        from companion.record.reader import is_empty
+        from companion.journal.reader import is_empty
 
         if is_empty(journal.path):
             journal.path.unlink()
@@ -185,7 +185,7 @@ def _left_lines(folder: Path, setup: Setup, training: str) -> list[str]:
     """Return that an earlier flight left ground of this map, where nobody goes on from any."""
     if setup.treated is not None or not setup.records_coverage or not folder.is_dir():
         return []
-    from companion.record.continuing import unfinished
+    from companion.journal.continuing import unfinished
 
     left = unfinished(folder, setup, training=training)
     if left is None:

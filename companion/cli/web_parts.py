@@ -18,9 +18,9 @@ from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import ConfigError
+from companion.journal.journal import Journal
 from companion.link.vehicle_link import VehicleLink
 from companion.ports import Recorder
-from companion.record.journal import Journal
 from companion.web import Obey, OperatorPage, Order, Outcome, listen, map_object
 from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens
 from companion.wording import install_command

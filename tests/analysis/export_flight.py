@@ -8,7 +8,7 @@ from pathlib import Path
 from companion.core.controller import Memory, step
 from companion.core.setup import Setup
 from companion.core.types import PressureReport
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from tests.analysis.report_flight import REAL
 from tests.builders import along, flying, setup
 

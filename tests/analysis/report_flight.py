@@ -7,7 +7,7 @@ import random
 from pathlib import Path
 
 from analysis.replay import FlownCore
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from companion.simulated import Simulated
 from tests.analysis.test_replay import inputs_of
 from tests.builders import setup

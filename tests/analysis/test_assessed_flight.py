@@ -24,7 +24,7 @@ from analysis.journals.content import read_journal
 from analysis.replay import replay
 from companion.cli.app import execute
 from companion.errors import JournalError
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from sitl.flight import FlightOptions
 from sitl.flight import fly as simulate
 from sitl.fly import FlyOptions, prepare

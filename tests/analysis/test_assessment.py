@@ -25,7 +25,7 @@ from analysis.student import t_factor
 from companion.core.cells import CellGrid, Warp
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
-from companion.record.writer import Event
+from companion.journal.writer import Event
 from tests.analysis.applied_flights import SPEED_M_S, changes_of, eastwards
 from tests.builders import plots, setup
 

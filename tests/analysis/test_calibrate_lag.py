@@ -18,7 +18,7 @@ from companion.cli.app import execute
 from companion.config import load
 from companion.core.schedule import LagModel
 from companion.core.types import Decision, FlowReport, SprayPlan, TimedChange
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from missions.maps.compiling import compiled_setup
 from sitl.calibration_mission import make_layout, write_calibration
 from sitl.demo_field import demo_setup

@@ -16,7 +16,7 @@ from analysis.exports.columns import plain_names
 from analysis.exports.output import ExportError, write_beside, write_folder
 from analysis.exports.registry import FORMATS, format_for
 from companion.cli.app import execute
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from tests.analysis.export_flight import fly
 from tests.builders import setup
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from analysis.journals.kept_pages import kept_pages
 from analysis.journals.stray_rows import stray_rows
-from companion.record.geopackage import PAGE_BYTES, SCHEMA
-from companion.record.leaf_page import (
+from companion.journal.geopackage import PAGE_BYTES, SCHEMA
+from companion.journal.leaf_page import (
     COLUMNS,
     cells_of,
     local_bytes,

@@ -15,10 +15,10 @@ import pytest
 from analysis.journals.content import read_journal
 from analysis.journals.salvage import recover, salvage
 from companion.cli.app import execute
-from companion.record.folder import look_at
-from companion.record.geopackage import PAGE_BYTES
-from companion.record.leaf_page import cells_of, tables_of
-from companion.record.read_only import log_of, salvaged_name
+from companion.journal.folder import look_at
+from companion.journal.geopackage import PAGE_BYTES
+from companion.journal.leaf_page import cells_of, tables_of
+from companion.journal.read_only import log_of, salvaged_name
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import example_setup
 from tests.companion.test_journal import change, query

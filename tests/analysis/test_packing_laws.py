@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.journals.unpacking import part_of, unpack
-from companion.record.packing import Packer, pack
+from companion.journal.packing import Packer, pack
 
 NUMBERS = st.one_of(
     st.floats(),

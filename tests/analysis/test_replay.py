@@ -35,7 +35,7 @@ from companion.core.types import (
     Telemetry,
 )
 from companion.errors import ConfigError, JournalError
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from tests.builders import setup
 from tests.companion.journal_edit import edit_rows, with_body
 

@@ -23,7 +23,7 @@ from analysis.report.contents import METRICS, contents_of, held_between, held_gr
 from analysis.report.drawing import histogram
 from analysis.report.legal_fields import told_with
 from analysis.report.treated import clock_of, treated_of
-from companion.record.writer import Event
+from companion.journal.writer import Event
 from tests.analysis.report_flight import EU_TOLD, fly
 
 # Attributes by which a page would fetch something.

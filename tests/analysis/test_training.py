@@ -19,8 +19,8 @@ from companion.cli.app import execute
 from companion.cli.run import component_options, training_mark
 from companion.cli.sensor_parts import TankSensor
 from companion.config import load
+from companion.journal.journal import Journal
 from companion.link.component import Component, ComponentOptions
-from companion.record.journal import Journal
 from tests import builders
 from tests.analysis import report_flight
 from tests.analysis.test_evaluation_flights import Flight, record_of

@@ -21,11 +21,11 @@ import numpy as np
 from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input, OperatorCommand, Telemetry
+from companion.journal.journal import Journal
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import ServoExecutor, ServoOptions
 from companion.ports import Recorder
-from companion.record.journal import Journal
 from companion.runtime import NoRecorder, execute, run
 from tests.bench.fields import grid_setup
 from tests.bench.figures import Figure, spread

@@ -34,8 +34,8 @@ from companion.core.types import (
     UtcReport,
     WindReport,
 )
-from companion.record.valve_rows import ValveOrder, ValveRows
-from companion.record.writer import LinkSample
+from companion.journal.valve_rows import ValveOrder, ValveRows
+from companion.journal.writer import LinkSample
 from missions.maps.compiling import compiled_setup
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/anyang/config.toml"

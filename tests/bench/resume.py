@@ -27,8 +27,8 @@ from companion.core.options.coverage import Coverage
 from companion.core.options.overlap import OverlapGuard
 from companion.core.setup import Setup
 from companion.core.types import Input, OperatorCommand, VehicleState
+from companion.journal.continuing import SWITCH_OFF_PERCENT
 from companion.ports import COMMIT_EVERY_S
-from companion.record.continuing import SWITCH_OFF_PERCENT
 from companion.runtime import COVERAGE_EVERY_S, coverage_ahead_s
 from sitl.demo_field import START_S, demo_route
 from sitl.deposit import L_HA_PER_ML_M2, Deposit

@@ -16,8 +16,8 @@ import pytest
 
 from companion.core.types import Decision, HeartbeatReport, Input, Method, SprayPlan
 from companion.errors import JournalError
-from companion.record.journal import Journal
-from companion.record.writer import Writer
+from companion.journal.journal import Journal
+from companion.journal.writer import Writer
 from companion.runtime import run
 from sitl.demo import _interrupt_held_back, _pool
 from sitl.demo_cli import _termination_as_interrupt

@@ -20,7 +20,7 @@ from companion.core.cells import NO_RATE, CellGrid, Warp, exponents, rectangles
 from companion.core.crossings import find_routes
 from companion.core.prescription import FIELD, Prescription, Zone
 from companion.errors import MapError
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.cells import cell_areas_m2, cell_size_m
 from missions.maps.model import Affine, MapCells, MapFile

@@ -61,9 +61,9 @@ NOT_OF_EVERY_FLIGHT = (
     "companion.config.motor_rules",
     "companion.core.options.liquid_faults", "companion.flight_map.child",
     "companion.link.signing", "companion.output.engine",
-    "companion.output.gpio", "companion.output.hardware_pwm", "companion.record.continuing",
-    "companion.record.leaf_page", "companion.record.log_damage", "companion.record.reader",
-    "companion.record.recovery", "companion.record.retention", "companion.sensors",
+    "companion.output.gpio", "companion.output.hardware_pwm", "companion.journal.continuing",
+    "companion.journal.leaf_page", "companion.journal.log_damage", "companion.journal.reader",
+    "companion.journal.recovery", "companion.journal.retention", "companion.sensors",
 )  # fmt: skip
 
 

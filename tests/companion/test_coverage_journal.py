@@ -38,7 +38,7 @@ from companion.core.types import (
     Telemetry,
 )
 from companion.errors import JournalError
-from companion.record.continuing import (
+from companion.journal.continuing import (
     SWITCH_OFF_PERCENT,
     continued,
     is_journal,
@@ -47,14 +47,14 @@ from companion.record.continuing import (
     treated_by,
     unfinished,
 )
-from companion.record.coverage_area import moved, polygons
-from companion.record.coverage_table import (
+from companion.journal.coverage_area import moved, polygons
+from companion.journal.coverage_table import (
     read_coverage,
     read_treated,
     write_coverage,
     write_treated,
 )
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from companion.runtime import coverage_ahead_s
 from tests.builders import setup
 

@@ -21,13 +21,13 @@ from companion.core.options.lines import Lines
 from companion.core.options.liquid_evidence import Detection
 from companion.core.setup import Setup
 from companion.core.types import SpeedReport, WindReport
+from companion.journal.codec import decode, encode
 from companion.link.codec import Codec
 from companion.link.component import Component, ComponentOptions
 from companion.link.messages import ParamValue
 from companion.link.parameters import Parameters, known_parameters
 from companion.output.autopilot_options import ServoOptions
 from companion.output.servo import ServoExecutor
-from companion.record.codec import decode, encode
 from tests.bench.bad_frames import READ, extreme_frames, packed, sealed
 from tests.bench.gate_frames import Loop, Vehicle, long_setup
 

@@ -37,7 +37,7 @@ from companion.core.types import (
     TankReport,
     TimedChange,
 )
-from companion.record.codec import decode, encode
+from companion.journal.codec import decode, encode
 from sitl.demo_field import demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.liquid_faults import LiquidFault, LiquidFaultKind

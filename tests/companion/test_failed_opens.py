@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from companion.journal.new_file import open_for_flight
 from companion.output.engine.lines import FileLines
 from companion.output.engine.spi595 import SpiDevice
 from companion.output.gpio import EngineChild
-from companion.record.new_file import open_for_flight
 from sitl.stub.protocol import Channel
 from sitl.stub.server import open_link
 

@@ -30,8 +30,8 @@ from companion.flight_map import (
 )
 from companion.flight_map import child as child_module
 from companion.flight_map import file as file_module
+from companion.journal.geopackage import LOCAL_ID, geometry_blob
 from companion.problem import Problem
-from companion.record.geopackage import LOCAL_ID, geometry_blob
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.compiling import (
     MapOrder,

@@ -13,10 +13,10 @@ from companion.cli.app import execute
 from companion.cli.record_parts import made_ready
 from companion.config.tables import JournalTable
 from companion.errors import JournalError
-from companion.record import retention
-from companion.record.folder import Flight, journals, look_at, set_pinned
-from companion.record.journal import Journal
-from companion.record.retention import Rules, Space, chosen, prune
+from companion.journal import retention
+from companion.journal.folder import Flight, journals, look_at, set_pinned
+from companion.journal.journal import Journal
+from companion.journal.retention import Rules, Space, chosen, prune
 from tests.builders import setup
 from tests.companion.test_journal import change, closed_journal
 
@@ -268,6 +268,6 @@ def test_a_full_disk_is_refused_before_the_flight(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = Space(total_bytes=10**12, free_bytes=10**6)
-    monkeypatch.setattr("companion.record.retention.space_of", lambda _folder: full)
+    monkeypatch.setattr("companion.journal.retention.space_of", lambda _folder: full)
     with pytest.raises(JournalError, match="only 1 MB are free"):
         list(made_ready(folder, JournalTable()))

@@ -30,7 +30,7 @@ from companion.core.types import (
     LandedReport,
     OperatorCommand,
 )
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from missions.maps.compiling import compiled_setup
 from tests.builders import CURVE, flying, plots, position, setup
 from tests.companion.trim_bench import STEP_S, TrimBench, tracking

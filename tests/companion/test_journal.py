@@ -52,10 +52,10 @@ from companion.core.types import (
     WindReport,
 )
 from companion.errors import JournalError
-from companion.record.codec import decode, encode
-from companion.record.journal import Journal
-from companion.record.new_file import open_for_flight
-from companion.record.writer import Event, Writer
+from companion.journal.codec import decode, encode
+from companion.journal.journal import Journal
+from companion.journal.new_file import open_for_flight
+from companion.journal.writer import Event, Writer
 from tests.builders import flying, setup
 from tests.companion.journal_edit import with_body
 
@@ -415,7 +415,7 @@ def test_every_committed_row_survives_the_death_of_the_process(tmp_path: Path) -
 CHILD = textwrap.dedent(
     """
     import pathlib, sys, time
-    from companion.record.journal import Journal
+    from companion.journal.journal import Journal
     from tests.builders import setup
     from tests.companion.test_journal import decisions
 

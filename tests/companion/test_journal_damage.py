@@ -21,12 +21,12 @@ from companion.cli.record_parts import made_ready
 from companion.config.tables import JournalTable
 from companion.core.types import UtcReport
 from companion.errors import JournalError, NoMapError
-from companion.record.folder import journals, look_at
-from companion.record.new_file import open_for_flight
-from companion.record.read_only import log_of, salvaged_name
-from companion.record.reader import opened
-from companion.record.valve_rows import ValveOrder
-from companion.record.writer import Writer
+from companion.journal.folder import journals, look_at
+from companion.journal.new_file import open_for_flight
+from companion.journal.read_only import log_of, salvaged_name
+from companion.journal.reader import opened
+from companion.journal.valve_rows import ValveOrder
+from companion.journal.writer import Writer
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import example_setup
 from tests.builders import setup

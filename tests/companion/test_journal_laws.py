@@ -28,10 +28,10 @@ from companion.core.types import (
     VehicleState,
 )
 from companion.errors import JournalError
-from companion.record.codec import FIELD_NAMES, decode, encode
-from companion.record.journal import Journal
-from companion.record.new_file import open_for_flight
-from companion.record.writer import Writer
+from companion.journal.codec import FIELD_NAMES, decode, encode
+from companion.journal.journal import Journal
+from companion.journal.new_file import open_for_flight
+from companion.journal.writer import Writer
 from tests.builders import flying, setup
 
 

@@ -15,11 +15,11 @@ from analysis.journals.salvage import recover, recover_folder
 from companion.cli.app import execute
 from companion.cli.record_parts import made_ready
 from companion.config.tables import JournalTable
-from companion.record.geopackage import PAGE_BYTES
-from companion.record.log_damage import EVENT_KIND, META_KEY, log_damage
-from companion.record.log_frames import log_from
-from companion.record.new_file import open_for_flight
-from companion.record.read_only import kept_log_of, log_of
+from companion.journal.geopackage import PAGE_BYTES
+from companion.journal.log_damage import EVENT_KIND, META_KEY, log_damage
+from companion.journal.log_frames import log_from
+from companion.journal.new_file import open_for_flight
+from companion.journal.read_only import kept_log_of, log_of
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import START_S, example_setup
 from tests.companion.test_journal import query

@@ -12,9 +12,9 @@ import pytest
 
 from analysis.journals.content import content_sha256, read_journal
 from analysis.journals.salvage import recover, recover_folder
-from companion.record.folder import look_at
-from companion.record.journal import Journal
-from companion.record.read_only import log_of, salvaged_name
+from companion.journal.folder import look_at
+from companion.journal.journal import Journal
+from companion.journal.read_only import log_of, salvaged_name
 from tests.bench.journal import crashed, kills, torn
 from tests.bench.journal_flight import example_setup
 from tests.builders import setup

@@ -12,8 +12,8 @@ from typing import NamedTuple, cast
 import pytest
 
 from companion.core.types import Decision, HeartbeatReport, Inhibit, Input, SprayerState
-from companion.record import journal as journal_module
-from companion.record.journal import Journal
+from companion.journal import journal as journal_module
+from companion.journal.journal import Journal
 from companion.runtime import ControlLoop, NoRecorder
 from tests.analysis.test_replay import inputs_of
 from tests.builders import setup

@@ -11,14 +11,14 @@ import pytest
 
 from analysis.journals.content import read_journal
 from companion.core.types import SprayPlan, TimedChange, UtcReport
+from companion.journal.folder import look_at
+from companion.journal.journal import Journal
+from companion.journal.valve_rows import ValveOrder, ValveRows
+from companion.journal.writer import FlightClock
 from companion.link.codec import FROM_VEHICLE
 from companion.output.engine.wire import Issued
 from companion.output.gpio import GpioExecutor
 from companion.output.timed import DryRunExecutor
-from companion.record.folder import look_at
-from companion.record.journal import Journal
-from companion.record.valve_rows import ValveOrder, ValveRows
-from companion.record.writer import FlightClock
 from tests.analysis.test_replay import fly
 from tests.builders import setup
 from tests.companion.test_journal import decisions, query

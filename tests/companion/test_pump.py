@@ -17,7 +17,7 @@ from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.liquid_evidence import Detection
 from companion.core.options.pump import Pump, liquid_plan
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
-from companion.record.codec import FIELD_NAMES, decode, encode
+from companion.journal.codec import FIELD_NAMES, decode, encode
 from tests.builders import boom, flying, setup
 from tests.pump_flight import CURVE, PUMP_LAG, fly, prescribed_ml, pump, pump_setup
 

@@ -14,7 +14,7 @@ import pytest
 from analysis.journals.content import read_journal
 from companion.cli.record_parts import follow
 from companion.config import load
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from missions.maps.compiling import compiled_setup
 from sitl.serve import ServeOptions
 from tests.bench.wire import RTK, example

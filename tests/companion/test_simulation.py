@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.journal.journal import Journal
+from companion.journal.reader import opened
 from companion.link.simulation import SIMSTATE, judge, mode_sign, sensor_sign
-from companion.record.journal import Journal
-from companion.record.reader import opened
 from companion.simulated import SIMULATED, Simulated, parsed, simulated_in
 from tests import builders
 from tests.companion.test_px4_output import Peer

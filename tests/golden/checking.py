@@ -23,10 +23,10 @@ from analysis.journals.content import read_journal
 from analysis.replay import FlownCore
 from companion.core.setup import Setup
 from companion.core.types import Decision
-from companion.record import codec
-from companion.record.codec import FieldNames, encode
-from companion.record.coverage_table import read_coverage
-from companion.record.reader import opened
+from companion.journal import codec
+from companion.journal.codec import FieldNames, encode
+from companion.journal.coverage_table import read_coverage
+from companion.journal.reader import opened
 
 FOLDER = Path(__file__).parent / "journals"
 TIME_WITHIN_S = 1e-6

@@ -13,8 +13,8 @@ from companion.cli.record_parts import follow
 from companion.config import load
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
-from companion.record.continuing import continued
-from companion.record.journal import Journal
+from companion.journal.continuing import continued
+from companion.journal.journal import Journal
 from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions
 from sitl.flight import fly as fly_twin

@@ -13,7 +13,7 @@ from companion.cli.app import execute
 from companion.cli.record_parts import follow
 from companion.config import load
 from companion.config.application_table import PROFILES
-from companion.record.journal import Journal
+from companion.journal.journal import Journal
 from companion.simulated import Simulated
 from missions.maps.compiling import compiled_setup
 from sitl.serve import ServeOptions

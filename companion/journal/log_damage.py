@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.atomic_write import sync_folder
-from companion.record.geopackage import time_text
-from companion.record.leaf_page import Cell, cells_of, is_of, tables_of, values_of
-from companion.record.log_frames import Log, page_bytes_of, read_log
-from companion.record.read_only import kept_log_of, log_of
-from companion.record.writer import SET_META
+from companion.journal.geopackage import time_text
+from companion.journal.leaf_page import Cell, cells_of, is_of, tables_of, values_of
+from companion.journal.log_frames import Log, page_bytes_of, read_log
+from companion.journal.read_only import kept_log_of, log_of
+from companion.journal.writer import SET_META
 
 EVENT_KIND = "log-damaged"
 META_KEY = "log_damaged"

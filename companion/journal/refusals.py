@@ -12,7 +12,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from companion.errors import JournalError, UnreadableError
-from companion.record.read_only import one_line
+from companion.journal.read_only import one_line
 
 # Tables of a journal, of any version; a file with some of them is one, whatever else is gone.
 _OWN = frozenset(

@@ -11,7 +11,7 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 from companion.errors import VrsprayError
-from companion.record.distrust import check_beside, distrust
+from companion.journal.distrust import check_beside, distrust
 
 # What a damaged journal may do to its reader: SQLite's findings, and values that are none.
 DAMAGE = (

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from companion.errors import JournalError
-from companion.record.folder import Flight, journals, look_at, pin_of
-from companion.record.read_only import kept_log_of, log_of
+from companion.journal.folder import Flight, journals, look_at, pin_of
+from companion.journal.read_only import kept_log_of, log_of
 
 # The newest flights stay by every rule: a disk that something else has filled, or a clock that is
 # wrong, must not cost the records of the season.

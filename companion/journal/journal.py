@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Self
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import JournalError
+from companion.journal.new_file import about, new_file, open_for_flight
+from companion.journal.valve_rows import ValveOrder
+from companion.journal.writer import Event, Item, LinkSample, Writer
 from companion.ports import COMMIT_EVERY_S
-from companion.record.new_file import about, new_file, open_for_flight
-from companion.record.valve_rows import ValveOrder
-from companion.record.writer import Event, Item, LinkSample, Writer
 from companion.simulated import BECAUSE, NOT_ASKED, SIMULATED, Simulated
 
 if TYPE_CHECKING:

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING
 
 from companion.core.frame import LocalFrame
 from companion.core.types import Decision, Input, UtcReport
-from companion.record.blocks import Block
-from companion.record.codec import encode
-from companion.record.coverage_table import write_coverage
-from companion.record.layers import set_box
-from companion.record.totals import totals_of
-from companion.record.valve_rows import Row, ValveOrder, ValveRows
+from companion.journal.blocks import Block
+from companion.journal.codec import encode
+from companion.journal.coverage_table import write_coverage
+from companion.journal.layers import set_box
+from companion.journal.totals import totals_of
+from companion.journal.valve_rows import Row, ValveOrder, ValveRows
 from companion.simulated import BECAUSE, SIMULATED, Simulated, parsed
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ from dataclasses import dataclass
 
 from companion.core.frame import course_deg
 from companion.core.types import Inhibit, SprayerState, VehicleState
-from companion.record.geopackage import point_blob, time_text
+from companion.journal.geopackage import point_blob, time_text
 
 __all__ = ["Event", "Item", "Writer"]
 

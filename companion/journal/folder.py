@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from companion.errors import JournalError
-from companion.record.read_only import DAMAGE, log_of, one_line
-from companion.record.reader import OpenJournal, opened
-from companion.record.totals import applied_l
-from companion.record.versions import OtherVersionError
+from companion.journal.read_only import DAMAGE, log_of, one_line
+from companion.journal.reader import OpenJournal, opened
+from companion.journal.totals import applied_l
+from companion.journal.versions import OtherVersionError
 from companion.simulated import Simulated, simulated_in
 
 _NAME = re.compile(r"flight-\d+(\.salvaged)?\.gpkg")

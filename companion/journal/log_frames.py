@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from companion.record.geopackage import PAGE_BYTES
+from companion.journal.geopackage import PAGE_BYTES
 
 _MAGIC = 0x377F0682  # its last bit: the words of the check sums are big-endian
 _VERSION = 3_007_000

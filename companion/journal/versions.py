@@ -12,8 +12,8 @@ from datetime import datetime
 from importlib import metadata
 
 from companion.errors import UnreadableError
-from companion.record.geopackage import JOURNAL_VERSION
-from companion.record.refusals import check_kind
+from companion.journal.geopackage import JOURNAL_VERSION
+from companion.journal.refusals import check_kind
 
 _BOTH = {"meta", "events", "zones", "field", "applied"}
 _TABLES = {

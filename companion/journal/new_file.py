@@ -14,10 +14,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from companion.core.setup import Setup
-from companion.record.coverage_table import write_treated
-from companion.record.geopackage import JOURNAL_VERSION, SCHEMA
-from companion.record.layers import write_layers
-from companion.record.setup_json import calibration_sha256, setup_to_json
+from companion.journal.coverage_table import write_treated
+from companion.journal.geopackage import JOURNAL_VERSION, SCHEMA
+from companion.journal.layers import write_layers
+from companion.journal.setup_json import calibration_sha256, setup_to_json
 
 _LIBRARIES = ("vrspray", "numpy", "shapely", "pyproj")
 

@@ -17,7 +17,7 @@ from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
 
-from companion.record.geopackage import SCHEMA
+from companion.journal.geopackage import SCHEMA
 
 _MIB = 1 << 20
 # One value, as large as any journal's set-up with all its ground. SQLite's own limit is a gigabyte.

@@ -11,19 +11,19 @@ from typing import Any
 
 from companion.core.setup import Setup
 from companion.errors import NoMapError, UnreadableError
-from companion.record.coverage_table import read_treated
-from companion.record.distrust import allow_damaged_list, check_programs
-from companion.record.geopackage import APPLICATION_ID
-from companion.record.layers import read_ground
-from companion.record.read_only import (
+from companion.journal.coverage_table import read_treated
+from companion.journal.distrust import allow_damaged_list, check_programs
+from companion.journal.geopackage import APPLICATION_ID
+from companion.journal.layers import read_ground
+from companion.journal.read_only import (
     DAMAGE,
     log_of,
     one_line,
     read_only,
 )
-from companion.record.refusals import check_kind, extent, no_file, refused, why_no_setup
-from companion.record.setup_json import setup_from_json
-from companion.record.versions import (
+from companion.journal.refusals import check_kind, extent, no_file, refused, why_no_setup
+from companion.journal.setup_json import setup_from_json
+from companion.journal.versions import (
     as_far_as_said,
     check_said,
     check_version,

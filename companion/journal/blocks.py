@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlite3
 import zlib
 
-from companion.record.packing import Packer, deflated
+from companion.journal.packing import Packer, deflated
 
 # A second of a flight has a hundred rows; a simulation has thousands, which are several blocks.
 ROWS_MAX = 1000

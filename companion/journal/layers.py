@@ -18,7 +18,7 @@ from shapely import MultiPolygon, Polygon
 from companion.core.cells import CellGrid, Warp
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
-from companion.record.geopackage import (
+from companion.journal.geopackage import (
     LOCAL_ID,
     WGS84_ID,
     geometry_blob,

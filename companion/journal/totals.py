@@ -6,7 +6,7 @@ import math
 import sqlite3
 from collections.abc import Iterator, Mapping
 
-from companion.record.read_only import one_line
+from companion.journal.read_only import one_line
 
 # Behind the name of a table: how many rows it has.
 _COUNTED = {"rows_applied": "applied", "rows_valve_changes": "valve_changes"}

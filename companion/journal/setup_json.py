@@ -12,8 +12,8 @@ from typing import Any, cast
 
 from companion.core.prescription import Overlap, Prescription, Zone
 from companion.core.setup import Setup
-from companion.record.codec import FIELD_NAMES, FieldNames, from_plain, to_plain
-from companion.record.layers import Ground
+from companion.journal.codec import FIELD_NAMES, FieldNames, from_plain, to_plain
+from companion.journal.layers import Ground
 
 SETUP_VERSION = 1
 # In tables of their own: the ground as layers, what earlier flights treated as tiles.
