@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -184,6 +185,8 @@ def narrow_patches(
     return found[np.sort(order[~(spare & poor)])]
 
 
+# Most layouts of a field leave the same nooks.
+@lru_cache(maxsize=PATCHES_MAX)
 def _over(patch: BaseGeometry, ground: BaseGeometry, width_m: float) -> Floats:
     """Return the line whose strip covers most of a patch and nothing outside; none for crumbs."""
     if not patch.area > PATCH_MIN_M2:

@@ -22,7 +22,10 @@ NEAREST = 12
 
 @dataclass(slots=True)
 class _State:
-    """The sorties while they are changed; `of` says in which one each piece is."""
+    """The sorties while they are changed; `of` says in which one each piece is.
+
+    `end_litres` are those of the piece of each end.
+    """
 
     between: list[Sequence[float]]
     near: list[list[int]]
@@ -31,11 +34,13 @@ class _State:
     depot: int
     sorties: list[Sortie]
     lasts: Lasts | None = None
+    end_litres: list[float] = field(default_factory=list)
     of: list[int] = field(default_factory=list)
     load: list[float] = field(default_factory=list)
 
     def fill(self) -> None:
         """Note where every piece is and how full every sortie."""
+        self.end_litres = [litres for litres in self.litres for _ in range(2)]
         self.of = [0] * len(self.litres)
         self.load = [0.0] * len(self.sorties)
         for number in range(len(self.sorties)):
@@ -44,9 +49,10 @@ class _State:
     def note(self, number: int) -> None:
         """Note one sortie anew."""
         sortie = self.sorties[number]
+        of = self.of
         for enter in sortie:
-            self.of[enter >> 1] = number
-        self.load[number] = sum(self.litres[enter >> 1] for enter in sortie)
+            of[enter >> 1] = number
+        self.load[number] = sum(map(self.end_litres.__getitem__, sortie))
 
     def fits(self, load_l: float) -> bool:
         """Return whether a tank holds this."""

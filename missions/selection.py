@@ -161,8 +161,7 @@ def chosen(
     for pool, first in pools:
         cost_s = motion.legs_s(lengths_m(pool)) + motion.between_passes_s(boom.width_m)
         state = _Set(
-            covers=_covered(pool, points, boom), count=len(points), each_m2=each_m2,
-            cost_s=cost_s.tolist(), aim=aim,
+            covers=_covered(pool, points, boom), each_m2=each_m2, cost_s=cost_s.tolist(), aim=aim,
         )  # fmt: skip
         state.take(first)
         value_s, lines = state.anneal(random.Random(1), moves)
@@ -188,37 +187,44 @@ def _points(target: BaseGeometry) -> tuple[Floats, float]:
     return points, target.area / max(len(points), 1)
 
 
-def _covered(pool: Floats, points: Floats, boom: Boom) -> list[NDArray[np.int64]]:
-    """Return which points each line's strip covers."""
+def _covered(pool: Floats, points: Floats, boom: Boom) -> NDArray[np.bool_]:
+    """Return which points each line's strip covers, shape (lines, points)."""
     spans = boom.spans(pool)
     ways = directions(pool)
-    covers = []
+    covers = np.zeros((len(pool), len(points)), dtype=np.bool_)
     for number, (line, way) in enumerate(zip(pool, ways, strict=True)):
         off = points - line[:2]
         s, t = off @ way, off @ np.array([way[1], -way[0]])
-        on = np.zeros(len(points), dtype=np.bool_)
+        on = covers[number]
         first, last = np.searchsorted(spans[:, 0], [number, number + 1])
         for left_m, right_m, start_m, end_m in spans[first:last, 1:].tolist():
             aside = (t >= left_m - SLACK_M) & (t <= right_m + SLACK_M)
             on |= aside & (s >= start_m) & (s <= end_m)
-        covers.append(np.flatnonzero(on))
     return covers
 
 
 class _Set:
-    """The lines that are taken, and how often each point is covered."""
+    """The lines that are taken, and how often each point is covered.
+
+    Points are the bits of whole numbers: a few operations change a line's thousand of them. What a
+    point is covered by is counted in binary, each of the `_digits` for all points.
+    """
 
     def __init__(
-        self, *, covers: list[NDArray[np.int64]], count: int, each_m2: float,
-        cost_s: list[float], aim: Aim,
-    ) -> None:  # fmt: skip
-        self._covers, self._each_m2, self._cost_s, self._aim = covers, each_m2, cost_s, aim
-        self._times = np.zeros(count, dtype=np.int16)
+        self, *, covers: NDArray[np.bool_], each_m2: float, cost_s: list[float], aim: Aim
+    ) -> None:
+        count = covers.shape[1]
+        self._covers = [
+            int.from_bytes(row.tobytes(), "little")
+            for row in np.packbits(covers, axis=1, bitorder="little")
+        ]
+        self._sizes: list[int] = covers.sum(axis=1).tolist()
+        self._each_m2, self._cost_s, self._aim = each_m2, cost_s, aim
+        self._every, self._digits, self._treated = (1 << count) - 1, [0], 0
         self._taken: list[int] = []
-        self._over: list[list[int]] = [[] for _ in range(count)]
-        for line, own in enumerate(covers):
-            for point in own.tolist():
-                self._over[point].append(line)
+        # The lines over a point follow each other, from where the first of them is.
+        self._over: list[int] = np.nonzero(covers.T)[1].tolist()
+        self._first: list[int] = [0, *np.cumsum(covers.sum(axis=0)).tolist()]
         self._bare, self._doubled, self._spent_s = count, 0, 0.0
 
     def take(self, lines: list[int]) -> None:
@@ -230,21 +236,32 @@ class _Set:
 
     def add(self, line: int) -> None:
         own = self._covers[line]
-        times = self._times[own]
-        new = len(times) - int(np.count_nonzero(times))
-        self._bare -= new
-        self._doubled += len(times) - new
-        self._times[own] = times + 1
+        again = (own & self._treated).bit_count()
+        self._bare -= self._sizes[line] - again
+        self._doubled += again
+        self._treated |= own
+        digits = self._digits
+        for place, digit in enumerate(digits):
+            digits[place] = digit ^ own
+            own &= digit
+            if not own:
+                break
+        else:
+            digits.append(own)
         self._taken.append(line)
         self._spent_s += self._cost_s[line]
 
     def drop(self, line: int) -> None:
-        own = self._covers[line]
-        times = self._times[own] - 1
-        bared = len(times) - int(np.count_nonzero(times))
-        self._bare += bared
-        self._doubled -= len(times) - bared
-        self._times[own] = times
+        own = left = self._covers[line]
+        digits, treated = self._digits, 0
+        for place, digit in enumerate(digits):
+            digits[place] = digit = digit ^ left
+            left &= digit
+            treated |= digit
+        again = (own & treated).bit_count()
+        self._bare += self._sizes[line] - again
+        self._doubled -= again
+        self._treated = treated
         self._taken.remove(line)
         self._spent_s -= self._cost_s[line]
 
@@ -286,15 +303,34 @@ class _Set:
 
     def _drawn(self, draw: random.Random, changed: list[int]) -> int | None:
         """Return a line over ground that is bare now."""
-        some = self._covers[changed[0]] if changed else np.arange(len(self._times))
-        bare = some[self._times[some] == 0]
-        if not len(bare):
+        some = self._covers[changed[0]] if changed else self._every
+        bare = some & ~self._treated
+        if not bare:
             return None
-        over = self._over[int(bare[draw.randrange(len(bare))])]
-        return over[draw.randrange(len(over))] if over else None
+        point = _set_bit(bare, draw.randrange(bare.bit_count()))
+        first, end = self._first[point], self._first[point + 1]
+        return self._over[first + draw.randrange(end - first)] if end > first else None
 
     def _flip(self, line: int) -> None:
         if line in self._taken:
             self.drop(line)
         else:
             self.add(line)
+
+
+def _set_bit(bits: int, number: int) -> int:
+    """Return the place of a bit that is set; the lowest one has the number 0.
+
+    >>> [_set_bit(0b1011000, number) for number in range(3)]
+    [3, 4, 6]
+    """
+    place, wide = 0, bits.bit_length()
+    while wide > 1:
+        half = wide >> 1
+        low = bits & ((1 << half) - 1)
+        count = low.bit_count()
+        if number < count:
+            bits, wide = low, half
+        else:
+            bits, wide, place, number = bits >> half, wide - half, place + half, number - count
+    return place

@@ -127,6 +127,8 @@ class SortieSearch:
             parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
             raise _too_far(passes, limits, parts, self.ways, settings)
         drawn = [self._as_flown(each) for each in found]
+        if len(drawn) == 1:
+            return drawn[0]
         return min(drawn, key=lambda each: _total_s(each[1], settings))
 
     def with_less(
@@ -499,7 +501,8 @@ class Budget:
     """Time and watt-hours without liquid, from end to end and along each piece.
 
     The rows and columns are those of `Network.between_s`, but without the search's extra time for
-    a refill. `limit_wh` is what a sortie may take.
+    a refill. What a piece takes is known for both of its ends. `limit_wh` is what a sortie may
+    take.
     """
 
     between_s: list[Sequence[float]]
@@ -516,20 +519,22 @@ class Budget:
 
     def wh(self, sortie: list[int]) -> float:
         """Return what a sortie takes."""
-        left_l = self.reserve_l + sum(self.litres[enter >> 1] for enter in sortie)
-        used = self.start_wh + self.per_l_wh_s * self.start_s * left_l
+        # Asked for with every move of the search: nothing is looked up twice.
+        between_s, between_wh, per_l_wh_s = self.between_s, self.between_wh, self.per_l_wh_s
+        litres, piece_s, piece_wh = self.litres, self.piece_s, self.piece_wh
+        left_l = self.reserve_l + sum(map(litres.__getitem__, sortie))
+        used = self.start_wh + per_l_wh_s * self.start_s * left_l
         here = self.depot
         for enter in sortie:
-            piece = enter >> 1
-            half_l = self.litres[piece] / 2.0
-            seconds = self.between_s[here][enter] * left_l
-            seconds += self.piece_s[piece] * (left_l - half_l)
-            used += self.between_wh[here][enter] + self.piece_wh[piece]
-            used += self.per_l_wh_s * seconds
-            left_l -= 2.0 * half_l
+            own_l = litres[enter]
+            seconds = between_s[here][enter] * left_l
+            seconds += piece_s[enter] * (left_l - own_l / 2.0)
+            used += between_wh[here][enter] + piece_wh[enter]
+            used += per_l_wh_s * seconds
+            left_l -= own_l
             here = enter ^ 1
-        home = self.between_wh[here][self.depot]
-        return used + home + self.per_l_wh_s * self.between_s[here][self.depot] * left_l
+        home = between_wh[here][self.depot]
+        return used + home + per_l_wh_s * between_s[here][self.depot] * left_l
 
     def lasts(self, sortie: list[int]) -> bool:
         """Return whether the battery lasts."""
@@ -572,9 +577,9 @@ def build_budget(
     return Budget(
         between_s=rows_of(between_s + nose_s),
         between_wh=rows_of(between_wh),
-        piece_s=(cruise_s + stops_s).tolist(),
-        piece_wh=piece_wh.tolist(),
-        litres=network.litres.tolist(),
+        piece_s=np.repeat(cruise_s + stops_s, 2).tolist(),
+        piece_wh=np.repeat(piece_wh, 2).tolist(),
+        litres=np.repeat(network.litres, 2).tolist(),
         depot=network.depot,
         start_wh=upright_s * battery.hover_w / J_WH,
         start_s=upright_s,

@@ -132,7 +132,7 @@ class _Crowded:
 class Spacing:
     """Keeps waypoints apart; `apart`, lines have waypoints at both ends whatever comes.
 
-    What was found for a way between two lines is known when it comes again.
+    What was found for a way between two lines, or for a sortie, is known when it comes again.
     """
 
     ways: Ways
@@ -141,10 +141,16 @@ class Spacing:
     _known: dict[tuple[object, ...], list[_Option]] = field(
         default_factory=dict, repr=False, compare=False
     )
+    _known_legs: dict[tuple[Leg, ...], tuple[Leg, ...]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     def spaced(self, sorties: Sequence[Sortie]) -> tuple[Sortie, ...]:
         """Return the sorties with their ways between lines so that waypoints are far apart."""
-        return tuple(self._spaced(each) for each in sorties)
+        for each in sorties:
+            if each.legs not in self._known_legs:
+                self._known_legs[each.legs] = self._spaced(each).legs
+        return tuple(replace(each, legs=self._known_legs[each.legs]) for each in sorties)
 
     def _spaced(self, sortie: Sortie) -> Sortie:
         known = _Crowded()

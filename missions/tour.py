@@ -241,6 +241,8 @@ def by_savings(
     sortie_of = list(range(len(litres)))
     for one, other in _best_first(network, every_pair_max):
         first, second = sortie_of[one >> 1], sortie_of[other >> 1]
+        if len(sorties) == 1:
+            break
         if first == second or load[first] + load[second] > capacity_l + 1e-9:
             continue
         head = _leaving(sorties[first], one)

@@ -79,6 +79,17 @@ class Ways:
 
     def between(self, start: Place, end: Place) -> tuple[list[Place], bool]:
         """Return the way between two places of the field, and whether it leaves the field."""
+        if (start, end) not in self._between:
+            self._between[start, end] = self._way_between(start, end)
+        way, leaves = self._between[start, end]
+        return list(way), leaves
+
+    @cached_property
+    def _between(self) -> dict[tuple[Place, Place], tuple[list[Place], bool]]:
+        """Return the ways that `between` has found: most of them are asked for again."""
+        return {}
+
+    def _way_between(self, start: Place, end: Place) -> tuple[list[Place], bool]:
         way = self.inside.way(start, end)
         if way:
             return way, False

@@ -10,7 +10,7 @@ counted.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
@@ -108,6 +108,41 @@ class Ground:
     settings: Settings
 
 
+class Borders:
+    """Borders around some ground and how far outside the field, the nearest first.
+
+    Each is drawn when it is first asked for: most fences need one or two of them.
+    """
+
+    def __init__(self, ground: BaseGeometry, field: BaseGeometry, simpler: Sequence[float]) -> None:
+        self._drawn: list[tuple[float, BaseGeometry]] = []
+        self._more = _borders(ground, field, simpler)
+
+    def __iter__(self) -> Iterator[tuple[float, BaseGeometry]]:
+        yield from self._drawn
+        for each in self._more:
+            self._drawn.append(each)
+            yield each
+
+
+def _borders(
+    ground: BaseGeometry, field: BaseGeometry, simpler: Sequence[float]
+) -> Iterator[tuple[float, BaseGeometry]]:
+    shapely.prepare(ground)
+    shapely.prepare(field)
+    edges = _edges(field)
+    for simpler_m in simpler:
+        # Bays in which it would be no farther from the field are closed, and a first, quick
+        # simplification is made up for by a wider buffer.
+        wide_m = OUT_M + QUICK_M + simpler_m
+        wider = ground.buffer(wide_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
+        closed = wider.buffer(-simpler_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
+        border = around_with_fewer_corners(closed.simplify(QUICK_M), simpler_m)
+        outside_m = _outside_m(border, field, edges)
+        if outside_m <= OUTSIDE_MAX_M and border.covers(ground):
+            yield outside_m, border
+
+
 @dataclass(frozen=True)
 class Fences:
     """The fences of all sorties of a plan."""
@@ -166,10 +201,10 @@ class Fences:
         return [(_smaller(part), _circle(part)) for part in parts]
 
     @cached_property
-    def borders(self) -> list[tuple[float, BaseGeometry]]:
+    def borders(self) -> Borders:
         """Return the borders of the field with its ways outside, which most sorties share."""
         outline = self.plan.field.outline
-        return self._borders(outline, outline, SIMPLER_M)
+        return Borders(outline, outline, SIMPLER_M)
 
     def of(self, sortie: Sortie) -> Fence:
         """Return the fence of one sortie, drawn once.
@@ -207,22 +242,22 @@ class Fences:
         whole: BaseGeometry = outline
         if not beyond.is_empty:
             whole = outline.union(beyond.buffer(FERRY_M, quad_segs=2))
-            borders = self._borders(whole, whole, SIMPLER_M)
-        tried: list[Tried] = [(None, *each) for each in borders]
-        fitting = self._fitting(borders, way, obstacles, aside_m=None)
+            borders = Borders(whole, whole, SIMPLER_M)
+        looked_at: list[tuple[float | None, Borders]] = [(None, borders)]
+        fence = self._fitting(borders, way, obstacles, aside_m=None)
         for aside_m in ASIDE_M:
-            if fitting:
+            if fence is not None:
                 break
             part = whole.intersection(_beside(way, aside_m))
             near = shapely.union_all([Polygon(each.exterior) for each in polygons_of(part)])
-            borders = self._borders(near, whole, PART_SIMPLER_M)
-            tried += [(aside_m, *each) for each in borders]
-            fitting = self._fitting(borders, way, obstacles, aside_m=aside_m)
-        if not fitting:
-            fitting = self._with_few_corners(tried, whole, way, obstacles)
-        if not fitting:
-            raise self._refusal(sortie, tried, way)
-        fence = min(fitting, key=lambda found: found.left_out)
+            borders = Borders(near, whole, PART_SIMPLER_M)
+            looked_at.append((aside_m, borders))
+            fence = self._fitting(borders, way, obstacles, aside_m=aside_m)
+        if fence is None:
+            tried = [(far_m, *each) for far_m, some in looked_at for each in some]
+            fence = self._with_few_corners(tried, whole, way, obstacles)
+            if fence is None:
+                raise self._refusal(sortie, tried, way)
         if fence.left_out:
             fence = self._with_more_obstacles(fence, whole, obstacles)
         self._check(fence, way, sortie)
@@ -230,8 +265,8 @@ class Fences:
 
     def _with_few_corners(
         self, borders: list[Tried], whole: BaseGeometry, way: BaseGeometry, obstacles: list[Shape]
-    ) -> list[Fence]:
-        """Return a fence of one of these borders that need not keep near inside the field.
+    ) -> Fence | None:
+        """Return a fence of one of these borders that need not keep near inside the field, if any.
 
         Outside of the field it keeps within `OUTSIDE_MAX_M`, as all do.
         """
@@ -250,8 +285,8 @@ class Fences:
             outside_m = _outside_m(fewer, whole, _edges(whole))
             found = self._with_obstacles(fewer, outside_m, obstacles)
             if found is not None:
-                return [replace(found, aside_m=aside_m)]
-        return []
+                return replace(found, aside_m=aside_m)
+        return None
 
     def _with_more_obstacles(
         self, fence: Fence, whole: BaseGeometry, obstacles: list[Shape]
@@ -298,40 +333,27 @@ class Fences:
 
     def _fitting(
         self,
-        borders: list[tuple[float, BaseGeometry]],
+        borders: Borders,
         way: BaseGeometry,
         obstacles: list[Shape],
         *,
         aside_m: float | None,
-    ) -> list[Fence]:
-        """Return the fences of these borders that hold the way and have room."""
-        return [
-            replace(found, aside_m=aside_m)
-            for outside_m, drawn in borders
-            for border in polygons_of(drawn)
-            if border.covers(way)
-            if (found := self._with_obstacles(border, outside_m, obstacles)) is not None
-        ]
+    ) -> Fence | None:
+        """Return a fence of these borders that holds the way, with as many obstacles as any.
 
-    def _borders(
-        self, ground: BaseGeometry, field: BaseGeometry, simpler: Sequence[float]
-    ) -> list[tuple[float, BaseGeometry]]:
-        """Return borders around some ground and how far outside the field, the nearest first."""
-        shapely.prepare(ground)
-        shapely.prepare(field)
-        edges = _edges(field)
-        found = []
-        for simpler_m in simpler:
-            # Bays in which it would be no farther from the field are closed, and a first, quick
-            # simplification is made up for by a wider buffer.
-            wide_m = OUT_M + QUICK_M + simpler_m
-            wider = ground.buffer(wide_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
-            closed = wider.buffer(-simpler_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
-            border = around_with_fewer_corners(closed.simplify(QUICK_M), simpler_m)
-            outside_m = _outside_m(border, field, edges)
-            if outside_m <= OUTSIDE_MAX_M and border.covers(ground):
-                found.append((outside_m, border))
-        return found
+        The first one with all of them: no more borders are drawn than that takes.
+        """
+        best: Fence | None = None
+        for outside_m, drawn in borders:
+            for border in polygons_of(drawn):
+                found = None
+                if border.covers(way):
+                    found = self._with_obstacles(border, outside_m, obstacles)
+                if found is not None and (best is None or found.left_out < best.left_out):
+                    best = replace(found, aside_m=aside_m)
+                    if not best.left_out:
+                        return best
+        return best
 
     def _with_obstacles(
         self, border: Polygon, outside_m: float, obstacles: list[Shape]

@@ -6,6 +6,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -434,3 +436,12 @@ def test_ctrl_c_while_files_are_written_leaves_all_of_one_plan(
     sorties = sorties_from(tmp_path / "m.plan")
     assert len(sorties) > 2
     assert sorted(tmp_path.glob("m*.plan")) == sorted(sorties)
+
+
+def test_no_plan_needs_matplotlib() -> None:
+    """It is half a second of each plan, and an extra that may be missing."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys; sys.modules['matplotlib'] = None; import missions.cli"],
+        check=False, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import random
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from missions.picture import draw_plan
 from missions.plan import Leg, Plan, Settings
 from missions.planner import plan_mission
 from missions.prices import closing_hint, overlap_warnings
-from missions.selection import Aim, chosen, families
+from missions.selection import Aim, _Set, chosen, families
 from missions.sheet import sheet
 from missions.strips import border_passes, joined, lengths_m, rectangles, united, whole
 from tests.bench.small_fields import VALVES
@@ -254,3 +255,27 @@ def test_choices_are_printed_with_their_price(
     assert price["option"] == "without --leave-max"
     assert price["swaths"] > found["swaths"]
     assert price["left_percent"] < 0.2 < 100.0 - found["reachable_percent"]
+
+
+def test_lines_that_are_taken_and_dropped_are_counted_as_one_by_one() -> None:
+    draw = random.Random(5)
+    covers = np.random.default_rng(5).random((30, 333)) < 0.2
+    state = _Set(
+        covers=covers, each_m2=1.0, cost_s=[0.0] * len(covers),
+        aim=Aim(left_max_m2=0.0, doubled_s_m2=1000.0),
+    )  # fmt: skip
+    taken: set[int] = set()
+    for _ in range(400):
+        line = draw.randrange(len(covers))
+        if line in taken:
+            state.drop(line)
+        else:
+            state.add(line)
+        taken ^= {line}
+        times = covers[sorted(taken)].sum(axis=0)
+        bare, doubled = int((times == 0).sum()), int(np.maximum(times - 1, 0).sum())
+        assert state.value_s() == pytest.approx(4.0 * bare + 1000.0 * doubled)
+        bared = state._drawn(draw, [])
+        assert (bared is None) == (bare == 0)
+        if bared is not None:
+            assert covers[bared][times == 0].any()

@@ -1,6 +1,6 @@
 """A map as a picture: rates in colours, with legend, north and a scale.
 
-With `picture_ground` and `picture_legend` all that needs matplotlib here (extra `plot`). Drawn is
+With `ground` all that needs matplotlib here (extra `plot`), imported when it is asked for. Drawn is
 what would be sprayed: the default rate as ground of its own, nothing beyond the map's boundary.
 """
 
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.errors import ShapelyError
 
 from companion.core.frame import LocalFrame
@@ -26,17 +27,11 @@ from missions.maps.totals import Totals, as_sprayed, totals
 from missions.maps.whole_file import write_whole
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
-from matplotlib.artist import Artist
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from numpy.typing import NDArray
-
-from missions.maps.picture.ground import BARE, HATCH, LINE, Colours
+    from missions.maps.picture.ground import Colours
 
 SUFFIXES = (".png", ".svg", ".pdf")
 # 1600 by 1200 pixels at most; the map's own part of them, and what legend and title take.
@@ -277,6 +272,11 @@ def draw_legend(
     boundary: bool,
 ) -> None:
     """Write what the colours mean, and the ground and the litres of each rate."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    from missions.maps.picture.ground import BARE, HATCH, LINE
+
     shown = found.rates_l_ha >= 0.0 if colours.are_listed else found.rates_l_ha == 0.0
     shades = colours(found.rates_l_ha[shown]).tolist()
     handles: list[Artist] = []
