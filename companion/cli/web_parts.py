@@ -64,6 +64,12 @@ def build_page(
         "tls_key": key,
         "way_file": str(config.resolve(config.journal.folder).resolve() / WAY_NAME),
         "doctor": _doctor(config, given),
+        "host": {
+            "folder": str(config.resolve(config.link.state_folder).resolve()),
+            "config": _config_words(config, given),
+            "upload_link": web.upload_link or "",
+            "journals": str(config.resolve(config.journal.folder).resolve()),
+        },
         "version": version("vrspray"),
     }
     for line in invitation(config, doors, tokens):
@@ -86,10 +92,14 @@ def _doctor(config: Config, given: Sequence[str]) -> list[str]:
     """Return the command whose checks the page shows; none where it would want our own lines."""
     if config.output.kind == "gpio" or config.reads_sensors:
         return []
-    overrides = [word for item in given for word in ("--set", item)]
-    file = str(config.path.resolve())
     command = [sys.executable, "-m", "companion", "doctor", "--no-link", "--json"]
-    return [*command, "--config", file, *overrides]
+    return [*command, *_config_words(config, given)]
+
+
+def _config_words(config: Config, given: Sequence[str]) -> list[str]:
+    """Return the arguments by which a command has the configuration of this run."""
+    overrides = [word for item in given for word in ("--set", item)]
+    return ["--config", str(config.path.resolve()), *overrides]
 
 
 def _tls_files(config: Config) -> tuple[str, str]:

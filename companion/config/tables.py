@@ -391,6 +391,10 @@ class WebTable(Table):
     session_hours: float = Field(
         default=12.0, ge=0.1, le=720, description="how long a phone stays logged in"
     )
+    upload_link: Text | None = Field(
+        default=None,
+        description="second link to the autopilot, by which the page uploads missions",
+    )
     tls_certificate: Text | None = Field(default=None, description="PEM file; with tls_key: https")
     tls_key: Text | None = Field(default=None, description="PEM file of its private key")
 

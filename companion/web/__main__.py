@@ -19,6 +19,7 @@ import uvicorn
 
 from companion.web.guard import Doors, Guard, Tokens
 from companion.web.live import Live
+from companion.web.parts import registered, uploads
 from companion.web.ring import RingReader
 from companion.web.server import Guarded, Orders, Site, build_app
 
@@ -50,9 +51,10 @@ async def _serve(
     live = Live(about, way_file=Path(way) if way else None, utc_s=time.time())
     orders = Orders(socket.socket(fileno=orders_fd))
     doors = Doors(is_local=about["is_local"], names=tuple(about["names"]))
-    guard = Guard(doors=doors, tokens=Tokens(**about["tokens"]))
+    parts = registered()
+    guard = Guard(doors=doors, tokens=Tokens(**about["tokens"]), uploads=uploads(parts))
     site = Site(live, orders, guard, about)
-    app = Guarded(build_app(site), guard, ancestors=tuple(about["frame_ancestors"]))
+    app = Guarded(build_app(site, parts), guard, ancestors=tuple(about["frame_ancestors"]))
     server = uvicorn.Server(
         uvicorn.Config(
             app,

@@ -252,6 +252,12 @@ class Guard:
 
     doors: Doors
     tokens: Tokens
+    # Below these paths a body is a file, whose size its own handler limits.
+    uploads: tuple[str, ...] = ()
+
+    def is_upload(self, path: str) -> bool:
+        """Return whether the body of a POST is a file."""
+        return path.startswith(self.uploads)
 
     def scope_of(self, asked: Asked, now_s: float) -> Scope:
         """Return what a request may do, by its token or its session."""
@@ -293,6 +299,10 @@ class Guard:
         elif asked.header("authorization") is None and asked.path not in _NO_ORIGIN:
             return 403, "an order needs an Origin, or a token as Authorization: Bearer"
         kind = (asked.header("content-type") or "").partition(";")[0].strip().lower()
-        if kind != "application/json":
+        if self.is_upload(asked.path):
+            # Like JSON it is none of the types that another page's form can send.
+            if kind != "application/octet-stream":
+                return 415, "a file is bytes; send Content-Type: application/octet-stream"
+        elif kind != "application/json":
             return 415, "an order is JSON; send Content-Type: application/json"
         return None

@@ -271,7 +271,8 @@ class Live:
         self._meter: list[tuple[float, float]] = []
         self._file: IO[str] | None = None
         self.way_id = round(utc_s, 1)
-        self._key = f"{ground['sha256']} {len(valves)}"
+        # Water and dry runs have a way of their own: it is not what the product covered.
+        self._key = f"{ground['sha256']} {len(valves)} {about['facts']['training']}"
         if way_file is not None:
             self._resume(way_file, utc_s)
 

@@ -14,12 +14,12 @@ import secrets
 import socket
 import time
 from asyncio.subprocess import DEVNULL, PIPE
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import FastAPI, HTTPException, Query, Request, Response
+from fastapi import APIRouter, FastAPI, HTTPException, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
@@ -28,6 +28,7 @@ from starlette.types import Scope as Connection
 
 from companion.web.guard import API, COOKIE, Asked, Failures, Guard, Scope, session
 from companion.web.live import Live, map_parts
+from companion.web.parts import Host, Part
 
 STATIC = Path(__file__).parent / "static"
 STATE_S = 0.2  # 5 Hz
@@ -202,7 +203,7 @@ class Guarded:
 
         asked = asked_of(scope)
         refusal = self._guard.refusal(asked, time.time())
-        if refusal is None and asked.method == "POST":
+        if refusal is None and asked.method == "POST" and not self._guard.is_upload(asked.path):
             body = await _body(receive)
             if body is None:
                 refusal = 413, f"a request has at most {BODY_BYTES_MAX} bytes"
@@ -287,8 +288,9 @@ class Site:
         self.ground_gzip, self.zones_gzip, self.places_gzip = map(_packed, map_parts(about["map"]))
         self.facts: dict[str, Any] = about["facts"]
         self.version = str(about["version"])
-        self._files: dict[str, tuple[bytes, str]] = {}
+        self._files: dict[Path, tuple[bytes, str]] = {}
         self._news = asyncio.Event()
+        self.host: dict[str, Any] = about["host"]
         self._doctor: list[str] = about["doctor"]
         self._checks: list[dict[str, Any]] = []
         self._checked_s = float("-inf")
@@ -343,15 +345,22 @@ class Site:
             since, sent_version, sent_s = until, live.version, now_s
             yield f"id: {since}\ndata: {json.dumps(event, separators=(',', ':'))}\n\n".encode()
 
-    def file(self, name: str) -> tuple[bytes, str] | None:
+    def file(self, folder: Path, name: str) -> tuple[bytes, str]:
         """Return a file of the page, compressed, and its type; read once and kept."""
-        if name not in self._files:
-            path = (STATIC / name).resolve()
+        path = (folder / name.replace("\0", "/")).resolve()
+        if path not in self._files:
             kind = _TYPES.get(path.suffix)
-            if kind is None or not path.is_relative_to(STATIC.resolve()) or not path.is_file():
-                return None
-            self._files[name] = (gzip.compress(path.read_bytes(), 6), kind)
-        return self._files[name]
+            if kind is None or not path.is_relative_to(folder.resolve()) or not path.is_file():
+                raise HTTPException(404, "not found")
+            self._files[path] = (gzip.compress(path.read_bytes(), 6), kind)
+        return self._files[path]
+
+    def flying(self) -> str | None:
+        """Return why nothing may be worked out beside the flight now; None on the ground."""
+        vehicle = self.live.state.get("vehicle") or {}
+        if vehicle.get("in_air"):
+            return "the vehicle is in the air: wait until it has landed and is disarmed"
+        return "the vehicle is armed: disarm it first" if vehicle.get("armed") else None
 
 
 def _packed(item: object) -> bytes:
@@ -402,8 +411,8 @@ async def _unusable(_request: Request, error: Exception) -> Response:
     return JSONResponse({"detail": f"{where[:80]}: {text[:200]}"}, 422)
 
 
-def build_app(site: Site) -> FastAPI:
-    """Return the application; `Guarded` belongs around it."""
+def build_app(site: Site, parts: Mapping[str, Part] | None = None) -> FastAPI:
+    """Return the application with its further parts; `Guarded` belongs around it."""
     app = FastAPI(
         title="vrspray operator's page",
         version=site.version,
@@ -417,6 +426,8 @@ def build_app(site: Site) -> FastAPI:
     _add_sessions(app, site)
     _add_orders(app, site)
     _add_files(app, site)
+    for name, part in (parts or {}).items():
+        _add_part(app, site, name, part)
     return app
 
 
@@ -559,14 +570,20 @@ def _add_files(app: FastAPI, site: Site) -> None:
 
     @app.get("/", include_in_schema=False)
     async def index(request: Request) -> Response:
-        found = site.file("index.html")
-        if found is None:
-            raise HTTPException(404, "not found")
-        return _compressed(request, *found)
+        return _compressed(request, *site.file(STATIC, "index.html"))
 
     @app.get("/static/{name:path}", include_in_schema=False)
     async def static(name: str, request: Request) -> Response:
-        found = None if "\0" in name else site.file(name)
-        if found is None:
-            raise HTTPException(404, "not found")
-        return _compressed(request, *found)
+        return _compressed(request, *site.file(STATIC, name))
+
+
+def _add_part(app: FastAPI, site: Site, name: str, part: Part) -> None:
+    """Add what another package registered: its files at NAME/, its interface at api/v1/NAME/."""
+    router = APIRouter(prefix=f"{API}{name}", tags=[name], responses=_REFUSED)
+    part.add(router, Host(flying=site.flying, **site.host))
+    app.include_router(router)
+    site.facts.setdefault("parts", []).append({"name": name, "title": part.title})
+
+    @app.get(f"/{name}/{{file:path}}", include_in_schema=False)
+    async def file(file: str, request: Request) -> Response:
+        return _compressed(request, *site.file(part.static, file or "index.html"))

@@ -14,10 +14,11 @@ from tests.companion.web_site import OPERATE, served
 
 @pytest.mark.timeout(240)
 async def test_no_request_makes_the_page_fail(tmp_path: Path) -> None:
-    async with served(is_local=False) as site:
+    async with served(tmp_path, is_local=False) as site:
         place = f"http://127.0.0.1:{site.port}"
         schema = await site.asked("GET", "/api/v1/openapi.json")
-        assert set(schema.json["paths"]) >= {"/api/v1/stop", "/api/v1/enable", "/api/v1/state"}
+        names = ("stop", "enable", "state", "office/plan", "office/files/{name}")
+        assert set(schema.json["paths"]) >= {f"/api/v1/{name}" for name in names}
         process = await asyncio.create_subprocess_exec(
             *(str(Path(sys.executable).with_name("st")), "run", f"{place}/api/v1/openapi.json"),
             *("--checks", "not_a_server_error", "--max-examples", "10", "--seed", "1"),

@@ -440,6 +440,23 @@ def test_the_page_notes_a_filling() -> None:
     assert component.tank_l == 12.5
 
 
+def test_a_dry_run_goes_on_with_no_way_of_a_product(tmp_path: Path) -> None:
+    def of(training: str) -> Live:
+        told = about(facts={"training": training})
+        return Live(told, way_file=tmp_path / "way.jsonl", utc_s=1000.0)
+
+    flown = of("no")
+    for east_m in range(20):
+        flown.take(json.dumps(_frame(float(east_m), float(east_m))).encode())
+    flown.close()
+    assert flown.way.points
+    again, dry = of("no"), of("dry")
+    assert len(again.way.points) == len(flown.way.points)
+    assert not dry.way.points
+    for one in (again, dry):
+        one.close()
+
+
 def test_a_port_that_is_taken_is_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.web.page.BIND_TRIES_S", 0.0)
     said = r"web\.port: cannot listen .* in use; write another"

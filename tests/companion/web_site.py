@@ -67,7 +67,7 @@ class Site:
         host: str | None = None,
     ) -> Reply:
         """Ask over a new connection; a POST comes from the page itself, unless told otherwise."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30.0)
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=250.0)
         given = {"Host": f"127.0.0.1:{self.port}" if host is None else host}
         data = None
         if method == "POST":
@@ -112,6 +112,12 @@ def about(folder: Path | None = None, **change: object) -> dict[str, Any]:
         "tls_key": "",
         "way_file": "" if folder is None else str(folder / "page-track.jsonl"),
         "doctor": [],
+        "host": {
+            "folder": str(folder or "/dev/null"),
+            "config": [],
+            "upload_link": "",
+            "journals": "",
+        },
         "version": "1.2.3",
     }
     return found | change

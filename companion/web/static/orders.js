@@ -3,8 +3,9 @@
 const ANSWER_MS = 2500;
 const STOP_TRIES = 6;
 
+// Relative to this file: a part of the page below it stops as well as the page itself.
 async function post(name, body = {}) {
-  const response = await fetch(`api/v1/${name}`, {
+  const response = await fetch(new URL(`../api/v1/${name}`, import.meta.url), {
     method: "POST",
     headers: { "Content-Type": "application/json" },
     body: JSON.stringify(body),
@@ -16,6 +17,23 @@ async function post(name, body = {}) {
   return answer;
 }
 
+export function stopping(button, say) {
+  let touched = -Infinity; // a key in the first second counts, too
+  const stop = async () => {
+    for (let k = 0; k < STOP_TRIES; k += 1) {
+      try {
+        const answer = await post("stop");
+        if (answer.accepted) { say(answer.text); return; }
+      } catch { /* tried again */ }
+      say("STOP NOT CONFIRMED: use the transmitter's switch!", true);
+      await new Promise((resolve) => setTimeout(resolve, 300));
+    }
+  };
+  // At the touch itself, not when the finger is lifted; a click remains for the keyboard.
+  button.addEventListener("pointerdown", (event) => { if (event.button === 0) { touched = performance.now(); stop(); } });
+  button.addEventListener("click", () => { if (performance.now() - touched > 1000) stop(); });
+}
+
 export class Orders {
   constructor(say) {
     this.say = say;
@@ -24,7 +42,7 @@ export class Orders {
     this.enableButton = document.getElementById("enable");
     this.disableButton = document.getElementById("disable");
     this.refill = document.getElementById("refill");
-    this.stops();
+    stopping(this.stopButton, say);
     this.holds();
     this.disableButton.addEventListener("click", () => this.give("disable"));
   }
@@ -38,23 +56,6 @@ export class Orders {
       this.say(error.name === "TimeoutError" ? "No answer from the companion." : error.message, true);
       return false;
     }
-  }
-
-  stops() {
-    let touched = -Infinity; // a key in the first second counts, too
-    const stop = async () => {
-      for (let k = 0; k < STOP_TRIES; k += 1) {
-        try {
-          const answer = await post("stop");
-          if (answer.accepted) { this.say(answer.text); return; }
-        } catch { /* tried again */ }
-        this.say("STOP NOT CONFIRMED: use the transmitter's switch!", true);
-        await new Promise((resolve) => setTimeout(resolve, 300));
-      }
-    };
-    // At the touch itself, not when the finger is lifted; a click remains for the keyboard.
-    this.stopButton.addEventListener("pointerdown", (event) => { if (event.button === 0) { touched = performance.now(); stop(); } });
-    this.stopButton.addEventListener("click", () => { if (performance.now() - touched > 1000) stop(); });
   }
 
   holds() {

@@ -118,6 +118,12 @@ async function begin() {
   begun = performance.now();
   feed.open();
   [facts, ground] = await Promise.all([json("api/v1/facts"), json("api/v1/map")]);
+  byId("parts").replaceChildren(...(facts.parts ?? []).map(({ name, title }) => {
+    const link = document.createElement("a");
+    link.href = `${name}/`;
+    link.textContent = title;
+    return link;
+  }));
   show();
   await map.load(ground, document.documentElement.dataset.theme);
   document.body.dataset.map = "ready";

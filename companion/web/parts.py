@@ -1,0 +1,73 @@
+"""More parts of the page, which other packages announce by entry points.
+
+Nobody here knows who they are: a distribution names its parts in the group `vrspray.web`. A part
+runs in the page's process, on the ground only, and must leave what computes or reads strangers'
+files to a child of that process.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from companion.web.guard import API
+
+if TYPE_CHECKING:
+    from fastapi import APIRouter
+
+_logger = logging.getLogger(__name__)
+
+GROUP = "vrspray.web"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Host:
+    """What the page gives to a part.
+
+    `folder`: where it may keep files. `config`: arguments that name the configuration of the
+    flight. `upload_link`: a second link to the autopilot, or nothing. `journals`: their folder.
+    `flying`: why nothing may be begun now.
+    """
+
+    folder: str
+    config: tuple[str, ...] | list[str]
+    upload_link: str
+    journals: str
+    flying: Callable[[], str | None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """A part of the page: a title for its link, its files, and what adds its interface.
+
+    `files_at` is the path below its interface at which the body of a POST is a file.
+    """
+
+    title: str
+    static: Path
+    add: Callable[[APIRouter, Host], None]
+    files_at: str | None = None
+
+
+def registered() -> dict[str, Part]:
+    """Return the parts that are installed, by their names; one that cannot be loaded is missing."""
+    found: dict[str, Part] = {}
+    for point in entry_points(group=GROUP):
+        try:
+            part = point.load()
+        except (ImportError, AttributeError) as error:
+            _logger.warning("the page has no %s: %s", point.name, error)
+            continue
+        if isinstance(part, Part) and point.name.isidentifier():
+            found[point.name] = part
+    return dict(sorted(found.items()))
+
+
+def uploads(parts: Mapping[str, Part]) -> tuple[str, ...]:
+    """Return the paths below which the body of a POST is a file."""
+    pairs = ((name, part.files_at) for name, part in parts.items())
+    return tuple(f"{API}{name}/{place}/" for name, place in pairs if place)

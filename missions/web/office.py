@@ -1,0 +1,464 @@
+"""The office's interface: files come in, are checked and planned by children, and go out.
+
+No file of a stranger is read here: each is handed to `vrspray` itself in a child process with
+limits of time and memory, whose one line of refusal is the answer. One child runs at a time, at low
+priority, and it ends when the vehicle is armed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, HTTPException, Request, Response
+from fastapi.responses import FileResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from companion.web.parts import Host, Part
+
+FILE_BYTES_MAX, ALL_BYTES_MAX, FILES_MAX = 64_000_000, 256_000_000, 60
+# What is left for the journals of flights.
+FREE_MIN_BYTES = 500_000_000
+RECEIVE_WITHIN_S = 300.0
+# A file is a name, never a path; what it may hold is the readers' to say.
+NAME = re.compile(r"\w[\w .()+-]{0,79}")
+NAME_BYTES_MAX = 200
+SUFFIXES = (
+    *(".shp", ".shx", ".dbf", ".prj", ".cpg", ".geojson", ".json", ".gpkg", ".kml", ".kmz"),
+    *(".xml", ".bin", ".tif", ".tiff", ".parquet", ".geoparquet", ".csv", ".txt", ".zip"),
+)
+MEMORY_MAX_BYTES = 2_000_000_000
+OUTPUT_MAX_BYTES = 256_000_000
+SAID_MAX_BYTES = 4_000_000
+# Seconds of computing, and of waiting.
+TIMES: dict[str, tuple[int, float]] = {"check": (60, 180.0), "plan": (300, 900.0)}
+# As `vrspray` lowers itself where it is patient: in all, whatever the page has already.
+NICENESS = 5
+UPLOAD_S = (60, 120.0)
+LOOK_S = 0.25
+_PR_SET_PDEATHSIG = 1
+_LIBC = ctypes.CDLL(None)
+_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "ARROW_NUM_THREADS")
+
+Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", max_length=80)]
+Places = Annotated[list[Name], Field(max_length=8)]
+
+
+class _Body(BaseModel):
+    """A request's own small JSON: nothing unknown is in it."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class Reading(_Body):
+    """What a file does not say of itself, as `vrspray map check` takes it."""
+
+    rate_field: Annotated[str, Field(max_length=60)] | None = None
+    unit: Annotated[str, Field(max_length=30)] | None = None
+    crs: Annotated[str, Field(max_length=60)] | None = None
+    layer: Annotated[str, Field(max_length=60)] | None = None
+
+    def words(self) -> list[str]:
+        """Return the arguments that say so; a value never reads as an option."""
+        given = self.model_dump(include=set(Reading.model_fields), exclude_none=True)
+        return [f"--{key.replace('_', '-')}={value}" for key, value in given.items() if value]
+
+
+class Check(Reading):
+    """A prescription map to look at."""
+
+    file: Name
+
+
+class Planning(Reading):
+    """What to plan; what is left out comes from the configuration of the flight."""
+
+    field: Name
+    prescription: Name | None = None
+    no_spray: Places = []
+    obstacle: Places = []
+    rate_l_ha: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
+    swath_m: Annotated[float, Field(gt=0.0, le=100.0)] | None = None
+    speed_m_s: Annotated[float, Field(gt=0.0, le=30.0)] | None = None
+    tank_l: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
+    border_m: Annotated[float, Field(ge=0.0, le=50.0)] | None = None
+    angle_deg: Annotated[float, Field(ge=0.0, lt=360.0)] | None = None
+    depot: tuple[float, float] | None = None
+    kind: Literal["plan", "waypoints"] = "plan"
+
+    def settings(self) -> list[str]:
+        """Return the arguments of the plan's settings."""
+        names = ("rate_l_ha", "swath_m", "speed_m_s", "tank_l", "border_m", "angle_deg")
+        given = self.model_dump(include=set(names), exclude_none=True)
+        words = [f"--{key.replace('_', '-')}={value:g}" for key, value in given.items()]
+        return words if self.depot is None else [*words, f"--depot={self.depot[0]},{self.depot[1]}"]
+
+
+class Sent(_Body):
+    """The planned sortie to put on the vehicle."""
+
+    file: Name
+
+
+class Named(_Body):
+    """A file that came in."""
+
+    file: Name
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a command of ours said: its JSON, or the one line in which it refused."""
+
+    found: dict[str, Any]
+    error: str | None
+
+
+@dataclass(slots=True)
+class Office:
+    """The files of one field, and the child that works on them."""
+
+    host: Host
+    given: Path = field(init=False)
+    made: Path = field(init=False)
+    task: str | None = None
+    results: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Name the folders; they are made when the first file comes."""
+        self.given = Path(self.host.folder) / "office" / "given"
+        self.made = self.given.with_name("made")
+        for part in self.given.parent.glob("*.part"):  # of a page that was ended
+            part.unlink(missing_ok=True)
+
+    def state(self) -> dict[str, Any]:
+        """Return what is there, what was found in it, and why nothing can be done now."""
+        return {
+            "files": _listed(self.given),
+            "made": _listed(self.made),
+            "not_now": self.host.flying(),
+            "task": self.task,
+            "uploads": bool(self.host.upload_link),
+            **self.results,
+        }
+
+    def path(self, name: str) -> Path:
+        """Return a file that came in; a 404 where it is not there."""
+        path = self.given / name
+        if not _is_name(name) or not path.is_file():
+            raise HTTPException(404, f"{name}: not among the files; load it first")
+        return path
+
+    async def receive(self, name: str, request: Request) -> None:
+        """Write a file as it comes, within the limits of the office."""
+        self.refuse_now()
+        if not _is_name(name) or Path(name).suffix.lower() not in SUFFIXES:
+            raise HTTPException(422, f"{name[:80]}: not the name of a map; takes {_kinds()}")
+        part = self.given.with_name(f"{os.urandom(8).hex()}.part")
+        try:
+            room = self._room(name)
+            async with asyncio.timeout(RECEIVE_WITHIN_S):
+                await _written(part, name, request, room)
+            part.replace(self.given / name)
+        except TimeoutError as error:
+            raise HTTPException(408, f"{name}: came too slowly; try again") from error
+        except OSError as error:
+            reason = (error.strerror or "cannot be written").lower()
+            raise HTTPException(413, f"{name}: not kept on this computer: {reason}") from error
+        finally:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+        self.results.clear()
+
+    def _room(self, name: str) -> int:
+        """Return how many bytes a file may have; a 413 where there is no room for it."""
+        self.given.mkdir(parents=True, exist_ok=True, mode=0o700)
+        others = [path for path in self.given.iterdir() if path.name != name]
+        room = ALL_BYTES_MAX - sum(path.stat().st_size for path in others)
+        room = min(room, FILE_BYTES_MAX, shutil.disk_usage(self.given).free - FREE_MIN_BYTES)
+        if len(others) >= FILES_MAX or room <= 0:
+            raise HTTPException(413, "no room for more files: remove some")
+        return room
+
+    def refuse_now(self) -> None:
+        """Refuse while the vehicle is armed or a child works: a 409 with the reason."""
+        reason = self.host.flying()
+        if reason is None and self.task is not None:
+            reason = f"busy: {self.task}; wait until it is done"
+        if reason is not None:
+            raise HTTPException(409, reason)
+
+    # ------------------------------------------------------------------------- what is worked out
+
+    async def check(self, asked: Check) -> dict[str, Any]:
+        """Return what `map check` finds, and have the zones written for the page's map."""
+        self.refuse_now()
+        self.path(asked.file)
+        file, words = f"given/{asked.file}", asked.words()
+        zones = self.made / "zones.geojson"
+        with self._working("check", "zones.geojson"):
+            checked = await self.run("check", ["map", "check", file, *words, "--json"])
+            if checked.error is None:
+                out = "made/zones.geojson"
+                await self.run("check", ["map", "convert", file, out, *words, "--json"])
+            self.results["check"] = {
+                "file": asked.file, "error": checked.error, "found": checked.found,
+                "zones": zones.is_file(),
+            }  # fmt: skip
+        return self.state()
+
+    async def plan(self, asked: Planning) -> dict[str, Any]:
+        """Plan the field, and compile its flight map where there is a prescription."""
+        self.refuse_now()
+        named = [asked.field, *asked.no_spray, *asked.obstacle]
+        for name in [*named, *([asked.prescription] if asked.prescription else [])]:
+            self.path(name)
+        with self._working("plan", "field*", "sheet.html"):
+            out = f"made/field.{asked.kind}"
+            planned = await self.run("plan", [*_plan_words(asked, self.host, out), "--json"])
+            error, found = planned.error, planned.found
+            flight_map = None
+            if error is None and asked.prescription and self.host.config:
+                flight_map = await self._compiled(asked, found.get("lines_file"))
+            self.results["plan"] = {
+                "error": error, "found": found, "flight_map": flight_map,
+                "files": [Path(path).name for path in found.get("files", [])],
+            }  # fmt: skip
+        return self.state()
+
+    async def _compiled(self, asked: Planning, lines: str | None) -> dict[str, Any]:
+        """Compile the flight map of what was planned, by the configuration of the flight."""
+        folder = self.given.parent.resolve()
+        sets: dict[str, Path | str] = {
+            "prescription.file": folder / "given" / str(asked.prescription),
+            "prescription.boundary": folder / "given" / asked.field,
+            **({"mission.lines": folder / lines} if lines else {}),
+        }
+        sets |= {f"prescription.{key}": value for key, value in _answers(asked).items()}
+        words = [word for key, value in sets.items() for word in ("--set", f"{key}={value}")]
+        file, out = f"given/{asked.prescription}", "made/field.flightmap.gpkg"
+        command = ["map", "compile", file, "--out", out, *self.host.config, *words, "--json"]
+        done = await self.run("plan", command)
+        return {"error": done.error, "problems": done.found.get("problems", [])}
+
+    async def send(self, asked: Sent) -> dict[str, Any]:
+        """Put a planned sortie on the vehicle by the office's second link, and read it back."""
+        self.refuse_now()
+        if not self.host.upload_link:
+            raise HTTPException(409, "web.upload_link names no link to the autopilot for uploads")
+        if not (self.made / asked.file).is_file():
+            raise HTTPException(404, f"{asked.file}: not planned here; plan first")
+        with self._working("upload"):
+            words = ["upload", f"made/{asked.file}", "--link", self.host.upload_link, "--json"]
+            done = await self.run("upload", words)
+            self.results["upload"] = {"file": asked.file, "error": done.error, "found": done.found}
+        return self.state()
+
+    @contextmanager
+    def _working(self, task: str, *stale: str) -> Iterator[None]:
+        """Be busy with a task, whose earlier results are removed."""
+        self.task = task
+        try:
+            self.results.pop(task, None)
+            self.results.pop("upload", None)
+            self.made.mkdir(parents=True, exist_ok=True, mode=0o700)
+            for path in [path for name in stale for path in self.made.glob(name)]:
+                path.unlink()
+            yield
+        finally:
+            self.task = None
+
+    async def run(self, task: str, words: Sequence[str]) -> Outcome:
+        """Run a command of ours within limits; it ends when the vehicle is armed."""
+        cpu_s, wait_s = TIMES.get(task, UPLOAD_S)
+        folder = self.given.parent
+        out, err = (folder / f"{name}.said" for name in ("out", "err"))
+        environment = {
+            **{key: os.environ[key] for key in ("PATH", "HOME", "PYTHONPATH") if key in os.environ},
+            **dict.fromkeys(_THREADS, "1"), "MALLOC_ARENA_MAX": "2", "NO_COLOR": "1",
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }  # fmt: skip
+        with out.open("wb") as said, err.open("wb") as told:
+            child = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "companion", *words), cwd=folder, env=environment,
+                stdin=asyncio.subprocess.DEVNULL, stdout=said, stderr=told,
+                start_new_session=True, preexec_fn=partial(_limit, cpu_s, os.getpid()),
+            )  # fmt: skip
+        ended = await self._ended(child, wait_s)
+        if ended is not None:
+            return Outcome({}, ended)
+        found = _json_of(out)
+        error = found.get("error") or found.get("text")
+        if child.returncode in (0, 1) and error is None and found:
+            return Outcome(found, None)
+        return Outcome(found, str(error or _why(err, child.returncode or 0, cpu_s)).strip())
+
+    async def _ended(self, child: asyncio.subprocess.Process, wait_s: float) -> str | None:
+        """Wait for a child; return why it had to be ended, if it had to be."""
+        until_s = time.monotonic() + wait_s
+        reason, is_over = None, False
+        while not is_over and reason is None:
+            try:
+                await asyncio.wait_for(child.wait(), LOOK_S)
+                is_over = True
+            except TimeoutError:
+                reason = self.host.flying()
+                if reason is None and time.monotonic() > until_s:
+                    reason = f"took longer than {wait_s:.0f} s: ended; use a simpler file"
+        with suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)  # it may have children of its own
+        await child.wait()
+        return reason
+
+
+async def _written(part: Path, name: str, request: Request, room: int) -> None:
+    """Write a request's body into a file; a 413 where it is larger than there is room."""
+    size = 0
+    with part.open("xb") as file:
+        async for data in request.stream():
+            size += len(data)
+            if size > room:
+                raise HTTPException(413, f"{name}: larger than {room / 1e6:.0f} MB")
+            await asyncio.to_thread(file.write, data)
+
+
+def _limit(cpu_s: int, parent: int) -> None:
+    """Limit a child, in the child: memory, computing, files; it ends with its parent."""
+    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+    os.nice(NICENESS)
+    for limit, most in (
+        (resource.RLIMIT_AS, MEMORY_MAX_BYTES),
+        (resource.RLIMIT_CPU, cpu_s),
+        (resource.RLIMIT_FSIZE, OUTPUT_MAX_BYTES),
+        (resource.RLIMIT_CORE, 0),
+    ):
+        resource.setrlimit(limit, (most, most))
+
+
+def _why(err: Path, code: int, cpu_s: int) -> str:
+    """Return in one line why a command ended without an answer."""
+    if code in (-signal.SIGXCPU, -signal.SIGKILL):
+        return f"took more than {cpu_s} s of computing: ended; use a simpler file"
+    said = err.read_bytes()[-SAID_MAX_BYTES:].decode("utf-8", "replace").splitlines()
+    lines = [line for line in said if line.startswith("error: ")]
+    if lines:
+        return lines[-1].removeprefix("error: ")
+    if any("MemoryError" in line for line in said[-3:]) or code < 0:
+        return f"needs more than {MEMORY_MAX_BYTES / 1e9:.0f} GB of memory; use a simpler file"
+    return said[-1][:300] if said else f"ended with exit code {code}"
+
+
+def _json_of(path: Path) -> dict[str, Any]:
+    """Return the one JSON object that a command printed; nothing where it did not."""
+    with path.open("rb") as file:
+        data = file.read(SAID_MAX_BYTES)
+    with suppress(ValueError):
+        found = json.loads(data)
+        return found if isinstance(found, dict) else {}
+    return {}
+
+
+def _answers(asked: Planning) -> dict[str, str]:
+    """Return what the configuration's prescription table says of the map's file."""
+    given = asked.model_dump(include={"rate_field", "unit", "crs", "layer"}, exclude_none=True)
+    return {key: value for key, value in given.items() if value}
+
+
+def _plan_words(asked: Planning, host: Host, out: str) -> list[str]:
+    words = ["plan", f"given/{asked.field}", "--out", out, "--force", "--sheet", "made/sheet.html"]
+    if asked.prescription:
+        words += ["--prescription", f"given/{asked.prescription}"]
+    for option in ("no_spray", "obstacle"):
+        for name in getattr(asked, option):
+            words += [f"--{option.replace('_', '-')}", f"given/{name}"]
+    return [*words, *asked.settings(), *asked.words(), *host.config[:2]]
+
+
+def _is_name(name: str) -> bool:
+    return NAME.fullmatch(name) is not None and len(os.fsencode(name)) <= NAME_BYTES_MAX
+
+
+def _kinds() -> str:
+    return ", ".join(SUFFIXES)
+
+
+def _listed(folder: Path) -> list[dict[str, Any]]:
+    if not folder.is_dir():
+        return []
+    paths = sorted(path for path in folder.iterdir() if path.is_file())
+    return [{"name": path.name, "bytes": path.stat().st_size} for path in paths]
+
+
+def add(router: APIRouter, host: Host) -> None:
+    """Add the office's interface to the page."""
+    office = Office(host)
+    busy: dict[int | str, dict[str, Any]] = {
+        404: {"description": "no such file"},
+        409: {"description": "the vehicle is armed, or a file is being worked on"},
+    }
+
+    @router.get("")
+    async def state() -> dict[str, Any]:
+        """Return the files, what was found in them, and why nothing can be done now."""
+        return office.state()
+
+    @router.post("/files/{name}", responses=busy | {408: {"description": "too slow"}})
+    async def load(name: str, request: Request) -> dict[str, Any]:
+        """Take a file; its body is the file itself."""
+        await office.receive(name, request)
+        return office.state()
+
+    @router.post("/remove", responses=busy)
+    async def remove(named: Named) -> dict[str, Any]:
+        """Remove a file that came in."""
+        office.refuse_now()
+        office.path(named.file).unlink()
+        office.results.clear()
+        return office.state()
+
+    @router.post("/check", responses=busy)
+    async def check(asked: Check) -> dict[str, Any]:
+        """Read a prescription map in a child, and return what is in it and wrong with it."""
+        return await office.check(asked)
+
+    @router.post("/plan", responses=busy)
+    async def plan(asked: Planning) -> dict[str, Any]:
+        """Plan in a child, and return sorties, litres and files."""
+        return await office.plan(asked)
+
+    @router.post("/upload", responses=busy)
+    async def upload(asked: Sent) -> dict[str, Any]:
+        """Put a planned sortie on the vehicle, and verify it by reading it back."""
+        return await office.send(asked)
+
+    @router.get("/{place}/{name}", responses=busy, response_class=Response)
+    async def file(place: Literal["given", "made"], name: str) -> Response:
+        """Return a file; browsers keep it, and never show it as a page."""
+        path = (office.given if place == "given" else office.made) / name
+        if not _is_name(name) or not path.is_file():
+            raise HTTPException(404, "no such file")
+        return FileResponse(
+            path, filename=name, media_type="application/octet-stream",
+            headers={"Content-Security-Policy": "default-src 'none'; sandbox"},
+        )  # fmt: skip
+
+
+PART = Part(
+    title="Field and plan", static=Path(__file__).parent / "static", add=add, files_at="files"
+)

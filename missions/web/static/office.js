@@ -1,0 +1,230 @@
+// The office on the page: files in, the map's check, areas drawn, the plan, and what to do with it.
+
+import { stopping } from "../static/orders.js";
+import { OfficeMap } from "./office-map.js";
+
+const API = "../api/v1/";
+const byId = (id) => document.getElementById(id);
+const ROLES = { boundary: "drawn-boundary.geojson", "no-spray": "drawn-no-spray.geojson" };
+let state = { files: [], made: [] }, corners = [], role = null;
+
+function make(tag, text, className) {
+  const element = document.createElement(tag);
+  if (text !== undefined) element.textContent = text;
+  if (className) element.className = className;
+  return element;
+}
+
+let saying = 0;
+function say(what, isTrouble = false) {
+  const box = byId("answer");
+  box.textContent = what;
+  box.hidden = false;
+  clearTimeout(saying);
+  saying = setTimeout(() => { box.hidden = true; }, isTrouble ? 8000 : 3000);
+}
+
+async function ask(place, body, kind = "application/json") {
+  const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": kind }, body: kind === "application/json" ? JSON.stringify(body) : body };
+  const response = await fetch(`${API}${place}`, { credentials: "same-origin", ...options });
+  const answer = await response.json().catch(() => ({}));
+  if (!response.ok) throw new Error(typeof answer.detail === "string" ? answer.detail : `refused (${response.status})`);
+  return answer;
+}
+
+// One thing at a time; what comes back is the whole state of the office.
+async function doing(word, work) {
+  document.body.dataset.busy = word;
+  for (const button of document.querySelectorAll("main button")) button.disabled = true;
+  say(`${word} …`);
+  try {
+    state = await work();
+    say(`${word}: done`);
+  } catch (error) {
+    say(error.message, true);
+    state = await ask("office").catch(() => state);
+  }
+  for (const button of document.querySelectorAll("main button")) button.disabled = false;
+  delete document.body.dataset.busy;
+  show();
+}
+
+function choices(select, names, chosen) {
+  const before = select.multiple ? new Set([...select.selectedOptions].map((one) => one.value)) : new Set([chosen ?? select.value]);
+  select.replaceChildren(...names.map(([value, text]) => { const one = new Option(text, value); one.selected = before.has(value); return one; }));
+}
+
+function showFiles() {
+  byId("files").replaceChildren(...state.files.map((file) => {
+    const item = make("li"), button = make("button", "Remove");
+    button.type = "button";
+    button.setAttribute("aria-label", `Remove ${file.name}`);
+    button.addEventListener("click", () => doing("Removing", () => ask("office/remove", { file: file.name })));
+    item.append(make("span", `${file.name} · ${file.bytes < 1e6 ? `${(file.bytes / 1e3).toFixed(1)} kB` : `${(file.bytes / 1e6).toFixed(1)} MB`}`), button);
+    return item;
+  }));
+  const maps = state.files.map((file) => file.name).filter((name) => !/[.](shx|dbf|prj|cpg|bin)$/i.test(name));
+  const named = maps.map((name) => [name, name]);
+  const has = (text) => maps.find((name) => name.toLowerCase().includes(text));
+  choices(byId("prescription"), [["", "none: one rate"], ...named], byId("prescription").value || has("presc") || "");
+  choices(byId("field"), named, byId("field").value || has("bound") || maps[0]);
+  choices(byId("no_spray"), named);
+}
+
+function refused(text) { return make("p", text, "refused"); }
+
+function showCheck() {
+  const box = byId("check"), check = state.check;
+  if (!check) { box.replaceChildren(); return; }
+  const found = check.found ?? {}, items = (found.problems ?? []).map((one) => make("li", `${one.severity}: ${one.text}${one.fix ? `; ${one.fix}` : ""}`));
+  const list = make("ul");
+  list.append(...items);
+  if (check.error) { box.replaceChildren(refused(check.error)); return; }
+  box.replaceChildren(make("p", `${check.file}: ${found.zones} zones, ${found.area_ha.toFixed(2)} ha, ${found.litres.toFixed(1)} L, ${Math.min(...found.rates_l_ha)} to ${Math.max(...found.rates_l_ha)} L/ha.`), items.length ? list : make("p", "Nothing wrong was found.", "small"));
+}
+
+function sortieTable(found) {
+  const table = make("table"), head = make("tr");
+  head.append(...["Sortie", "Litres", "Fill to", "Minutes", "Passes"].map((text) => { const cell = make("th", text); cell.scope = "col"; return cell; }));
+  table.append(head, ...found.sorties.map((one) => {
+    const row = make("tr");
+    row.append(...[one.number, one.volume_l.toFixed(1), one.fill_l.toFixed(1), (one.flight_s / 60).toFixed(1), one.swaths].map((text) => make("td", String(text))));
+    return row;
+  }));
+  return table;
+}
+
+function showPlan() {
+  const box = byId("plan"), plan = state.plan;
+  if (!plan) { box.replaceChildren(); return; }
+  if (plan.error) { box.replaceChildren(refused(plan.error)); return; }
+  const found = plan.found, parts = [
+    make("p", `${found.sorties.length} ${found.sorties.length === 1 ? "sortie" : "sorties"}, ${found.volume_l.toFixed(1)} L, ${(found.flight_s / 60).toFixed(0)} min; ${found.coverage_percent.toFixed(1)} % covered, ${found.overlap_percent.toFixed(1)} % twice.`),
+    sortieTable(found), ...found.warnings.map((text) => make("p", text, "refused")),
+  ];
+  if (plan.flight_map?.error) parts.push(refused(`flight map: ${plan.flight_map.error}`));
+  const links = make("p");
+  for (const file of state.made) {
+    const link = make("a", file.name);
+    link.href = `${API}office/made/${encodeURIComponent(file.name)}`;
+    link.download = file.name;
+    links.append(link);
+  }
+  parts.push(links);
+  for (const name of state.uploads ? plan.files : []) {
+    const button = make("button", `Upload ${name} to the vehicle`);
+    button.type = "button";
+    button.addEventListener("click", () => doing("Uploading", () => ask("office/upload", { file: name })));
+    parts.push(button);
+  }
+  if (!state.uploads) parts.push(make("p", "To upload from here, set web.upload_link; or load the file into your ground station.", "small"));
+  if (state.upload) parts.push(state.upload.error ? refused(state.upload.error) : make("p", `${state.upload.file}: on the vehicle, read back and the same.`));
+  box.replaceChildren(...parts);
+}
+
+function show() {
+  const box = byId("not-now");
+  box.hidden = !state.not_now;
+  box.textContent = state.not_now ? `Not now: ${state.not_now}.` : "";
+  showFiles(); showCheck(); showPlan();
+  byId("draw-save").disabled = corners.length < 3 || !role;
+  byId("draw-edit").disabled = !byId("field").value.endsWith(".geojson");
+  const lines = state.made.find((file) => file.name.endsWith(".lines.geojson"));
+  const place = (folder, name) => new URL(`${API}office/${folder}/${encodeURIComponent(name)}`, document.baseURI).href;
+  map.showFiles({
+    zones: state.check?.zones ? place("made", "zones.geojson") : null,
+    lines: lines ? place("made", lines.name) : null,
+    field: byId("field").value.endsWith("json") ? place("given", byId("field").value) : null,
+    rates: state.check?.found?.rates_l_ha ?? [],
+  });
+}
+
+function textOf(found) { return found.map(([lng, lat]) => `${lat.toFixed(7)}, ${lng.toFixed(7)}`).join("\n"); }
+
+function cornersOf(text) {
+  return text.split("\n").filter((line) => line.trim()).map((line) => line.split(/[,;\s]+/).filter(Boolean).map(Number))
+    .filter(([lat, lng]) => Math.abs(lat) <= 90 && Math.abs(lng) <= 180).map(([lat, lng]) => [lng, lat]);
+}
+
+function draw(found, isTyped = false) {
+  corners = found;
+  if (!isTyped) byId("corners").value = textOf(found);
+  byId("draw-save").disabled = corners.length < 3 || !role;
+  map.showCorners(corners);
+}
+
+function startDrawing(wanted, found = []) {
+  role = wanted;
+  for (const name of Object.keys(ROLES)) byId(`draw-${name}`).setAttribute("aria-pressed", String(name === role));
+  map.draws = Boolean(role);
+  draw(found);
+}
+
+async function save() {
+  const ring = [...corners, corners[0]];
+  const data = { type: "FeatureCollection", features: [{ type: "Feature", properties: {}, geometry: { type: "Polygon", coordinates: [ring] } }] };
+  let name = ROLES[role];
+  for (let k = 2; role === "no-spray" && state.files.some((file) => file.name === name); k += 1) name = `drawn-no-spray-${k}.geojson`;
+  const chosen = role;
+  await doing("Saving", () => ask(`office/files/${name}`, JSON.stringify(data), "application/octet-stream"));
+  if (chosen === "boundary") byId("field").value = name;
+  else for (const one of byId("no_spray").options) if (one.value === name) one.selected = true;
+  startDrawing(null);
+  show();
+}
+
+async function edit() {
+  const data = await ask(`office/given/${encodeURIComponent(byId("field").value)}`).catch(() => null);
+  const shape = data?.features?.[0]?.geometry ?? data?.geometry ?? data;
+  const ring = shape?.type === "Polygon" ? shape.coordinates[0] : shape?.type === "MultiPolygon" ? shape.coordinates[0][0] : null;
+  if (!ring || ring.length > 400) { say("This boundary cannot be edited here: it is no polygon, or has over 400 corners.", true); return; }
+  startDrawing("boundary", ring.slice(0, -1).map(([lng, lat]) => [lng, lat]));
+}
+
+function reading() {
+  return Object.fromEntries(["rate_field", "unit"].map((id) => [id, byId(id).value.trim()]).filter(([, value]) => value));
+}
+
+async function load(list) {
+  for (const file of list) await doing(`Loading ${file.name}`, () => ask(`office/files/${encodeURIComponent(file.name)}`, file, "application/octet-stream"));
+}
+
+function planned() {
+  const body = { field: byId("field").value, kind: byId("kind").value, no_spray: [...byId("no_spray").selectedOptions].map((one) => one.value), ...reading() };
+  if (byId("prescription").value) body.prescription = byId("prescription").value;
+  for (const id of ["swath_m", "speed_m_s", "tank_l", "rate_l_ha", "border_m", "angle_deg"]) if (byId(id).value !== "") body[id] = Number(byId(id).value);
+  if (byId("depot").value.trim()) body.depot = byId("depot").value.split(/[,;\s]+/).filter(Boolean).map(Number).slice(0, 2);
+  return body;
+}
+
+const isNight = matchMedia("(prefers-color-scheme: dark)").matches;
+let chosen = null;
+try { chosen = localStorage.getItem("vrspray-theme"); } catch { /* private mode */ }
+const theme = chosen === "night" || (chosen !== "day" && isNight) ? "night" : "day";
+document.documentElement.dataset.theme = theme;
+
+const map = new OfficeMap(byId("map"), theme, {
+  onClick(place) { if (role) draw([...corners, place]); },
+  onMove(index, place) { draw(corners.map((one, k) => (k === index ? place : one))); },
+});
+stopping(byId("stop"), say);
+byId("pick").addEventListener("change", async (event) => { await load([...event.target.files]); event.target.value = ""; });
+byId("check-form").addEventListener("submit", (event) => { event.preventDefault(); if (byId("prescription").value) doing("Checking", () => ask("office/check", { file: byId("prescription").value, ...reading() })); });
+byId("plan-form").addEventListener("submit", (event) => { event.preventDefault(); if (byId("field").value) doing("Planning", () => ask("office/plan", planned())); });
+for (const name of Object.keys(ROLES)) byId(`draw-${name}`).addEventListener("click", () => startDrawing(role === name ? null : name));
+byId("draw-undo").addEventListener("click", () => draw(corners.slice(0, -1)));
+byId("draw-save").addEventListener("click", save);
+byId("draw-edit").addEventListener("click", edit);
+byId("corners").addEventListener("input", (event) => draw(cornersOf(event.target.value), true));
+byId("field").addEventListener("change", show);
+
+state = await ask("office").catch((error) => { say(error.message, true); return state; });
+await map.ready;
+byId("map-note").hidden = map.works;
+show();
+document.body.dataset.office = "ready";
+setInterval(async () => { // the vehicle may be armed meanwhile
+  if (document.body.dataset.busy || document.hidden) return;
+  const next = await ask("office").catch(() => null);
+  if (next && next.not_now !== state.not_now) { state = next; show(); }
+}, 2000);

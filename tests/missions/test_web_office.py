@@ -1,0 +1,294 @@
+"""The office on the operator's page: files are read and planned by children with limits."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_asyncio
+from fastapi import APIRouter, HTTPException
+
+from companion.web.parts import Host, registered, uploads
+from missions.web import office as module
+from missions.web.office import Office
+from tests.companion.web_site import OPERATE, VIEW, Reply, Site, served, until
+
+ANYANG = Path(__file__).resolve().parents[2] / "examples" / "anyang"
+CONFIG = ["--config", str(ANYANG / "config.toml")]
+BYTES = {"Content-Type": "application/octet-stream"}
+# Planning computes, and a computer that runs all tests has much to do.
+pytestmark = pytest.mark.timeout(300)
+IN_LOOP = pytest.mark.asyncio(loop_scope="module")
+OFFICE = "/api/v1/office"
+SQUARE = {
+    "type": "Polygon",
+    "coordinates": [[[8.0, 47.0], [8.001, 47.0], [8.001, 47.0004], [8.0, 47.0004], [8.0, 47.0]]],
+}
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def site(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Site]:
+    folder = tmp_path_factory.mktemp("office")
+    host = {"folder": str(folder), "config": CONFIG, "upload_link": "", "journals": ""}
+    async with served(host=host) as found:
+        await on_ground(found)
+        yield found
+
+
+async def on_ground(site: Site, *, armed: bool = False) -> None:
+    site.show(armed=armed, in_air=False)
+    await until(lambda: (site.ask("GET", OFFICE).json["not_now"] is not None) == armed)
+
+
+async def load(site: Site, name: str, data: bytes, **headers: str) -> Reply:
+    path = f"{OFFICE}/files/{name}"
+    reply: Reply = await site.asked("POST", path, data, BYTES | headers)
+    return reply
+
+
+async def do(site: Site, what: str, **body: Any) -> Any:
+    reply = await site.asked("POST", f"{OFFICE}/{what}", body)
+    assert reply.status == 200, reply.body
+    return reply.json
+
+
+async def load_anyang(site: Site) -> None:
+    for path in ANYANG.glob("prescription.*"):
+        assert (await load(site, path.name, path.read_bytes())).status == 200
+    assert (await load(site, "boundary.geojson", (ANYANG / "boundary.geojson").read_bytes())).json
+
+
+@IN_LOOP
+@pytest.mark.timeout(600)
+async def test_a_field_is_loaded_checked_planned_and_its_files_downloaded(site: Site) -> None:
+    await load_anyang(site)
+    checked = await do(site, "check", file="prescription.shp", rate_field="rate")
+    assert checked["check"]["error"] is None
+    assert checked["check"]["found"]["zones"] == 40
+    zones = (await site.asked("GET", f"{OFFICE}/made/zones.geojson")).json
+    assert len(zones["features"]) == 40
+    state = await do(
+        site, "plan", field="boundary.geojson", prescription="prescription.shp",
+        rate_field="rate", tank_l=4, speed_m_s=4, depot=[35.9962, 114.5434],
+    )  # fmt: skip
+    plan = state["plan"]
+    assert plan["error"] is None
+    found = plan["found"]
+    assert len(found["sorties"]) >= 2
+    # The sum over the map, by a tenth more at most: places that are covered twice.
+    assert 1.0 <= found["volume_l"] / checked["check"]["found"]["litres"] <= 1.1
+    assert sum(one["volume_l"] for one in found["sorties"]) == pytest.approx(found["volume_l"])
+    assert all(one["fill_l"] <= 4.0 for one in found["sorties"])
+    assert plan["flight_map"]["error"] is None
+    made = {one["name"]: one["bytes"] for one in state["made"]}
+    assert {*plan["files"], "field.lines.geojson", "field.flightmap.gpkg", "sheet.html"} <= {*made}
+    first = await site.asked("GET", f"{OFFICE}/made/{plan['files'][0]}")
+    assert json.loads(first.body)["fileType"] == "Plan"
+    sheet = await site.asked("GET", f"{OFFICE}/made/sheet.html")
+    assert sheet.headers["content-type"] == "application/octet-stream"
+    assert "sandbox" in sheet.headers["content-security-policy"]
+    assert sheet.headers["content-disposition"].startswith("attachment")
+
+
+@IN_LOOP
+async def test_what_the_command_line_refuses_is_refused_with_its_line(site: Site) -> None:
+    assert (await load(site, "bad.geojson", b'{"type": "FeatureCollection"')).status == 200
+    state = await do(site, "check", file="bad.geojson")
+    said = subprocess.run(  # noqa: ASYNC221
+        [sys.executable, "-m", "companion", "map", "check", "given/bad.geojson", "--json"],
+        cwd=await folder_of(site), capture_output=True, check=False,
+    )  # fmt: skip
+    assert said.returncode == 2
+    assert state["check"]["error"] == json.loads(said.stdout)["error"]
+    assert "given/bad.geojson" in state["check"]["error"]
+    state = await do(site, "plan", field="bad.geojson", rate_l_ha=20)
+    assert state["plan"]["error"].startswith("given/bad.geojson")
+    assert "\n" not in state["plan"]["error"]
+
+
+async def folder_of(site: Site) -> Path:
+    host = json.loads(site.page._about)["host"]
+    return Path(host["folder"]) / "office"
+
+
+@IN_LOOP
+@pytest.mark.parametrize(
+    ("name", "status"),
+    [
+        ("..%2Fevil.geojson", 404), ("%2e%2e", 422), (".hidden.geojson", 422),
+        ("--help.geojson", 422), ("x.py", 422), ("x.toml", 422), ("a%00b.geojson", 422),
+        ("a%0ab.geojson", 422), ("x" * 90 + ".csv", 422), ("%F0%9F%98%80.csv", 422),
+        ("%C3%A4" * 70 + ".csv", 200), ("%F0%9D%94%B8" * 60 + ".csv", 422),
+    ],
+)  # fmt: skip
+async def test_a_file_is_a_name_of_a_map_and_never_a_path(
+    site: Site, name: str, status: int
+) -> None:
+    assert (await load(site, name, b"x")).status == status
+    assert not list((await folder_of(site)).parent.glob("*evil*"))
+
+
+async def test_only_an_operator_loads_and_only_from_the_page_itself(tmp_path: Path) -> None:
+    host = {"folder": str(tmp_path), "config": [], "upload_link": "", "journals": ""}
+    async with served(is_local=False, host=host) as site:
+        for token, status in ((VIEW, 403), ("", 401), ("x" * 43, 401)):
+            reply = await load(site, "a.csv", b"x", Authorization=f"Bearer {token}")
+            assert reply.status == status
+        mine = {"Authorization": f"Bearer {OPERATE}"}
+        assert (await load(site, "a.csv", b"x", **mine, Origin="http://evil.example")).status == 403
+        wrong = mine | {"Content-Type": "application/json"}
+        assert (await load(site, "a.csv", b"x", **wrong)).status == 415
+        form = mine | {"Content-Type": "multipart/form-data"}
+        assert (await load(site, "a.csv", b"x", **form)).status == 415
+        large = await site.asked("POST", f"{OFFICE}/check", b"x" * 5000, mine)
+        assert large.status == 413
+        look = {"Authorization": f"Bearer {VIEW}"}
+        assert (await site.asked("GET", OFFICE, headers=look)).status == 200
+        assert not (tmp_path / "office").exists()
+
+
+@IN_LOOP
+async def test_nothing_begins_while_the_vehicle_is_armed(site: Site) -> None:
+    await load(site, "a.geojson", json.dumps(SQUARE).encode())
+    await on_ground(site, armed=True)
+    assert (await load(site, "b.geojson", b"x")).status == 409
+    for what, body in (
+        ("check", {"file": "a.geojson"}), ("plan", {"field": "a.geojson"}),
+        ("remove", {"file": "a.geojson"}), ("upload", {"file": "field.plan"}),
+    ):  # fmt: skip
+        reply = await site.asked("POST", f"{OFFICE}/{what}", body)
+        assert reply.status == 409
+        assert reply.json["detail"] == "the vehicle is armed: disarm it first"
+    await on_ground(site)
+    assert (await site.asked("POST", f"{OFFICE}/upload", {"file": "field.plan"})).status == 409
+
+
+@IN_LOOP
+async def test_files_are_limited_in_number(site: Site) -> None:
+    for number in range(module.FILES_MAX):
+        reply = await load(site, f"many-{number}.csv", b"x")
+        if reply.status != 200:
+            break
+    assert reply.status == 413
+    for one in (await site.asked("GET", OFFICE)).json["files"]:
+        await do(site, "remove", file=one["name"])
+    assert (await site.asked("POST", f"{OFFICE}/remove", {"file": "many-1.csv"})).status == 404
+
+
+# ----------------------------------------------------------------------- children, by themselves
+
+
+def office(folder: Path, flying: Any = lambda: None) -> Office:
+    found = Office(Host(folder=str(folder), config=[], upload_link="", journals="", flying=flying))
+    found.given.mkdir(parents=True)
+    found.made.mkdir()
+    return found
+
+
+class Large:
+    """A request that never ends."""
+
+    async def stream(self) -> AsyncIterator[bytes]:
+        while True:
+            yield b"x" * 100_000
+
+
+async def test_a_file_without_end_is_refused_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "FILE_BYTES_MAX", 1_000_000)
+    found = office(tmp_path)
+    with pytest.raises(HTTPException) as refused:
+        await found.receive("a.csv", Large())  # type: ignore[arg-type]
+    assert refused.value.status_code == 413
+    assert not [name for _, _, names in os.walk(tmp_path) for name in names]
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        ("x = bytearray(4_000_000_000)", "2 GB of memory"),
+        ("while True: pass", "1 s of computing"),
+        ("import time; time.sleep(60)", "longer than 2 s"),
+        ("import os; os.abort()", "2 GB of memory"),
+    ],
+)
+async def test_a_child_ends_at_its_limits_with_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, words: str
+) -> None:
+    await _with_child(tmp_path, monkeypatch, code)
+    if "longer" in words:
+        monkeypatch.setattr(module, "TIMES", {"check": (10, 2.0)})
+    done = await office(tmp_path / "field").run("check", [])
+    assert done.error is not None
+    assert words in done.error
+    assert "\n" not in done.error
+
+
+async def test_a_child_and_its_own_children_end_when_the_vehicle_is_armed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = (
+        "import subprocess, time\n"
+        "child = subprocess.Popen(['sleep', '300'])\n"
+        f"open({str(tmp_path / 'pid')!r}, 'w').write(str(child.pid))\n"
+        "time.sleep(300)"
+    )
+    await _with_child(tmp_path, monkeypatch, code)
+    pid = tmp_path / "pid"
+    reason = "the vehicle is armed: disarm it first"
+    found = office(tmp_path / "field", lambda: reason if pid.exists() else None)
+    monkeypatch.setattr(module, "TIMES", {"check": (10, 60.0)})
+    assert (await found.run("check", [])).error == reason
+    assert not alive(int(pid.read_text()))
+
+
+async def test_work_that_fails_leaves_the_office_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = office(tmp_path)
+    (found.given / "a.csv").write_text("x")
+
+    async def failing(self: Office, task: str, words: Any) -> None:
+        assert self.task == task
+        raise OSError("no processes left")
+
+    monkeypatch.setattr(Office, "run", failing)
+    with pytest.raises(OSError, match="no processes"):
+        await found.check(module.Check(file="a.csv"))
+    assert found.task is None
+
+
+def alive(pid: int) -> bool:
+    """Return whether a process runs; one that nobody has asked about yet does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+async def _with_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    """Have children run this in place of our own commands."""
+    script = tmp_path / "python"
+    script.write_text(f"#!{sys.executable}\n{code}\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(module.sys, "executable", str(script))
+    monkeypatch.setattr(module, "TIMES", {"check": (1, 100.0)})
+
+
+def test_the_page_finds_the_office_by_its_entry_point() -> None:
+    parts = registered()
+    assert parts["office"] is module.PART
+    assert uploads(parts) == ("/api/v1/office/files/",)
+    for suffix in ("html", "js", "css"):
+        assert list(parts["office"].static.glob(f"*.{suffix}"))
+    router = APIRouter()
+    host = Host(folder=os.devnull, config=[], upload_link="", journals="", flying=lambda: None)
+    parts["office"].add(router, host)
+    assert len(router.routes) == 7
