@@ -309,6 +309,8 @@ def plan(
             note(f"{head}{rest}".rstrip())
 
 
+# What ground under two passes is, where valves do not close over treated ground and where they do.
+_TWICE = ("twice", "under two passes")
 _FLOWN_ONCE = (
     "fly it with `vrspray run --continue`: its guard closes the valves on treated ground and on "
     "what is covered twice, and the litres count neither"
@@ -440,10 +442,7 @@ def _choices(planned: Plan, result: dict[str, Any], prices: list[str], *, asked:
 
 def _once(planned: Plan) -> str:
     """Return that the litres count on valves that close, where they spare any."""
-    legs = [leg for sortie in planned.sorties for leg in sortie.legs]
-    if all(leg.overlap_l is None for leg in legs):
-        return ""
-    return ", treated ground not again, as the litres count"
+    return ", treated ground not again, as the litres count" if planned.closes else ""
 
 
 def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str]:
@@ -451,15 +450,17 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
     coverage = planned.coverage
     minutes = planned.flight_s / 60.0
     where = ", ".join(f"{lat:.6f} {lon:.6f}" for lat, lon in result["depots"])
+    least_m = result["least_idle_m"]
+    idle = f", both {least_m / 1000:.2f} km at least in any order" if least_m >= 50.0 else ""
     lines = [
         f"{names_of(files)}: {counted(len(planned.sorties), 'sortie')}, {planned.volume_l:.1f} L, "
         f"{minutes:.0f} min",
         f"covered   {coverage.percent:.2f} % of {ground_text(result)}, "
-        f"{coverage.overlap_percent:.2f} % twice, {coverage.outside_m2:.1f} m2 outside",
+        f"{coverage.overlap_percent:.2f} % {_TWICE[planned.closes]}, "
+        f"{coverage.outside_m2:.1f} m2 outside",
         f"passes    {len(planned.lines)} at {planned.angle_deg:.1f} deg, "
         f"{result['spray_m'] / 1000:.2f} km; transit {result['transit_m'] / 1000:.2f} km, "
-        f"ferry {result['ferry_m'] / 1000:.2f} km, both {result['least_idle_m'] / 1000:.2f} km "
-        "at least in any order",
+        f"ferry {result['ferry_m'] / 1000:.2f} km{idle}",
         f"depot     {where}{' (suggested)' if planned.suggested_depot else ''}",
     ]
     if result["lines_file"] is not None:

@@ -327,11 +327,12 @@ def write_title(figure: Figure, plan: Plan, title: str) -> None:
     """Write the name of the field and the figures of the plan."""
     wide_in, high_in = figure.get_figwidth(), figure.get_figheight()
     count = len(plan.sorties)
+    doubled = "under two passes" if plan.closes else "twice"
     figures = (
         f"{plan.field.area_m2 / 1e4:.2f} ha    {plan.volume_l:,.1f} L    "
         f"{_duration(plan.total_s)} with refills    "
         f"{counted(count, 'sortie')}    covered {plan.coverage.percent:.2f} %    "
-        f"twice {plan.coverage.overlap_percent:.2f} %    "
+        f"{doubled} {plan.coverage.overlap_percent:.2f} %    "
         f"ferry {plan.length_m('ferry') / 1e3:.1f} km"
     )
     settings = plan.settings
@@ -397,7 +398,8 @@ def write_legend(figure: Figure, plan: Plan, seen: dict[str, bool], *, left: flo
         ),
     ]  # fmt: skip
     if seen["twice"]:
-        handles.append(Patch(facecolor=TWICE, alpha=0.45, label="sprayed twice"))
+        label = "under two passes (valves close)" if plan.closes else "sprayed twice"
+        handles.append(Patch(facecolor=TWICE, alpha=0.45, label=label))
     if seen["skipped"]:
         handles.append(Patch(facecolor=SKIPPED, label="left unsprayed"))
     if seen["bare"]:

@@ -245,6 +245,11 @@ class Plan:
         """Return the frame of all places."""
         return self.field.frame
 
+    @property
+    def closes(self) -> bool:
+        """Return whether valves close over treated ground, as the litres count."""
+        return any(leg.overlap_l is not None for each in self.sorties for leg in each.legs)
+
     def length_m(self, kind: Kind) -> float:
         """Return the length of all legs of one kind."""
         return sum(sortie.length_m(kind) for sortie in self.sorties)

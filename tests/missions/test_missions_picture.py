@@ -56,6 +56,19 @@ def test_a_plan_is_drawn_with_all_of_its_sorties(
     assert "left unsprayed" not in text  # square corners, all covered
 
 
+def test_ground_on_which_valves_close_is_not_said_to_be_sprayed_twice(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    anyang = Path(__file__).parents[2] / "examples" / "anyang"
+    words = ["plan", anyang / "boundary.geojson", "--config", anyang / "config.toml",
+             "--out", tmp_path / "m.plan", "--png", tmp_path / "m.svg"]  # fmt: skip
+    assert execute([*map(str, words)]) == 0
+    assert " % under two passes, " in capsys.readouterr().out
+    text = (tmp_path / "m.svg").read_text()
+    assert "<!-- under two passes (valves close) -->" in text
+    assert "twice" not in text
+
+
 def test_wind_speed_heights_and_both_ends_of_every_sortie_are_shown(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
