@@ -15,8 +15,8 @@ import numpy as np
 
 from companion.core.braking import CREEP_M_S, braking_begins_s
 from companion.core.frame import Floats
-from companion.core.motion import carried_s2, gained_s
-from companion.core.types import VehicleState
+from companion.core.motion import stretch
+from companion.core.types import StopAhead, VehicleState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,9 +151,12 @@ def predict(
             for i, dt_s in enumerate(knots)
         ]
     else:
-        motions = _braked(state, back_s, ahead_s)
+        ae, an = _along(state)
+        motions = None
+        if state.stop_ahead is not None:
+            motions = _braked(state, state.stop_ahead, ae, an, back_s, ahead_s)
         if motions is None:
-            motions = [(dt_s, *_carried(state, dt_s, *_along(state))) for dt_s in knots]
+            motions = [(dt_s, *_carried(state, dt_s, ae, an)) for dt_s in knots]
         knots = [motion[0] for motion in motions]
         east, north, pace, middle = _straight(motions, heading_deg, right_m, forward_m)
     rights = []
@@ -191,9 +194,9 @@ def _carried(
 
     The place outruns the velocity where an autopilot tells two motions.
     """
-    ahead_s, fade_s = max(dt_s, 0.0), state.acceleration_fade_s
+    over = stretch(state.acceleration_fade_s, dt_s)
+    gained, carried = over.gained_s, over.carried_s2
     goes_east, goes_north = place_velocity(state)
-    gained, carried = gained_s(ahead_s, fade_s), carried_s2(ahead_s, fade_s)
     return (
         state.velocity_east_m_s + ae * gained,
         state.velocity_north_m_s + an * gained,
@@ -218,16 +221,16 @@ def _along(state: VehicleState) -> tuple[float, float]:
     return gain * ve, gain * vn
 
 
-def _braked(state: VehicleState, back_s: float, ahead_s: float) -> list[_Motion] | None:
+def _braked(
+    state: VehicleState, stop: StopAhead, ae: float, an: float, back_s: float, ahead_s: float
+) -> list[_Motion] | None:
     """Return the motion at the knots of a path that brakes for a stop; None if none does.
 
     Its chords are those before the braking, of the braking and, at the stop, a creeping on.
     """
-    stop = state.stop_ahead
     speed = math.hypot(state.velocity_east_m_s, state.velocity_north_m_s)
-    if stop is None or not speed > CREEP_M_S:
+    if not speed > CREEP_M_S:
         return None
-    ae, an = _along(state)
     along = (ae * state.velocity_east_m_s + an * state.velocity_north_m_s) / speed
     begins_s = braking_begins_s(stop, speed, along, state.acceleration_fade_s, ahead_s)
     if begins_s is None:

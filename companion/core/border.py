@@ -30,59 +30,91 @@ def add_contacts(
     merge: Merge | None,
 ) -> None:
     """Add to `closed` when an edge of the border lies within a strip."""
-    if len(ends):
-        for chord in range(len(paths.time_s) - 1):
-            _add_chord_contacts(paths, chord, ends, boom, buffer_m, closed, merge)
+    if not len(ends):
+        return
+    chords = len(paths.time_s) - 1
+    half_m = boom.half_width_m + buffer_m
+    for chord in range(chords):
+        if chords == 1:
+            contacts = _contacts_of_one_chord(paths, ends, half_m.tolist())
+        else:
+            contacts = _contacts(paths, chord, ends, half_m)
+        if contacts is None:
+            for intervals in closed:
+                intervals.append((paths.time_s[chord], paths.time_s[chord + 1]))
+            continue
+        length = paths.length_m[:, chord].tolist()
+        for valve, _, limits in contacts if merge is None else merge(contacts):
+            first, last = limits[0] - buffer_m, limits[1] + buffer_m
+            reach = length[valve]
+            if last < 0.0 or first > reach:
+                continue
+            begin = time_on_chord(paths, chord, valve, max(first, 0.0), reach)[0]
+            end = time_on_chord(paths, chord, valve, min(last, reach), reach)[0]
+            beyond = last > reach and chord == chords - 1
+            closed[valve].append((begin, math.inf if beyond else end))
 
 
-def _add_chord_contacts(
-    paths: Paths,
-    chord: int,
-    ends: Floats,
-    boom: Boom,
-    buffer_m: float,
-    closed: list[Intervals],
-    merge: Merge | None,
-) -> None:
-    """Add the contacts of one chord, in the skewed frame of path and boom."""
+def _contacts_of_one_chord(paths: Paths, ends: Floats, half_m: list[float]) -> list[Contact] | None:
+    """Return the contacts on a straight pass, where all strips go the same way.
+
+    In plain numbers, as few edges are near. None where the boom lies along its own motion.
+    """
+    rx, ry = paths.right[0]
+    edges = ends.tolist()
+    contacts: list[Contact] = []
+    for valve, (px, py, dx, dy, length, half) in enumerate(
+        zip(
+            paths.east_m[:, 0].tolist(), paths.north_m[:, 0].tolist(),
+            paths.step_east_m[:, 0].tolist(), paths.step_north_m[:, 0].tolist(),
+            paths.length_m[:, 0].tolist(), half_m, strict=True,
+        )
+    ):  # fmt: skip
+        safe = max(length, 1e-12)
+        ux, uy = dx / safe, dy / safe
+        turn = (dx * ry - dy * rx) / safe  # sine of the angle from path to boom
+        if not abs(turn) >= ACROSS_MIN:
+            return None
+        for edge, (x0, y0, x1, y1) in enumerate(edges):
+            across_0 = (ux * (y0 - py) - uy * (x0 - px)) / turn
+            across_1 = (ux * (y1 - py) - uy * (x1 - px)) / turn
+            if (across_0 > half and across_1 > half) or (across_0 < -half and across_1 < -half):
+                continue
+            along_0 = ((x0 - px) * ry - (y0 - py) * rx) / turn
+            along_1 = ((x1 - px) * ry - (y1 - py) * rx) / turn
+            limits = _clip((across_0, along_0), (across_1, along_1), half)
+            contacts.append((valve, edge, limits))
+    return contacts
+
+
+def _contacts(paths: Paths, chord: int, ends: Floats, half_m: Floats) -> list[Contact] | None:
+    """Return the contacts of one chord, in the skewed frame of path and boom; None as above."""
     px, py = paths.east_m[:, chord], paths.north_m[:, chord]
     dx, dy = paths.step_east_m[:, chord], paths.step_north_m[:, chord]
-    length = paths.length_m[:, chord]
     rx, ry = paths.right[chord]
-    safe = np.maximum(length, 1e-12)
+    safe = np.maximum(paths.length_m[:, chord], 1e-12)
     turn = (dx * ry - dy * rx) / safe  # sine of the angle from path to boom
     if not np.abs(turn).min() >= ACROSS_MIN:
-        for intervals in closed:
-            intervals.append((paths.time_s[chord], paths.time_s[chord + 1]))
-        return
+        return None
     ux, uy, t2 = (dx / safe)[:, None], (dy / safe)[:, None], turn[:, None]
     x, y = ends[:, 0::2].ravel() - px[:, None], ends[:, 1::2].ravel() - py[:, None]
     across = (ux * y - uy * x) / t2
     across_0, across_1 = across[:, 0::2], across[:, 1::2]
-    half = (boom.half_width_m + buffer_m)[:, None]
+    half = half_m[:, None]
     touching = (np.minimum(across_0, across_1) <= half) & (np.maximum(across_0, across_1) >= -half)
     valves, hits = touching.nonzero()
     if not len(valves):
-        return
+        return []
     along = (x * ry - y * rx) / t2
     along_0, along_1 = along[:, 0::2], along[:, 1::2]
-    contacts = [
+    return [
         (valve, hit, _clip(
             (float(across_0[valve, hit]), float(along_0[valve, hit])),
             (float(across_1[valve, hit]), float(along_1[valve, hit])),
-            float(half[valve, 0]),
+            float(half_m[valve]),
         ))
         for valve, hit in zip(valves.tolist(), hits.tolist(), strict=True)
     ]  # fmt: skip
-    for valve, _, limits in contacts if merge is None else merge(contacts):
-        first, last = limits[0] - buffer_m, limits[1] + buffer_m
-        reach = float(length[valve])
-        if last < 0.0 or first > reach:
-            continue
-        begin = time_on_chord(paths, chord, valve, max(first, 0.0), reach)[0]
-        end = time_on_chord(paths, chord, valve, min(last, reach), reach)[0]
-        beyond = last > reach and chord == len(paths.time_s) - 2
-        closed[valve].append((begin, math.inf if beyond else end))
 
 
 def _clip(a: tuple[float, float], b: tuple[float, float], half_m: float) -> tuple[float, float]:

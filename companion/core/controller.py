@@ -337,10 +337,10 @@ def _orders(
         # In a turn each valve has a speed of its own.
         own = route[0].speed_m_s / speed_m_s if abs(state.yaw_rate_deg_s) > 1.0 else 1.0
         of_valve = dosing(valve) if setup.pumping is None else on_off
-        # Neighbours in the middle of one zone that have nothing to do have it together.
+        # Neighbours in the middle of one zone do the same.
         key = (route[0].rate_l_ha, own, in_force[valve], of_valve) if len(route) == 1 else None
-        if key is not None and key == before_key and not valves[-1].changes:
-            valves.append(valves[-1])
+        if key is not None and key == before_key:
+            valves.append(valves[-1].of(valve))
             continue
         before_key = key
         valves.append(
@@ -487,7 +487,7 @@ def _decision(
     flow_of = _flow_of(setup, state, orders.speed_m_s)
     known = {rate: flow_of(rate or 0.0) for rate in set(rates)}
     flows = [known[rates[valve]] for valve in nozzles.valves]
-    too_much = {flow for flow in set(flows) if not nozzles.curve.delivers(flow)}
+    too_much = {flow for flow in known.values() if not nozzles.curve.delivers(flow)}
     late = unresolved = 0
     for of_valve in orders.valves:
         late += of_valve.late

@@ -12,16 +12,16 @@ outside (`border.py`).
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from companion.core.boom import STRAIGHT_YAW_RATE_DEG_S, Boom, Paths, place_velocity, predict
 from companion.core.border import Intervals, add_contacts, joined, swept
-from companion.core.frame import Floats, Offset
+from companion.core.frame import Floats, Ints, Offset
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
 from companion.core.types import VehicleState
 
@@ -32,6 +32,8 @@ Border = Literal["inside", "volume"]
 SAMPLE_ACROSS_M = 0.1
 SAMPLES_ACROSS = (5, 40)
 START_NUDGE_M = 1e-6
+# The ways of points that go alike differ by rounding: by less than this, as an area.
+SAME_SIDE_M2 = 1e-6
 
 
 class Crossing(NamedTuple):
@@ -68,49 +70,25 @@ class _Cut(NamedTuple):
     enters: bool
 
 
-def _cuts(paths: Paths, ends: Floats, owner: NDArray[np.int64]) -> list[list[_Cut]]:
-    """Return, for each point, where its path cuts the edges, in order of time.
+# Where a path meets an edge: chord, rounded way along it, whether its polygon is entered, point,
+# way, the chord's length, and the polygon. In order of the path; leaving before entering, where
+# both are at one place.
+_Met = tuple[int, int, bool, int, float, float, int]
 
-    All chords of all points at once: row = chord * points + point.
-    """
+
+def _cuts(paths: Paths, ends: Floats, owner: Ints) -> list[list[_Cut]]:
+    """Return, for each point, where its path cuts the edges, in order of time."""
     count, chords = paths.length_m.shape
     found: list[list[_Cut]] = [[] for _ in range(count)]
     if not len(ends):
         return found
-    if chords == 1:  # a straight pass, the usual case
-        px, py, reach = paths.east_m[:, 0], paths.north_m[:, 0], paths.length_m[:, 0]
-        dx, dy = paths.step_east_m[:, 0], paths.step_north_m[:, 0]
-    else:
-        px, py = paths.east_m[:, :-1].T.ravel(), paths.north_m[:, :-1].T.ravel()
-        dx, dy = paths.step_east_m.T.ravel(), paths.step_north_m.T.ravel()
-        reach = paths.length_m.T.ravel()
-    corners = ends.reshape(-1, 2)
-    left = dx[:, None] * corners[:, 1] - dy[:, None] * corners[:, 0]
-    own = dx * py - dy * px
-    is_left = left >= own[:, None]
-    rows, hits = (is_left[:, 0::2] != is_left[:, 1::2]).nonzero()
-    if not len(rows):
+    met = _met_on_one_chord(paths, ends, owner) if chords == 1 else _met(paths, ends, owner)
+    if not met:
         return found
-    l0, l1 = left[rows, 2 * hits].tolist(), left[rows, 2 * hits + 1].tolist()
-    own_, reach_ = own.tolist(), reach.tolist()
-    px_, py_, dx_, dy_ = px.tolist(), py.tolist(), dx.tolist(), dy.tolist()
+    met.sort()
     pace = paths.speed_m_s.tolist()
-    kept = []
-    for row, a, b, (x0, y0, x1, y1), who in zip(
-        rows.tolist(), l0, l1, ends[hits].tolist(), owner[hits].tolist(), strict=True
-    ):
-        share = (a - own_[row]) / (a - b)
-        reach_m = reach_[row]
-        s = (x0 + share * (x1 - x0) - px_[row]) * dx_[row]
-        s += (y0 + share * (y1 - y0) - py_[row]) * dy_[row]
-        s /= max(reach_m, 1e-12)
-        if (START_NUDGE_M if row < count else 0.0) < s <= reach_m:
-            # In order of the path; leaving before entering, where both are at one place.
-            kept.append((row // count, round(s * 1e6), a > b, row, s, reach_m, who))
-    kept.sort()
     along = np.cumsum(paths.length_m, axis=1).tolist() if chords > 1 else []
-    for chord, _, enters, row, s, reach_m, who in kept:
-        point = row - chord * count
+    for chord, _, enters, point, s, reach_m, who in met:
         share = s / reach_m
         v0, v1 = pace[point][chord : chord + 2]
         v0_2 = v0 * v0
@@ -120,6 +98,69 @@ def _cuts(paths: Paths, ends: Floats, owner: NDArray[np.int64]) -> list[list[_Cu
         gone = along[point][chord - 1] if chord else 0.0
         found[point].append(_Cut(at_s, gone + s, speed, who, enters))
     return found
+
+
+def _met_on_one_chord(paths: Paths, ends: Floats, owner: Ints) -> list[_Met]:
+    """Return what is met on a straight pass, where all points go the same way.
+
+    There only points between the ends of an edge, seen along the way, can meet it. In plain
+    numbers: few edges are near.
+    """
+    east, north = paths.east_m[:, 0].tolist(), paths.north_m[:, 0].tolist()
+    steps_e, steps_n = paths.step_east_m[:, 0].tolist(), paths.step_north_m[:, 0].tolist()
+    lengths = paths.length_m[:, 0].tolist()
+    way_e, way_n = steps_e[0], steps_n[0]
+    in_order = sorted(
+        [(way_e * y - way_n * x, i) for i, (x, y) in enumerate(zip(east, north, strict=True))]
+    )
+    sides = [side for side, _ in in_order]
+    met: list[_Met] = []
+    for (x0, y0, x1, y1), who in zip(ends.tolist(), owner.tolist(), strict=True):
+        low, high = sorted((way_e * y0 - way_n * x0, way_e * y1 - way_n * x1))
+        first = bisect_left(sides, low - SAME_SIDE_M2)
+        for _, point in in_order[first : bisect_left(sides, high + SAME_SIDE_M2, first)]:
+            px, py, dx, dy = east[point], north[point], steps_e[point], steps_n[point]
+            a, b, own = dx * y0 - dy * x0, dx * y1 - dy * x1, dx * py - dy * px
+            if (a >= own) == (b >= own):
+                continue
+            share = (a - own) / (a - b)
+            s = (x0 + share * (x1 - x0) - px) * dx
+            s += (y0 + share * (y1 - y0) - py) * dy
+            reach_m = lengths[point]
+            s /= max(reach_m, 1e-12)
+            if START_NUDGE_M < s <= reach_m:
+                met.append((0, round(s * 1e6), a > b, point, s, reach_m, who))
+    return met
+
+
+def _met(paths: Paths, ends: Floats, owner: Ints) -> list[_Met]:
+    """Return what is met on chords of any directions: row = chord * points + point."""
+    count = len(paths.length_m)
+    px, py = paths.east_m[:, :-1].T.ravel(), paths.north_m[:, :-1].T.ravel()
+    dx, dy = paths.step_east_m.T.ravel(), paths.step_north_m.T.ravel()
+    corners = ends.reshape(-1, 2)
+    left = dx[:, None] * corners[:, 1] - dy[:, None] * corners[:, 0]
+    own = dx * py - dy * px
+    is_left = left >= own[:, None]
+    rows, hits = (is_left[:, 0::2] != is_left[:, 1::2]).nonzero()
+    if not len(rows):
+        return []
+    l0, l1 = left[rows, 2 * hits].tolist(), left[rows, 2 * hits + 1].tolist()
+    own_, reach_ = own.tolist(), paths.length_m.T.ravel().tolist()
+    px_, py_, dx_, dy_ = px.tolist(), py.tolist(), dx.tolist(), dy.tolist()
+    met: list[_Met] = []
+    for row, a, b, (x0, y0, x1, y1), who in zip(
+        rows.tolist(), l0, l1, ends[hits].tolist(), owner[hits].tolist(), strict=True
+    ):
+        share = (a - own_[row]) / (a - b)
+        reach_m = reach_[row]
+        s = (x0 + share * (x1 - x0) - px_[row]) * dx_[row]
+        s += (y0 + share * (y1 - y0) - py_[row]) * dy_[row]
+        s /= max(reach_m, 1e-12)
+        if (START_NUDGE_M if row < count else 0.0) < s <= reach_m:
+            chord, point = divmod(row, count)
+            met.append((chord, round(s * 1e6), a > b, point, s, reach_m, who))
+    return met
 
 
 def find_routes(
@@ -151,8 +192,9 @@ def find_routes(
         rates = _rates(prescription, paths, bases, cuts)
     else:
         rates = _rates_across(prescription, state, boom, (ends, owner), across, back_s, ahead_s)
+    start_s = paths.time_s[0]
     closed = [
-        _centre_outside(FIELD in base, found, paths.time_s[0])
+        _centre_outside(FIELD in base, found, start_s)
         for base, found in zip(bases, cuts, strict=True)
     ]
     if border == "inside":
@@ -163,10 +205,8 @@ def find_routes(
         add_contacts(paths, edges, boom, border_buffer_m, closed, merge)
     if close_more is not None:
         close_more(paths, closed)
-    speeds = paths.speed_m_s[:, (0, -1)].tolist()
     return tuple(
-        _combine(rates[valve], closed[valve], paths, speeds[valve], border)
-        for valve in range(len(boom.valves))
+        [_combine(rates[valve], closed[valve], paths, valve, border) for valve in range(len(rates))]
     )
 
 
@@ -185,7 +225,8 @@ def _rates(
         inside = base - {FIELD}
         rate = prescription.rate_of(frozenset(inside))
         steps: _Steps = [(start_s, rate, pace)]
-        zone_cuts = [cut for cut in cuts if cut.owner != FIELD]
+        timelines.append(steps)
+        zone_cuts = [cut for cut in cuts if cut.owner != FIELD] if cuts else cuts
         for i, cut in enumerate(zone_cuts):
             if cut.enters:
                 inside.add(cut.owner)
@@ -197,7 +238,6 @@ def _rates(
             if new != rate:
                 steps.append((cut.at_s, new, cut.speed_m_s))
                 rate = new
-        timelines.append(steps)
     return timelines
 
 
@@ -207,20 +247,22 @@ def _starts(paths: Paths) -> tuple[Floats, Floats]:
     Ahead, so that none lies on an edge it just cut; to the right, as the side test has an edge
     that is flown along on the left: on the edge itself a point is in neither of its zones.
     """
+    east, north = paths.east_m[:, 0], paths.north_m[:, 0]
+    if len(paths.time_s) == 2:  # a straight pass: all go the same way
+        east_m, north_m = paths.step_east_m.item(0, 0), paths.step_north_m.item(0, 0)
+        nudge = START_NUDGE_M / max(paths.length_m.item(0, 0), START_NUDGE_M)
+        return east + nudge * (east_m + 0.1 * north_m), north + nudge * (north_m - 0.1 * east_m)
     dx, dy = paths.step_east_m[:, 0], paths.step_north_m[:, 0]
     ahead = START_NUDGE_M / np.maximum(paths.length_m[:, 0], START_NUDGE_M)
     aside = 0.1 * ahead
-    return (
-        paths.east_m[:, 0] + dx * ahead + dy * aside,
-        paths.north_m[:, 0] + dy * ahead - dx * aside,
-    )
+    return east + dx * ahead + dy * aside, north + dy * ahead - dx * aside
 
 
 def _rates_across(
     prescription: Prescription,
     state: VehicleState,
     boom: Boom,
-    edges: tuple[Floats, NDArray[np.int64]],
+    edges: tuple[Floats, Ints],
     across: Across,
     back_s: float,
     ahead_s: float,
@@ -303,7 +345,7 @@ def _combine(
     rates: _Steps,
     closed: Intervals,
     paths: Paths,
-    speeds: list[float],
+    valve: int,
     border: Border,
 ) -> Route:
     """Return one timeline of rates, closed where the border rule says so.
@@ -312,7 +354,7 @@ def _combine(
     times of the two differ by rounding, and the one that comes first says nothing.
     """
     if not closed:
-        return tuple(Crossing(at_s, rate, False, speed) for at_s, rate, speed in rates)
+        return tuple([Crossing(at_s, rate, False, speed) for at_s, rate, speed in rates])
     strict = border == "inside"
     ends = {t for interval in closed for t in interval if t < math.inf}
     start_s, end_s = paths.time_s[0], paths.time_s[-1]
@@ -323,8 +365,11 @@ def _combine(
         rate = None if shut else _value_at(rates, at_s)
         outside = strict and shut
         if not route or rate != route[-1].rate_l_ha or outside != route[-1].outside:
-            share = (at_s - start_s) / (end_s - start_s)
-            speed = pace.get(at_s, speeds[0] + share * (speeds[1] - speeds[0]))
+            speed = pace.get(at_s)
+            if speed is None:
+                share = (at_s - start_s) / (end_s - start_s)
+                begun, ended = paths.speed_m_s.item(valve, 0), paths.speed_m_s.item(valve, -1)
+                speed = begun + share * (ended - begun)
             route.append(Crossing(at_s, rate, outside, speed))
     return tuple(route)
 
@@ -467,11 +512,8 @@ def carried_on(
     shift = _shift(known.found_from, state, exact_s=exact_s, reach_m=reach_m, now_s=now_s)
     if shift is None:
         return None
-    routes = _shifted(known.routes, shift, now_s)
-    soon_s = now_s + exact_s
-    if not all(len(route) == 1 or route[1].at_s > soon_s for route in routes):
-        return None
-    return known._replace(routes=routes)
+    routes = _shifted(known.routes, shift, now_s, now_s + exact_s)
+    return None if routes is None else KnownRoutes(routes, known.found_from, known.drift_m)
 
 
 def _shift(
@@ -506,20 +548,23 @@ def _shift(
 
 
 def _shifted(
-    routes: tuple[Route, ...], shift: tuple[float, float, float], now_s: float
-) -> tuple[Route, ...]:
-    """Return the routes with their crossings at the times that the new position gives."""
+    routes: tuple[Route, ...], shift: tuple[float, float, float], now_s: float, soon_s: float
+) -> tuple[Route, ...] | None:
+    """Return the routes with their crossings at the times that the new position gives.
+
+    None where one of them is due by `soon_s`.
+    """
     along_m, then, speed = shift
     moved: list[Route] = []
     for route in routes:
         if len(route) == 1:
             moved.append(route)
             continue
-        moved.append(
-            route[:1]
-            + tuple(
-                crossing._replace(at_s=now_s + ((crossing.at_s - now_s) * then - along_m) / speed)
-                for crossing in route[1:]
-            )
-        )
+        later = [route[0]]
+        for was_s, rate, outside, pace in route[1:]:
+            at_s = now_s + ((was_s - now_s) * then - along_m) / speed
+            later.append(Crossing(at_s, rate, outside, pace))
+        if not later[1].at_s > soon_s:
+            return None
+        moved.append(tuple(later))
     return tuple(moved)

@@ -252,7 +252,7 @@ class Stretch(NamedTuple):
     astray_kept: float
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def stretch(fade_s: float, dt_s: float) -> Stretch:
     """Return what `dt_s` does to the motion of a filter; several ask for the same."""
     if dt_s <= 0.0:

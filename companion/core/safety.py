@@ -234,6 +234,8 @@ def settled(
     reasons: frozenset[Inhibit], before: Held, now_s: float
 ) -> tuple[frozenset[Inhibit], Held]:
     """Return the reasons with those that have not been gone for long enough, and what stays."""
+    if not reasons and not before:
+        return reasons, before
     still = tuple((reason, s) for reason, s in before if reason not in reasons and not now_s >= s)
     anew = tuple((reason, now_s + hold_s) for reason, hold_s in HOLD_S.items() if reason in reasons)
     return reasons.union(reason for reason, _ in still), anew + still

@@ -166,6 +166,16 @@ class ValveSchedule(NamedTuple):
     unresolved_count: int
     rate_now_l_ha: float | None
 
+    def of(self, valve: int) -> ValveSchedule:
+        """Return the same for another valve."""
+        if not self.changes:
+            return self
+        changes = [
+            TimedChange(at_s=each.at_s, valve=valve, duty=each.duty, restart=each.restart)
+            for each in self.changes
+        ]
+        return self._replace(changes=tuple(changes))
+
 
 def resolve(route: Route, dwell_min_s: float) -> tuple[Route, int]:
     """Return the route without zones too short for the lag, and how many were given up.
@@ -175,6 +185,8 @@ def resolve(route: Route, dwell_min_s: float) -> tuple[Route, int]:
     an opening too short to be used is not made. Several short stays in a row may be one that is
     still too short, hence the repetition; each round that drops one has fewer crossings.
     """
+    if len(route) == 2 and not route[1].is_as(route[0]):  # nothing follows: no stay is short
+        return route, 0
     given_up = 0
     while True:
         route, dropped = _resolve_once(route, dwell_min_s)
@@ -348,11 +360,9 @@ def schedule(
         else:
             next_s = made[due + 1].at_s if due + 1 < len(made) else math.inf
             changes.extend(_trims(valve, in_force, duty, now_s, next_s - TRIM_HOLD_S))
-    changes.extend(
-        TimedChange(at_s=order.at_s, valve=valve, duty=order.duty)
-        for order in made[due + 1 :]
-        if order.at_s < until_s
-    )
+    for order in made[due + 1 :]:
+        if order.at_s < until_s:
+            changes.append(TimedChange(at_s=order.at_s, valve=valve, duty=order.duty))
     return ValveSchedule(tuple(changes), late, unresolved, rate_at(route, now_s))
 
 

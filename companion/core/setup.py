@@ -56,6 +56,12 @@ class Setup:
     # What earlier flights treated; not compared by hash: tiles are a mapping.
     treated: Coverage | None = field(default=None, repr=False, hash=False)
     timing: Timing = field(init=False, repr=False, compare=False)
+    # The longest lead of any order: of valves, pump and atomisers.
+    longest_s: float = field(init=False, repr=False, compare=False)
+    # How far behind a path begins, so that short stays are seen whole.
+    back_s: float = field(init=False, repr=False, compare=False)
+    # How far ahead a path must reach: the lease, the longest lead and a short stay.
+    ahead_s: float = field(init=False, repr=False, compare=False)
     pumping: Pumping | None = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
     watching: Watching | None = field(init=False, repr=False, compare=False)
@@ -81,6 +87,11 @@ class Setup:
         )
         object.__setattr__(self, "timing", timing)
         object.__setattr__(self, "pumping", self._pumping())
+        stays_s = 2.0 * timing.dwell_min_s
+        object.__setattr__(self, "longest_s", self._longest_s())
+        object.__setattr__(self, "back_s", 0.1 + stays_s)
+        ahead_s = self.lease_s + (self.longest_s + stays_s) + ROUTES_KEPT_S + 0.05
+        object.__setattr__(self, "ahead_s", ahead_s)
         law, doses = self.flow_trim, self.doses
         trimming = None if law is None else Trimming.of(law, doses.lag, doses.pwm)
         object.__setattr__(self, "trimming", trimming)
@@ -125,23 +136,10 @@ class Setup:
         """Return what makes the flow: the valves, or the pump in their place."""
         return self if self.pumping is None else self.pumping
 
-    @property
-    def longest_s(self) -> float:
-        """Return the longest lead of any order: of valves, pump and atomisers."""
+    def _longest_s(self) -> float:
         longest_s = self.timing.longest_s
         if self.pumping is not None:
             longest_s = max(longest_s, self.pumping.timing.longest_s)
         for atomiser in self.atomisers:
             longest_s = max(longest_s, atomiser.spin_up_s + self.lag.output_s)
         return longest_s
-
-    @property
-    def back_s(self) -> float:
-        """Return how far behind a path begins, so that short stays are seen whole."""
-        return 0.1 + 2.0 * self.timing.dwell_min_s
-
-    @property
-    def ahead_s(self) -> float:
-        """Return how far ahead a path must reach: the lease, the longest lead and a short stay."""
-        longest_s = self.longest_s + 2.0 * self.timing.dwell_min_s
-        return self.lease_s + longest_s + ROUTES_KEPT_S + 0.05

@@ -98,7 +98,7 @@ class TimedChange:
     def __post_init__(self) -> None:
         if not 0.0 <= self.duty <= 1.0:
             raise ValueError(f"duty outside [0, 1]: {self.duty}")
-        if not abs(self.at_s) < float("inf"):
+        if not abs(self.at_s) < math.inf:
             raise ValueError(f"time of a change is not finite: {self.at_s}")
         if not self.valve >= 0:
             raise ValueError(f"valve index is negative: {self.valve}")

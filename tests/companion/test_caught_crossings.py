@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import shapely
 
-from companion.core.boom import Boom, Valve, predict
+from companion.core import border, crossings
+from companion.core.boom import Boom, Paths, Valve, predict
 from companion.core.controller import Memory, step
 from companion.core.crossings import Route, find_routes
 from companion.core.motion import CRUISE
@@ -74,6 +75,41 @@ def test_the_tip_of_a_zone_that_is_only_touched_changes_nothing() -> None:
     field = Prescription(zones, boundary=shapely.box(-5, -5, 25, 11))
     (found,) = routes_of(field, flying(10.0, 6.0, 3.0), one_valve())
     assert [rate for _, rate in found] == [10.0]
+
+
+def _ways_ahead(heading_deg: float, course_deg: float) -> tuple[Paths, Boom]:
+    """Return a straight pass whose middle flies through the corner at (12, 6)."""
+    valves = tuple(
+        Valve(name=str(k), right_m=k - 2.0, forward_m=0.2 * k, width_m=1.0) for k in range(5)
+    )
+    boom = Boom(width_m=5.0, valves=valves)
+    angle = math.radians(course_deg)
+    state = flying(
+        10.0, 12.0 - 3.0 * math.sin(angle), 6.0 - 3.0 * math.cos(angle), heading_deg=heading_deg,
+        velocity_east_m_s=5.0 * math.sin(angle), velocity_north_m_s=5.0 * math.cos(angle),
+    )  # fmt: skip
+    return predict(state, boom.right_m, boom.forward_m, back_s=0.3, ahead_s=1.2), boom
+
+
+@pytest.mark.parametrize("course_deg", [0.0, 45.0, 90.0, 137.0, 180.0, 211.0, 270.0, 359.0])
+@pytest.mark.parametrize("off_deg", [0.0, 20.0, 89.0])
+def test_a_straight_pass_meets_what_chords_of_any_direction_meet(
+    course_deg: float, off_deg: float
+) -> None:
+    zones = [
+        Zone(name=f"{x}-{y}", polygon=shapely.box(4 * x, 2 * y, 4 * x + 4, 2 * y + 2), rate_l_ha=9)
+        for x in range(6) for y in range(6)
+    ]  # fmt: skip
+    edges = Prescription(zones).edges
+    paths, boom = _ways_ahead(course_deg + off_deg, course_deg)
+    met = sorted(crossings._met_on_one_chord(paths, edges.ends, edges.owner))
+    assert met == sorted(crossings._met(paths, edges.ends, edges.owner))
+    assert len(met) > 5
+    half_m = boom.half_width_m + 0.1
+    touched = border._contacts_of_one_chord(paths, edges.ends, half_m.tolist())
+    by_arrays = border._contacts(paths, 0, edges.ends, half_m)
+    assert (touched is None) == (by_arrays is None) == (off_deg == 89.0)
+    assert sorted(touched or ()) == sorted(by_arrays or ())
 
 
 def test_a_boom_along_its_own_motion_is_closed_where_a_border_is_near() -> None:

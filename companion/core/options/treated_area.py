@@ -245,6 +245,8 @@ def _openings(
     for at_s, valve, opens in changes:
         if not at_s <= until_s:
             break
+        if opens is (runs if valve < 0 else duty[valve]):
+            continue
         if valve < 0:
             runs = opens
         else:
