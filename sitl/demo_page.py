@@ -104,7 +104,7 @@ def sentence(result: DemoResult) -> str:
         wrong = [one.misapplied_percent for one in found if one.misapplied_percent is not None]
         if lag and wrong:
             missed = sum(one.missed for one in found)
-            lost = f", {missed} changes missed," if missed else ""
+            lost = f", {missed} {'change' if missed == 1 else 'changes'} missed," if missed else ""
             parts.append(f"{lag}{lost} and {_range(wrong)} % with {method}")
     return (
         "Mean distance of a change of rate from its boundary, and misapplied volume: "

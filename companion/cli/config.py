@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from companion.assembly import build_setup, deliverable, flight_map_of
-from companion.cli.answer import AsJson, Overrides, answer, problem_line, problem_object
+from companion.cli.answer import AsJson, Overrides, answer, note, problem_line, problem_object
 from companion.cli.app import refusal
 from companion.config import Config, load
 from companion.config.rules import mismatches, remarks, without_effect
@@ -103,10 +103,17 @@ def new(
     valves: Annotated[int, typer.Option(metavar="N", help="Number of valves.")] = 6,
     spacing_m: Annotated[float, typer.Option(metavar="M", help="Between valves.")] = 1.0,
     nozzle: Annotated[
-        str, typer.Option(metavar="FLOW", help="Of one valve: L/min, or '03 at 3 bar' (ISO size).")
+        str,
+        typer.Option(
+            metavar="FLOW",
+            help="Of one valve: L/min, '03 at 3 bar' (ISO size), or a bucket test's CSV file.",
+        ),
     ] = "0.8",
     map_file: Annotated[
         str, typer.Option("--map", metavar="FILE", help="Prescription map; default: none.")
+    ] = "",
+    unit: Annotated[
+        str, typer.Option(metavar="UNIT", help="Of the map, where it does not say it: L/ha, ...")
     ] = "",
     swath_m: Annotated[
         float | None, typer.Option(metavar="M", help="Swath; default: valves times spacing.")
@@ -124,21 +131,32 @@ def new(
         raise ConfigError(f"{out}: is there already; give another --out, or --force to replace it")
     if profile is not None:
         text = new_config.profile_text(
-            new_config.read_profile(profile), map_name=new_config.map_seen_from(out, map_file)
+            new_config.read_profile(profile),
+            map_name=new_config.map_seen_from(out, map_file),
+            unit=new_config.known_unit(unit),
         )
     else:
         given = new_config.answers_of(
-            f"{autopilot} {link}", output, f"{valves} {spacing_m}", nozzle, map_file, swath_m
+            autopilot=f"{autopilot} {link}",
+            output=output,
+            valves=f"{valves} {spacing_m}",
+            nozzle=nozzle,
+            map_file=map_file,
+            unit=unit,
+            swath_m=swath_m,
         )
-        answers = given if yes else new_config.ask_all(given, _ask)
+        answers = given if yes else new_config.ask_all(given, _ask, note)
         text = new_config.text_of(answers, map_name=new_config.map_seen_from(out, answers.map_file))
     new_config.write_checked(out, text)
     problems = [problem_object(problem) for problem in problems_of(load(out))]
     ok = not any(problem["severity"] == "error" for problem in problems)
+    then = (
+        f"vrspray doctor --config {out}" if ok else f"correct it, then vrspray config check {out}"
+    )
     measure = [line[2:] for line in text.splitlines() if line.startswith("# MEASURE")]
     answer(
         {"ok": ok, "path": str(out), "problems": problems, "measure": measure},
-        [f"written: {out}", *map(problem_line, problems), f"next: vrspray doctor --config {out}"],
+        [f"written: {out}", *map(problem_line, problems), f"next: {then}"],
         as_json=as_json,
     )
     raise typer.Exit(0 if ok else 2)

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import io
+import json
 import math
 import os
 import re
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from companion.atomic_write import write_atomically
+from companion.cli.app import find_command, load_command
 from companion.config import load
-from companion.errors import ConfigError
+from companion.errors import ConfigError, VrsprayError
 
 Ask = Callable[[str, str], str]
 AUTOPILOTS = ("ardupilot", "px4")
 OUTPUTS = ("servo", "gpio")
+UNITS = ("L/ha", "gal/ac", "mL/m2", "L/mu")
 VALVES_MAX = 64
 # ISO 10625: the size is the flow in tenths of a US gallon a minute at 40 psi (2.76 bar).
 _ISO_L_MIN, _ISO_BAR = 0.37854, 2.758
@@ -27,7 +31,11 @@ _ISO = re.compile(r"(?:iso )?0*(\d{1,2}(?:\.\d)?) at (\d{1,2}(?:\.\d+)?) ?bar")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answers:
-    """What is asked of a sprayer. `nozzle_l_min` is of all nozzles of one valve, fully open."""
+    """What is asked of a sprayer. `nozzle_l_min` is of all nozzles of one valve, fully open.
+
+    `bucket` names the file of a bucket test, and `curves` holds its nozzle sets: valves, duty and
+    flow_l_min, which stand instead of that flow.
+    """
 
     autopilot: Literal["ardupilot", "px4"] = "ardupilot"
     link: str = "serial:/dev/serial0:921600"
@@ -36,7 +44,10 @@ class Answers:
     valves: int = 6
     spacing_m: float = 1.0
     nozzle_l_min: float = 0.8
+    bucket: str = ""
+    curves: tuple[Mapping[str, Any], ...] = ()
     map_file: str = ""
+    unit: str = ""
     swath_m: float | None = None
 
     @property
@@ -45,39 +56,75 @@ class Answers:
         return self.valves * self.spacing_m if self.swath_m is None else self.swath_m
 
 
-def ask_all(answers: Answers, ask: Ask) -> Answers:
-    """Return the answers after six questions; `ask` gets a question and its default."""
-    words = ask("1. Autopilot and its link", f"{answers.autopilot} {answers.link}").split()
-    answers = _with_autopilot(answers, words)
-    outputs = ask(
+def ask_all(answers: Answers, ask: Ask, complain: Callable[[str], None]) -> Answers:
+    """Return the answers after six questions; one whose answer cannot be is asked again.
+
+    `ask` gets a question and its default; `complain` is told what is wrong with an answer.
+    """
+
+    def asked(
+        question: str, default: str, take: Callable[[Answers, str], Answers], so_far: Answers
+    ) -> Answers:
+        while True:
+            try:
+                return take(so_far, ask(question, default))
+            except VrsprayError as error:
+                complain(str(error))
+
+    was = answers
+    answers = asked(
+        "1. Autopilot and its link", f"{was.autopilot} {was.link}", _with_autopilot, answers
+    )
+    answers = asked(
         "2. Valves on: servo or gpio, and the first output",
         f"{answers.output} {answers.first_channel}",
-    ).split()
-    answers = _with_outputs(answers, outputs)
-    count = ask(
-        "3. How many valves, and metres between them", f"{answers.valves} {answers.spacing_m:g}"
-    ).replace(",", " ")
-    answers = _with_valves(answers, count.split())
-    flow = ask(
-        "4. Flow of one valve, fully open: L/min, or ISO size as in '03 at 3 bar'",
-        f"{answers.nozzle_l_min:g}",
+        _with_outputs,
+        answers,
     )
-    answers = replace(answers, nozzle_l_min=nozzle_flow(flow))
-    answers = replace(answers, map_file=ask("5. Prescription map, if there is one", ""))
-    swath = ask("6. Swath in metres", f"{answers.width_m:g}")
-    return replace(answers, swath_m=_number(swath, "swath", 0.1, 100.0))
+    answers = asked(
+        "3. How many valves, and metres between them",
+        f"{answers.valves} {answers.spacing_m:g}",
+        _with_valves,
+        answers,
+    )
+    answers = asked(
+        "4. Flow of one valve, fully open: L/min, an ISO size as in '03 at 3 bar', or the CSV file "
+        "of a bucket test",
+        answers.bucket or f"{answers.nozzle_l_min:g}",
+        _with_flow,
+        answers,
+    )
+    answers = asked(
+        "5. Prescription map, if there is one, and its unit if the map does not say it, as in "
+        "field.geojson L/ha",
+        f"{answers.map_file} {answers.unit}".strip(),
+        _with_map,
+        answers,
+    )
+    return asked("6. Swath in metres", f"{answers.width_m:g}", _with_swath, answers)
 
 
 def answers_of(
-    autopilot: str, output: str, valves: str, nozzle: str, map_file: str, swath_m: float | None
+    *,
+    autopilot: str,
+    output: str,
+    valves: str,
+    nozzle: str,
+    map_file: str,
+    unit: str,
+    swath_m: float | None,
 ) -> Answers:
     """Return the answers of the command line; a ConfigError for one that cannot be."""
-    answers = _with_autopilot(Answers(map_file=map_file), autopilot.split())
-    answers = _with_valves(_with_outputs(answers, output.split()), valves.split())
-    answers = replace(answers, nozzle_l_min=nozzle_flow(nozzle))
-    if swath_m is None:
-        return answers
-    return replace(answers, swath_m=_number(f"{swath_m}", "swath", 0.1, 100.0))
+    answers = _with_autopilot(Answers(map_file=map_file, unit=known_unit(unit)), autopilot)
+    answers = _with_flow(_with_valves(_with_outputs(answers, output), valves), nozzle)
+    return answers if swath_m is None else _with_swath(answers, f"{swath_m}")
+
+
+def known_unit(unit: str) -> str:
+    """Return a unit of rates as it is, or none; a ConfigError for another."""
+    if unit and unit not in UNITS:
+        raise ConfigError(f"{unit!r}: no unit of rates; write one of {', '.join(UNITS)}")
+    return unit
 
 
 def nozzle_flow(text: str) -> float:
@@ -93,7 +140,22 @@ def nozzle_flow(text: str) -> float:
     return _number(f"{flow}", "flow of one valve", 0.01, 100.0)
 
 
-def _with_autopilot(answers: Answers, words: list[str]) -> Answers:
+def bucket_curves(csv: str) -> tuple[Mapping[str, Any], ...]:
+    """Return the nozzle sets that `vrspray calibrate flow` fits to a bucket test."""
+    command = find_command("calibrate")
+    if command is None:
+        raise ConfigError(f"{csv}: `vrspray calibrate` is not installed here; write a flow instead")
+    told = io.StringIO()
+    with redirect_stdout(told):
+        load_command("calibrate", command).main(["flow", csv, "--json"], standalone_mode=False)
+    result = json.loads(told.getvalue())
+    if "sets" not in result:
+        raise ConfigError(f"{csv}: was measured by pulse widths, of a pump; see examples/pump")
+    return tuple(result["sets"])
+
+
+def _with_autopilot(answers: Answers, text: str) -> Answers:
+    words = text.split()
     name, *rest = words or [""]
     if name not in AUTOPILOTS or len(rest) > 1:
         raise ConfigError(
@@ -110,7 +172,8 @@ def _with_autopilot(answers: Answers, words: list[str]) -> Answers:
     )
 
 
-def _with_outputs(answers: Answers, words: list[str]) -> Answers:
+def _with_outputs(answers: Answers, text: str) -> Answers:
+    words = text.split()
     kind, *rest = words or [""]
     if kind not in OUTPUTS or len(rest) > 1:
         raise ConfigError(f"{' '.join(words)!r}: no output; write servo 9, or gpio 5")
@@ -119,7 +182,8 @@ def _with_outputs(answers: Answers, words: list[str]) -> Answers:
     return replace(answers, output="gpio" if kind == "gpio" else "servo", first_channel=first)
 
 
-def _with_valves(answers: Answers, words: list[str]) -> Answers:
+def _with_valves(answers: Answers, text: str) -> Answers:
+    words = text.replace(",", " ").split()
     if len(words) != 2:
         raise ConfigError(f"{' '.join(words)!r}: write two numbers, such as 6 1.0")
     count = _number(words[0], "number of valves", 1, VALVES_MAX)
@@ -127,6 +191,27 @@ def _with_valves(answers: Answers, words: list[str]) -> Answers:
         raise ConfigError(f"number of valves {words[0]}: not a whole number")
     spacing_m = _number(words[1], "spacing", 0.05, 50.0)
     return replace(answers, valves=int(count), spacing_m=spacing_m, swath_m=None)
+
+
+def _with_flow(answers: Answers, text: str) -> Answers:
+    if Path(text).suffix.lower() == ".csv":
+        return replace(answers, bucket=text, curves=bucket_curves(text))
+    return replace(answers, nozzle_l_min=nozzle_flow(text), bucket="", curves=())
+
+
+def _with_map(answers: Answers, text: str) -> Answers:
+    name, _, unit = text.rpartition(" ")
+    if not name:
+        name, unit = unit, answers.unit
+    elif unit not in UNITS:  # a blank within the name
+        name, unit = text, answers.unit
+    if name and not Path(name).exists():
+        raise ConfigError(f"{name}: there is no such file; give a map, or nothing")
+    return replace(answers, map_file=name, unit=unit)
+
+
+def _with_swath(answers: Answers, text: str) -> Answers:
+    return replace(answers, swath_m=_number(text, "swath", 0.1, 100.0))
 
 
 def _number(text: str, what: str, least: float, most: float) -> float:
@@ -143,7 +228,7 @@ def text_of(answers: Answers, *, map_name: str = "") -> str:
     """Return the configuration as text; `map_name` is that of the map, seen from the file."""
     parts = [_HEAD, _link(answers)]
     if map_name:
-        parts.append(_PRESCRIPTION.format(file=_quoted(map_name)))
+        parts.append(_prescription(map_name, answers.unit))
     parts += [_boom(answers), _flows(answers), _LAG, _output(answers), _safety(answers)]
     parts += [_mission(answers), _JOURNAL]
     return "\n".join(part.strip() + "\n" for part in parts)
@@ -159,6 +244,7 @@ _PRESCRIPTION = """
 # The map. If it has several columns of rates, or does not say its unit, write rate_field and unit.
 [prescription]
 file = {file}
+{unit}
 """
 _LAG = """
 # MEASURE: how late the spray is. These are those of an example, and `vrspray doctor` says so until
@@ -188,6 +274,11 @@ def _link(answers: Answers) -> str:
     )
 
 
+def _prescription(map_name: str, unit: str) -> str:
+    unit_line = f"unit = {_quoted(unit)}" if unit else ""
+    return _PRESCRIPTION.format(file=_quoted(map_name), unit=unit_line).strip()
+
+
 def _boom(answers: Answers) -> str:
     lines = [
         "# Width of a pass, and the height above the crop.",
@@ -206,9 +297,20 @@ def _boom(answers: Answers) -> str:
 
 
 def _flows(answers: Answers) -> str:
-    names = ", ".join(f'"{number + 1}"' for number in range(answers.valves))
+    every = [str(number + 1) for number in range(answers.valves)]
     duty = (0.2, 0.4, 0.6, 0.8, 1.0)
-    flows = ", ".join(f"{each * answers.valves * answers.nozzle_l_min:.3f}" for each in duty)
+    guess = {
+        "valves": every,
+        "duty": duty,
+        "flow_l_min": [each * answers.valves * answers.nozzle_l_min for each in duty],
+    }
+    if answers.curves:
+        source = f"# Flow of all valves of a set together: the bucket test in {answers.bucket}."
+    else:
+        source = f"""# MEASURE: flow of all valves together at each duty, here in proportion to it,
+# {answers.nozzle_l_min:.3g} L/min a valve. A bucket test:
+# vrspray calibrate flow bucket.csv --config FILE --write"""
+    sets = "\n".join(_nozzle_set(each, every) for each in answers.curves or (guess,))
     return f"""
 [pwm]
 frequency_hz = 11.0
@@ -216,13 +318,17 @@ duty_min = 0.2
 duty_max = 0.9
 valve = "normally-closed"
 
-# MEASURE: flow of all valves together at each duty, here {answers.nozzle_l_min:.3g} L/min a
-# valve in proportion to the duty. A bucket test:
-# vrspray calibrate flow bucket.csv --config FILE --write
-[[nozzle_set]]
+{source}
+{sets}
+"""
+
+
+def _nozzle_set(curve: Mapping[str, Any], every: list[str]) -> str:
+    names = ", ".join(_quoted(name) for name in curve["valves"] or every)
+    return f"""[[nozzle_set]]
 valves = [{names}]
-duty = [{", ".join(f"{each:g}" for each in duty)}]
-flow_l_min = [{flows}]
+duty = [{", ".join(f"{each:g}" for each in curve["duty"])}]
+flow_l_min = [{", ".join(f"{each:.3f}" for each in curve["flow_l_min"])}]
 """
 
 
@@ -304,9 +410,9 @@ def _folders() -> list[Path]:
     return [place / "profiles" for place in places if (place / "profiles").is_dir()]
 
 
-def profile_text(text: str, *, map_name: str) -> str:
+def profile_text(text: str, *, map_name: str, unit: str = "") -> str:
     """Return a profile with another map; without one, for `plan` and without a map."""
-    table = _PRESCRIPTION.format(file=_quoted(map_name)).strip() + "\n\n" if map_name else ""
+    table = f"{_prescription(map_name, unit)}\n\n" if map_name else ""
     found = re.sub(
         r"(?m)(^#[^\n]*\n)*^\[prescription\]\n(?:(?!\[)[^\n]*\n)*", lambda _: table, text, count=1
     )

@@ -163,11 +163,11 @@ def run_companion(
 
 
 def _kept(path: Path, link: VehicleLink) -> tuple[str | None, str]:
-    """Return the journal, and what is said of it; one of a link that never opened is removed."""
-    if link.has_been_up:
+    """Return the journal, and what is said of it; one of a link on which nobody spoke is removed."""
+    if link.has_been_heard:
         return str(path), f"journal: {path}"
     path.unlink(missing_ok=True)
-    return None, "no journal is kept: the link never opened"
+    return None, "no journal is kept: nothing was heard on the link"
 
 
 def _guard_lines(setup: Setup) -> list[str]:

@@ -76,7 +76,7 @@ class VehicleLink:
         self.statistics: LinkStatistics | None = None
         self._changed = False
         self._heard, self._told = True, True
-        self.has_been_up = False
+        self.has_been_heard = False
 
     @property
     def fault(self) -> str | None:
@@ -99,7 +99,6 @@ class VehicleLink:
             self._url, self._on_bytes, self._on_change, self._on_trouble
         )
         if self._transport.is_up:
-            self.has_been_up = True
             _logger.info("link up: %s", self._url)
             self._watch.link_up(self._clock())
         else:
@@ -218,6 +217,7 @@ class VehicleLink:
 
         Before anything is answered: what the vehicle is asked at once must reach it.
         """
+        self.has_been_heard = True
         speaker, now_s = self._spoke
         if self._transport is not None:
             self._transport.adopt(speaker, now_s, is_vehicle=is_vehicle)
@@ -225,7 +225,6 @@ class VehicleLink:
     def _on_change(self, is_up: bool) -> None:
         _logger.warning("link %s: %s", "is up" if is_up else "was lost", self._url)
         self._changed = is_up
-        self.has_been_up = self.has_been_up or is_up
         self._heard = self._told = False
         self._chunks.clear()
         if is_up:

@@ -54,6 +54,77 @@ def test_six_questions_are_asked_and_answered(tmp_path: Path) -> None:
     assert config.resolve(config.prescription.file).resolve() == MAP
 
 
+def test_what_cannot_be_is_asked_again(tmp_path: Path) -> None:
+    out = tmp_path / "field.toml"
+    said = f"rover\npx4\nrelay\nservo\n6\n6 1\nnone.csv\nblue\n1.5\nno-map.shp\n{MAP}\nwide\n5\n"
+    done = CliRunner().invoke(app, ["config", "new", "--out", str(out)], input=said)
+    assert done.exit_code == 0, done.output
+    assert [done.output.count(f"{number}. ") for number in range(1, 7)] == [2, 2, 2, 3, 2, 2]
+    assert "none.csv: there is no such file" in done.output
+    assert load(out).boom_table.width_m == 5.0
+
+
+BUCKET = """duty,seconds,millilitres,set
+0.2,60,1481,1-6
+0.4,60,2672,1-6
+0.6,60,3790,1-6
+0.8,60,5021,1-6
+1.0,60,6090,1-6
+"""
+
+
+@pytest.mark.parametrize("is_asked", [False, True])
+def test_a_bucket_test_gives_the_flows_instead_of_a_guess(is_asked: bool, tmp_path: Path) -> None:
+    out, table = tmp_path / "field.toml", tmp_path / "bucket.csv"
+    table.write_text(BUCKET)
+    words = ["config", "new", "--out", str(out)]
+    words += [] if is_asked else ["--yes", "--nozzle", str(table), "--json"]
+    done = CliRunner().invoke(app, words, input=f"\n\n\n{table}\n\n\n" if is_asked else None)
+    assert done.exit_code == 0, done.output
+    (curve,) = load(out).nozzle_set
+    assert curve.valves == ("1", "2", "3", "4", "5", "6")
+    assert curve.flow_l_min == pytest.approx((1.481, 2.672, 3.790, 5.021, 6.090), rel=0.03)
+    assert "MEASURE: flow" not in out.read_text()
+    if not is_asked:
+        assert "flow" not in " ".join(json.loads(done.stdout)["measure"])
+
+
+def test_a_bucket_test_of_other_valves_is_refused(tmp_path: Path, capsys: Captured) -> None:
+    out, table = tmp_path / "field.toml", tmp_path / "bucket.csv"
+    table.write_text(BUCKET)
+    words = ["config", "new", "--yes", "--valves", "4", "--out", str(out), "--nozzle", str(table)]
+    assert execute(words) == 2
+    assert "nozzle_set" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("profile", [[], ["--profile", "wang-2024-normally-closed"]])
+def test_a_map_without_a_unit_needs_one(
+    profile: list[str], tmp_path: Path, capsys: Captured
+) -> None:
+    zone = tmp_path / "zone.geojson"
+    corners = [[114.0, 36.0], [114.01, 36.0], [114.01, 36.01], [114.0, 36.0]]
+    geometry = {"type": "Polygon", "coordinates": [corners]}
+    feature = {"type": "Feature", "properties": {"rate": 18}, "geometry": geometry}
+    zone.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    out = tmp_path / "field.toml"
+    words = ["config", "new", "--yes", "--out", str(out), "--map", str(zone), "--force", *profile]
+    assert execute(words) == 2
+    said = capsys.readouterr()
+    assert "no unit is given" in said.out
+    assert f"vrspray config check {out}" in said.out
+    assert execute([*words, "--unit", "L/ha"]) == 0
+    assert load(out).prescription.unit == "L/ha"  # type: ignore[union-attr]
+    assert execute([*words, "--unit", "furlongs"]) == 2
+    assert "write one of L/ha" in capsys.readouterr().err
+    blank = tmp_path / "my zone.geojson"
+    zone.rename(blank)
+    told = f"\n\n\n\n{blank} L/ha\n\n"
+    asking = ["config", "new", "--out", str(out), "--force"]
+    assert CliRunner().invoke(app, asking, input=told).exit_code == 0
+    assert load(out).prescription.unit == "L/ha"  # type: ignore[union-attr]
+
+
 @pytest.mark.parametrize(
     "name", sorted(path.stem for path in (ROOT / "examples/profiles").iterdir())
 )
