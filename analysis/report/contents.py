@@ -469,7 +469,8 @@ def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
             "one of them is wrong.",
         )
     if evaluation.missed:
-        yield _warning("missed", f"{evaluation.missed} change{'' if evaluation.missed == 1 else 's'} of rate never happened.")
+        changes = "change" if evaluation.missed == 1 else "changes"
+        yield _warning("missed", f"{evaluation.missed} {changes} of rate never happened.")
     if evaluation.off_target_ml > 1.0:
         yield _warning("outside", f"{evaluation.off_target_ml:.1f} mL fell outside the border.")
 

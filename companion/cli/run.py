@@ -163,7 +163,7 @@ def run_companion(
 
 
 def _kept(path: Path, link: VehicleLink) -> tuple[str | None, str]:
-    """Return the journal, and what is said of it; one of a link on which nobody spoke is removed."""
+    """Return the journal, and what is said of it; without anybody heard it is removed."""
     if link.has_been_heard:
         return str(path), f"journal: {path}"
     path.unlink(missing_ok=True)

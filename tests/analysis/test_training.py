@@ -26,6 +26,7 @@ from tests.analysis import report_flight
 from tests.analysis.test_evaluation_flights import Flight, record_of
 from tests.companion.test_component import Peer
 from tests.companion.test_sensors_gauges import FakeCounter, FakeLevel
+from tests.companion.wire_peer import free_port, heard
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "anyang" / "config.toml"
 
@@ -47,12 +48,11 @@ def test_the_mark_is_what_is_in_the_tank(overrides: tuple[str, ...], mark: str) 
 
 
 def test_run_marks_its_journal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = execute(
-        [
-            *("run", "--config", str(EXAMPLE), "--water", "--json", "--duration-s", "0.2"),
-            *("--set", "link.url=udpin:127.0.0.1:0", "--set", f"journal.folder={tmp_path}"),
-        ]
-    )
+    port = free_port()
+    words = ["run", "--config", str(EXAMPLE), "--water", "--json", "--duration-s", "0.5"]
+    words += ["--set", f"link.url=udpin:127.0.0.1:{port}", "--set", f"journal.folder={tmp_path}"]
+    with heard(port):
+        code = execute(words)
     result = json.loads(capsys.readouterr().out)
     assert (code, result["training"]) == (0, "water")
     assert read_journal(Path(result["journal"])).training == "water"

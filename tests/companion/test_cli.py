@@ -21,6 +21,7 @@ from companion.link.vehicle_link import VehicleLink
 from companion.output.gpio import GpioExecutor
 from companion.output.servo import ServoExecutor
 from companion.output.timed import DryRunExecutor
+from tests.companion.wire_peer import free_port, heard
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 CONFIG = str(FOLDER / "config.toml")
@@ -553,8 +554,16 @@ def test_run_whose_link_never_opened_leaves_no_journal(capsys: Captured, tmp_pat
     assert not list(tmp_path.glob("*.gpkg*"))
 
 
-def test_run_ends_after_its_duration_and_leaves_a_journal(capsys: Captured, tmp_path: Path) -> None:
+def test_run_that_heard_nobody_leaves_no_journal(capsys: Captured, tmp_path: Path) -> None:
     code, found = run_json(capsys, *run_arguments(tmp_path, 0), "--duration-s", "0.2")
+    assert (code, found["journal"]) == (0, None)
+    assert not list(tmp_path.glob("*.gpkg*"))
+
+
+def test_run_ends_after_its_duration_and_leaves_a_journal(capsys: Captured, tmp_path: Path) -> None:
+    port = free_port()
+    with heard(port):
+        code, found = run_json(capsys, *run_arguments(tmp_path, port), "--duration-s", "0.5")
     assert code == 0
     assert Path(found["journal"]) == tmp_path / "flight-0001.gpkg"
     code, replayed = run_json(capsys, "replay", found["journal"])

@@ -12,6 +12,7 @@ import pytest
 
 from companion.commands import registered
 from tests.companion.test_flight_map import config_naming, office_files, written
+from tests.companion.wire_peer import free_port, heard
 
 # What the README of a distribution of somebody else would say (docs/contributing/commands.md).
 METADATA = "Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n"
@@ -141,10 +142,12 @@ def test_a_vehicle_without_the_office_flies_a_compiled_map(vehicle: Path, tmp_pa
     config = config_naming(tmp_path, flight_map.path.name)
     checked = vrspray(vehicle, "config", "check", str(config), "--json")
     assert (checked.returncode, json.loads(checked.stdout)["ok"]) == (0, True)
-    flown = vrspray(
-        vehicle, "run", "--config", str(config), "--duration-s", "0.5", "--json",
-        "--set", "link.url=udpin:127.0.0.1:0", "--set", "output.kind=none",
-    )  # fmt: skip
+    port = free_port()
+    with heard(port):
+        flown = vrspray(
+            vehicle, "run", "--config", str(config), "--duration-s", "0.5", "--json",
+            "--set", f"link.url=udpin:127.0.0.1:{port}", "--set", "output.kind=none",
+        )  # fmt: skip
     assert flown.returncode == 0, flown.stderr
     listed = vrspray(vehicle, "flights", "list", "--folder", str(tmp_path / "flights"))
     assert "flight-0001.gpkg" in listed.stdout

@@ -20,6 +20,7 @@ from companion.cli.live import Screen, Shown, Watcher, drawn, shown_of
 from companion.core.types import Decision, Inhibit, SprayerState, SprayPlan, TimedChange
 from companion.tally import Tally, next_change_s
 from tests.builders import flying
+from tests.companion.wire_peer import free_port, heard
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 
@@ -102,8 +103,9 @@ def test_nothing_is_drawn_just_before_a_valve_moves() -> None:
     assert shown == [1.0]
 
 
-def run_words(folder: Path) -> list[str]:
-    settings = [f"journal.folder={folder}", "link.url=udpin:127.0.0.1:0", "output.kind=none"]
+def run_words(folder: Path, port: int) -> list[str]:
+    url = f"udpin:127.0.0.1:{port}"
+    settings = [f"journal.folder={folder}", f"link.url={url}", "output.kind=none"]
     words = [part for one in settings for part in ("--set", one)]
     config = str(FOLDER / "config.toml")
     return [sys.executable, "-m", "companion", "run", "--config", config, *words]
@@ -120,9 +122,10 @@ def test_output_that_nobody_reads_stops_neither_loop_nor_end(kind: str, tmp_path
         ours, theirs = pty.openpty()
     else:
         ours, theirs = os.pipe()
-    with (tmp_path / "out").open("wb") as out:
+    port = free_port()
+    with heard(port), (tmp_path / "out").open("wb") as out:
         process = subprocess.Popen(
-            [*run_words(tmp_path), "--duration-s", "3"],
+            [*run_words(tmp_path, port), "--duration-s", "3"],
             stdout=out,
             stderr=theirs,
             env={**os.environ, "TERM": "xterm"},

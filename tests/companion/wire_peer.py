@@ -9,8 +9,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +37,27 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+@contextlib.contextmanager
+def heard(port: int) -> Iterator[None]:
+    """Say an autopilot's heartbeat to a port of this computer, twenty times a second, and no more."""
+    mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    is_over = threading.Event()
+
+    def say() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+            while not is_over.wait(0.05):
+                with contextlib.suppress(OSError):  # nobody listens yet, or any more
+                    out.sendto(mav.heartbeat_encode(2, 3, 0, 0, 4).pack(mav), ("127.0.0.1", port))
+
+    speaker = threading.Thread(target=say)
+    speaker.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        speaker.join()
 
 
 def _begin_s() -> float:
