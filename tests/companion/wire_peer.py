@@ -41,7 +41,7 @@ def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
 
 @contextlib.contextmanager
 def heard(port: int) -> Iterator[None]:
-    """Say an autopilot's heartbeat to a port of this computer, twenty times a second, and no more."""
+    """Say an autopilot's heartbeat, and no more, to a port of this computer."""
     mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     is_over = threading.Event()
 
