@@ -235,12 +235,14 @@ def ordered_ml_s(
 
 def _total_of(nozzles: NozzleSet, valve: Ints, duty: Floats) -> Floats:
     """Return the flow of a set's valves after each order, if all of them gave its shares."""
-    share = np.where(np.isin(valve, nozzles.valves), flow_of(nozzles, duty), 0.0)
-    share /= len(nozzles.valves)
-    rise = share.copy()
+    own = np.where(np.isin(valve, nozzles.valves), flow_of(nozzles, duty), 0.0)
+    own /= len(nozzles.valves)
+    for each in nozzles.valves:
+        own[valve == each] *= nozzles.share(each)
+    rise = own.copy()
     for each in nozzles.valves:
         its = np.flatnonzero(valve == each)
-        rise[its[1:]] -= share[its[:-1]]
+        rise[its[1:]] -= own[its[:-1]]
     # What sums of rises and falls leave where all is closed is rounding.
     total = np.cumsum(rise)
     return np.where(np.abs(total) < 1e-9, 0.0, total)

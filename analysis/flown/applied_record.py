@@ -81,7 +81,8 @@ def modelled_ml(flight: AppliedFlight, time_s: Floats) -> Floats:
     if setup.pumping is not None:
         return pumped_ml(flight, time_s)
     changes = flight.changes
-    flows = valve_flows(changes, setup.nozzle_sets, setup.lag, len(setup.boom.valves))
+    lags = [setup.lag.of_valve(valve) for valve in setup.boom.valves]
+    flows = valve_flows(changes, setup.nozzle_sets, lags)
     return np.stack([flow.volume_ml(time_s) for flow in flows], axis=1)
 
 

@@ -61,14 +61,14 @@ def ordered_s(changes: ValveChanges) -> Floats:
 
 
 def valve_flows(
-    changes: ValveChanges, nozzle_sets: Sequence[NozzleSet], lag: LagModel, valve_count: int
+    changes: ValveChanges, nozzle_sets: Sequence[NozzleSet], lags: Sequence[LagModel]
 ) -> list[ValveFlow]:
-    """Return the flow of each valve that the executed changes stand for."""
+    """Return the flow of each valve that the executed changes stand for; `lags` are of each."""
     order_s = ordered_s(changes)
     levels = levels_ml_s(changes, nozzle_sets)
     return [
         ramped(order_s[changes.valve == valve], levels[changes.valve == valve], lag)
-        for valve in range(valve_count)
+        for valve, lag in enumerate(lags)
     ]
 
 
@@ -85,7 +85,8 @@ def levels_ml_s(changes: ValveChanges, nozzle_sets: Sequence[NozzleSet]) -> Floa
     levels = np.zeros(len(changes.duty))
     for i, nozzles in enumerate(by_size):
         its = (number == i) & np.isin(changes.valve, nozzles.valves)
-        levels[its] = flow_of(nozzles, changes.duty[its]) / len(nozzles.valves)
+        shares = np.array([nozzles.share(valve) for valve in changes.valve[its].tolist()])
+        levels[its] = flow_of(nozzles, changes.duty[its]) * shares / len(nozzles.valves)
     return levels
 
 

@@ -197,6 +197,7 @@ def _setup(flight: AppliedFlight) -> dict[str, Any]:
                 "valves": [setup.boom.valves[valve].name for valve in nozzles.valves],
                 "duty": list(nozzles.curve.duty),
                 "flow_l_min": list(nozzles.curve.flow_l_min),
+                "shares": [nozzles.share(valve) for valve in nozzles.valves],
             }
             for nozzles in setup.nozzle_sets
         ],

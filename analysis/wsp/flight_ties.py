@@ -398,13 +398,14 @@ def _applied_l_ha(
     if not sets:
         return None
     nozzles = min(sets, key=lambda each: len(each.valves))
-    flow = nozzles.curve.flow_for(duties[valve]) / len(nozzles.valves)
+    flow = nozzles.curve.flow_for(duties[valve]) * nozzles.share(valve) / len(nozzles.valves)
     return flow / (_ML_FACTOR * speed_m_s * boom.valves[valve].width_m)
 
 
 def duty_at(flight: AppliedFlight, valve: int, time_s: float) -> float:
     """Return the duty that the liquid of a valve followed: each change after its lag."""
-    changes, lag = flight.changes, flight.setup.lag
+    changes = flight.changes
+    lag = flight.setup.lag.of_valve(flight.setup.boom.valves[valve])
     own = changes.valve == valve
     planned_s, actual_s = changes.planned_s[own], changes.actual_s[own]
     ordered_s = np.where(np.isfinite(actual_s), actual_s, planned_s)

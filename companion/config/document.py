@@ -118,6 +118,11 @@ class Document(tables.Table):
                     forward_m=_or(valve.forward_m, self.boom_table.forward_m),
                     width_m=_or(valve.width_m, shared_m),
                     channel=valve.channel or 0,
+                    flow_factor=valve.flow_factor,
+                    lag_on_s=valve.lag_on_s,
+                    lag_off_s=valve.lag_off_s,
+                    lag_up_s=valve.lag_up_s,
+                    lag_down_s=valve.lag_down_s,
                 )
                 for valve in self.valve
             ),

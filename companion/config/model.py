@@ -47,13 +47,15 @@ class Config(Document):
 
             return (pump_set(self, self.pump),)
         index = {valve.name: number for number, valve in enumerate(self.valve)}
+        factors = [valve.flow_factor for valve in self.valve]
         sets = []
         for table in self.nozzle_set:
             duty, flow_l_min = table.points(self.valve)
             sets.append(
-                NozzleSet(
-                    valves=tuple(sorted(index[name] for name in table.valves)),
-                    curve=FlowCurve(duty=duty, flow_l_min=flow_l_min),
+                NozzleSet.with_factors(
+                    tuple(sorted(index[name] for name in table.valves)),
+                    FlowCurve(duty=duty, flow_l_min=flow_l_min),
+                    factors,
                 )
             )
         return tuple(sorted(sets, key=lambda nozzles: nozzles.flow_max_l_min))

@@ -12,6 +12,7 @@ from companion.core.nozzle import FLOW_LAWS
 
 Lag = Annotated[FiniteFloat, Field(ge=0.0, le=30.0)]
 Offset = Annotated[FiniteFloat, Field(ge=-50.0, le=50.0)]
+OwnLag = Annotated[FiniteFloat, Field(ge=-0.1, le=0.1)]
 
 
 class BoomTable(Table):
@@ -45,6 +46,14 @@ class ValveTable(Table):
         description="of its strip; else boom.width_m over the valves of the largest set",
     )
     forward_m: Offset | None = Field(default=None, description="instead of boom.forward_m")
+    flow_factor: Annotated[FiniteFloat, Field(ge=0.5, le=1.5)] = Field(
+        default=1.0,
+        description="measured: its flow over that of the mean valve, at the same duty",
+    )
+    lag_on_s: OwnLag = Field(default=0.0, description="measured: later than lag.on_s by so much")
+    lag_off_s: OwnLag = Field(default=0.0, description="measured: later than lag.off_s")
+    lag_up_s: OwnLag = Field(default=0.0, description="measured: later than lag.up_s")
+    lag_down_s: OwnLag = Field(default=0.0, description="measured: later than lag.down_s")
 
 
 class PwmTable(Table):

@@ -24,6 +24,8 @@ class Valve:
     """One valve and the strip of ground that its nozzles cover, in the body frame.
 
     `right_m` and `forward_m` are from the autopilot's position reference to the strip's centre.
+    `flow_factor` is what it delivers at a duty over what the mean valve of its set does, and the
+    lags are how much later [s] it is than the set's own; measured by `vrspray calibrate valves`.
     """
 
     name: str
@@ -31,12 +33,26 @@ class Valve:
     forward_m: float
     width_m: float
     channel: int = 0
+    flow_factor: float = 1.0
+    lag_on_s: float = 0.0
+    lag_off_s: float = 0.0
+    lag_up_s: float = 0.0
+    lag_down_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0.0 < self.width_m < 1000.0:
             raise ValueError(f"width of valve {self.name} must be positive, got {self.width_m}")
         if not (abs(self.right_m) < 1000.0 and abs(self.forward_m) < 1000.0):
             raise ValueError(f"offset of valve {self.name} is no length")
+        if not 0.5 <= self.flow_factor <= 2.0:
+            raise ValueError(f"flow_factor of valve {self.name} must lie in [0.5, 2]")
+        if not all(abs(lag_s) <= 0.5 for lag_s in self.lags_s):
+            raise ValueError(f"lags of valve {self.name} must lie in [-0.5, 0.5] s")
+
+    @property
+    def lags_s(self) -> tuple[float, float, float, float]:
+        """Return how much later than its set it is: on, off, up, down."""
+        return self.lag_on_s, self.lag_off_s, self.lag_up_s, self.lag_down_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

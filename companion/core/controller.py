@@ -317,8 +317,8 @@ def _orders(
     trim = _trim(setup, state, before, liquid, now_s)
     skew = skew_of(state, speed_m_s)
 
-    def dose(number: int) -> Dosing:
-        own = 1.0 if trim is None else trim.sets[number].trim
+    def dose(number: int, share: float) -> Dosing:
+        own = share if trim is None else share * trim.sets[number].trim
         return dosing_of(setup, number, skew / own, state.rate_percent)
 
     dosing = dosing_by_valve(setup.nozzle_sets, index, set_of_rate, dose)
@@ -347,7 +347,7 @@ def _orders(
             schedule(
                 route,
                 valve=valve,
-                timing=setup.timing,
+                timing=setup.timings[valve],
                 dosing=of_valve,
                 in_force=in_force[valve],
                 speed_soon_m_s=soon_m_s * own,
@@ -521,4 +521,5 @@ def _flow(setup: Setup, plan: SprayPlan, index: int) -> float:
     nozzles = setup.doses.nozzle_sets[index]
     now = _in_force(setup, liquid_of(setup.pumping, plan), plan.issued_s)
     flows = {duty: nozzles.curve.flow_for(duty) for duty in set(now)}
-    return sum(flows[now[valve]] for valve in nozzles.valves) / len(nozzles.valves)
+    of_each = [flows[now[valve]] * nozzles.share(valve) for valve in nozzles.valves]
+    return sum(of_each) / len(of_each)

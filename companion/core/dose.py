@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Protocol
 
 from companion.core.boom import Boom
@@ -57,7 +58,11 @@ def skew_of(state: VehicleState, speed_m_s: float) -> float:
 
 
 def dosing_of(setup: Sprayer, index: int, skew: float, percent: float) -> Dosing:
-    """Return the function from rate and speed to the duty of a valve of the set in use."""
+    """Return the function from rate and speed to the duty of a valve of the set in use.
+
+    A valve that delivers less than the mean of its set is dosed as if the boom were wider: `skew`
+    over its share.
+    """
     width_m = setup.boom.width_m * skew
     curve, pwm = setup.nozzle_sets[index].curve, setup.pwm
     known: dict[tuple[float, float], float] = {}  # neighbours ask for the same
@@ -163,23 +168,33 @@ def _delivers(nozzles: NozzleSet, flow_l_min: float) -> bool:
 
 
 def dosing_by_valve(
-    sets: tuple[NozzleSet, ...], in_use: int, of_rate: SetOfRate, dose: Callable[[int], Dosing]
+    sets: tuple[NozzleSet, ...],
+    in_use: int,
+    of_rate: SetOfRate,
+    dose: Callable[[int, float], Dosing],
 ) -> Callable[[int], Dosing]:
     """Return each valve's dosing: by the set of its rate, closed where that set lacks the valve.
 
-    `dose` makes the dosing of a set. A rate that only the sides of the boom meet is sprayed with
-    the set in use: the boom's middle decides.
+    `dose` makes the dosing of a set and of a valve's share. A rate that only the sides of the boom
+    meet is sprayed with the set in use: the boom's middle decides.
     """
     chosen = dict(of_rate)
-    doses = {number: dose(number) for number in {in_use, *chosen.values()}}
-    if len(doses) == 1:
-        members, one = sets[in_use].valves, doses[in_use]
-        return lambda valve: one if valve in members else _shut
+    known: dict[tuple[int, float], Dosing] = {}
+
+    def member(number: int, valve: int) -> Dosing:
+        if valve not in sets[number].valves:
+            return _shut
+        key = (number, sets[number].share(valve))
+        if key not in known:
+            known[key] = dose(*key)
+        return known[key]
+
+    if len({in_use, *chosen.values()}) == 1:
+        return partial(member, in_use)
 
     def of_valve(valve: int) -> Dosing:
         def duty(rate_l_ha: float, speed_m_s: float) -> float:
-            number = chosen.get(rate_l_ha, in_use)
-            return doses[number](rate_l_ha, speed_m_s) if valve in sets[number].valves else 0.0
+            return member(chosen.get(rate_l_ha, in_use), valve)(rate_l_ha, speed_m_s)
 
         return duty
 

@@ -7,6 +7,7 @@ P1's Eq. 2 contradicts its own table by up to 22 % of flow. It is here as a pres
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -120,14 +121,44 @@ class FlowCurve:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NozzleSet:
-    """Valves (indices from the left) that spray together, and their measured curve."""
+    """Valves (indices from the left) that spray together, and their measured curve.
+
+    `shares` are what each delivers at a duty over the mean of the set; empty: all the same.
+    """
 
     valves: tuple[int, ...]
     curve: FlowCurve
+    shares: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.valves or len(set(self.valves)) != len(self.valves):
             raise ValueError(f"a nozzle set needs valves, each once, got {self.valves}")
+        if self.shares and len(self.shares) != len(self.valves):
+            raise ValueError("a nozzle set needs a share of each of its valves, or none")
+        if not all(0.2 <= share <= 5.0 for share in self.shares):
+            raise ValueError(f"shares of a nozzle set must lie in [0.2, 5], got {self.shares}")
+
+    @classmethod
+    def with_factors(
+        cls, valves: tuple[int, ...], curve: FlowCurve, factors: Sequence[float]
+    ) -> NozzleSet:
+        """Return a set whose valves differ; `factors` are of all valves of the boom.
+
+        The curve is of the set's whole flow, so that only ratios within the set count.
+
+        >>> curve = FlowCurve(duty=(0.0, 1.0), flow_l_min=(0.0, 2.0))
+        >>> NozzleSet.with_factors((0, 2), curve, (0.9, 7.0, 1.1)).shares
+        (0.9, 1.1)
+        """
+        own = [factors[valve] for valve in valves]
+        if all(factor == own[0] for factor in own):
+            return cls(valves=valves, curve=curve)
+        mean = sum(own) / len(own)
+        return cls(valves=valves, curve=curve, shares=tuple(factor / mean for factor in own))
+
+    def share(self, valve: int) -> float:
+        """Return what a valve of the set delivers over the mean of the set."""
+        return self.shares[self.valves.index(valve)] if self.shares else 1.0
 
     @property
     def flow_min_l_min(self) -> float:

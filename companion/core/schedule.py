@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
+from companion.core.boom import Valve
 from companion.core.crossings import Crossing, Route
 from companion.core.types import Method, TimedChange
 
@@ -86,6 +87,25 @@ class LagModel:
             raise ValueError("on_start_s (first flow) cannot be later than on_s")
         if not self.off_end_s >= self.off_s:
             raise ValueError("off_end_s (last flow) cannot be earlier than off_s")
+
+    def of_valve(self, valve: Valve) -> LagModel:
+        """Return the lags of one valve, whose own differ from its set's.
+
+        The two ends of the flow move to the safe side only: nobody measured them of one valve.
+        """
+        if not any(valve.lags_s):
+            return self
+        on_s = max(self.on_s + valve.lag_on_s, 0.0)
+        off_s = max(self.off_s + valve.lag_off_s, 0.0)
+        return replace(
+            self,
+            on_s=on_s,
+            off_s=off_s,
+            up_s=max(self.up_s + valve.lag_up_s, self.up_time_s),
+            down_s=max(self.down_s + valve.lag_down_s, self.down_time_s),
+            on_start_s=min(max(self.on_start_s + min(valve.lag_on_s, 0.0), 0.0), on_s),
+            off_end_s=max(self.off_end_s + max(valve.lag_off_s, 0.0), off_s),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

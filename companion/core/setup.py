@@ -56,6 +56,7 @@ class Setup:
     # What earlier flights treated; not compared by hash: tiles are a mapping.
     treated: Coverage | None = field(default=None, repr=False, hash=False)
     timing: Timing = field(init=False, repr=False, compare=False)
+    timings: tuple[Timing, ...] = field(init=False, repr=False, compare=False)  # of each valve
     # The longest lead of any order: of valves, pump and atomisers.
     longest_s: float = field(init=False, repr=False, compare=False)
     # How far behind a path begins, so that short stays are seen whole.
@@ -82,12 +83,11 @@ class Setup:
         count = len(self.boom.valves)
         if any(valve >= count for nozzles in self.nozzle_sets for valve in nozzles.valves):
             raise ValueError("a nozzle set names a valve that the boom does not have")
-        timing = Timing.of(
-            self.method, self.lag, look_ahead_s=self.look_ahead_s, period_s=self.pwm.period_s
-        )
-        object.__setattr__(self, "timing", timing)
+        object.__setattr__(self, "timing", self._timing(self.lag))
+        timings = tuple(self._timing(self.lag.of_valve(valve)) for valve in self.boom.valves)
+        object.__setattr__(self, "timings", timings)
         object.__setattr__(self, "pumping", self._pumping())
-        stays_s = 2.0 * timing.dwell_min_s
+        stays_s = 2.0 * max(timing.dwell_min_s for timing in timings)
         object.__setattr__(self, "longest_s", self._longest_s())
         object.__setattr__(self, "back_s", 0.1 + stays_s)
         ahead_s = self.lease_s + (self.longest_s + stays_s) + ROUTES_KEPT_S + 0.05
@@ -103,6 +103,11 @@ class Setup:
             watching = Watching.of(self.detection, doses.nozzle_sets, doses.lag, doses.pwm)
         object.__setattr__(self, "watching", watching)
         object.__setattr__(self, "recording", self._recording() if self.records_coverage else None)
+
+    def _timing(self, lag: LagModel) -> Timing:
+        return Timing.of(
+            self.method, lag, look_ahead_s=self.look_ahead_s, period_s=self.pwm.period_s
+        )
 
     def _recording(self) -> TreatedAreaSettings:
         return TreatedAreaSettings(
@@ -137,7 +142,7 @@ class Setup:
         return self if self.pumping is None else self.pumping
 
     def _longest_s(self) -> float:
-        longest_s = self.timing.longest_s
+        longest_s = max(timing.longest_s for timing in self.timings)
         if self.pumping is not None:
             longest_s = max(longest_s, self.pumping.timing.longest_s)
         for atomiser in self.atomisers:

@@ -32,7 +32,7 @@ SET = NozzleSet(valves=tuple(range(6)), curve=CURVE)
 
 
 def test_a_lone_valve_opens_by_its_lag_and_closes_by_the_other() -> None:
-    flow = valve_flows(changes_of([(10.0, 0, 0.7), (12.0, 0, 0.0)]), [SET], LAG, 1)[0]
+    flow = valve_flows(changes_of([(10.0, 0, 0.7), (12.0, 0, 0.0)]), [SET], [LAG])[0]
     full_ml_s = CURVE.flow_for(0.7) * ML_S_PER_L_MIN / 6
     sprayed_s = 2.0 + LAG.off_s - LAG.on_s
     assert flow.volume_ml(np.array([20.0]))[0] == pytest.approx(full_ml_s * sprayed_s, rel=1e-9)

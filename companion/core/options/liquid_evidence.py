@@ -522,6 +522,7 @@ class Watching:
     full_ml_s: float
     open_ml_s: float
     valves: tuple[tuple[int, ...], ...]
+    shares: tuple[tuple[float, ...], ...]
     tables: tuple[tuple[float, ...], ...]
 
     @classmethod
@@ -542,6 +543,7 @@ class Watching:
             full_ml_s=full_ml_s,
             open_ml_s=full_ml_s / len(largest.valves),
             valves=tuple(nozzles.valves for nozzles in sets),
+            shares=tuple(tuple(map(nozzles.share, nozzles.valves)) for nozzles in sets),
             tables=tuple(
                 tuple(
                     nozzles.curve.flow_for(duty) * ML_S_PER_L_MIN / len(nozzles.valves)
@@ -554,8 +556,9 @@ class Watching:
     def order(self, at_s: float, duties: tuple[float, ...], index: int) -> Order:
         """Return what duties stand for, by the table of a nozzle set."""
         table, flows, known = self.tables[index], [0.0] * len(duties), dict[float, float]()
+        shares = self.shares[index]
         total = 0.0
-        for valve in self.valves[index]:
+        for valve, share in zip(self.valves[index], shares, strict=True):
             duty = duties[valve]
             if duty > 0.0:
                 flow = known.get(duty)
@@ -563,7 +566,7 @@ class Watching:
                     i = min(int(duty * CURVE_STEPS), CURVE_STEPS - 1)
                     part = duty * CURVE_STEPS - i
                     flow = known[duty] = table[i] + (table[i + 1] - table[i]) * part
-                flows[valve] = flow
+                flows[valve] = flow * share
                 total += duty
         used = sum(1 for flow in flows if flow > 0.0)
         pressure = self.settings.pressure_at(total / used) if used else None
