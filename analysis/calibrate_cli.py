@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 OTHERS = {
     "lag-marks": Command(target="analysis.calibrate_marks:lag_marks", help=""),
     "flow": Command(target="analysis.calibrate_flow:flow", help=""),
+    "valves": Command(target="analysis.calibrate_valves:valves", help=""),
 }
 MISSION = "sitl.calibration_mission"
 
@@ -45,7 +46,7 @@ class Commands(TyperGroup):
 
 app = typer.Typer(
     cls=Commands,
-    help="Measure a sprayer: lags (from flow or marks) and flow curves.",
+    help="Measure a sprayer: lags (from flow or marks), flow curves, and each valve by itself.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,

@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from analysis.bucket import BucketCurve
+    from analysis.calibration.valves import IdentifiedValves
     from analysis.marks import Mark, MarksFit
 
 # Okabe and Ito's colours, told apart by all kinds of eyes.
@@ -33,6 +35,7 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
 }
 DPI = 150
+MS = 1000.0
 # Courses that differ by less are one direction of flight.
 SAME_DEG = 15.0
 
@@ -113,9 +116,59 @@ def plot_flow(
         axes.legend()
 
 
+def plot_valves(found: IdentifiedValves, names: Sequence[str], path: Path) -> None:
+    """Draw each valve's flow against the mean, and its lags, all with their intervals."""
+    with _figure(path) as figure:
+        flow_axes, lag_axes = figure.subplots(1, 2)
+        for place, own in enumerate(found.valves):
+            factor = own.factor
+            half = 50.0 * (factor.high - factor.low)
+            colour = COLOURS[1] if own.is_worn else COLOURS[0]
+            flow_axes.errorbar(
+                place, 100.0 * (factor.value - 1.0), yerr=half, fmt="o", color=colour, capsize=4
+            )
+            for number, (kind, lag) in enumerate(own.lags.items()):
+                lag_axes.errorbar(
+                    place + 0.16 * (number - 1.5),
+                    MS * lag.value,
+                    yerr=0.5 * MS * (lag.high - lag.low),
+                    fmt="o",
+                    ms=4,
+                    color=COLOURS[number],
+                    capsize=3,
+                    label=kind.value if not place else None,
+                )
+        for axes, what in (
+            (flow_axes, "flow against the mean of all [%]"),
+            (lag_axes, "later than the mean of all [ms]"),
+        ):
+            axes.axhline(0.0, color=FAINT, lw=0.8)
+            axes.set_xticks(range(len(names)), list(names))
+            axes.set_xlabel("valve")
+            axes.set_title(what)
+        if any(own.lags for own in found.valves):
+            lag_axes.legend(ncols=2)
+        else:
+            lag_axes.text(
+                0.5,
+                0.5,
+                "a catch says nothing of lags",
+                transform=lag_axes.transAxes,
+                ha="center",
+                color=FAINT,
+            )
+
+
 @contextmanager
 def _axes(path: Path) -> Iterator[Axes]:
     """Give axes to draw on, and write them to `path` at the end."""
+    with _figure(path) as figure:
+        yield figure.subplots()
+
+
+@contextmanager
+def _figure(path: Path) -> Iterator[Figure]:
+    """Give a figure to draw on, and write it to `path` at the end."""
     if importlib.util.find_spec("matplotlib") is None:
         raise TableError(f"no picture without matplotlib; {install_command('office')}")
     from matplotlib import rc_context
@@ -127,7 +180,7 @@ def _axes(path: Path) -> Iterator[Axes]:
     with rc_context(STYLE):
         figure = Figure(figsize=(6.4, 4.2), layout="constrained")
         FigureCanvasAgg(figure)
-        yield figure.subplots()
+        yield figure
         try:
             figure.savefig(path, dpi=DPI, facecolor="white", metadata={"Software": None})
         except OSError as error:

@@ -27,6 +27,8 @@ _HEADER = re.compile(r"\s*\[(\[?)\s*([A-Za-z0-9_]+)\s*\]")
 _KEY = re.compile(r"\s*([A-Za-z0-9_]+)\s*=")
 # A set with measured points has no published law any more.
 _REPLACED = {"nozzle_set": ("preset",)}
+# What tells the tables of a list apart.
+_NAMED_BY = {"nozzle_set": "valves", "valve": "name"}
 
 
 Write = Annotated[
@@ -95,18 +97,21 @@ def _wanted(old: dict[str, Any], tables: Mapping[str, Any], config: Path) -> dic
             continue
         for each in given:
             there = new[name][_place(old, name, each, config)]
-            there.update({key: value for key, value in each.items() if key != "valves"})
+            there.update({key: value for key, value in each.items() if key != _NAMED_BY[name]})
             for key in _REPLACED.get(name, ()):
                 there.pop(key, None)
     return new
 
 
 def _place(old: Mapping[str, Any], name: str, each: Mapping[str, Any], config: Path) -> int:
-    """Return which of the tables in a list has the valves of a measured one."""
+    """Return which of the tables in a list is the measured one: by its valves, or its name."""
+    key = _NAMED_BY[name]
     for number, there in enumerate(old.get(name, [])):
-        if set(there.get("valves", [])) == set(each.get("valves", [])):
+        if set(there.get(key, [])) == set(each.get(key, [])):
             return number
     valves = ", ".join(each.get("valves", [])) or "not named"
+    if key == "name":
+        raise ConfigError(f"{config}: has no [[{name}]] called {each[key]!r}")
     raise ConfigError(
         f"{config}: has no [[{name}]] of these valves ({valves}); write one, or name them in the "
         "column set"
@@ -121,7 +126,7 @@ def _edited(before: str, tables: Mapping[str, Any], config: Path) -> str:
             continue
         for each in given:
             number = _place(old, name, each, config)
-            keys = {key: value for key, value in each.items() if key != "valves"}
+            keys = {key: value for key, value in each.items() if key != _NAMED_BY[name]}
             _set(lines, name, number, keys, drop=_REPLACED.get(name, ()))
     return "\n".join(lines) + "\n"
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from companion.core.types import Decision, FlowReport
 
 if TYPE_CHECKING:
+    from companion.core.nozzle import NozzleSet
     from companion.core.schedule import LagModel
     from companion.core.setup import Setup
     from companion.core.types import Input, SprayPlan, TimedChange
@@ -54,7 +55,7 @@ class FlowRecord:
 
 def record_of(items: Iterable[Input | Decision], setup: Setup) -> FlowRecord:
     """Return the record in a journal's inputs and decisions."""
-    plans = _Plans(valve_count=len(setup.boom.valves))
+    plans = CarriedOut(valve_count=len(setup.boom.valves))
     times_s: list[float] = []
     volumes_ml: list[float] = []
     for item in items:
@@ -65,7 +66,7 @@ def record_of(items: Iterable[Input | Decision], setup: Setup) -> FlowRecord:
             volumes_ml.append(item.volume_ml)
     plans.finish()
     return FlowRecord(
-        orders=_orders(plans, setup),
+        orders=orders_of(plans, setup.nozzle_sets[-1]),
         time_s=np.array(times_s, dtype=np.float64),
         volume_ml=np.array(volumes_ml, dtype=np.float64),
         period_s=setup.pwm.period_s,
@@ -80,11 +81,10 @@ def _is_newer(report: FlowReport, times_s: list[float]) -> bool:
     return not times_s or report.received_s > times_s[-1]
 
 
-def _orders(plans: _Plans, setup: Setup) -> tuple[Order, ...]:
+def orders_of(plans: CarriedOut, largest: NozzleSet) -> tuple[Order, ...]:
     """Return the orders with the flow of the largest set's curve, which all steps are judged by."""
-    largest = setup.nozzle_sets[-1]
     share_ml_s = 1000.0 / 60.0 / len(largest.valves)
-    duty = [0.0] * len(setup.boom.valves)
+    duty = [0.0] * plans.valve_count
     made = []
     for at_s, valve, after in plans.done:
         before, duty[valve] = duty[valve], after
@@ -101,10 +101,11 @@ def _orders(plans: _Plans, setup: Setup) -> tuple[Order, ...]:
     return tuple(made)
 
 
-class _Plans:
+class CarriedOut:
     """Carries plans out as every executor does: each change at its time, until the lease ends."""
 
     def __init__(self, *, valve_count: int) -> None:
+        self.valve_count = valve_count
         self.done: list[tuple[float, int, float]] = []
         self._duty = [0.0] * valve_count
         self._changes: tuple[TimedChange, ...] = ()

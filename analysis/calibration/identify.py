@@ -304,7 +304,7 @@ def identify(record: FlowRecord, *, meter_lag_s: float = METER_LAG_S) -> Identif
     meter = None
     if len(record.time_s) >= 2:
         meter = Meter(record.time_s, record.volume_ml, lag_s=meter_lag_s, period_s=record.period_s)
-        fits, more = _fit_all(meter, steps, record)
+        fits, more = fit_all(meter, steps, record)
         rejected += more
     else:
         rejected[Reject.NO_METER] += len(steps)
@@ -343,7 +343,7 @@ def _spread_s(fits: Sequence[Fit]) -> float:
     return math.sqrt(max(variance(fit.lag_s for fit in fits) - own, 0.0))
 
 
-def _fit_all(
+def fit_all(
     meter: Meter, steps: Sequence[Step], record: FlowRecord
 ) -> tuple[list[Fit], Counter[Reject]]:
     """Return the steps that can be used, with their lags, and why the others cannot."""
@@ -378,6 +378,8 @@ def _without_odd(fits: Sequence[Fit]) -> tuple[list[Fit], Counter[Reject]]:
             if abs(each / share - 1.0) <= FOLLOWED_SHARE
         ]
         rejected[Reject.NOT_FOLLOWED] += len(chosen) - len(followed)
+        if not followed:
+            continue
         middle_s = median(fit.lag_s for fit in followed)
         off_s = [abs(fit.lag_s - middle_s) for fit in followed]
         deviation_s = MAD_TO_SD * median(off_s)

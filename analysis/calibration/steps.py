@@ -92,14 +92,19 @@ def is_trim(order: Order) -> bool:
     return is_open and abs(order.change_ml_s) < TRIM_SHARE * larger_ml_s
 
 
-def find_steps(record: FlowRecord) -> tuple[list[Step], Counter[Reject]]:
-    """Return all steps whose surroundings allow an estimate, and why the others do not."""
+def find_steps(
+    record: FlowRecord, *, smallest: float = SMALLEST_STEP
+) -> tuple[list[Step], Counter[Reject]]:
+    """Return all steps whose surroundings allow an estimate, and why the others do not.
+
+    `smallest` is the least share of the larger flow that a step may be.
+    """
     groups = _groups(record.orders)
     trims = [order for order in record.orders if is_trim(order)]
     rejected: Counter[Reject] = Counter()
     steps = []
     for number in range(len(groups)):
-        step = _step(record, groups, number, trims)
+        step = _step(record, groups, number, trims, smallest)
         if isinstance(step, Reject):
             rejected[step] += 1
         else:
@@ -139,6 +144,7 @@ def _step(
     groups: Sequence[tuple[Order, ...]],
     number: int,
     trims: Sequence[Order],
+    smallest: float,
 ) -> Step | Reject:
     """Return one step, or why it cannot be used."""
     group = groups[number]
@@ -148,7 +154,7 @@ def _step(
     # What all valves give: steps of a few valves only are small beside the flow of the others.
     larger_ml_s = max(_flow_ml_s(record.orders, group, is_after=a) for a in (False, True))
     change_ml_s = math.fsum(order.change_ml_s for order in group)
-    if not abs(change_ml_s) >= SMALLEST_STEP * larger_ml_s:
+    if not abs(change_ml_s) >= smallest * larger_ml_s:
         return Reject.SMALL
     settle = settle_s(record.lag)
     most_s = PERIODS_MAX * record.period_s

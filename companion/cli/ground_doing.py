@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -35,7 +35,8 @@ from companion.config import Config
 from companion.errors import ActuatorError, JournalError
 from companion.ground import shell
 from companion.ground.shell import GroundOutcome
-from companion.ground.work import GroundKind, GroundReason
+from companion.ground.work import GroundDecision, GroundKind, GroundReason, GroundTask
+from companion.ports import Sensor
 from companion.sensors.estop import EstopSwitch
 
 _ConfigFile = Annotated[
@@ -92,10 +93,10 @@ def do(asked: Asked, wish: Wish, *, is_water: bool = False) -> None:
     config, given = load_with_kept(asked.config_file, wanted)
     piece = piece_of(config, wish)
     log = ready_log(config.resolve(config.journal.folder))
-    descriptor = _stdin(asked.is_lines)
+    descriptor = listening(asked.is_lines)
     _ask(piece, config, descriptor)
     hand = Hand(descriptor, is_lines=asked.is_lines)
-    outcome = _perform(config, given, piece, hand)
+    outcome = perform(config, given, piece.task, hand)
     result = _result(config, piece, outcome)
     if outcome.has_begun:
         trouble = append(log, {"ended_utc": datetime.now(UTC).isoformat(), **result})
@@ -109,7 +110,7 @@ def do(asked: Asked, wish: Wish, *, is_water: bool = False) -> None:
     raise typer.Exit(0 if result["ok"] else 1)
 
 
-def _stdin(is_lines: bool) -> int:
+def listening(is_lines: bool) -> int:
     """Return where the hand is heard; a script has to say that it is one."""
     try:
         descriptor = sys.stdin.fileno()
@@ -127,7 +128,12 @@ def _ask(piece: Piece, config: Config, descriptor: int) -> None:
     """Say what will be done and take the deliberate word."""
     word = "click" if piece.task.kind is GroundKind.CLICK else "spray"
     note(plan_line(piece))
-    if piece.task.kind is not GroundKind.CLICK:
+    ask(word, config, descriptor)
+
+
+def ask(word: str, config: Config, descriptor: int) -> None:
+    """Say what has to be so, and take the deliberate word."""
+    if word != "click":
         note(_warning(config))
     if needs_autopilot(config):
         note("The flight controller's safety switch must be off, or nothing opens.")
@@ -144,7 +150,16 @@ def _warning(config: Config) -> str:
     return f"Everybody away from the nozzles. {pump}"
 
 
-def _perform(config: Config, given: tuple[str, ...], piece: Piece, hand: Hand) -> GroundOutcome:
+def perform(
+    config: Config,
+    given: tuple[str, ...],
+    task: GroundTask,
+    hand: Hand,
+    *,
+    sensors: Sequence[Sensor] = (),
+    on_step: Callable[[GroundDecision], None] = lambda _: None,
+) -> GroundOutcome:
+    """Do one piece with the configured link and outputs; `sensors` are read beside the stops."""
     options = component_options(config, training="ground", watch_mission=True)
     link = build_link(config, given, options)
     executor = build_executor(config, link)
@@ -153,13 +168,14 @@ def _perform(config: Config, given: tuple[str, ...], piece: Piece, hand: Hand) -
     async def main() -> GroundOutcome:
         with hand.attending():
             return await shell.perform(
-                piece.task,
+                task,
                 ground_setup(config),
                 link=link,
                 executor=executor,
                 hand=hand,
-                sensors=stops,
+                sensors=[*stops, *sensors],
                 on_ready=lambda: note(hand.invitation),
+                on_step=on_step,
             )
 
     with shown():

@@ -16,7 +16,7 @@ from companion.gpio_chip import find_chip, load_gpiod
 from companion.link.vehicle_link import VehicleLink
 from companion.ports import Sensor
 from companion.sensors.estop import EstopSwitch
-from companion.sensors.flow_meter import Edge, FlowMeter, Meter
+from companion.sensors.flow_meter import Edge, EdgeSource, FlowMeter, Meter
 from companion.sensors.voltage import CurrentLoop, Gauge, I2cVoltage, IioVoltage, VoltageSource
 
 # The nozzle sets' largest flow is measured; a burst hose gives more, a broken wire far more.
@@ -31,7 +31,8 @@ def build_sensors(config: Config) -> list[Sensor]:
     if config.safety.estop_line is not None:
         line = GpiodLevel(config.output.chip, config.safety.estop_line, key="safety.estop_line")
         sensors.append(EstopSwitch(line))
-    meter = _flow_meter(config)
+    parts = pulse_meter(config)
+    meter = None if parts is None else FlowMeter(*parts)
     if meter is not None:
         sensors.append(meter)
     pressure = _pressure(config)
@@ -50,7 +51,8 @@ def follow_refills(sensors: Sequence[Sensor], link: VehicleLink) -> None:
             link.on_refilled(sensor.refilled)
 
 
-def _flow_meter(config: Config) -> FlowMeter | None:
+def pulse_meter(config: Config) -> tuple[Meter, EdgeSource] | None:
+    """Return what is known of the flow meter that this computer reads, and its pulses."""
     table = config.flow_meter
     if not table.is_read_here or table.line is None or table.pulses_per_l is None:
         return None
@@ -60,7 +62,7 @@ def _flow_meter(config: Config) -> FlowMeter | None:
         flow_max_l_min=table.flow_max_l_min or FLOW_MAX_FACTOR * largest_l_min,
         pwm_period_s=config.pwm_limits().period_s,
     )
-    return FlowMeter(meter, GpiodEdges(table.chip, table.line, pull=table.pull))
+    return meter, GpiodEdges(table.chip, table.line, pull=table.pull)
 
 
 def _voltage(table: ConverterTable, source: str) -> VoltageSource:

@@ -99,10 +99,11 @@ class _Work:
         hand: HandHold,
         sensors: Sequence[Sensor],
         clock: Callable[[], float],
+        on_step: Callable[[GroundDecision], None],
     ) -> None:
         self._task, self._setup = task, setup
         self._link, self._executor, self._hand = link, executor, hand
-        self._sensors, self._clock = sensors, clock
+        self._sensors, self._clock, self._on_step = sensors, clock, on_step
         self._state, self._memory = GroundState(), GroundMemory()
         self._started_s: float | None = None
         self.fault = ""
@@ -146,6 +147,7 @@ class _Work:
             # A watchdog that has heard no sign of life would undo an order to open.
             self._link.tell(told, now_s)
             self._executor.submit(decision.plan)
+        self._on_step(decision)
         return decision
 
     def outcome(self, decision: GroundDecision) -> GroundOutcome:
@@ -203,15 +205,19 @@ async def perform(
     settle_s: float = SETTLE_S,
     clock: Callable[[], float] = time.monotonic,
     on_ready: Callable[[], None] = lambda: None,
+    on_step: Callable[[GroundDecision], None] = lambda _: None,
 ) -> GroundOutcome:
     """Do one piece of ground work, and return what came of it; everything is closed then.
 
     Waits up to `wait_s` for a vehicle at which it may be done for `settle_s`; `on_ready` is called
-    before the hold counts. Raises a `LinkError`, `ActuatorError` or `SensorError` for what cannot
-    be opened.
+    before the hold counts, `on_step` with each decision when it was carried out. Raises a
+    `LinkError`, `ActuatorError` or `SensorError` for what cannot be opened.
     """
     wake = asyncio.Event()
-    work = _Work(task, setup, link=link, executor=executor, hand=hand, sensors=sensors, clock=clock)
+    work = _Work(
+        task, setup,
+        link=link, executor=executor, hand=hand, sensors=sensors, clock=clock, on_step=on_step,
+    )  # fmt: skip
     try:
         await link.open(wake.set)
         async with AsyncExitStack() as opened:

@@ -48,6 +48,7 @@ class GroundKind(StrEnum):
     RINSE = "rinse"  # the same with so much clean water
     CATCH = "catch"  # an exact time at one duty, over cups
     CLICK = "click"  # dry: each valve in turn, to be heard
+    VALVES = "valves"  # a course of duties for one valve, read by the flow meter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

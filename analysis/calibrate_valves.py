@@ -1,0 +1,445 @@
+"""`vrspray calibrate valves`: each valve by itself, on the ground, read by the flow meter."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from analysis.calibration.flow_record import CarriedOut, FlowRecord, Order, orders_of
+from analysis.calibration.valves import (
+    CYCLES,
+    WORN_SHARE,
+    Piece,
+    ValveCourseError,
+    course_of,
+    identify_caught,
+    identify_valves,
+)
+from analysis.write_back import Write, written_lines
+from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.core.schedule import LagModel
+from companion.errors import ConfigError
+
+if TYPE_CHECKING:
+    from analysis.calibration.valves import Course, IdentifiedValves
+    from companion.config import Config
+    from companion.core.types import Input
+    from companion.ground.shell import GroundOutcome
+    from companion.ground.work import GroundDecision, GroundTask
+    from companion.sensors.flow_meter import EdgeSource, Meter
+
+MS = 1000.0
+# A piece that was broken off is done again so many times before it is given up.
+TRIES = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """What one piece of ground work brought: how it ended, its plans, the meter's pulses."""
+
+    outcome: GroundOutcome
+    plans: CarriedOut
+    time_s: Sequence[float]
+    volume_ml: Sequence[float]
+    fault: str = ""
+
+
+Measure = Callable[["GroundTask"], Measured]
+
+
+class PulseRecorder:
+    """The flow meter as a sensor of ground work: keeps the time of every pulse.
+
+    Implements `companion.ports.Sensor`.
+    """
+
+    def __init__(self, meter: Meter, source: EdgeSource) -> None:
+        from companion.sensors.flow_meter import PulseCounter
+
+        self._counter, self._source = PulseCounter(meter), source
+        self.time_s: list[float] = []
+        self.volume_ml: list[float] = []
+        self.fault = ""
+
+    async def open(self, wake: Callable[[], None]) -> None:  # noqa: ARG002 - steps come anyway
+        """Take the line: SensorError where that cannot be had."""
+        self._source.open()
+
+    def read(self, now_s: float) -> Sequence[Input]:
+        """Take down what was counted; ground work itself needs none of it."""
+        if not self.time_s:
+            self._keep(now_s)
+        try:
+            edges = self._source.read()
+        except OSError as error:
+            self.fault = f"flow meter: its line cannot be read: {error.strerror or error}"
+            return []
+        for edge in edges:
+            before = self._counter.count
+            self._counter.take(edge)
+            if self._counter.count > before and edge.at_s > self.time_s[-1]:
+                self._keep(edge.at_s)
+        self.fault = self.fault or self._counter.fault(now_s)
+        return []
+
+    def _keep(self, at_s: float) -> None:
+        self.time_s.append(at_s)
+        self.volume_ml.append(self._counter.volume_ml)
+
+    async def close(self) -> None:
+        """Let go of the line."""
+        self._source.close()
+
+
+def valves(
+    config_file: Annotated[
+        Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
+    ],
+    cycles: Annotated[
+        int, typer.Option(min=6, max=200, help="How often each kind of change is made of a valve.")
+    ] = CYCLES,
+    is_among: Annotated[
+        bool,
+        typer.Option(
+            "--others-open",
+            help="The other valves spray meanwhile: where one alone is too little for the meter.",
+        ),
+    ] = False,
+    is_lines: Annotated[
+        bool,
+        typer.Option(
+            "--hold-lines", help="Lines on stdin hold instead of the space bar: for scripts."
+        ),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Keep what was recorded (JSON), to evaluate it again."),
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="FILE", help="Evaluate such a record; nothing is opened."),
+    ] = None,
+    catch: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CSV",
+            help="Without a meter: columns valve, seconds, millilitres of a catch; flow only.",
+        ),
+    ] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of all valves.")] = None,
+    overrides: Overrides = None,
+    is_write: Write = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure each valve by itself: its flow against the others', and its lags.
+
+    With water, disarmed, on the ground, while you hold a key. Exit 1: the measurement failed.
+    """
+    from companion.cli.link_parts import load_with_kept
+
+    config, given = load_with_kept(config_file, tuple(overrides or ()))
+    if config.makes_flow:
+        raise ConfigError(
+            f"{config_file}: the pump makes the flow and the valves only open and shut, so none "
+            "is dosed by itself; measure the pump with `vrspray calibrate flow`"
+        )
+    names = [valve.name for valve in config.valve]
+    if len(names) < 2:
+        raise ConfigError(f"{config_file}: has one valve; there is none to compare it with")
+    if catch is not None:
+        result = as_shape(identify_caught(read_catch(catch, names)), names, None)
+    else:
+        if record is not None:
+            pieces = read_record(record, names)
+        else:
+            course = course_of(
+                config.pwm_limits(), config.lag_model(), cycles=cycles, is_alone=not is_among
+            )
+            pieces = _measured_here(config, given, course, is_lines=is_lines)
+            if out is not None:
+                write_record(out, names, pieces)
+        try:
+            found = identify_valves(pieces, len(names))
+        except ValveCourseError as error:
+            answer({"error": str(error)} if as_json else {}, (), as_json=as_json)
+            note(f"error: {error}")
+            raise typer.Exit(1) from error
+        result = as_shape(found, names, config.lag_model())
+        if plot is not None:
+            from analysis.calibrate_plots import plot_valves
+
+            plot_valves(found, names, plot)
+    changed = written_lines(config_file, result, is_write=is_write)
+    answer(result, [*lines(result), *changed], as_json=as_json)
+
+
+def _measured_here(
+    config: Config, given: tuple[str, ...], course: Course, *, is_lines: bool
+) -> list[Piece]:
+    """Do all pieces with the configured outputs and the meter, while a key is held."""
+    from companion.cli.ground_doing import append, ask, listening, perform, ready_log
+    from companion.cli.hand import INTERRUPTED, Hand
+    from companion.cli.sensor_parts import pulse_meter
+
+    parts = pulse_meter(config)
+    if parts is None:
+        raise ConfigError(
+            "calibrate valves: needs a flow meter on this computer ([flow_meter] source = "
+            '"gpio"), which times every pulse; without one catch each valve by itself and give '
+            "--catch CSV"
+        )
+    log = ready_log(config.resolve(config.journal.folder))
+    descriptor = listening(is_lines)
+    names = [valve.name for valve in config.valve]
+    for line in course_lines(config, course):
+        note(line)
+    ask("spray", config, descriptor)
+
+    def measure(task: GroundTask) -> Measured:
+        pulses, plans = PulseRecorder(*parts), CarriedOut(valve_count=len(names))
+
+        def on_step(decision: GroundDecision) -> None:
+            plans.take(decision.plan, decision.now_s)
+
+        hand = Hand(descriptor, is_lines=is_lines)
+        outcome = perform(config, given, task, hand, sensors=[pulses], on_step=on_step)
+        if outcome.has_begun:
+            entry = {
+                "ended_utc": datetime.now(UTC).isoformat(),
+                "kind": str(task.kind),
+                "open_s": round(outcome.open_s, 4),
+                "is_done": outcome.is_done,
+                "reasons": sorted(str(reason) for reason in outcome.reasons),
+                "training": "ground",
+                "liquid": "water",
+            }
+            trouble = append(log, entry)
+            if trouble is not None:
+                note(f"warning: {trouble}")
+        if INTERRUPTED in outcome.reasons:
+            raise KeyboardInterrupt
+        plans.finish()
+        return Measured(
+            outcome=outcome,
+            plans=plans,
+            time_s=pulses.time_s,
+            volume_ml=pulses.volume_ml,
+            fault=pulses.fault,
+        )
+
+    return measured_pieces(config, course, measure)
+
+
+def measured_pieces(config: Config, course: Course, measure: Measure) -> list[Piece]:
+    """Return the record of every piece; one that was broken off is done again.
+
+    Raises:
+        ValveCourseError: naming the piece that could not be done.
+    """
+    from companion.cli.ground_doing import in_words
+
+    names = [valve.name for valve in config.valve]
+    lag, largest = config.lag_model(), config.nozzle_sets()[-1]
+    pieces: list[Piece] = []
+    for valve, name in enumerate(names):
+        for number in range(1, course.pieces + 1):
+            what = f"valve {name}, piece {number} of {course.pieces}"
+            for _ in range(TRIES):
+                note(f"{what}: {course.piece_s:.0f} s")
+                done = measure(course.task(valve, len(names)))
+                why = done.fault or (
+                    ""
+                    if done.outcome.is_done
+                    else in_words(done.outcome.reasons, done.outcome.text)
+                )
+                if not why:
+                    break
+                note(f"{what}: {why}")
+                if not done.outcome.has_begun:
+                    raise ValveCourseError(f"{what}: nothing was opened: {why}")
+            else:
+                raise ValveCourseError(f"{what}: given up after {TRIES} tries: {why}")
+            record = FlowRecord(
+                orders=orders_of(done.plans, largest),
+                time_s=np.array(done.time_s, dtype=np.float64),
+                volume_ml=np.array(done.volume_ml, dtype=np.float64),
+                period_s=config.pwm_limits().period_s,
+                lag=lag,
+            )
+            pieces.append(Piece(valve=valve, record=record))
+    return pieces
+
+
+def course_lines(config: Config, course: Course) -> Iterator[str]:
+    """Yield in words what will be done, and what it takes."""
+    count = len(config.valve)
+    seconds, open_s = course.open_s(count)
+    largest = config.nozzle_sets()[-1]
+    litres = open_s / 60.0 * largest.flow_max_l_min / len(largest.valves)
+    how = "each by itself" if not course.base else "each while the others spray"
+    yield (
+        f"{count} valves, {how}: {course.pieces * count} pieces of {course.piece_s:.0f} s, "
+        f"about {seconds / 60.0:.0f} min and {litres:.1f} L of water in all"
+    )
+
+
+# What was recorded, to be evaluated again.
+
+FORMAT = "vrspray-valves-1"
+
+
+def write_record(path: Path, names: Sequence[str], pieces: Sequence[Piece]) -> None:
+    """Write what was recorded as JSON; ConfigError where that cannot be."""
+    first = pieces[0].record
+    document = {
+        "format": FORMAT,
+        "valves": list(names),
+        "period_s": first.period_s,
+        "lag": asdict(first.lag),
+        "pieces": [
+            {
+                "valve": names[piece.valve],
+                "orders": [asdict(order) for order in piece.record.orders],
+                "time_s": [round(at_s, 6) for at_s in piece.record.time_s.tolist()],
+                "volume_ml": [round(ml, 4) for ml in piece.record.volume_ml.tolist()],
+            }
+            for piece in pieces
+        ],
+    }
+    try:
+        path.write_text(json.dumps(document, allow_nan=False) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"--out {path}: cannot be written ({error})") from error
+
+
+def read_record(path: Path, names: Sequence[str]) -> list[Piece]:
+    """Read what `write_record` wrote; ConfigError where it is none of these valves."""
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"--from {path}: cannot be read ({error})") from error
+    if not isinstance(document, dict) or document.get("format") != FORMAT:
+        raise ConfigError(f"--from {path}: is no record that --out has written")
+    if document.get("valves") != list(names):
+        raise ConfigError(f"--from {path}: is of other valves than the configuration has")
+    try:
+        lag = LagModel(**document["lag"])
+        return [
+            Piece(
+                valve=list(names).index(piece["valve"]),
+                record=FlowRecord(
+                    orders=tuple(Order(**order) for order in piece["orders"]),
+                    time_s=np.array(piece["time_s"], dtype=np.float64),
+                    volume_ml=np.array(piece["volume_ml"], dtype=np.float64),
+                    period_s=float(document["period_s"]),
+                    lag=lag,
+                ),
+            )
+            for piece in document["pieces"]
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"--from {path}: is damaged ({error!r})") from error
+
+
+def read_catch(path: Path, names: Sequence[str]) -> list[list[float]]:
+    """Return what was caught of each valve [mL/s], a figure for each catch.
+
+    Columns valve, seconds, millilitres, of catches at one duty.
+    """
+    from analysis.csv_rows import TableError, read_rows
+
+    caught: list[list[float]] = [[] for _ in names]
+    for row in read_rows(path, ("valve", "seconds", "millilitres")):
+        name = row.text("valve")
+        if name is None or name not in names:
+            raise row.error(f"valve is {name!r}; the valves are {', '.join(names)}")
+        seconds = row.needed("seconds", low=1.0, high=3600.0)
+        caught[list(names).index(name)].append(
+            row.needed("millilitres", low=1.0, high=1e6) / seconds
+        )
+    for name, flows in zip(names, caught, strict=True):
+        if len(flows) < 2:
+            raise TableError(f"{path}: valve {name} was caught {len(flows)} times; two are needed")
+    return caught
+
+
+# The answer.
+
+
+def as_shape(
+    found: IdentifiedValves, names: Sequence[str], configured: LagModel | None
+) -> dict[str, Any]:
+    """Return the answer: each valve, the set's own lags beside the configured ones, TOML."""
+    return {
+        "valves": [
+            {
+                "name": name,
+                "flow_factor": _figures(own.factor),
+                "lags": {f"lag_{kind.value}_s": _figures(lag) for kind, lag in own.lags.items()},
+                "is_worn": own.is_worn,
+            }
+            for name, own in zip(names, found.valves, strict=True)
+        ],
+        "set_lags": {
+            f"{kind.value}_s": _figures(lag)
+            | ({} if configured is None else {"configured": getattr(configured, f"{kind.value}_s")})
+            for kind, lag in found.lags.items()
+        },
+        "volume_l": None if math.isnan(found.volume_ml) else found.volume_ml / 1000.0,
+        "toml": "\n".join(toml_lines(found, names)),
+    }
+
+
+def _figures(estimate: Any) -> dict[str, float]:
+    return {"value": estimate.value, "low": estimate.low, "high": estimate.high}
+
+
+def toml_lines(found: IdentifiedValves, names: Sequence[str]) -> Iterator[str]:
+    """Yield the keys of the `[[valve]]` tables that were measured."""
+    for name, own in zip(names, found.valves, strict=True):
+        yield "[[valve]]"
+        yield f"name = {json.dumps(name)}"
+        yield f"flow_factor = {own.factor.value:.4f}"
+        for kind, lag in own.lags.items():
+            yield f"lag_{kind.value}_s = {lag.value:.4f}"
+
+
+def lines(result: dict[str, Any]) -> Iterator[str]:
+    """Yield the answer for a person."""
+    yield "each valve against the mean of all; 95 % interval:"
+    for valve in result["valves"]:
+        factor = valve["flow_factor"]
+        text = f"  {valve['name']:>4s}  flow {factor['value']:.3f} +- {_half(factor):.3f}"
+        for key, lag in valve["lags"].items():
+            kind = key.removeprefix("lag_").removesuffix("_s")
+            text += f"   {kind} {lag['value'] * MS:+.1f} +- {_half(lag) * MS:.1f} ms"
+        yield text
+    for valve in result["valves"]:
+        if valve["is_worn"]:
+            off = 100.0 * (valve["flow_factor"]["value"] - 1.0)
+            why = "worn, or of another size" if off > 0.0 else "blocked, or of another size"
+            yield (
+                f"valve {valve['name']}: {off:+.0f} % from the others, more than "
+                f"{100.0 * WORN_SHARE:.0f} %: its nozzle is {why}; clean or replace it, then "
+                "measure again"
+            )
+    for key, lag in result["set_lags"].items():
+        told = f" (configured: {lag['configured'] * MS:.1f})" if "configured" in lag else ""
+        yield f"mean of all valves, {key.removesuffix('_s')}: {lag['value'] * MS:.1f} ms{told}"
+    if result["volume_l"] is not None:
+        yield f"{result['volume_l']:.1f} L were used"
+    yield "paste into the [[valve]] tables of these names, or give --write:"
+    yield ""
+    yield result["toml"]
+
+
+def _half(figures: dict[str, float]) -> float:
+    return 0.5 * (figures["high"] - figures["low"])

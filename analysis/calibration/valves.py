@@ -1,0 +1,303 @@
+"""Each valve by itself: its flow over the mean valve's, and how much later or sooner it is.
+
+Every valve goes through the same course of duties on the ground, the others closed or, where one
+alone is below what the meter can tell, open and steady. Whatever is common to all (the meter's
+gain and delay, the pressure, the curve) cancels in the comparison: so factors are ratios with the
+mean 1, and no dose comes from here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean, stdev
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.calibration.identify import (
+    CONFIDENCE,
+    METER_LAG_S,
+    STEPS_MIN,
+    Estimate,
+    Fit,
+    Meter,
+    fit_all,
+    mean_of,
+)
+from analysis.calibration.steps import Kind, find_steps, settle_s
+from analysis.student import t_factor
+from companion.errors import VrsprayError
+from companion.ground.work import PIECE_MAX_S, GroundKind, GroundTask, Phase
+
+if TYPE_CHECKING:
+    from analysis.calibration.flow_record import Floats, FlowRecord
+    from companion.core.nozzle import PwmLimits
+    from companion.core.schedule import LagModel
+
+# How often each kind of change is made of every valve: 2.4 ms of lag in 95 % of the twin's valves.
+CYCLES = 20
+# Steady PWM periods after each change: more say the flow better, fewer leave time for more changes.
+STEADY_PERIODS = 9
+# One valve among 24 that spray: its step is repeated so often that it shows.
+SMALLEST_STEP = 0.01
+# Low and high duty, as shares of the window that the valves can follow. Off and on are changes from
+# and to the high one: the more a change makes, the better the meter says when it was.
+LOW_SHARE, HIGH_SHARE = 0.25, 0.8
+# A nozzle that gives 10 % more or less than it should is replaced (ISO 16122-2, 4.9.2: the flow of
+# a nozzle within 10 % of the mean of all; FAO and the trade use the same figure).
+WORN_SHARE = 0.10
+
+
+class ValveCourseError(VrsprayError):
+    """A sprayer whose valves cannot be measured one by one, or a record that does not say it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Course:
+    """How each valve is measured: a piece of ground work that is done so many times.
+
+    `base` is the duty of the other valves: 0 where one alone is enough for the meter.
+    """
+
+    low: float
+    high: float
+    base: float
+    dwell_s: float
+    cycles: int
+    pieces: int
+
+    @property
+    def piece_s(self) -> float:
+        """Return how long one piece takes: a steady beginning, and four changes a cycle."""
+        return (1 + 4 * self.cycles) * self.dwell_s
+
+    def task(self, valve: int, count: int) -> GroundTask:
+        """Return one piece for a valve out of `count`."""
+        phases = []
+        duties = [0.0, *([self.high, self.low, self.high, 0.0] * self.cycles)]
+        for number, own in enumerate(duties):
+            duty = [self.base] * count
+            duty[valve] = own
+            phases.append(Phase(at_s=number * self.dwell_s, duty=tuple(duty)))
+        return GroundTask(
+            kind=GroundKind.VALVES, phases=tuple(phases), seconds=self.piece_s, is_whole=True
+        )
+
+    def open_s(self, count: int) -> tuple[float, float]:
+        """Return what all of it takes: seconds, and seconds of one fully open valve."""
+        own_s = self.cycles * self.dwell_s * (2.0 * self.high + self.low)
+        others_s = self.piece_s * self.base * (count - 1)
+        pieces = self.pieces * count
+        return self.piece_s * pieces, (own_s + others_s) * pieces
+
+
+def course_of(pwm: PwmLimits, lag: LagModel, *, cycles: int, is_alone: bool) -> Course:
+    """Return the course for valves of one sprayer; `cycles` is how often each kind of change comes.
+
+    Raises:
+        ValveCourseError: where not even one cycle fits into a piece of ground work.
+    """
+    window = pwm.duty_max - pwm.duty_min
+    dwell_s = settle_s(lag) + STEADY_PERIODS * pwm.period_s
+    fitting = math.floor((PIECE_MAX_S / dwell_s - 1.0) / 4.0)
+    if fitting < 1:
+        raise ValveCourseError(
+            f"lags of {lag.off_end_s:.2g} s leave no time for a cycle within {PIECE_MAX_S:g} s"
+        )
+    pieces = max(math.ceil(cycles / fitting), 1)
+    low = pwm.duty_min + LOW_SHARE * window
+    return Course(
+        low=low,
+        high=pwm.duty_min + HIGH_SHARE * window,
+        base=0.0 if is_alone else low,
+        dwell_s=dwell_s,
+        cycles=math.ceil(cycles / pieces),
+        pieces=pieces,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Piece:
+    """What one piece of ground work has recorded of one valve."""
+
+    valve: int
+    record: FlowRecord
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ValveFigures:
+    """One valve against the mean of all: flow as a ratio, lags in seconds (+ is later)."""
+
+    factor: Estimate
+    lags: dict[Kind, Estimate]
+
+    @property
+    def is_worn(self) -> bool:
+        """Whether its flow is out of what nozzles of one set may differ by."""
+        return not abs(self.factor.value - 1.0) <= WORN_SHARE
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IdentifiedValves:
+    """All valves, the set's own lags (the mean over its valves), and what was counted."""
+
+    valves: tuple[ValveFigures, ...]
+    lags: dict[Kind, Estimate]
+    volume_ml: float
+
+
+def identify_valves(
+    pieces: Sequence[Piece], count: int, *, meter_lag_s: float = METER_LAG_S
+) -> IdentifiedValves:
+    """Return flow and lags of each of `count` valves, with 95 % intervals.
+
+    Raises:
+        ValveCourseError: naming the valve of which there are too few good changes.
+    """
+    fits: list[list[Fit]] = [[] for _ in range(count)]
+    volume_ml = 0.0
+    for piece in pieces:
+        fits[piece.valve] += _fits_of(piece, meter_lag_s)
+        if len(piece.record.volume_ml):
+            volume_ml += float(piece.record.volume_ml[-1] - piece.record.volume_ml[0])
+    own = [_lags(of_valve, valve) for valve, of_valve in enumerate(fits)]
+    flows = [_flow(of_valve) for of_valve in fits]
+    mean_flow = fmean(flow.value for flow in flows)
+    factors = [_scaled(flow, 1.0 / mean_flow) for flow in flows]
+    found = [
+        ValveFigures(
+            factor=_against_mean(factors, valve, 1.0),
+            lags={kind: _against_mean([each[kind] for each in own], valve, 0.0) for kind in Kind},
+        )
+        for valve in range(count)
+    ]
+    lags = {kind: _mean([each[kind] for each in own]) for kind in Kind}
+    output_s = pieces[0].record.lag.output_s
+    return IdentifiedValves(
+        valves=tuple(found),
+        lags={kind: lag.shifted(-output_s) for kind, lag in lags.items()},
+        volume_ml=volume_ml,
+    )
+
+
+def _fits_of(piece: Piece, meter_lag_s: float) -> list[Fit]:
+    record = piece.record
+    if len(record.time_s) < 2:
+        return []
+    steps, _ = find_steps(record, smallest=SMALLEST_STEP)
+    time_s, volume_ml = _with_rests(record.time_s, record.volume_ml, record.period_s)
+    meter = Meter(time_s, volume_ml, lag_s=meter_lag_s, period_s=record.period_s)
+    # The others open together at the beginning and close at the end.
+    own = [step for step in steps if {order.valve for order in step.orders} == {piece.valve}]
+    return fit_all(meter, own, record)[0]
+
+
+def _with_rests(time_s: Floats, volume_ml: Floats, period_s: float) -> tuple[Floats, Floats]:
+    """Return readings at a meter's pulses with such as say that meanwhile none came.
+
+    Between two pulses of a flow the volume is taken to grow evenly; where none came for more than
+    a PWM period there was no flow, and it stood.
+    """
+    gaps = np.flatnonzero(np.diff(time_s) > period_s)
+    half_s = 0.5 * period_s
+    rests = [np.arange(time_s[gap] + half_s, time_s[gap + 1], half_s) for gap in gaps]
+    more_s = np.concatenate([time_s, *rests])
+    more_ml = np.concatenate(
+        [volume_ml, *(np.full(len(r), volume_ml[g]) for g, r in zip(gaps, rests, strict=True))]
+    )
+    order = np.argsort(more_s, kind="stable")
+    return more_s[order], more_ml[order]
+
+
+def _lags(fits: Sequence[Fit], valve: int) -> dict[Kind, Estimate]:
+    found = {}
+    for kind in Kind:
+        chosen = [fit for fit in fits if fit.step.kind is kind]
+        if len(chosen) < STEPS_MIN:
+            raise ValveCourseError(
+                f"valve {valve + 1}: {len(chosen)} good changes of kind {kind.value}, "
+                f"{STEPS_MIN} are needed; look whether it opens and whether the meter counts"
+            )
+        found[kind] = mean_of([fit.lag_s for fit in chosen], [fit.sd_s for fit in chosen])
+    return found
+
+
+def _flow(fits: Sequence[Fit]) -> Estimate:
+    """Return the flow over what the curve says, from the changes; the interval is Student's.
+
+    On and off are a change of the low flow, up and down of what is between it and the high one:
+    each kind counts by the flow that it changes.
+    """
+    value = variance = 0.0
+    count = 0
+    whole = math.fsum(_expected(fits, kind) for kind in Kind)
+    for kind in Kind:
+        ratios = [fit.change_ml_s / fit.step.change_ml_s for fit in fits if fit.step.kind is kind]
+        mean, weight = fmean(ratios), _expected(fits, kind) / whole
+        value += weight * mean
+        scatter = math.fsum((ratio - mean) ** 2 for ratio in ratios) / (len(ratios) - 1)
+        variance += weight**2 * scatter / len(ratios)
+        count += len(ratios)
+    half = t_factor(max(count // 4 - 1, 1), CONFIDENCE) * math.sqrt(variance)
+    return Estimate(value=value, low=value - half, high=value + half, count=count)
+
+
+def _expected(fits: Sequence[Fit], kind: Kind) -> float:
+    return fmean(abs(fit.step.change_ml_s) for fit in fits if fit.step.kind is kind)
+
+
+def _half(estimate: Estimate) -> float:
+    return 0.5 * (estimate.high - estimate.low)
+
+
+def _scaled(estimate: Estimate, by: float) -> Estimate:
+    return Estimate(
+        value=by * estimate.value,
+        low=by * estimate.low,
+        high=by * estimate.high,
+        count=estimate.count,
+    )
+
+
+def _mean(estimates: Sequence[Estimate]) -> Estimate:
+    """Return the mean of independent estimates."""
+    value = fmean(estimate.value for estimate in estimates)
+    half = math.sqrt(math.fsum(_half(each) ** 2 for each in estimates)) / len(estimates)
+    count = sum(estimate.count for estimate in estimates)
+    return Estimate(value=value, low=value - half, high=value + half, count=count)
+
+
+def _against_mean(estimates: Sequence[Estimate], own: int, middle: float) -> Estimate:
+    """Return one of them with the mean of all moved to `middle`; that mean is uncertain too."""
+    count = len(estimates)
+    value = estimates[own].value - fmean(each.value for each in estimates) + middle
+    halves = [
+        _half(each) * ((1.0 - 1.0 / count) if number == own else 1.0 / count)
+        for number, each in enumerate(estimates)
+    ]
+    half = math.sqrt(math.fsum(each**2 for each in halves))
+    return Estimate(value=value, low=value - half, high=value + half, count=estimates[own].count)
+
+
+def identify_caught(caught: Sequence[Sequence[float]]) -> IdentifiedValves:
+    """Return the flow factors of valves that were caught one by one; of lags a jug says nothing.
+
+    `caught` is the flow of each valve in each of its catches, in any unit: two catches or more.
+    """
+    flows = []
+    for own in caught:
+        mean = fmean(own)
+        half = t_factor(len(own) - 1, CONFIDENCE) * stdev(own) / math.sqrt(len(own))
+        flows.append(Estimate(value=mean, low=mean - half, high=mean + half, count=len(own)))
+    middle = fmean(flow.value for flow in flows)
+    factors = [_scaled(flow, 1.0 / middle) for flow in flows]
+    return IdentifiedValves(
+        valves=tuple(
+            ValveFigures(factor=_against_mean(factors, valve, 1.0), lags={})
+            for valve in range(len(factors))
+        ),
+        lags={},
+        volume_ml=math.nan,
+    )

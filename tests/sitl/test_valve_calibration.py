@@ -1,0 +1,188 @@
+"""`calibrate valves` on the twin: what is found of each valve is what the sprayer is."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.calibrate_valves import read_record, write_record
+from analysis.calibration.steps import Kind
+from analysis.calibration.valves import (
+    Piece,
+    ValveCourseError,
+    course_of,
+    identify_caught,
+    identify_valves,
+)
+from companion.cli.app import execute
+from companion.core.setup import Setup
+from sitl.flight import FlightOptions
+from sitl.profile import PlantProfile, draw_scatter, load_profile
+from sitl.valve_calibration import calibrate_valves, recorded, with_figures
+from tests.bench.sprayers import sprayer_setup
+
+ANYANG = Path(__file__).parents[2] / "examples" / "anyang" / "config.toml"
+NAMES = ("1", "2", "3", "4", "5", "6")
+
+
+def truth(profile: PlantProfile, seed: int) -> tuple[list[float], list[float]]:
+    """Return flow ratios and shifts against the mean, from the sprayer that was drawn."""
+    drawn = draw_scatter(profile, np.random.default_rng(seed))
+    flow = np.array(drawn.flow_scale) / np.mean(drawn.flow_scale)
+    shift = np.array(drawn.shift_s) - np.mean(drawn.shift_s)
+    return flow.tolist(), shift.tolist()
+
+
+@pytest.fixture(scope="module")
+def profile() -> PlantProfile:
+    return load_profile("wang-2024")
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    return sprayer_setup("wang-2024", "gpio")
+
+
+@pytest.fixture(scope="module")
+def pieces(setup: Setup, profile: PlantProfile) -> list[Piece]:
+    course = course_of(setup.pwm, setup.lag, cycles=10, is_alone=True)
+    return recorded(setup, profile, FlightOptions(seed=5), course)[0]
+
+
+def test_flow_and_lags_of_each_valve_are_found(setup: Setup, profile: PlantProfile) -> None:
+    errors, late_s, held = [], [], []
+    for seed in (1, 2):
+        flow, shift = truth(profile, seed)
+        found = calibrate_valves(setup, profile, FlightOptions(seed=seed)).found
+        for valve, own in enumerate(found.valves):
+            errors.append(abs(own.factor.value - flow[valve]))
+            held.append(own.factor.low <= flow[valve] <= own.factor.high)
+            for lag in own.lags.values():
+                late_s.append(abs(lag.value - shift[valve]))
+                held.append(lag.low <= shift[valve] <= lag.high)
+    assert np.quantile(errors, 0.95) < 0.005
+    assert np.quantile(late_s, 0.95) < 0.003
+    assert np.mean(held) > 0.85
+
+
+def test_among_open_valves_it_is_found_less_well_but_as_true(
+    setup: Setup, profile: PlantProfile
+) -> None:
+    flow, _ = truth(profile, 3)
+    found = calibrate_valves(setup, profile, FlightOptions(seed=3), is_alone=False).found
+    for own, true in zip(found.valves, flow, strict=True):
+        assert own.factor.value == pytest.approx(true, abs=0.03)
+        assert own.factor.high - own.factor.low < 0.06
+
+
+def test_factors_have_the_mean_one_and_lags_the_mean_nought(pieces: list[Piece]) -> None:
+    found = identify_valves(pieces, 6)
+    assert np.mean([own.factor.value for own in found.valves]) == pytest.approx(1.0)
+    for kind in Kind:
+        assert np.mean([own.lags[kind].value for own in found.valves]) == pytest.approx(0.0)
+
+
+def test_the_gain_of_the_meter_moves_nothing(pieces: list[Piece]) -> None:
+    gained = [
+        Piece(
+            valve=piece.valve,
+            record=replace(piece.record, volume_ml=1.03 * piece.record.volume_ml),
+        )
+        for piece in pieces
+    ]
+    once, twice = identify_valves(pieces, 6), identify_valves(gained, 6)
+    for own, other in zip(once.valves, twice.valves, strict=True):
+        assert own.factor.value == pytest.approx(other.factor.value, rel=1e-9)
+        for kind in Kind:
+            assert own.lags[kind].value == pytest.approx(other.lags[kind].value, abs=1e-9)
+
+
+def test_a_valve_that_does_not_open_is_named(pieces: list[Piece]) -> None:
+    silent = [
+        piece
+        if piece.valve != 2
+        else Piece(valve=2, record=replace(piece.record, volume_ml=0.0 * piece.record.volume_ml))
+        for piece in pieces
+    ]
+    with pytest.raises(ValveCourseError, match=r"valve 3: 0 good changes of kind on"):
+        identify_valves(silent, 6)
+
+
+def test_a_worn_nozzle_is_said(
+    setup: Setup, profile: PlantProfile, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flows = [1.0, 1.0, 1.16, 1.0, 1.0, 1.0]
+    found = identify_caught([[10.0 * flow, 10.01 * flow] for flow in flows])
+    assert [own.is_worn for own in found.valves] == [False, False, True, False, False, False]
+    catch = tmp_path / "catch.csv"
+    rows = [f"{n},30,{300 * f + d:.1f}" for n, f in zip(NAMES, flows, strict=True) for d in (0, 1)]
+    catch.write_text("valve,seconds,millilitres\n" + "\n".join(rows) + "\n")
+    assert execute(["calibrate", "valves", "--config", str(ANYANG), "--catch", str(catch)]) == 0
+    told = capsys.readouterr().out
+    assert "valve 3: +13 % from the others" in told
+    assert "worn" in told
+
+
+def test_a_record_is_evaluated_again_and_written_into_the_configuration(
+    pieces: list[Piece], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record, config = tmp_path / "valves.json", tmp_path / "config.toml"
+    write_record(record, NAMES, pieces)
+    assert len(read_record(record, NAMES)) == len(pieces)
+    config.write_text(ANYANG.read_text(encoding="utf-8"), encoding="utf-8")
+    (tmp_path / "prescription.csv").write_text("")
+    picture = tmp_path / "valves.png"
+    arguments = ["--config", str(config), "--from", str(record), "--plot", str(picture)]
+    assert execute(["calibrate", "valves", *arguments, "--write", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    found = identify_valves(pieces, 6)
+    for told, own in zip(result["valves"], found.valves, strict=True):
+        assert told["flow_factor"]["value"] == pytest.approx(own.factor.value, abs=1e-6)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    from companion.config import load
+
+    shares = [load(config).nozzle_sets()[-1].share(valve) for valve in range(6)]
+    assert shares == pytest.approx([own.factor.value for own in found.valves], abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("{}", "is no record"),
+        ("nonsense", "cannot be read"),
+        ('{"format": "vrspray-valves-1", "valves": ["a"]}', "other valves"),
+        ('{"format": "vrspray-valves-1", "valves": ["1","2","3","4","5","6"]}', "is damaged"),
+    ],
+)
+def test_what_is_no_record_is_one_line(
+    text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record = tmp_path / "valves.json"
+    record.write_text(text)
+    assert execute(["calibrate", "valves", "--config", str(ANYANG), "--from", str(record)]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_without_a_meter_it_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    assert execute(["calibrate", "valves", "--config", str(ANYANG)]) == 2
+    error = capsys.readouterr().err
+    assert "[flow_meter]" in error
+    assert "--catch CSV" in error
+
+
+def test_the_controller_that_knows_its_valves_has_their_figures(
+    setup: Setup, pieces: list[Piece]
+) -> None:
+    found = identify_valves(pieces, 6)
+    known = with_figures(setup, found)
+    assert [known.nozzle_sets[-1].share(valve) for valve in range(6)] == pytest.approx(
+        [own.factor.value for own in found.valves]
+    )
+    leads = [timing.up_s - setup.timing.up_s for timing in known.timings]
+    assert leads == pytest.approx([own.lags[Kind.UP].value for own in found.valves])
