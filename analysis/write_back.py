@@ -61,8 +61,10 @@ def write_back(config: Path, measured: str) -> list[str]:
     load(config)
     before = config.read_text(encoding="utf-8-sig")
     tables = tomllib.loads(measured)
-    if "lag" in tables:
-        tables["lag"]["measured_on"] = datetime.now(tz=UTC).astimezone().date().isoformat()
+    if "lag" in tables or "valve" in tables:
+        tables.setdefault("lag", {})["measured_on"] = (
+            datetime.now(tz=UTC).astimezone().date().isoformat()
+        )
     after = _edited(before, tables, config)
     if tomllib.loads(after) != _wanted(tomllib.loads(before), tables, config):
         raise ConfigError(f"{config}: cannot be changed line by line; paste the figures yourself")

@@ -1,0 +1,187 @@
+"""Valves measured one by one: how well they are found, and what that is worth in the field.
+
+    python -m tests.bench.valves [--seeds 20] [--speeds 2,4,6] [--plant wang-2024]
+
+Each seed is another sprayer whose valves scatter. It is measured by the twin's own meter through
+the companion's ground work, then flown over the example: with the set's figures alone, with those
+of each valve, with identical valves (the noise floor), and with perfect knowledge.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from statistics import fmean
+
+import numpy as np
+
+from analysis.evaluation import Evaluation, evaluate
+from sitl.demo import do_all
+from sitl.flight import fly
+from sitl.profile import draw_scatter, load_profile
+from sitl.valve_calibration import calibrate_valves, with_figures
+from tests.bench.flights import Task, perfect, place
+from tests.bench.sprayers import PLANT, Output, options_of, sprayer_setup
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Found:
+    """How far one valve's figures are off, and whether their intervals hold the truth."""
+
+    factor: float
+    factor_held: bool
+    lags_s: tuple[float, ...]
+    lags_held: tuple[bool, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flight:
+    """What is kept of a flight."""
+
+    misapplied_percent: float
+    accuracy_percent: float
+    mean_m: float
+    worst_m: float
+    missed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One sprayer at one speed: its calibration and its flights by what is known of it."""
+
+    seed: int
+    speed_m_s: float
+    output: Output
+    minutes: float
+    litres: float
+    valves: tuple[Found, ...]
+    flights: dict[str, Flight]
+
+
+def measure(todo: tuple[str, int, float, Output, bool]) -> Row:
+    """Calibrate one sprayer and fly it four times."""
+    plant, seed, speed_m_s, output, is_alone = todo
+    profile, options = load_profile(plant), options_of(output, seed)
+    ground = calibrate_valves(
+        sprayer_setup(plant, "gpio"), profile, options_of("gpio", seed), is_alone=is_alone
+    )
+    drawn = draw_scatter(profile, np.random.default_rng(seed))
+    flow, shift = np.array(drawn.flow_scale), np.array(drawn.shift_s)
+    true = zip((flow / flow.mean()).tolist(), (shift - shift.mean()).tolist(), strict=True)
+    valves = tuple(
+        Found(
+            factor=own.factor.value - factor,
+            factor_held=own.factor.low <= factor <= own.factor.high,
+            lags_s=tuple(lag.value - late_s for lag in own.lags.values()),
+            lags_held=tuple(lag.low <= late_s <= lag.high for lag in own.lags.values()),
+        )
+        for own, (factor, late_s) in zip(ground.found.valves, true, strict=True)
+    )
+    task = Task(plant=plant, speed_m_s=speed_m_s, seed=seed, outputs=(output,))
+    setup, path = place(task, output)
+    known = with_figures(setup, ground.found)
+    alike = replace(options, scatter=False)
+    best = perfect(task)
+    flights = {
+        "the set's figures": evaluate(
+            fly(setup, path, profile, options, speed_m_s=speed_m_s).record
+        ),
+        "each valve's": evaluate(fly(known, path, profile, options, speed_m_s=speed_m_s).record),
+        "identical valves": evaluate(fly(setup, path, profile, alike, speed_m_s=speed_m_s).record),
+    }
+    if best is not None:
+        flights["perfect knowledge"] = best
+    return Row(
+        seed=seed,
+        speed_m_s=speed_m_s,
+        output=output,
+        minutes=ground.minutes,
+        litres=ground.litres,
+        valves=valves,
+        flights={name: _flight(each) for name, each in flights.items()},
+    )
+
+
+def _flight(found: Evaluation) -> Flight:
+    lag = found.lag_distance_m
+    return Flight(
+        misapplied_percent=_number(found.misapplied_percent),
+        accuracy_percent=_number(found.spraying_accuracy_percent),
+        mean_m=_number(lag.mean_abs),
+        worst_m=_number(lag.max_abs),
+        missed=found.missed,
+    )
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def lines(rows: Sequence[Row]) -> list[str]:
+    """Return the figures for a person."""
+    valves = [valve for row in rows for valve in row.valves]
+    factors = np.abs([valve.factor for valve in valves])
+    lags = np.abs([lag for valve in valves for lag in valve.lags_s])
+    held = [each for valve in valves for each in valve.lags_held]
+    told = [
+        f"{len(valves)} valves, {fmean(row.minutes for row in rows):.1f} min and "
+        f"{fmean(row.litres for row in rows):.1f} L a sprayer",
+        f"flow factor: 95 % within {100 * np.quantile(factors, 0.95):.2f} %, worst "
+        f"{100 * factors.max():.2f} %; interval holds the truth in "
+        f"{100 * fmean(valve.factor_held for valve in valves):.0f} %",
+        f"lags: 95 % within {1000 * np.quantile(lags, 0.95):.2f} ms, worst "
+        f"{1000 * lags.max():.2f} ms; interval holds the truth in {100 * fmean(held):.0f} %",
+    ]
+    for output in sorted({row.output for row in rows}):
+        for speed in sorted({row.speed_m_s for row in rows}):
+            told += _of_speed([r for r in rows if (r.output, r.speed_m_s) == (output, speed)])
+    return told
+
+
+def _of_speed(rows: Sequence[Row]) -> list[str]:
+    told = [f"{rows[0].output}, {rows[0].speed_m_s:g} m/s, {len(rows)} seeds:"]
+    for name in rows[0].flights:
+        flights = [row.flights[name] for row in rows]
+        over = [
+            row.flights[name].misapplied_percent
+            / row.flights["identical valves"].misapplied_percent
+            for row in rows
+        ]
+        told.append(
+            f"  {name:18s} misapplied {fmean(f.misapplied_percent for f in flights):.2f} %, "
+            f"{fmean(over):.3f} x identical valves (worst {max(over):.3f}); accuracy "
+            f"{fmean(f.accuracy_percent for f in flights):.2f} %; lag "
+            f"{fmean(f.mean_m for f in flights):.3f} m, worst "
+            f"{max(f.worst_m for f in flights):.3f} m; missed {sum(f.missed for f in flights)}"
+        )
+    return told
+
+
+def main() -> None:
+    """Measure, and print what came of it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--speeds", default="2,4,6")
+    parser.add_argument("--outputs", default="gpio,servo")
+    parser.add_argument("--plant", default=PLANT)
+    parser.add_argument("--others-open", action="store_true")
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--json", action="store_true")
+    asked = parser.parse_args()
+    todo = [
+        (asked.plant, seed, float(speed), output, not asked.others_open)
+        for output in asked.outputs.split(",")
+        for speed in asked.speeds.split(",")
+        for seed in range(1, asked.seeds + 1)
+    ]
+    rows = do_all(measure, todo, processes=asked.processes)
+    told = json.dumps([asdict(row) for row in rows]) if asked.json else "\n".join(lines(rows))
+    sys.stdout.write(told + "\n")
+
+
+if __name__ == "__main__":
+    main()
