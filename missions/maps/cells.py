@@ -107,22 +107,20 @@ def _nowhere(cells: MapCells, path: Path, box: tuple[float, float, float, float]
     )
 
 
-def grid_of(
-    cells: MapCells, frame: LocalFrame, path: Path, *, offset_m: tuple[float, float] = (0.0, 0.0)
-) -> CellGrid:
-    """Return the cells in the flight's frame, moved by an offset (east, north)."""
+def grid_of(cells: MapCells, frame: LocalFrame, path: Path) -> CellGrid:
+    """Return the cells in the flight's frame."""
     rates, kinds = _classes(cells)
     flipped = turns_clockwise(cells)
     if flipped:
         kinds = kinds[::-1]
-    to_frame, to_cells = _fitted(cells, frame, path, offset_m, flipped=flipped)
+    to_frame, to_cells = _fitted(cells, frame, path, flipped=flipped)
     return CellGrid(kinds, rates, to_frame, to_cells)
 
 
 def cell_areas_m2(cells: MapCells, frame: LocalFrame) -> Floats:
     """Return the area of every cell (rows, columns), by its four corners in the frame."""
     rows, columns = cells.rates_l_ha.shape
-    to_frame, _ = _fitted(cells, frame, Path("cells"), (0.0, 0.0), flipped=False)
+    to_frame, _ = _fitted(cells, frame, Path("cells"), flipped=False)
     areas = np.empty((rows, columns))
     # In blocks of rows: all corners at once would take the memory of many maps.
     block = max(1, BLOCK_CELLS // columns)
@@ -253,14 +251,7 @@ def turns_clockwise(cells: MapCells) -> bool:
     return a * e - b * d < 0.0
 
 
-def _fitted(
-    cells: MapCells,
-    frame: LocalFrame,
-    path: Path,
-    offset_m: tuple[float, float],
-    *,
-    flipped: bool,
-) -> tuple[Warp, Warp]:
+def _fitted(cells: MapCells, frame: LocalFrame, path: Path, *, flipped: bool) -> tuple[Warp, Warp]:
     """Return the polynomials from cell numbers to the frame and back, of the least degree."""
     rows, columns = cells.rates_l_ha.shape
 
@@ -270,7 +261,7 @@ def _fitted(
             cells, column.ravel(), (rows - row if flipped else row).ravel()
         )
         east, north = frame.to_local_all(latitude.tolist(), longitude.tolist())
-        return column.ravel(), row.ravel(), east + offset_m[0], north + offset_m[1]
+        return column.ravel(), row.ravel(), east, north
 
     known, checked = places(FIT_SIDE), places(2 * FIT_SIDE + 1)
     size_m = float(np.hypot(np.ptp(known[2]), np.ptp(known[3])) / np.hypot(rows, columns))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import sqlite3
 import threading
@@ -19,7 +20,8 @@ from companion.errors import JournalError
 from companion.journal.journal import Journal
 from companion.journal.writer import Writer
 from companion.runtime import run
-from sitl.demo import _interrupt_held_back, _pool
+from companion.web.server import _either
+from sitl.demo import _interrupt_held_back, _no_module_of_this_folder, _pool
 from sitl.demo_cli import _termination_as_interrupt
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.server import _TcpServer
@@ -299,5 +301,31 @@ async def test_waiting_for_the_landing_leaves_nothing_waiting(cancelled: bool) -
     else:
         flight._done.set()
     await asyncio.gather(task, return_exceptions=True)
+    await asyncio.sleep(0)
+    assert asyncio.all_tasks() == before
+
+
+@pytest.mark.parametrize("before", [None, "", "1"])
+def test_the_environment_is_as_before_when_no_process_could_be_started(
+    before: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    if before is not None:
+        monkeypatch.setenv("PYTHONSAFEPATH", before)
+    with suppress(BrokenPartError), _no_module_of_this_folder():
+        assert os.environ["PYTHONSAFEPATH"] == "1"
+        raise BrokenPartError
+    assert os.environ.get("PYTHONSAFEPATH") == before
+
+
+async def test_a_browser_that_is_given_up_leaves_nobody_waiting_for_news() -> None:
+    before = asyncio.all_tasks()
+    waits = asyncio.ensure_future(
+        _either(asyncio.Event(), asyncio.get_running_loop().create_future())
+    )
+    await asyncio.sleep(0)
+    waits.cancel()
+    with suppress(asyncio.CancelledError):
+        await waits
     await asyncio.sleep(0)
     assert asyncio.all_tasks() == before

@@ -136,3 +136,12 @@ def test_the_configuration_hands_them_to_the_core(tmp_path: Path) -> None:
 def test_factors_that_are_no_ratios_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"flow_factor.*mean 1\.1 and not 1; divide each by it"):
         load(configuration(tmp_path, (1.1,) * 6))
+
+
+def test_at_the_border_a_late_valve_opens_as_late_as_the_others_and_an_early_one_later() -> None:
+    # Into the field at 0 m.
+    same = ordered(builders.setup(), -1.2)[1]
+    own = ordered(different((1.0,) * 6, lag_on_s=LAGS_S), -1.2)[1]
+    assert [own[v] - same[v] for v in range(6)] == pytest.approx(
+        [-min(lag, 0.0) for lag in LAGS_S], abs=1e-9
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
@@ -259,6 +260,19 @@ def test_map_is_written_over_its_own_files(tmp_path: Path) -> None:
     assert isinstance(found, Grid)
     assert found.bands[0].values.tolist() == [[5.0]]
     assert sorted(file.name for file in tmp_path.iterdir()) == ["GRD00001.BIN", "TASKDATA.XML"]
+
+
+def test_a_folder_that_cannot_be_written_whole_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: Path, target: Path) -> Path:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "rename", full)
+    with pytest.raises(MapError) as caught:
+        write_isoxml(cell_map(RATES), tmp_path / "field")
+    assert caught.value.code == "not-written"
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("place", ["nowhere/TASKDATA.XML", "nowhere/a.zip", "nowhere/field"])
