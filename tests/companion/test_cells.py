@@ -221,6 +221,12 @@ def test_an_offset_moves_the_cells() -> None:
     assert np.array(moved.bounds_m) - np.array(plain.bounds_m) == pytest.approx(
         [1.25, -0.5, 1.25, -0.5], abs=1e-6
     )
+    # Rates too: a metre to each side of the edge between the two cells, before and after.
+    west, south, east, north = plain.bounds_m
+    edge_m, middle_m = (west + east) / 2, (south + north) / 2
+    for side, rate in ((-1.0, 1.0), (1.0, 2.0)):
+        assert plain.rate_at(edge_m + side, middle_m) == rate
+        assert moved.rate_at(edge_m + 1.25 + side, middle_m - 0.5) == rate
 
 
 def test_the_boundary_and_the_default_of_the_map_itself_hold() -> None:
