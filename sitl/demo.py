@@ -41,6 +41,7 @@ from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.knowledge import perfect_setup
 from sitl.own_method import load_controller
 from sitl.profile import FlowLaw, PlantProfile, load_profile
+from sitl.valve_calibration import calibrate_valves, with_figures
 from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
 
 if TYPE_CHECKING:
@@ -234,6 +235,8 @@ P1_LOOK_AHEAD_S = {
 }
 SCHEDULED, PERFECT = "scheduled", "perfect"
 METHODS = (*P1_LOOK_AHEAD_S, SCHEDULED)
+# Ours again, on a sprayer each valve of which was measured by itself.
+CALIBRATED = "calibrated"
 
 SPEED_MIN_M_S, SPEED_MAX_M_S = 1.0, 15.0
 
@@ -354,7 +357,7 @@ def check(options: DemoOptions) -> None:
         )
     if options.controller is not None:
         load_controller(options.controller)
-        if options.own_method in (*METHODS, PERFECT):
+        if options.own_method in (*METHODS, CALIBRATED, PERFECT):
             raise ConfigError(
                 f"--controller {options.controller}: {options.own_method} is one of the demo's own "
                 "methods; give the class another name"
@@ -367,7 +370,7 @@ def jobs_of(options: DemoOptions, journal_folder: Path | None) -> list[Job]:
     for speed_m_s in options.speeds_m_s:
         shown = speed_m_s == options.shown_m_s
         own = () if options.own_method is None else (options.own_method,)
-        for method in (*METHODS, *own, PERFECT):
+        for method in (*METHODS, CALIBRATED, *own, PERFECT):
             jobs.append(
                 Job(
                     method=method,
@@ -428,6 +431,9 @@ def _fly(
     profile = true_profile(profile, options)
     if knows:
         setup = perfect_setup(setup, profile, seed=job.seed, output_s=setup.lag.output_s)
+    if job.method == CALIBRATED:
+        by_pulses = replace(options, fidelity="pulsed", output="gpio")
+        setup = with_figures(setup, calibrate_valves(setup, profile, by_pulses).found)
     wang = None
     if look_ahead_s is not None:
         wang = WangController(setup=setup, look_ahead_s=look_ahead_s)

@@ -14,7 +14,7 @@ from analysis.published import (
     p1_accuracy_percent,
     p1_lag_distance_m,
 )
-from sitl.demo import METHODS, SCHEDULED, DemoResult, Flown
+from sitl.demo import CALIBRATED, METHODS, SCHEDULED, DemoResult, Flown
 from sitl.demo_field import MAP_SPEED_M_S
 
 if TYPE_CHECKING:
@@ -98,14 +98,15 @@ def sentence(result: DemoResult) -> str:
     """Return what the figures say, in one sentence."""
     parts = []
     own = result.options.own_method
-    for method in (SCHEDULED, *([] if own is None else [own]), "look-ahead", "none"):
+    for method in (CALIBRATED, SCHEDULED, *([] if own is None else [own]), "look-ahead", "none"):
         found = [f.evaluation for f in result.flights if f.job.method == method]
         lag = _over([one.lag_distance_m for one in found])
         wrong = [one.misapplied_percent for one in found if one.misapplied_percent is not None]
         if lag and wrong:
             missed = sum(one.missed for one in found)
             lost = f", {missed} {'change' if missed == 1 else 'changes'} missed," if missed else ""
-            parts.append(f"{lag}{lost} and {_range(wrong)} % with {method}")
+            how = "scheduled, each valve measured by itself" if method == CALIBRATED else method
+            parts.append(f"{lag}{lost} and {_range(wrong)} % with {how}")
     return (
         "Mean distance of a change of rate from its boundary, and misapplied volume: "
         f"{'; '.join(parts)}."

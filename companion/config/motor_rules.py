@@ -27,6 +27,12 @@ def motor_contradictions(config: Document) -> Found:
         yield from _pulses(config.pump)
         if config.makes_flow:
             yield from _modulating(config, config.pump)
+            if any(valve.flow_factor != 1.0 for valve in config.valve):
+                yield (
+                    "valve[0].flow_factor",
+                    "the pump makes the flow and the valves only open and shut, so none can be "
+                    "dosed by itself; leave it out",
+                )
         else:
             yield from _constant(config.pump)
     for number, table in enumerate(config.atomiser):

@@ -27,7 +27,6 @@ LINES_MAX = 64
 GPIO_LAST = {"lines": 1023, "spi595": LINES_MAX - 1}
 # Less than this between closed and full leaves a servo output too few steps for a duty.
 SPAN_MIN_US = 100
-# Factors are written with four digits; a mean further off was not taken of all valves.
 FACTOR_MEAN_TOLERANCE = 0.005
 # Passes spaced by another width than the flow law's leave skips or overlaps in every pass.
 SWATH_TOLERANCE = 0.02
@@ -247,19 +246,12 @@ def _valves(config: Document) -> Rule:
 
 
 def _flow_factors(config: Document) -> Rule:
-    """Yield flow factors that are no ratios to the mean valve, or of a flow no valve doses."""
     factors = [valve.flow_factor for valve in config.valve]
     mean = sum(factors) / len(factors)
     if not abs(mean - 1.0) <= FACTOR_MEAN_TOLERANCE:
         yield Contradiction(
             key="valve[0].flow_factor",
             text=f"the factors of all valves have the mean {mean:.4g} and not 1; divide each by it",
-        )
-    elif config.makes_flow and any(factor != 1.0 for factor in factors):
-        yield Contradiction(
-            key="valve[0].flow_factor",
-            text="the pump makes the flow and the valves only open and shut, so none can be "
-            "dosed by itself; leave it out",
         )
 
 

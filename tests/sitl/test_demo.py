@@ -16,6 +16,7 @@ from companion.core.prescription import Prescription
 from companion.errors import ConfigError
 from sitl.anyang import anyang_route
 from sitl.demo import (
+    CALIBRATED,
     CELL_M,
     METHODS,
     PERFECT,
@@ -76,7 +77,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
 def test_every_method_is_flown_at_every_speed_and_once_with_perfect_knowledge() -> None:
     jobs = jobs_of(DemoOptions(), None)
     assert [(job.speed_m_s, job.method) for job in jobs] == [
-        (speed, method) for speed in (4.0, 5.0, 6.0) for method in (*METHODS, PERFECT)
+        (speed, method) for speed in (4.0, 5.0, 6.0) for method in (*METHODS, CALIBRATED, PERFECT)
     ]
     assert METHODS == ("none", "look-ahead", "look-ahead-stated", "scheduled")
 
@@ -150,7 +151,7 @@ def test_speed_is_reached_before_the_field(speed_m_s: float) -> None:
 
 
 def test_each_flight_is_told_once(shown: Shown) -> None:
-    assert shown.told == len(shown.result.flights) + len(shown.result.perfect) == 5
+    assert shown.told == len(shown.result.flights) + len(shown.result.perfect) == 6
 
 
 def test_json_has_the_keys_of_the_contract(shown: Shown) -> None:
@@ -158,7 +159,7 @@ def test_json_has_the_keys_of_the_contract(shown: Shown) -> None:
     assert {"flights", "perfect", "wall_s", "simulated_s"} <= found.keys()
     flights = found["flights"]
     assert isinstance(flights, list)
-    assert [flight["method"] for flight in flights] == list(METHODS)
+    assert [flight["method"] for flight in flights] == [*METHODS, CALIBRATED]
     for flight in flights:
         assert flight.keys() >= CONTRACT_KEYS
         assert flight["lag_distance_m"].keys() >= {"mean", "mean_abs", "max_abs", "count"}
@@ -172,7 +173,10 @@ def test_methods_are_what_they_are_called(shown: Shown) -> None:
     assert lag["look-ahead"].mean is not None and abs(lag["look-ahead"].mean) < 0.6
     assert lag["look-ahead-stated"].mean is not None and lag["look-ahead-stated"].mean < -0.6
     assert lag["scheduled"].mean_abs is not None and lag["scheduled"].mean_abs < 0.06
-    assert {f.evaluation.meta.method for f in shown.result.flights} == set(METHODS)
+    wrong = {f.job.method: f.evaluation.misapplied_percent for f in shown.result.flights}
+    assert wrong["calibrated"] is not None and wrong["scheduled"] is not None
+    assert wrong["calibrated"] < 0.95 * wrong["scheduled"]
+    assert {f.evaluation.meta.method for f in shown.result.flights} == {*METHODS, CALIBRATED}
 
 
 def test_limit_ratio_is_against_perfect_knowledge(shown: Shown) -> None:
@@ -211,7 +215,7 @@ def test_field_lies_on_its_side_with_its_corner_at_zero() -> None:
 
 
 def test_raster_holds_all_that_was_applied(shown: Shown) -> None:
-    for flown in shown.result.flights:
+    for flown in (each for each in shown.result.flights if each.job.method in METHODS):
         assert flown.traces is not None
         drawn_ml = flown.traces.applied_l_ha.sum() * CELL_M**2 / 10.0
         assert drawn_ml == pytest.approx(flown.evaluation.applied_ml, rel=0.01)
@@ -220,7 +224,8 @@ def test_raster_holds_all_that_was_applied(shown: Shown) -> None:
 def test_raster_of_scheduled_is_the_map(shown: Shown) -> None:
     setup, (nozzles,) = demo_setup(5.0), demo_setup(5.0).nozzle_sets
     law = load_profile("wang-2024").nozzle_sets[-1]
-    axes, traces = field_axes(setup), shown.result.flights[-1].traces
+    axes = field_axes(setup)
+    traces = next(f.traces for f in shown.result.flights if f.job.method == "scheduled")
     assert traces is not None
     for zone in setup.prescription.zones:
         x_m, y_m = axes.place(
@@ -237,7 +242,7 @@ def test_raster_of_scheduled_is_the_map(shown: Shown) -> None:
 
 
 def test_flows_are_prescribed_in_the_field_only_and_ordered_ahead_of_it(shown: Shown) -> None:
-    traces = shown.result.flights[-1].traces
+    traces = next(f.traces for f in shown.result.flights if f.job.method == "scheduled")
     assert traces is not None
     inside = (traces.along_m > 0.0) & (traces.along_m < 120.0)
     assert (traces.prescribed_l_min[inside] > 2.0).all()
@@ -249,10 +254,10 @@ def test_flows_are_prescribed_in_the_field_only_and_ordered_ahead_of_it(shown: S
 
 def test_table_has_p1_s_own_figures_beside_ours(shown: Shown) -> None:
     (group,) = rows_of(shown.result)
-    assert [row.cells[1] for row in group] == [*METHODS, "P1: none", "P1: look-ahead"]
+    assert [row.cells[1] for row in group] == [*METHODS, CALIBRATED, "P1: none", "P1: look-ahead"]
     assert [row.cells[COLUMNS.index(SETTLED)] for row in group[-2:]] == ["3.87", "0.32"]
     assert group[-1].cells[COLUMNS.index(ACCURACY)] == "94.79"
-    assert [row.published for row in group] == [False] * 4 + [True] * 2
+    assert [row.published for row in group] == [False] * 5 + [True] * 2
     assert all(len(row.cells) == len(COLUMNS) for row in group)
 
 

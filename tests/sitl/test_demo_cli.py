@@ -9,7 +9,7 @@ import pytest
 
 from analysis.replay import replay
 from companion.cli.app import execute
-from sitl.demo import METHODS
+from sitl.demo import CALIBRATED, METHODS
 from sitl.demo_cli import FILES, PICTURES, _move, _staging, _termination_as_interrupt
 
 Captured = pytest.CaptureFixture[str]
@@ -22,7 +22,7 @@ def test_demo_makes_its_files_and_one_object_on_stdout(tmp_path: Path, capsys: C
     captured = capsys.readouterr()
     found: dict[str, Any] = json.loads(captured.out)
     assert captured.err == ""
-    assert [flight["method"] for flight in found["flights"]] == list(METHODS)
+    assert [flight["method"] for flight in found["flights"]] == [*METHODS, CALIBRATED]
     assert json.loads((out / "demo.json").read_text()) == found
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
     assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in PICTURES)
