@@ -9,9 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.calibrate_valves import read_record, write_record
+from analysis.calibrate_valves import (
+    Measured,
+    PulseRecorder,
+    measured_pieces,
+    read_record,
+    write_record,
+)
+from analysis.calibration.flow_record import CarriedOut
 from analysis.calibration.steps import Kind
 from analysis.calibration.valves import (
+    Course,
     Piece,
     ValveCourseError,
     course_of,
@@ -19,7 +27,11 @@ from analysis.calibration.valves import (
     identify_valves,
 )
 from companion.cli.app import execute
+from companion.config import load
 from companion.core.setup import Setup
+from companion.ground.shell import GroundOutcome
+from companion.ground.work import PIECE_MAX_S, GroundReason, GroundTask
+from companion.sensors.flow_meter import Meter, VirtualEdges
 from sitl.flight import FlightOptions
 from sitl.profile import PlantProfile, draw_scatter, load_profile
 from sitl.valve_calibration import calibrate_valves, recorded, with_figures
@@ -143,8 +155,6 @@ def test_a_record_is_evaluated_again_and_written_into_the_configuration(
     for told, own in zip(result["valves"], found.valves, strict=True):
         assert told["flow_factor"]["value"] == pytest.approx(own.factor.value, abs=1e-6)
     assert picture.read_bytes().startswith(b"\x89PNG")
-    from companion.config import load
-
     shares = [load(config).nozzle_sets()[-1].share(valve) for valve in range(6)]
     assert shares == pytest.approx([own.factor.value for own in found.valves], abs=1e-4)
 
@@ -186,3 +196,97 @@ def test_the_controller_that_knows_its_valves_has_their_figures(
     )
     leads = [timing.up_s - setup.timing.up_s for timing in known.timings]
     assert leads == pytest.approx([own.lags[Kind.UP].value for own in found.valves])
+
+
+# ------------------------------------------------------------------------- the work at the vehicle
+
+
+class Bench:
+    """A vehicle on the ground: gives recorded pieces, but of those numbers (from 1) none."""
+
+    def __init__(self, pieces: list[Piece], spoilt: dict[int, GroundOutcome]) -> None:
+        self.pieces, self.spoilt, self.count, self.done = pieces, spoilt, 0, 0
+
+    def measure(self, task: GroundTask) -> Measured:
+        self.count += 1
+        record = self.pieces[self.done].record
+        plans = CarriedOut(valve_count=6)
+        plans.done = [(order.at_s, order.valve, order.after) for order in record.orders]
+        outcome = self.spoilt.get(self.count)
+        if outcome is None:
+            outcome = GroundOutcome(
+                reasons=frozenset({GroundReason.DONE}), open_s=task.seconds, has_begun=True
+            )
+            self.done += 1
+        return Measured(
+            outcome=outcome,
+            plans=plans,
+            time_s=record.time_s.tolist(),
+            volume_ml=record.volume_ml.tolist(),
+        )
+
+
+LET_GO = GroundOutcome(reasons=frozenset({GroundReason.NOT_HELD}), open_s=3.0, has_begun=True)
+ARMED = GroundOutcome(reasons=frozenset({GroundReason.ARMED}), open_s=0.0, has_begun=False)
+
+
+def course() -> Course:
+    config = load(ANYANG)
+    return course_of(config.pwm_limits(), config.lag_model(), cycles=10, is_alone=True)
+
+
+def test_a_piece_that_was_broken_off_is_done_again(
+    pieces: list[Piece], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bench = Bench(pieces, {2: LET_GO})
+    found = measured_pieces(load(ANYANG), course(), bench.measure)
+    assert bench.count == len(pieces) + 1
+    assert [piece.valve for piece in found] == [piece.valve for piece in pieces]
+    once, twice = identify_valves(pieces, 6), identify_valves(found, 6)
+    assert [own.factor.value for own in once.valves] == pytest.approx(
+        [own.factor.value for own in twice.valves], rel=1e-3
+    )
+    assert "valve 1, piece 2 of 2: the key was released" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "words"),
+    [
+        ({3: LET_GO, 4: LET_GO, 5: LET_GO}, "valve 2, piece 1 of 2: given up after 3 tries"),
+        ({1: ARMED}, "valve 1, piece 1 of 2: nothing was opened: the vehicle is armed"),
+    ],
+)
+def test_what_cannot_be_measured_is_said(
+    pieces: list[Piece], spoilt: dict[int, GroundOutcome], words: str
+) -> None:
+    with pytest.raises(ValveCourseError, match=words):
+        measured_pieces(load(ANYANG), course(), Bench(pieces, spoilt).measure)
+
+
+def test_no_piece_opens_another_valve_or_takes_longer_than_ground_work_may() -> None:
+    for valve in range(6):
+        task = course().task(valve, 6)
+        assert task.seconds <= PIECE_MAX_S
+        assert task.is_whole
+        assert task.phases[0].duty == task.phases[-1].duty == (0.0,) * 6
+        opened = {n for phase in task.phases for n, duty in enumerate(phase.duty) if duty > 0.0}
+        assert opened == {valve}
+
+
+async def test_every_pulse_keeps_its_time_and_a_lost_one_is_said() -> None:
+    source = VirtualEdges()
+    meter = Meter(pulses_per_l=4600.0, flow_max_l_min=10.0, pwm_period_s=1 / 11)
+    recorder = PulseRecorder(meter, source)
+    await recorder.open(lambda: None)
+    assert recorder.read(10.0) == []
+    source.put(10.01, 10.03, 10.0301, 10.05)  # the third is an echo of the second
+    recorder.read(10.06)
+    assert recorder.time_s == [10.0, 10.01, 10.03, 10.05]
+    assert recorder.volume_ml == pytest.approx([0.0, *(n / 4.6 for n in (1, 2, 3))])
+    assert recorder.fault == ""
+    source.put(10.2, lost=2)
+    recorder.read(10.25)
+    assert recorder.volume_ml[-1] == pytest.approx(6 / 4.6)
+    assert "pulses lost" in recorder.fault
+    await recorder.close()
+    assert not source.is_open
