@@ -198,15 +198,18 @@ def _with_rests(time_s: Floats, volume_ml: Floats, period_s: float) -> tuple[Flo
     """Return readings at a meter's pulses with such as say that meanwhile none came.
 
     Between two pulses of a flow the volume is taken to grow evenly; where none came for more than
-    a PWM period there was no flow, and it stood.
+    a PWM period there was no flow, and it stood: somewhere between two pulses, so half of one more
+    was delivered than was counted.
     """
-    gaps = np.flatnonzero(np.diff(time_s) > period_s)
+    rises = np.diff(volume_ml)
+    half_ml = 0.5 * float(rises[rises > 0.0].min()) if (rises > 0.0).any() else 0.0
     half_s = 0.5 * period_s
-    rests = [np.arange(time_s[gap] + half_s, time_s[gap + 1], half_s) for gap in gaps]
-    more_s = np.concatenate([time_s, *rests])
-    more_ml = np.concatenate(
-        [volume_ml, *(np.full(len(r), volume_ml[g]) for g, r in zip(gaps, rests, strict=True))]
-    )
+    rests_s, rests_ml = [time_s], [volume_ml]
+    for gap in np.flatnonzero(np.diff(time_s) > period_s).tolist():
+        rest_s = np.arange(time_s[gap] + half_s, time_s[gap + 1], half_s, dtype=np.float64)
+        rests_s.append(rest_s)
+        rests_ml.append(np.full(len(rest_s), volume_ml[gap] + half_ml))
+    more_s, more_ml = np.concatenate(rests_s), np.concatenate(rests_ml)
     order = np.argsort(more_s, kind="stable")
     return more_s[order], more_ml[order]
 
