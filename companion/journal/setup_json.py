@@ -43,7 +43,10 @@ def setup_to_json(setup: Setup) -> str:
 
 def calibration_sha256(setup: Setup) -> str:
     """Return what changes with anything that was measured of the sprayer, and with nothing else."""
-    measured = (setup.nozzle_sets, setup.lag, setup.pwm)
+    own_lags_s = tuple(valve.lags_s for valve in setup.boom.valves)
+    measured: tuple[object, ...] = (setup.nozzle_sets, setup.lag, setup.pwm)
+    if any(any(each) for each in own_lags_s):
+        measured = (*measured, own_lags_s)
     text = json.dumps(to_plain(measured), separators=(",", ":"))
     return hashlib.sha256(text.encode("ascii")).hexdigest()
 

@@ -16,6 +16,8 @@ from companion.core.controller import Memory, step
 from companion.core.nozzle import NozzleSet
 from companion.core.setup import Setup
 from companion.errors import ConfigError
+from companion.journal.layers import Ground
+from companion.journal.setup_json import calibration_sha256, setup_from_json, setup_to_json
 from tests import builders
 
 FACTORS = (0.97, 1.01, 1.03, 0.99, 1.02, 0.98)
@@ -145,3 +147,25 @@ def test_at_the_border_a_late_valve_opens_as_late_as_the_others_and_an_early_one
     assert [own[v] - same[v] for v in range(6)] == pytest.approx(
         [-min(lag, 0.0) for lag in LAGS_S], abs=1e-9
     )
+
+
+def test_a_journal_keeps_them_to_the_bit() -> None:
+    written = different(lag_up_s=LAGS_S, lag_off_s=LAGS_S)
+    ground = Ground(
+        zones=tuple(
+            (zone.name, zone.rate_l_ha, zone.polygon) for zone in written.prescription.zones
+        ),
+        field=written.prescription.field,
+        cells=None,
+    )
+    read = setup_from_json(setup_to_json(written), ground)
+    assert read.boom.valves == written.boom.valves
+    assert read.nozzle_sets == written.nozzle_sets
+    assert read.timings == written.timings
+
+
+def test_figures_of_a_valve_are_another_calibration() -> None:
+    same = calibration_sha256(builders.setup())
+    assert calibration_sha256(different()) != same
+    assert calibration_sha256(different((1.0,) * 6, lag_on_s=LAGS_S)) != same
+    assert calibration_sha256(different((1.0,) * 6)) == same

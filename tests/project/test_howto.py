@@ -37,10 +37,10 @@ BLOCK = re.compile(
 # Commands that need a vehicle, a second terminal, a person at the keys or the internet.
 NEEDS_MORE = {
     ("run",), ("upload",), ("doctor",), ("ground",), ("service",), ("sitl", "serve"), ("wsp",),
-    ("demo",), ("examples",), ("calibrate", "lag"),
+    ("demo",), ("examples",), ("calibrate", "lag"), ("calibrate", "valves"),
 }  # fmt: skip
 # Options with which one of these needs nothing else.
-ALONE = ("--no-link", "--dry-run")
+ALONE = ("--no-link", "--dry-run", "--catch")
 # Pages whose plans or flights would repeat those of others, and take long.
 ONLY_READ = re.compile(r"^vrspray (sitl fly|replay|plan .*(--choices|--aircraft|--terrain))")
 
