@@ -230,20 +230,25 @@ def _lags(fits: Sequence[Fit], valve: int) -> dict[Kind, Estimate]:
 def _flow(fits: Sequence[Fit]) -> Estimate:
     """Return the flow over what the curve says, from the changes; the interval is Student's.
 
-    On and off are a change of the low flow, up and down of what is between it and the high one:
-    each kind counts by the flow that it changes.
+    On and off are a change of the high flow, up and down of what is between it and the low one:
+    each kind counts by the flow that it changes. The four changes of a cycle share stretches of
+    steady flow, so that it is cycles, and not changes, that say how much the figure scatters.
     """
-    value = variance = 0.0
-    count = 0
     whole = math.fsum(_expected(fits, kind) for kind in Kind)
+    by_kind = []
     for kind in Kind:
-        ratios = [fit.change_ml_s / fit.step.change_ml_s for fit in fits if fit.step.kind is kind]
-        mean, weight = fmean(ratios), _expected(fits, kind) / whole
-        value += weight * mean
-        scatter = math.fsum((ratio - mean) ** 2 for ratio in ratios) / (len(ratios) - 1)
-        variance += weight**2 * scatter / len(ratios)
-        count += len(ratios)
-    half = t_factor(max(count // 4 - 1, 1), CONFIDENCE) * math.sqrt(variance)
+        weight = _expected(fits, kind) / whole
+        by_kind.append(
+            [
+                weight * fit.change_ml_s / fit.step.change_ml_s
+                for fit in fits
+                if fit.step.kind is kind
+            ]
+        )
+    value = math.fsum(fmean(each) for each in by_kind)
+    cycles = [math.fsum(each) for each in zip(*by_kind, strict=False)]
+    half = t_factor(len(cycles) - 1, CONFIDENCE) * stdev(cycles) / math.sqrt(len(cycles))
+    count = sum(len(each) for each in by_kind)
     return Estimate(value=value, low=value - half, high=value + half, count=count)
 
 

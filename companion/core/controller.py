@@ -521,5 +521,8 @@ def _flow(setup: Setup, plan: SprayPlan, index: int) -> float:
     nozzles = setup.doses.nozzle_sets[index]
     now = _in_force(setup, liquid_of(setup.pumping, plan), plan.issued_s)
     flows = {duty: nozzles.curve.flow_for(duty) for duty in set(now)}
-    of_each = [flows[now[valve]] * nozzles.share(valve) for valve in nozzles.valves]
+    shares = nozzles.shares or (1.0,) * len(nozzles.valves)
+    of_each = [
+        flows[now[valve]] * share for valve, share in zip(nozzles.valves, shares, strict=True)
+    ]
     return sum(of_each) / len(of_each)

@@ -179,6 +179,10 @@ def dosing_by_valve(
     meet is sprayed with the set in use: the boom's middle decides.
     """
     chosen = dict(of_rate)
+    is_one = len({in_use, *chosen.values()}) == 1
+    if is_one and not sets[in_use].shares:
+        members, one = sets[in_use].valves, dose(in_use, 1.0)
+        return lambda valve: one if valve in members else _shut
     known: dict[tuple[int, float], Dosing] = {}
 
     def member(number: int, valve: int) -> Dosing:
@@ -189,7 +193,7 @@ def dosing_by_valve(
             known[key] = dose(*key)
         return known[key]
 
-    if len({in_use, *chosen.values()}) == 1:
+    if is_one:
         return partial(member, in_use)
 
     def of_valve(valve: int) -> Dosing:
