@@ -69,9 +69,9 @@ def test_edges_lie_where_the_orders_take_effect_and_not_where_they_were_meant_to
     # Valves that open and close half a second later than the schedule believes.
     slow = replace(LAG, on_s=LAG.on_s + 0.5, off_s=LAG.off_s + 0.5, off_end_s=LAG.off_end_s + 0.5)
     own = given()
-    plan_by = own.timing
     slow_setup = replace(own, lag=slow)
-    object.__setattr__(slow_setup, "timing", plan_by)
+    for planned_by in ("timing", "timings"):
+        object.__setattr__(slow_setup, planned_by, getattr(own, planned_by))
     assert along_middle(treated(slow_setup)) == pytest.approx((2.5, 50.5), abs=0.15)
 
 
