@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -93,6 +94,28 @@ def test_one_python_runs_everything_once(computer: Computer) -> None:
     assert "the tests run once" in result.stdout
     assert "not tested: 3.11 3.13 3.14" in result.stdout
     assert sum("test-computing" in line for line in computer.made()) == 1
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root installs packages")
+@pytest.mark.parametrize(("status", "skipped"), [(0, False), (100, True)])
+def test_a_browser_is_installed_where_it_can_be(
+    computer: Computer, status: int, skipped: bool
+) -> None:
+    computer.on_path("3.11")
+    computer.has(
+        computer.bin / "apt-get",
+        f'#!/bin/sh\necho "apt-get $*" >> {computer.log}\n[ "$1" = update ] || exit {status}\n',
+    )
+    result = computer.run()
+    assert (result.returncode, result.stderr) == (0, "")
+    assert ("tests in a browser are skipped" in result.stdout) == skipped
+    assert computer.made()[1].endswith("chromium")
+
+
+def test_a_browser_that_is_there_is_taken(computer: Computer) -> None:
+    computer.on_path("3.11")
+    computer.has(computer.bin / "chromium", "#!/bin/sh\n")
+    assert "skipped" not in computer.run().stdout
 
 
 def test_without_a_python_nothing_passes(computer: Computer) -> None:
