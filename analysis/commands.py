@@ -40,3 +40,9 @@ FLIGHTS_RECOVER = Command(
     target="analysis.journals.cli:RECOVER",
     help="Repair journals after a crash or power cut.",
 )
+FLEET = Command(
+    target="analysis.fleet.cli:app",
+    help="Many journals as one data set: add, query, report, serve.",
+    haste="patient",
+    hastes={"serve": "at-once"},
+)

@@ -1,0 +1,1 @@
+"""Many journals as one data set: added, asked by SQL, reported, served."""

@@ -1,0 +1,188 @@
+"""Command line of the fleet: `vrspray fleet`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from companion.cli.answer import AsJson, answer, note, progress
+from companion.wording import counted
+
+FAILED, INTERRUPTED = 1, 130
+SHOWN_MAX = 20
+# Below this nothing is to be seen.
+PROGRESS_AFTER_S = 2.0
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode=None,
+    no_args_is_help=True,
+    help="Many journals as one data set: add them, ask by SQL, report, serve.",
+    epilog="Example: vrspray fleet add flights --into fleet",
+)
+
+Place = Annotated[
+    str,
+    typer.Option(
+        "--fleet", metavar="FOLDER|URL", help="Where the flights are: a folder, or an fsspec URL."
+    ),
+]
+
+
+@app.command(epilog="Example: vrspray fleet add flights other/flight-0001.gpkg --into fleet")
+def add(
+    journals: Annotated[
+        list[Path], typer.Argument(metavar="JOURNAL...", help="Journals, or folders of them.")
+    ],
+    into: Annotated[
+        str,
+        typer.Option(
+            "--into",
+            "--fleet",
+            metavar="FOLDER|URL",
+            help="A folder, or an fsspec URL; made if it is not there.",
+        ),
+    ],
+    machine: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="Who flew these, where a journal names no application.aircraft."
+        ),
+    ] = None,
+    is_quick: Annotated[
+        bool,
+        typer.Option("--quick", help="Do not evaluate the flights now; a later add does."),
+    ] = False,
+    processes: Annotated[
+        int | None,
+        typer.Option(min=1, max=256, help="How many at once. Default: one for each core."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Take journals into a fleet's data set.
+
+    Adding a journal twice changes nothing; one that went on takes the place of its earlier copy.
+    Exit 0: all are in; 1: some could not be read, and are listed; 2: wrong input.
+    """
+    from analysis.fleet.adding import add as add_all
+    from analysis.fleet.adding import journals_in
+    from analysis.fleet.store import STORE_ERRORS, Store
+
+    paths = journals_in(journals)
+    store = Store.at(into)
+    with progress(quiet=as_json, after_s=PROGRESS_AFTER_S) as tell:
+        try:
+            done = add_all(
+                paths,
+                store,
+                machine=machine,
+                evaluate=not is_quick,
+                processes=processes,
+                tell=tell,
+            )
+        except STORE_ERRORS as error:
+            raise store.refused(error) from error
+    for each in done.problems[:SHOWN_MAX]:
+        note(f"not added: {each.path}: {each.text}")
+    if len(done.problems) > SHOWN_MAX:
+        note(f"not added: {len(done.problems) - SHOWN_MAX} more; --json lists all")
+    per_s = done.journals / done.record_s if done.record_s > 0.0 else None
+    result: dict[str, Any] = {
+        "fleet": into,
+        "journals": done.journals,
+        "added": done.added,
+        "replaced": done.replaced,
+        "unchanged": done.unchanged,
+        "evaluated": done.evaluated,
+        "not_evaluated": done.not_evaluated,
+        "problems": [
+            {"file": str(each.path), "text": each.text, "is_damaged": each.is_damaged}
+            for each in done.problems
+        ],
+        "record_s": done.record_s,
+        "evaluate_s": done.evaluate_s,
+        "journals_per_s": per_s,
+        "interrupted": done.is_interrupted,
+    }
+    lines = [
+        f"{counted(done.added, 'flight')} added, {done.replaced} replaced, {done.unchanged} there "
+        f"already, {counted(len(done.problems), 'journal')} not read"
+    ]
+    if done.evaluated:
+        lines.append(f"{counted(done.evaluated, 'flight')} evaluated")
+    if done.not_evaluated:
+        lines.append(f"{done.not_evaluated} not evaluated yet: run the same command again")
+    answer(result, lines, as_json=as_json)
+    if done.is_interrupted:
+        raise typer.Exit(INTERRUPTED)
+    if done.problems:
+        raise typer.Exit(FAILED)
+
+
+@app.command(
+    epilog='Example: vrspray fleet query "SELECT machine, sum(area_ha) FROM flights GROUP BY 1" '
+    "--fleet fleet"
+)
+def query(
+    sql: Annotated[str, typer.Argument(help="One SELECT; the tables are in the reference.")],
+    fleet: Place,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="All rows as .csv, .parquet or .json, in place of a table."
+        ),
+    ] = None,
+    memory_mb: Annotated[
+        int, typer.Option(min=50, max=1_000_000, help="What the question may take, in MB.")
+    ] = 300,
+    as_json: AsJson = False,
+) -> None:
+    """Ask the flights by SQL (DuckDB): tables flights, closings, faults, valves, damaged."""
+    from analysis.fleet.asking import asked
+    from analysis.fleet.store import Store
+    from analysis.fleet.tables import check_out, lines_of, rows_of, write_table
+
+    if out is not None:
+        check_out(out)
+    with asked(Store.at(fleet).existing(), memory_mb=memory_mb) as flights:
+        table = flights.ask(sql)
+    result: dict[str, Any] = {"columns": table.column_names, "row_count": len(table)}
+    if out is not None:
+        write_table(out, table)
+        answer(
+            {**result, "file": str(out)},
+            [f"{out}: {counted(len(table), 'row')}"],
+            as_json=as_json,
+        )
+        return
+    rows = rows_of(table) if as_json else []
+    answer({**result, "rows": rows}, () if as_json else lines_of(table), as_json=as_json)
+
+
+@app.command(epilog='Example: vrspray fleet forget "A. Grower" --fleet fleet')
+def forget(
+    operator: Annotated[str, typer.Argument(help="The operator: the name, or the number op-...")],
+    fleet: Place,
+    with_flights: Annotated[
+        bool, typer.Option("--flights", help="Remove the flights too, not only who flew them.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Remove an operator from every file, and keep him out when journals come again."""
+    from analysis.fleet.flight_row import operator_number
+    from analysis.fleet.store import STORE_ERRORS, Store
+
+    store = Store.at(fleet).existing()
+    number = operator_number(operator)
+    try:
+        count = store.forget(number, with_flights=with_flights)
+    except STORE_ERRORS as error:
+        raise store.refused(error) from error
+    what = "removed" if with_flights else "kept, without their operator"
+    answer(
+        {"operator": number, "flights": count, "flights_removed": with_flights},
+        [f"{number}: {counted(count, 'flight')} {what}"],
+        as_json=as_json,
+    )

@@ -1,0 +1,424 @@
+"""One journal as one row of the fleet: what it says of itself, and the report's figures.
+
+A row is made in two steps. `recorded` takes what the journal's tables hold already, in some 15 ms
+whatever was flown; `evaluated` adds what `vrspray report` says, which takes a millisecond for each
+second of flight. Names of people are not in a row: an operator is a number.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import sqlite3
+from collections import Counter, defaultdict
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from shapely.errors import ShapelyError
+
+from analysis.assess.assessment import assess
+from analysis.assess.figures import figures_of
+from analysis.flown.applied_record import EvaluationError
+from analysis.flown.read_applied import OFFSET_S_MAX, read_applied
+from analysis.flown.unknown import GAP_S
+from analysis.journals.content import damages
+from analysis.report.legal_fields import told_in
+from analysis.report.treated import treated_of
+from companion.errors import JournalError, UnreadableError
+from companion.journal.coverage_table import read_coverage, read_treated
+from companion.journal.read_only import DAMAGE, log_of, one_line
+from companion.journal.reader import OpenJournal, opened
+from companion.journal.totals import applied_l
+from companion.simulated import simulated_in
+
+Row = dict[str, Any]
+Type = Literal[
+    "text", "whole number", "number", "yes or no", "time", "closings", "faults", "valves"
+]
+
+# A row of another meaning is made anew by the next `fleet add`.
+ROW_VERSION = 1
+KINDS = ("real", "unknown", "training", "simulated")
+# What a journal is worth beside another of the same flight; the end of the flight tells most.
+_STATES = {"no": "cut", "salvaged": "salvaged", "recovered": "recovered", "yes": "closed"}
+_M2_PER_HA = 10_000.0
+_PIECE_BYTES = 1 << 20
+_FAULT = "fault-"
+
+
+class Column(NamedTuple):
+    """A column of the table of flights."""
+
+    name: str
+    type: Type
+    meaning: str
+
+
+COLUMNS = (
+    Column("flight_id", "text", "identifies the flight: start, set-up and computer, hashed"),
+    Column("kind", "text", "`real`, `training` (water, dry), `simulated`, or `unknown`"),
+    Column("month", "text", "of the start, UTC, as 2026-05; `unknown`: no clock was right"),
+    Column("journal", "text", "name of the file"),
+    Column("journal_sha256", "text", "its hash"),
+    Column("journal_state", "text", "`closed`, `recovered`, `salvaged`, or `cut`"),
+    Column("entries", "whole number", "inputs, decisions and events of the record"),
+    Column("lost_rows", "whole number", "rows that the disk could not take"),
+    Column("record_version", "text", "of two records of one flight the later in order counts"),
+    Column("is_evaluated", "yes or no", "whether the figures of the report are in the row"),
+    Column("why_not_evaluated", "text", "such as: nothing was sprayed"),
+    Column("machine", "text", "`application.aircraft`, or what `--machine` said"),
+    Column("field", "text", "`application.field_name`, else the parcel"),
+    Column("product", "text", "`product.name`"),
+    Column("operator", "text", "a number made of the name; `fleet forget` removes it"),
+    Column("crop", "text", "`application.crop`"),
+    Column("training", "text", "`no` for a product, `water`, `dry`, `simulated`"),
+    Column("simulated", "text", "`yes`, `no`, or `unknown`"),
+    Column("started_utc", "time", "start of the record"),
+    Column("utc_source", "text", "whose clock: `autopilot`, or `computer`"),
+    Column("duration_s", "number", "of the record"),
+    Column("spraying_s", "number", "with a valve open"),
+    Column("latitude_deg", "number", "of the field's origin, to 10 m"),
+    Column("longitude_deg", "number", "of the field's origin, to 10 m"),
+    Column("field_ha", "number", "area where spraying was allowed"),
+    Column("area_ha", "number", "ground treated; by the raster until the flight is evaluated"),
+    Column("applied_l", "number", "litres"),
+    Column("applied_by", "text", "`flow meter`, `model`, `orders` (not evaluated), or `nothing`"),
+    Column("modelled_l", "number", "litres by executed changes, curves and lags"),
+    Column("prescribed_l", "number", "litres by the map, on the ground flown over"),
+    Column("flow_drift_percent", "number", "meter against model: wear, blocked nozzles, the meter"),
+    Column("within_10_percent", "number", "share of the ground that got its rate within 10 %"),
+    Column("missed_m2", "number", "flown over and left bare"),
+    Column("doubled_m2", "number", "treated twice"),
+    Column("untreated_m2", "number", "of the field with a rate, not treated in this flight"),
+    Column("outside_ml", "number", "fell outside the border"),
+    Column("changes", "whole number", "changes of rate whose lag was measured"),
+    Column("missed_changes", "whole number", "changes of rate that never came"),
+    Column("apart_changes", "whole number", "changes of rate that cannot be measured"),
+    Column("mean_lag_m", "number", "mean of the absolute lag distances"),
+    Column("worst_lag_m", "number", "bound of the worst change (95 %)"),
+    Column("link_lost_percent", "number", "messages of the autopilot that were lost"),
+    Column("closings", "closings", "`reason`, `count`, `seconds`: what closed open valves"),
+    Column("faults", "faults", "`kind`, `count`: what the fault detection found"),
+    Column("valves", "valves", "`valve`, `flow_factor`: as measured by `calibrate valves`"),
+    Column("map_sha256", "text", "of the map"),
+    Column("calibration_sha256", "text", "of nozzle sets, lags and PWM"),
+    Column("method", "text", "of the controller"),
+    Column("flown_with", "text", "version of vrspray on board"),
+    Column("evaluated_with", "text", "version of vrspray that made the row"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """A journal that gave no row, and why; `is_damaged`: it is one all the same."""
+
+    path: Path
+    text: str
+    is_damaged: bool
+    journal_sha256: str = ""
+    flight_id: str | None = None
+
+
+def operator_number(name: str) -> str:
+    """Return the number that stands for an operator; of a number, itself.
+
+    >>> operator_number("A. Grower") == operator_number(" a.  grower ")
+    True
+    >>> operator_number("op-0123456789ab")
+    'op-0123456789ab'
+    """
+    text = " ".join(name.split()).casefold()
+    if len(text) == 15 and text.startswith("op-") and set(text[3:]) <= set("0123456789abcdef"):
+        return text
+    return f"op-{hashlib.sha256(f'operator {text}'.encode()).hexdigest()[:12]}"
+
+
+def flight_id_of(meta: Mapping[str, str]) -> str:
+    """Return what identifies a flight in every copy of its journal; KeyError where that is gone.
+
+    The start to the microsecond, the clock then, the computer, and all that was constant: copies,
+    recovered and salvaged ones have the same.
+    """
+    facts = [meta[key] for key in ("started_utc", "started_s", "setup")]
+    facts += [meta.get(key, "") for key in ("platform", "flight", "map_sha256")]
+    return hashlib.sha256("\0".join(facts).encode()).hexdigest()[:20]
+
+
+def sha256_of(path: Path) -> str:
+    """Return the hash of a journal, with the log that a cut left beside it."""
+    found = hashlib.sha256()
+    for each in (path, log_of(path)):
+        if each.is_file():
+            with each.open("rb") as file:
+                while piece := file.read(_PIECE_BYTES):
+                    found.update(piece)
+    return found.hexdigest()
+
+
+def recorded(
+    path: Path, *, machine: str | None = None, known: Container[str] = ()
+) -> Row | Problem | str:
+    """Return what a journal's tables hold as a row, or why there is none.
+
+    Of a journal whose hash is among the `known` ones only that.
+    """
+    digest = ""
+    flight_id = None
+    try:
+        if path.is_file() and (digest := sha256_of(path)) in known:
+            return digest
+        with opened(path, is_lenient=True) as journal:
+            flight_id = flight_id_of(journal.meta) if "setup" in journal.meta else None
+            unread = [*journal.unread, *damages(journal.connection)]
+            if unread:
+                return Problem(
+                    path=path,
+                    text=f"is damaged: {'; '.join(unread)}; vrspray flights recover copies what "
+                    "can be read",
+                    is_damaged=True,
+                    journal_sha256=digest,
+                    flight_id=flight_id,
+                )
+            return _row(journal, digest, machine)
+    except (JournalError, ShapelyError, *DAMAGE) as error:
+        is_damaged = isinstance(error, UnreadableError) or not isinstance(error, JournalError)
+        text = str(error).removeprefix(f"{path}: ")
+        return Problem(
+            path=path,
+            text=text if isinstance(error, JournalError) else f"is damaged: {text}",
+            is_damaged=is_damaged,
+            journal_sha256=digest,
+            flight_id=flight_id,
+        )
+
+
+def flown_by(row: Row, machine: str | None) -> Row:
+    """Return a row with the machine that was named before, where its journal names none."""
+    return row if row["machine"] is not None else _versioned({**row, "machine": machine})
+
+
+def evaluated(path: Path, *, machine: str | None = None) -> Row | Problem | str:
+    """Return a journal's row with the figures of its report, or why there is none."""
+    row = recorded(path, machine=machine)
+    return _evaluated(row, path) if isinstance(row, dict) else row
+
+
+def _evaluated(row: Row, path: Path) -> Row:
+    found = {**row, "is_evaluated": True, "evaluated_with": _own_version()}
+    unread: list[str] = []
+    try:
+        flight = read_applied(path, unread=unread)
+        assessment = assess(flight)
+    except (EvaluationError, JournalError, ShapelyError, *DAMAGE) as error:
+        # One strange flight is no reason to lose the others.
+        found["why_not_evaluated"] = one_line(error).removeprefix(f"{path}: ")
+        return _versioned(found)
+    is_whole = not (unread or flight.lost)
+    if not is_whole and not assessment.evaluation.applied_ml > 0.0:
+        found["why_not_evaluated"] = "too little of the journal can be read"
+        return _versioned(found)
+    figures = figures_of(assessment, area_ha=treated_of(flight).area_ha, is_whole=is_whole)
+    evaluation = assessment.evaluation
+    found |= {
+        "area_ha": figures.area_ha,
+        "applied_l": figures.applied_l,
+        "applied_by": figures.applied_by,
+        "modelled_l": assessment.balance.model_l,
+        "prescribed_l": figures.prescribed_l,
+        "flow_drift_percent": assessment.balance.meter_to_model_percent,
+        "within_10_percent": figures.within_10_percent,
+        "missed_m2": figures.missed_m2,
+        "doubled_m2": figures.doubled_m2,
+        "untreated_m2": figures.untreated_m2,
+        "outside_ml": figures.outside_ml,
+        "changes": figures.lag_count,
+        "missed_changes": evaluation.missed,
+        "apart_changes": evaluation.apart,
+        "mean_lag_m": figures.mean_lag_m,
+        "worst_lag_m": figures.worst_m,
+    }
+    return _versioned(found)
+
+
+def _row(journal: OpenJournal, digest: str, machine: str | None) -> Row:
+    meta, connection = journal.meta, journal.connection
+    setup, told, simulated = journal.setup(), told_in(meta), simulated_in(meta)
+    training = meta.get("training")
+    began_s, ended_s, entries = _extent(journal)
+    started = _started(meta, began_s)
+    flown = _flown(connection)
+    row: Row = dict.fromkeys(each.name for each in COLUMNS)
+    row |= {
+        "flight_id": flight_id_of(meta),
+        "kind": _kind(simulated.word, training),
+        "month": "unknown" if started is None else started.strftime("%Y-%m"),
+        "journal": journal.path.name,
+        "journal_sha256": digest,
+        "journal_state": _STATES[meta["closed"]],
+        "entries": entries,
+        "lost_rows": int(meta["lost"]),
+        "is_evaluated": False,
+        "machine": told.get("application.aircraft") or machine,
+        "field": told.get("application.field_name") or told.get("application.parcel"),
+        "product": told.get("product.name"),
+        "operator": _operator(told),
+        "crop": told.get("application.crop"),
+        "training": training,
+        "simulated": simulated.word,
+        "started_utc": started,
+        "utc_source": meta["utc_source"],
+        "duration_s": None if began_s is None or ended_s is None else ended_s - began_s,
+        "spraying_s": flown.spraying_s,
+        "latitude_deg": round(setup.frame.latitude_deg, 4),
+        "longitude_deg": round(setup.frame.longitude_deg, 4),
+        "field_ha": float(setup.prescription.field.area) / _M2_PER_HA,
+        "area_ha": _treated_ha(connection),
+        "applied_l": applied_l(connection, meta),
+        "applied_by": "orders",
+        "link_lost_percent": _link_lost(connection),
+        "closings": flown.closings,
+        "faults": _faults(connection),
+        "valves": [
+            {"valve": each.name, "flow_factor": each.flow_factor} for each in setup.boom.valves
+        ],
+        "map_sha256": meta.get("map_sha256") or None,
+        "calibration_sha256": meta.get("calibration_sha256"),
+        "method": meta.get("method"),
+        "flown_with": meta.get("version_vrspray"),
+        "evaluated_with": _own_version(),
+    }
+    return _versioned(row)
+
+
+@cache
+def _own_version() -> str:
+    return version("vrspray")
+
+
+def _versioned(row: Row) -> Row:
+    """Return a row with its place among records of the same flight, as a text that sorts so."""
+    state = list(_STATES.values()).index(row["journal_state"])
+    parts = (
+        f"{row['entries']:012d}",
+        str(state),
+        f"{ROW_VERSION:04d}",
+        str(int(row["machine"] is not None)),
+        str(int(row["is_evaluated"])),
+        row["journal_sha256"][:16],
+    )
+    return {**row, "record_version": ".".join(parts)}
+
+
+def _kind(simulated: str, training: str | None) -> str:
+    """Return which flights this one stands with: nothing but product on a field is real.
+
+    >>> _kind("no", "no"), _kind("no", "water"), _kind("unknown", "no"), _kind("yes", "no")
+    ('real', 'training', 'unknown', 'simulated')
+    """
+    if simulated == "yes":
+        return "simulated"
+    if training in ("water", "dry"):
+        return "training"
+    return "real" if simulated == "no" and training == "no" else "unknown"
+
+
+def _operator(told: Mapping[str, Any]) -> str | None:
+    for key in ("application.operator", "application.pilot", "application.licence"):
+        if told.get(key):
+            return operator_number(str(told[key]))
+    return None
+
+
+def _extent(journal: OpenJournal) -> tuple[float | None, float | None, int]:
+    """Return first and last time of a record, and how far its numbers go."""
+    sql = (
+        "SELECT min(time_s), max(time_s), max(sequence) FROM records"
+        if journal.version == "1"
+        else "SELECT min(from_s), max(until_s), max(last_sequence) FROM blocks"
+    )
+    began_s, ended_s, last = journal.connection.execute(sql).fetchone()
+    (other,) = journal.connection.execute("SELECT max(sequence) FROM events").fetchone()
+    return began_s, ended_s, max(last or 0, other or 0)
+
+
+def _started(meta: Mapping[str, str], began_s: float | None) -> datetime | None:
+    """Return the start by the best clock that the flight had; None where it is no time."""
+    offset_s = float(meta["utc_offset_s"])
+    at_s = (float(meta["started_s"]) if began_s is None else began_s) + offset_s
+    if not (math.isfinite(at_s) and 0.0 <= at_s <= OFFSET_S_MAX):
+        return None
+    return datetime.fromtimestamp(at_s, UTC)
+
+
+class _Flown(NamedTuple):
+    spraying_s: float
+    closings: list[Row]
+
+
+def _flown(connection: sqlite3.Connection) -> _Flown:
+    """Return how long valves were open, and by which reasons they were closed.
+
+    A closing lasts until no reason is left. Reasons that stand while no valve is open, such as a
+    vehicle that is not yet armed, close nothing.
+    """
+    spraying_s, was_open = 0.0, False
+    before_s = -math.inf
+    reasons: tuple[str, ...] = ()
+    counts: Counter[str] = Counter()
+    seconds: dict[str, float] = defaultdict(float)
+    rows = connection.execute("SELECT time_s, duty, inhibits FROM applied ORDER BY sequence")
+    for at_s, duty, inhibits in (row for row in rows if row[0] is not None):
+        if was_open and 0.0 < at_s - before_s <= GAP_S:
+            spraying_s += at_s - before_s
+        for reason in reasons:
+            seconds[reason] += at_s - before_s
+        if not inhibits:
+            reasons = ()
+        elif was_open and not reasons:
+            reasons = tuple(inhibits.split())
+            counts.update(reasons)
+        before_s, was_open = at_s, bool(duty and duty > 0.0)
+    closings = [
+        {"reason": reason, "count": counts[reason], "seconds": round(seconds[reason], 3)}
+        for reason in sorted(counts)
+    ]
+    return _Flown(spraying_s, closings)
+
+
+def _treated_ha(connection: sqlite3.Connection) -> float | None:
+    """Return the ground that this flight treated and none before it, by the raster."""
+    whole, before = read_coverage(connection), read_treated(connection)
+    if whole is None:
+        return None
+    return (whole.area_m2 - (0.0 if before is None else before.area_m2)) / _M2_PER_HA
+
+
+def _faults(connection: sqlite3.Connection) -> list[Row]:
+    sql = "SELECT kind, count(*) FROM events WHERE kind LIKE 'fault-%' GROUP BY kind ORDER BY kind"
+    return [
+        {"kind": str(kind).removeprefix(_FAULT), "count": count}
+        for kind, count in connection.execute(sql)
+    ]
+
+
+def _link_lost(connection: sqlite3.Connection) -> float | None:
+    sql = "SELECT 1 FROM sqlite_master WHERE name = 'link_stats'"
+    if connection.execute(sql).fetchone() is None:
+        return None
+    (lost,) = connection.execute("SELECT max(lost_percent) FROM link_stats").fetchone()
+    return None if lost is None else float(lost)
+
+
+def newest(rows: Iterable[Row]) -> dict[str, Row]:
+    """Return of each flight the record that counts, by its number."""
+    found: dict[str, Row] = {}
+    for row in rows:
+        known = found.get(row["flight_id"])
+        if known is None or known["record_version"] < row["record_version"]:
+            found[row["flight_id"]] = row
+    return found
