@@ -44,7 +44,7 @@ from sitl.drives import DrivenOutput, DriveTruth, Motors, Ranges
 from sitl.earth import Earth
 from sitl.knowledge import KnowingOutput, WaitingForDuties, WaitingForEdges, pwm_limits
 from sitl.liquid_faults import LiquidFault, LiquidSensors
-from sitl.navigation import Navigation
+from sitl.navigation import SPEED_REPORT_RATE_HZ, Navigation
 from sitl.outputs import WIRE_S, AveragedOutput, Output, PlanFollower, ServoOutput, TakesEdges
 from sitl.own_method import MakeController, OwnFlight, Sprayer, made
 from sitl.plants import duty_plant, edge_plant
@@ -83,6 +83,8 @@ class FlightOptions:
     board: Literal["restarting", "free-running"] = "restarting"
     seed: int = 1
     position_rate_hz: float = 20.0
+    imu_rate_hz: float = 0.0
+    speed_rate_hz: float = SPEED_REPORT_RATE_HZ
     estimator_lag_s: float = 0.031
     noise: bool = True
     scatter: bool = True
@@ -267,6 +269,8 @@ def _inputs(setup: Setup, trajectory: Trajectory, options: FlightOptions) -> Ite
         seed=options.seed,
         start_s=float(trajectory.time_s[0]),
         position_rate_hz=options.position_rate_hz,
+        imu_rate_hz=options.imu_rate_hz if is_noisy else 0.0,
+        speed_rate_hz=options.speed_rate_hz,
         estimator_lag_s=options.estimator_lag_s if is_noisy else 0.0,
         message_delay_s=MESSAGE_DELAY_S if is_noisy else 0.0,
         jitter_s=0.003 if is_noisy else 0.0,

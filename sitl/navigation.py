@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from companion.core.types import SpeedReport, Telemetry
+from companion.core.types import AttitudeReport, ImuReport, SpeedReport, Telemetry
+from sitl.leaning import GRAVITY_M_S2, MEAN_S, Leaning, leaning
 from sitl.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -23,7 +24,15 @@ WANDER_SD_M = 0.014
 WANDER_TIME_S = 30.0
 VELOCITY_SD_M_S = 0.03
 SPEED_REPORT_RATE_HZ = 10.0
-_DRAWS = 8
+# What an estimator's attitude is off by: it wanders as its accelerometer's bias is learned.
+TILT_SD_RAD, TILT_TIME_S = math.radians(0.4), 30.0
+YAW_SD_RAD, ATTITUDE_NOISE_RAD = math.radians(2.0), math.radians(0.05)
+# The accelerometer: an offset of its own, the vibration that its filter leaves, and how late that
+# makes it (ArduPilot: INS_ACCEL_FILTER, 20 Hz).
+IMU_BIAS_SD_M_S2, IMU_NOISE_M_S2, IMU_LATE_S = 0.1, 0.3, 0.01
+_DRAWS, _IMU_DRAWS = 8, 9
+
+Heard = Telemetry | SpeedReport | AttitudeReport | ImuReport
 
 
 class TruthSource(Protocol):
@@ -53,6 +62,8 @@ class Navigation:
         jitter_s: float = 0.003,
         noise: bool = True,
         boot_s: float = 0.0,
+        imu_rate_hz: float = 0.0,
+        speed_rate_hz: float = SPEED_REPORT_RATE_HZ,
     ) -> None:
         if not (0.1 <= position_rate_hz <= 1000.0 and message_delay_s >= 0.0 and jitter_s >= 0.0):
             raise ValueError("rate, delay and jitter of the position must be sensible")
@@ -64,19 +75,27 @@ class Navigation:
         self._start_s, self._boot_s = start_s, boot_s
         decay = math.exp(-self._period_s / WANDER_TIME_S)
         self._decay, self._kick = decay, WANDER_SD_M * math.sqrt(1.0 - decay**2)
-        position_seed, speed_seed = np.random.SeedSequence(seed).spawn(2)
+        position_seed, speed_seed, imu_seed = np.random.SeedSequence(seed).spawn(3)
         self._position_rng = np.random.default_rng(position_seed)
         self._speed_rng = np.random.default_rng(speed_seed)
+        self._speed_rate_hz, self._imu_rate_hz = speed_rate_hz, imu_rate_hz
+        self._imu_rng = np.random.default_rng(imu_seed)
+        self._tilt = TILT_SD_RAD * self._noise * self._imu_rng.standard_normal(2)
+        self._yaw_off = YAW_SD_RAD * self._noise * float(self._imu_rng.standard_normal())
+        self._imu_bias = IMU_BIAS_SD_M_S2 * self._noise * self._imu_rng.standard_normal(3)
+        self._imu_count = 0
+        self._imu_received_s = -math.inf
         east, north = self._position_rng.standard_normal(2).tolist()
         self._wander = (WANDER_SD_M * east, WANDER_SD_M * north)
         self._position_count = self._speed_count = self._order = 0
         self._position_received_s = self._speed_received_s = -math.inf
-        self._under_way: list[tuple[float, int, Telemetry | SpeedReport]] = []
+        self._under_way: list[tuple[float, int, Heard]] = []
 
-    def advance(self, until_s: float) -> list[Telemetry | SpeedReport]:
+    def advance(self, until_s: float) -> list[Heard]:
         """Return what has arrived since the last call up to `until_s`."""
         self._send_positions(until_s)
         self._send_speeds(until_s)
+        self._send_imu(until_s)
         arrived = []
         while self._under_way and self._under_way[0][0] <= until_s:
             arrived.append(heapq.heappop(self._under_way)[2])
@@ -135,7 +154,7 @@ class Navigation:
         # Half a period after the position: the two streams of an autopilot do not coincide.
         times_s = []
         while True:
-            at_s = self._start_s + (self._speed_count + 0.5) / SPEED_REPORT_RATE_HZ
+            at_s = self._start_s + (self._speed_count + 0.5) / self._speed_rate_hz
             if not at_s <= until_s:
                 break
             times_s.append(at_s)
@@ -149,10 +168,71 @@ class Navigation:
             self._speed_received_s = received_s
             self._put(received_s, SpeedReport(received_s=received_s, ground_speed_m_s=speed_m_s))
 
+    def _send_imu(self, until_s: float) -> None:
+        """Send attitude and accelerometer one behind the other, as an autopilot's streams do."""
+        if not self._imu_rate_hz > 0.0:
+            return
+        times_s = []
+        while (at_s := self._start_s + (self._imu_count + 0.25) / self._imu_rate_hz) <= until_s:
+            times_s.append(at_s)
+            self._imu_count += 1
+        decay = math.exp(-1.0 / (self._imu_rate_hz * TILT_TIME_S))
+        kick = TILT_SD_RAD * self._noise * math.sqrt(1.0 - decay * decay)
+        for at_s in times_s:
+            draws = self._imu_rng.standard_normal(_IMU_DRAWS)
+            self._tilt = decay * self._tilt + kick * draws[:2]
+            received_s = self._receive_s(at_s, float(draws[2]), self._imu_received_s)
+            self._imu_received_s = received_s
+            self._put(received_s, self._attitude(at_s, received_s, draws[3:6]))
+            self._put(received_s, self._imu(at_s, received_s, draws[6:9]))
+
+    def _leaning(self, at_s: float) -> Leaning:
+        before, now = self._source_truths([at_s - MEAN_S, at_s])
+        return leaning(before, now, MEAN_S)
+
+    def _source_truths(self, times_s: list[float]) -> list[Truth]:
+        if isinstance(self._source, Trajectory):
+            return self._source.truths_at(times_s)
+        return [self._source.truth_at(time_s) for time_s in times_s]
+
+    def _attitude(
+        self, at_s: float, received_s: float, draws: NDArray[np.float64]
+    ) -> AttitudeReport:
+        now, before = self._leaning(at_s), self._leaning(at_s - MEAN_S)
+        off = ATTITUDE_NOISE_RAD * self._noise * draws
+        turned = math.remainder(now.yaw_rad - before.yaw_rad, 2.0 * math.pi)
+        return AttitudeReport(
+            received_s=received_s,
+            boot_s=self._boot(at_s),
+            roll_deg=math.degrees(now.roll_rad + self._tilt[0] + off[0]),
+            pitch_deg=math.degrees(now.pitch_rad + self._tilt[1] + off[1]),
+            yaw_deg=math.degrees(now.yaw_rad + self._yaw_off + off[2]),
+            roll_rate_deg_s=math.degrees((now.roll_rad - before.roll_rad) / MEAN_S),
+            pitch_rate_deg_s=math.degrees((now.pitch_rad - before.pitch_rad) / MEAN_S),
+            yaw_rate_deg_s=math.degrees(turned / MEAN_S),
+        )
+
+    def _imu(self, at_s: float, received_s: float, draws: NDArray[np.float64]) -> ImuReport:
+        """Return SCALED_IMU's: thousandths of gravity."""
+        force = self._leaning(at_s - IMU_LATE_S).felt_m_s2
+        off = self._imu_bias + IMU_NOISE_M_S2 * self._noise * draws
+        unit = GRAVITY_M_S2 / 1000.0
+        x, y, z = (round((f + d) / unit) * unit for f, d in zip(force, off.tolist(), strict=True))
+        return ImuReport(
+            received_s=received_s,
+            boot_s=self._boot(at_s),
+            forward_m_s2=x,
+            right_m_s2=y,
+            down_m_s2=z,
+        )
+
+    def _boot(self, at_s: float) -> float:
+        return math.floor((at_s - self._boot_s) * 1e3 + 1e-6) / 1e3
+
     def _receive_s(self, sent_s: float, jitter: float, after_s: float) -> float:
         received_s = sent_s + max(self._delay_s + self._jitter_s * jitter, 0.0)
         return max(received_s, after_s)
 
-    def _put(self, received_s: float, message: Telemetry | SpeedReport) -> None:
+    def _put(self, received_s: float, message: Heard) -> None:
         self._order += 1
         heapq.heappush(self._under_way, (received_s, self._order, message))

@@ -220,6 +220,7 @@ def component_options(
         use_mission=config.prediction.use_mission or has_lines,
         need_mission=has_lines,
         use_switch=config.safety.rc_channel is not None,
+        use_imu=config.prediction.use_imu,
         use_battery="autopilot" in (config.flow_meter.source, config.tank.source),
         watch_mission=watch_mission,
         may_enable="command" in config.safety.enable_by,

@@ -476,6 +476,10 @@ class DriftTable(Table):
 class PredictionTable(Table):
     """What the prediction of the vehicle's motion may use; see prediction.md."""
 
+    use_imu: bool = Field(
+        default=False,
+        description="true: attitude and accelerometer tell the motion between two positions",
+    )
     use_mission: bool = Field(
         default=False,
         description="true: the autopilot's mission is read, and braking for a stop is foreseen",

@@ -13,8 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from companion.core import motion
-from companion.core.arithmetic import exp
 from companion.core.braking import (
     Approach,
     StoppingLeg,
@@ -25,6 +23,7 @@ from companion.core.braking import (
     stop_ahead,
 )
 from companion.core.clock import Clock, on_time_s, tick
+from companion.core.inertial import NO_INERTIA, Inertia, blended
 from companion.core.inputs import MISSION_MODES
 from companion.core.motion import (
     BELIEVING,
@@ -42,17 +41,30 @@ from companion.core.motion import (
     Told,
     agreed,
     doubted,
+    drawn_after,
     follow_pair,
     mixed,
     moved,
+    seen_of,
     stretch,
+    together,
     told,
+    turning,
 )
 from companion.core.nozzle import is_override
-from companion.core.positions import Arrival, LastPlace, PositionStream, look, noted, sorted_in
+from companion.core.positions import (
+    Arrival,
+    LastPlace,
+    PositionStream,
+    look,
+    noted,
+    place_of,
+    sorted_in,
+)
 from companion.core.safety import NO_CONSENT, Consent, consented
 from companion.core.setup import Setup
 from companion.core.types import (
+    AttitudeReport,
     BatteryReport,
     ClockReport,
     EstimatorReport,
@@ -60,6 +72,7 @@ from companion.core.types import (
     FlowReport,
     GnssReport,
     HeartbeatReport,
+    ImuReport,
     Input,
     LandedReport,
     LegReport,
@@ -82,7 +95,6 @@ from companion.core.types import (
 
 # The vehicle's motion as its positions tell it: the filters of `motion.py`, course and height.
 
-YAW_RATE_TIME_S = 0.25
 # After a jump the filters start anew, and nothing is sprayed until so many positions confirm it.
 CONFIRM_COUNT = 5
 
@@ -109,6 +121,7 @@ class Motion:
     height_m: float
     velocity_known: bool
     confirm_left: int
+    likely: float | None = None  # how the filters found the last message; None: they begin with it
 
     def after(self, dt_s: float) -> tuple[Told, Told]:
         """Return the motion to the east and to the north `dt_s` later: the place as it is told.
@@ -134,7 +147,7 @@ class Motion:
 
 def begun(item: Telemetry, place: tuple[float, float], time_s: float) -> Motion:
     """Return what a first position says."""
-    east, north = _seen(item, place)
+    east, north = seen_of(item, place)
     belief = Belief(
         Axis(place[0], east.velocity_m_s or 0.0, 0.0),
         Axis(place[1], north.velocity_m_s or 0.0, 0.0),
@@ -163,11 +176,12 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
     dt_s = time_s - before.time_s
     if not 0.0 < dt_s < BRIDGED_MAX_S:
         return begun(item, place, time_s)
-    east, north = _seen(item, place)
+    east, north = seen_of(item, place)
     believing = follow_pair(BELIEVING, before.believing, dt_s, east, north)
     if believing is None:
         return begun(item, place, time_s)
     doubting = follow_pair(DOUBTING, before.doubting, dt_s, east, north)
+    doubted_one = None if doubting is None else doubting[1]
     known = east.velocity_m_s is not None
     share = before.doubt_share
     if doubting is None:
@@ -185,40 +199,16 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
         agreed=agreed(believing[0], doubting[0], share),
         seen=(east, north),
         drawn=(
-            _drawn_after(before.drawn[0], dt_s, before.seen[0], east),
-            _drawn_after(before.drawn[1], dt_s, before.seen[1], north),
+            drawn_after(before.drawn[0], dt_s, before.seen[0], east),
+            drawn_after(before.drawn[1], dt_s, before.seen[1], north),
         ),
         heading_deg=item.heading_deg,
-        yaw_rate_deg_s=_yaw_rate(before, item.heading_deg, dt_s),
+        yaw_rate_deg_s=turning(before.yaw_rate_deg_s, before.heading_deg, item.heading_deg, dt_s),
         height_m=item.relative_altitude_m,
         velocity_known=known,
         confirm_left=max(before.confirm_left - 1, 0),
+        likely=believing[1] if doubted_one is None else together(share, believing[1], doubted_one),
     )
-
-
-def _seen(item: Telemetry, place: tuple[float, float]) -> tuple[Seen, Seen]:
-    """Return what a message says to the east and to the north; half a velocity is none."""
-    east_m_s, north_m_s = item.velocity_east_m_s, item.velocity_north_m_s
-    if east_m_s is None or north_m_s is None:
-        return Seen(place[0], None), Seen(place[1], None)
-    return Seen(place[0], east_m_s), Seen(place[1], north_m_s)
-
-
-def _drawn_after(by: Drawn, dt_s: float, before: Seen, now: Seen) -> Drawn:
-    if before.velocity_m_s is None or now.velocity_m_s is None:
-        return NOT_DRAWN
-    told_m_s = 0.5 * (before.velocity_m_s + now.velocity_m_s)
-    return motion.followed(by, dt_s, now.position_m - before.position_m, told_m_s)
-
-
-def _yaw_rate(before: Motion, heading_deg: float | None, dt_s: float) -> float:
-    if heading_deg is None or before.heading_deg is None:
-        return 0.0
-    if not abs(heading_deg - before.heading_deg) <= 720.0:
-        return 0.0  # one of them is no number; the rate would never be one again
-    turned_deg = (heading_deg - before.heading_deg + 180.0) % 360.0 - 180.0
-    share = 1.0 - exp(-dt_s / YAW_RATE_TIME_S)
-    return before.yaw_rate_deg_s + share * (turned_deg / dt_s - before.yaw_rate_deg_s)
 
 
 SPEED_REPORT_AGE_MAX_S = 1.0
@@ -241,6 +231,7 @@ class Track:
     order: PositionStream = _NOTHING_HEARD
     position_valid: bool = False
     position_received_s: float = -math.inf
+    inertia: Inertia = NO_INERTIA
     speed: SpeedReport | None = None
     gnss: GnssReport | None = None
     estimator: EstimatorReport | None = None
@@ -290,6 +281,9 @@ def _is_new_leg(before: MissionLeg | None, now: MissionLeg | None) -> bool:
 
 # Reports of which only the last one counts.
 _KEEP: dict[type, Callable[[Track, Any], Track]] = {
+    AttitudeReport: lambda track, item: replace(
+        track, inertia=replace(track.inertia, attitude=item)
+    ),
     SpeedReport: lambda track, item: replace(track, speed=item),
     GnssReport: lambda track, item: replace(track, gnss=item),
     EstimatorReport: lambda track, item: replace(track, estimator=item),
@@ -363,6 +357,9 @@ def _observe_standstill(track: Track, item: StandstillReport, _setup: Setup) -> 
 
 
 _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
+    ImuReport: lambda track, item, setup: replace(
+        track, inertia=track.inertia.with_imu(item, setup.lag.position_s)
+    ),
     HeartbeatReport: _observe_consent,
     OperatorCommand: _observe_consent,
     EstopReport: _observe_consent,
@@ -380,7 +377,7 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
     track = replace(track, order=order)
     if kind is Arrival.ANEW:
         track = _restarted(track)
-    place = _place(item, setup)
+    place = place_of(item, setup.frame)
     if place is None:
         return replace(track, position_valid=False, position_received_s=item.received_s)
     before = track.motion
@@ -404,6 +401,9 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
     return replace(
         track,
         motion=motion,
+        inertia=track.inertia.after_position(
+            motion.boot_s, motion.seen, motion.agreed.cruise, motion.likely
+        ),
         clock=clock,
         clock_refused=ticked.is_refused,
         flow=_dated(track, clock),
@@ -419,7 +419,13 @@ def _restarted(track: Track) -> Track:
     """Forget what was known by the autopilot's old clock, but an exchange with the new one."""
     exchange = track.order.exchange
     return replace(
-        track, motion=None, clock=None, clock_report=exchange, clock_refused=False, last_place=None
+        track,
+        motion=None,
+        clock=None,
+        clock_report=exchange,
+        clock_refused=False,
+        last_place=None,
+        inertia=NO_INERTIA,
     )
 
 
@@ -433,28 +439,13 @@ def _stand(track: Track, item: Telemetry) -> LastPlace:
     return look(track.last_place, item, expected_m_s=expected_m_s, reported_m_s=checked_m_s)
 
 
-def _place(item: Telemetry, setup: Setup) -> tuple[float, float] | None:
-    """Return (east_m, north_m); None for what is no position: NaN, out of range, or 0, 0."""
-    latitude, longitude = item.latitude_deg, item.longitude_deg
-    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
-        return None
-    if abs(latitude) < 1e-6 and abs(longitude) < 1e-6:
-        return None
-    if not (abs(item.received_s) < math.inf and abs(item.boot_s) < math.inf):
-        return None
-    east_m, north_m = setup.frame.to_local(latitude, longitude)
-    if not (abs(east_m) < 1e8 and abs(north_m) < 1e8 and abs(item.relative_altitude_m) < 1e6):
-        return None
-    return east_m, north_m
-
-
 def estimate(track: Track, now_s: float) -> VehicleState | None:
     """Return the vehicle's state at `now_s`; None before the first position."""
     motion = track.motion
     if motion is None:
         return None
     dt_s = now_s - motion.time_s
-    east, north = motion.after(dt_s)
+    east, north = _after(track.inertia, motion, dt_s)
     velocity_east, velocity_north = east.velocity_m_s, north.velocity_m_s
     checked = _checked_speed(track, now_s)
     known = motion.velocity_known
@@ -507,6 +498,16 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         mission_leg=track.mission_leg,
         mission_leg_before=track.mission_leg_before,
     )
+
+
+def _after(inertia: Inertia, motion: Motion, dt_s: float) -> tuple[Told, Told]:
+    """Return the motion `dt_s` after the last position, by all that is known of it."""
+    east, north = motion.after(dt_s)
+    by_inertia = inertia.after(dt_s, motion.acceleration_fade_s)
+    if by_inertia is None:
+        return east, north
+    share = inertia.share
+    return blended(east, by_inertia[0], share), blended(north, by_inertia[1], share)
 
 
 def _heading(motion: Motion, dt_s: float) -> float | None:

@@ -57,6 +57,34 @@ class SpeedReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class AttitudeReport:
+    """How the vehicle lies and turns (ATTITUDE): yaw, then pitch, then roll; rates of the body."""
+
+    received_s: float
+    boot_s: float
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+    roll_rate_deg_s: float
+    pitch_rate_deg_s: float
+    yaw_rate_deg_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImuReport:
+    """What the accelerometer feels along the body (SCALED_IMU, HIGHRES_IMU): all but gravity.
+
+    At rest and level, `down_m_s2` is -9.81.
+    """
+
+    received_s: float
+    boot_s: float
+    forward_m_s2: float
+    right_m_s2: float
+    down_m_s2: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class GnssReport:
     """Quality of the GNSS fix (GPS_RAW_INT)."""
 
@@ -291,6 +319,8 @@ class AutopilotLiquid:
 
 Input = (
     Telemetry
+    | AttitudeReport
+    | ImuReport
     | SpeedReport
     | GnssReport
     | EstimatorReport

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from companion.core.arithmetic import (
     Matrix,
@@ -35,6 +35,9 @@ from companion.core.arithmetic import (
     product,
     transposed,
 )
+
+if TYPE_CHECKING:
+    from companion.core.inputs import Telemetry
 
 # Noise of what is heard, as assumed: RTK position, fused velocity (accuracy.md section 4).
 POSITION_SD_M = 0.02
@@ -66,6 +69,7 @@ EVIDENCE_MAX = 50.0
 # The longest time between messages that the filters bridge, and the finest step of their gains.
 BRIDGED_MAX_S = 2.0
 GAIN_STEP_S = 0.005
+YAW_RATE_TIME_S = 0.25
 # So many rounds stand for thousands of messages; most are there sooner.
 DOUBLINGS = 14
 SETTLED = 1e-12
@@ -85,6 +89,7 @@ class Model(NamedTuple):
     """An acceleration driven by white noise that fades (Singer, IEEE Trans. AES 1970).
 
     `astray_m_s` is how far the told velocity may be from that of the place; 0 believes it.
+    `shaken_m_s_sqrt_s` is white noise of the acceleration itself, as an accelerometer has.
     """
 
     wander_m_s2_sqrt_s: float
@@ -92,6 +97,7 @@ class Model(NamedTuple):
     position_sd_m: float = POSITION_SD_M
     astray_m_s: float = 0.0
     velocity_sd_m_s: float = VELOCITY_SD_M_S
+    shaken_m_s_sqrt_s: float = 0.0
 
 
 class Models(NamedTuple):
@@ -164,6 +170,14 @@ class Seen(NamedTuple):
     velocity_m_s: float | None
 
 
+def seen_of(item: Telemetry, place: tuple[float, float]) -> tuple[Seen, Seen]:
+    """Return what a message says to the east and to the north; half a velocity is none."""
+    east_m_s, north_m_s = item.velocity_east_m_s, item.velocity_north_m_s
+    if east_m_s is None or north_m_s is None:
+        return Seen(place[0], None), Seen(place[1], None)
+    return Seen(place[0], east_m_s), Seen(place[1], north_m_s)
+
+
 @lru_cache(maxsize=1024)
 def gains(model: Model, steps: int, velocity_known: bool) -> Gains:
     """Return the steady-state Kalman filter of messages every `steps` times `GAIN_STEP_S`."""
@@ -189,6 +203,8 @@ def gains(model: Model, steps: int, velocity_known: bool) -> Gains:
         ),
         size,
     )
+    if model.shaken_m_s_sqrt_s > 0.0:
+        wander = added(wander, _cut(_shaken(model.shaken_m_s_sqrt_s, dt_s), size))
     seen = _cut(((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 1.0)), size)[: 2 if velocity_known else 1]
     place2 = model.position_sd_m * model.position_sd_m
     pace2 = model.velocity_sd_m_s * model.velocity_sd_m_s
@@ -213,6 +229,14 @@ def gains(model: Model, steps: int, velocity_known: bool) -> Gains:
         weight=(weight[0][0], weight[0][1], weight[1][1]),
         half_log=0.5 * log(first * second - both * both),
     )
+
+
+def _shaken(noise_m_s_sqrt_s: float, dt_s: float) -> Matrix:
+    """Return what white noise of the acceleration makes of place and velocity."""
+    power = noise_m_s_sqrt_s * noise_m_s_sqrt_s
+    place, both, pace = power * dt_s**3 / 3.0, power * dt_s**2 / 2.0, power * dt_s
+    none = (0.0,) * 4
+    return ((place, both, 0.0, 0.0), (both, pace, 0.0, 0.0), none, none)
 
 
 def _cut(matrix: Matrix, size: int) -> Matrix:
@@ -328,6 +352,11 @@ def doubted(share: float, dt_s: float, believing_likely: float, doubting_likely:
     """Return how far the velocity is doubted, after what both pairs foretold."""
     prior = foreseen(share, dt_s, begins_s=DOUBT_TIME_S)
     return judged(prior, min(doubting_likely - believing_likely, DOUBT_MAX))
+
+
+def together(share: float, likely: float, other_likely: float) -> float:
+    """Return how likely two found a message together, the other with a share (logarithms)."""
+    return likely + log((1.0 - share) + share * exp(min(other_likely - likely, EVIDENCE_MAX)))
 
 
 def foreseen(share: float, dt_s: float, *, begins_s: float, ends_s: float = CHANGE_TIME_S) -> float:
@@ -474,5 +503,26 @@ def followed(before: Drawn, dt_s: float, gone_m: float, told_m_s: float) -> Draw
     )
 
 
+def drawn_after(by: Drawn, dt_s: float, before: Seen, now: Seen) -> Drawn:
+    """Return the means after a message; none where one of the two velocities is not known."""
+    if before.velocity_m_s is None or now.velocity_m_s is None:
+        return NOT_DRAWN
+    told_m_s = 0.5 * (before.velocity_m_s + now.velocity_m_s)
+    return followed(by, dt_s, now.position_m - before.position_m, told_m_s)
+
+
 def _mean(before: float, now: float, times: float) -> float:
     return before + (1.0 - exp(-times)) * (now - before)
+
+
+def turning(
+    before_deg_s: float, before_deg: float | None, heading_deg: float | None, dt_s: float
+) -> float:
+    """Return how fast the nose turns after one more heading."""
+    if heading_deg is None or before_deg is None:
+        return 0.0
+    if not abs(heading_deg - before_deg) <= 720.0:
+        return 0.0  # one of them is no number; the rate would never be one again
+    turned_deg = (heading_deg - before_deg + 180.0) % 360.0 - 180.0
+    share = 1.0 - exp(-dt_s / YAW_RATE_TIME_S)
+    return before_deg_s + share * (turned_deg / dt_s - before_deg_s)

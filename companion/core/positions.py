@@ -23,9 +23,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from companion.core.inputs import ClockReport, HeartbeatReport, Input, Telemetry, UtcReport
+
+if TYPE_CHECKING:
+    from companion.core.frame import LocalFrame
 
 # A clock that jumped ahead by more than this is another run of it; nothing comes before it is sent.
 AHEAD_MAX_S = 1.0
@@ -280,3 +283,18 @@ def _said(item: Telemetry) -> float | None:
     if item.velocity_east_m_s is None or item.velocity_north_m_s is None:
         return None
     return math.hypot(item.velocity_east_m_s, item.velocity_north_m_s)
+
+
+def place_of(item: Telemetry, frame: LocalFrame) -> tuple[float, float] | None:
+    """Return (east_m, north_m); None for what is no position: NaN, out of range, or 0, 0."""
+    latitude, longitude = item.latitude_deg, item.longitude_deg
+    if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
+        return None
+    if abs(latitude) < 1e-6 and abs(longitude) < 1e-6:
+        return None
+    if not (abs(item.received_s) < math.inf and abs(item.boot_s) < math.inf):
+        return None
+    east_m, north_m = frame.to_local(latitude, longitude)
+    if not (abs(east_m) < 1e8 and abs(north_m) < 1e8 and abs(item.relative_altitude_m) < 1e6):
+        return None
+    return east_m, north_m

@@ -13,6 +13,7 @@ from enum import StrEnum
 from itertools import pairwise
 
 from companion.core.inputs import (
+    AttitudeReport,
     BatteryReport,
     ClockReport,
     EstimatorReport,
@@ -21,6 +22,7 @@ from companion.core.inputs import (
     FlowReport,
     GnssReport,
     HeartbeatReport,
+    ImuReport,
     Input,
     LandedReport,
     LegReport,
@@ -39,6 +41,7 @@ from companion.core.inputs import (
 )
 
 __all__ = [
+    "AttitudeReport",
     "BatteryReport",
     "ClockReport",
     "Decision",
@@ -53,6 +56,7 @@ __all__ = [
     "FlowTrimState",
     "GnssReport",
     "HeartbeatReport",
+    "ImuReport",
     "Inhibit",
     "Input",
     "LandedReport",

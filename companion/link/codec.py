@@ -26,6 +26,7 @@ from companion.core.types import (
 from companion.link.census import AUTOPILOT_COMPONENT, Census, Vehicle, autopilot_name, mode_name
 from companion.link.messages import (
     CURRENT,
+    INERTIAL,
     RADIO_STATUS,
     TRANSFERS,
     AckReceived,
@@ -576,6 +577,7 @@ FROM_VEHICLE: dict[int, Decoder] = {
     231: _wind_cov,
     245: _landed,
     **CURRENT,
+    **INERTIAL,
 }
 FROM_ANYONE: dict[int, Decoder] = {
     4: _ping,

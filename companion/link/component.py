@@ -21,9 +21,11 @@ from companion.core.positions import (
     sorted_in,
 )
 from companion.core.types import (
+    AttitudeReport,
     ClockReport,
     Decision,
     HeartbeatReport,
+    ImuReport,
     Input,
     LandedReport,
     RcReport,
@@ -84,6 +86,7 @@ class ComponentOptions:
     need_mission: bool = False
     use_battery: bool = False
     use_switch: bool = True
+    use_imu: bool = False
     watch_mission: bool = False
     may_enable: bool = True
     page_may_enable: bool = False
@@ -211,6 +214,8 @@ class Component:
         for message in self._heard(data, received_s):
             if self._supervisor is None and self.is_vehicle_known:
                 self._meet(received_s)
+            if isinstance(message, AttitudeReport | ImuReport) and not self._options.use_imu:
+                continue  # another station asked for it
             if _is_input(message):
                 self._look_at(message)
                 inputs.append(self._wind.take(message))
@@ -306,6 +311,7 @@ class Component:
             with_mission=self._options.use_mission or self._options.watch_mission,
             with_battery=self._options.use_battery,
             with_switch=self._options.use_switch,
+            with_imu=self._options.use_imu,
         )
         for request in self._supervisor.start(self.streams, now_s):
             self._ask(request)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Literal
 
-from companion.core.types import Input
+from companion.core.types import AttitudeReport, ImuReport, Input
 from companion.link.census import AUTOPILOT_COMPONENT
 
 RADIO_STATUS = 109  # a radio's own report: never signed, and no word of the vehicle
@@ -167,6 +167,60 @@ TRANSFERS: dict[int, Transfer] = {
     47: _ended,
     51: _asked,  # MISSION_REQUEST_INT
     73: _item,
+}
+
+
+# Attitude and accelerometer.
+
+_MILLI_G_M_S2 = 9.80665e-3
+_ACCELEROMETER = 7  # x, y and z in HIGHRES_IMU_UPDATED_FLAGS
+
+
+def _attitude(m: Any, received_s: float) -> AttitudeReport | None:
+    told = (m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
+    if not all(map(math.isfinite, told)):
+        return None
+    return AttitudeReport(
+        received_s=received_s,
+        boot_s=m.time_boot_ms / 1000.0,
+        roll_deg=math.degrees(m.roll),
+        pitch_deg=math.degrees(m.pitch),
+        yaw_deg=math.degrees(m.yaw),
+        roll_rate_deg_s=math.degrees(m.rollspeed),
+        pitch_rate_deg_s=math.degrees(m.pitchspeed),
+        yaw_rate_deg_s=math.degrees(m.yawspeed),
+    )
+
+
+def _scaled_imu(m: Any, received_s: float) -> ImuReport:
+    return ImuReport(
+        received_s=received_s,
+        boot_s=m.time_boot_ms / 1000.0,
+        forward_m_s2=m.xacc * _MILLI_G_M_S2,
+        right_m_s2=m.yacc * _MILLI_G_M_S2,
+        down_m_s2=m.zacc * _MILLI_G_M_S2,
+    )
+
+
+def _highres_imu(m: Any, received_s: float) -> ImuReport | None:
+    """Return what the first accelerometer feels; None where the message has only other sensors."""
+    if m.fields_updated & _ACCELEROMETER != _ACCELEROMETER or m.id != 0:
+        return None
+    if not all(map(math.isfinite, (m.xacc, m.yacc, m.zacc))):
+        return None
+    return ImuReport(
+        received_s=received_s,
+        boot_s=m.time_usec / 1e6,
+        forward_m_s2=m.xacc,
+        right_m_s2=m.yacc,
+        down_m_s2=m.zacc,
+    )
+
+
+INERTIAL: dict[int, Callable[[Any, float], AttitudeReport | ImuReport | None]] = {
+    26: _scaled_imu,
+    30: _attitude,
+    105: _highres_imu,
 }
 
 

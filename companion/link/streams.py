@@ -55,7 +55,10 @@ class StreamRequest:
     by_group: bool
 
 
-_EXTENDED_STATUS, _RC_CHANNELS, _POSITION, _EXTRA2, _EXTRA3 = 2, 3, 6, 11, 12
+_RAW_SENSORS, _EXTENDED_STATUS, _RC_CHANNELS, _POSITION = 1, 2, 3, 6
+_EXTRA1, _EXTRA2, _EXTRA3 = 10, 11, 12
+# Ten times a second is the least that bridges two positions (core/inertial.py).
+IMU_RATE_MIN_HZ, IMU_RATE_MAX_HZ = 10.0, 20.0
 
 
 def wanted_streams(
@@ -65,12 +68,14 @@ def wanted_streams(
     with_mission: bool = False,
     with_battery: bool = False,
     with_switch: bool = True,
+    with_imu: bool = False,
 ) -> tuple[Stream, ...]:
     """Return what the core and the statistics live on; few distinct rates, as ArduPilot likes.
 
     `with_battery`: also the battery monitors, of which a flow meter may be one.
     `with_switch`: the pilot's channels have to come; PX4 sends none without a receiver.
     `with_mission`: also which item is flown to; PX4 has no such stream and says it by itself.
+    `with_imu`: attitude and accelerometer too, as often as positions.
     """
     estimator, wind = (230, 231) if is_px4 else (193, 168)
     with_mission = with_mission and not is_px4
@@ -87,7 +92,18 @@ def wanted_streams(
         # ArduPilot's battery monitors take turns: three of them come 3 times a second each.
         Stream(message_id=2, rate_hz=1.0, group=_EXTRA3, optional=True),  # time of day
         *([Stream(message_id=147, rate_hz=10.0, group=_EXTRA3)] if with_battery else []),
+        *(_imu_streams(position_rate_hz, is_px4=is_px4) if with_imu else ()),
         *([Stream(message_id=42, rate_hz=2.0, group=_EXTENDED_STATUS)] if with_mission else []),
+    )
+
+
+def _imu_streams(rate_hz: float, *, is_px4: bool) -> tuple[Stream, Stream]:
+    """Return attitude and accelerometer; faster than 20 Hz they say nothing more."""
+    rate_hz = min(max(rate_hz, IMU_RATE_MIN_HZ), IMU_RATE_MAX_HZ)
+    imu = 105 if is_px4 else 26  # HIGHRES_IMU, SCALED_IMU
+    return (
+        Stream(message_id=30, rate_hz=rate_hz, group=_EXTRA1, optional=True),
+        Stream(message_id=imu, rate_hz=rate_hz, group=_RAW_SENSORS, optional=True),
     )
 
 

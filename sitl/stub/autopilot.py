@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Protocol
 
+from sitl.leaning import MEAN_S, Leaning, leaning
 from sitl.stub import actions, mission, services
 from sitl.stub.faults import Fault, FaultClock, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Parts, Upload
@@ -180,6 +181,11 @@ class Autopilot:
         if self._frozen is None:
             self._frozen = self._estimator.frozen(now_s)
         return self._frozen
+
+    def leaning(self, now_s: float) -> Leaning:
+        """Return how the copter truly leans, as its sensors have it."""
+        world = self.flight.world
+        return leaning(world.pose_at(now_s - MEAN_S), world.pose_at(now_s), MEAN_S)
 
     def estimator_lost(self, now_s: float) -> bool:
         """Return whether the estimator says that it has no position."""

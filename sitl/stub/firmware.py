@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from sitl.leaning import Leaning
 from sitl.stub.faults import Fault, FaultClock, FaultKind
 from sitl.stub.flight import Flight
 from sitl.stub.liquid import Battery
@@ -138,6 +139,9 @@ class Autopilot(Protocol):
 
     def believed(self, now_s: float) -> Pose:
         """Return the estimated pose; frozen and at rest while the estimator is lost."""
+
+    def leaning(self, now_s: float) -> Leaning:
+        """Return how the copter truly leans, as its sensors have it."""
 
     def estimator_lost(self, now_s: float) -> bool:
         """Return whether the estimator says that it has no position."""

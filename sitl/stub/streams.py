@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from sitl.leaning import GRAVITY_M_S2
 from sitl.stub.faults import RC_COUNT, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Builder
 from sitl.stub.mission_items import LANDED_STATES
@@ -48,6 +49,9 @@ _SENSORS = (
     | dialect.MAV_SYS_STATUS_SENSOR_GPS
 )
 
+_STILL = (0, 0, 0)
+# Rates of turning are taken over so long.
+_TURN_S = 0.02
 # A second vehicle on the link would lie here: a latitude in no field of ours.
 _EXTREME_E7 = 0x7FFFFFFF
 
@@ -154,9 +158,29 @@ def sys_status(_autopilot: Autopilot, _now_s: float) -> Message:
 
 
 def attitude(autopilot: Autopilot, now_s: float) -> Message:
-    """Return ATTITUDE, level."""
-    yaw = math.radians((autopilot.believed(now_s).heading_deg + 180.0) % 360.0 - 180.0)
-    return dialect.MAVLink_attitude_message(autopilot.boot_ms(now_s), 0, 0, yaw, 0, 0, 0)
+    """Return ATTITUDE: how the copter leans, and how fast that changes."""
+    now, before = autopilot.leaning(now_s), autopilot.leaning(now_s - _TURN_S)
+    full = 2.0 * math.pi
+    angles = (now.roll_rad, now.pitch_rad, now.yaw_rad)
+    old = (before.roll_rad, before.pitch_rad, before.yaw_rad)
+    rates = (math.remainder(a - b, full) / _TURN_S for a, b in zip(angles, old, strict=True))
+    wrapped = (math.remainder(angle, full) for angle in angles)
+    return dialect.MAVLink_attitude_message(autopilot.boot_ms(now_s), *wrapped, *rates)
+
+
+def scaled_imu(autopilot: Autopilot, now_s: float) -> Message:
+    """Return SCALED_IMU: the accelerometer in thousandths of gravity."""
+    felt = autopilot.leaning(now_s).felt_m_s2
+    scaled = (clipped(each * 1000.0 / GRAVITY_M_S2, -32768, 32767) for each in felt)
+    return dialect.MAVLink_scaled_imu_message(autopilot.boot_ms(now_s), *scaled, *_STILL, *_STILL)
+
+
+def highres_imu(autopilot: Autopilot, now_s: float) -> Message:
+    """Return HIGHRES_IMU with nothing but an accelerometer."""
+    felt = autopilot.leaning(now_s).felt_m_s2
+    return dialect.MAVLink_highres_imu_message(
+        autopilot.boot_ms(now_s) * 1000, *felt, *_STILL, *_STILL, 0.0, 0.0, 0.0, 0.0, 7
+    )
 
 
 def home_position(autopilot: Autopilot, now_s: float) -> Message:
@@ -199,6 +223,8 @@ COMMON: dict[int, Builder] = {
     dialect.MAVLINK_MSG_ID_SYSTEM_TIME: system_time,
     dialect.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw,
     dialect.MAVLINK_MSG_ID_ATTITUDE: attitude,
+    dialect.MAVLINK_MSG_ID_SCALED_IMU: scaled_imu,
+    dialect.MAVLINK_MSG_ID_HIGHRES_IMU: highres_imu,
     dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position,
     dialect.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: servo_output,
     dialect.MAVLINK_MSG_ID_RC_CHANNELS: rc_channels,

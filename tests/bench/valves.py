@@ -1,6 +1,6 @@
 """Valves measured one by one: how well they are found, and what that is worth in the field.
 
-    python -m tests.bench.valves [--seeds 20] [--speeds 2,4,6] [--plant wang-2024]
+    python -m tests.bench.valves [--seeds 20] [--speeds 2,4,6] [--plant wang-2024] [--rows FILE]
 
 Each seed is another sprayer whose valves scatter. It is measured by the twin's own meter through
 the companion's ground work, then flown over the example: with the set's figures alone, with those
@@ -16,6 +16,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from statistics import fmean
 
@@ -25,7 +26,7 @@ from analysis.evaluation import Evaluation, evaluate
 from sitl.demo import do_all
 from sitl.flight import fly
 from sitl.profile import draw_scatter, load_profile
-from sitl.valve_calibration import calibrate_valves, with_figures
+from sitl.valve_calibration import Calibrated, calibrate_valves, with_figures
 from tests.bench.flights import Task, perfect, place
 from tests.bench.sprayers import PLANT, Output, options_of, sprayer_setup
 
@@ -86,9 +87,7 @@ def measure(todo: tuple[str, int, float, Output, bool]) -> Row:
     """Calibrate one sprayer and fly it four times."""
     plant, seed, speed_m_s, output, is_alone = todo
     profile, options = load_profile(plant), options_of(output, seed)
-    ground = calibrate_valves(
-        sprayer_setup(plant, "gpio"), profile, options_of("gpio", seed), is_alone=is_alone
-    )
+    ground = _calibrated(plant, seed, is_alone)
     drawn = draw_scatter(profile, np.random.default_rng(seed))
     flow, shift = np.array(drawn.flow_scale), np.array(drawn.shift_s)
     true = zip((flow / flow.mean()).tolist(), (shift - shift.mean()).tolist(), strict=True)
@@ -124,6 +123,13 @@ def measure(todo: tuple[str, int, float, Output, bool]) -> Row:
         valves=valves,
         flights={name: _flight(each) for name, each in flights.items()},
     )
+
+
+@lru_cache(maxsize=32)
+def _calibrated(plant: str, seed: int, is_alone: bool) -> Calibrated:
+    """Return what a sprayer's valves are found to be; it serves all speeds and outputs."""
+    setup = sprayer_setup(plant, "gpio")
+    return calibrate_valves(setup, load_profile(plant), options_of("gpio", seed), is_alone=is_alone)
 
 
 def _flight(found: Evaluation) -> Flight:

@@ -86,7 +86,7 @@ def whole_component(sent: list[bytes], events: list[str]) -> Component:
         return True
 
     options = ComponentOptions(
-        use_mission=True, need_mission=True, use_battery=True, watch_mission=True
+        use_mission=True, need_mission=True, use_battery=True, watch_mission=True, use_imu=True
     )
     parameters = Parameters(known_parameters({"lag.on_s": 0.1}, tank_l=20.0))
     component = Component(options, send, parameters=parameters)
