@@ -6,6 +6,8 @@ SEED ?=
 ARGS ?=
 WORKERS ?= 3
 FLIGHT_WORKERS ?= 4
+# Python's development mode, but for its guards around memory: those are for modules in C, and slow.
+STRICT := PYTHONDEVMODE=1 PYTHONMALLOC=pymalloc
 # What goes by the wall clock.
 IN_REAL_TIME := $(wildcard tests/*/realtime)
 # Each Python needs its own: make PYTHON=python3.13 VENV=.venv-3.13 test
@@ -30,20 +32,17 @@ setup: $(INSTALLED) ## the virtual environment, from the lock files
 demo: $(INSTALLED) ## fly the demo; pictures and figures in demo-out
 	$(BIN)/vrspray demo --out demo-out $(ARGS)
 
-# Computing fills the cores; flights go by the wall clock, need little and want it at once. Apart
-# from each other, both are quicker. Each of the processes that tests start would else compile all
-# it imports.
+# Each of the processes that tests start would else compile all it imports.
 test test-computing test-flights: export PYTHONDONTWRITEBYTECODE :=
 test: $(INSTALLED) ## all tests (ARGS="-k lag" for some; WORKERS=0 for one process)
 ifeq ($(strip $(ARGS)),)
-	@$(MAKE) --no-print-directory --keep-going test-computing && computed=0 || computed=1; \
-		$(MAKE) --no-print-directory test-flights && exit $$computed
+	@$(BIN)/python -m tests.whole $(MAKE)
 else
-	PYTHONDEVMODE=1 $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
 endif
 
 test-computing: $(INSTALLED) ## of these all but the flights in real time
-	PYTHONDEVMODE=1 $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(IN_REAL_TIME:%=--ignore %) $(ARGS)
+	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(IN_REAL_TIME:%=--ignore %) $(ARGS)
 
 test-flights: $(INSTALLED) ## of these the flights in real time: leave them two idle cores
 	$(BIN)/pytest --numprocesses $(FLIGHT_WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS) $(IN_REAL_TIME)
@@ -54,7 +53,7 @@ test-missions test-analysis test-sitl: ## the same of another package
 test-companion: ALSO := tests/golden
 test-companion test-missions test-analysis test-sitl: export PYTHONDONTWRITEBYTECODE :=
 test-companion test-missions test-analysis test-sitl: test-%: $(INSTALLED)
-	PYTHONDEVMODE=1 $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --ignore tests/$*/realtime $(ARGS) $* tests/$* $(ALSO)
+	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --ignore tests/$*/realtime $(ARGS) $* tests/$* $(ALSO)
 
 lint: format-check ruff mypy imports ## format, ruff, mypy, import rules
 
