@@ -35,6 +35,7 @@ DEPTH_COST = 0.125
 TOGETHER, AHEAD = 64, 8
 # Rounding of angles [rad]: 1e-9 is a micrometre over a kilometre. The caller keeps a margin.
 ROUNDING = 1e-9
+TURN = 2.0 * math.pi
 # Where the whole tolerance leads to no border, it is made less, so many times.
 LESS, TRIED_MAX = 0.6, 6
 # With less it is the same place. An edge along a given corner is beyond it by the digits of its
@@ -132,14 +133,14 @@ def _cheapest(closed: Floats, inwards: Floats, tolerance_m: float) -> Floats:
     cost = np.full((len(STARTS), count + 1, depths), np.inf)
     cost[np.arange(len(STARTS)), 0, STARTS] = 0.0
     before = np.full(cost.shape, -1, dtype=np.int64)
-    edge = 1.0 + DEPTH_COST * DEPTHS
-    for at, possible in _seen(closed, places, tolerance_m):
-        spent = np.where(possible, edge + cost[:, at, :, None, None], np.inf)
-        which, least = spent.argmin(axis=1), spent.min(axis=1)
-        ends = slice(at + 1, at + 1 + possible.shape[1])
+    for at, edges in _seen(closed, places, tolerance_m):
+        spent = edges + cost[:, at, :, None, None]
+        least = spent.min(axis=1)
+        ends = slice(at + 1, at + 1 + edges.shape[1])
         better = least < cost[:, ends] - 1e-12
-        np.copyto(cost[:, ends], least, where=better)
-        np.copyto(before[:, ends], at * depths + which, where=better)
+        if better.any():
+            np.copyto(cost[:, ends], least, where=better)
+            np.copyto(before[:, ends], at * depths + spent.argmin(axis=1), where=better)
     cost_of = cost[np.arange(len(STARTS)), count, STARTS]
     row = int(np.argmin(cost_of))
     if not math.isfinite(cost_of[row]):
@@ -152,30 +153,32 @@ def _cheapest(closed: Floats, inwards: Floats, tolerance_m: float) -> Floats:
     return found
 
 
-def _seen(closed: Floats, places: Floats, tolerance_m: float) -> Iterator[tuple[int, Bools]]:
-    """Yield each corner with the places ahead at which an edge from it may end.
+def _seen(closed: Floats, places: Floats, tolerance_m: float) -> Iterator[tuple[int, Floats]]:
+    """Yield each corner with what edges from it to places ahead cost, infinite where none may be.
 
-    What it may is by the depth of its start, how many corners ahead, and the depth there.
+    It is by the depth of its start, how many corners ahead it ends, and the depth there.
     """
     count = len(closed) - 1
+    edge = 1.0 + DEPTH_COST * DEPTHS
     for first in range(0, count, TOGETHER):
         starts = np.arange(first, min(first + TOGETHER, count))
-        chunks: list[list[Bools]] = [[] for _ in starts]
-        for some, possible in _ahead(closed, places, starts, tolerance_m):
-            for at, each in zip((some - first).tolist(), possible, strict=True):
-                chunks[at].append(each)
-        for at, each in zip(starts.tolist(), chunks, strict=True):
-            possible = np.concatenate(each, axis=1)[:, : count - at]
-            ends = np.flatnonzero(possible.any(axis=(0, 2)))
-            if len(ends):
-                yield at, possible[:, : ends[-1] + 1]
+        possible = _ahead(closed, places, starts, tolerance_m)
+        beyond = starts[:, None] + np.arange(possible.shape[2]) >= count
+        is_end = possible.any(axis=(1, 3)) & ~beyond
+        farthest = possible.shape[2] - is_end[:, ::-1].argmax(axis=1)
+        costs = np.where(possible, edge, np.inf)
+        for at in np.flatnonzero(is_end.any(axis=1)).tolist():
+            yield first + at, costs[at, :, : farthest[at]]
 
 
-def _ahead(
-    closed: Floats, places: Floats, at: Ints, tolerance_m: float
-) -> Iterator[tuple[Ints, Bools]]:
-    """Yield runs of corners ahead of some that still see any, the nearest first."""
+def _ahead(closed: Floats, places: Floats, starts: Ints, tolerance_m: float) -> Bools:
+    """Return from which depths of some corners edges to corners ahead may end at which depth.
+
+    Corners are looked at some together, the nearest first, as long as any of them is seen.
+    """
     count = len(closed) - 1
+    found = []
+    some, at = np.arange(len(starts)), starts
     onward = np.arctan2(*(closed[at + 1] - closed[at]).T[::-1])
     low = np.full((len(at), len(DEPTHS)), -math.inf)
     high = -low
@@ -183,25 +186,25 @@ def _ahead(
     while len(at):
         # Beyond the last corner it is looked at again: nothing comes after it.
         ends = np.minimum(at[:, None] + np.arange(ahead, ahead + many), count)
-        ahead, many = ahead + many, 2 * many
-        starts = places[at]
-        least, most = _sectors(closed[ends], starts, onward, tolerance_m)
+        least, most = _sectors(closed[ends], places[at], onward, tolerance_m)
         least = np.maximum(np.maximum.accumulate(least, axis=2), low[:, :, None])
         most = np.minimum(np.minimum.accumulate(most, axis=2), high[:, :, None])
-        possible = np.zeros((*least.shape, len(DEPTHS)), dtype=np.bool_)
+        possible = np.zeros((len(starts), *least.shape[1:], len(DEPTHS)), dtype=np.bool_)
         # Courses are dear: they are asked for only where there are any that an edge may have.
-        some, depth, end = np.nonzero(least - ROUNDING <= most + ROUNDING)
-        low_some, high_some = least[some, depth, end, None], most[some, depth, end, None]
+        row, depth, end = np.nonzero(least - ROUNDING <= most + ROUNDING)
+        low_some, high_some = least[row, depth, end, None], most[row, depth, end, None]
         course, far_m = _courses(
-            places[ends[some, end]], starts[some, depth, None], onward[some, None]
+            places[ends[row, end]], places[at[row], depth, None], onward[row, None]
         )
-        possible[some, depth, end] = (
+        possible[some[row], depth, end] = (
             (course >= low_some - ROUNDING) & (course <= high_some + ROUNDING) & (far_m > SAME_M)
         )
-        yield at, possible
+        found.append(possible)
+        ahead, many = ahead + many, 2 * many
         low, high = least[:, :, -1], most[:, :, -1]
         on = (low <= high).any(axis=1) & (at + ahead <= count)
-        at, onward, low, high = at[on], onward[on], low[on], high[on]
+        some, at, onward, low, high = some[on], at[on], onward[on], low[on], high[on]
+    return np.concatenate(found, axis=2)
 
 
 def _sectors(
@@ -225,5 +228,7 @@ def _courses(points: Floats, starts: Floats, onward: Floats) -> tuple[Floats, Fl
     """Return the course to points from starts, from the course onward, and how far they are."""
     way = points - starts
     east_m, north_m = way[..., 0], way[..., 1]
-    course = np.arctan2(north_m, east_m) - onward
-    return (course + math.pi) % (2.0 * math.pi) - math.pi, np.hypot(east_m, north_m)
+    course = np.arctan2(north_m, east_m) - onward + math.pi
+    # The remainder of two half turns, in a fraction of its time.
+    course += TURN * ((course < 0.0) * 1.0 - (course >= TURN))
+    return course - math.pi, np.hypot(east_m, north_m)

@@ -34,6 +34,7 @@ from missions.sorties import Flying, SortieSearch
 from missions.spacing import Spacing, near_warnings
 from missions.speeds import choices, chosen, short_warnings, stretches_of
 from missions.strips import (
+    Bools,
     Extents,
     Floats,
     Objects,
@@ -275,6 +276,8 @@ def _depots(frame: LocalFrame, depots: tuple[tuple[float, float], ...]) -> Float
 
 # Treated ground is looked at so often along a line, and in so many places across a valve's strip.
 ALONG_M, ACROSS = 0.5, 5
+# Ground of strips that is put together lies no farther from theirs than this.
+BESIDE_M = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -323,7 +326,7 @@ def _counted(sortie: Sortie, rates: Rates, boom: _Closing) -> Sortie:
     for row, at in enumerate(flown):
         litres_l, twice_l = legs[at].volume_l, 0.0
         if earlier[row]:
-            litres_l, twice_l = _litres(lines[row], whole(strips[earlier[row]]), rates, boom)
+            litres_l, twice_l = _litres(lines[row], strips[earlier[row]], rates, boom)
         legs[at] = replace(legs[at], volume_l=litres_l, overlap_l=twice_l)
     return replace(sortie, legs=tuple(legs))
 
@@ -338,31 +341,56 @@ def _earlier(strips: Objects) -> list[list[int]]:
     return found
 
 
-def _litres(
-    line: Floats, treated: BaseGeometry, rates: Rates, boom: _Closing
-) -> tuple[float, float]:
+def _litres(line: Floats, treated: Objects, rates: Rates, boom: _Closing) -> tuple[float, float]:
     """Return what a line needs, and what of it falls on treated ground."""
-    shapely.prepare(treated)
     length_m = float(lengths_m(line[None])[0])
     along = directions(line[None])[0]
     right = np.array([along[1], -along[0]])
     count = max(1, round(length_m / ALONG_M))
+    along_m = (np.arange(count) + 0.5) * length_m / count
     places = line[:2] + along * ((np.arange(count) + 0.5) * length_m / count)[:, None]
-    across = (np.arange(ACROSS) + 0.5) / ACROSS - 0.5
-    litres = twice = 0.0
-    for right_m, width_m in boom.places.tolist():
-        middle = places + right * right_m
-        rate = np.nan_to_num(rates.rates_at(middle[:, 0], middle[:, 1]), nan=0.0)
-        if boom.extents is not None:
-            to_right = np.broadcast_to(right, places.shape)
-            rate = rate * boom.extents.is_open(places, to_right, (right_m, width_m))
-        points = middle[:, None, :] + right * (across * width_m)[:, None]
-        share = shapely.contains_xy(treated, points[..., 0], points[..., 1]).mean(axis=1)
-        rate = np.where(share >= boom.closes_from - 1e-9, 0.0, rate)
-        each_l = rate * width_m * length_m / count / M2_PER_HA
-        litres += float(each_l.sum())
-        twice += float((each_l * share).sum())
-    return litres, twice
+    middle_m = boom.places[:, :1]
+    aside_m = ((np.arange(ACROSS) + 0.5) / ACROSS - 0.5) * boom.places[:, 1:]
+    is_done = _is_near(treated, line[:2], along, along_m, middle_m + aside_m)
+    if is_done.any():
+        ground = whole(treated)
+        shapely.prepare(ground)
+        points = places[:, None, None] + right * middle_m[..., None] + right * aside_m[..., None]
+        is_done[is_done] = shapely.contains_xy(ground, points[is_done])
+    share = is_done.mean(axis=2).T
+    middle = places + right * boom.places[:, :1, None]
+    rate = rates.rates_at(middle[..., 0].ravel(), middle[..., 1].ravel()).reshape(share.shape)
+    rate = np.nan_to_num(rate, nan=0.0)
+    if boom.extents is not None:
+        to_right = np.broadcast_to(right, places.shape)
+        for row, (right_m, width_m) in zip(rate, boom.places.tolist(), strict=True):
+            row *= boom.extents.is_open(places, to_right, (right_m, width_m))
+    rate = np.where(share >= boom.closes_from - 1e-9, 0.0, rate)
+    each_l = rate * boom.places[:, 1:] * length_m / count / M2_PER_HA
+    return sum(each_l.sum(axis=1).tolist()), sum((each_l * share).sum(axis=1).tolist())
+
+
+def _is_near(
+    strips: Objects, start: Floats, along: Floats, along_m: Floats, across_m: Floats
+) -> Bools:
+    """Return which places beside a line may lie in strips: those in the box of one along the line.
+
+    Passes beside each other share a hair, and headlands the ends: most places need no closer look.
+    """
+    points, strip_of = shapely.get_coordinates(strips, return_index=True)
+    first = np.flatnonzero(np.diff(strip_of, prepend=-1))
+    found: Bools = np.zeros((len(along_m), *across_m.shape), dtype=np.bool_)
+    is_within = []
+    for unit, at_m in ((along, along_m), (np.array([along[1], -along[0]]), across_m)):
+        corners_m = (points - start) @ unit
+        low_m = np.minimum.reduceat(corners_m, first) - BESIDE_M
+        high_m = np.maximum.reduceat(corners_m, first) + BESIDE_M
+        is_within.append(
+            [(at_m >= low) & (at_m <= high) for low, high in zip(low_m, high_m, strict=True)]
+        )
+    for on_along, on_across in zip(*is_within, strict=True):
+        found |= on_along[:, None, None] & on_across
+    return found
 
 
 # Sorties with their speeds, each within a tank and, as it is flown in the end, a battery.

@@ -437,9 +437,7 @@ class _Run:
     @staticmethod
     def _ferries_s(outs_s: Floats, homes_s: Floats) -> tuple[Floats, Floats]:
         """Return the ferries from and to the best depot, of ends by beginnings of sorties."""
-        shape = homes_s.shape[1], outs_s.shape[1]
-        out_s = np.broadcast_to(outs_s[0], shape)
-        back_s = np.broadcast_to(homes_s[0][:, None], shape)
+        out_s, back_s = outs_s[0][None, :], homes_s[0][:, None]
         for other_s, home_s in zip(outs_s[1:], homes_s[1:, :, None], strict=True):
             is_better = other_s + home_s < out_s + back_s
             out_s, back_s = np.where(is_better, other_s, out_s), np.where(is_better, home_s, back_s)

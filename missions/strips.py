@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import shapely
@@ -87,12 +88,45 @@ def reach_inside(
     ends = starts[some] + along[some] * reach[some, None]
     ahead = rectangles(np.column_stack([starts[some], ends]), width_m - 2.0 * NARROWER_M)
     shapely.prepare(ground)
-    out = ~shapely.covers(ground, ahead)
-    for index, beyond in zip(some[out], shapely.difference(ahead[out], ground), strict=True):
-        points = shapely.get_coordinates(beyond)
-        if len(points):
-            reach[index] = max(0.0, float(((points - starts[index]) @ along[index]).min()))
+    out = some[~shapely.covers(ground, ahead)]
+    if len(out):
+        half_m = width_m / 2.0 - NARROWER_M
+        reach[out] = _to_border_m(starts[out], along[out], reach[out], ground, half_m)
     return reach
+
+
+def _to_border_m(
+    starts: Floats, along: Floats, up_to_m: Floats, ground: BaseGeometry, half_m: float
+) -> Floats:
+    """Return how far strips, as wide to both sides, go until some of them leaves the ground."""
+    found = np.where(shapely.intersects_xy(ground, starts), up_to_m, 0.0)
+    edges, tree = border_edges(ground)
+    strips = rectangles(np.column_stack([starts, starts + along * up_to_m[:, None]]), 2.0 * half_m)
+    row, edge = tree.query(strips)
+    ends = edges[edge] - starts[row, None]
+    ahead_m = np.einsum("pej,pj->pe", ends, along[row])
+    aside_m = ends[..., 0] * along[row, None, 1] - ends[..., 1] * along[row, None, 0]
+    # What of each edge is in front of the strip: a part of it, from its first end on.
+    rise_m, sides_m = np.diff(aside_m), np.array([-half_m, half_m])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossed = np.sort((sides_m - aside_m[:, :1]) / rise_m)
+    is_along = np.abs(rise_m) < 1e-12
+    crossed = np.where(is_along, np.where(np.abs(aside_m[:, :1]) < half_m, [0, 1], 2), crossed)
+    part = np.clip(crossed, 0.0, 1.0)
+    met_m = ahead_m[:, :1] + np.diff(ahead_m) * part
+    is_met = (part[:, 0] < part[:, 1]) & (met_m.max(axis=1) > 0.0)
+    np.minimum.at(found, row[is_met], np.maximum(met_m[is_met].min(axis=1), 0.0))
+    return found
+
+
+# One ground is looked at many times.
+@lru_cache(maxsize=4)
+def border_edges(ground: BaseGeometry) -> tuple[Floats, shapely.STRtree]:
+    """Return the edges of some ground by their ends, and where to find them."""
+    rings = shapely.get_rings(shapely.get_parts(ground))
+    points, ring = shapely.get_coordinates(rings, return_index=True)
+    edges = np.stack([points[:-1], points[1:]], axis=1)[ring[1:] == ring[:-1]]
+    return edges, shapely.STRtree(shapely.linestrings(edges))
 
 
 def stretched(

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import shapely
-from shapely import LineString, Polygon, STRtree
+from shapely import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
@@ -29,7 +29,7 @@ from missions.files.fence_corners import with_corners
 from missions.files.plan_rules import FENCE_CORNERS_MAX, NAMES
 from missions.maps.local import polygons_of
 from missions.plan import Place, Plan, Settings, Sortie
-from missions.strips import Objects
+from missions.strips import Objects, border_edges
 
 # The fence lies so far outside the field, at least; drawn with fewer corners, so much farther.
 # Lines end on the field's edge: PX4 in simulation went 1.24 m beyond one, and a fence at 1.2 m
@@ -66,8 +66,8 @@ MITRE_LIMIT = 2.0
 # A polygon, and the circle (east, north, radius) that may stand for it.
 Shape = tuple[Polygon, tuple[float, float, float] | None]
 Way = tuple[tuple[Place, ...], ...]
-# How far beside the way ground is held, None for all of the field; how far outside; the border.
-Tried = tuple[float | None, float, BaseGeometry]
+# How far beside the way ground is held, None for all of the field; the border.
+Tried = tuple[float | None, BaseGeometry]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,17 +108,36 @@ class Ground:
     settings: Settings
 
 
+@dataclass(frozen=True)
+class Border:
+    """A border around some ground of a field."""
+
+    parts: BaseGeometry
+    ground: BaseGeometry
+    field: BaseGeometry
+
+    @cached_property
+    def outside_m(self) -> float:
+        """Return how far outside the field it lies at most."""
+        return _outside_m(self.parts, self.field)
+
+    @cached_property
+    def is_near(self) -> bool:
+        """Return whether it keeps near the field and holds its ground: asked for of few."""
+        return self.outside_m <= OUTSIDE_MAX_M and bool(self.parts.covers(self.ground))
+
+
 class Borders:
-    """Borders around some ground and how far outside the field, the nearest first.
+    """Borders around some ground, the nearest first.
 
     Each is drawn when it is first asked for: most fences need one or two of them.
     """
 
     def __init__(self, ground: BaseGeometry, field: BaseGeometry, simpler: Sequence[float]) -> None:
-        self._drawn: list[tuple[float, BaseGeometry]] = []
+        self._drawn: list[Border] = []
         self._more = _borders(ground, field, simpler)
 
-    def __iter__(self) -> Iterator[tuple[float, BaseGeometry]]:
+    def __iter__(self) -> Iterator[Border]:
         yield from self._drawn
         for each in self._more:
             self._drawn.append(each)
@@ -127,20 +146,16 @@ class Borders:
 
 def _borders(
     ground: BaseGeometry, field: BaseGeometry, simpler: Sequence[float]
-) -> Iterator[tuple[float, BaseGeometry]]:
+) -> Iterator[Border]:
     shapely.prepare(ground)
     shapely.prepare(field)
-    edges = _edges(field)
     for simpler_m in simpler:
         # Bays in which it would be no farther from the field are closed, and a first, quick
         # simplification is made up for by a wider buffer.
         wide_m = OUT_M + QUICK_M + simpler_m
         wider = ground.buffer(wide_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
         closed = wider.buffer(-simpler_m, join_style="mitre", mitre_limit=MITRE_LIMIT)
-        border = around_with_fewer_corners(closed.simplify(QUICK_M), simpler_m)
-        outside_m = _outside_m(border, field, edges)
-        if outside_m <= OUTSIDE_MAX_M and border.covers(ground):
-            yield outside_m, border
+        yield Border(around_with_fewer_corners(closed.simplify(QUICK_M), simpler_m), ground, field)
 
 
 @dataclass(frozen=True)
@@ -254,7 +269,9 @@ class Fences:
             looked_at.append((aside_m, borders))
             fence = self._fitting(borders, way, obstacles, aside_m=aside_m)
         if fence is None:
-            tried = [(far_m, *each) for far_m, some in looked_at for each in some]
+            tried = [
+                (far_m, each.parts) for far_m, some in looked_at for each in some if each.is_near
+            ]
             fence = self._with_few_corners(tried, whole, way, obstacles)
             if fence is None:
                 raise self._refusal(sortie, tried, way)
@@ -274,7 +291,7 @@ class Fences:
         for aside_m in (None, *ASIDE_M):
             drawn = [
                 border
-                for far_m, _, parts in borders
+                for far_m, parts in borders
                 for border in polygons_of(parts)
                 if far_m == aside_m and border.covers(way)
             ]
@@ -282,8 +299,7 @@ class Fences:
             if simplest is None or _corners(simplest) > TIMES_MAX * self.room:
                 continue
             fewer = with_corners(simplest, allowed, self.room)
-            outside_m = _outside_m(fewer, whole, _edges(whole))
-            found = self._with_obstacles(fewer, outside_m, obstacles)
+            found = self._with_obstacles(fewer, _outside_m(fewer, whole), obstacles)
             if found is not None:
                 return replace(found, aside_m=aside_m)
         return None
@@ -316,7 +332,7 @@ class Fences:
         if key not in self._fewer:
             allowed = whole.buffer(max(NEAR_M, fence.outside_m) - ROUNDED_M)
             border = with_corners(fence.border, allowed, most)
-            self._fewer[key] = border, _outside_m(border, whole, _edges(whole))
+            self._fewer[key] = border, _outside_m(border, whole)
         return self._fewer[key]
 
     def _simpler_obstacle(self, shape: Shape, simpler_m: float) -> Shape:
@@ -344,11 +360,11 @@ class Fences:
         The first one with all of them: no more borders are drawn than that takes.
         """
         best: Fence | None = None
-        for outside_m, drawn in borders:
-            for border in polygons_of(drawn):
+        for drawn in borders:
+            for border in polygons_of(drawn.parts):
                 found = None
-                if border.covers(way):
-                    found = self._with_obstacles(border, outside_m, obstacles)
+                if _corners(border) <= self.room and drawn.is_near and border.covers(way):
+                    found = self._with_obstacles(border, drawn.outside_m, obstacles)
                 if found is not None and (best is None or found.left_out < best.left_out):
                     best = replace(found, aside_m=aside_m)
                     if not best.left_out:
@@ -486,18 +502,11 @@ def _beside(way: BaseGeometry, aside_m: float) -> BaseGeometry:
     return shapely.union_all(shapely.buffer(shapely.get_parts(way), aside_m, quad_segs=2))
 
 
-def _edges(field: BaseGeometry) -> STRtree:
-    """Return the edges of a field, quick to find the nearest of."""
-    rings = shapely.get_rings(shapely.get_parts(field))
-    points, ring = shapely.get_coordinates(rings, return_index=True)
-    both = np.stack([points[:-1], points[1:]], axis=1)[ring[1:] == ring[:-1]]
-    return STRtree(shapely.linestrings(both))
-
-
-def _outside_m(border: BaseGeometry, field: BaseGeometry, edges: STRtree) -> float:
+def _outside_m(border: BaseGeometry, field: BaseGeometry) -> float:
     """Return how far outside the field a border lies at most."""
     places = shapely.get_coordinates(shapely.segmentize(border, STEP_M))
     places = places[~shapely.contains_xy(field, places)]
+    _, edges = border_edges(field)
     _, far_m = edges.query_nearest(shapely.points(places), return_distance=True, all_matches=False)
     return float(far_m.max(initial=0.0))
 

@@ -32,12 +32,14 @@ from missions.strips import (
     inner_lines,
     joined,
     lengths_m,
+    reach_inside,
     rectangles,
     united,
 )
 from missions.tour import by_savings, cost_s
 from missions.ways import build_ways
 from tests.bench.missions import FRAME, random_field, to_degrees
+from tests.mission_fields import blob
 
 WIDTH_M = 7.0
 MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5)
@@ -167,3 +169,30 @@ def test_waypoints_are_apart_and_lines_end_where_they_end(seed: int) -> None:
             assert (leg.points[0], leg.points[-1]) == (given_leg.points[0], given_leg.points[-1])
             if leg.points != given_leg.points and leg.kind == "transit":
                 assert ways.inside.space.covers(shapely.LineString(leg.points))
+
+
+def test_a_strip_reaches_as_far_as_what_of_it_leaves_the_ground() -> None:
+    draw = np.random.default_rng(1)
+    field = blob(3.0, seed=1).simplify(1.0)
+    trees = [shapely.Point(place).buffer(4.0) for place in draw.uniform(-60.0, 60.0, (12, 2))]
+    ground = field.difference(shapely.union_all(trees))
+    places = draw.uniform(-90.0, 90.0, (400, 2))
+    starts = places[shapely.contains_xy(ground.buffer(-3.1), places)]
+    course = draw.uniform(0.0, 2.0 * math.pi, len(starts))
+    along = np.column_stack([np.cos(course), np.sin(course)])
+    wanted_m = draw.uniform(1.0, 120.0, len(starts))
+    ends = starts + along * wanted_m[:, None]
+    beyond = shapely.difference(
+        shapely.buffer(
+            shapely.linestrings(np.stack([starts, ends], axis=1)), 3.0, cap_style="flat"
+        ),
+        ground,
+    )
+    expected_m = [
+        min([most, *((shapely.get_coordinates(each) - start) @ way).tolist()])
+        for each, start, way, most in zip(beyond, starts, along, wanted_m.tolist(), strict=True)
+    ]
+    found_m = reach_inside(starts, along, wanted_m, ground, 6.0)
+    assert len(starts) > 100
+    assert np.count_nonzero(found_m < wanted_m) > 50
+    np.testing.assert_allclose(found_m, expected_m, atol=1e-3)
