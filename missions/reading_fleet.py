@@ -63,6 +63,8 @@ class BreakAsked:
 
 
 NO_BREAK = BreakAsked()
+# How a journal without lines is refused: who goes on from one may leave it at its ground.
+NO_LINES = "its flight had no planned lines"
 
 
 def fleet_settings(mission: MissionTable) -> dict[str, Any]:
@@ -131,8 +133,7 @@ def _flown_lines(journal: Path, frame: LocalFrame) -> list[tuple[int, Floats]]:
     found = read_treated_ground(journal)
     if found.setup.lines is None:
         raise PlanError(
-            f"{journal}: its flight had no planned lines; give the plan's .geojson to --resume and "
-            "the journal to --done"
+            f"{journal}: {NO_LINES}; give the plan's .geojson to --resume and the journal to --done"
         )
     pieces = [piece for line in found.setup.lines.polylines for piece in pairwise(line)]
     places = np.array(pieces, dtype=np.float64).reshape(-1, 2)

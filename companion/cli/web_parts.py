@@ -121,6 +121,8 @@ def _facts(config: Config, setup: Setup, training: str) -> dict[str, Any]:
     return {
         "training": training,
         "product": config.product.name,
+        # Whether valves stay closed over ground that is treated already.
+        "spares_treated": setup.overlap is not None,
         "tank_l": tank,
         "reserve_l": config.tank.reserve_l,
         "rate_max_l_ha": setup.rate_max_l_ha,

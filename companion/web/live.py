@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -271,7 +272,10 @@ class Live:
         self._meter: list[tuple[float, float]] = []
         self._file: IO[str] | None = None
         self.way_id = round(utc_s, 1)
-        # Water and dry runs have a way of their own: it is not what the product covered.
+        self._way_file, self._begun_s = way_file, (utc_s, time.monotonic())
+        # Water, dry runs and simulated vehicles have a way of their own: it is not what the product
+        # covered. Of the vehicle one hears only later.
+        self._is_simulated = False
         self._key = f"{ground['sha256']} {len(valves)} {about['facts']['training']}"
         if way_file is not None:
             self._resume(way_file, utc_s)
@@ -279,6 +283,7 @@ class Live:
     def take(self, payload: bytes) -> None:
         """Take a frame from the control loop."""
         frame = json.loads(payload)
+        self._mark(frame)
         point = self.way.take(frame)
         if point is not None:
             self._keep(point)
@@ -297,6 +302,23 @@ class Live:
         frame["volume_l"] = round(self.way.volume_l, 3)
         frame["point_count"] = len(self.way.points)
         self.state = frame
+
+    def _mark(self, frame: dict[str, Any]) -> None:
+        """Begin the way anew where the one so far is of simulated flights and this is none.
+
+        Or the reverse. A vehicle that says nothing of itself is real once it flies.
+        """
+        is_simulated = bool(frame.get("simulated"))
+        is_known = is_simulated or bool((frame.get("vehicle") or {}).get("in_air"))
+        if is_simulated == self._is_simulated or not is_known:
+            return
+        self._is_simulated = is_simulated
+        self.way = Way(self.way.valves)
+        utc_s, begun_s = self._begun_s
+        self.way_id = round(utc_s + time.monotonic() - begun_s, 1)
+        self.close()
+        if self._way_file is not None:
+            self._open(self._way_file)
 
     def _line(self, frame: dict[str, Any]) -> str:
         if frame["state"] == SprayerState.SPRAYING.value:
@@ -335,15 +357,22 @@ class Live:
             head = json.loads(file.readline(1000))
             if head["key"] == self._key and 0.0 <= utc_s - head["utc_s"] <= KEEP_S:
                 self.way_id = float(head["utc_s"])
+                self._is_simulated = bool(head["simulated"])
                 self._read(file)
+        if not self.way.points:
+            self.way_id, self._is_simulated = round(utc_s, 1), False
+        self._open(path)
+
+    def _open(self, path: Path) -> None:
+        """Go on in the file, or begin it; without one the page works as well."""
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("a" if self.way.points else "w", encoding="utf-8")
-            if not self.way.points:
-                self.way_id = round(utc_s, 1)
-                self._write({"key": self._key, "utc_s": self.way_id})
         except OSError:
-            self._file = None  # the page works without
+            self._file = None
+        if not self.way.points:
+            head = {"key": self._key, "utc_s": self.way_id, "simulated": self._is_simulated}
+            self._write(head)
 
     def _read(self, file: IO[str]) -> None:
         for line in file:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from companion.web.child import Work
 from companion.web.guard import API
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ class Host:
 
     `folder`: where it may keep files. `config`: arguments that name the configuration of the
     flight. `upload_link`: a second link to the autopilot, or nothing. `journals`: their folder.
-    `flying`: why nothing may be begun now.
+    `flying`: why nothing may be begun now. `work`: what is being worked on, by any part.
     """
 
     folder: str
@@ -38,6 +39,7 @@ class Host:
     upload_link: str
     journals: str
     flying: Callable[[], str | None]
+    work: Work = field(default_factory=Work)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import Message, Receive, Send
 from starlette.types import Scope as Connection
 
+from companion.web.child import Work
 from companion.web.guard import API, COOKIE, Asked, Failures, Guard, Scope, session
 from companion.web.live import Live, map_parts
 from companion.web.parts import Host, Part
@@ -290,7 +291,7 @@ class Site:
         self.version = str(about["version"])
         self._files: dict[Path, tuple[bytes, str]] = {}
         self._news = asyncio.Event()
-        self.host: dict[str, Any] = about["host"]
+        self.host: dict[str, Any] = {**about["host"], "work": Work()}
         self._doctor: list[str] = about["doctor"]
         self._checks: list[dict[str, Any]] = []
         self._checked_s = float("-inf")

@@ -8,19 +8,12 @@ priority, and it ends when the vehicle is armed.
 from __future__ import annotations
 
 import asyncio
-import ctypes
-import json
 import os
 import re
-import resource
 import shutil
-import signal
-import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,9 +21,12 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
+from companion.web.child import Limits, Outcome, journal_to_read, run_child
 from companion.web.parts import Host, Part
+from missions.reading_fleet import NO_LINES
 
 FILE_BYTES_MAX, ALL_BYTES_MAX, FILES_MAX = 64_000_000, 256_000_000, 60
+FLIGHTS_MAX = 50
 # What is left for the journals of flights.
 FREE_MIN_BYTES = 500_000_000
 RECEIVE_WITHIN_S = 300.0
@@ -41,18 +37,8 @@ SUFFIXES = (
     *(".shp", ".shx", ".dbf", ".prj", ".cpg", ".geojson", ".json", ".gpkg", ".kml", ".kmz"),
     *(".xml", ".bin", ".tif", ".tiff", ".parquet", ".geoparquet", ".csv", ".txt", ".zip"),
 )
-MEMORY_MAX_BYTES = 2_000_000_000
-OUTPUT_MAX_BYTES = 256_000_000
-SAID_MAX_BYTES = 4_000_000
-# Seconds of computing, and of waiting.
-TIMES: dict[str, tuple[int, float]] = {"check": (60, 180.0), "plan": (300, 900.0)}
-# As `vrspray` lowers itself where it is patient: in all, whatever the page has already.
-NICENESS = 5
-UPLOAD_S = (60, 120.0)
-LOOK_S = 0.25
-_PR_SET_PDEATHSIG = 1
-_LIBC = ctypes.CDLL(None)
-_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "ARROW_NUM_THREADS")
+TIMES = {"check": Limits(cpu_s=60, wait_s=180.0), "plan": Limits(cpu_s=300, wait_s=900.0)}
+UPLOAD = Limits(cpu_s=60, wait_s=120.0)
 
 Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", max_length=80)]
 Places = Annotated[list[Name], Field(max_length=8)]
@@ -98,6 +84,8 @@ class Planning(Reading):
     border_m: Annotated[float, Field(ge=0.0, le=50.0)] | None = None
     angle_deg: Annotated[float, Field(ge=0.0, lt=360.0)] | None = None
     depot: tuple[float, float] | None = None
+    # A flight whose treated ground is left out: what it left is planned.
+    done: Name | None = None
     kind: Literal["plan", "waypoints"] = "plan"
 
     def settings(self) -> list[str]:
@@ -120,14 +108,6 @@ class Named(_Body):
     file: Name
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What a command of ours said: its JSON, or the one line in which it refused."""
-
-    found: dict[str, Any]
-    error: str | None
-
-
 @dataclass(slots=True)
 class Office:
     """The files of one field, and the child that works on them."""
@@ -135,7 +115,6 @@ class Office:
     host: Host
     given: Path = field(init=False)
     made: Path = field(init=False)
-    task: str | None = None
     results: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -151,7 +130,8 @@ class Office:
             "files": _listed(self.given),
             "made": _listed(self.made),
             "not_now": self.host.flying(),
-            "task": self.task,
+            "task": self.host.work.task,
+            "flights": self.flights(),
             "uploads": bool(self.host.upload_link),
             **self.results,
         }
@@ -162,6 +142,17 @@ class Office:
         if not _is_name(name) or not path.is_file():
             raise HTTPException(404, f"{name}: not among the files; load it first")
         return path
+
+    def flights(self) -> list[str]:
+        """Return the journals of earlier flights, the newest first; none of them is opened."""
+        found = Path(self.host.journals).glob("*.gpkg") if self.host.journals else ()
+        return sorted((path.name for path in found), reverse=True)[:FLIGHTS_MAX]
+
+    def journal(self, name: str) -> Path:
+        """Return the journal of an earlier flight; a 404 where it is not there."""
+        if name not in self.flights():
+            raise HTTPException(404, f"{name}: no flight of this name in journal.folder")
+        return Path(self.host.journals) / name
 
     async def receive(self, name: str, request: Request) -> None:
         """Write a file as it comes, within the limits of the office."""
@@ -197,8 +188,9 @@ class Office:
     def refuse_now(self) -> None:
         """Refuse while the vehicle is armed or a child works: a 409 with the reason."""
         reason = self.host.flying()
-        if reason is None and self.task is not None:
-            reason = f"busy: {self.task}; wait until it is done"
+        task = self.host.work.task
+        if reason is None and task is not None:
+            reason = f"busy: {task}; wait until it is done"
         if reason is not None:
             raise HTTPException(409, reason)
 
@@ -227,9 +219,11 @@ class Office:
         named = [asked.field, *asked.no_spray, *asked.obstacle]
         for name in [*named, *([asked.prescription] if asked.prescription else [])]:
             self.path(name)
+        done = None if asked.done is None else self.journal(asked.done)
         with self._working("plan", "field*", "sheet.html"):
             out = f"made/field.{asked.kind}"
-            planned = await self.run("plan", [*_plan_words(asked, self.host, out), "--json"])
+            words = [*_plan_words(asked, self.host, out), "--json"]
+            planned = await self._planned(words, done)
             error, found = planned.error, planned.found
             flight_map = None
             if error is None and asked.prescription and self.host.config:
@@ -239,6 +233,17 @@ class Office:
                 "files": [Path(path).name for path in found.get("files", [])],
             }  # fmt: skip
         return self.state()
+
+    async def _planned(self, words: list[str], done: Path | None) -> Outcome:
+        """Plan what there is to spray, or what a flight left of it: of its lines, if it had any."""
+        if done is None:
+            return await self.run("plan", words)
+        with journal_to_read(done, self.given.parent) as readable:
+            journal = str(readable.resolve())
+            planned = await self.run("plan", [*words, "--resume", journal])
+            if planned.error is not None and NO_LINES in planned.error:
+                planned = await self.run("plan", [*words, "--done", journal])
+            return planned
 
     async def _compiled(self, asked: Planning, lines: str | None) -> dict[str, Any]:
         """Compile the flight map of what was planned, by the configuration of the flight."""
@@ -271,58 +276,18 @@ class Office:
     @contextmanager
     def _working(self, task: str, *stale: str) -> Iterator[None]:
         """Be busy with a task, whose earlier results are removed."""
-        self.task = task
-        try:
+        with self.host.work.on(task):
             self.results.pop(task, None)
             self.results.pop("upload", None)
             self.made.mkdir(parents=True, exist_ok=True, mode=0o700)
             for path in [path for name in stale for path in self.made.glob(name)]:
                 path.unlink()
             yield
-        finally:
-            self.task = None
 
     async def run(self, task: str, words: Sequence[str]) -> Outcome:
-        """Run a command of ours within limits; it ends when the vehicle is armed."""
-        cpu_s, wait_s = TIMES.get(task, UPLOAD_S)
-        folder = self.given.parent
-        out, err = (folder / f"{name}.said" for name in ("out", "err"))
-        environment = {
-            **{key: os.environ[key] for key in ("PATH", "HOME", "PYTHONPATH") if key in os.environ},
-            **dict.fromkeys(_THREADS, "1"), "MALLOC_ARENA_MAX": "2", "NO_COLOR": "1",
-            "PYTHONDONTWRITEBYTECODE": "1",
-        }  # fmt: skip
-        with out.open("wb") as said, err.open("wb") as told:
-            child = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "companion", *words), cwd=folder, env=environment,
-                stdin=asyncio.subprocess.DEVNULL, stdout=said, stderr=told,
-                start_new_session=True, preexec_fn=partial(_limit, cpu_s, os.getpid()),
-            )  # fmt: skip
-        ended = await self._ended(child, wait_s)
-        if ended is not None:
-            return Outcome({}, ended)
-        found = _json_of(out)
-        error = found.get("error") or found.get("text")
-        if child.returncode in (0, 1) and error is None and found:
-            return Outcome(found, None)
-        return Outcome(found, str(error or _why(err, child.returncode or 0, cpu_s)).strip())
-
-    async def _ended(self, child: asyncio.subprocess.Process, wait_s: float) -> str | None:
-        """Wait for a child; return why it had to be ended, if it had to be."""
-        until_s = time.monotonic() + wait_s
-        reason, is_over = None, False
-        while not is_over and reason is None:
-            try:
-                await asyncio.wait_for(child.wait(), LOOK_S)
-                is_over = True
-            except TimeoutError:
-                reason = self.host.flying()
-                if reason is None and time.monotonic() > until_s:
-                    reason = f"took longer than {wait_s:.0f} s: ended; use a simpler file"
-        with suppress(ProcessLookupError):
-            os.killpg(child.pid, signal.SIGKILL)  # it may have children of its own
-        await child.wait()
-        return reason
+        """Run a command of ours within the limits of the task."""
+        limits = TIMES.get(task, UPLOAD)
+        return await run_child(words, self.given.parent, limits, flying=self.host.flying)
 
 
 async def _written(part: Path, name: str, request: Request, room: int) -> None:
@@ -334,44 +299,6 @@ async def _written(part: Path, name: str, request: Request, room: int) -> None:
             if size > room:
                 raise HTTPException(413, f"{name}: larger than {room / 1e6:.0f} MB")
             await asyncio.to_thread(file.write, data)
-
-
-def _limit(cpu_s: int, parent: int) -> None:
-    """Limit a child, in the child: memory, computing, files; it ends with its parent."""
-    _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
-        os._exit(1)
-    os.nice(NICENESS)
-    for limit, most in (
-        (resource.RLIMIT_AS, MEMORY_MAX_BYTES),
-        (resource.RLIMIT_CPU, cpu_s),
-        (resource.RLIMIT_FSIZE, OUTPUT_MAX_BYTES),
-        (resource.RLIMIT_CORE, 0),
-    ):
-        resource.setrlimit(limit, (most, most))
-
-
-def _why(err: Path, code: int, cpu_s: int) -> str:
-    """Return in one line why a command ended without an answer."""
-    if code in (-signal.SIGXCPU, -signal.SIGKILL):
-        return f"took more than {cpu_s} s of computing: ended; use a simpler file"
-    said = err.read_bytes()[-SAID_MAX_BYTES:].decode("utf-8", "replace").splitlines()
-    lines = [line for line in said if line.startswith("error: ")]
-    if lines:
-        return lines[-1].removeprefix("error: ")
-    if any("MemoryError" in line for line in said[-3:]) or code < 0:
-        return f"needs more than {MEMORY_MAX_BYTES / 1e9:.0f} GB of memory; use a simpler file"
-    return said[-1][:300] if said else f"ended with exit code {code}"
-
-
-def _json_of(path: Path) -> dict[str, Any]:
-    """Return the one JSON object that a command printed; nothing where it did not."""
-    with path.open("rb") as file:
-        data = file.read(SAID_MAX_BYTES)
-    with suppress(ValueError):
-        found = json.loads(data)
-        return found if isinstance(found, dict) else {}
-    return {}
 
 
 def _answers(asked: Planning) -> dict[str, str]:

@@ -22,6 +22,8 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any
 
+from companion.errors import ConfigError
+from sitl.own_method import load_controller
 from tests.bench.figures import Figure, rounded, table
 from tests.bench.parts import PARTS, Options, Part, chosen
 from tests.bench.report import page
@@ -60,12 +62,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     given = parser.parse_args(words)
     count = given.seeds or (QUICK_SEEDS if given.quick else SEEDS)
+    if given.controller is not None:
+        try:
+            load_controller(given.controller)  # refused before any flight
+        except ConfigError as error:
+            parser.error(str(error))
     options = Options(
         seed=given.seed,
         count=count,
         is_quick=given.quick,
         flights=given.flights,
         processes=given.processes,
+        controller=given.controller,
         say=say,
     )
     # With saved results only what is asked for by name is measured again.
@@ -95,6 +103,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--only", action="append", default=[], metavar="PATTERN", help="some parts")
     parser.add_argument("--flights", type=int, default=0, help="calibration missions more; 200")
     parser.add_argument("--processes", type=int, default=PROCESSES, help="flights at a time")
+    parser.add_argument(
+        "--controller", metavar="MODULE:CLASS", help="fly one's own method beside ours"
+    )
     parser.add_argument("--page", type=Path, help="also write a page of Markdown here")
     parser.add_argument(
         "--from", dest="saved", action="append", default=[], type=Path, metavar="JSON",

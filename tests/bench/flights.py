@@ -17,6 +17,7 @@ from analysis.evaluation import Evaluation, evaluate, limit_ratio, whole_boom
 from sitl.demo import do_all
 from sitl.demo_field import demo_trajectory
 from sitl.flight import FlightOptions, fly
+from sitl.own_method import load_controller
 from sitl.profile import load_profile
 from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
 from tests.bench.conditions import CONDITIONS, condition_of, laid_out
@@ -88,6 +89,8 @@ class Task:
     seed: int
     outputs: tuple[Output, ...]
     with_paper: bool = False
+    # One's own method, `module:Class`, flown instead of all others.
+    controller: str | None = None
 
 
 def tasks(seeds: Iterable[int], *, is_quick: bool) -> list[Task]:
@@ -143,13 +146,18 @@ def fly_all(
 
 
 def fly_task(task: Task) -> list[Flown]:
-    """Fly one path with every output, and with the paper's controller where it is asked for."""
+    """Fly one path with every output, and with the paper's controller where it is asked for.
+
+    With a method of one's own that flies instead, as often as ours.
+    """
     profile, seed = load_profile(task.plant), task.seed
     keep = partial(kept, task=task, perfect=perfect(task))
+    own = None if task.controller is None else load_controller(task.controller)
     results = []
     for output in task.outputs:
         setup, path = place(task, output)
-        ours = fly(setup, path, profile, options_of(output, seed), speed_m_s=task.speed_m_s)
+        options = options_of(output, seed)
+        ours = fly(setup, path, profile, options, speed_m_s=task.speed_m_s, own=own)
         results.append(keep(evaluate(ours.record), output=output))
     setup, path = place(task, "gpio")
     for method, look_ahead_s in PAPER_METHODS.items() if task.with_paper else ():

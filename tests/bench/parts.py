@@ -42,18 +42,23 @@ UNKNOWN_SECTION = "A sprayer that the controller does not know"
 IDENTIFICATION_SECTION = "Identified lags"
 TRIM_SECTION = "Closed loop on flow"
 PUMP_SECTION = "A pump that makes the flow"
+OWN_SECTION = "A method of your own"
 LAW_SECTION = "Three laws of the flow"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Options:
-    """How much is measured; `flights` is that of calibration missions."""
+    """How much is measured; `flights` is that of calibration missions.
+
+    `controller` is a method of one's own, `module:Class`, flown beside ours.
+    """
 
     seed: int = 1
     count: int = 20
     is_quick: bool = False
     flights: int = 0
     processes: int = 2
+    controller: str | None = None
     say: Say = lambda _: None
 
     @property
@@ -103,19 +108,29 @@ def _flown(works: Sequence[Task], options: Options, name: str) -> list[Flown]:
     return fly_all(works, processes=options.processes, progress=told)
 
 
+def _flights(works: Sequence[Task], options: Options, name: str, *, section: str) -> list[Figure]:
+    """Return our accuracy over these paths, and that of one's own method beside it."""
+    figures = accuracy(_flown(works, options, name), section=section)
+    if options.controller is None:
+        return figures
+    again = [replace(work, controller=options.controller, with_paper=False) for work in works]
+    own = _unjudged(accuracy(_flown(again, options, f"{name}, own"), section=OWN_SECTION))
+    return figures + [replace(one, key=f"own_{one.key}") for one in own]
+
+
 def _field(options: Options) -> list[Figure]:
     works = tasks(options.seeds, is_quick=options.is_quick)
-    return accuracy(_flown(works, options, "field"), section=FIELD_SECTION)
+    return _flights(works, options, "field", section=FIELD_SECTION)
 
 
 def _pinpoint(options: Options) -> list[Figure]:
     works = pinpoint_tasks(options.seeds, is_quick=options.is_quick)
-    return accuracy(_flown(works, options, "pinpoint"), section=FIELD_SECTION)
+    return _flights(works, options, "pinpoint", section=FIELD_SECTION)
 
 
 def _condition(options: Options, *, name: str) -> list[Figure]:
     works = condition_tasks(name, options.seeds)
-    return accuracy(_flown(works, options, name), section=CONDITIONS_SECTION)
+    return _flights(works, options, name, section=CONDITIONS_SECTION)
 
 
 def _identified(options: Options) -> list[Figure]:

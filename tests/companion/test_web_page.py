@@ -173,6 +173,35 @@ def test_a_way_of_another_map_is_not_taken_up(tmp_path: Path) -> None:
     later.close()
 
 
+def test_a_real_flight_and_a_simulated_one_have_ways_of_their_own(tmp_path: Path) -> None:
+    path, utc_s = tmp_path / "track.jsonl", 1.7e9
+
+    def flown(seconds: float, *, simulated: bool, begin_s: float) -> Live:
+        live = Live(about(), way_file=path, utc_s=utc_s + begin_s)
+        waiting = _frame(begin_s, 0.0, bits="000000") | {"simulated": simulated}
+        waiting["vehicle"] = {**waiting["vehicle"], "in_air": False}  # type: ignore[dict-item]
+        live.take(json.dumps(waiting).encode())
+        for k in range(round(10 * seconds)):
+            frame = _frame(begin_s + 0.1 * k, 0.5 * k, bits="111111") | {"simulated": simulated}
+            live.take(json.dumps(frame).encode())
+        live.close()
+        return live
+
+    first = flown(4.0, simulated=True, begin_s=0.0)
+    again = flown(4.0, simulated=True, begin_s=60.0)
+    assert again.way_id == first.way_id
+    assert len(again.way.points) > len(first.way.points)
+    real = flown(2.0, simulated=False, begin_s=120.0)
+    assert real.way_id != first.way_id
+    assert 0 < len(real.way.points) < len(first.way.points)
+    # Nothing of the simulation is left in the file either, and a glance at it on the ground keeps.
+    looked = Live(about(), way_file=path, utc_s=utc_s + 180.0)
+    assert looked.way.points == real.way.points
+    assert looked.way_id == real.way_id
+    looked.close()
+    assert len(flown(1.0, simulated=True, begin_s=240.0).way.points) < len(real.way.points)
+
+
 # ---------------------------------------------------------------------------- over the wire
 
 

@@ -14,6 +14,7 @@ import pytest
 import pytest_asyncio
 from fastapi import APIRouter, HTTPException
 
+from companion.web.child import Limits
 from companion.web.parts import Host, registered, uploads
 from missions.web import office as module
 from missions.web.office import Office
@@ -224,7 +225,7 @@ async def test_a_child_ends_at_its_limits_with_one_line(
 ) -> None:
     await _with_child(tmp_path, monkeypatch, code)
     if "longer" in words:
-        monkeypatch.setattr(module, "TIMES", {"check": (10, 2.0)})
+        monkeypatch.setattr(module, "TIMES", {"check": Limits(cpu_s=10, wait_s=2.0)})
     done = await office(tmp_path / "field").run("check", [])
     assert done.error is not None
     assert words in done.error
@@ -243,10 +244,11 @@ async def test_a_child_and_its_own_children_end_when_the_vehicle_is_armed(
     await _with_child(tmp_path, monkeypatch, code)
     pid = tmp_path / "pid"
     reason = "the vehicle is armed: disarm it first"
-    found = office(tmp_path / "field", lambda: reason if pid.exists() else None)
-    monkeypatch.setattr(module, "TIMES", {"check": (10, 60.0)})
+    found = office(tmp_path / "field", lambda: reason if pid.exists() and pid.read_text() else None)
+    monkeypatch.setattr(module, "TIMES", {"check": Limits(cpu_s=10, wait_s=60.0)})
     assert (await found.run("check", [])).error == reason
-    assert not alive(int(pid.read_text()))
+    # Told to end, it does so when it is its turn on a processor.
+    await until(lambda: not alive(int(pid.read_text())))
 
 
 async def test_work_that_fails_leaves_the_office_free(
@@ -256,13 +258,13 @@ async def test_work_that_fails_leaves_the_office_free(
     (found.given / "a.csv").write_text("x")
 
     async def failing(self: Office, task: str, words: Any) -> None:
-        assert self.task == task
+        assert self.host.work.task == task
         raise OSError("no processes left")
 
     monkeypatch.setattr(Office, "run", failing)
     with pytest.raises(OSError, match="no processes"):
         await found.check(module.Check(file="a.csv"))
-    assert found.task is None
+    assert found.host.work.task is None
 
 
 def alive(pid: int) -> bool:
@@ -278,8 +280,8 @@ async def _with_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
     script = tmp_path / "python"
     script.write_text(f"#!{sys.executable}\n{code}\n")
     script.chmod(0o755)
-    monkeypatch.setattr(module.sys, "executable", str(script))
-    monkeypatch.setattr(module, "TIMES", {"check": (1, 100.0)})
+    monkeypatch.setattr(sys, "executable", str(script))
+    monkeypatch.setattr(module, "TIMES", {"check": Limits(cpu_s=1, wait_s=100.0)})
 
 
 def test_the_page_finds_the_office_by_its_entry_point() -> None:

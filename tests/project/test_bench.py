@@ -14,6 +14,7 @@ import pytest
 from companion.core.nozzle import flow_for_rate
 from sitl.demo_field import demo_trajectory
 from tests.bench import __main__ as bench
+from tests.bench import parts
 from tests.bench.accuracy import accuracy
 from tests.bench.arrival import arrivals
 from tests.bench.conditions import condition_of, laid_out
@@ -39,6 +40,8 @@ from tests.bench.sprayers import PLANT, PLANTS, nominal_lag, scaled_lag, sprayer
 from tests.bench.steps import growth, large_field
 from tests.bench.timings import TIMINGS
 
+# The controller of Wang et al. 2024, written as anybody would write his own.
+OWN_METHOD = Path(__file__).parents[2] / "examples/own-method/wang2024.py"
 EVERY_FIGURE = {"what", "value", "unit", "n", "target", "bound", "met", "alternative"}
 FLOWN = Flown(
     speed_m_s=5.0,
@@ -161,6 +164,7 @@ def test_a_page_is_made_of_saved_results_without_measuring(tmp_path: Path) -> No
     [
         (["--only", "nothing"], "choose of"),
         (["--from", "nowhere.json"], "cannot be read"),
+        (["--controller", "nowhere:Nothing"], "nowhere"),
     ],
 )
 def test_what_cannot_be_measured_is_said_in_one_line(
@@ -258,6 +262,23 @@ def test_a_task_flies_one_path_by_every_way() -> None:
     assert lag.value < (lag.alternative["paper's none"] or 0.0)
     assert figures["paper_none"].value is not None
     assert {"limit_ratio_arc-40_gpio_5_m_s", "missed_arc-40_gpio_5_m_s"} <= figures.keys()
+
+
+def test_a_method_of_ones_own_is_flown_beside_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = Task(condition="arc-40", seed=3, outputs=("gpio",), with_paper=True)
+    monkeypatch.setattr(parts, "condition_tasks", lambda _name, _seeds: [task])
+    options = parts.Options(count=1, processes=1, controller=f"{OWN_METHOD}:Wang2024")
+    (part,) = (part for part in parts.PARTS if part.name == "arc-40")
+    figures = by_key(part.run(options))
+    ours, own = (figures[f"{name}lag_arc-40_gpio_5_m_s"] for name in ("", "own_"))
+    # The example is the paper's controller with its look-ahead, on our nozzle set.
+    assert own.value is not None
+    assert ours.value is not None
+    assert own.value > 2.0 * ours.value
+    assert own.target is None
+    assert own.section == parts.OWN_SECTION != ours.section
+    assert "paper_none" in figures
+    assert "own_paper_none" not in figures
 
 
 def test_over_the_example_its_own_path_is_flown() -> None:

@@ -48,6 +48,7 @@ function show() {
   panels.showLinks(state, facts, feed.age());
   panels.showChecklist(state, facts, ground, checks);
   panels.showTank(state, facts);
+  panels.showLanded(state, facts);
   panels.showEvents(state);
   orders.show(state, facts, scope);
   showMark();

@@ -166,6 +166,19 @@ export function showTank(state, facts) {
   bar.setAttribute("aria-label", parts[0]);
 }
 
+// After landing: what was done, and the way to the report of this flight.
+export function showLanded(state, facts) {
+  const isLanded = state.vehicle?.armed === false && state.point_count > 0;
+  byId("landed").hidden = !isLanded;
+  if (!isLanded) return;
+  text(byId("landed-text"), `${withUnit("area", state.area_ha)} treated with ${withUnit("volume", state.volume_l)} ordered; ${withUnit("area", state.left_ha)} left.`);
+  const box = byId("landed-link"), name = state.journal?.name;
+  if (box.firstChild || !name || !(facts.parts ?? []).some((one) => one.name === "flights")) return;
+  const link = make("a", "", "Report, and what is left");
+  link.href = `flights/#report=${encodeURIComponent(name)}`;
+  box.append(link);
+}
+
 export function showEvents(state) {
   list("events", (state.events ?? []).slice().reverse(), ([at, kind, what]) => {
     const item = make("li");

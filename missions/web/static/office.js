@@ -1,11 +1,14 @@
 // The office on the page: files in, the map's check, areas drawn, the plan, and what to do with it.
 
 import { stopping } from "../static/orders.js";
+import { toSi, unitOf, useUnits, withUnit } from "../static/units.js";
 import { OfficeMap } from "./office-map.js";
 
 const API = "../api/v1/";
 const byId = (id) => document.getElementById(id);
+const KINDS = { swath_m: "length", speed_m_s: "speed", tank_l: "volume", rate_l_ha: "rate", border_m: "length" };
 const ROLES = { boundary: "drawn-boundary.geojson", "no-spray": "drawn-no-spray.geojson" };
+const chosenBy = {}; // by the operator: which file is what
 let state = { files: [], made: [] }, corners = [], role = null;
 
 function make(tag, text, className) {
@@ -66,9 +69,12 @@ function showFiles() {
   const maps = state.files.map((file) => file.name).filter((name) => !/[.](shx|dbf|prj|cpg|bin)$/i.test(name));
   const named = maps.map((name) => [name, name]);
   const has = (text) => maps.find((name) => name.toLowerCase().includes(text));
-  choices(byId("prescription"), [["", "none: one rate"], ...named], byId("prescription").value || has("presc") || "");
-  choices(byId("field"), named, byId("field").value || has("bound") || maps[0]);
-  choices(byId("no_spray"), named);
+  // What the operator chose stays; else each file goes where its name says.
+  const kept = (id) => (maps.includes(chosenBy[id]) || chosenBy[id] === "" ? chosenBy[id] : undefined);
+  choices(byId("prescription"), [["", "none: one rate"], ...named], kept("prescription") ?? has("presc") ?? "");
+  choices(byId("field"), named, kept("field") ?? has("bound") ?? maps.find((name) => name !== byId("prescription").value) ?? maps[0]);
+  choices(byId("no_spray"), named.filter(([name]) => name !== byId("prescription").value && name !== byId("field").value));
+  choices(byId("done"), [["", "nothing: the whole field"], ...(state.flights ?? []).map((name) => [name, name])], byId("done").value || wanted);
 }
 
 function refused(text) { return make("p", text, "refused"); }
@@ -80,15 +86,15 @@ function showCheck() {
   const list = make("ul");
   list.append(...items);
   if (check.error) { box.replaceChildren(refused(check.error)); return; }
-  box.replaceChildren(make("p", `${check.file}: ${found.zones} zones, ${found.area_ha.toFixed(2)} ha, ${found.litres.toFixed(1)} L, ${Math.min(...found.rates_l_ha)} to ${Math.max(...found.rates_l_ha)} L/ha.`), items.length ? list : make("p", "Nothing wrong was found.", "small"));
+  box.replaceChildren(make("p", `${check.file}: ${found.zones} zones, ${withUnit("area", found.area_ha)}, ${withUnit("volume", found.litres)}, ${withUnit("rate", Math.min(...found.rates_l_ha))} to ${withUnit("rate", Math.max(...found.rates_l_ha))}.`), items.length ? list : make("p", "Nothing wrong was found.", "small"));
 }
 
 function sortieTable(found) {
   const table = make("table"), head = make("tr");
-  head.append(...["Sortie", "Litres", "Fill to", "Minutes", "Passes"].map((text) => { const cell = make("th", text); cell.scope = "col"; return cell; }));
+  head.append(...["Sortie", "Volume", "Fill to", "Minutes", "Passes"].map((text) => { const cell = make("th", text); cell.scope = "col"; return cell; }));
   table.append(head, ...found.sorties.map((one) => {
     const row = make("tr");
-    row.append(...[one.number, one.volume_l.toFixed(1), one.fill_l.toFixed(1), (one.flight_s / 60).toFixed(1), one.swaths].map((text) => make("td", String(text))));
+    row.append(...[one.number, withUnit("volume", one.volume_l), withUnit("volume", one.fill_l), (one.flight_s / 60).toFixed(1), one.swaths].map((text) => make("td", String(text))));
     return row;
   }));
   return table;
@@ -99,7 +105,7 @@ function showPlan() {
   if (!plan) { box.replaceChildren(); return; }
   if (plan.error) { box.replaceChildren(refused(plan.error)); return; }
   const found = plan.found, parts = [
-    make("p", `${found.sorties.length} ${found.sorties.length === 1 ? "sortie" : "sorties"}, ${found.volume_l.toFixed(1)} L, ${(found.flight_s / 60).toFixed(0)} min; ${found.coverage_percent.toFixed(1)} % covered, ${found.overlap_percent.toFixed(1)} % twice.`),
+    make("p", `${found.sorties.length} ${found.sorties.length === 1 ? "sortie" : "sorties"}, ${withUnit("volume", found.volume_l)}, ${(found.flight_s / 60).toFixed(0)} min; ${found.coverage_percent.toFixed(1)} % covered, ${found.overlap_percent.toFixed(1)} % twice.`),
     sortieTable(found), ...found.warnings.map((text) => make("p", text, "refused")),
   ];
   if (plan.flight_map?.error) parts.push(refused(`flight map: ${plan.flight_map.error}`));
@@ -167,7 +173,7 @@ async function save() {
   for (let k = 2; role === "no-spray" && state.files.some((file) => file.name === name); k += 1) name = `drawn-no-spray-${k}.geojson`;
   const chosen = role;
   await doing("Saving", () => ask(`office/files/${name}`, JSON.stringify(data), "application/octet-stream"));
-  if (chosen === "boundary") byId("field").value = name;
+  if (chosen === "boundary") chosenBy.field = name;
   else for (const one of byId("no_spray").options) if (one.value === name) one.selected = true;
   startDrawing(null);
   show();
@@ -192,16 +198,21 @@ async function load(list) {
 function planned() {
   const body = { field: byId("field").value, kind: byId("kind").value, no_spray: [...byId("no_spray").selectedOptions].map((one) => one.value), ...reading() };
   if (byId("prescription").value) body.prescription = byId("prescription").value;
-  for (const id of ["swath_m", "speed_m_s", "tank_l", "rate_l_ha", "border_m", "angle_deg"]) if (byId(id).value !== "") body[id] = Number(byId(id).value);
+  if (byId("done").value) body.done = byId("done").value;
+  for (const [id, kind] of Object.entries(KINDS)) if (byId(id).value !== "") body[id] = toSi(kind, Number(byId(id).value));
+  if (byId("angle_deg").value !== "") body.angle_deg = Number(byId("angle_deg").value);
   if (byId("depot").value.trim()) body.depot = byId("depot").value.split(/[,;\s]+/).filter(Boolean).map(Number).slice(0, 2);
   return body;
 }
 
 const isNight = matchMedia("(prefers-color-scheme: dark)").matches;
 let chosen = null;
-try { chosen = localStorage.getItem("vrspray-theme"); } catch { /* private mode */ }
+try { chosen = localStorage.getItem("vrspray-theme"); useUnits(localStorage.getItem("vrspray-units") ?? "si"); } catch { /* private mode */ }
 const theme = chosen === "night" || (chosen !== "day" && isNight) ? "night" : "day";
 document.documentElement.dataset.theme = theme;
+for (const element of document.querySelectorAll("[data-unit]")) element.textContent = unitOf(element.dataset.unit);
+// From the report of a flight: what it left is planned.
+let wanted = new URLSearchParams(location.hash.slice(1)).get("done") ?? "";
 
 const map = new OfficeMap(byId("map"), theme, {
   onClick(place) { if (role) draw([...corners, place]); },
@@ -216,12 +227,13 @@ byId("draw-undo").addEventListener("click", () => draw(corners.slice(0, -1)));
 byId("draw-save").addEventListener("click", save);
 byId("draw-edit").addEventListener("click", edit);
 byId("corners").addEventListener("input", (event) => draw(cornersOf(event.target.value), true));
-byId("field").addEventListener("change", show);
+for (const id of ["prescription", "field"]) byId(id).addEventListener("change", () => { chosenBy[id] = byId(id).value; show(); });
 
 state = await ask("office").catch((error) => { say(error.message, true); return state; });
 await map.ready;
 byId("map-note").hidden = map.works;
 show();
+wanted = "";
 document.body.dataset.office = "ready";
 setInterval(async () => { // the vehicle may be armed meanwhile
   if (document.body.dataset.busy || document.hidden) return;

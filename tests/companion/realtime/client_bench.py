@@ -112,7 +112,17 @@ class Bench:
 @asynccontextmanager
 async def flying_bench(autopilot: str, folder: Path, *overrides: str) -> AsyncIterator[Bench]:
     """Run the stub and `vrspray run` on one link, to which a client may come."""
-    bench = Bench(autopilot, write_field(folder, autopilot))
+    async with (
+        vehicle_bench(autopilot, write_field(folder, autopilot)) as bench,
+        companion_of(bench, *overrides),
+    ):
+        yield bench
+
+
+@asynccontextmanager
+async def vehicle_bench(autopilot: str, config: Path) -> AsyncIterator[Bench]:
+    """Run the stub alone, with the sprayer of a configuration."""
+    bench = Bench(autopilot, config)
     async with AsyncExitStack() as stack:
         if autopilot == "ardupilot":
             server = await stack.enter_async_context(StubServer(bench.stub, ["tcpin:127.0.0.1:0"]))
@@ -122,24 +132,30 @@ async def flying_bench(autopilot: str, folder: Path, *overrides: str) -> AsyncIt
             bench.url = f"udpout:127.0.0.1:{router.port}"
             server = await stack.enter_async_context(StubServer(bench.stub, [bench.url]))
         server.ticked = bench.tick
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "companion", "run", "--config", str(bench.config)),
-            *(word for one in (f"link.url={bench.url}", *overrides) for word in ("--set", one)),
-            stdout=asyncio.subprocess.DEVNULL,
-            stderr=asyncio.subprocess.PIPE,
-        )
-        reading = asyncio.create_task(bench.read(process))
-        try:
-            yield bench
-            assert process.returncode is None, bench.said
-            process.terminate()
-            async with asyncio.timeout(10.0):
-                assert await process.wait() == 0, bench.said
-        finally:
-            if process.returncode is None:
-                process.kill()
-                await process.wait()
-            await reading
+        yield bench
+
+
+@asynccontextmanager
+async def companion_of(bench: Bench, *overrides: str) -> AsyncIterator[None]:
+    """Run `vrspray run` on the bench's link; it ends in order."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "companion", "run", "--config", str(bench.config)),
+        *(word for one in (f"link.url={bench.url}", *overrides) for word in ("--set", one)),
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    reading = asyncio.create_task(bench.read(process))
+    try:
+        yield
+        assert process.returncode is None, bench.said
+        process.terminate()
+        async with asyncio.timeout(10.0):
+            assert await process.wait() == 0, bench.said
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+        await reading
     assert "Traceback" not in bench.said, bench.said
 
 

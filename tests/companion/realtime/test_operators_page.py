@@ -122,7 +122,7 @@ async def chromium(arguments: list[str] = ARGUMENTS) -> AsyncIterator[Browser]:
             await browser.close()
 
 
-async def _press(page: Page, name: str) -> None:
+async def press(page: Page, name: str) -> None:
     """Hold a button for as long as it wants."""
     await page.locator(name).hover()
     await page.mouse.down()
@@ -142,7 +142,7 @@ async def test_a_flight_is_watched_stopped_released_and_enabled_from_the_page(
         second = await flight.open(browser, viewport={"width": 1280, "height": 800})
         peer.place(east_m=2.0)
         await shows(page, "ready")
-        await _press(page, "#enable")
+        await press(page, "#enable")
 
         async def closing_s() -> float:
             if not peer.is_spraying:
@@ -158,11 +158,11 @@ async def test_a_flight_is_watched_stopped_released_and_enabled_from_the_page(
             await shows(page, "estop")
             await shows(second, "estop")
             peer.enable()  # latched: enabling by another way opens nothing
-            await _press(page, "#enable")  # releases
+            await press(page, "#enable")  # releases
             peer.place(east_m=2.0)
             await shows(page, "ready")
             assert all(order.pulse_us == 1000 for order in peer.orders[closed:])
-            await _press(page, "#enable")
+            await press(page, "#enable")
             return took_s
 
         assert await quickest(closing_s, within_s=STOP_WITHIN_S, tries=3) <= STOP_WITHIN_S
@@ -257,7 +257,7 @@ async def test_a_whole_flight_on_the_stub_is_watched_from_enable_to_landing(
         flight = bench.stub.flight
         flight.set_items(passes("ardupilot"), time.monotonic())
         await shows(page, "ready")
-        await _press(page, "#enable")
+        await press(page, "#enable")
         assert flight.arm(time.monotonic())
         assert flight.start_mission(time.monotonic())
         await shows(page, "spraying")

@@ -1,0 +1,258 @@
+"""A whole field in the browser on the stub: from its map to the report, with a stop in between.
+
+Needs Chromium (`apt-get install chromium`); without it this test is skipped.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+import shapely
+from playwright.async_api import Page
+from shapely.geometry.base import BaseGeometry
+
+from tests.companion.realtime.client_bench import (
+    CLOSED_US,
+    EXAMPLE,
+    Bench,
+    companion_of,
+    vehicle_bench,
+)
+from tests.companion.realtime.test_operators_page import (
+    ARGUMENTS,
+    CHROMIUM,
+    STOP_WITHIN_S,
+    chromium,
+    press,
+    shows,
+)
+from tests.companion.wire_peer import free_port
+from tests.quickest import quickest
+from tests.sitl.stub_bench import HOME
+
+pytest.importorskip("mavsdk.asyncio")
+pytestmark = [
+    pytest.mark.sitl,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium"),
+]
+# Two passes of 6 m over two zones; the vehicle stands south of it.
+WIDTH_M, ZONE_M, FIRST_M = 12.0, 20.0, 9.0
+RATES_L_HA = (15.0, 25.0)
+FIELD_HA = WIDTH_M * ZONE_M * len(RATES_L_HA) / 10_000.0
+# As the page shows it.
+ROUNDED_HA = 0.005
+PRESCRIBED_L = sum(RATES_L_HA) * WIDTH_M * ZONE_M / 10_000.0
+
+
+Box = tuple[float, float, float, float]
+
+
+def write_maps(folder: Path, zones: Iterable[tuple[Box, float]]) -> tuple[Path, list[Path]]:
+    """Write a configuration, and what a browser loads: a prescription and its boundary.
+
+    A zone is west, south, east, north in metres from the vehicle's home, and its rate.
+    """
+    shutil.copy(EXAMPLE / "config.toml", folder)
+    config = folder / "config.toml"
+    text = config.read_text().replace('"prescription.shp"', '"prescription.geojson"\nunit = "L/ha"')
+    # A strict border would keep the outer valves shut where the position's noise is over it.
+    config.write_text(text.replace('border = "inside"', 'border = "volume"'))
+    rated = [(shapely.box(*box), {"rate": rate}) for box, rate in zones]
+    outline = shapely.union_all([box for box, _ in rated])
+    files = {"prescription": rated, "boundary": [(outline, {})]}
+    for name, found in files.items():
+        features = [
+            {"type": "Feature", "geometry": _placed(shape), "properties": properties}
+            for shape, properties in found
+        ]
+        text = json.dumps({"type": "FeatureCollection", "features": features})
+        (folder / f"{name}.geojson").write_text(text)
+    return config, [folder / f"{name}.geojson" for name in files]
+
+
+def _placed(shape: BaseGeometry) -> object:
+    placed = shapely.transform(shape, lambda xy: [HOME.to_geographic(*one)[::-1] for one in xy])
+    return json.loads(shapely.to_geojson(placed))
+
+
+def two_zones() -> list[tuple[Box, float]]:
+    """Return two zones, one north of the other."""
+    souths_m = [FIRST_M + k * ZONE_M for k in range(len(RATES_L_HA))]
+    boxes = [(-WIDTH_M / 2, south, WIDTH_M / 2, south + ZONE_M) for south in souths_m]
+    return list(zip(boxes, RATES_L_HA, strict=True))
+
+
+async def idle(page: Page) -> None:
+    await page.wait_for_function("() => !document.body.dataset.busy")
+
+
+async def plan_and_upload(page: Page) -> None:
+    """Plan what is chosen on the office's page, and put it on the vehicle."""
+    await page.get_by_role("button", name="Plan", exact=True).click()
+    await page.wait_for_function("() => document.getElementById('plan').textContent")
+    await idle(page)
+    assert "% covered" in await page.locator("#plan").inner_text()
+    await page.get_by_role("button", name="Upload field.plan to the vehicle").click()
+    await page.wait_for_function("() => document.body.dataset.busy")
+    await idle(page)
+    said = await page.locator("#plan").inner_text()
+    assert "field.plan: on the vehicle, read back and the same" in said
+
+
+async def left_ha(page: Page) -> float:
+    """Follow the link of the page to the report of its own flight; return what that left."""
+    await page.get_by_role("link", name="Report, and what is left").click()
+    await page.locator("#report .verdict").wait_for()
+    await idle(page)
+    assert "SIMULATED" in await page.locator("#report .mark-text").first.inner_text()
+    assert " L applied" in await page.locator("#report .verdict").inner_text()
+    text = await page.get_by_text("are left.").inner_text()
+    return float(text.partition("treated; ")[2].split()[0])
+
+
+def is_open(bench: Bench) -> bool:
+    return bool(_last(bench)) and any(pulse > CLOSED_US + 20 for pulse in _last(bench).values())
+
+
+def _last(bench: Bench) -> dict[int, float]:
+    """Return the newest pulse of each channel that has left the autopilot."""
+    return {order.channel: order.pulse_us for order in bench.sprayer.orders}
+
+
+@dataclass
+class Day:
+    """The vehicle, a browser's page, and what went over it."""
+
+    bench: Bench
+    page: Page
+    place: str
+    requests: list[str] = field(default_factory=list)
+    troubles: list[str] = field(default_factory=list)
+
+    def watch(self) -> None:
+        self.page.set_default_timeout(60_000)
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.on("pageerror", lambda error: self.troubles.append(str(error)))
+
+    async def open(self, path: str = "", ready: str = "map") -> None:
+        await self.page.goto(self.place + path)
+        await self.is_ready(ready)
+
+    async def is_ready(self, ready: str) -> None:
+        await self.page.wait_for_function("(name) => name in document.body.dataset", arg=ready)
+
+    async def load_and_check(self, files: list[Path]) -> None:
+        page = self.page
+        await self.open("office/", "office")
+        await page.locator("#pick").set_input_files(files)
+        await page.wait_for_function("() => document.querySelectorAll('#files li')[1]")
+        await idle(page)
+        await page.locator("#unit").fill("L/ha")
+        await page.get_by_role("button", name="Check the map").click()
+        await page.wait_for_function("() => document.getElementById('check').textContent")
+        assert " zones" in await page.locator("#check").inner_text()
+        await idle(page)
+        await page.locator("#speed_m_s").fill("5")
+
+    async def take_off(self) -> None:
+        """Enable on the page; the pilot arms and starts the mission."""
+        await shows(self.page, "ready")
+        await press(self.page, "#enable")
+        flight = self.bench.stub.flight
+        await self.bench.until(lambda: flight.arm(time.monotonic()))
+        assert flight.start_mission(time.monotonic())
+        await self.bench.until(lambda: is_open(self.bench))
+        await shows(self.page, "spraying")
+
+    async def stop(self) -> None:
+        """Tap STOP in mid-pass; the valves close on the wire in time, and stay closed."""
+        bench, page = self.bench, self.page
+
+        async def closing_s() -> float:
+            if not is_open(bench):  # an earlier try, on a computer that had much to do
+                await press(page, "#enable")  # releases
+                await press(page, "#enable")
+                await bench.until(lambda: is_open(bench), within_s=30.0)
+            count, tapped_s = len(bench.sprayer.orders), time.monotonic()
+            await page.locator("#stop").tap()
+            await bench.until(lambda: not is_open(bench))
+            closed_s = max(one.at_s for one in bench.sprayer.orders[count:])
+            await shows(page, "estop")
+            return closed_s - tapped_s
+
+        assert await quickest(closing_s, within_s=STOP_WITHIN_S, tries=2) <= STOP_WITHIN_S
+        stopped = len(bench.sprayer.orders)
+        await self.land()
+        assert all(one.pulse_us <= CLOSED_US for one in bench.sprayer.orders[stopped:])
+
+    async def land(self, within_s: float = 90.0) -> None:
+        await self.bench.until(lambda: not self.bench.stub.flight.armed, within_s=within_s)
+
+    async def plan_the_rest(self) -> None:
+        """Follow the report's link: what is left is planned on the same maps."""
+        await self.page.get_by_role("link", name="Plan what is left").click()
+        await self.is_ready("office")
+        assert (await self.page.locator("#done").input_value()).startswith("flight-")
+        await self.page.locator("#speed_m_s").fill("5")
+        await plan_and_upload(self.page)
+
+    async def release(self) -> None:
+        await self.open()
+        await shows(self.page, "estop")
+        await press(self.page, "#enable")
+
+
+@pytest.mark.timeout(400)
+async def test_a_field_is_loaded_planned_flown_stopped_continued_and_reported(
+    tmp_path: Path,
+) -> None:
+    config, files = write_maps(tmp_path, two_zones())
+    port = free_port(socket.SOCK_STREAM)
+    async with vehicle_bench("ardupilot", config) as bench, chromium(ARGUMENTS) as browser:
+        web = (
+            "web.enabled=true", f"web.port={port}", 'safety.enable_by=["web"]',
+            f"web.upload_link={bench.url}",
+        )  # fmt: skip
+        page = await browser.new_page(viewport={"width": 390, "height": 844}, has_touch=True)
+        day = Day(bench, page, f"http://127.0.0.1:{port}/")
+        day.watch()
+        async with companion_of(bench, *web):
+            await bench.until(lambda: "link up" in bench.said, within_s=60.0)
+            await day.load_and_check(files)
+            await plan_and_upload(page)
+        assert len(bench.stub.flight.items) >= 6
+        bench.said = ""
+        async with companion_of(bench, *web, *planned(tmp_path)):
+            await bench.until(lambda: "link up" in bench.said, within_s=60.0)
+            await day.open()
+            await day.take_off()
+            await day.stop()
+            assert 0.4 * FIELD_HA < await left_ha(page) <= FIELD_HA + ROUNDED_HA
+            await day.plan_the_rest()
+            await day.release()
+            await day.take_off()
+            await day.land()
+            assert await left_ha(page) <= 0.1 * FIELD_HA
+            async with page.context.expect_page() as loading:
+                await page.get_by_role("link", name="Open the report").click()
+            report = await loading.value
+            await report.get_by_role("heading", level=1).wait_for()
+            assert "SIMULATED" in await report.title()
+        assert {urlsplit(url).netloc for url in day.requests} == {f"127.0.0.1:{port}"}
+        assert not day.troubles
+    assert bench.truth.summary()["volume_l"] == pytest.approx(PRESCRIBED_L, rel=0.15)
+
+
+def planned(folder: Path) -> tuple[str, ...]:
+    """Return the settings by which a flight follows what the page has planned."""
+    flight_map = next(folder.rglob("field.flightmap.gpkg"))
+    lines = flight_map.with_name("field.lines.geojson")
+    return f"prescription.file={flight_map}", f"mission.lines={lines}"
