@@ -18,7 +18,12 @@ ALLOWED = {
     "pymavlink": ("companion/link", "sitl/stub"),
     "mavsdk": ("missions/upload/",),
     "serial": ("companion/link", "sitl/stub"),
-    "pydantic": ("companion/config", "companion/web/server.py", "missions/web/office.py"),
+    "pydantic": (
+        "companion/config",
+        "companion/web/server.py",
+        "missions/web/office.py",
+        "analysis/web/flights.py",
+    ),
     "shapefile": ("missions/maps", "analysis/exports/"),
 }
 CORE_ALLOWED = {
