@@ -50,9 +50,8 @@ def plots() -> list[tuple[Box, float]]:
 
 
 async def kept(page: Page, path: Path) -> None:
-    """Keep a picture."""
+    """Keep a picture; it is made smaller later, as the stub flies in this process."""
     await page.screenshot(path=path)
-    smaller(path)
 
 
 def smaller(path: Path) -> None:
@@ -122,6 +121,8 @@ def main() -> int:
     out = parser.parse_args().out
     with tempfile.TemporaryDirectory() as folder:
         asyncio.run(drawn(out, Path(folder)))
+    for path in sorted(out.glob("operators-page-*.png")):
+        smaller(path)
     return 0
 
 
