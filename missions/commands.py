@@ -9,6 +9,11 @@ MAP = Command(
     # A flight waits for a map to be compiled.
     hastes={"rate": "quick", "new": "quick", "offset": "quick", "compile": "at-once"},
 )
+MAKE = Command(
+    target="missions.make.cli:app",
+    help="Make prescriptions from a field's data.",
+    haste="patient",
+)
 PLAN = Command(
     target="missions.cli:app",
     help="Plan the passes over a field, sortie by sortie.",

@@ -117,6 +117,15 @@ def grid_of(cells: MapCells, frame: LocalFrame, path: Path) -> CellGrid:
     return CellGrid(kinds, rates, to_frame, to_cells)
 
 
+def to_cells_of(
+    transform: Affine, crs: CRS, shape: tuple[int, int], frame: LocalFrame, path: Path
+) -> Warp:
+    """Return the way from metres of the frame to column and row of a raster of any values."""
+    cells = MapCells(rates_l_ha=np.broadcast_to(0.0, shape), transform=transform, crs=crs)
+    check_place(cells, path)
+    return _fitted(cells, frame, path, flipped=False)[1]
+
+
 def cell_areas_m2(cells: MapCells, frame: LocalFrame) -> Floats:
     """Return the area of every cell (rows, columns), by its four corners in the frame."""
     rows, columns = cells.rates_l_ha.shape

@@ -251,6 +251,11 @@ def read_records(path: Path, *, crs: str | None = None, layer: str | None = None
     ]
 
 
+def read_layer(path: Path, *, layer: str | None = None) -> Layer | Grid:
+    """Return what stands in a file, before anybody makes sense of it as rates."""
+    return _read(Path(path), layer)
+
+
 def _no_grid(layer: Layer | Grid, path: Path) -> Layer:
     if isinstance(layer, Grid):
         raise map_error(

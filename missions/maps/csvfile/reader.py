@@ -71,6 +71,29 @@ def read_csv(path: Path, layer: str | None = None) -> Layer | Grid:
     return _grid(table, place, sha256)
 
 
+def read_point_table(path: Path) -> tuple[Floats, CRS | None, dict[str, Floats]] | None:
+    """Return the points (x, y) of a CSV, their CRS where it says it, and its numbers by column.
+
+    None for a file of polygons.
+    """
+    content = read_bytes(path)
+    table = read_table(content, path, wanted=lambda names: bool(_place_columns(names)))
+    place = _place_columns(tuple(table.columns))
+    if len(place) == 1:
+        if any(map(_AREA.match, table.columns[place[0]])):
+            return None
+        place = _place_columns([name for name in table.columns if name not in place]) or place
+    if len(place) == 1:
+        return None
+    x, y = (_coordinates(table, name) for name in place)
+    in_degrees = _letters(place[0]) in _LONGITUDE
+    if in_degrees:
+        _check_degrees(table, x, y)
+    found = {name: table.numbers(name) for name in table.columns if name not in place}
+    numbers = {name: values for name, values in found.items() if values is not None}
+    return np.column_stack([x, y]), WGS84 if in_degrees else None, numbers
+
+
 def _place_columns(names: Sequence[str]) -> tuple[str, ...]:
     """Return the column of polygons, or those of x (longitude) and y, or nothing."""
     for kinds in ((_WKT,), (_LONGITUDE, _LATITUDE), (_X, _Y)):

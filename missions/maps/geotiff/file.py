@@ -72,8 +72,13 @@ def gdal(path: Path) -> Any:
     return rasterio
 
 
-def read_raster(content: bytes, path: Path, *, layer: str | None, described: bool) -> Raster:
-    """Return all bands of a GeoTIFF; `described`: another file says what each of them is."""
+def read_raster(
+    content: bytes, path: Path, *, layer: str | None, described: bool, colours: bool = False
+) -> Raster:
+    """Return all bands of a GeoTIFF; `described`: another file says what each of them is.
+
+    With `colours` they may be those of a camera: they are no rates then, but measurements.
+    """
     if not content.startswith(_MAGIC):
         raise map_error(
             path, "this is no TIFF file", fix="export the map again as GeoTIFF",
@@ -82,7 +87,7 @@ def read_raster(content: bytes, path: Path, *, layer: str | None, described: boo
     with _opened(content, path, layer) as source:
         _check_size(source, path)
         _check_numbers(source, path)
-        if not described:
+        if not described and not colours:
             _check_no_picture(source, path)
         crs, transform = _crs(source, path), _transform(source, path)
         tags = {name.casefold(): text for name, text in source.tags().items()}

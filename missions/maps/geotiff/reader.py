@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from missions.maps.adapt.catalogue import Operation, described_beside
 from missions.maps.bundle import Bundle, files_beside
 from missions.maps.geotiff.bands import (
@@ -25,6 +27,9 @@ from missions.maps.geotiff.file import Raster, read_raster
 from missions.maps.layer import Band, Grid, digest
 from missions.maps.model import Affine, Problem, map_error
 
+# What programs fill with lies below and above all indices, reflectances and yields.
+FILL_LEAST, FILL_MOST = 5_000.0, 65_000.0
+
 
 def read_geotiff(path: Path, layer: str | None = None) -> Grid:
     """Return what a GeoTIFF holds; `layer` is the number of one of several pictures in it."""
@@ -35,6 +40,39 @@ def read_geotiff(path: Path, layer: str | None = None) -> Grid:
     operation, content = found
     return grid_of_tiff(
         bundle, path.name, format="adapt", operation=operation, also={"adapt.json": content}
+    )
+
+
+def read_bands(path: Path, layer: str | None = None) -> Grid:
+    """Return the bands of a GeoTIFF as measurements, which are no rates and may be negative."""
+    bundle = files_beside(path)
+    content = bundle.read(path.name)
+    raster = read_raster(content, path, layer=layer, described=False, colours=True)
+    if not raster.bands:
+        raise map_error(
+            path, "it has no band of values", fix="export the raster again", code="no-rate-column"
+        )
+    for one in raster.bands:
+        values = one.band.values
+        if one.fault is None or one.fault.code != "nodata-undeclared":
+            continue
+        # A fill is far from all measurements; a single negative index is one.
+        if not float(np.nanmin(values)) >= -FILL_LEAST or float(np.nanmax(values)) > FILL_MOST:
+            raise one.fault
+    rows, columns = raster.bands[0].band.values.shape
+    name = world_file_of(bundle, path.name)
+    world = None
+    if name is not None:
+        alone = raster.transform is None
+        world = parse_world_file(bundle.read(name), bundle.path / name, alone=alone)
+    transform, moved = _placed(raster, world, (rows, columns), path)
+    return Grid(
+        format="geotiff",
+        crs=raster.crs,
+        transform=transform,
+        bands=_told_apart([one.band for one in raster.bands]),
+        sha256=digest([content]),
+        problems=(*moved, *(problem for one in raster.bands for problem in one.problems)),
     )
 
 

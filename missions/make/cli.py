@@ -1,0 +1,515 @@
+"""`vrspray make`: prescriptions from a field's data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, get_args
+
+import numpy as np
+import typer
+from shapely import MultiPolygon
+
+from companion.assembly import flow_range
+from companion.cli.answer import AsJson, answer, note, problem_line, problem_object, progress
+from companion.config import Config, load
+from companion.core.frame import LocalFrame
+from companion.core.nozzle import rate_for_flow
+from companion.errors import ConfigError
+from companion.flight_map import is_flight_map
+from companion.problem import Problem
+from companion.wording import counted
+from missions.errors import PlanError
+from missions.layouts import spray_lines
+from missions.make.classes import Method
+from missions.make.cleaning import STEPS, Step
+from missions.make.data import INDICES, Values, Wanted, filled, read_values
+from missions.make.passes import Passes, Places, passes_of, places_in
+from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
+from missions.maps.cli.plan import plan_of, sprayer_problems
+from missions.maps.compiling import MapOrder, compile_map, write_flight_map
+from missions.maps.convert.formats import write_map, writer_for
+from missions.maps.layer import digest, read_bytes
+from missions.maps.lint import Sprayer, check_map
+from missions.maps.model import MapFile
+from missions.maps.registry import read_area
+from missions.maps.whole_file import check_folder, not_written
+from missions.reading import Asked, Task, read_task
+
+app = typer.Typer(
+    add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
+    no_args_is_help=True, help="Make prescriptions from a field's data.",
+)  # fmt: skip
+
+# A zone is this much longer than a change takes: for wind, and for the aircraft's own speed.
+MARGIN = 1.5
+BAR_AFTER_S = 2.0
+# Places are finer than the data and than a run, and never so many that they take the memory.
+PLACE_MAX_M, PLACES_MAX = 1.0, 12_000_000
+# More zones are no management zones any more.
+ZONES_MAX = 20
+
+
+@app.callback()
+def _make() -> None:
+    """Make prescriptions from a field's data."""
+
+
+@app.command(
+    epilog="Example: vrspray make zones ndvi.tif --value NDVI --boundary field.geojson "
+    "--config field.toml --rates 24,18,12 --out field.gpkg"
+)
+def zones(
+    data: Annotated[
+        list[Path], typer.Argument(metavar="DATA...", help="Raster, points or polygons.")
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="The map; its suffix says the format.")
+    ],
+    config_file: Annotated[
+        Path, typer.Option("--config", metavar="FILE", help="Configuration of the flight.")
+    ],
+    rates: Annotated[
+        str | None,
+        typer.Option(metavar="R,R,...", help="L/ha of each zone, lowest values first."),
+    ] = None,
+    law: Annotated[
+        str | None,
+        typer.Option(metavar="V:R,V:R,...", help="L/ha by value, straight lines between."),
+    ] = None,
+    litres_max: Annotated[
+        float | None, typer.Option(metavar="L", help="Lower all rates to this total.", min=0.001)
+    ] = None,
+    count: Annotated[
+        int | None,
+        typer.Option(
+            "--zones",
+            metavar="K",
+            help="Number of zones; default 4, or one a rate.",
+            min=1,
+            max=ZONES_MAX,
+        ),
+    ] = None,
+    method: Annotated[
+        str, typer.Option(metavar="M", help=f"{', '.join(get_args(Method))}.")
+    ] = "jenks",
+    value: Annotated[
+        list[str] | None,
+        typer.Option(metavar="V", help="Band, index or column; one, or one for each DATA."),
+    ] = None,
+    band: Annotated[
+        list[str] | None,
+        typer.Option(metavar="COLOUR=B", help="Which band is nir, red, green, rededge or swir."),
+    ] = None,
+    band_offset: Annotated[
+        float, typer.Option(metavar="D", help="Added to bands; Sentinel-2 since 2022: -1000.")
+    ] = 0.0,
+    boundary: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Field outline; default: prescription.boundary."),
+    ] = None,
+    no_spray: Annotated[
+        list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
+    ] = None,
+    angle_deg: Annotated[
+        float | None,
+        typer.Option(metavar="DEG", help="Course of the passes; default: as vrspray plan."),
+    ] = None,
+    smooth_m: Annotated[
+        float,
+        typer.Option(
+            metavar="M", help="Most common zone within so many metres.", min=0.0, max=500.0
+        ),
+    ] = 0.0,
+    margin: Annotated[
+        float,
+        typer.Option(metavar="X", help="Times the length that a change takes.", min=1.0, max=20.0),
+    ] = MARGIN,
+    step_percent: Annotated[
+        float,
+        typer.Option(metavar="PCT", help="Rates closer than this become one.", min=0.0, max=100.0),
+    ] = 8.0,
+    clean: Annotated[
+        str | None,
+        typer.Option(metavar="S,S,...", help=f"Steps for points: {', '.join(STEPS)}, or none."),
+    ] = None,
+    data_width_m: Annotated[
+        float | None, typer.Option(metavar="M", help="Between passes of points.", min=0.1)
+    ] = None,
+    ends_m: Annotated[
+        float | None,
+        typer.Option(metavar="M", help="Left out at both ends of a pass of points.", min=0.0),
+    ] = None,
+    as_is: Annotated[
+        bool, typer.Option("--as-is", help="Without the sprayer's limits, to compare.")
+    ] = False,
+    crs: Annotated[
+        str | None, typer.Option(metavar="C", help="Of DATA, where it does not say.")
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option(metavar="L", help="Of DATA, where there are several.")
+    ] = None,
+    png: Annotated[
+        Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
+    ] = None,
+    format_name: Annotated[
+        str | None,
+        typer.Option("--format", metavar="F", help="Where the suffix can hold several."),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Make zones that the sprayer can follow, and say what its limits cost.
+
+    Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
+    """
+    config = load(config_file)
+    wish = _wish(rates, law, litres_max, count, method, smooth_m, step_percent)
+    if as_is and is_flight_map(out):
+        raise typer.BadParameter("--as-is is to compare, not to fly: name another format")
+    target = _target(out)
+    writer = writer_for(target, format_name)
+    for path in (out, *([] if png is None else [png])):
+        check_folder(path)
+    wanted = _wanted(
+        data, value or [],
+        Wanted(
+            bands=_bands(band or []), band_offset=band_offset, crs=crs, layer=layer,
+            steps=_steps(clean), width_m=data_width_m, ends_m=ends_m,
+        ),
+    )  # fmt: skip
+    with progress(after_s=BAR_AFTER_S) as tell:
+        tell("planning the passes", 0, 4)
+        field = _field(config, boundary, no_spray or [], angle_deg)
+        tell("reading the data", 1, 4)
+        read = [read_values(path, one, field.frame) for path, one in zip(data, wanted, strict=True)]
+        limits = None if as_is else _limits(config, field.sprayer, margin)
+        places = _places(field, read, limits or _limits(config, field.sprayer, margin), as_is, out)
+        layers, missing = [], 0.0
+        for path, values in zip(data, read, strict=True):
+            whole, share = filled(values.at(places), places, path)
+            layers.append(whole)
+            missing = max(missing, share)
+        tell("making the zones", 2, 4)
+        made = make_zones(np.array(layers), places, wish, limits)
+        tell("writing the map", 3, 4)
+        map_file = _map_file(made, field, target, data, as_is)
+        problems = _problems(map_file, config, field)
+        files = _written(map_file, out, target, config, field, problems, writer.name, force=force)
+    if png is not None:
+        from missions.maps.picture.draw import draw
+
+        draw(map_file, png, title=out.name)
+    result = _result(made, read, field, limits, missing, problems, files)
+    for problem in result["problems"]:
+        note(problem_line(problem))
+    answer(result, _lines(result, made, read), as_json=as_json)
+    raise typer.Exit(0 if result["ok"] else 1)
+
+
+# What is asked.
+
+
+def _numbers(text: str, option: str) -> list[float]:
+    try:
+        found = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise typer.BadParameter(
+            f"{option} takes numbers with commas between, not {text!r}"
+        ) from None
+    if not all(math.isfinite(one) for one in found):
+        raise typer.BadParameter(f"{option} takes finite numbers, not {text!r}")
+    return found
+
+
+def _wish(
+    rates: str | None, law: str | None, litres_max: float | None, count: int | None, method: str,
+    smooth_m: float, step_percent: float,
+) -> Wish:  # fmt: skip
+    if method not in get_args(Method):
+        raise typer.BadParameter(f"--method is one of {', '.join(get_args(Method))}")
+    if (rates is None) == (law is None):
+        raise typer.BadParameter("give the rates, either with --rates or with --law")
+    table = [] if rates is None else _numbers(rates, "--rates")
+    points = [] if law is None else _law(law)
+    for rate in (*table, *(rate for _, rate in points)):
+        if not 0.0 <= rate < 10_000.0:
+            raise typer.BadParameter(f"{rate:g} L/ha is no rate")
+    number = count or (len(table) if table else 4)
+    if (table and len(table) != number) or number > ZONES_MAX:
+        raise typer.BadParameter(
+            f"--rates gives {len(table)} rates for {number} zones: one for each, at most "
+            f"{ZONES_MAX}"
+        )
+    return Wish(
+        count=number, method=method, rates_l_ha=tuple(table), law=tuple(points),  # type: ignore[arg-type]
+        litres_max=litres_max, smooth_m=smooth_m, step_percent=step_percent,
+    )  # fmt: skip
+
+
+def _law(text: str) -> list[tuple[float, float]]:
+    pairs = [part.split(":") for part in text.split(",")]
+    if any(len(pair) != 2 for pair in pairs):
+        raise typer.BadParameter(f"--law takes value:rate with commas between, not {text!r}")
+    points = [tuple(_numbers(",".join(pair), "--law")) for pair in pairs]
+    points.sort()
+    if len({at for at, _ in points}) < max(len(points), 2):
+        raise typer.BadParameter("--law takes two or more different values")
+    return points  # type: ignore[return-value]
+
+
+def _bands(given: Sequence[str]) -> dict[str, str]:
+    found = {}
+    for text in given:
+        name, _, number = text.partition("=")
+        colours = sorted({colour for pair in INDICES.values() for colour in pair})
+        if name.casefold() not in colours or not number:
+            raise typer.BadParameter(
+                f"--band takes COLOUR=BAND with a colour of {', '.join(colours)}, not {text!r}"
+            )
+        found[name.casefold()] = number
+    return found
+
+
+def _steps(clean: str | None) -> tuple[Step, ...] | None:
+    if clean is None:
+        return None
+    names = [] if clean == "none" else clean.split(",")
+    unknown = [name for name in names if name not in STEPS]
+    if unknown:
+        raise typer.BadParameter(f"--clean takes {', '.join(STEPS)} or none, not {unknown[0]!r}")
+    return tuple(step for step in STEPS if step in names)
+
+
+def _wanted(data: Sequence[Path], values: Sequence[str], of_all: Wanted) -> list[Wanted]:
+    if len(values) not in (0, 1, len(data)):
+        raise typer.BadParameter(f"{len(values)} --value for {counted(len(data), 'file')}")
+    names: list[str | None] = [*values] * (len(data) if len(values) == 1 else 1)
+    names = names or [None] * len(data)
+    return [replace(of_all, value=name) for name in names]
+
+
+def _target(out: Path) -> Path:
+    """Return the map that is written: beside a flight map, the one that it is compiled from."""
+    if not is_flight_map(out):
+        return out
+    return out.with_name(out.name.removesuffix(".flightmap.gpkg") + ".gpkg")
+
+
+# The field as it will be flown.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Field:
+    boundary: MultiPolygon
+    boundary_file: Path
+    task: Task
+    passes: Passes
+    sprayer: Sprayer
+
+    @property
+    def frame(self) -> LocalFrame:
+        return self.task.field.frame
+
+
+def _field(
+    config: Config, boundary: Path | None, no_spray: Sequence[Path], angle_deg: float | None
+) -> _Field:
+    """Return the field with its passes, those that `vrspray plan` lays over it."""
+    table = config.prescription
+    named = None if table is None or table.boundary is None else config.resolve(table.boundary)
+    path = boundary or named
+    if path is None:
+        raise ConfigError(
+            f"{config.path}: prescription.boundary: missing; where the field ends is not in the "
+            "data, so name its outline there or with --boundary"
+        )
+    asked = Asked(field=path, rate_l_ha=1.0, no_spray=tuple(no_spray))
+    task = read_task(asked, config, {"angle_deg": angle_deg})
+    lines, course_deg = spray_lines(task.field, task.settings, task.settings.motion)
+    if not len(lines):
+        raise PlanError(f"{path}: no pass of {task.settings.swath_width_m:g} m fits into the field")
+    sprayer = plan_of(config, None)[0].sprayer
+    if sprayer is None:
+        raise ConfigError(f"{config.path}: mission: missing; write at least swath_width_m, speed")
+    return _Field(
+        boundary=read_area(path, repairs=[]),
+        boundary_file=path,
+        task=task,
+        passes=passes_of(lines, course_deg, task.field.limit, task.settings.swath_width_m),
+        sprayer=replace(sprayer, angle_deg=course_deg),
+    )
+
+
+def _limits(config: Config, sprayer: Sprayer, margin: float) -> Limits:
+    width_m, speed = config.boom_table.width_m, sprayer.speed_m_s
+    low, high = flow_range(config.nozzle_sets(), config.pwm_limits())
+    label = config.product.rate_max_l_ha
+    high_l_ha = rate_for_flow(high, speed, width_m)
+    low_l_ha = rate_for_flow(low, speed, width_m)
+    if label is not None and label < low_l_ha:
+        raise ConfigError(
+            f"{config.path}: product.rate_max_l_ha = {label:g}: below the {low_l_ha:.2f} L/ha that "
+            f"the nozzles deliver at least at {speed:g} m/s; fly faster or fit smaller nozzles"
+        )
+    return Limits(
+        least_m=margin * sprayer.length_min_m,
+        low_l_ha=low_l_ha,
+        high_l_ha=high_l_ha if label is None else min(high_l_ha, label),
+    )
+
+
+def _places(
+    field: _Field, read: Sequence[Values], limits: Limits, as_is: bool, out: Path
+) -> Places:
+    grain_m = min(values.grain_m for values in read)
+    size_m = min(max(grain_m / 8.0, limits.least_m / 6.0), grain_m, PLACE_MAX_M)
+    ground = field.task.field.limit
+    size_m = max(size_m, math.sqrt(ground.area / PLACES_MAX))
+    passes = field.passes
+    if as_is:
+        # As the data have it, in even rows.
+        count = len(passes.edges_m) - 1
+        even = np.linspace(passes.edges_m[0], passes.edges_m[-1], count + 1)
+        passes = replace(passes, edges_m=even)
+    places = places_in(ground, passes, size_m=size_m, path=out)
+    if not len(places.row):
+        raise PlanError(f"{field.boundary_file}: nothing of the field may be sprayed")
+    return places
+
+
+# What is made of it.
+
+
+def _map_file(
+    made: Made, field: _Field, target: Path, data: Sequence[Path], as_is: bool
+) -> MapFile:
+    found: dict[str, Any] = (
+        {"zones": (), "cells": cells(made, field.frame)}
+        if as_is
+        else {"zones": tuple(polygons(made, field.task.field.limit, field.frame))}
+    )
+    return MapFile(
+        path=target, format="made", crs="EPSG:4326", unit="L/ha", rate_field="rate",
+        sha256=digest([read_bytes(path) for path in data if path.is_file()]),
+        boundary=field.boundary, **found,
+    )  # fmt: skip
+
+
+def _problems(map_file: MapFile, config: Config, field: _Field) -> list[Problem]:
+    """Return what `map check` says of the map, flown as it was made for."""
+    plan, found = plan_of(config, None)
+    plan = replace(plan, boundary=field.boundary, sprayer=field.sprayer)
+    return [
+        *check_map(map_file, overlap="error", plan=plan),
+        *found,
+        *sprayer_problems(config, map_file, plan),
+    ]
+
+
+def _written(
+    map_file: MapFile, out: Path, target: Path, config: Config, field: _Field,
+    problems: Sequence[Problem], format_name: str, *, force: bool,
+) -> list[Path]:  # fmt: skip
+    """Write the map, and beside it the flight map if that is asked for."""
+    files = write_map(
+        map_file, target, format=format_name, force=force,
+        flow_width_m=config.boom_table.width_m, flow_speed_m_s=field.sprayer.speed_m_s,
+    )  # fmt: skip
+    if not is_flight_map(out):
+        return files
+    order = MapOrder.of(config)
+    changes = {"file": str(target.absolute()), "rate_field": None, "unit": None, "layer": None,
+               "sha256": None, "boundary": str(field.boundary_file.absolute())}  # fmt: skip
+    order = replace(order, table=order.table.model_copy(update=changes))
+    try:
+        write_flight_map(out, compile_map(order, findings=problems))
+    except OSError as error:
+        raise not_written(out, error) from None
+    return [out, *files]
+
+
+def _result(
+    made: Made, read: Sequence[Values], field: _Field, limits: Limits | None, missing: float,
+    problems: Sequence[Problem], files: Sequence[Path],
+) -> dict[str, Any]:  # fmt: skip
+    ok = not any(problem.severity == "error" for problem in problems)
+    return {
+        "ok": ok,
+        "files": [str(path) for path in files],
+        "values": [
+            {"name": one.name, "grain_m": one.grain_m, "points": one.count,
+             "removed": None if one.removed is None else dict(one.removed)}
+            for one in read
+        ],
+        "missing_percent": 100.0 * missing,
+        "course_deg": field.passes.angle_deg,
+        "aligned_percent": field.passes.aligned_percent,
+        "least_m": None if limits is None else limits.least_m,
+        "rates_min_l_ha": None if limits is None else limits.low_l_ha,
+        "rates_max_l_ha": None if limits is None else limits.high_l_ha,
+        "zones": [
+            {"rate_l_ha": rate, "mean_value": mean, "area_ha": area_ha}
+            for rate, mean, area_ha in zip(
+                made.rates_l_ha, made.means, made.areas_ha, strict=True
+            )
+        ],
+        "breaks": list(made.breaks),
+        "steps": [asdict(step) for step in made.steps],
+        "litres": made.litres,
+        "ideal_litres": made.ideal_l,
+        "misapplied_litres": made.misapplied_l,
+        "misapplied_percent": made.misapplied_percent,
+        "short_ha": made.short_ha,
+        "notes": list(dict.fromkeys((*made.notes, *(text for one in read for text in one.said)))),
+        "problems": [problem_object(problem) for problem in problems],
+    }  # fmt: skip
+
+
+def _lines(result: dict[str, Any], made: Made, read: Sequence[Values]) -> list[str]:
+    lines = []
+    for one in read:
+        removed = {name: count for name, count in (one.removed or {}).items() if count}
+        if one.count is not None:
+            shown = ", ".join(f"{name} {count}" for name, count in removed.items()) or "none"
+            left = one.count - sum(removed.values())
+            lines.append(f"{one.name}: {left} of {one.count} points kept; removed: {shown}")
+    if result["missing_percent"] > 0.0:
+        lines.append(
+            f"{result['missing_percent']:.1f} % of the field has no data: it takes the nearest"
+        )
+    if result["least_m"] is None:
+        lines.append("as the data have it, without the sprayer's limits: to compare, not to fly")
+    else:
+        lines.append(
+            f"course {result['course_deg']:g} deg; zones at least {result['least_m']:.2f} m along "
+            f"the passes, {result['rates_min_l_ha']:.2f} to {result['rates_max_l_ha']:.2f} L/ha"
+        )
+    lines += [
+        f"zone {number}: {zone['rate_l_ha']:g} L/ha on {zone['area_ha']:.4f} ha, "
+        f"{read[0].name} {zone['mean_value']:.4g} on average"
+        for number, zone in enumerate(result["zones"], 1)
+    ]
+    lines += [
+        f"{step.name}: {step.changed_ha:.4f} ha changed, {step.moved_l:.2f} L moved; "
+        f"{step.variance_kept_percent:.1f} % of the variance kept"
+        for step in made.steps
+    ]
+    lines += result["notes"]
+    lines.append(
+        f"{made.litres:.1f} L; the data ask for {made.ideal_l:.1f} L, and "
+        f"{made.misapplied_percent:.1f} % of that lies elsewhere"
+    )
+    if result["least_m"] is not None and result["aligned_percent"] < 99.95:
+        lines.append(
+            f"{100 - result['aligned_percent']:.1f} % of the planned passes are flown across these "
+            "zones or beside their middle: along the border, or in parts side by side"
+        )
+    if made.short_ha >= 5e-5:
+        lines.append(
+            f"{made.short_ha:.4f} ha at corners of the field are shorter than a zone, and take one"
+        )
+    lines += [f"written: {name}" for name in result["files"]]
+    return lines
