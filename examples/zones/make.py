@@ -10,13 +10,14 @@
 - `soil.csv`, samples of electrical conductivity on a loose grid;
 - `scouted.geojson`, polygons with a score of weeds.
 
-The same seed makes the same files. `config.toml` beside this script is a sprayer for it.
+The same seed makes the same files. `config.toml`, a sprayer for it, is copied beside them.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ import rasterio
 import shapely
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
-from rasterio.transform import from_origin
+from rasterio.transform import Affine
 
 Floats = NDArray[np.float64]
 Ground = Any  # a polygon or several
@@ -103,7 +104,7 @@ def raster(path: Path, ground: Ground, utm: CRS, cell_m: float, gap_m: float) ->
     values[:, np.hypot(x - middle.x - 30.0, y - middle.y - 20.0) < gap_m] = 0
     with rasterio.open(
         path, "w", driver="GTiff", width=columns, height=rows, count=len(BANDS), dtype="uint16",
-        crs=utm.to_wkt(), transform=from_origin(west, north, cell_m, cell_m), nodata=0,
+        crs=utm.to_wkt(), transform=Affine(cell_m, 0.0, west, 0.0, -cell_m, north), nodata=0,
         compress="deflate",
     ) as target:  # fmt: skip
         target.write(values)
@@ -153,6 +154,7 @@ def harvest(ground: Ground) -> list[tuple[float, float, float, float, str]]:
 def main(folder: Path, given: Path | None = None) -> None:
     """Write all files."""
     folder.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(Path(__file__).with_name("config.toml"), folder / "config.toml")
     if given is None:
         local = CRS.from_proj4(
             f"+proj=tmerc +lat_0={LATITUDE_DEG} +lon_0={LONGITUDE_DEG} +k=1 +datum=WGS84"

@@ -21,7 +21,7 @@ Method = Literal["jenks", "quantiles", "equal", "kmeans"]
 # less than any sensor tells apart.
 BINS = 4096
 # k-means learns from so many places, chosen by a fixed seed, and starts so many times.
-LEARNT_FROM, STARTS, ROUNDS_MAX = 50_000, 8, 100
+LEARNT_FROM, STARTS, ROUNDS_MAX = 5_000, 25, 100
 
 
 class Classes(NamedTuple):

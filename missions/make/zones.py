@@ -32,6 +32,8 @@ STEPS_A_RUN = 8
 EDGE_MAX_M = 100.0
 # Less is a sliver between a band and the border, and goes to its neighbour.
 SMALL_M2 = 1.0
+# What rounding leaves between two polygons that meet, and the grid on which their corners lie.
+NOTHING_M2, GRID_M = 1e-3, 1e-4
 # Rates are written with two decimals: a hundredth of a litre is below any nozzle.
 DECIMALS = 2
 # The search for the factor that meets a total of litres ends well below a millilitre.
@@ -394,7 +396,8 @@ def polygons(made: Made, ground: BaseGeometry, frame: LocalFrame) -> list[MapZon
         parts = polygons_of(shapely.intersection(area, turned))
         found.append((number, MultiPolygon([one for one in parts if one.area >= SMALL_M2])))
         taken = shapely.union(taken, found[-1][1])
-    rest = polygons_of(shapely.difference(turned, taken))
+    beyond = polygons_of(shapely.difference(turned, taken))
+    rest = [one for one in beyond if one.area >= NOTHING_M2]
     return _with_rest(made, found, rest, passes, frame)
 
 
@@ -447,7 +450,8 @@ def _with_rest(
             parts[numbers[int(np.lexsort((nearest, -shared))[0])]].append(piece)
     zones = []
     for number in numbers:
-        area = MultiPolygon(polygons_of(shapely.union_all(np.array(parts[number], dtype=object))))
+        united = shapely.union_all(np.array(parts[number], dtype=object))
+        area = MultiPolygon(polygons_of(shapely.set_precision(united, GRID_M)))
         if area.is_empty:
             continue
         local = shapely.transform(shapely.segmentize(area, EDGE_MAX_M), passes.back)

@@ -10,6 +10,8 @@ import json
 import re
 import shlex
 import shutil
+import subprocess
+import sys
 import tomllib
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -131,6 +133,8 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for one in (ROOT / "examples" / "anyang").iterdir():
         if one.is_file():
             shutil.copy(one, folder / one.name)
+    make = [sys.executable, "examples/zones/make.py", "data"]
+    subprocess.run(make, cwd=folder, check=True)
     lines = (folder / "mission.waypoints").read_text().splitlines()
     (folder / "short.waypoints").write_text("\n".join(lines[:5]) + "\n")  # one pass of four
     config = ["--config", "examples/anyang/config.toml"]
