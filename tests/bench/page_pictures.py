@@ -21,7 +21,7 @@ from PIL import Image
 from playwright.async_api import Page
 
 from tests.companion.realtime.client_bench import companion_of, vehicle_bench
-from tests.companion.realtime.test_operators_page import chromium, shows
+from tests.companion.realtime.test_operators_page import WITHOUT_WEBGL, chromium, shows
 from tests.companion.wire_peer import free_port
 from tests.missions.realtime.test_page_field import (
     Box,
@@ -66,12 +66,17 @@ async def drawn(out: Path, folder: Path) -> None:
     config, files = write_maps(folder, plots())
     port = free_port(socket.SOCK_STREAM)
     area_ha = (PLOTS * PLOT_M) ** 2 / 10_000.0
-    async with vehicle_bench("ardupilot", config) as bench, chromium() as browser:
+    # In flight the simple map is drawn: WebGL without a graphics card takes the cores of the stub.
+    async with (
+        vehicle_bench("ardupilot", config) as bench,
+        chromium() as office,
+        chromium(WITHOUT_WEBGL) as browser,
+    ):
         web = (
             "web.enabled=true", f"web.port={port}", 'safety.enable_by=["web"]',
             f"web.upload_link={bench.url}",
         )  # fmt: skip
-        page = await browser.new_page(viewport={"width": 1280, "height": 1000})
+        page = await office.new_page(viewport={"width": 1280, "height": 1000})
         day = Day(bench, page, f"http://127.0.0.1:{port}/")
         day.watch()
         async with companion_of(bench, *web):
@@ -82,16 +87,17 @@ async def drawn(out: Path, folder: Path) -> None:
             await page.locator("#plan").scroll_into_view_if_needed()
             await page.locator("#answer").wait_for(state="hidden")
             await kept(page, out / "operators-page-plan.png")
+            await page.close()
         bench.said = ""
         async with companion_of(bench, *web, *planned(folder)):
             await bench.until(lambda: "link up" in bench.said, within_s=60.0)
-            phone = page
-            await phone.set_viewport_size({"width": 390, "height": 844})
+            phone = await browser.new_page(viewport={"width": 390, "height": 844})
+            day = Day(bench, phone, day.place)
+            day.watch()
             await day.open()
             desk = await browser.new_page(viewport={"width": 1280, "height": 800})
             desk.set_default_timeout(120_000)
             await desk.goto(day.place)
-            await day.is_ready("map")
             await desk.wait_for_function("() => 'map' in document.body.dataset")
             await day.take_off()
             await desk.wait_for_function(
@@ -104,14 +110,19 @@ async def drawn(out: Path, folder: Path) -> None:
                     await one.emulate_media(color_scheme=scheme)
                     await one.evaluate("() => scrollTo(0, 0)")
                     await shows(one, "spraying")
+                    await one.wait_for_function(
+                        "() => parseFloat(document.getElementById('numbers').textContent"
+                        ".split('Ground speed')[1]) >= 4.8"
+                        " && document.getElementById('n-actual').textContent > '10'"
+                    )
                     await kept(one, out / f"operators-page-{name}-{light}.png")
             await desk.close()
-            await page.emulate_media(color_scheme="light")
+            await phone.emulate_media(color_scheme="light")
             await day.land(within_s=300.0)
-            await page.get_by_role("link", name="Report, and what is left").click()
-            await page.locator("#report .verdict").wait_for()
-            await idle(page)
-            await kept(page, out / "operators-page-report.png")
+            await phone.get_by_role("link", name="Report, and what is left").click()
+            await phone.locator("#report .verdict").wait_for()
+            await idle(phone)
+            await kept(phone, out / "operators-page-report.png")
 
 
 def main() -> int:

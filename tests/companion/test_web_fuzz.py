@@ -17,7 +17,7 @@ async def test_no_request_makes_the_page_fail(tmp_path: Path) -> None:
     async with served(tmp_path, is_local=False) as site:
         place = f"http://127.0.0.1:{site.port}"
         schema = await site.asked("GET", "/api/v1/openapi.json")
-        names = ("stop", "enable", "state", "office/plan", "office/files/{name}")
+        names = ("stop", "enable", "state", "office/plan", "office/files/{name}", "flights/report")
         assert set(schema.json["paths"]) >= {f"/api/v1/{name}" for name in names}
         process = await asyncio.create_subprocess_exec(
             *(str(Path(sys.executable).with_name("st")), "run", f"{place}/api/v1/openapi.json"),

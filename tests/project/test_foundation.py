@@ -313,8 +313,9 @@ def test_compose_file_names_commands_that_there_are() -> None:
     config = re.search(r"--config=(\S+)", text)
     assert config is not None
     assert (ROOT / config[1]).exists()
-    given = re.findall(r"--set=(\S+?)=", text)
-    assert given == ["link.url", "journal.folder"]
+    given = re.findall(r"--set=(\S+?)=", text)  # also in quotes
+    assert given[:3] == ["link.url", "journal.folder", "link.state_folder"]
+    assert given[3:] == ["web.enabled", "web.host", "web.names"]
 
 
 # ------------------------------------------------------------------------------- nothing is left

@@ -27,9 +27,9 @@ from tests.companion.realtime.client_bench import (
     vehicle_bench,
 )
 from tests.companion.realtime.test_operators_page import (
-    ARGUMENTS,
     CHROMIUM,
     STOP_WITHIN_S,
+    WITHOUT_WEBGL,
     chromium,
     press,
     shows,
@@ -216,7 +216,7 @@ async def test_a_field_is_loaded_planned_flown_stopped_continued_and_reported(
 ) -> None:
     config, files = write_maps(tmp_path, two_zones())
     port = free_port(socket.SOCK_STREAM)
-    async with vehicle_bench("ardupilot", config) as bench, chromium(ARGUMENTS) as browser:
+    async with vehicle_bench("ardupilot", config) as bench, chromium(WITHOUT_WEBGL) as browser:
         web = (
             "web.enabled=true", f"web.port={port}", 'safety.enable_by=["web"]',
             f"web.upload_link={bench.url}",
