@@ -73,7 +73,8 @@ def load(name: str, target: str | EntryPoint) -> Any:
         VrsprayError: where it is not installed.
     """
     try:
-        if isinstance(target, EntryPoint):
+        # Not by its class: some libraries put another one in the place of the standard one.
+        if not isinstance(target, str):
             return target.load()
         module_name, _, attribute = target.partition(":")
         return getattr(import_module(module_name), attribute)

@@ -3,6 +3,7 @@
     VrsprayError
      +-- ConfigError      the operator's file is wrong: the message names file, key, value and fix
      +-- MapError         a prescription cannot be used
+     +-- StoppedError     the user interrupted work that is kept
      +-- LinkError        the link to the autopilot cannot be opened or was lost
      +-- ActuatorError    the valve driver refused or did not answer
      +-- SensorError      a sensor that the configuration names is not to be had
@@ -50,6 +51,10 @@ class MapError(VrsprayError):
         super().__init__(text)
         self.code = code
         self.fix = fix
+
+
+class StoppedError(VrsprayError):
+    """The user interrupted; the message says what is kept and how it goes on."""
 
 
 class LinkError(VrsprayError):

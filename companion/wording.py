@@ -7,7 +7,7 @@ from pathlib import PurePath
 from typing import Literal
 
 # What a computer is for: the extras of pyproject.toml.
-Role = Literal["vehicle", "office"]
+Role = Literal["vehicle", "office", "campaign", "cluster"]
 
 
 def counted(count: int, name: str) -> str:

@@ -7,6 +7,12 @@ DEMO = Command(
     help="Simulate the field of Wang et al. 2024 with all methods; compare.",
     haste="patient",
 )
+CAMPAIGN = Command(
+    target="sitl.campaign.cli:app",
+    help="Fly many simulated flights over settings; show what they say.",
+    haste="patient",
+    hastes={"show": "quick"},
+)
 SITL = Command(
     target="sitl.cli:app",
     help="Simulate a flight controller and sprayer.",

@@ -43,22 +43,13 @@ from sitl.own_method import load_controller
 from sitl.profile import FlowLaw, PlantProfile, load_profile
 from sitl.valve_calibration import calibrate_valves, with_figures
 from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
+from sitl.workers import do_all
 
 if TYPE_CHECKING:
     from analysis.flight_record import FlightRecord
     from companion.core.frame import LocalFrame
     from companion.core.setup import Setup
 
-
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
-from multiprocessing.connection import Connection
-from typing import TypeVar
 
 __all__ = [
     "METHODS",
@@ -450,98 +441,3 @@ def _fly(
         observer=None if journal is None else journal.record_decision,
         on_input=None if journal is None else journal.record_input,
     )
-
-
-# Several pieces of work at a time, each in a process; none of them outlives the one that asked.
-
-Work = TypeVar("Work")
-Done = TypeVar("Done")
-
-PROCESSES_MAX = 2
-_SAFE_PATH = "PYTHONSAFEPATH"
-
-
-def do_all(
-    function: Callable[[Work], Done],
-    works: Sequence[Work],
-    *,
-    processes: int | None = None,
-    on_done: Callable[[], None] = lambda: None,
-) -> list[Done]:
-    """Return what `function` makes of each piece of work, in their order.
-
-    One process is this one. By default there are two, where there are cores for them.
-    """
-    if processes is None:
-        processes = min(PROCESSES_MAX, len(os.sched_getaffinity(0)))
-    if processes == 1:
-        return [_told(function(work), on_done) for work in works]
-    with _no_module_of_this_folder(), _pool(processes) as pool:
-        futures: list[Future[Done]] = [pool.submit(function, work) for work in works]
-        for future in as_completed(futures):
-            _told(future.result(), on_done)
-        return [future.result() for future in futures]
-
-
-def _told(done: Done, on_done: Callable[[], None]) -> Done:
-    on_done()
-    return done
-
-
-@contextmanager
-def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Yield processes that end when this block does, however it does, and when we do.
-
-    Each watches one end of a pipe. The other end is ours alone and closes with us, so that even
-    a kill leaves none of them behind.
-    """
-    context = multiprocessing.get_context("spawn")
-    theirs, ours = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(
-        processes, mp_context=context, initializer=_end_with_parent, initargs=(theirs,)
-    )
-    try:
-        with _interrupt_held_back():
-            for _ in range(processes):
-                pool.submit(os.getpid)  # starts the process
-        yield pool
-    except BaseException:
-        ours.close()  # at once: what they are at is of no use to anyone
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-        ours.close()
-        theirs.close()
-
-
-@contextmanager
-def _no_module_of_this_folder() -> Iterator[None]:
-    """Start every Python as with -P: `multiprocessing` starts its own by `-c`, which looks here."""
-    before = os.environ.get(_SAFE_PATH)
-    os.environ[_SAFE_PATH] = "1"
-    try:
-        yield
-    finally:
-        del os.environ[_SAFE_PATH]
-        if before is not None:
-            os.environ[_SAFE_PATH] = before
-
-
-@contextmanager
-def _interrupt_held_back() -> Iterator[None]:
-    """Start processes that Ctrl-C does not reach: they inherit what is blocked, and we do not."""
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-
-def _end_with_parent(lifeline: Connection) -> None:
-    """Begin to watch the pipe; its end is ours."""
-
-    def watch() -> None:
-        lifeline.poll(None)
-        os._exit(1)
-
-    threading.Thread(target=watch, name="lifeline", daemon=True).start()

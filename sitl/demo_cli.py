@@ -7,9 +7,7 @@ import itertools
 import json
 import os
 import shutil
-import signal
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,6 +24,7 @@ from companion.cli.answer import AsJson, answer, note, progress
 from companion.errors import ConfigError
 from companion.wording import install_command
 from sitl.cli import FlowLaw
+from sitl.workers import termination_as_interrupt
 
 if TYPE_CHECKING:
     from sitl.demo import DemoOptions, DemoResult
@@ -100,7 +99,7 @@ def demo_flights(
         controller=controller,
     )
     check(options)
-    with _termination_as_interrupt(), _staging(out) as stage:
+    with termination_as_interrupt(), _staging(out) as stage:
         result = _flown(options, stage, quiet=as_json)
         found = {**result.as_json(), "wall_s": time.perf_counter() - began_s}
         names = _write(result, found, stage)
@@ -181,19 +180,6 @@ def _move(names: Sequence[str], stage: Path, out: Path) -> None:
         raise ConfigError(
             f"--out {out}: cannot be written ({error.strerror}); give a folder that can"
         ) from error
-
-
-@contextmanager
-def _termination_as_interrupt() -> Iterator[None]:
-    """Have SIGTERM end the demo as Ctrl-C does, with nothing left behind."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 # ---------------------------------------------------------------------------------------- the table

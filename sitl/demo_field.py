@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 from companion.config import Config, load
+from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
@@ -31,12 +32,18 @@ def example() -> Config:
 @cache
 def demo_setup(speed_m_s: float) -> Setup:
     """Return the example's set-up with its rates for one speed, and limits that allow the speed."""
-    setup = compiled_setup(example())
+    return at_speed(compiled_setup(example()), speed_m_s)
+
+
+def at_speed(setup: Setup, speed_m_s: float, *, scale: bool = True) -> Setup:
+    """Return a set-up whose limits allow the speed, and whose rates are for it where they scale."""
     limits = replace(
         setup.limits,
         speed_min_m_s=min(setup.limits.speed_min_m_s, 0.5 * speed_m_s),
         speed_max_m_s=max(setup.limits.speed_max_m_s, 1.5 * speed_m_s),
     )
+    if not scale:
+        return replace(setup, limits=limits)
     prescription = scaled(setup.prescription, MAP_SPEED_M_S / speed_m_s)
     return replace(setup, limits=limits, prescription=prescription)
 
@@ -66,10 +73,15 @@ def demo_trajectory(speed_m_s: float, seed: int) -> Trajectory:
     return vehicle.fly_to_end()
 
 
-def demo_route(speed_m_s: float) -> Route:
+def demo_route(
+    speed_m_s: float,
+    frame: LocalFrame | None = None,
+    *,
+    acceleration_m_s2: float = ACCELERATION_M_S2,
+) -> Route:
     """Return the passes over the field, longer where the speed needs more room to be reached."""
-    route = anyang_route(speed_m_s, demo_setup(speed_m_s).frame)
-    more_m = speed_m_s**2 / (2.0 * ACCELERATION_M_S2) + STEADY_M - RUN_OUT_M
+    route = anyang_route(speed_m_s, demo_setup(speed_m_s).frame if frame is None else frame)
+    more_m = speed_m_s**2 / (2.0 * acceleration_m_s2) + STEADY_M - RUN_OUT_M
     if not more_m > 0.0:
         return route
     first = route.legs[0]

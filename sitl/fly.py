@@ -78,6 +78,7 @@ class FlyOptions:
 
     config: Path
     mission: Path
+    overrides: tuple[str, ...] = ()
     scenario: Path | None = None
     plant: str | None = None
     fidelity: Fidelity | None = None
@@ -184,7 +185,7 @@ def prepare(options: FlyOptions) -> Task:
         raise ConfigError(
             f"--meter-rate-hz {options.meter_rate_hz:g}: give 0 (no meter) to {METER_RATE_MAX_HZ:g}"
         )
-    config = load(options.config)
+    config = load(options.config, overrides=options.overrides)
     refuse_mismatch(config)
     setup = compiled_setup(config)
     profile = _plant(options.plant, setup)

@@ -29,6 +29,7 @@ from companion.errors import (
     NOT_ENOUGH_MEMORY,
     ActuatorError,
     MapError,
+    StoppedError,
     UnreadableError,
     VrsprayError,
 )
@@ -233,6 +234,7 @@ def _ended(error: BaseException, *, as_json: bool) -> int:
         return _fail(f"{error.format_message()} (see --help)", error.exit_code, as_json=as_json)
     if isinstance(error, VrsprayError):
         code = FAILED if isinstance(error, ActuatorError | UnreadableError) else REFUSED
+        code = INTERRUPTED if isinstance(error, StoppedError) else code
         more = {"ok": False, "problems": [refusal(error)]} if isinstance(error, MapError) else {}
         return _fail(str(error), code, as_json=as_json, more=more)
     if isinstance(error, MemoryError):

@@ -223,7 +223,7 @@ def sources_of(named: Mapping[str, Path]) -> tuple[SourceFile, ...]:
     found = []
     for key, path in named.items():
         try:
-            for name, file in _files(path):
+            for name, file in belonging_files(path):
                 found.append(SourceFile(key=key, name=name, sha256=_sha256(file)))
         except (OSError, ValueError) as error:
             raise MapError(
@@ -234,7 +234,7 @@ def sources_of(named: Mapping[str, Path]) -> tuple[SourceFile, ...]:
     return tuple(found)
 
 
-def _files(path: Path) -> Iterator[tuple[str, Path]]:
+def belonging_files(path: Path) -> Iterator[tuple[str, Path]]:
     """Yield the files that belong to one path, by their names: a set beside it, or a folder."""
     if path.is_dir():
         start = path

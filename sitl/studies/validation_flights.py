@@ -21,11 +21,12 @@ from analysis.flow_accuracy import RateAccuracy, accuracy_by_rate, pooled_by_rat
 from analysis.published import P1_RATES_L_HA, P1_RESULTS, P1LagDistance, p1_lag_distance_m
 from analysis.strips import strips_of
 from companion.core.setup import Setup
-from sitl.demo import P1_LOOK_AHEAD_S, PROFILE, SCHEDULED, do_all
+from sitl.demo import P1_LOOK_AHEAD_S, PROFILE, SCHEDULED
 from sitl.demo_field import MAP_SPEED_M_S, demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.wang import WangController, curve_duties, eq_2_duties, table_2_sets
+from sitl.workers import do_all
 
 SPEEDS_M_S = (4.0, 5.0, 6.0)
 # How near the means of P1's controller must be to P1's where P1 has a mean for both methods.

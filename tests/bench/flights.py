@@ -14,12 +14,12 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 from analysis.evaluation import Evaluation, evaluate, limit_ratio, whole_boom
-from sitl.demo import do_all
 from sitl.demo_field import demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.own_method import load_controller
 from sitl.profile import load_profile
 from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
+from sitl.workers import do_all
 from tests.bench.conditions import CONDITIONS, condition_of, laid_out
 from tests.bench.sprayers import (
     BOTH,

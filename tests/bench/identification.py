@@ -31,11 +31,11 @@ from companion.core.types import Decision, FlowReport
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.calibration_mission import write_calibration
-from sitl.demo import do_all
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.routes import read_route
 from sitl.vehicle import Vehicle
+from sitl.workers import do_all
 from tests.bench.identification_figures import Compared, all_four, summary
 from tests.bench.sprayers import PLANT, nominal_lag, scaled_flow, scaled_lag, with_sprayer
 

@@ -8,7 +8,7 @@ from fnmatch import fnmatchcase
 from functools import partial
 from typing import TypeVar
 
-from sitl.demo import do_all
+from sitl.workers import do_all
 from tests.bench import (
     clocks,
     flow_laws,

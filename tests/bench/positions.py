@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from analysis.evaluation import Evaluation, evaluate
-from sitl.demo import do_all
+from sitl.workers import do_all
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from tests.bench.conditions import condition_of

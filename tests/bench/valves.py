@@ -23,7 +23,7 @@ from statistics import fmean
 import numpy as np
 
 from analysis.evaluation import Evaluation, evaluate
-from sitl.demo import do_all
+from sitl.workers import do_all
 from sitl.flight import fly
 from sitl.profile import draw_scatter, load_profile
 from sitl.valve_calibration import Calibrated, calibrate_valves, with_figures

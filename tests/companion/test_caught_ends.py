@@ -21,10 +21,14 @@ from companion.journal.journal import Journal
 from companion.journal.writer import Writer
 from companion.runtime import run
 from companion.web.server import _either
-from sitl.demo import _interrupt_held_back, _no_module_of_this_folder, _pool
-from sitl.demo_cli import _termination_as_interrupt
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.server import _TcpServer
+from sitl.workers import (
+    _environment,
+    _interrupt_held_back,
+    process_pool,
+    termination_as_interrupt,
+)
 from tests.builders import setup
 
 
@@ -106,7 +110,7 @@ async def test_no_timer_is_left_behind_whatever_fails(fail_on: str) -> None:
 
 def test_a_demo_that_fails_gives_the_signal_back() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(BrokenPartError), _termination_as_interrupt():
+    with pytest.raises(BrokenPartError), termination_as_interrupt():
         raise BrokenPartError
     assert signal.getsignal(signal.SIGTERM) is before
 
@@ -199,7 +203,7 @@ def test_a_journal_whose_writer_fails_is_a_closed_file(
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_a_pool_takes_no_work_after_its_block_however_it_ended(fails: bool) -> None:
-    with suppress(BrokenPartError), _pool(1) as pool:
+    with suppress(BrokenPartError), process_pool(1) as pool:
         if fails:
             raise BrokenPartError
     # Let go of by `shutdown` only; work is refused by a pool whose processes died as well.
@@ -312,7 +316,7 @@ def test_the_environment_is_as_before_when_no_process_could_be_started(
     monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
     if before is not None:
         monkeypatch.setenv("PYTHONSAFEPATH", before)
-    with suppress(BrokenPartError), _no_module_of_this_folder():
+    with suppress(BrokenPartError), _environment():
         assert os.environ["PYTHONSAFEPATH"] == "1"
         raise BrokenPartError
     assert os.environ.get("PYTHONSAFEPATH") == before

@@ -17,7 +17,7 @@ from companion.core.nozzle import PwmLimits
 from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack
 from companion.output.gpio import COMMAND, EngineChild
-from sitl.demo import do_all
+from sitl.workers import do_all
 from tests.companion.test_service_unit import UNIT
 
 VRSPRAY = Path(sys.executable).with_name("vrspray")

@@ -10,7 +10,8 @@ import pytest
 from analysis.replay import replay
 from companion.cli.app import execute
 from sitl.demo import CALIBRATED, METHODS
-from sitl.demo_cli import FILES, PICTURES, _move, _staging, _termination_as_interrupt
+from sitl.demo_cli import FILES, PICTURES, _move, _staging
+from sitl.workers import termination_as_interrupt
 
 Captured = pytest.CaptureFixture[str]
 ONE = ["--speed", "5", "--fidelity", "averaged"]
@@ -90,6 +91,6 @@ def test_interrupted_demo_leaves_the_folder_as_it_was(exists: bool, tmp_path: Pa
 
 def test_termination_ends_the_demo_as_an_interrupt_does() -> None:
     before = signal.getsignal(signal.SIGTERM)
-    with pytest.raises(KeyboardInterrupt), _termination_as_interrupt():
+    with pytest.raises(KeyboardInterrupt), termination_as_interrupt():
         signal.raise_signal(signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is before

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from sitl.demo import do_all
+from sitl.workers import do_all
 
 
 @pytest.mark.parametrize("processes", [1, 2])

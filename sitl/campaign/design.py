@@ -1,0 +1,423 @@
+"""The campaign file: which settings are varied, how, and over which seeds; and each flight of it.
+
+A flight has a number. From the number follow its settings and its seed, so that any process can fly
+any of them, and nothing has to be kept of those that were not flown yet.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import math
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.config import load
+from companion.config.wording import say_syntax
+from companion.errors import ConfigError
+from companion.wording import install_command
+from sitl.anyang import EXAMPLE
+from sitl.campaign.settings import (
+    ON_P1S_FIELD,
+    Settings,
+    Value,
+    check_name,
+    check_value,
+    overrides_of,
+)
+
+VERSION = 1
+GRID, HYPERCUBE, SOBOL, MORRIS = "grid", "latin-hypercube", "sobol", "morris"
+KINDS = (GRID, HYPERCUBE, SOBOL, MORRIS)
+FLIGHTS_MAX = 10_000_000
+SIZE_MAX_BYTES = 1_000_000
+MORRIS_LEVELS = 4
+EXAMPLE_CONFIG = EXAMPLE / "config.toml"
+TRIED_MAX = 20
+TOP = ("version", "name", "seeds", "fixed", "design", "vary", "case")
+OF_DESIGN = ("kind", "samples", "seed", "second_order")
+OF_FACTOR = ("set", "values", "low", "high", "steps")
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """A setting that is varied: over values, or between two ends."""
+
+    name: str
+    values: tuple[Value, ...] = ()
+    low: float = 0.0
+    high: float = 0.0
+
+    def at(self, share: float) -> Value:
+        """Return the value at a share of the way from the lowest to the highest."""
+        if self.values:
+            return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
+        return self.low + share * (self.high - self.low)
+
+    @property
+    def tried(self) -> tuple[Value, ...]:
+        """Return what tells whether the setting takes what it will be given."""
+        return self.values or (self.low, self.high)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Campaign:
+    """A campaign file that was read and checked."""
+
+    path: Path
+    text: str
+    name: str
+    seeds: tuple[int, ...]
+    fixed: Mapping[str, Value]
+    kind: str
+    samples: int
+    seed: int
+    second_order: bool
+    factors: tuple[Factor, ...]
+    cases: tuple[tuple[str, Mapping[str, Value]], ...]
+
+    @property
+    def sha256(self) -> str:
+        """Return the hash of the file."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Return a row for each point of the design, a column for each factor: 0 to 1."""
+        return _points(self)
+
+    @property
+    def settings_count(self) -> int:
+        """Return how many settings are flown, each with every seed."""
+        return len(self.cases) * len(self.points)
+
+    @property
+    def flights(self) -> int:
+        """Return how many flights there are."""
+        return self.settings_count * len(self.seeds)
+
+    @property
+    def varied(self) -> tuple[str, ...]:
+        """Return every setting that is not the same in all flights."""
+        of_cases = (name for _, case in self.cases for name in case)
+        return tuple(dict.fromkeys((*(each.name for each in self.factors), *of_cases)))
+
+    def flight(self, number: int) -> tuple[str, Settings, int]:
+        """Return the case, all settings and the seed of one flight."""
+        point, seed = divmod(number, len(self.seeds))
+        case, place = divmod(point, len(self.points))
+        name, of_case = self.cases[case]
+        varied = {
+            factor.name: factor.at(share)
+            for factor, share in zip(self.factors, self.points[place].tolist(), strict=True)
+        }
+        return name, tuple(sorted({**self.fixed, **of_case, **varied}.items())), self.seeds[seed]
+
+    def tried(self) -> Iterator[dict[str, Value]]:
+        """Yield settings in which every value is tried once, beside the first of all others."""
+        first = {factor.name: factor.tried[0] for factor in self.factors}
+        for _, case in self.cases:
+            yield {**self.fixed, **first, **case}
+        for factor in self.factors:
+            for value in factor.tried:
+                yield {**self.fixed, **first, **self.cases[0][1], factor.name: value}
+
+
+def _points(campaign: Campaign) -> NDArray[np.float64]:
+    factors = campaign.factors
+    if not factors:
+        return np.zeros((1, 0))
+    if campaign.kind == GRID:
+        middles = [[(k + 0.5) / len(f.values) for k in range(len(f.values))] for f in factors]
+        return np.array(list(itertools.product(*middles)))
+    try:
+        if campaign.kind == HYPERCUBE:
+            from scipy.stats import qmc
+
+            rng = np.random.default_rng(np.random.SeedSequence(campaign.seed))
+            drawn = qmc.LatinHypercube(len(factors), rng=rng).random(campaign.samples)
+            return np.asarray(drawn, dtype=np.float64)
+        return _for_sensitivity(campaign)
+    except ImportError as error:
+        raise ConfigError(
+            f"{campaign.path}: design.kind = '{campaign.kind}' needs {error.name}; "
+            f"{install_command('campaign')}"
+        ) from error
+
+
+def problem_of(campaign: Campaign) -> dict[str, Any]:
+    """Return the factors as SALib has them."""
+    return {
+        "num_vars": len(campaign.factors),
+        "names": [factor.name for factor in campaign.factors],
+        "bounds": [[0.0, 1.0]] * len(campaign.factors),
+    }
+
+
+def _for_sensitivity(campaign: Campaign) -> NDArray[np.float64]:
+    from SALib.sample import morris, sobol
+
+    problem = problem_of(campaign)
+    if campaign.kind == SOBOL:
+        drawn = sobol.sample(
+            problem,
+            campaign.samples,
+            calc_second_order=campaign.second_order,
+            seed=campaign.seed,
+        )
+    else:
+        drawn = morris.sample(
+            problem, campaign.samples, num_levels=MORRIS_LEVELS, seed=campaign.seed
+        )
+    return np.asarray(drawn, dtype=np.float64)
+
+
+# ------------------------------------------------------------------------------------------ reading
+
+
+def read_campaign(path: Path, *, checked: bool = True) -> Campaign:
+    """Read a campaign file; without `checked` the other files that it names may be gone.
+
+    Raises:
+        ConfigError: in one line: file, key, value, what to write instead.
+    """
+    try:
+        content = path.read_bytes()
+        if len(content) > SIZE_MAX_BYTES:
+            raise ConfigError(f"{path}: too large for a campaign; give the .toml file")
+        text = content.decode("utf-8-sig")
+        table = tomllib.loads(text)
+    except OSError as error:
+        reason = (error.strerror or "cannot be read").lower()
+        raise ConfigError(f"{path}: {reason}; give the path of a campaign file") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not UTF-8 text; save the file as UTF-8") from error
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(say_syntax(path, text, str(error))) from error
+    try:
+        found = _campaign(path, text, table)
+        if checked:
+            _check_configuration(found)
+        return found
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _campaign(path: Path, text: str, table: Mapping[str, Any]) -> Campaign:
+    _refuse_unknown(table, TOP, "")
+    if table.get("version") != VERSION:
+        raise ConfigError(f"version = {table.get('version')!r}: write version = {VERSION}")
+    design = _table(table, "design")
+    _refuse_unknown(design, OF_DESIGN, "design.")
+    factors = tuple(_factor(each, n) for n, each in enumerate(_tables(table, "vary")))
+    kind = design.get("kind", GRID)
+    if kind not in KINDS:
+        raise ConfigError(f"design.kind = {kind!r}: choose of {', '.join(KINDS)}")
+    found = Campaign(
+        path=path,
+        text=text,
+        name=_text(table.get("name", path.stem), "name"),
+        seeds=_seeds(table.get("seeds", 1)),
+        fixed=_checked(_table(table, "fixed"), "fixed"),
+        kind=kind,
+        samples=_whole(design.get("samples", 0), "design.samples", least=0),
+        seed=_whole(design.get("seed", 1), "design.seed", least=0),
+        second_order=design.get("second_order", False) is True,
+        factors=factors,
+        cases=_cases(_tables(table, "case")),
+    )
+    _check_design(found)
+    _check_settings(found)
+    return found
+
+
+def _check_design(found: Campaign) -> None:
+    names = [factor.name for factor in found.factors]
+    for name in names:
+        if names.count(name) > 1 or any(name in case for _, case in found.cases):
+            raise ConfigError(f"vary.set = '{name}': varied twice; keep one of them")
+    for factor in found.factors:
+        if found.kind == GRID and not factor.values:
+            raise ConfigError(
+                f"vary.set = '{factor.name}': a grid needs values, or low, high, steps"
+            )
+    if found.kind != GRID:
+        if not found.factors:
+            raise ConfigError(
+                f"design.kind = '{found.kind}': nothing is varied; add [[vary]] tables"
+            )
+        if not found.samples >= 2:
+            raise ConfigError(f"design.samples = {found.samples}: write 2 or more")
+    if found.kind == SOBOL and found.samples & (found.samples - 1):
+        near = 1 << round(math.log2(found.samples))
+        raise ConfigError(
+            f"design.samples = {found.samples}: a sobol design needs a power of two; write {near}"
+        )
+    per_factor = {GRID: 0, HYPERCUBE: 1, SOBOL: 2 * len(names) + 2, MORRIS: len(names) + 1}
+    points = found.samples * per_factor[found.kind] or math.prod(
+        len(factor.values) for factor in found.factors
+    )
+    if not points * len(found.cases) * len(found.seeds) <= FLIGHTS_MAX:
+        raise ConfigError(f"more than {FLIGHTS_MAX:,} flights; take fewer values, samples or seeds")
+
+
+def _check_settings(found: Campaign) -> None:
+    """Refuse what no flight can have; what some have is told by their rows."""
+    for given in found.tried():
+        if ("flight.config" in given) != ("flight.mission" in given):
+            missing = "mission" if "flight.config" in given else "config"
+            raise ConfigError(
+                f"flight.{missing}: missing; give flight.config and flight.mission, or neither of "
+                "them for P1's field"
+            )
+        if "flight.config" in given:
+            for name in ON_P1S_FIELD:
+                if name in given:
+                    raise ConfigError(f"{name}: on P1's field only; leave it out, or flight.config")
+        if "method.controller" in given and {"method.name", "method.look_ahead_s"} & set(given):
+            raise ConfigError(
+                "method.controller: stands alone; leave out the other method. settings"
+            )
+
+
+def _check_configuration(found: Campaign) -> None:
+    """Refuse keys that the configuration does not have, and those whose every value it refuses.
+
+    A value that it refuses beside others that it takes costs the flights that have it.
+    """
+    folder = found.path.resolve().parent
+    by_name: dict[str, set[Value]] = {}
+    for given in found.tried():
+        path = folder / str(given["flight.config"]) if "flight.config" in given else EXAMPLE_CONFIG
+        for name, value in given.items():
+            if name.startswith("config."):
+                by_name.setdefault(name, set()).add(value)
+    for name, values in by_name.items():
+        refused = []
+        for value in sorted(values, key=str)[:TRIED_MAX]:
+            try:
+                load(path, overrides=overrides_of({name: value}))
+                break
+            except ConfigError as error:
+                refused.append(error)
+        else:
+            raise ConfigError(f"{name}: the configuration refuses it: {refused[0]}")
+
+
+def _factor(entry: Mapping[str, Any], number: int) -> Factor:
+    where = f"vary[{number}]"
+    _refuse_unknown(entry, OF_FACTOR, f"{where}.")
+    name = _text(entry.get("set"), f"{where}.set")
+    check_name(name)
+    if ("values" in entry) == ("low" in entry or "high" in entry):
+        raise ConfigError(f"{where} ({name}): give values, or low and high")
+    if "values" in entry:
+        values = entry["values"]
+        if not isinstance(values, list) or not values:
+            raise ConfigError(f"{where}.values = {values!r}: write a list of values")
+        checked = tuple(check_value(name, value) for value in values)
+        if len({str(value) for value in checked}) < len(checked):
+            raise ConfigError(f"{where}.values: one of them stands there twice")
+        return Factor(name, values=checked)
+    low, high = (_number(entry.get(end), f"{where}.{end}") for end in ("low", "high"))
+    if not low < high:
+        raise ConfigError(f"{where}: low = {low:g} must be below high = {high:g}")
+    for end in (low, high):
+        check_value(name, end)
+    if "steps" in entry:
+        steps = _whole(entry["steps"], f"{where}.steps", least=2)
+        return Factor(name, values=tuple(np.linspace(low, high, steps).tolist()))
+    return Factor(name, low=low, high=high)
+
+
+def _cases(entries: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, Mapping[str, Value]], ...]:
+    found: list[tuple[str, Mapping[str, Value]]] = []
+    for number, entry in enumerate(entries):
+        settings = dict(entry)
+        name = _text(settings.pop("name", f"case {number + 1}"), f"case[{number}].name")
+        if any(name == other for other, _ in found):
+            raise ConfigError(f"case[{number}].name = '{name}': another case has this name")
+        found.append((name, _checked(settings, f"case[{number}]")))
+    return tuple(found) or (("", {}),)
+
+
+def _checked(table: Mapping[str, Any], where: str) -> dict[str, Value]:
+    found = {}
+    for name, value in _flat(table):
+        try:
+            check_name(name)
+            found[name] = check_value(name, value)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from error
+    return found
+
+
+def _flat(table: Mapping[str, Any], start: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the settings of nested tables by their dotted names.
+
+    >>> dict(_flat({"config": {"lag": {"on_s": 0.1}}, "flight.fidelity": "averaged"}))
+    {'config.lag.on_s': 0.1, 'flight.fidelity': 'averaged'}
+    """
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{start}{key}.")
+        else:
+            yield f"{start}{key}", value
+
+
+def _seeds(given: object) -> tuple[int, ...]:
+    if isinstance(given, dict):
+        _refuse_unknown(given, ("first", "count"), "seeds.")
+        first = _whole(given.get("first", 1), "seeds.first", least=0)
+        return tuple(range(first, first + _whole(given.get("count"), "seeds.count", least=1)))
+    if isinstance(given, list) and given:
+        seeds = tuple(_whole(each, "seeds", least=0) for each in given)
+        if len(set(seeds)) == len(seeds):
+            return seeds
+        raise ConfigError("seeds: one of them stands there twice")
+    return tuple(range(1, 1 + _whole(given, "seeds", least=1)))
+
+
+def _refuse_unknown(table: Mapping[str, Any], known: Sequence[str], start: str) -> None:
+    for key in table:
+        if key not in known:
+            raise ConfigError(f"{start}{key}: unknown key; choose of {', '.join(known)}")
+
+
+def _table(table: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    found = table.get(key, {})
+    if not isinstance(found, dict):
+        raise ConfigError(f"{key}: write a table: [{key}]")
+    return found
+
+
+def _tables(table: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
+    found = table.get(key, [])
+    if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
+        raise ConfigError(f"{key}: write tables: [[{key}]]")
+    return found
+
+
+def _text(value: object, where: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise ConfigError(f"{where} = {value!r}: write text")
+    return value
+
+
+def _whole(value: object, where: str, *, least: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not value >= least:
+        raise ConfigError(f"{where} = {value!r}: write a whole number, {least} or more")
+    return value
+
+
+def _number(value: object, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ConfigError(f"{where} = {value!r}: write a number")
+    return float(value)

@@ -1,0 +1,494 @@
+"""Campaigns: the file, one flight as a function, the dataset to the byte, and who may die."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scipy.stats import t
+from typer.testing import CliRunner
+
+from analysis.evaluation import evaluate
+from companion.cli.app import execute
+from companion.errors import ConfigError, VrsprayError
+from sitl.campaign import cli
+from sitl.campaign.bundle import Bundle, bundle_of, unpack
+from sitl.campaign.dataset import Dataset, open_dataset, part_size
+from sitl.campaign.design import Campaign, read_campaign
+from sitl.campaign.executors import pool_of
+from sitl.campaign.flying import fly_flight
+from sitl.campaign.running import LOST, Tally, fly_missing
+from sitl.campaign.sensitivity import sensitivity_of
+from sitl.campaign.show import groups_of, read_rows
+from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
+from sitl.flight import FlightOptions, fly
+from sitl.profile import load_profile
+from tests.sitl.campaign_files import files_of, write_campaign
+
+VARIED = """
+seeds = 4
+[[vary]]
+set = "vehicle.gust_m_s"
+values = [0.0, 1.0, 2.0]
+[[vary]]
+set = "config.lag.up_s"
+values = [0.10, -1.0]
+"""
+
+
+@pytest.fixture
+def here(tmp_path: Path) -> Path:
+    return write_campaign(tmp_path, VARIED)
+
+
+class OwnProcess:
+    """Flies in this process, at once."""
+
+    deaths = 1
+
+    def __init__(self, folder: Path) -> None:
+        self.folder: Path | None = folder
+
+    def count(self) -> int:
+        return 1
+
+    def submit(self, function: Callable[..., Any], *given: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*given))
+        except VrsprayError as error:
+            future.set_exception(error)
+        return future
+
+    def lost(self, error: BaseException) -> bool:
+        return False
+
+    def renew(self) -> None:
+        raise AssertionError
+
+
+def opened(file: Path, out: Path) -> tuple[Dataset, Bundle]:
+    campaign = read_campaign(file)
+    bundle = bundle_of(campaign)
+    return open_dataset(campaign, bundle, out), bundle
+
+
+def rows_of(out: Path) -> list[dict[str, Any]]:
+    paths = sorted((out / "flights").glob("part=*/flights.parquet"))
+    return [row for path in paths for row in pq.ParquetFile(path).read().to_pylist()]
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset as this process alone makes it."""
+    folder = tmp_path_factory.mktemp("reference")
+    dataset, bundle = opened(write_campaign(folder, VARIED), folder / "out")
+    workers = OwnProcess(unpack(bundle, folder / "bundle"))
+    fly_missing(dataset, bundle, workers, Tally(), tell=lambda _: None)
+    return folder / "out"
+
+
+# --------------------------------------------------------------------------------------- one flight
+
+
+def test_a_flight_of_the_published_field_is_that_of_the_demo_to_the_bit(tmp_path: Path) -> None:
+    setup = replace(demo_setup(6.0), lag=demo_lags("gpio"))
+    flown = fly(
+        setup,
+        demo_trajectory(6.0, 3),
+        load_profile("wang-2024"),
+        FlightOptions(fidelity="averaged", seed=3),
+        speed_m_s=6.0,
+    )
+    found = evaluate(flown.record)
+    row = fly_flight((("vehicle.speed_m_s", 6.0),), 3, tmp_path).figures
+    assert row["lag_distance_mean_m"] == found.lag_distance_m.mean
+    assert row["misapplied_percent"] == found.misapplied_percent
+    assert row["border_margin_min_m"] == found.border_margin_m.min
+    assert (row["applied_ml"], row["missed"]) == (found.applied_ml, found.missed)
+
+
+def test_rows_have_settings_figures_and_the_reason_where_there_are_none(reference: Path) -> None:
+    rows = rows_of(reference)
+    assert [row["flight"] for row in rows] == list(range(24))
+    assert [row["seed"] for row in rows] == [1, 2, 3, 4] * 6
+    good = [row for row in rows if row["error"] is None]
+    assert {row["config.lag.up_s"] for row in good} == {0.10} and len(good) == 12
+    assert all(row["lag_distance_count"] > 0 and row["applied_ml"] > 0.0 for row in good)
+    assert len({row["misapplied_percent"] for row in good}) == 12  # each flight is its own
+    assert all(sum(row["rate_samples"]) > 0 for row in good)
+    bad = [row for row in rows if row["error"] is not None]
+    assert {row["error"].partition("; ")[0] for row in bad} == {
+        "field/config.toml: lag.up_s = -1.0: out of range"
+    }
+    assert all(row["misapplied_percent"] is None for row in bad)
+
+
+# ------------------------------------------------------------------------------------------- dying
+
+
+def test_a_worker_that_is_killed_costs_no_row(here: Path, reference: Path, tmp_path: Path) -> None:
+    dataset, bundle = opened(here, tmp_path / "out")
+    tally, killed = Tally(), []
+
+    def kill_one(flights: int) -> None:
+        if flights == 3:
+            victim = multiprocessing.active_children()[0]
+            assert victim.pid is not None
+            os.kill(victim.pid, signal.SIGKILL)
+            killed.append(victim.pid)
+
+    with pool_of(2, bundle) as pool:
+        fly_missing(dataset, bundle, pool, tally, tell=kill_one)
+    assert killed and tally.lost_workers > 0
+    assert files_of(tmp_path / "out") == files_of(reference)
+
+
+DIES = """
+import os, signal, sys
+from pathlib import Path
+from sitl.campaign.executors import pool_of
+from sitl.campaign.running import Tally, fly_missing
+from tests.sitl.test_campaign import opened
+
+if __name__ == "__main__":
+    dataset, bundle = opened(Path(sys.argv[1]), Path(sys.argv[2]))
+
+    def die(flights):
+        if flights == 13:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    with pool_of(2, bundle) as pool:
+        fly_missing(dataset, bundle, pool, Tally(), tell=die)
+"""
+
+
+def test_a_campaign_whose_scheduler_is_killed_goes_on_to_the_same_bytes(
+    here: Path, reference: Path, tmp_path: Path
+) -> None:
+    script, out = tmp_path / "dies.py", tmp_path / "out"
+    script.write_text(DIES)
+    given = [sys.executable, str(script), str(here), str(out)]
+    root = str(Path(__file__).parents[2])
+    # Its workers hold its output open: that it ends says that they have ended.
+    ended = subprocess.run(given, env=os.environ | {"PYTHONPATH": root}, capture_output=True)
+    assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
+    parts = len(rows_of(out)) // part_size(24)
+    assert 0 < parts < 3
+    dataset, bundle = opened(here, out)
+    tally = Tally()
+    workers = OwnProcess(unpack(bundle, tmp_path / "bundle"))
+    fly_missing(dataset, bundle, workers, tally, tell=lambda _: None)
+    assert tally.flights == 24 - 10 * parts
+    assert files_of(out) == files_of(reference)
+
+
+KILLER = """
+import os, signal
+
+
+class Killer:
+    def __init__(self, sprayer):
+        pass
+
+    def order(self, seen):
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_flight_that_kills_its_worker_is_a_row_and_the_others_are_flown(tmp_path: Path) -> None:
+    file = write_campaign(
+        tmp_path,
+        '[[case]]\nname = "kills"\nmethod.controller = "killer.py:Killer"\n'
+        '[[case]]\nname = "ours"\n[[case]]\nname = "gust"\nvehicle.gust_m_s = 2.0\n',
+    )
+    (tmp_path / "killer.py").write_text(KILLER)
+    dataset, bundle = opened(file, tmp_path / "out")
+    with pool_of(2, bundle) as pool:
+        fly_missing(dataset, bundle, pool, Tally(), tell=lambda _: None)
+    rows = rows_of(tmp_path / "out")
+    assert [(row["case"], row["error"]) for row in rows] == [
+        ("kills", LOST),
+        ("ours", None),
+        ("gust", None),
+    ]
+
+
+# -------------------------------------------------------------------------------------- the cluster
+
+
+@pytest.mark.timeout(300)
+def test_a_real_dask_cluster_gives_the_same_rows(
+    here: Path, reference: Path, tmp_path: Path
+) -> None:
+    """A scheduler and two workers as processes, none of which has the campaign's files."""
+    dask, told = [sys.executable, "-m", "dask"], tmp_path / "scheduler.json"
+    common: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    worker = [*dask, "worker", "--scheduler-file", str(told), "--nthreads", "1", "--no-nanny",
+              "--dashboard-address", "127.0.0.1:0", "--host", "127.0.0.1", "--local-directory"]  # fmt: skip
+    started = [
+        subprocess.Popen(
+            [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0",
+             "--dashboard-address", "127.0.0.1:0", "--scheduler-file", str(told)], **common,
+        ),
+        *(subprocess.Popen([*worker, str(tmp_path / name)], **common) for name in "ab"),
+    ]  # fmt: skip
+    try:
+        flown = subprocess.run(
+            [sys.executable, "-c", THROUGH_DASK, str(told), str(here), str(tmp_path / "out")],
+            capture_output=True,
+            text=True,
+        )
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+    assert flown.returncode == 0, flown.stderr
+    assert json.loads(flown.stdout)["workers"] == 2
+    assert files_of(tmp_path / "out") == files_of(reference)
+
+
+# The scheduler's file tells its address; the client of it waits for the workers.
+THROUGH_DASK = """
+import json, sys, time
+from pathlib import Path
+from companion.cli.app import execute
+from distributed import Client
+
+told, file, out = sys.argv[1:]
+for _ in range(600):
+    if Path(told).exists() and Path(told).read_text().endswith("}"):
+        break
+    time.sleep(0.1)
+address = json.loads(Path(told).read_text())["address"]
+with Client(address) as client:
+    client.wait_for_workers(2, timeout=60)
+sys.exit(execute(["campaign", file, "--out", out, "--cluster", address, "--json"]))
+"""
+
+
+def test_an_address_where_nobody_is_is_refused_in_one_line(
+    here: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sitl.campaign.executors.WAIT_S", 0.2)
+    assert execute(["campaign", str(here), "--cluster", "tcp://127.0.0.1:1"]) == 2
+    line = capsys.readouterr().err.strip()
+    assert "no Dask scheduler answers" in line and "\n" not in line
+
+
+# ---------------------------------------------------------------------------------------- the file
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("seed = 3", "seed: unknown key; choose of version, name, seeds"),
+        ("seeds = 0", "seeds = 0: write a whole number, 1 or more"),
+        ('[[vary]]\nset = "vehicle.gusts_m_s"\nvalues = [1]', "did you mean vehicle.gust_m_s?"),
+        ('[[vary]]\nset = "engine.power"\nvalues = [1]', "engine.power: no such setting"),
+        ('[[vary]]\nset = "plant.dead_opens_s"\nvalues = [1]', "did you mean plant.dead_open_s?"),
+        ('[[vary]]\nset = "config.lag.on_ss"\nvalues = [1]', "did you mean lag.on_s?"),
+        ('[[vary]]\nset = "config.lag.on_s"\nvalues = [-1]', "the configuration refuses it"),
+        ('[[vary]]\nset = "vehicle.gust_m_s"\nvalues = [-1]', "write a number from 0 to 20"),
+        ('[[vary]]\nset = "flight.fidelity"\nvalues = ["x"]', "choose of averaged, pulsed"),
+        ('[[vary]]\nset = "vehicle.gust_m_s"', "give values, or low and high"),
+        ('[[vary]]\nset = "vehicle.gust_m_s"\nlow = 2\nhigh = 1', "low = 2 must be below high = 1"),
+        ('[[vary]]\nset = "vehicle.gust_m_s"\nlow = 1\nhigh = 2', "a grid needs values"),
+        ('[design]\nkind = "random"', "choose of grid, latin-hypercube, sobol, morris"),
+        ('[design]\nkind = "sobol"\nsamples = 8', "nothing is varied; add [[vary]] tables"),
+        ('[[case]]\nname = "a"\n[[case]]\nname = "a"', "another case has this name"),
+        ("[[case]]\nerror.along_m = 0.1", "error.along_m: on P1's field only"),
+        ('[[case]]\nflight.scenario = "no.toml"', "no such file"),
+        ("seeds = [1", "Unclosed array"),
+        ('seeds = 4000\n[[vary]]\nset = "vehicle.gust_m_s"\nlow = 0\nhigh = 9\nsteps = 5000',
+         "more than 10,000,000 flights"),
+    ],
+)  # fmt: skip
+def test_a_file_that_cannot_be_flown_is_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+) -> None:
+    file = write_campaign(tmp_path, text + "\n")
+    assert execute(["campaign", str(file), "--dry-run"]) == 2
+    line = capsys.readouterr().err.strip()
+    assert line.startswith(f"error: {file}: ") or said == "no such file"
+    assert said in line and "\n" not in line
+
+
+def designed(folder: Path, kind: str, samples: int) -> Campaign:
+    return read_campaign(
+        write_campaign(
+            folder,
+            f'seeds = {{first = 5, count = 2}}\n[design]\nkind = "{kind}"\nsamples = {samples}\n'
+            '[[vary]]\nset = "vehicle.gust_m_s"\nlow = 1.0\nhigh = 3.0\n'
+            '[[vary]]\nset = "flight.fidelity"\nvalues = ["averaged", "pulsed"]\n',
+        )
+    )
+
+
+def test_a_latin_hypercube_has_each_share_of_a_setting_once(tmp_path: Path) -> None:
+    campaign = designed(tmp_path, "latin-hypercube", 10)
+    assert campaign.flights == 20
+    flights = [campaign.flight(number) for number in range(0, 20, 2)]
+    gusts = [dict(settings)["vehicle.gust_m_s"] for _, settings, _ in flights]
+    assert sorted(int((gust - 1.0) / 0.2) for gust in gusts) == list(range(10))  # type: ignore[operator]
+    words = [dict(settings)["flight.fidelity"] for _, settings, _ in flights]
+    assert words.count("pulsed") == 5
+    assert [campaign.flight(number)[2] for number in range(4)] == [5, 6, 5, 6]
+    again = read_campaign(campaign.path)
+    assert [again.flight(number) for number in (19, 0)] == [
+        campaign.flight(19),
+        campaign.flight(0),
+    ]
+
+
+@pytest.mark.parametrize(("kind", "samples", "points"), [("sobol", 8, 32), ("morris", 7, 21)])
+def test_designs_for_sensitivity_have_their_number_of_points(
+    tmp_path: Path, kind: str, samples: int, points: int
+) -> None:
+    assert designed(tmp_path, kind, samples).settings_count == points
+
+
+def test_a_flight_needs_no_other_flight_before_it(tmp_path: Path) -> None:
+    campaign = read_campaign(write_campaign(tmp_path, VARIED))
+    folder = tmp_path
+    one = fly_flight(*campaign.flight(9)[1:], folder).figures
+    fly_flight(*campaign.flight(1)[1:], folder)
+    assert fly_flight(*campaign.flight(9)[1:], folder).figures == one
+
+
+# ------------------------------------------------------------------------------------- the dataset
+
+
+def test_another_campaign_does_not_go_on_in_a_dataset(here: Path, tmp_path: Path) -> None:
+    opened(here, tmp_path / "out")
+    opened(here, tmp_path / "out")
+    here.write_text(here.read_text() + "# changed\n")
+    with pytest.raises(ConfigError, match="another campaign_sha256"):
+        opened(here, tmp_path / "out")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(ConfigError, match="holds other files"):
+        opened(here, tmp_path / "mine")
+
+
+def test_the_manifest_names_every_file_and_what_flew(reference: Path) -> None:
+    manifest = json.loads((reference / "manifest.json").read_text())
+    assert {"field/config.toml", "field/short.waypoints", "field/prescription.dbf"} <= set(
+        manifest["files"]
+    )
+    assert {"vrspray", "numpy", "python"} <= set(manifest["versions"])
+    assert (manifest["flights"], manifest["settings"], manifest["part_flights"]) == (24, 6, 10)
+
+
+# ------------------------------------------------------------------------------------------ showing
+
+
+def test_means_and_intervals_are_those_of_the_rows(reference: Path) -> None:
+    shown = CliRunner().invoke(cli.app, ["show", str(reference), "--json"])
+    assert shown.exit_code == 0, shown.output
+    found = json.loads(shown.stdout)
+    assert (found["written"], found["failed"], len(found["errors"])) == (24, 12, 1)
+    group = next(
+        each for each in found["groups"]
+        if (each["setting"], each["value"]) == ("vehicle.gust_m_s", "2")
+    )  # fmt: skip
+    values = [
+        row["misapplied_percent"] for row in rows_of(reference)
+        if row["vehicle.gust_m_s"] == 2.0 and row["error"] is None
+    ]  # fmt: skip
+    estimate = group["figures"]["misapplied_percent"]
+    assert estimate["mean"] == pytest.approx(np.mean(values))
+    assert (estimate["min"], estimate["max"]) == (min(values), max(values))
+
+
+def test_one_setting_has_its_interval_over_the_seeds(reference: Path) -> None:
+    rows = read_rows(reference, ["misapplied_percent"])
+    point = rows.point[0]
+    chosen = rows.point == point
+    one = replace(
+        rows,
+        case=["x"] * int(chosen.sum()),
+        point=rows.point[chosen],
+        settings={name: column[: int(chosen.sum())] for name, column in rows.settings.items()},
+        figures={"misapplied_percent": rows.figures["misapplied_percent"][chosen]},
+    )
+    values = one.figures["misapplied_percent"]
+    estimate = groups_of(one, by="case")[0].figures["misapplied_percent"]
+    half = t.ppf(0.975, len(values) - 1) * values.std(ddof=1) / len(values) ** 0.5
+    assert estimate is not None and estimate.high is not None
+    assert estimate.high - estimate.mean == pytest.approx(half)
+
+
+@pytest.mark.parametrize("kind", ["sobol", "morris", "latin-hypercube"])
+def test_sensitivity_finds_the_setting_that_matters(
+    reference: Path, tmp_path: Path, kind: str
+) -> None:
+    """Of a figure that is known: four times one setting, and nothing of the other."""
+    campaign = read_campaign(
+        write_campaign(
+            tmp_path,
+            f'[design]\nkind = "{kind}"\nsamples = 128\n'
+            '[[vary]]\nset = "vehicle.gust_m_s"\nlow = 0.0\nhigh = 3.0\n'
+            '[[vary]]\nset = "vehicle.gust_time_s"\nlow = 1.0\nhigh = 3.0\n',
+        )
+    )
+    count = campaign.settings_count
+    rows = replace(
+        read_rows(reference, []),
+        campaign=campaign,
+        point=np.arange(count),
+        figures={"misapplied_percent": 4.0 * campaign.points[:, 0]},
+    )
+    found = {(each.setting, each.name): each for each in sensitivity_of(rows)}
+    name, size, slack = {
+        "sobol": ("ST", 1.0, 0.1),
+        "morris": ("mu_star", 4.0, 1e-6),
+        "latin-hypercube": ("S1", 1.0, 0.1),
+    }[kind]
+    matters, other = found["vehicle.gust_m_s", name], found["vehicle.gust_time_s", name]
+    assert matters.value == pytest.approx(size, abs=slack)
+    assert abs(other.value) < 0.15
+    assert matters.low <= matters.value <= matters.high
+
+
+def test_pictures_are_drawn(reference: Path, tmp_path: Path) -> None:
+    given = ["show", str(reference), "--plots", str(tmp_path), "--figure", "applied_ml"]
+    shown = CliRunner().invoke(cli.app, given)
+    assert shown.exit_code == 0, shown.output
+    for name in ("responses.png", "parallel.png"):
+        assert (tmp_path / name).read_bytes().startswith(b"\x89PNG")
+    assert "applied_ml" in shown.stdout
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["show", "nowhere"], "no campaign's manifest"),
+        (["nowhere.toml"], "no such file or directory"),
+        (["FILE", "--workers", "0"], "--workers 0: give 1 to 256"),
+        (["FILE", "--workers", "2", "--cluster", "tcp://x:1"], "leave it out with --cluster"),
+        (["show", "DIR", "--figure", "lag"], "--figure lag: choose of"),
+        (["show", "DIR", "--by", "lag"], "--by lag: choose of case, "),
+    ],
+)
+def test_a_wrong_call_is_refused_in_one_line(
+    reference: Path, here: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, given: list[str], said: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    names = {"FILE": str(here), "DIR": str(reference)}
+    assert execute(["campaign", *(names.get(each, each) for each in given)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert said in error and "\n" not in error
