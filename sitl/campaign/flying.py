@@ -31,6 +31,7 @@ from sitl.motor_parts import ranges_us
 from sitl.outputs import WIRE_S
 from sitl.own_method import MakeController, load_controller
 from sitl.profile import load_profile
+from sitl.valve_calibration import calibrate_valves, with_figures
 from sitl.vehicle import Vehicle
 from sitl.wang import (
     LOOK_AHEAD_S,
@@ -324,9 +325,14 @@ def _flown(
     task = scene.task
     setup = replace(task.setup, lag=shortened(task.setup.lag, what))
     name = given.get("method.name")
-    look_ahead_s, wang, method = _look_ahead_s(given), None, None
+    look_ahead_s, wang = _look_ahead_s(given), None
+    method: str | None = None
     if name == "perfect":
         return _knowing(scene, path, options)
+    if name == "calibrated":  # each valve measured by itself beforehand
+        by_pulses = replace(options, fidelity="pulsed", output="gpio")
+        found = calibrate_valves(setup, true_profile(task.profile, options), by_pulses).found
+        setup, method = with_figures(setup, found), "calibrated"
     if look_ahead_s is not None:
         wang, setup = _wang(setup, look_ahead_s, given, task)
         method = str(name or "look-ahead")

@@ -23,7 +23,7 @@ Value = bool | int | float | str | tuple[Any, ...]
 # The settings of one flight, in the order of their names.
 Settings = tuple[tuple[str, Value], ...]
 
-Method = Literal["scheduled", "none", "look-ahead", "look-ahead-stated", "perfect"]
+Method = Literal["scheduled", "none", "look-ahead", "look-ahead-stated", "calibrated", "perfect"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -237,7 +237,8 @@ def test_a_real_dask_cluster_gives_the_same_rows(
     dask, told = [sys.executable, "-m", "dask"], tmp_path / "scheduler.json"
     common: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     worker = [*dask, "worker", "--scheduler-file", str(told), "--nthreads", "1", "--no-nanny",
-              "--dashboard-address", "127.0.0.1:0", "--host", "127.0.0.1", "--local-directory"]  # fmt: skip
+              "--dashboard-address", "127.0.0.1:0", "--host", "127.0.0.1",
+              "--local-directory"]  # fmt: skip
     started = [
         subprocess.Popen(
             [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0",
