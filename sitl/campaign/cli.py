@@ -29,12 +29,14 @@ SAY_EVERY_S = 30.0
 
 
 class RunIsUnsaid(TyperGroup):
-    """A group whose first command needs no name: `campaign FILE` is `campaign run FILE`."""
+    """A group one of whose commands needs no name: `campaign FILE` is `campaign run FILE`."""
+
+    unsaid = "run"
 
     def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
-        """Put `run` in front of what is no command's name."""
+        """Put its name in front of what is no command's name."""
         if args and args[0] not in self.commands and args[0] not in ("-h", "--help"):
-            args = ["run", *args]
+            args = [self.unsaid, *args]
         return super().parse_args(ctx, args)
 
 

@@ -101,7 +101,7 @@ def check_name(name: str) -> None:
         return
     known = [each for each in KINDS if each.startswith(f"{table}.")]
     if table == "plant":
-        known += _plant_names()
+        known += plant_names()
         if name in known:
             return
     near = difflib.get_close_matches(name, known, n=1)
@@ -177,7 +177,8 @@ def _toml(value: Value) -> str:
 _PARTS: dict[str, Any] = {"pwm": Pulsing, "meter": Meter, "pump": Pump, "supply": Supply}
 
 
-def _plant_names() -> list[str]:
+def plant_names() -> list[str]:
+    """Return the numbers of a sprayer that can be set."""
     owners = {"": PlantProfile, **{f"{part}.": kind for part, kind in _PARTS.items()}}
     return [
         f"plant.{start}{each.name}"

@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from analysis.evaluation import Evaluation, evaluate
-from sitl.workers import do_all
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
+from sitl.workers import do_all
 from tests.bench.conditions import condition_of
 from tests.bench.flights import FIELD, Task, place
 from tests.bench.sprayers import PLANT, known_setup, options_of

@@ -23,10 +23,10 @@ from statistics import fmean
 import numpy as np
 
 from analysis.evaluation import Evaluation, evaluate
-from sitl.workers import do_all
 from sitl.flight import fly
 from sitl.profile import draw_scatter, load_profile
 from sitl.valve_calibration import Calibrated, calibrate_valves, with_figures
+from sitl.workers import do_all
 from tests.bench.flights import Task, perfect, place
 from tests.bench.sprayers import PLANT, Output, options_of, sprayer_setup
 

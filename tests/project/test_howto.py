@@ -39,6 +39,7 @@ BLOCK = re.compile(
 # Commands that need a vehicle, a second terminal, a person at the keys or the internet.
 NEEDS_MORE = {
     ("run",), ("upload",), ("doctor",), ("ground",), ("service",), ("sitl", "serve"), ("wsp",),
+    ("campaign",),
     ("demo",), ("examples",), ("calibrate", "lag"), ("calibrate", "valves"),
 }  # fmt: skip
 # Options with which one of these needs nothing else.
@@ -72,6 +73,9 @@ def leaf(words: list[str]) -> tuple[tuple[str, ...], set[str], list[str]]:
     context = found.make_context("vrspray", [], None, resilient_parsing=True)
     while words and hasattr(found, "list_commands"):
         below = found.get_command(context, words[0])
+        if below is None and hasattr(found, "unsaid"):
+            words = [found.unsaid, *words]
+            below = found.get_command(context, words[0])
         assert below is not None, f"no command {' '.join([*names, words[0]])}"
         context = below.make_context(words[0], [], context, resilient_parsing=True)
         found, words, names = below, words[1:], [*names, words[0]]

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.reference import (
+    campaigns,
     checks,
     commands,
     configuration,
@@ -30,6 +31,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "metrics.md": metrics.page,
     "journal.md": journal.page,
     "scenarios.md": scenarios.page,
+    "campaigns.md": campaigns.page,
     "driver-board.md": driver_board.page,
 }
 

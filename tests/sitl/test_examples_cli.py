@@ -7,6 +7,7 @@ import pytest
 
 from companion.cli.app import execute
 from companion.config import load
+from sitl.campaign.design import read_campaign
 from sitl.examples_cli import ABOUT, DEPLOY, all_examples
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -40,6 +41,9 @@ def test_a_copied_example_has_all_that_its_configurations_name(
     }
     assert {path.relative_to(folder) for path in _files(folder)} == theirs
     for path in folder.glob("*.toml"):
+        if name == "campaigns":
+            assert read_campaign(path).flights > 1
+            continue
         config = load(path)
         assert config.prescription is not None
         assert (path.parent / config.prescription.file).resolve().exists()
