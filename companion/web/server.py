@@ -286,7 +286,9 @@ class Site:
         self.clients = 0
         self.login_s = int(about["login_s"])
         self.is_tls = bool(about["is_tls"])
-        self.ground_gzip, self.zones_gzip, self.places_gzip = map(_packed, map_parts(about["map"]))
+        ground, zones, places = map_parts(about["map"])
+        self.ground_gzip, self.zones_gzip = _packed(ground), _packed(zones)
+        self.places_gzip = [_packed(part) for part in places]
         self.facts: dict[str, Any] = about["facts"]
         self.version = str(about["version"])
         self._files: dict[Path, tuple[bytes, str]] = {}
@@ -424,6 +426,7 @@ def build_app(site: Site, parts: Mapping[str, Part] | None = None) -> FastAPI:
     )
     app.add_exception_handler(RequestValidationError, _unusable)
     _add_reading(app, site)
+    _add_ground(app, site)
     _add_sessions(app, site)
     _add_orders(app, site)
     _add_files(app, site)
@@ -449,21 +452,6 @@ def _add_reading(app: FastAPI, site: Site) -> None:
         begin = int(last) if last.isascii() and last.isdecimal() and len(last) < 10 else since
         return EventStream(site, begin)
 
-    @app.get(f"{API}map", tags=["state"], response_class=Response)
-    async def ground(request: Request) -> Response:
-        """Return field, rates and boom, in metres from the origin."""
-        return _compressed(request, site.ground_gzip, "application/json")
-
-    @app.get(f"{API}zones", tags=["state"], response_class=Response)
-    async def zones(request: Request) -> Response:
-        """Return the zones, in metres from the origin."""
-        return _compressed(request, site.zones_gzip, "application/json")
-
-    @app.get(f"{API}zones.geojson", tags=["state"], response_class=Response)
-    async def places(request: Request) -> Response:
-        """Return the zones as GeoJSON: a browser's worker reads it, not its main thread."""
-        return _compressed(request, site.places_gzip, "application/geo+json")
-
     @app.get(f"{API}facts", tags=["state"])
     async def facts() -> dict[str, Any]:
         """Return what does not change in a flight: limits, product, tank, training."""
@@ -479,6 +467,25 @@ def _add_reading(app: FastAPI, site: Site) -> None:
         """Return the points of the way since a number."""
         points = site.live.way.points
         return {"since": since, "count": len(points), "points": points[since : since + 20_000]}
+
+
+def _add_ground(app: FastAPI, site: Site) -> None:
+    @app.get(f"{API}map", tags=["state"], response_class=Response)
+    async def ground(request: Request) -> Response:
+        """Return field, rates and boom, in metres from the origin."""
+        return _compressed(request, site.ground_gzip, "application/json")
+
+    @app.get(f"{API}zones", tags=["state"], response_class=Response)
+    async def zones(request: Request) -> Response:
+        """Return the zones, in metres from the origin."""
+        return _compressed(request, site.zones_gzip, "application/json")
+
+    @app.get(f"{API}zones.geojson", tags=["state"], response_class=Response)
+    async def places(request: Request, part: Annotated[int, Query(ge=0, le=10**6)] = 0) -> Response:
+        """Return a part of the zones as GeoJSON: a browser's worker reads it."""
+        if part >= len(site.places_gzip):
+            raise HTTPException(404, f"there are {len(site.places_gzip)} parts")
+        return _compressed(request, site.places_gzip[part], "application/geo+json")
 
 
 _REFUSED: dict[int | str, dict[str, Any]] = {

@@ -21,7 +21,7 @@ from companion.errors import ConfigError
 from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
 from companion.web.frames import frame_of, packed
-from companion.web.live import ADVICE, Live, Way, actual_rate, quads_between, reasons_of
+from companion.web.live import ADVICE, Live, Way, actual_rate, map_parts, quads_between, reasons_of
 from companion.web.page import ORDER_BYTES_MAX, parse_order
 from companion.web.ring import PAYLOAD_MAX, SLOTS, RingReader, RingWriter, new_memory
 from tests.companion.web_site import SETUP, Site, about, aged, served, until
@@ -173,6 +173,18 @@ def test_a_way_of_another_map_is_not_taken_up(tmp_path: Path) -> None:
     later.close()
 
 
+def test_many_zones_come_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = map_parts(about()["map"])[2][0]["features"]
+    assert len(whole) == 4
+    monkeypatch.setattr("companion.web.live.ZONES_AT_ONCE", 3)
+    summary, _, places = map_parts(about()["map"])
+    assert summary["zone_parts"] == 2
+    assert [len(part["features"]) for part in places] == [3, 1]
+    assert [one for part in places for one in part["features"]] == whole
+    none = about()["map"] | {"zones": []}
+    assert map_parts(none)[0]["zone_parts"] == 1
+
+
 def test_a_real_flight_and_a_simulated_one_have_ways_of_their_own(tmp_path: Path) -> None:
     path, utc_s = tmp_path / "track.jsonl", 1.7e9
 
@@ -230,6 +242,8 @@ async def test_the_map_comes_in_metres_of_the_frame(site: Site) -> None:
             longitude_deg, latitude_deg = there[2]
             found = SETUP.frame.to_local(latitude_deg, longitude_deg)
             assert found == pytest.approx((ring[4], ring[5]), abs=0.01)
+    assert ground["zone_parts"] == 1
+    assert (await site.asked("GET", "/api/v1/zones.geojson?part=1")).status == 404
     packed_map = await site.asked("GET", "/api/v1/map", headers={"Accept-Encoding": "gzip"})
     assert packed_map.headers["content-encoding"] == "gzip"
 

@@ -71,12 +71,15 @@ export async function create(element, ground, scale, theme, onView) {
     return found;
   };
 
-  map.addSource("zones", { type: "geojson", data: new URL("api/v1/zones.geojson", document.baseURI).href, tolerance: 0.1, buffer: 8 });
+  // In parts: what the worker has read is given to this thread in one go each.
+  const parts = Array.from({ length: ground.zone_parts }, (_, k) => k);
+  const zoneLayers = parts.map((k) => `zones-${k}`);
+  for (const k of parts) map.addSource(`zones-${k}`, { type: "geojson", data: new URL(`api/v1/zones.geojson?part=${k}`, document.baseURI).href, tolerance: 0.1, buffer: 8 });
   map.addSource("field", { type: "geojson", data: collection(ground.field.map((area) => ({ type: "Feature", properties: {}, geometry: { type: "Polygon", coordinates: area.map((one) => pairs(one).map(([e, n]) => frame.lngLat(e, n))) } }))) });
   for (const name of ["boom", "ahead", "craft"]) map.addSource(name, { type: "geojson", data: collection() });
-  map.addLayer({ id: "zones", type: "fill", source: "zones", paint: { "fill-color": zoneColor(), "fill-opacity": 0.3, "fill-antialias": false } });
-  if (ground.zone_count <= 3000) map.addLayer({ id: "zone-lines", type: "line", source: "zones", paint: { "line-color": LOOK[theme].zone, "line-width": 1, "line-opacity": 0.7 } });
-  map.addLayer({ id: "zone-ahead", type: "line", source: "zones", filter: ["==", ["get", "zone"], -1], paint: { "line-color": LOOK[theme].ahead, "line-width": 3 } });
+  for (const id of zoneLayers) map.addLayer({ id, type: "fill", source: id, paint: { "fill-color": zoneColor(), "fill-opacity": 0.3, "fill-antialias": false } });
+  if (ground.zone_count <= 3000) map.addLayer({ id: "zone-lines", type: "line", source: "zones-0", paint: { "line-color": LOOK[theme].zone, "line-width": 1, "line-opacity": 0.7 } });
+  for (const k of parts) map.addLayer({ id: `zone-ahead-${k}`, type: "line", source: `zones-${k}`, filter: ["==", ["get", "zone"], -1], paint: { "line-color": LOOK[theme].ahead, "line-width": 3 } });
   map.addLayer({ id: "field", type: "line", source: "field", paint: { "line-color": LOOK[theme].field, "line-width": 2.5 } });
   map.addLayer({ id: "ahead-line", type: "line", source: "ahead", paint: { "line-color": LOOK[theme].ahead, "line-width": 2, "line-dasharray": [2, 2] } });
   map.addLayer({ id: "ahead", type: "circle", source: "ahead", filter: ["==", ["geometry-type"], "Point"], paint: { "circle-radius": 6, "circle-color": LOOK[theme].ahead, "circle-stroke-width": 2, "circle-stroke-color": LOOK[theme].halo } });
@@ -101,7 +104,7 @@ export async function create(element, ground, scale, theme, onView) {
       if (chunks[number]) map.getSource(`treated-${number}`).setData(data);
       else {
         map.addSource(`treated-${number}`, { type: "geojson", data, tolerance: 0, buffer: 0 });
-        map.addLayer({ id: `treated-${number}`, type: "fill", source: `treated-${number}`, paint: { "fill-color": ["get", "color"], "fill-opacity": 0.92, "fill-antialias": false } }, "zone-ahead");
+        map.addLayer({ id: `treated-${number}`, type: "fill", source: `treated-${number}`, paint: { "fill-color": ["get", "color"], "fill-opacity": 0.92, "fill-antialias": false } }, "zone-ahead-0");
         chunks[number] = true;
       }
     }
@@ -126,9 +129,9 @@ export async function create(element, ground, scale, theme, onView) {
         { type: "Feature", properties: {}, geometry: line([[vehicle.east_m, vehicle.north_m], ahead]) },
         { type: "Feature", properties: {}, geometry: { type: "Point", coordinates: frame.lngLat(...ahead) } },
       ]));
-      const found = ahead[0] === null || !vehicle.in_air ? [] : map.queryRenderedFeatures(map.project(frame.lngLat(...ahead)), { layers: ["zones"] });
+      const found = ahead[0] === null || !vehicle.in_air ? [] : map.queryRenderedFeatures(map.project(frame.lngLat(...ahead)), { layers: zoneLayers });
       const next = found[0]?.properties.zone ?? -1;
-      if (next !== zone) { zone = next; map.setFilter("zone-ahead", ["==", ["get", "zone"], zone]); }
+      if (next !== zone) { zone = next; for (const k of parts) map.setFilter(`zone-ahead-${k}`, ["==", ["get", "zone"], zone]); }
       if (follows) map.easeTo({ center: here, duration: 180, easing: (t) => t });
     },
     setTheme(name, next) {
@@ -136,14 +139,14 @@ export async function create(element, ground, scale, theme, onView) {
       const look = LOOK[name];
       map.setPaintProperty("ground", "background-color", look.ground);
       if (map.getLayer("zone-lines")) map.setPaintProperty("zone-lines", "line-color", look.zone);
-      for (const id of ["zone-ahead", "ahead-line"]) map.setPaintProperty(id, "line-color", look.ahead);
+      for (const id of [...parts.map((k) => `zone-ahead-${k}`), "ahead-line"]) map.setPaintProperty(id, "line-color", look.ahead);
       map.setPaintProperty("field", "line-color", look.field);
       map.setPaintProperty("ahead", "circle-color", look.ahead);
       map.setPaintProperty("ahead", "circle-stroke-color", look.halo);
       map.setPaintProperty("boom-halo", "line-color", look.halo);
       map.setPaintProperty("boom", "line-color", ["case", ["get", "isOpen"], look.open, look.closed]);
       map.updateImage("craft", craftImage(look.craft, look.halo));
-      map.setPaintProperty("zones", "fill-color", zoneColor());
+      for (const id of zoneLayers) map.setPaintProperty(id, "fill-color", zoneColor());
       draw(0);
     },
     follow(yes) { follows = yes; },
