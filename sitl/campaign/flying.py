@@ -270,7 +270,7 @@ def _error(given: Mapping[str, Value]) -> Disturbance:
     }
     if "error.lags" in given:
         values["kinds"] = given["error.lags"]
-    return Disturbance(key="", label="", **values)
+    return Disturbance(**values)
 
 
 def _options(scene: _Scene, given: Mapping[str, Value], seed: int) -> FlightOptions:

@@ -8,6 +8,7 @@ row as well.
 from __future__ import annotations
 
 import itertools
+import resource
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
@@ -50,6 +51,7 @@ class Tally:
             "wall_s": round(self.wall_s, 3),
             "flight_cpu_s": round(cpu_s, 3),
             "own_cpu_s": round(self.own_cpu_s, 3),
+            "own_peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
             "flights_per_cpu_s": (self.flights - self.failed) / cpu_s if cpu_s else None,
             "flights_per_s": self.flights / self.wall_s if self.wall_s else None,
             "overhead_percent": 100.0 * self.own_cpu_s / cpu_s if cpu_s else None,

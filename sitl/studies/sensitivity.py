@@ -1,10 +1,11 @@
 """What an error that nobody knows of costs: of lag, of position, of its rate, of wind.
 
-    python -m sitl.studies.sensitivity --page docs/measurements/sensitivity.md
+    vrspray campaign examples/campaigns/sensitivity.toml --out flown
+    python -m sitl.studies.sensitivity flown --page docs/measurements/sensitivity.md
 
-flies the field of Wang et al. 2024 (P1) with `scheduled`, once undisturbed and once with each
-disturbance, and compares flights of the same seed. Wind is not flown: where the undisturbed
-flight's liquid lands is moved by wind x fall time and judged again.
+compares the cases of a campaign with its first one, flights of the same seed with each other. Of
+wind: where the liquid lands is moved by wind x fall time, 0.80 s for ballistic droplets of 250 um
+from 3.5 m through a downwash of 8 m/s that fades to the ground, 0.45 s at its full speed.
 """
 
 from __future__ import annotations
@@ -13,35 +14,30 @@ import importlib.util
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from statistics import fmean
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from analysis.evaluation import Evaluation, evaluate
-from analysis.flight_record import Fidelity, FlightRecord
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError, VrsprayError
 from companion.wording import install_command
-from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
-from sitl.disturbances import (
-    UNDISTURBED,
-    Disturbance,
-    chosen,
-    displaced,
-    drifted,
-    shortened,
-)
-from sitl.flight import FlightOptions, fly
-from sitl.profile import load_profile
+from sitl.campaign.dataset import read_columns, read_manifest
 
-SPEED_M_S = 5.0
-PROFILE = "wang-2024"
+# Figures by their columns in a campaign's dataset.
+COLUMNS = {
+    "lag_mean_m": "lag_distance_mean_m",
+    "lag_mean_abs_m": "lag_distance_mean_abs_m",
+    "lag_worst_m": "lag_distance_max_abs_m",
+    "misapplied_percent": "misapplied_percent",
+    "off_target_ml": "off_target_ml",
+    "apart": "apart",
+    "missed": "missed",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,26 +53,17 @@ class Figures:
     missed: int
 
     @staticmethod
-    def of(found: Evaluation) -> Figures:
+    def of(row: Mapping[str, Any]) -> Figures:
         """Return the figures of one flight.
 
         Raises:
             VrsprayError: when there was nothing to measure.
         """
-        lag = found.lag_distance_m
-        mean, mean_abs, worst = lag.mean, lag.mean_abs, lag.max_abs
-        misapplied = found.misapplied_percent
-        if mean is None or mean_abs is None or worst is None or misapplied is None:
-            raise VrsprayError(f"seed {found.meta.seed}: no change of rate could be measured")
-        return Figures(
-            lag_mean_m=mean,
-            lag_mean_abs_m=mean_abs,
-            lag_worst_m=worst,
-            misapplied_percent=misapplied,
-            off_target_ml=found.off_target_ml,
-            apart=found.apart,
-            missed=found.missed,
-        )
+        values = {name: row[column] for name, column in COLUMNS.items()}
+        if None in values.values():
+            reason = row["error"] or "no change of rate could be measured"
+            raise VrsprayError(f"{row['case']}, seed {row['seed']}: {reason}")
+        return Figures(**values)
 
     @staticmethod
     def all_of(flights: Iterable[Figures]) -> Figures:
@@ -114,7 +101,6 @@ class Cost:
 class Row:
     """A disturbance, what was achieved under it, and what it cost."""
 
-    key: str
     label: str
     figures: Figures
     lag_mean_abs_cost_m: Cost
@@ -123,11 +109,10 @@ class Row:
     off_target_cost_ml: Cost
 
     @staticmethod
-    def of(what: Disturbance, flights: list[Figures], plain: list[Figures]) -> Row:
+    def of(label: str, flights: list[Figures], plain: list[Figures]) -> Row:
         """Return the row of the flights of some seeds beside the undisturbed ones."""
         return Row(
-            key=what.key,
-            label=what.label,
+            label=label,
             figures=Figures.all_of(flights),
             lag_mean_abs_cost_m=Cost.of(flights, plain, "lag_mean_abs_m"),
             lag_worst_cost_m=Cost.of(flights, plain, "lag_worst_m"),
@@ -141,85 +126,51 @@ class Result:
     """The undisturbed flights and every row."""
 
     speed_m_s: float
-    fidelity: Fidelity
+    fidelity: str
     seeds: tuple[int, ...]
     flights: int
     undisturbed: Figures
+    plain: str
     rows: tuple[Row, ...]
 
 
-def measure(
-    what: Iterable[Disturbance],
-    *,
-    seeds: Iterable[int],
-    fidelity: Fidelity = "pulsed",
-    on_flown: Callable[[], None] = lambda: None,
-) -> Result:
-    """Fly every disturbance with every seed; the same arguments give the same figures."""
-    disturbances, numbers = tuple(what), tuple(seeds)
-    plain: list[Figures] = []
-    found: dict[str, list[Figures]] = {each.key: [] for each in disturbances}
-    flights = 0
-    for seed in numbers:
-        record = flown(UNDISTURBED, seed=seed, fidelity=fidelity)
-        plain.append(Figures.of(evaluate(record)))
-        on_flown()
-        flights += 1
-        for each in disturbances:
-            if each.is_drift:
-                landed = drifted(record, each, demo_setup(SPEED_M_S).frame)
-            else:
-                landed = flown(each, seed=seed, fidelity=fidelity)
-                flights += 1
-            found[each.key].append(Figures.of(evaluate(landed)))
-            on_flown()
+def result_of(folder: Path) -> Result:
+    """Return what a campaign's dataset says; its first case is the undisturbed one.
+
+    Raises:
+        VrsprayError: it is none, or lacks flights.
+    """
+    names = ["case", "seed", "error", "speed_m_s", "fidelity", *COLUMNS.values()]
+    rows = read_columns(folder, names).to_pylist()
+    if len(rows) < read_manifest(folder)["flights"]:
+        raise ConfigError(f"{folder}: not all flown yet; run the campaign to its end")
+    found: dict[str, list[Figures]] = {}
+    for row in rows:
+        found.setdefault(row["case"], []).append(Figures.of(row))
+    plain, *others = found
     return Result(
-        speed_m_s=SPEED_M_S,
-        fidelity=fidelity,
-        seeds=numbers,
-        flights=flights,
-        undisturbed=Figures.all_of(plain),
-        rows=tuple(Row.of(each, found[each.key], plain) for each in disturbances),
+        speed_m_s=rows[0]["speed_m_s"],
+        fidelity=rows[0]["fidelity"],
+        seeds=tuple(sorted({row["seed"] for row in rows})),
+        flights=len(rows),
+        undisturbed=Figures.all_of(found[plain]),
+        plain=plain,
+        rows=tuple(Row.of(label, found[label], found[plain]) for label in others),
     )
-
-
-def flown(what: Disturbance, *, seed: int, fidelity: Fidelity) -> FlightRecord:
-    """Return the truth of one flight whose controller knows nothing of the disturbance."""
-    profile, setup = load_profile(PROFILE), demo_setup(SPEED_M_S)
-    result = fly(
-        replace(setup, lag=shortened(demo_lags("gpio"), what)),
-        demo_trajectory(SPEED_M_S, seed),
-        profile,
-        FlightOptions(fidelity=fidelity, seed=seed, position_rate_hz=what.rate_hz),
-        speed_m_s=SPEED_M_S,
-        disturb=partial(displaced, what=what, frame=setup.frame),
-    )
-    return result.record
 
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m sitl.studies.sensitivity --seeds 5 --only lag-short-20")
+@app.command(epilog="Example: python -m sitl.studies.sensitivity flown --page sensitivity.md")
 def sensitivity(
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds 1 to N.")] = 5,
-    only: Annotated[
-        list[str] | None,
-        typer.Option(metavar="KEY", help="This disturbance; may be repeated. Default: all."),
-    ] = None,
-    averaged: Annotated[
-        bool, typer.Option("--averaged", help="The mean of the pulses instead of pulses.")
-    ] = False,
+    flown: Annotated[Path, typer.Argument(metavar="DIR", help="Dataset of the campaign.")],
     page: Annotated[Path | None, typer.Option(metavar="MD", help="Write the page.")] = None,
     plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Draw the costs.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Say what errors of lag, position, rate and wind cost in lag distance and volume."""
-    result = measure(
-        chosen(only or ()),
-        seeds=range(1, seeds + 1),
-        fidelity="averaged" if averaged else "pulsed",
-    )
+    result = result_of(flown)
     if plot is not None:
         write_plot(result, plot)
     if page is not None:
@@ -353,7 +304,7 @@ def _basis(result: Result) -> str:
 
 def _rows(result: Result) -> list[tuple[str, ...]]:
     plain = result.undisturbed
-    return [_row("undisturbed, positions at 20 Hz", plain, None)] + [
+    return [_row(result.plain, plain, None)] + [
         _row(row.label, row.figures, row) for row in result.rows
     ]
 

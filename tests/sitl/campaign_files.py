@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
+from typing import Any
 
+from companion.errors import VrsprayError
 from sitl.anyang import EXAMPLE
+from sitl.campaign.bundle import Bundle, bundle_of, unpack
+from sitl.campaign.dataset import Dataset, open_dataset
+from sitl.campaign.design import read_campaign
+from sitl.campaign.running import Tally, fly_missing
 
 # Home, take-off, 5 m/s, and 45 m along the first pass.
 MISSION = """\
@@ -45,3 +53,44 @@ def files_of(folder: Path) -> dict[str, bytes]:
         for path in sorted(folder.rglob("*"))
         if path.is_file() and path.name != "log.jsonl"
     }
+
+
+class OwnProcess:
+    """Flies in this process, at once."""
+
+    deaths = 1
+
+    def __init__(self, folder: Path) -> None:
+        self.folder: Path | None = folder
+
+    def count(self) -> int:
+        return 1
+
+    def submit(self, function: Callable[..., Any], *given: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*given))
+        except VrsprayError as error:
+            future.set_exception(error)
+        return future
+
+    def lost(self, error: BaseException) -> bool:
+        return False
+
+    def renew(self) -> None:
+        raise AssertionError
+
+
+def opened(file: Path, out: Path) -> tuple[Dataset, Bundle]:
+    campaign = read_campaign(file)
+    bundle = bundle_of(campaign)
+    return open_dataset(campaign, bundle, out), bundle
+
+
+def fly_here(file: Path, out: Path) -> Tally:
+    """Fly what a dataset lacks in this process alone."""
+    dataset, bundle = opened(file, out)
+    tally = Tally()
+    workers = OwnProcess(unpack(bundle, out.with_name(f"{out.name}-bundle")))
+    fly_missing(dataset, bundle, workers, tally, tell=lambda _: None)
+    return tally

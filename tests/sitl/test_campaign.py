@@ -8,8 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,10 +20,9 @@ from typer.testing import CliRunner
 
 from analysis.evaluation import evaluate
 from companion.cli.app import execute
-from companion.errors import ConfigError, VrsprayError
+from companion.errors import ConfigError
 from sitl.campaign import cli
-from sitl.campaign.bundle import Bundle, bundle_of, unpack
-from sitl.campaign.dataset import Dataset, open_dataset, part_size
+from sitl.campaign.dataset import part_size
 from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.executors import pool_of
 from sitl.campaign.flying import fly_flight
@@ -35,7 +32,7 @@ from sitl.campaign.show import groups_of, read_rows
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
-from tests.sitl.campaign_files import files_of, write_campaign
+from tests.sitl.campaign_files import files_of, fly_here, opened, write_campaign
 
 VARIED = """
 seeds = 4
@@ -53,38 +50,6 @@ def here(tmp_path: Path) -> Path:
     return write_campaign(tmp_path, VARIED)
 
 
-class OwnProcess:
-    """Flies in this process, at once."""
-
-    deaths = 1
-
-    def __init__(self, folder: Path) -> None:
-        self.folder: Path | None = folder
-
-    def count(self) -> int:
-        return 1
-
-    def submit(self, function: Callable[..., Any], *given: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(function(*given))
-        except VrsprayError as error:
-            future.set_exception(error)
-        return future
-
-    def lost(self, error: BaseException) -> bool:
-        return False
-
-    def renew(self) -> None:
-        raise AssertionError
-
-
-def opened(file: Path, out: Path) -> tuple[Dataset, Bundle]:
-    campaign = read_campaign(file)
-    bundle = bundle_of(campaign)
-    return open_dataset(campaign, bundle, out), bundle
-
-
 def rows_of(out: Path) -> list[dict[str, Any]]:
     paths = sorted((out / "flights").glob("part=*/flights.parquet"))
     return [row for path in paths for row in pq.ParquetFile(path).read().to_pylist()]
@@ -94,9 +59,7 @@ def rows_of(out: Path) -> list[dict[str, Any]]:
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The dataset as this process alone makes it."""
     folder = tmp_path_factory.mktemp("reference")
-    dataset, bundle = opened(write_campaign(folder, VARIED), folder / "out")
-    workers = OwnProcess(unpack(bundle, folder / "bundle"))
-    fly_missing(dataset, bundle, workers, Tally(), tell=lambda _: None)
+    fly_here(write_campaign(folder, VARIED), folder / "out")
     return folder / "out"
 
 
@@ -161,7 +124,7 @@ import os, signal, sys
 from pathlib import Path
 from sitl.campaign.executors import pool_of
 from sitl.campaign.running import Tally, fly_missing
-from tests.sitl.test_campaign import opened
+from tests.sitl.campaign_files import opened
 
 if __name__ == "__main__":
     dataset, bundle = opened(Path(sys.argv[1]), Path(sys.argv[2]))
@@ -187,10 +150,7 @@ def test_a_campaign_whose_scheduler_is_killed_goes_on_to_the_same_bytes(
     assert ended.returncode == -signal.SIGKILL, ended.stderr.decode()
     parts = len(rows_of(out)) // part_size(24)
     assert 0 < parts < 3
-    dataset, bundle = opened(here, out)
-    tally = Tally()
-    workers = OwnProcess(unpack(bundle, tmp_path / "bundle"))
-    fly_missing(dataset, bundle, workers, tally, tell=lambda _: None)
+    tally = fly_here(here, out)
     assert tally.flights == 24 - 10 * parts
     assert files_of(out) == files_of(reference)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,36 +11,49 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.core.types import Input, Telemetry
-from companion.errors import ConfigError, VrsprayError
+from companion.errors import ConfigError
 from sitl.anyang import anyang_lag
+from sitl.campaign.design import read_campaign
 from sitl.demo_field import demo_setup
-from sitl.disturbances import (
-    DISTURBANCES,
-    UNDISTURBED,
-    Disturbance,
-    chosen,
-    displaced,
-    on_ground,
-    shortened,
-)
+from sitl.disturbances import BORDER, INSIDE, Disturbance, displaced, on_ground, shortened
 from sitl.studies.sensitivity import (
-    SPEED_M_S,
     Cost,
     Figures,
     Result,
     app,
-    measure,
+    result_of,
     table_lines,
     write_page,
     write_plot,
 )
+from tests.sitl.campaign_files import fly_here
 
+CAMPAIGN = Path(__file__).parents[2] / "examples" / "campaigns" / "sensitivity.toml"
+FLOWN = (
+    "undisturbed, positions at 20 Hz",
+    "lags 20 ms too short",
+    "wind 1 m/s along, 0.80 s of fall",
+)
+SPEED_M_S = 5.0
+UNDISTURBED = Disturbance()
 FRAME = demo_setup(SPEED_M_S).frame
 
 
 @pytest.fixture(scope="module")
-def result() -> Result:
-    return measure(chosen(["lag-short-20", "wind-along"]), seeds=[1], fidelity="averaged")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three cases of the campaign that is shipped, of one seed, by the averaged twin."""
+    folder = tmp_path_factory.mktemp("sensitivity")
+    head, *cases = CAMPAIGN.read_text(encoding="utf-8").split("[[case]]\n")
+    head = head.replace("seeds = 5", "seeds = 1").replace("pulsed", "averaged")
+    chosen = [case for case in cases if case.split('"')[1] in FLOWN]
+    (folder / "some.toml").write_text("[[case]]\n".join([head, *chosen]), encoding="utf-8")
+    fly_here(folder / "some.toml", folder / "flown")
+    return folder / "flown"
+
+
+@pytest.fixture(scope="module")
+def result(flown: Path) -> Result:
+    return result_of(flown)
 
 
 def told(north_m_s: float | None, east_m_s: float | None) -> Telemetry:
@@ -70,7 +84,7 @@ def test_wind_is_late_one_way_and_early_the_other(result: Result) -> None:
     assert row.figures.lag_mean_m == pytest.approx(result.undisturbed.lag_mean_m, abs=0.01)
     assert row.figures.lag_mean_abs_m == pytest.approx(0.80, abs=0.02)
     assert row.figures.off_target_ml > result.undisturbed.off_target_ml
-    assert result.flights == 2  # wind is not flown
+    assert row.figures.lag_worst_m > 0.5
 
 
 def test_page_and_picture_hold_what_was_measured(result: Result, tmp_path: Path) -> None:
@@ -88,14 +102,14 @@ def test_page_and_picture_hold_what_was_measured(result: Result, tmp_path: Path)
 
 
 def test_behind_is_against_the_course_and_nothing_where_it_is_unknown() -> None:
-    behind = Disturbance(key="x", label="x", behind_m=0.10)
+    behind = Disturbance(behind_m=0.10)
     assert place(behind, told(0.0, 5.0)) == pytest.approx((9.9, 20.0), abs=1e-6)
     assert place(behind, told(-5.0, 0.0)) == pytest.approx((10.0, 20.1), abs=1e-6)
     assert place(behind, told(None, None)) == pytest.approx((10.0, 20.0), abs=1e-6)
 
 
 def test_a_ground_offset_is_the_same_in_every_direction() -> None:
-    ground = Disturbance(key="x", label="x", along_m=0.10, across_m=0.05)
+    ground = Disturbance(along_m=0.10, across_m=0.05)
     east_m, north_m = on_ground(FRAME, 0.10, 0.05)
     assert east_m**2 + north_m**2 == pytest.approx(0.10**2 + 0.05**2)
     assert north_m > 0.0  # the first pass leads north
@@ -111,12 +125,17 @@ def test_the_undisturbed_flight_is_not_touched() -> None:
 
 def test_every_error_of_lag_can_be_configured() -> None:
     lag = anyang_lag("gpio")
-    for each in DISTURBANCES:
-        wrong = shortened(lag, each)
-        for name in each.kinds:
-            assert getattr(lag, name) - getattr(wrong, name) == pytest.approx(each.lag_short_s)
-    up = shortened(lag, next(each for each in DISTURBANCES if each.key == "up-short-20"))
-    assert replace(up, up_s=lag.up_s) == lag
+    for name in (*INSIDE, *BORDER):
+        wrong = shortened(lag, Disturbance(lag_short_s=0.02, kinds=(name,)))
+        assert getattr(lag, name) - getattr(wrong, name) == pytest.approx(0.02)
+        assert replace(wrong, **{name: getattr(lag, name)}) == lag
+
+
+def test_the_campaign_that_is_shipped_has_every_error_alone() -> None:
+    campaign = read_campaign(CAMPAIGN)
+    assert campaign.cases[0] == (FLOWN[0], {}) and len(campaign.cases) == 16
+    assert {"error.behind_m", "error.across_m", "vehicle.position_rate_hz"} < set(campaign.varied)
+    assert all(len(case) <= 2 for _, case in campaign.cases)
 
 
 def test_a_cost_is_taken_seed_by_seed() -> None:
@@ -130,27 +149,19 @@ def test_a_cost_is_taken_seed_by_seed() -> None:
     assert Figures.all_of([worse, plain]).lag_worst_m == 0.5
 
 
-def test_an_unknown_key_is_refused() -> None:
-    assert chosen([]) == DISTURBANCES
-    with pytest.raises(VrsprayError, match="--only nonsense"):
-        chosen(["nonsense"])
+def test_a_dataset_that_is_not_complete_is_refused(flown: Path, tmp_path: Path) -> None:
+    shutil.copytree(flown, tmp_path / "half")
+    manifest = tmp_path / "half" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"flights": 3,', '"flights": 4,'))
+    with pytest.raises(ConfigError, match="not all flown yet"):
+        result_of(tmp_path / "half")
 
 
-def test_json_is_one_object(
-    result: Result, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    asked: list[tuple[str, list[int], str]] = []
-
-    def measured(what: tuple[Disturbance, ...], *, seeds: range, fidelity: str) -> Result:
-        asked.extend((each.key, list(seeds), fidelity) for each in what)
-        return result
-
-    monkeypatch.setattr("sitl.studies.sensitivity.measure", measured)
+def test_json_is_one_object(result: Result, flown: Path, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    given = ["--seeds", "2", "--only", "wind-across", "--page", str(page), "--json"]
-    answer = CliRunner().invoke(app, given)
+    answer = CliRunner().invoke(app, [str(flown), "--page", str(page), "--json"])
     assert answer.exit_code == 0, answer.output
-    assert asked == [("wind-across", [1, 2], "pulsed")]
     found = json.loads(answer.stdout)
-    assert [row["key"] for row in found["rows"]] == ["lag-short-20", "wind-along"]
+    assert [row["label"] for row in found["rows"]] == list(FLOWN[1:])
+    assert found["undisturbed"]["missed"] == result.undisturbed.missed
     assert page.is_file()

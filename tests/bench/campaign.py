@@ -1,0 +1,228 @@
+"""What a campaign costs: `python -m tests.bench.campaign [--dataset DIR] [--page]`.
+
+Two workers of a campaign beside two processes that share nothing and fly the same flights, in turns
+in one run, so that what else the computer does meets both. `--dataset` takes what a long campaign
+has logged. `--page` writes docs/measurements/scale.md, up to the part that others write.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from sitl.campaign.bundle import bundle_of
+from sitl.campaign.dataset import open_dataset
+from sitl.campaign.design import read_campaign
+from sitl.campaign.executors import pool_of
+from sitl.campaign.running import Tally, fly_missing
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "measurements" / "scale.md"
+FIELD = """
+version = 1
+seeds = {{first = {first}, count = {count}}}
+[fixed]
+flight.fidelity = "averaged"
+"""
+OTHERS = "\n## Journals"
+WORKERS = (1, 8, 64)
+MANY = 1_000_000
+# Flies seeds of the field when it is told to, and says what it took.
+ALONE = """
+import json, sys, time
+from pathlib import Path
+from sitl.campaign.flying import fly_flight
+first, count = map(int, sys.argv[1:])
+given = (("flight.fidelity", "averaged"),)
+fly_flight(given, first, Path())
+print("ready", flush=True)
+sys.stdin.readline()
+began_s, loop_s, simulated_s = time.process_time(), 0.0, 0.0
+for seed in range(first + 1, first + 1 + count):
+    row = fly_flight(given, seed, Path())
+    loop_s += row.loop_cpu_s
+    simulated_s += row.figures["simulated_s"]
+print(json.dumps([time.process_time() - began_s, simulated_s / loop_s]))
+"""
+
+
+def alone(count: int) -> dict[str, float]:
+    """Fly `count` flights by two processes that know nothing of each other."""
+    halves = [(100, count // 2), (200, count // 2)]
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", ALONE, *map(str, half)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        )
+        for half in halves
+    ]  # fmt: skip
+    for each in started:
+        assert each.stdout is not None
+        each.stdout.readline()
+    began_s = time.monotonic()
+    for each in started:
+        assert each.stdin is not None
+        each.stdin.write("\n")
+        each.stdin.flush()
+    told = [json.loads(each.communicate()[0]) for each in started]
+    wall_s = time.monotonic() - began_s
+    return {
+        "flights_per_s": count / wall_s,
+        "flights_per_cpu_s": count / sum(cpu_s for cpu_s, _ in told),
+        "times_real_time": sum(times for _, times in told) / len(told),
+    }
+
+
+def together(count: int, folder: Path) -> dict[str, float]:
+    """Fly as many by two workers of a campaign, which have flown before."""
+    with_workers: dict[str, float] = {}
+    for name, first, number in (("warm", 900, 4), ("measured", 300, count)):
+        file = folder / f"{name}.toml"
+        file.write_text(FIELD.format(first=first, count=number))
+    campaign = read_campaign(folder / "measured.toml")
+    bundle = bundle_of(campaign)
+    with pool_of(2, bundle) as pool:
+        warm = open_dataset(read_campaign(folder / "warm.toml"), bundle, folder / "warm")
+        fly_missing(warm, bundle, pool, Tally(), tell=lambda _: None)
+        tally = Tally()
+        dataset = open_dataset(campaign, bundle, folder / "measured")
+        fly_missing(dataset, bundle, pool, tally, tell=lambda _: None)
+    told = tally.as_json()
+    for key in ("flights_per_s", "flights_per_cpu_s", "times_real_time", "overhead_percent"):
+        with_workers[key] = told[key]
+    return with_workers
+
+
+def compare(count: int, rounds: int) -> dict[str, Any]:
+    """Return both, round by round, and the ratio of their rates."""
+    found: dict[str, Any] = {"alone": [], "together": []}
+    for _ in range(rounds):
+        found["alone"].append(alone(count))
+        with tempfile.TemporaryDirectory() as folder:
+            found["together"].append(together(count, Path(folder)))
+    pairs = list(zip(found["together"], found["alone"], strict=True))
+    for key in ("flights_per_s", "flights_per_cpu_s", "times_real_time"):
+        found[f"{key}_ratio"] = median(ours[key] / theirs[key] for ours, theirs in pairs)
+        found[key] = median(ours[key] for ours, _ in pairs)
+    found["overhead_percent"] = median(ours["overhead_percent"] for ours, _ in pairs)
+    return found
+
+
+def logged(folder: Path) -> dict[str, Any]:
+    """Return what the runs of a dataset took, and its size."""
+    runs = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    parts = list((folder / "flights").glob("part=*/flights.parquet"))
+    size = json.loads((folder / "manifest.json").read_text())["part_flights"]
+    sums = {
+        key: sum(run[key] for run in runs)
+        for key in ("flown", "failed", "wall_s", "flight_cpu_s", "own_cpu_s")
+    }
+    return sums | {
+        "runs": len(runs),
+        "written": len(parts) * size,
+        "bytes_per_flight": sum(part.stat().st_size for part in parts) / (len(parts) * size),
+        "flights_per_cpu_s": (sums["flown"] - sums["failed"]) / sums["flight_cpu_s"],
+        "overhead_percent": 100.0 * sums["own_cpu_s"] / sums["flight_cpu_s"],
+        "own_s_per_flight": sums["own_cpu_s"] / sums["flown"],
+        "own_peak_mb": max(run.get("own_peak_mb", 0.0) for run in runs),
+        "times_real_time": median(run["times_real_time"] for run in runs if run["times_real_time"]),
+    }
+
+
+def page(found: dict[str, Any], log: dict[str, Any] | None, command: str) -> str:
+    """Return the page's first part."""
+    of = log or found
+    rate = of["flights_per_cpu_s"]
+    lines = [
+        "<!-- Written by `python -m tests.bench.campaign --page`; do not edit. -->\n",
+        "# Scale\n",
+        "What one core does, where the limits are, and what a million flights cost. *Measured* is",
+        "marked apart from *computed*.\n",
+        "## Campaigns, measured\n",
+        f"Made by `{command}` on {datetime.now(tz=UTC).date()}, {os.cpu_count()} x86_64 cores with"
+        f" other programs, load average {os.getloadavg()[0]:.1f}: times are upper bounds, ratios"
+        " are of the same run.\n",
+        "| What | Measured | Target |",
+        "| --- | --- | --- |",
+        "| two workers over two processes that share nothing: flights a second | "
+        f"{found['flights_per_s_ratio']:.2f} | >= 0.9 |",
+        "| the same, flights a second of processor time | "
+        f"{found['flights_per_cpu_s_ratio']:.2f} | |",
+        f"| averaged twin in a worker over the same outside | {found['times_real_time_ratio']:.2f} "
+        f"| |\n| averaged twin in a worker | {found['times_real_time']:.0f} x real time | >= 300 |",
+    ]
+    if log is not None:
+        lines += [
+            f"| flights of the published field, one campaign of {log['runs']} runs | "
+            f"{log['flown']} | 2000 |",
+            f"| flights a second and core | {log['flights_per_cpu_s']:.2f} | |",
+            "| scheduling and writing, of a flight's processor time | "
+            f"{log['overhead_percent']:.2f} % | <= 5 |",
+            f"| dataset, bytes a flight | {log['bytes_per_flight']:.0f} | |",
+        ]
+        if log["own_peak_mb"]:
+            lines.append(f"| memory of the scheduling process | {log['own_peak_mb']:.0f} MB | |")
+    lines += ["", *_computed(rate, of, log)]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _computed(rate: float, of: dict[str, Any], log: dict[str, Any] | None) -> list[str]:
+    own_s = log["own_s_per_flight"] if log else of["overhead_percent"] / 100.0 / rate
+    lines = [
+        "## Campaigns, computed\n",
+        f"A million such flights at {rate:.2f} a second and core, a core for each worker:\n",
+        "| Workers | Time | Processor time |",
+        "| --- | --- | --- |",
+    ]
+    for workers in WORKERS:
+        hours = MANY / rate / 3600.0 / workers
+        lines.append(f"| {workers} | {hours:.1f} h | {MANY / rate / 3600.0:.0f} core hours |")
+    lines += [
+        "",
+        "- One process schedules and writes. At "
+        f"{1000.0 * own_s:.1f} ms a flight it is busy all the time with "
+        f"{1.0 / (own_s * rate):.0f} workers; more of them bring nothing.",
+        "- It holds the points of the design (8 bytes a setting and point), the rows of parts under"
+        " way, and two flights a worker; not the flights to come.",
+        "- A million flights are 200 parts of 5000: a killed scheduler loses the parts under way.",
+        "- Files travel once to each worker, 200 MB at most.",
+    ]
+    if log is not None:
+        lines.append(f"- Their dataset has {MANY * log['bytes_per_flight'] / 1e9:.2f} GB.")
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, print JSON, and write the page where it is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--flights", type=int, default=8)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--dataset", type=Path)
+    parser.add_argument("--page", action="store_true")
+    given = parser.parse_args(arguments)
+    found = compare(given.flights, given.rounds)
+    log = None if given.dataset is None else logged(given.dataset)
+    sys.stdout.write(json.dumps({"compared": found, "logged": log}, indent=1) + "\n")
+    if given.page:
+        words = [f"--flights {given.flights}", f"--rounds {given.rounds}"]
+        words += ["--dataset DIR"] if log else []
+        text = page(found, log, f"python -m tests.bench.campaign {' '.join(words)}")
+        rest = ""
+        if PAGE.exists():
+            _, mark, rest = PAGE.read_text(encoding="utf-8").partition(OTHERS)
+            rest = mark + rest
+        PAGE.write_text(text + rest, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
