@@ -206,8 +206,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return found
 
 
-def read_columns(folder: Path, names: Sequence[str]) -> pa.Table:
-    """Return some columns of all rows that there are, in the order of their flights.
+def read_columns(folder: Path, names: Sequence[str] | None) -> pa.Table:
+    """Return some columns, or all, of the rows that there are, in the order of their flights.
 
     Raises:
         ConfigError: a part is damaged.
@@ -218,7 +218,7 @@ def read_columns(folder: Path, names: Sequence[str]) -> pa.Table:
     tables = []
     for path in sorted((folder / FLIGHTS).glob(f"part=*/{FILE}")):
         try:
-            tables.append(pq.ParquetFile(path).read(columns=list(names)))
+            tables.append(pq.ParquetFile(path).read(columns=None if names is None else list(names)))
         except (OSError, pa.ArrowException) as error:
             raise ConfigError(
                 f"{path}: damaged ({error}); delete it and run the campaign again"

@@ -1,8 +1,9 @@
 """The twin against what Wang et al. 2024 (P1) measured with a real sprayer, as a command.
 
-    python -m sitl.studies.validation --out docs/measurements
+    vrspray campaign examples/campaigns/validation.toml --out flown
+    python -m sitl.studies.validation flown --out docs/measurements
 
-`validation_flights` flies, `validation_page` and `validation_pictures` show.
+`validation_flights` reads the flights, `validation_page` and `validation_pictures` show.
 """
 
 from __future__ import annotations
@@ -18,47 +19,27 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError, VrsprayError
 from companion.wording import install_command
-from sitl.studies.validation_flights import EVERY_WAY, SPEEDS_M_S, Validation, validate
+from sitl.studies.validation_flights import Validation, validate
 from sitl.studies.validation_page import COMMAND, summary_lines, write_page
 
 IMAGES = "images"
-NOTE_EVERY = 30
-
-
-class _Told:
-    """Says on stderr how far it is; it takes minutes."""
-
-    def __init__(self, total: int) -> None:
-        self._total, self._done = total, 0
-
-    def one(self) -> None:
-        """Count one flight."""
-        self._done += 1
-        if self._done % NOTE_EVERY == 0:
-            note(f"{self._done} of {self._total} flights")
-
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
-@app.command(epilog="Example: python -m sitl.studies.validation --seeds 20 --out docs/measurements")
+@app.command(epilog="Example: python -m sitl.studies.validation flown --out docs/measurements")
 def validation(
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds 1 to N.")] = 20,
+    flown: Annotated[Path, typer.Argument(metavar="DIR", help="Dataset of the campaign.")],
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Write validation.md and images/validation*.png there."),
     ] = None,
-    processes: Annotated[int, typer.Option(min=1, max=2, help="Flights at a time.")] = 2,
     as_json: AsJson = False,
 ) -> None:
-    """Fly P1's controller and ours over P1's field, beside what P1 measured."""
+    """Show P1's controller and ours over P1's field, beside what P1 measured."""
     if out is not None:
         check_folder(out)
-    result = validate(
-        range(1, seeds + 1),
-        processes=processes,
-        on_flown=_Told(len(EVERY_WAY) * len(SPEEDS_M_S) * seeds).one,
-    )
+    result = validate(flown)
     if out is not None:
         command = f"{COMMAND} {shlex.join(sys.argv[1:])}".strip()
         write_all(result, out, command=command)

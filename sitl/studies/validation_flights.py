@@ -1,8 +1,9 @@
 """The twin against what Wang et al. 2024 (P1) measured with a real sprayer.
 
-    python -m sitl.studies.validation --out docs/measurements
+    vrspray campaign examples/campaigns/validation.toml --out flown
+    python -m sitl.studies.validation flown --out docs/measurements
 
-flies P1's controller (`sitl/wang.py`, which doses by P1's Eq. 2) over P1's field at P1's speeds,
+P1's controller (`sitl/wang.py`, which doses by P1's Eq. 2) flies over P1's field at P1's speeds,
 without compensation and with both look-aheads, and then the same flights with `scheduled`. The
 rates are P1's at every speed: its Table 5 has the same ten at 4, 5 and 6 m/s, and they fill its
 valves' range of 2 to 6 L/min. (The demo scales them by speed, so that it can fly at any.)
@@ -10,23 +11,17 @@ valves' range of 2 to 6 L/min. (The demo scales them by speed, so that it can fl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
-from statistics import fmean
-from typing import Literal
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
 
-from analysis.evaluation import Distances, Evaluation, evaluate
-from analysis.flight_record import FlightRecord, whole_boom
-from analysis.flow_accuracy import RateAccuracy, accuracy_by_rate, pooled_by_rate, pooled_percent
+from analysis.evaluation import Distances
+from analysis.flow_accuracy import RateAccuracy, pooled_by_rate, pooled_percent
 from analysis.published import P1_RATES_L_HA, P1_RESULTS, P1LagDistance, p1_lag_distance_m
-from analysis.strips import strips_of
-from companion.core.setup import Setup
+from companion.errors import ConfigError, VrsprayError
+from sitl.campaign.dataset import read_columns, read_manifest
 from sitl.demo import P1_LOOK_AHEAD_S, PROFILE, SCHEDULED
-from sitl.demo_field import MAP_SPEED_M_S, demo_lags, demo_setup, demo_trajectory
-from sitl.flight import FlightOptions, fly
-from sitl.profile import load_profile
-from sitl.wang import WangController, curve_duties, eq_2_duties, table_2_sets
-from sitl.workers import do_all
 
 SPEEDS_M_S = (4.0, 5.0, 6.0)
 # How near the means of P1's controller must be to P1's where P1 has a mean for both methods.
@@ -64,22 +59,42 @@ LOOK_AHEAD, BY_TABLE = Way(method="look-ahead"), Way(method="look-ahead", by_tab
 EVERY_WAY = (*WAYS, BY_TABLE)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Job:
-    """One flight to be flown, perhaps by another process."""
-
-    way: Way
-    speed_m_s: float
-    seed: int
+def pooled(flights: Iterable[Distances]) -> Distances:
+    """Return the distances of all flights as those of one."""
+    each = [one for one in flights if one.count]
+    if not each:
+        return Distances.of(())
+    count = sum(one.count for one in each)
+    return Distances(
+        mean=sum((one.mean or 0.0) * one.count for one in each) / count,
+        mean_abs=sum((one.mean_abs or 0.0) * one.count for one in each) / count,
+        max_abs=max(one.max_abs or 0.0 for one in each),
+        min=min(one.min or 0.0 for one in each),
+        max=max(one.max or 0.0 for one in each),
+        count=count,
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Flown:
-    """What is kept of a flight."""
+    """What is kept of a flight: a row of the campaign's dataset."""
 
-    job: Job
-    evaluation: Evaluation
-    by_rate: tuple[RateAccuracy, ...]
+    row: Mapping[str, Any]
+
+    def distances(self, name: str) -> Distances:
+        """Return one of its distances."""
+        ends = ("mean", "mean_abs", "max_abs", "min", "max")
+        found = {end: self.row[f"{name}_{end}_m"] for end in ends}
+        return Distances(**found, count=self.row[f"{name}_count"])
+
+    @property
+    def by_rate(self) -> tuple[RateAccuracy, ...]:
+        """Return its accuracy by rate."""
+        columns = ("rate_l_ha", "rate_accuracy_percent", "rate_samples")
+        return tuple(
+            RateAccuracy(rate_l_ha=rate, percent=percent, samples=samples)
+            for rate, percent, samples in zip(*(self.row[name] for name in columns), strict=True)
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,22 +112,27 @@ class SettledLag:
     missed: int
 
     @staticmethod
-    def of(flights: Iterable[Evaluation]) -> SettledLag:
+    def of(flights: Iterable[Flown]) -> SettledLag:
         """Return the summary of some flights at one speed."""
         each = list(flights)
-        by_rate: dict[float, list[float]] = {}
-        for found in each:
-            for step in found.settled_steps:
-                if step.lag_distance_m is not None:
-                    by_rate.setdefault(step.change.after_l_ha, []).append(step.lag_distance_m)
-        means = [found.settled_lag_distance_m.mean for found in each]
-        seeds = [mean for mean in means if mean is not None]
+        by_rate: dict[float, list[tuple[float, int]]] = {}
+        columns = ("rate_l_ha", "rate_settled_lag_mean_m", "rate_settled_lag_count")
+        for one in each:
+            for rate, mean, count in zip(*(one.row[name] for name in columns), strict=True):
+                if count and rate is not None:
+                    by_rate.setdefault(rate, []).append((mean, count))
+        all_m = [one.distances("settled_lag_distance") for one in each]
+        seeds = [one.mean for one in all_m if one.mean is not None]
         return SettledLag(
-            all_m=Distances.of(lag for lags in by_rate.values() for lag in lags),
-            rate_means_m=tuple(fmean(by_rate[rate]) for rate in sorted(by_rate)),
+            all_m=pooled(all_m),
+            rate_means_m=tuple(
+                sum(mean * count for mean, count in by_rate[rate])
+                / sum(count for _, count in by_rate[rate])
+                for rate in sorted(by_rate)
+            ),
             seed_means_m=(min(seeds), max(seeds)) if seeds else None,
-            apart=sum(found.settled_apart for found in each),
-            missed=sum(found.settled_missed for found in each),
+            apart=sum(one.row["settled_apart"] for one in each),
+            missed=sum(one.row["settled_missed"] for one in each),
         )
 
 
@@ -137,25 +157,23 @@ class Row:
     by_rate: tuple[RateAccuracy, ...]
 
     @staticmethod
-    def of(flights: list[Flown]) -> Row:
+    def of(way: Way, speed_m_s: float, flights: list[Flown]) -> Row:
         """Return the row of the flights of one method at one speed."""
-        job = flights[0].job
         by_rate = pooled_by_rate(flown.by_rate for flown in flights)
         whole = pooled_percent(by_rate)
         seeds = [pooled_percent(flown.by_rate) for flown in flights]
         known = [percent for percent in seeds if percent is not None]
         if whole is None:
-            raise ValueError("no flight sprayed in the field")
-        steps = [s for f in flights for s in f.evaluation.steps if not s.change.border]
+            raise VrsprayError(f"{way.name} at {speed_m_s:g} m/s: no flight sprayed in the field")
         return Row(
-            way=job.way,
-            speed_m_s=job.speed_m_s,
+            way=way,
+            speed_m_s=speed_m_s,
             flights=len(flights),
-            settled=SettledLag.of(flown.evaluation for flown in flights),
-            published=p1_lag_distance_m(job.way.method, job.speed_m_s),
-            lag_distance_m=Distances.of(step.lag_distance_m for step in steps),
-            apart=sum(flown.evaluation.apart for flown in flights),
-            missed=sum(flown.evaluation.missed for flown in flights),
+            settled=SettledLag.of(flights),
+            published=p1_lag_distance_m(way.method, speed_m_s),
+            lag_distance_m=pooled(flown.distances("lag_distance") for flown in flights),
+            apart=sum(flown.row["apart"] for flown in flights),
+            missed=sum(flown.row["missed"] for flown in flights),
             accuracy_percent=whole,
             seed_accuracy_percent=(min(known), max(known)),
             by_rate=by_rate,
@@ -210,56 +228,29 @@ class Validation:
         }
 
 
-def validate(
-    seeds: Iterable[int],
-    *,
-    speeds_m_s: Iterable[float] = SPEEDS_M_S,
-    ways: Iterable[Way] = EVERY_WAY,
-    processes: int | None = None,
-    on_flown: Callable[[], None] = lambda: None,
-) -> Validation:
-    """Fly all of it; the same arguments give the same figures."""
-    numbers, each_way = tuple(seeds), tuple(ways)
-    groups = [(way, speed) for speed in speeds_m_s for way in each_way]
-    jobs = [Job(way=w, speed_m_s=v, seed=seed) for w, v in groups for seed in numbers]
-    flown = do_all(fly_one, jobs, processes=processes, on_done=on_flown)
-    size = len(numbers)
+def validate(folder: Path) -> Validation:
+    """Return what the dataset of examples/campaigns/validation.toml says.
+
+    Raises:
+        VrsprayError: it is another one, or lacks flights.
+    """
+    if len(read_columns(folder, ["flight"])) < read_manifest(folder)["flights"]:
+        raise ConfigError(f"{folder}: not all flown yet; run the campaign to its end")
+    rows = read_columns(folder, None).to_pylist()
+    ways = {way.name: way for way in EVERY_WAY}
+    groups: dict[tuple[float, str], list[Flown]] = {}
+    for row in rows:
+        if row["error"] is not None:
+            raise VrsprayError(f"{folder}: flight {row['flight']}: {row['error']}")
+        if row["case"] not in ways:
+            raise ConfigError(f"{folder}: no validation: its cases are not those of the study")
+        groups.setdefault((row["speed_m_s"], row["case"]), []).append(Flown(row=row))
+    order = [(speed, name) for speed in sorted({speed for speed, _ in groups}) for name in ways]
     return Validation(
-        seeds=numbers,
-        rows=tuple(Row.of(flown[i : i + size]) for i in range(0, len(flown), size)),
+        seeds=tuple(sorted({row["seed"] for row in rows})),
+        rows=tuple(
+            Row.of(ways[name], speed, groups[speed, name])
+            for speed, name in order
+            if (speed, name) in groups
+        ),
     )
-
-
-def fly_one(job: Job) -> Flown:
-    """Fly one flight and judge it by its truth."""
-    record = record_of(job)
-    if job.way.method in P1_LOOK_AHEAD_S:
-        # Its nozzle sets change: what single valves share says nothing then.
-        record = whole_boom(record)
-    return Flown(job=job, evaluation=evaluate(record), by_rate=accuracy_by_rate(strips_of(record)))
-
-
-def record_of(job: Job) -> FlightRecord:
-    """Return the truth of one flight."""
-    profile, setup = load_profile(PROFILE), field_setup(job.speed_m_s)
-    look_ahead_s = P1_LOOK_AHEAD_S.get(job.way.method)
-    wang = None
-    if look_ahead_s is not None:
-        dose = curve_duties(setup) if job.way.by_table else eq_2_duties
-        wang = WangController(setup=setup, look_ahead_s=look_ahead_s, dose=dose)
-        setup = replace(setup, nozzle_sets=table_2_sets())
-    return fly(
-        replace(setup, lag=demo_lags(job.way.output)),
-        demo_trajectory(job.speed_m_s, job.seed),
-        profile,
-        FlightOptions(output=job.way.output, seed=job.seed),
-        speed_m_s=job.speed_m_s,
-        wang=wang,
-        method=job.way.method,
-    ).record
-
-
-def field_setup(speed_m_s: float) -> Setup:
-    """Return the example's set-up for a speed, with P1's rates as they are."""
-    prescription = demo_setup(MAP_SPEED_M_S).prescription
-    return replace(demo_setup(speed_m_s), prescription=prescription)

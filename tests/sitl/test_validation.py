@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from analysis.evaluation import Distances
-from analysis.flight_record import FlightRecord
 from analysis.flow_accuracy import (
     RateAccuracy,
     accuracy_by_rate,
@@ -27,62 +26,50 @@ from analysis.published import (
 )
 from analysis.strips import strips_of
 from companion.errors import ConfigError
-from sitl.demo_field import demo_setup
-from sitl.studies import validation, validation_flights, validation_page
+from sitl.campaign.dataset import read_columns
+from sitl.campaign.design import read_campaign
+from sitl.campaign.flying import fly_flight
+from sitl.demo import PROFILE
+from sitl.demo_field import demo_setup, demo_trajectory
+from sitl.flight import FlightOptions, fly
+from sitl.profile import load_profile
+from sitl.studies import validation, validation_page
 from sitl.studies.validation_flights import (
     BOUND_M,
     BOUND_METHODS,
     EVERY_WAY,
     SPEEDS_M_S,
     Flown,
-    Job,
     Row,
     Validation,
     Way,
-    field_setup,
-    fly_one,
-    record_of,
+    pooled,
     validate,
 )
+from tests.sitl.campaign_files import fly_here
 
+CAMPAIGN = Path(__file__).parents[2] / "examples" / "campaigns" / "validation.toml"
 SEEDS = (4, 5)
 SPEED_M_S = 5.0
 NONE, LOOK_AHEAD = Way(method="none"), Way(method="look-ahead")
 CHANGES = 36  # forty plots in four passes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Seen:
-    """The flights of all tests: they take most of the time."""
-
-    result: Validation
-    flights: tuple[Flown, ...]
-    record: FlightRecord
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two cases of the campaign that is shipped, at one speed, of two seeds."""
+    folder = tmp_path_factory.mktemp("validation")
+    head, *cases = CAMPAIGN.read_text(encoding="utf-8").split("[[case]]\n")
+    head = head.replace("seeds = 20", f"seeds = {list(SEEDS)}").replace("4.0, 5.0, 6.0", "5.0")
+    text = "[[case]]\n".join([head, *cases[:2]])
+    (folder / "some.toml").write_text(text, encoding="utf-8")
+    fly_here(folder / "some.toml", folder / "flown")
+    return folder / "flown"
 
 
 @pytest.fixture(scope="module")
-def seen() -> Seen:
-    flights: list[Flown] = []
-    records: list[FlightRecord] = []
-
-    def keep_record(job: Job) -> FlightRecord:
-        records[:] = [record_of(job)]
-        return records[0]
-
-    def keep(job: Job) -> Flown:
-        flights.append(fly_one(job))
-        return flights[-1]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(validation_flights, "record_of", keep_record)
-        patch.setattr(validation_flights, "fly_one", keep)
-        found = validate(SEEDS, speeds_m_s=[SPEED_M_S], ways=[NONE, LOOK_AHEAD], processes=1)
-    return Seen(result=found, flights=tuple(flights), record=records[0])
-
-
-@pytest.fixture(scope="module")
-def result(seen: Seen) -> Validation:
-    return seen.result
+def result(flown: Path) -> Validation:
+    return validate(flown)
 
 
 def rows_of(percent: float, samples: int, rate_l_ha: float | None = 10.0) -> RateAccuracy:
@@ -141,18 +128,32 @@ def test_the_table_has_the_published_rates_and_each_is_flown_equally_long(
         assert max(samples) == pytest.approx(len(SEEDS) * 960, rel=0.05)
 
 
-def test_the_rates_are_the_published_ones_at_every_speed() -> None:
-    for speed_m_s in SPEEDS_M_S:
-        zones = field_setup(speed_m_s).prescription.zones
-        assert {zone.rate_l_ha for zone in zones} == set(P1_RATES_L_HA)
-        assert field_setup(speed_m_s).limits == demo_setup(speed_m_s).limits
+def test_the_campaign_that_is_shipped_has_every_method_at_the_published_rates_and_speeds() -> None:
+    campaign = read_campaign(CAMPAIGN)
+    assert [name for name, _ in campaign.cases] == [way.name for way in EVERY_WAY]
+    assert campaign.factors[0].values == SPEEDS_M_S and len(campaign.seeds) == 20
+    assert campaign.fixed == {"flight.fidelity": "pulsed", "map.rates": "as-published"}
 
 
-def test_rates_weighted_by_their_samples_are_the_accuracy_of_the_whole_flight(seen: Seen) -> None:
-    assert len(seen.flights) == 2 * len(SEEDS)
-    for flown in seen.flights:
-        whole = flown.evaluation.spraying_accuracy_percent
-        assert pooled_percent(flown.by_rate) == pytest.approx(whole, abs=1e-9)
+def test_the_rates_are_the_published_ones_at_every_speed(tmp_path: Path) -> None:
+    settings = (("map.rates", "as-published"), ("vehicle.speed_m_s", 6.0))
+    row = fly_flight(settings, 1, tmp_path).figures
+    assert row["rate_l_ha"] == list(P1_RATES_L_HA)
+
+
+def test_rates_weighted_by_their_samples_are_the_accuracy_of_the_whole_flight(flown: Path) -> None:
+    rows = read_columns(flown, None).to_pylist()
+    assert len(rows) == 2 * len(SEEDS)
+    for row in rows:
+        whole = row["spraying_accuracy_percent"]
+        assert pooled_percent(Flown(row=row).by_rate) == pytest.approx(whole, abs=1e-9)
+
+
+def test_distances_of_several_flights_are_those_of_one_that_has_them_all() -> None:
+    first, second, none = [0.1, -0.3], [0.2, 0.4, -0.1], []
+    together = pooled(Distances.of(values) for values in (first, none, second))
+    assert asdict(together) == pytest.approx(asdict(Distances.of([*first, *second])))
+    assert pooled([Distances.of([])]).count == 0
 
 
 def test_flights_weighted_by_their_samples_are_the_accuracy_of_all(result: Validation) -> None:
@@ -161,9 +162,16 @@ def test_flights_weighted_by_their_samples_are_the_accuracy_of_all(result: Valid
     assert row.seed_accuracy_percent[0] < row.accuracy_percent < row.seed_accuracy_percent[1]
 
 
-def test_strips_over_several_rates_have_a_row_of_their_own(seen: Seen) -> None:
+def test_strips_over_several_rates_have_a_row_of_their_own() -> None:
+    record = fly(
+        demo_setup(SPEED_M_S),
+        demo_trajectory(SPEED_M_S, 1),
+        load_profile(PROFILE),
+        FlightOptions(fidelity="averaged"),
+        speed_m_s=SPEED_M_S,
+    ).record
     # Three metres to the side, every pass lies over the plots of two rows.
-    strips = strips_of(replace(seen.record, east_m=seen.record.east_m - 3.0))
+    strips = strips_of(replace(record, east_m=record.east_m - 3.0))
     rows = accuracy_by_rate(strips)
     assert rows[-1].rate_l_ha is None
     assert rows[-1].samples > sum(row.samples for row in rows[:-1])
@@ -240,8 +248,8 @@ def test_the_page_in_docs_says_what_the_code_says() -> None:
 def run(
     monkeypatch: pytest.MonkeyPatch, found: Validation, *arguments: str
 ) -> tuple[int, str, BaseException | None]:
-    monkeypatch.setattr(validation, "validate", lambda *_, **__: found)
-    outcome = CliRunner().invoke(validation.app, list(arguments))
+    monkeypatch.setattr(validation, "validate", lambda _: found)
+    outcome = CliRunner().invoke(validation.app, ["flown", *arguments])
     return outcome.exit_code, outcome.stdout, outcome.exception
 
 
