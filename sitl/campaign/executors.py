@@ -172,15 +172,14 @@ def cluster_at(address: str) -> Iterator[Cluster]:
         )
     except (OSError, ValueError, NobodyError) as error:
         raise nobody from error
-    try:
-        client.wait_for_workers(1, timeout=WAIT_S)
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=WAIT_S)
+        except NobodyError as error:
+            raise VrsprayError(
+                f"--cluster {address}: no worker is connected; start some: `dask worker {address}`"
+            ) from error
         yield Cluster(client)
-    except NobodyError as error:
-        raise VrsprayError(
-            f"--cluster {address}: no worker is connected; start some: `dask worker {address}`"
-        ) from error
-    finally:
-        client.close(timeout=WAIT_S)
 
 
 # ------------------------------------------------------------------------------------- at a worker

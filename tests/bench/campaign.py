@@ -1,7 +1,7 @@
 """What a campaign costs: `python -m tests.bench.campaign [--dataset DIR] [--page]`.
 
-Two workers of a campaign beside two processes that share nothing and fly the same flights, in turns
-in one run, so that what else the computer does meets both. `--dataset` takes what a long campaign
+Two workers of a campaign beside two processes that share nothing and fly the same flights, all four
+at a time, so that what else the computer does meets both. `--dataset` takes what a long campaign
 has logged. `--page` writes docs/measurements/scale.md, up to the part that others write.
 """
 
@@ -36,7 +36,7 @@ flight.fidelity = "averaged"
 OTHERS = "\n## Journals"
 WORKERS = (1, 8, 64)
 MANY = 1_000_000
-# Flies seeds of the field when it is told to, and says what it took.
+# Flies seeds of the field when it is told to, and says when each was done and what they took.
 ALONE = """
 import json, sys, time
 from pathlib import Path
@@ -46,76 +46,72 @@ given = (("flight.fidelity", "averaged"),)
 fly_flight(given, first, Path())
 print("ready", flush=True)
 sys.stdin.readline()
-began_s, loop_s, simulated_s = time.process_time(), 0.0, 0.0
+began_s, loop_s, simulated_s, done = time.process_time(), 0.0, 0.0, []
 for seed in range(first + 1, first + 1 + count):
     row = fly_flight(given, seed, Path())
     loop_s += row.loop_cpu_s
     simulated_s += row.figures["simulated_s"]
-print(json.dumps([time.process_time() - began_s, simulated_s / loop_s]))
+    done.append(time.monotonic())
+print(json.dumps([time.process_time() - began_s, simulated_s / loop_s, done]))
 """
 
 
-def alone(count: int) -> dict[str, float]:
-    """Fly `count` flights by two processes that know nothing of each other."""
-    halves = [(100, count // 2), (200, count // 2)]
+def compare(count: int) -> dict[str, Any]:
+    """Fly by two workers of a campaign and by two processes that share nothing, all at a time.
+
+    Each of the four gets the same share of the cores whatever else they have to do: so the rates
+    until the first side is done compare the two ways, and not two moments of this computer.
+    """
     started = [
         subprocess.Popen(
-            [sys.executable, "-c", ALONE, *map(str, half)],
+            [sys.executable, "-c", ALONE, str(first), str(count // 2)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             env=os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         )
-        for half in halves
+        for first in (100, 200)
     ]  # fmt: skip
     for each in started:
         assert each.stdout is not None
         each.stdout.readline()
-    began_s = time.monotonic()
-    for each in started:
-        assert each.stdin is not None
-        each.stdin.write("\n")
-        each.stdin.flush()
+    ours: list[float] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for part, first, number in (("warm", 900, 4), ("measured", 300, count)):
+            text = FIELD.format(first=first, count=number)
+            (folder / f"{part}.toml").write_text(text)
+        campaign = read_campaign(folder / "measured.toml")
+        bundle = bundle_of(campaign)
+        with pool_of(2, bundle) as pool:
+            warm = open_dataset(read_campaign(folder / "warm.toml"), bundle, folder / "warm")
+            fly_missing(warm, bundle, pool, Tally(), tell=lambda _: None)
+            tally, dataset = Tally(), open_dataset(campaign, bundle, folder / "measured")
+            began_s = time.monotonic()
+            for each in started:
+                assert each.stdin is not None
+                each.stdin.write("\n")
+                each.stdin.flush()
+            fly_missing(dataset, bundle, pool, tally, tell=lambda _: ours.append(time.monotonic()))
     told = [json.loads(each.communicate()[0]) for each in started]
-    wall_s = time.monotonic() - began_s
-    return {
-        "flights_per_s": count / wall_s,
-        "flights_per_cpu_s": count / sum(cpu_s for cpu_s, _ in told),
-        "times_real_time": sum(times for _, times in told) / len(told),
+    theirs = sorted(at_s for _, _, done in told for at_s in done)
+    end_s = min(ours[-1], theirs[-1])
+    rates = [sum(at_s <= end_s for at_s in done) / (end_s - began_s) for done in (ours, theirs)]
+    of = tally.as_json()
+    alone = {
+        "flights_per_cpu_s": count / sum(cpu_s for cpu_s, _, _ in told),
+        "times_real_time": sum(times for _, times, _ in told) / len(told),
     }
-
-
-def together(count: int, folder: Path) -> dict[str, float]:
-    """Fly as many by two workers of a campaign, which have flown before."""
-    with_workers: dict[str, float] = {}
-    for name, first, number in (("warm", 900, 4), ("measured", 300, count)):
-        file = folder / f"{name}.toml"
-        file.write_text(FIELD.format(first=first, count=number))
-    campaign = read_campaign(folder / "measured.toml")
-    bundle = bundle_of(campaign)
-    with pool_of(2, bundle) as pool:
-        warm = open_dataset(read_campaign(folder / "warm.toml"), bundle, folder / "warm")
-        fly_missing(warm, bundle, pool, Tally(), tell=lambda _: None)
-        tally = Tally()
-        dataset = open_dataset(campaign, bundle, folder / "measured")
-        fly_missing(dataset, bundle, pool, tally, tell=lambda _: None)
-    told = tally.as_json()
-    for key in ("flights_per_s", "flights_per_cpu_s", "times_real_time", "overhead_percent"):
-        with_workers[key] = told[key]
-    return with_workers
-
-
-def compare(count: int, rounds: int) -> dict[str, Any]:
-    """Return both, round by round, and the ratio of their rates."""
-    found: dict[str, Any] = {"alone": [], "together": []}
-    for _ in range(rounds):
-        found["alone"].append(alone(count))
-        with tempfile.TemporaryDirectory() as folder:
-            found["together"].append(together(count, Path(folder)))
-    pairs = list(zip(found["together"], found["alone"], strict=True))
-    for key in ("flights_per_s", "flights_per_cpu_s", "times_real_time"):
-        found[f"{key}_ratio"] = median(ours[key] / theirs[key] for ours, theirs in pairs)
-        found[key] = median(ours[key] for ours, _ in pairs)
-    found["overhead_percent"] = median(ours["overhead_percent"] for ours, _ in pairs)
-    return found
+    return {
+        "flights_per_s": rates[0],
+        "flights_per_s_alone": rates[1],
+        "flights_per_s_ratio": rates[0] / rates[1],
+        "overhead_percent": of["overhead_percent"],
+    } | {
+        key: value
+        for name, theirs_is in alone.items()
+        for key, value in (
+            (name, of[name]), (f"{name}_alone", theirs_is), (f"{name}_ratio", of[name] / theirs_is)
+        )
+    }  # fmt: skip
 
 
 def logged(folder: Path) -> dict[str, Any]:
@@ -205,16 +201,15 @@ def _computed(rate: float, of: dict[str, Any], log: dict[str, Any] | None) -> li
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, print JSON, and write the page where it is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--flights", type=int, default=8)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--flights", type=int, default=20)
     parser.add_argument("--dataset", type=Path)
     parser.add_argument("--page", action="store_true")
     given = parser.parse_args(arguments)
-    found = compare(given.flights, given.rounds)
+    found = compare(given.flights)
     log = None if given.dataset is None else logged(given.dataset)
     sys.stdout.write(json.dumps({"compared": found, "logged": log}, indent=1) + "\n")
     if given.page:
-        words = [f"--flights {given.flights}", f"--rounds {given.rounds}"]
+        words = [f"--flights {given.flights}"]
         words += ["--dataset DIR"] if log else []
         text = page(found, log, f"python -m tests.bench.campaign {' '.join(words)}")
         rest = ""

@@ -243,7 +243,7 @@ sys.exit(execute(["campaign", file, "--out", out, "--cluster", address, "--json"
 def test_an_address_where_nobody_is_is_refused_in_one_line(
     here: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sitl.campaign.executors.WAIT_S", 0.2)
+    monkeypatch.chdir(tmp_path)
     assert execute(["campaign", str(here), "--cluster", "tcp://127.0.0.1:1"]) == 2
     line = capsys.readouterr().err.strip()
     assert "no Dask scheduler answers" in line and "\n" not in line
