@@ -42,20 +42,25 @@ class Timed(runtime.ControlLoop):
     """A control loop that notes how long its steps take, and when they were."""
 
     took_s: list[float]
+    cpu_s: list[float]
+    ordered_cpu_s: list[float]
     ordered_s: list[float]
     at_s: list[float]
-    begin_s = 0.0
+    begin_s = begin_cpu_s = 0.0
 
     def turn(self) -> Decision | None:
         begin_s = self.begin_s = time.perf_counter()
+        begin_cpu_s = self.begin_cpu_s = time.thread_time()
         decision = super().turn()
         if decision is not None:
+            self.cpu_s.append(time.thread_time() - begin_cpu_s)
             self.took_s.append(time.perf_counter() - begin_s)
             self.at_s.append(begin_s)
         return decision
 
     def _carry_out(self, decision: Decision) -> None:
         super()._carry_out(decision)
+        self.ordered_cpu_s.append(time.thread_time() - self.begin_cpu_s)
         self.ordered_s.append(time.perf_counter() - self.begin_s)
 
 
@@ -66,6 +71,7 @@ class Nothing(runtime.NoRecorder):
 async def measured(seconds: float, folder: Path, *, page: bool, clients: bool) -> dict[str, float]:
     """Fly for some seconds, and return how long the loop's steps took."""
     Timed.took_s, Timed.ordered_s, Timed.at_s = [], [], []
+    Timed.cpu_s, Timed.ordered_cpu_s = [], []
     port = free_port()
     link = VehicleLink(f"udpin:127.0.0.1:{port}", ComponentOptions(page_may_enable=True))
     executor = ServoExecutor(ServoOptions(channels=CHANNELS), link.order)
@@ -92,7 +98,9 @@ async def measured(seconds: float, folder: Path, *, page: bool, clients: bool) -
             assert browsers.stdout is not None
             await browsers.stdout.readline()
         peer.enable()
-        for times in (Timed.took_s, Timed.ordered_s, Timed.at_s):
+        for times in (
+            *(Timed.took_s, Timed.ordered_s, Timed.at_s, Timed.cpu_s, Timed.ordered_cpu_s),
+        ):
             times.clear()
         gc.collect()
         until_s = time.monotonic() + seconds
@@ -104,6 +112,7 @@ async def measured(seconds: float, folder: Path, *, page: bool, clients: bool) -
             await browsers.wait()
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+    cpu_ms, ordered_cpu_ms = 1e3 * np.array(Timed.cpu_s), 1e3 * np.array(Timed.ordered_cpu_s)
     ordered_ms = 1e3 * np.array(Timed.ordered_s)
     took_ms = 1e3 * np.array(Timed.took_s)
     apart_ms = 1e3 * np.diff(Timed.at_s)
@@ -113,6 +122,11 @@ async def measured(seconds: float, folder: Path, *, page: bool, clients: bool) -
         "step_p99_ms": float(np.percentile(took_ms, 99)),
         "ordered_p50_ms": float(np.percentile(ordered_ms, 50)),
         "ordered_p99_ms": float(np.percentile(ordered_ms, 99)),
+        # Of the processor: what other programs take away is not in it.
+        "step_cpu_p50_ms": float(np.percentile(cpu_ms, 50)),
+        "step_cpu_p99_ms": float(np.percentile(cpu_ms, 99)),
+        "ordered_cpu_p50_ms": float(np.percentile(ordered_cpu_ms, 50)),
+        "ordered_cpu_p99_ms": float(np.percentile(ordered_cpu_ms, 99)),
         "step_max_ms": float(took_ms.max()),
         "apart_p99_ms": float(np.percentile(apart_ms, 99)),
     }
@@ -171,7 +185,7 @@ async def compare(seconds: float) -> dict[str, Any]:
     }
     ratios = {
         f"{key}_ratio": round(least["ten"][f"{key}_ms"] / least["none"][f"{key}_ms"], 3)
-        for key in ("step_p99", "ordered_p99")
+        for key in ("step_p99", "ordered_p99", "step_cpu_p99", "ordered_cpu_p99")
     }
     return {**least, **ratios}
 
