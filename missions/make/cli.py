@@ -15,6 +15,7 @@ from shapely import MultiPolygon
 from companion.assembly import flow_range
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object, progress
 from companion.config import Config, load
+from companion.config.tables import PrescriptionTable
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import rate_for_flow
 from companion.errors import ConfigError
@@ -165,7 +166,7 @@ def zones(
 
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """
-    config = load(config_file)
+    config = _bounded(load(config_file), boundary)
     wish = _wish(rates, law, litres_max, count, method, smooth_m, step_percent)
     if as_is and is_flight_map(out):
         raise typer.BadParameter("--as-is is to compare, not to fly: name another format")
@@ -182,7 +183,7 @@ def zones(
     )  # fmt: skip
     with progress(after_s=BAR_AFTER_S) as tell:
         tell("planning the passes", 0, 4)
-        field = _field(config, boundary, no_spray or [], angle_deg)
+        field = _field(config, no_spray or [], angle_deg)
         tell("reading the data", 1, 4)
         read = [read_values(path, one, field.frame) for path, one in zip(data, wanted, strict=True)]
         limits = None if as_is else _limits(config, field.sprayer, margin)
@@ -314,13 +315,23 @@ class _Field:
         return self.task.field.frame
 
 
-def _field(
-    config: Config, boundary: Path | None, no_spray: Sequence[Path], angle_deg: float | None
-) -> _Field:
+def _bounded(config: Config, boundary: Path | None) -> Config:
+    """Return the configuration with the outline that the command line names."""
+    if boundary is None:
+        return config
+    changes: dict[str, Any] = {"boundary": str(boundary.absolute())}
+    table = config.prescription
+    if table is None:
+        changed = PrescriptionTable.model_validate({"file": "made", **changes})
+    else:
+        changed = table.model_copy(update=changes)
+    return config.model_copy(update={"prescription": changed})
+
+
+def _field(config: Config, no_spray: Sequence[Path], angle_deg: float | None) -> _Field:
     """Return the field with its passes, those that `vrspray plan` lays over it."""
     table = config.prescription
-    named = None if table is None or table.boundary is None else config.resolve(table.boundary)
-    path = boundary or named
+    path = None if table is None or table.boundary is None else config.resolve(table.boundary)
     if path is None:
         raise ConfigError(
             f"{config.path}: prescription.boundary: missing; where the field ends is not in the "
@@ -389,7 +400,11 @@ def _map_file(
     found: dict[str, Any] = (
         {"zones": (), "cells": cells(made, field.frame)}
         if as_is
-        else {"zones": tuple(polygons(made, field.task.field.limit, field.frame))}
+        else {
+            "zones": tuple(
+                polygons(made, field.task.field.limit, field.frame, strip_m=field.sprayer.strip_m)
+            )
+        }
     )
     return MapFile(
         path=target, format="made", crs="EPSG:4326", unit="L/ha", rate_field="rate",

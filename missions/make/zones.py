@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely import MultiPolygon
+from shapely import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
@@ -378,8 +378,13 @@ def _short_ha(bands: Labels, work: _Work) -> float:
 # From runs along the passes to polygons.
 
 
-def polygons(made: Made, ground: BaseGeometry, frame: LocalFrame) -> list[MapZone]:
-    """Return the zones in longitude and latitude, cut at the field's border."""
+def polygons(
+    made: Made, ground: BaseGeometry, frame: LocalFrame, *, strip_m: float
+) -> list[MapZone]:
+    """Return the zones in longitude and latitude, cut at the field's border.
+
+    What the border leaves of a zone, narrower than the strip of one valve, goes to its neighbour.
+    """
     passes, places = made.places.passes, made.places
     edges = passes.edges_m
     row, start, zone, end = _runs(made.bands)
@@ -394,11 +399,17 @@ def polygons(made: Made, ground: BaseGeometry, frame: LocalFrame) -> list[MapZon
     for number in np.unique(zone).tolist():
         area = shapely.union_all(boxes[zone == number])
         parts = polygons_of(shapely.intersection(area, turned))
-        found.append((number, MultiPolygon([one for one in parts if one.area >= SMALL_M2])))
+        found.append((number, MultiPolygon([one for one in parts if _is_ground(one, strip_m)])))
         taken = shapely.union(taken, found[-1][1])
     beyond = polygons_of(shapely.difference(turned, taken))
     rest = [one for one in beyond if one.area >= NOTHING_M2]
     return _with_rest(made, found, rest, passes, frame)
+
+
+def _is_ground(part: Polygon, strip_m: float) -> bool:
+    """Tell whether a part of a zone is as wide on average as the strip of one valve."""
+    along_m = part.bounds[2] - part.bounds[0]
+    return bool(part.area >= max(SMALL_M2, strip_m * along_m))
 
 
 def cells(made: Made, frame: LocalFrame) -> MapCells:
