@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import typer
@@ -27,7 +27,7 @@ from missions.layouts import spray_lines
 from missions.make.classes import Method
 from missions.make.cleaning import STEPS, Step
 from missions.make.data import INDICES, Values, Wanted, filled, read_values
-from missions.make.passes import Passes, Places, passes_of, places_in
+from missions.make.passes import Passes, Places, by_valve, passes_of, places_in
 from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
 from missions.maps.cli.plan import plan_of, sprayer_problems
 from missions.maps.compiling import MapOrder, compile_map, write_flight_map
@@ -128,6 +128,10 @@ def zones(
         float,
         typer.Option(metavar="X", help="Times the length that a change takes.", min=1.0, max=20.0),
     ] = MARGIN,
+    across: Annotated[
+        Literal["swath", "valve"],
+        typer.Option(help="Zones at least as wide as a swath, or as one valve's strip."),
+    ] = "swath",
     step_percent: Annotated[
         float,
         typer.Option(metavar="PCT", help="Rates closer than this become one.", min=0.0, max=100.0),
@@ -183,7 +187,7 @@ def zones(
     )  # fmt: skip
     with progress(after_s=BAR_AFTER_S) as tell:
         tell("planning the passes", 0, 4)
-        field = _field(config, no_spray or [], angle_deg)
+        field = _field(config, no_spray or [], angle_deg, across)
         tell("reading the data", 1, 4)
         read = [read_values(path, one, field.frame) for path, one in zip(data, wanted, strict=True)]
         limits = None if as_is else _limits(config, field.sprayer, margin)
@@ -328,7 +332,21 @@ def _bounded(config: Config, boundary: Path | None) -> Config:
     return config.model_copy(update={"prescription": changed})
 
 
-def _field(config: Config, no_spray: Sequence[Path], angle_deg: float | None) -> _Field:
+def _by_valve(passes: Passes, config: Config) -> Passes:
+    """Return the bands of single valves, which only mean the same to and fro on an even boom."""
+    valves = sorted((valve.right_m, valve.width_m) for valve in config.boom().valves)
+    widths = [width_m for _, width_m in valves]
+    if not np.allclose(widths, widths[::-1], atol=0.01):
+        raise ConfigError(
+            f"{config.path}: [[valve]] width_m: the boom's left half is no mirror of its right "
+            "one, so that zones as wide as a valve fit one direction alone; leave out --across"
+        )
+    return by_valve(passes, widths)
+
+
+def _field(
+    config: Config, no_spray: Sequence[Path], angle_deg: float | None, across: str
+) -> _Field:
     """Return the field with its passes, those that `vrspray plan` lays over it."""
     table = config.prescription
     path = None if table is None or table.boundary is None else config.resolve(table.boundary)
@@ -345,11 +363,12 @@ def _field(config: Config, no_spray: Sequence[Path], angle_deg: float | None) ->
     sprayer = plan_of(config, None)[0].sprayer
     if sprayer is None:
         raise ConfigError(f"{config.path}: mission: missing; write at least swath_width_m, speed")
+    passes = passes_of(lines, course_deg, task.field.limit, task.settings.swath_width_m)
     return _Field(
         boundary=read_area(path, repairs=[]),
         boundary_file=path,
         task=task,
-        passes=passes_of(lines, course_deg, task.field.limit, task.settings.swath_width_m),
+        passes=_by_valve(passes, config) if across == "valve" else passes,
         sprayer=replace(sprayer, angle_deg=course_deg),
     )
 

@@ -8,7 +8,8 @@ the other.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -27,6 +28,8 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 PARALLEL_DEG = 1.0
 # Passes closer than this share of the swath belong to parts of the field that lie side by side.
 APART_MIN = 0.6
+# Where passes overlap, less than this share of an outer strip is left to the next one.
+STRIP_MIN = 0.5
 # What a line may be beside the middle of its band.
 BESIDE_MAX_M = 0.1
 
@@ -98,6 +101,26 @@ def _filled(edges: list[float], swath_m: float) -> list[float]:
         count = max(round((edge - found[-1]) / swath_m - 0.25), 1)
         found += np.linspace(found[-1], edge, count + 1)[1:].tolist()
     return found
+
+
+def by_valve(passes: Passes, strips_m: Sequence[float]) -> Passes:
+    """Return bands as wide as the strips of single valves, from left to right of the boom.
+
+    Flown to and fro a strip lies on the other side: `strips_m` must read the same from both ends.
+
+    >>> whole = Passes(angle_deg=0.0, edges_m=np.array([0.0, 5.0]), aligned_percent=100.0)
+    >>> by_valve(whole, (2.0, 2.0, 2.0)).edges_m.tolist()
+    [0.0, 1.5, 3.5, 5.0]
+    """
+    inner = np.cumsum(strips_m)[:-1] - sum(strips_m) / 2.0
+    edges = passes.edges_m
+    least_m = STRIP_MIN * min(strips_m)
+    found = [edges[:1]]
+    for left, right in pairwise(edges.tolist()):
+        places = (left + right) / 2.0 + inner
+        within = (places >= left + least_m) & (places <= right - least_m)
+        found.append(np.append(places[within], right))
+    return replace(passes, edges_m=np.concatenate(found))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

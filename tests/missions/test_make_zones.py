@@ -369,6 +369,7 @@ def planned(data: Path, course_deg: float, folder: Path) -> Any:
 @pytest.mark.parametrize(
     ("arguments", "zones"),
     [
+        (["drone.tif", "--value", "GNDVI", "--rates", "26,14", "--across", "valve"], 2),
         (["satellite.tif", "--value", "NDRE", "--rates", "26,22,18", "--method", "quantiles"], 3),
         (["yield.csv", "--value", "yield_t_ha", "--law", "3:14,9:26"], 4),
         (["soil.csv", "--rates", "14,22", "--smooth-m", "10"], 2),
