@@ -7,7 +7,7 @@ import importlib.util
 import json
 import logging
 from collections.abc import AsyncGenerator, AsyncIterator, Sequence
-from contextlib import aclosing, asynccontextmanager
+from contextlib import aclosing, asynccontextmanager, suppress
 from typing import Any
 
 from companion.errors import LinkError
@@ -24,6 +24,8 @@ ARMED_FLAG = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 # An autopilot's heartbeat comes once a second.
 HEARTBEAT_S = 5.0
 AUTOPILOT_COMPONENT = 1
+# MAV_AUTOPILOT.
+FIRMWARES: dict[int, Firmware] = {3: "ardupilot", 12: "px4"}
 SET_MESSAGE_INTERVAL, MISSION_CURRENT, CURRENT_EVERY_US = 511, 42, 500_000.0
 # So many heartbeats without it, and it is asked for again: a battery was changed.
 ASK_EVERY = 5
@@ -91,12 +93,37 @@ def _log(_level: object, text: str, _file: object, _line: int) -> bool:
 
 
 async def _firmware(system: Any, url: str) -> Firmware:
+    """Return what the autopilot is, by its own heartbeat where MAVSDK does not know.
+
+    MAVSDK takes it from any heartbeat of the vehicle, and the companion's names no autopilot.
+    """
     found = (await system.autopilot_type()).name
     if found == "ARDUPILOT":
         return "ardupilot"
     if found == "PX4":
         return "px4"
-    raise LinkError(f"--link {url}: the vehicle is neither ArduPilot nor PX4 but {found.lower()}")
+    beat = await _own_heartbeat(system)
+    told = None if beat is None else FIRMWARES.get(int(beat["autopilot"]))
+    if told is None:
+        text = f"--link {url}: the vehicle is neither ArduPilot nor PX4 but {found.lower()}"
+        raise LinkError(text)
+    return told
+
+
+async def _own_heartbeat(system: Any) -> dict[str, Any] | None:
+    """Return the fields of the autopilot's next heartbeat; None where none comes."""
+    from mavsdk.asyncio.plugins.mavlink_direct import MavlinkDirectAsync
+
+    with suppress(TimeoutError):
+        async with (
+            asyncio.timeout(HEARTBEAT_S),
+            aclosing(MavlinkDirectAsync(system).subscribe_message("HEARTBEAT")) as beats,
+        ):
+            async for beat in beats:
+                if beat.component_id == AUTOPILOT_COMPONENT:
+                    fields: dict[str, Any] = json.loads(beat.fields_json)
+                    return fields
+    return None
 
 
 class MavsdkVehicle:

@@ -7,18 +7,20 @@ import json
 import math
 import sys
 import time
-from collections.abc import AsyncGenerator, Iterable
-from contextlib import aclosing
+from collections.abc import AsyncGenerator, AsyncIterator, Iterable
+from contextlib import aclosing, asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from companion.link.transport import parse_url
 from missions.errors import UploadError
 from missions.upload.cli import read_mission_file
 from missions.upload.transfer import put
 from sitl.stub.mission_items import MissionItem, read_mission
+from sitl.stub.protocol import Speaker, dialect
 from tests.companion.wire_peer import free_port
 from tests.missions.realtime.upload_bench import sorties, stub_on_a_port
 
@@ -39,6 +41,45 @@ async def upload(file: Path, url: str, **options: Any) -> Any:
         return await put(
             vehicle, read_mission_file(file), progress=lambda _what, _share: None, **options
         )
+
+
+@asynccontextmanager
+async def companion_on(url: str) -> AsyncIterator[None]:
+    """Tell a link of a companion on the vehicle, a hundred times a second."""
+    place = parse_url(url)
+    speaker = Speaker(1, 191)
+    beat = dialect.MAVLink_heartbeat_message(
+        dialect.MAV_TYPE_ONBOARD_CONTROLLER, dialect.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3
+    )
+    loop = asyncio.get_running_loop()
+    transport, _ = await loop.create_datagram_endpoint(
+        asyncio.DatagramProtocol, remote_addr=(place.place, place.number)
+    )
+
+    def say() -> None:
+        nonlocal timer
+        transport.sendto(speaker.frame(beat))
+        timer = loop.call_later(0.01, say)
+
+    timer = loop.call_soon(say)
+    try:
+        yield
+    finally:
+        timer.cancel()
+        transport.close()
+
+
+@both
+async def test_a_companion_on_the_same_link_is_not_taken_for_the_autopilot(
+    autopilot: str, tmp_path: Path
+) -> None:
+    file = sorties(tmp_path, 1)[0]
+    async with stub_on_a_port(autopilot) as (server, url), companion_on(url):
+        done = await upload(file, url)
+        kept = server.autopilot
+    assert done.firmware == autopilot
+    items = read_mission(file)
+    assert without_yaw(kept.flight.items[1:]) == without_yaw(items[1:])
 
 
 @both
