@@ -11,7 +11,7 @@ import os
 import platform
 import shutil
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from importlib.metadata import PackageNotFoundError, version
@@ -22,7 +22,9 @@ from companion.config import load
 from companion.errors import ConfigError, MapError
 from companion.flight_map.child import belonging_files
 from companion.flight_map.model import named_files
+from sitl.anyang import EXAMPLE
 from sitl.campaign.settings import Value, overrides_of
+from sitl.profile import PROFILES
 
 if TYPE_CHECKING:
     from sitl.campaign.design import Campaign
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
 BYTES_MAX = 200_000_000
 OURS = ("companion", "missions", "analysis", "sitl")
 LIBRARIES = ("numpy", "scipy", "shapely", "pyproj", "pyarrow", "vrspray")
+NO_CODE = ("sitl/examples/", "companion/deploy/")
+DATA = frozenset({".toml", ".geojson", ".shp", ".shx", ".dbf", ".prj", ".cpg"})
 FILES = ("flight.config", "flight.mission", "flight.scenario")
 
 
@@ -155,11 +159,27 @@ def keep(bundle: Bundle) -> Path:
 def code_sha256() -> str:
     """Return the hash of this program's own code: rows of two of them do not go together."""
     found = hashlib.sha256()
+    for name, path in program_files():
+        found.update(f"\0{name}\0".encode() + path.read_bytes())
+    return found.hexdigest()
+
+
+def program_files() -> Iterator[tuple[str, Path]]:
+    """Yield what of this program decides on figures: code, sprayers, and the published field.
+
+    The same in a source tree and in an installed wheel, where examples and what is installed on a
+    vehicle are files of the packages.
+    """
     root = Path(__file__).parents[2]
     for package in OURS:
         for path in sorted((root / package).rglob("*.py")):
-            found.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return found.hexdigest()
+            name = path.relative_to(root).as_posix()
+            if not name.startswith(NO_CODE):
+                yield name, path
+    for folder in (PROFILES, EXAMPLE):
+        for path in sorted(folder.rglob("*")):
+            if path.suffix in DATA:
+                yield f"{folder.name}/{path.relative_to(folder).as_posix()}", path
 
 
 def versions() -> dict[str, str]:

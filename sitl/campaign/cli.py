@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sitl.campaign.running import Tally
 
 # Without a terminal: how often it says how far it is.
-SAY_EVERY_S = 30.0
+SAY_EVERY_S = 60.0
 
 
 class RunIsUnsaid(TyperGroup):

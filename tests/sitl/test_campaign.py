@@ -22,6 +22,7 @@ from analysis.evaluation import evaluate
 from companion.cli.app import execute
 from companion.errors import ConfigError
 from sitl.campaign import cli
+from sitl.campaign.bundle import program_files
 from sitl.campaign.dataset import part_size
 from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.executors import pool_of
@@ -351,6 +352,14 @@ def test_the_manifest_names_every_file_and_what_flew(reference: Path) -> None:
     )
     assert {"vrspray", "numpy", "python"} <= set(manifest["versions"])
     assert (manifest["flights"], manifest["settings"], manifest["part_flights"]) == (24, 6, 10)
+
+
+def test_rows_belong_to_code_sprayers_and_the_published_field() -> None:
+    names = {name for name, _ in program_files()}
+    assert {"sitl/campaign/flying.py", "companion/core/controller.py"} < names
+    assert {"profiles/wang-2024.toml", "anyang/prescription.dbf", "anyang/lags/gpio.toml"} < names
+    # A wheel holds copies of them, a source tree has links.
+    assert not any(name.startswith(("sitl/examples/", "companion/deploy/")) for name in names)
 
 
 # ------------------------------------------------------------------------------------------ showing
