@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -21,7 +22,7 @@ from companion.core.nozzle import rate_for_flow
 from companion.errors import ConfigError
 from companion.flight_map import is_flight_map
 from companion.problem import Problem
-from companion.wording import counted
+from companion.wording import counted, install_command
 from missions.errors import PlanError
 from missions.layouts import spray_lines
 from missions.make.classes import Method
@@ -34,7 +35,7 @@ from missions.maps.compiling import MapOrder, compile_map, write_flight_map
 from missions.maps.convert.formats import write_map, writer_for
 from missions.maps.layer import digest, read_bytes
 from missions.maps.lint import Sprayer, check_map
-from missions.maps.model import MapFile
+from missions.maps.model import MapFile, map_error
 from missions.maps.registry import read_area
 from missions.maps.whole_file import check_folder, not_written
 from missions.reading import Asked, Task, read_task
@@ -170,6 +171,11 @@ def zones(
 
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """
+    if importlib.util.find_spec("scipy") is None:
+        raise map_error(
+            data[0], "making zones takes the library scipy, which is not installed",
+            fix=f"install it with: {install_command('office')}", code="missing-library",
+        )  # fmt: skip
     config = _bounded(load(config_file), boundary)
     wish = _wish(rates, law, litres_max, count, method, smooth_m, step_percent)
     if as_is and is_flight_map(out):

@@ -429,6 +429,15 @@ def test_what_cannot_be_made_is_said_in_one_line(
     assert not list(tmp_path.iterdir())
 
 
+def test_without_scipy_the_extra_is_named(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    with pytest.raises(VrsprayError, match="scipy, which is not installed; install it with"):
+        run(data / "soil.csv", "--config", data / "config.toml", "--rates", "9,12", "--out",
+            tmp_path / "a.shp")  # fmt: skip
+
+
 def test_data_of_another_place_are_refused(data: Path, tmp_path: Path) -> None:
     far = tmp_path / "far.csv"
     far.write_text("lat,lon,ec\n" + "".join(f"48.3,16.{90 + i},1.{i}\n" for i in range(9)))
