@@ -18,7 +18,7 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from companion.web.child import Limits, Outcome, journal_to_read, run_child
-from companion.web.parts import Host, Part
+from companion.web.parts import Host, Part, or_refused
 
 NAME = re.compile(r"\w[\w .()+-]{0,79}")
 LIST = Limits(cpu_s=30, wait_s=90.0)
@@ -74,7 +74,7 @@ class Flights:
     async def look(self) -> dict[str, Any]:
         """Have the folder of journals listed, the newest flight first."""
         self.refuse_now()
-        with self.host.work.on("list of flights"):
+        with or_refused(), self.host.work.on("list of flights"):
             self.folder.mkdir(parents=True, exist_ok=True, mode=0o700)
             words = ["flights", "list", "--folder", self.host.journals or ".", "--json"]
             done = await self._run(words, LIST)
@@ -92,7 +92,7 @@ class Flights:
         journal = Path(self.host.journals) / asked.file
         if not self.host.journals or journal.suffix != ".gpkg" or not journal.is_file():
             raise HTTPException(404, f"{asked.file}: no flight of this name in journal.folder")
-        with self.host.work.on("report"):
+        with or_refused(), self.host.work.on("report"):
             self.report = None
             out = self.folder / journal.stem
             shutil.rmtree(out, ignore_errors=True)
@@ -141,6 +141,7 @@ def add(router: APIRouter, host: Host) -> None:
     busy: dict[int | str, dict[str, Any]] = {
         404: {"description": "no such file"},
         409: {"description": "the vehicle is armed, or something is being worked on"},
+        507: {"description": "no room"},
     }
 
     @router.get("")

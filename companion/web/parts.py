@@ -8,7 +8,8 @@ files to a child of that process.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -53,6 +54,18 @@ class Part:
     static: Path
     add: Callable[[APIRouter, Host], None]
     files_at: str | None = None
+
+
+@contextmanager
+def or_refused() -> Iterator[None]:
+    """Refuse what this computer cannot keep or copy, in one line, instead of failing."""
+    from fastapi import HTTPException
+
+    try:
+        yield
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise HTTPException(507, f"not done on this computer: {reason}") from error
 
 
 def registered() -> dict[str, Part]:

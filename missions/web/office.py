@@ -22,7 +22,7 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from companion.web.child import Limits, Outcome, journal_to_read, run_child
-from companion.web.parts import Host, Part
+from companion.web.parts import Host, Part, or_refused
 from missions.reading_fleet import NO_LINES
 
 FILE_BYTES_MAX, ALL_BYTES_MAX, FILES_MAX = 64_000_000, 256_000_000, 60
@@ -238,7 +238,7 @@ class Office:
         """Plan what there is to spray, or what a flight left of it: of its lines, if it had any."""
         if done is None:
             return await self.run("plan", words)
-        with journal_to_read(done, self.given.parent) as readable:
+        with or_refused(), journal_to_read(done, self.given.parent) as readable:
             journal = str(readable.resolve())
             planned = await self.run("plan", [*words, "--resume", journal])
             if planned.error is not None and NO_LINES in planned.error:

@@ -154,6 +154,22 @@ def test_a_copy_of_a_journal_that_keeps_changing_is_not_taken(
     assert (journal.read_bytes(), log.read_bytes()) == (b"pages", b"log")
 
 
+async def test_a_computer_that_keeps_nothing_refuses_in_one_line(tmp_path: Path) -> None:
+    fly(tmp_path)
+    (tmp_path / "state").write_text("no folder")
+    host = {
+        "folder": str(tmp_path / "state"), "config": [], "upload_link": "",
+        "journals": str(tmp_path),
+    }  # fmt: skip
+    async with served(host=host) as site:
+        await on_ground(site)
+        for what, body in (("look", {}), ("report", {"file": "flight-0001.gpkg"})):
+            reply = await site.asked("POST", f"{FLIGHTS}/{what}", body)
+            assert reply.status == 507
+            assert reply.json["detail"] == "not done on this computer: not a directory"
+        assert (await site.asked("GET", FLIGHTS)).json["task"] is None
+
+
 def test_the_page_finds_the_flights_by_their_entry_point() -> None:
     part = registered()["flights"]
     assert part.files_at is None
