@@ -28,6 +28,7 @@ ABOUT = {
     "pump-sections": "one pump, six on-off sections, a return valve",
     "atomiser": "two rotary atomisers fed by one pump",
     "own-method": "controllers of one's own, for --controller",
+    "zones": "a made-up field's data by a script, for vrspray make zones",
     "campaigns": "many flights over settings, for vrspray campaign",
     "profiles": "wirings of valves on this computer's own lines",
     DEPLOY: "for the vehicle: install script, ArduPilot's watchdog script, systemd unit",

@@ -46,6 +46,8 @@ def test_a_copied_example_has_all_that_its_configurations_name(
             continue
         config = load(path)
         assert config.prescription is not None
+        if name == "zones":  # whose script and `make zones` write what it names
+            continue
         assert (path.parent / config.prescription.file).resolve().exists()
 
 
