@@ -186,3 +186,103 @@ def forget(
         [f"{number}: {counted(count, 'flight')} {what}"],
         as_json=as_json,
     )
+
+
+Since = Annotated[str | None, typer.Option("--from", metavar="MONTH", help="As 2026-05.")]
+Until = Annotated[str | None, typer.Option(metavar="MONTH", help="As 2026-10, included.")]
+Kinds = Annotated[
+    list[str] | None,
+    typer.Option(metavar="KIND", help="real, unknown, training, simulated; repeatable."),
+]
+
+
+@app.command(epilog="Example: vrspray fleet report --fleet fleet --out fleet-report --from 2026-04")
+def report(
+    fleet: Place,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the files of the report.")],
+    since: Since = None,
+    until: Until = None,
+    kind: Kinds = None,
+    as_json: AsJson = False,
+) -> None:
+    """Sum the fleet up by machine, field, product, operator and month: page, JSON, CSV, Parquet."""
+    from analysis.fleet.asking import asked
+    from analysis.fleet.page import files_of
+    from analysis.fleet.store import Store
+    from analysis.fleet.summary import Chosen, summary_of
+    from analysis.report.folder import check_folder, write_files
+
+    chosen = Chosen(since=since, until=until, kinds=tuple(kind or ()))
+    check_folder(out)
+    with asked(Store.at(fleet).existing()) as flights:
+        summary = summary_of(flights, chosen)
+    files = files_of(summary)
+    write_files(out, files)
+    lines = [
+        f"{each['title']}: {counted(each['totals']['flights'], 'flight')}, "
+        f"{each['totals']['area_ha'] or 0.0:.2f} ha, {each['totals']['applied_l'] or 0.0:.1f} L"
+        for each in summary["sections"]
+    ]
+    answer(
+        {**summary, "files": [str(out / name) for name in files]},
+        [*(lines or ["no flights in this period"]), f"report: {out / 'fleet.html'}"],
+        as_json=as_json,
+    )
+
+
+@app.command(
+    epilog="Example: vrspray fleet serve --fleet fleet --host 0.0.0.0 --name office.example"
+)
+def serve(
+    fleet: Place,
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="Where to listen; 0.0.0.0 is every network.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = 8881,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Host name that the page may be called by; repeatable."),
+    ] = None,
+    tokens: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Where the page's tokens are kept; made if not there."),
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option("--tls-certificate", metavar="PEM", help="With --tls-key: HTTPS.")
+    ] = None,
+    key: Annotated[
+        Path | None, typer.Option("--tls-key", metavar="PEM", help="The certificate's key.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show the fleet's report on a page, read only, until Ctrl-C.
+
+    Who looks from another computer needs the link with its token that is printed here.
+    """
+    from analysis.fleet.serving import build_app
+    from analysis.fleet.serving import serve as serve_page
+    from analysis.fleet.store import Store
+    from companion.cli.web_parts import own_address
+    from companion.errors import ConfigError
+    from companion.web import listen
+    from companion.web.guard import Doors, Guard, is_loopback, kept_tokens
+
+    if (certificate is None) != (key is None):
+        raise ConfigError("--tls-certificate and --tls-key go together; give both")
+    tls = None if certificate is None or key is None else (str(certificate), str(key))
+    for each in tls or ():
+        if not Path(each).is_file():
+            raise ConfigError(f"{each}: there is no such file; give a PEM file")
+    store = Store.at(fleet).existing()
+    names = tuple(each.lower() for each in name or ())
+    doors = Doors(is_local=is_loopback(host), names=names)
+    kept = kept_tokens(tokens or Path.home() / ".local/state/vrspray/fleet-tokens.json")
+    guard = Guard(doors=doors, tokens=kept, names_by="--name", printed_by="vrspray fleet serve")
+    listener = listen(host, port, port_by="--port", host_by="--host")
+    local = "127.0.0.1" if doors.is_local else own_address(host)
+    shown = names[0] if names else local
+    link = f"http{'s' if tls else ''}://{f'[{shown}]' if ':' in shown else shown}:{port}/"
+    if doors.needs_token:
+        link += f"#token={kept.view}"
+    answer({"fleet": fleet, "url": link}, [f"the fleet's page: {link}"], as_json=as_json)
+    serve_page(build_app(store, guard, is_tls=tls is not None), listener, tls=tls)

@@ -161,9 +161,7 @@ def invitation(config: Config, doors: Doors, tokens: Tokens) -> list[str]:
     """Return where the page is, a line each, and for phones its QR code."""
     web = config.web
     scheme = "http" if web.tls_certificate is None else "https"
-    host = (
-        "127.0.0.1" if doors.is_local else (web.names[0] if web.names else _own_address(web.host))
-    )
+    host = "127.0.0.1" if doors.is_local else (web.names[0] if web.names else own_address(web.host))
     bare = f"[{host}]" if ":" in host else host
     place = f"{scheme}://{bare}:{web.port}/"
     if not doors.needs_token:
@@ -188,7 +186,7 @@ def _qr_lines(text: str) -> list[str]:
     return out.getvalue().splitlines()
 
 
-def _own_address(host: str) -> str:
+def own_address(host: str) -> str:
     """Return an address at which phones find this computer; the configured one if it is one."""
     if not ipaddress.ip_address(host).is_unspecified:
         return host

@@ -17,11 +17,12 @@ from typing import Any
 
 import uvicorn
 
+from companion.web.entrance import Guarded
 from companion.web.guard import Doors, Guard, Tokens
 from companion.web.live import Live
 from companion.web.parts import registered, uploads
 from companion.web.ring import RingReader
-from companion.web.server import Guarded, Orders, Site, build_app
+from companion.web.server import Orders, Site, build_app
 
 # The control loop comes first.
 NICENESS = 5

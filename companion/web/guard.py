@@ -254,6 +254,9 @@ class Guard:
     tokens: Tokens
     # Below these paths a body is a file, whose size its own handler limits.
     uploads: tuple[str, ...] = ()
+    # What a refusal tells to do: the setting of the names, and the command that prints the link.
+    names_by: str = "web.names"
+    printed_by: str = "vrspray run"
 
     def is_upload(self, path: str) -> bool:
         """Return whether the body of a POST is a file."""
@@ -272,7 +275,7 @@ class Guard:
         """Return status and text where a request is refused; None where it may go on."""
         hosts = [value for key, value in asked.headers if key == "host"]
         if len(hosts) != 1 or not self.doors.allows_host(hosts[0]):
-            return 421, "this address does not belong to the page; add its name to web.names"
+            return 421, f"this address does not belong to the page; add its name to {self.names_by}"
         if asked.method in ("GET", "HEAD"):
             is_open = not asked.path.startswith(API) or asked.path in _READ_OPEN
             needs: Scope = "none" if is_open else "view"
@@ -287,7 +290,7 @@ class Guard:
         if RANK[scope] >= RANK[needs]:
             return None
         if scope == "none":
-            return 401, "open the link, or scan the QR code, that vrspray run printed"
+            return 401, f"open the link, or scan the QR code, that {self.printed_by} printed"
         return 403, "this link may only look; an order needs the operator's link"
 
     def _foreign(self, asked: Asked, host: str) -> Refusal | None:

@@ -95,7 +95,9 @@ def parse_order(packet: bytes) -> Order | None:
         return None
 
 
-def listen(host: str, port: int) -> socket.socket:
+def listen(
+    host: str, port: int, *, port_by: str = "web.port", host_by: str = "web.host"
+) -> socket.socket:
     """Return a socket that listens at the page's address; a `ConfigError` where it cannot be had.
 
     A companion that was killed leaves its page to end by itself: the port is free a moment later.
@@ -112,8 +114,9 @@ def listen(host: str, port: int) -> socket.socket:
             found.close()
             if time.monotonic() >= until_s:
                 raise ConfigError(
-                    f"web.port: cannot listen on {host} port {port}: "
-                    f"{(error.strerror or str(error)).lower()}; write another web.port or web.host"
+                    f"{port_by}: cannot listen on {host} port {port}: "
+                    f"{(error.strerror or str(error)).lower()}; "
+                    f"write another {port_by} or {host_by}"
                 ) from error
             time.sleep(0.1)
         else:

@@ -21,13 +21,13 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, FastAPI, HTTPException, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, Field
-from starlette.types import Message, Receive, Send
+from pydantic import BaseModel, Field
+from starlette.types import Receive, Send
 from starlette.types import Scope as Connection
 
 from companion.web.child import Work
-from companion.web.guard import API, COOKIE, Asked, Failures, Guard, Scope, session
+from companion.web.entrance import REFUSED, Body, add_sessions, unusable
+from companion.web.guard import API, Guard
 from companion.web.live import Live, map_parts
 from companion.web.parts import Host, Part
 
@@ -36,18 +36,11 @@ STATE_S = 0.2  # 5 Hz
 SILENT_S = 1.0  # with nothing new a browser is told so, and how old the newest is
 POINTS_AT_ONCE = 500
 CLIENTS_MAX = 32
-BODY_BYTES_MAX = 4096
-SEND_WITHIN_S = 20.0
 # Pressing Enable takes this long; a press that is older has been forgotten.
 HOLD_S, HOLD_MAX_S = 0.9, 6.0
 HOLDS_MAX = 64
 ANSWER_WITHIN_S = 1.0
 CHECKS_S, CHECKS_WITHIN_S = 60.0, 60.0
-_CSP = (
-    "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; "
-    "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
-    "frame-ancestors "
-)
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".js": "text/javascript; charset=utf-8",
@@ -56,18 +49,6 @@ _TYPES = {
     ".svg": "image/svg+xml",
     ".txt": "text/plain; charset=utf-8",
 }
-
-
-class Body(BaseModel):
-    """A request's own small JSON: nothing unknown is in it."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class Login(Body):
-    """The token of the link or QR code that `run` prints."""
-
-    token: Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Press(Body):
@@ -94,13 +75,6 @@ class Ticket(BaseModel):
 
     ticket: str
     hold_s: float
-
-
-class Access(BaseModel):
-    """What one may do here."""
-
-    scope: Scope
-    needs_token: bool
 
 
 class Orders:
@@ -175,79 +149,6 @@ class Holds:
         self._since.clear()
 
 
-class Guarded:
-    """Refuses what comes from elsewhere, and adds the headers that keep a page to itself."""
-
-    def __init__(self, app: FastAPI, guard: Guard, *, ancestors: tuple[str, ...] = ()) -> None:
-        self._app = app
-        self._guard = guard
-        self._headers = {
-            b"content-security-policy": (_CSP + " ".join(("'self'", *ancestors))).encode(),
-            b"x-content-type-options": b"nosniff",
-            b"referrer-policy": b"no-referrer",
-            b"cross-origin-resource-policy": b"same-origin",
-            b"cache-control": b"no-store",
-        }
-
-    async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:
-        """Serve one request, or refuse it."""
-        if scope["type"] != "http":
-            return
-
-        async def sent(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                have = {name.lower() for name, _ in message["headers"]}
-                extra = [item for item in self._headers.items() if item[0] not in have]
-                message = {**message, "headers": [*message["headers"], *extra]}
-            # A browser that does not read is let go; until then it costs one message.
-            await asyncio.wait_for(send(message), SEND_WITHIN_S)
-
-        asked = asked_of(scope)
-        refusal = self._guard.refusal(asked, time.time())
-        if refusal is None and asked.method == "POST" and not self._guard.is_upload(asked.path):
-            body = await _body(receive)
-            if body is None:
-                refusal = 413, f"a request has at most {BODY_BYTES_MAX} bytes"
-            else:
-                receive = _replay(body, receive)
-        with suppress(TimeoutError, ConnectionError):
-            if refusal is not None:
-                await JSONResponse({"detail": refusal[1]}, refusal[0])(scope, receive, sent)
-            else:
-                await self._app(scope, receive, sent)
-
-
-def asked_of(scope: Connection) -> Asked:
-    """Return what of a request the guard looks at."""
-    headers = tuple((k.decode("latin-1").lower(), v.decode("latin-1")) for k, v in scope["headers"])
-    return Asked(method=scope["method"], path=scope["path"], headers=headers)
-
-
-async def _body(receive: Receive) -> bytes | None:
-    """Return a request's body; None where it is too large."""
-    body = b""
-    while True:
-        message = await receive()
-        body += bytes(message.get("body", b""))
-        if len(body) > BODY_BYTES_MAX:
-            return None
-        if message["type"] == "http.disconnect" or not message.get("more_body"):
-            return body
-
-
-def _replay(body: bytes, receive: Receive) -> Receive:
-    given = False
-
-    async def replayed() -> Message:
-        nonlocal given
-        if given:
-            return await receive()
-        given = True
-        return {"type": "http.request", "body": body, "more_body": False}
-
-    return replayed
-
-
 class EventStream(Response):
     """The state for one browser: at most 5 Hz, a change at once, never a backlog."""
 
@@ -282,7 +183,7 @@ class Site:
 
     def __init__(self, live: Live, orders: Orders, guard: Guard, about: dict[str, Any]) -> None:
         self.live, self.orders, self.guard = live, orders, guard
-        self.holds, self.failures = Holds(), Failures()
+        self.holds = Holds()
         self.clients = 0
         self.login_s = int(about["login_s"])
         self.is_tls = bool(about["is_tls"])
@@ -406,14 +307,6 @@ def _compressed(request: Request, data: bytes, kind: str) -> Response:
     return Response(data, media_type=kind, headers=headers | {"Content-Encoding": "gzip"})
 
 
-async def _unusable(_request: Request, error: Exception) -> Response:
-    """Say what is wrong with a request, without repeating what was in it."""
-    found = error.errors() if isinstance(error, RequestValidationError) else []
-    where = ".".join(str(part) for part in found[0]["loc"]) if found else "request"
-    text = str(found[0]["msg"]) if found else "cannot be used"
-    return JSONResponse({"detail": f"{where[:80]}: {text[:200]}"}, 422)
-
-
 def build_app(site: Site, parts: Mapping[str, Part] | None = None) -> FastAPI:
     """Return the application with its further parts; `Guarded` belongs around it."""
     app = FastAPI(
@@ -424,10 +317,10 @@ def build_app(site: Site, parts: Mapping[str, Part] | None = None) -> FastAPI:
         redoc_url=None,
         openapi_url=f"{API}openapi.json",
     )
-    app.add_exception_handler(RequestValidationError, _unusable)
+    app.add_exception_handler(RequestValidationError, unusable)
     _add_reading(app, site)
     _add_ground(app, site)
-    _add_sessions(app, site)
+    add_sessions(app, site.guard, login_s=site.login_s, is_tls=site.is_tls)
     _add_orders(app, site)
     _add_files(app, site)
     for name, part in (parts or {}).items():
@@ -488,73 +381,32 @@ def _add_ground(app: FastAPI, site: Site) -> None:
         return _compressed(request, site.places_gzip[part], "application/geo+json")
 
 
-_REFUSED: dict[int | str, dict[str, Any]] = {
-    401: {"description": "no session"},
-    403: {"description": "not from the page, or the session may only look"},
-    413: {"description": "too large"},
-    415: {"description": "no JSON"},
-    503: {"description": "the companion does not answer"},
-}
-
-
-def _add_sessions(app: FastAPI, site: Site) -> None:
-    @app.get(f"{API}session", tags=["session"])
-    async def access(request: Request) -> Access:
-        """Return what one may do."""
-        scope = site.guard.scope_of(asked_of(request.scope), time.time())
-        return Access(scope=scope, needs_token=site.guard.doors.needs_token)
-
-    @app.post(
-        f"{API}session", tags=["session"], responses=_REFUSED | {429: {"description": "wait"}}
-    )
-    async def log_in(login: Login, request: Request, response: Response) -> Access:
-        """Open a session by a token; the session is a cookie that scripts cannot read."""
-        address = "" if request.client is None else request.client.host
-        now_s = time.monotonic()
-        if site.failures.is_blocked(address, now_s):
-            raise HTTPException(429, "too many wrong tokens: wait a minute")
-        scope = site.guard.tokens.scope_of(login.token)
-        if scope == "none":
-            site.failures.failed(address, now_s)
-            raise HTTPException(401, "this token is not valid; take the newest link")
-        value = session(site.guard.tokens, scope, int(time.time()) + site.login_s)
-        response.set_cookie(
-            COOKIE,
-            value,
-            max_age=site.login_s,
-            httponly=True,
-            samesite="strict",
-            secure=site.is_tls,
-        )
-        return Access(scope=scope, needs_token=site.guard.doors.needs_token)
-
-
 def _add_orders(app: FastAPI, site: Site) -> None:
-    @app.post(f"{API}stop", tags=["orders"], responses=_REFUSED)
+    @app.post(f"{API}stop", tags=["orders"], responses=REFUSED)
     async def stop() -> Done:
         """Close all valves and latch; no session is needed."""
         site.holds.clear()
         return await site.orders.give("stop")
 
-    @app.post(f"{API}hold", tags=["orders"], responses=_REFUSED)
+    @app.post(f"{API}hold", tags=["orders"], responses=REFUSED)
     async def hold() -> Ticket:
         """Begin to press a button that has to be held."""
         return Ticket(ticket=site.holds.begin(), hold_s=HOLD_S)
 
-    @app.post(f"{API}enable", tags=["orders"], responses=_REFUSED)
+    @app.post(f"{API}enable", tags=["orders"], responses=REFUSED)
     async def enable(press: Press) -> Done:
         """Allow spraying, after the button was held."""
         if not site.holds.take(press.ticket):
             return Done(accepted=False, text=f"hold the button for {HOLD_S:g} s")
         return await site.orders.give("enable")
 
-    @app.post(f"{API}disable", tags=["orders"], responses=_REFUSED)
+    @app.post(f"{API}disable", tags=["orders"], responses=REFUSED)
     async def disable() -> Done:
         """Close all valves; also releases a stop that was commanded."""
         site.holds.clear()
         return await site.orders.give("disable")
 
-    @app.post(f"{API}refilled", tags=["orders"], responses=_REFUSED)
+    @app.post(f"{API}refilled", tags=["orders"], responses=REFUSED)
     async def refilled(filling: Refilled) -> Done:
         """Take what is in the tank now."""
         return await site.orders.give("refilled", filling.litres)
@@ -587,7 +439,7 @@ def _add_files(app: FastAPI, site: Site) -> None:
 
 def _add_part(app: FastAPI, site: Site, name: str, part: Part) -> None:
     """Add what another package registered: its files at NAME/, its interface at api/v1/NAME/."""
-    router = APIRouter(prefix=f"{API}{name}", tags=[name], responses=_REFUSED)
+    router = APIRouter(prefix=f"{API}{name}", tags=[name], responses=REFUSED)
     part.add(router, Host(flying=site.flying, **site.host))
     app.include_router(router)
     site.facts.setdefault("parts", []).append({"name": name, "title": part.title})

@@ -21,6 +21,7 @@ ALLOWED = {
     "pydantic": (
         "companion/config",
         "companion/web/server.py",
+        "companion/web/entrance.py",
         "missions/web/office.py",
         "analysis/web/flights.py",
     ),

@@ -1,0 +1,168 @@
+"""The entrance of a page: every request passes `Guarded`, and a token opens a session.
+
+The operator's page and the fleet's have it in common.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import suppress
+from typing import Annotated, Any
+
+from fastapi import FastAPI, HTTPException, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.types import ASGIApp, Message, Receive, Send
+from starlette.types import Scope as Connection
+
+from companion.web.guard import API, COOKIE, Asked, Failures, Guard, Scope, session
+
+BODY_BYTES_MAX = 4096
+SEND_WITHIN_S = 20.0
+_CSP = (
+    "default-src 'none'; script-src 'self'; worker-src 'self'; style-src 'self'; "
+    "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors "
+)
+REFUSED: dict[int | str, dict[str, Any]] = {
+    401: {"description": "no session"},
+    403: {"description": "not from the page, or the session may only look"},
+    413: {"description": "too large"},
+    415: {"description": "no JSON"},
+    503: {"description": "the companion does not answer"},
+}
+
+
+class Body(BaseModel):
+    """A request's own small JSON: nothing unknown is in it."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class Login(Body):
+    """The token of the link or QR code that `run` prints."""
+
+    token: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class Access(BaseModel):
+    """What one may do here."""
+
+    scope: Scope
+    needs_token: bool
+
+
+class Guarded:
+    """Refuses what comes from elsewhere, and adds the headers that keep a page to itself."""
+
+    def __init__(self, app: ASGIApp, guard: Guard, *, ancestors: tuple[str, ...] = ()) -> None:
+        self._app = app
+        self._guard = guard
+        self._headers = {
+            b"content-security-policy": (_CSP + " ".join(("'self'", *ancestors))).encode(),
+            b"x-content-type-options": b"nosniff",
+            b"referrer-policy": b"no-referrer",
+            b"cross-origin-resource-policy": b"same-origin",
+            b"cache-control": b"no-store",
+        }
+
+    async def __call__(self, scope: Connection, receive: Receive, send: Send) -> None:
+        """Serve one request, or refuse it."""
+        if scope["type"] != "http":
+            return
+
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                have = {name.lower() for name, _ in message["headers"]}
+                extra = [item for item in self._headers.items() if item[0] not in have]
+                message = {**message, "headers": [*message["headers"], *extra]}
+            # A browser that does not read is let go; until then it costs one message.
+            await asyncio.wait_for(send(message), SEND_WITHIN_S)
+
+        asked = asked_of(scope)
+        refusal = self._guard.refusal(asked, time.time())
+        if refusal is None and asked.method == "POST" and not self._guard.is_upload(asked.path):
+            body = await _body(receive)
+            if body is None:
+                refusal = 413, f"a request has at most {BODY_BYTES_MAX} bytes"
+            else:
+                receive = _replay(body, receive)
+        with suppress(TimeoutError, ConnectionError):
+            if refusal is not None:
+                await JSONResponse({"detail": refusal[1]}, refusal[0])(scope, receive, sent)
+            else:
+                await self._app(scope, receive, sent)
+
+
+def asked_of(scope: Connection) -> Asked:
+    """Return what of a request the guard looks at."""
+    headers = tuple((k.decode("latin-1").lower(), v.decode("latin-1")) for k, v in scope["headers"])
+    return Asked(method=scope["method"], path=scope["path"], headers=headers)
+
+
+async def _body(receive: Receive) -> bytes | None:
+    """Return a request's body; None where it is too large."""
+    body = b""
+    while True:
+        message = await receive()
+        body += bytes(message.get("body", b""))
+        if len(body) > BODY_BYTES_MAX:
+            return None
+        if message["type"] == "http.disconnect" or not message.get("more_body"):
+            return body
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    given = False
+
+    async def replayed() -> Message:
+        nonlocal given
+        if given:
+            return await receive()
+        given = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return replayed
+
+
+async def unusable(_request: Request, error: Exception) -> Response:
+    """Say what is wrong with a request, without repeating what was in it."""
+    found = error.errors() if isinstance(error, RequestValidationError) else []
+    where = ".".join(str(part) for part in found[0]["loc"]) if found else "request"
+    text = str(found[0]["msg"]) if found else "cannot be used"
+    return JSONResponse({"detail": f"{where[:80]}: {text[:200]}"}, 422)
+
+
+def add_sessions(app: FastAPI, guard: Guard, *, login_s: int, is_tls: bool) -> None:
+    """Add what opens a session by a token, and says what one may do."""
+    failures = Failures()
+
+    @app.get(f"{API}session", tags=["session"])
+    async def access(request: Request) -> Access:
+        """Return what one may do."""
+        scope = guard.scope_of(asked_of(request.scope), time.time())
+        return Access(scope=scope, needs_token=guard.doors.needs_token)
+
+    @app.post(f"{API}session", tags=["session"], responses=REFUSED | {429: {"description": "wait"}})
+    async def log_in(login: Login, request: Request, response: Response) -> Access:
+        """Open a session by a token; the session is a cookie that scripts cannot read."""
+        address = "" if request.client is None else request.client.host
+        now_s = time.monotonic()
+        if failures.is_blocked(address, now_s):
+            raise HTTPException(429, "too many wrong tokens: wait a minute")
+        scope = guard.tokens.scope_of(login.token)
+        if scope == "none":
+            failures.failed(address, now_s)
+            raise HTTPException(401, "this token is not valid; take the newest link")
+        value = session(guard.tokens, scope, int(time.time()) + login_s)
+        response.set_cookie(
+            COOKIE,
+            value,
+            max_age=login_s,
+            httponly=True,
+            samesite="strict",
+            secure=is_tls,
+        )
+        return Access(scope=scope, needs_token=guard.doors.needs_token)
