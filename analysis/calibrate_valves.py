@@ -249,32 +249,29 @@ def measured_pieces(config: Config, course: Course, measure: Measure) -> list[Pi
     names = [valve.name for valve in config.valve]
     lag, largest = config.lag_model(), config.nozzle_sets()[-1]
     pieces: list[Piece] = []
-    for valve, name in enumerate(names):
-        for number in range(1, course.pieces + 1):
-            what = f"valve {name}, piece {number} of {course.pieces}"
-            for _ in range(TRIES):
-                note(f"{what}: {course.piece_s:.0f} s")
-                done = measure(course.task(valve, len(names)))
-                why = done.fault or (
-                    ""
-                    if done.outcome.is_done
-                    else in_words(done.outcome.reasons, done.outcome.text)
-                )
-                if not why:
-                    break
-                note(f"{what}: {why}")
-                if not done.outcome.has_begun:
-                    raise ValveCourseError(f"{what}: nothing was opened: {why}")
-            else:
-                raise ValveCourseError(f"{what}: given up after {TRIES} tries: {why}")
-            record = FlowRecord(
-                orders=orders_of(done.plans, largest),
-                time_s=np.array(done.time_s, dtype=np.float64),
-                volume_ml=np.array(done.volume_ml, dtype=np.float64),
-                period_s=config.pwm_limits().period_s,
-                lag=lag,
+    for valve, number in course.rounds(len(names)):
+        what = f"valve {names[valve]}, piece {number} of {course.pieces}"
+        for _ in range(TRIES):
+            note(f"{what}: {course.piece_s:.0f} s")
+            done = measure(course.task(valve, len(names)))
+            why = done.fault or (
+                "" if done.outcome.is_done else in_words(done.outcome.reasons, done.outcome.text)
             )
-            pieces.append(Piece(valve=valve, record=record))
+            if not why:
+                break
+            note(f"{what}: {why}")
+            if not done.outcome.has_begun:
+                raise ValveCourseError(f"{what}: nothing was opened: {why}")
+        else:
+            raise ValveCourseError(f"{what}: given up after {TRIES} tries: {why}")
+        record = FlowRecord(
+            orders=orders_of(done.plans, largest),
+            time_s=np.array(done.time_s, dtype=np.float64),
+            volume_ml=np.array(done.volume_ml, dtype=np.float64),
+            period_s=config.pwm_limits().period_s,
+            lag=lag,
+        )
+        pieces.append(Piece(valve=valve, record=record))
     return pieces
 
 

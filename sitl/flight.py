@@ -208,7 +208,12 @@ def fly(
 def true_profile(profile: PlantProfile, options: FlightOptions) -> PlantProfile:
     """Return the sprayer as the options have it."""
     if not options.scatter:
-        profile = replace(profile, lag_scatter=0.0, flow_scatter=0.0)
+        profile = replace(
+            profile,
+            lag_scatter=0.0,
+            flow_scatter=0.0,
+            imperfections=None if profile.imperfections is None else profile.imperfections.alike,
+        )
     if options.flow_law is not None:
         profile = replace(profile, flow_law=options.flow_law)
     return profile

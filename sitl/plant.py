@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
+from sitl.imperfections import Parts
 from sitl.meter import Metering, MeterStream
 from sitl.profile import draw_scatter, flow_table
 
@@ -151,6 +152,7 @@ class Plant:
         self._duty = [0.0] * count
         self._is_open = [False] * count
         self._opened_s = [-math.inf] * count
+        self._late_s = [0.0] * count
         self._active = 0
         # What goes wrong in flight (`liquid_faults.py`): valves that stick, openings, the supply.
         self._stuck = set(self._faults.stuck_open | self._faults.stuck_closed)
@@ -165,6 +167,8 @@ class Plant:
             gain=1.0 + float(rng.uniform(-spread, spread)), noise_rng=rng.spawn(1)[0]
         )
         self._stream: MeterStream | None = None
+        what = profile.imperfections
+        self._parts = None if what is None else Parts(what, count, seed=seed, start_s=start_s)
         for valve in sorted(self._faults.stuck_open):
             self._take(start_s, valve, duty=1.0, is_open=True)
 
@@ -272,9 +276,14 @@ class Plant:
     def _take(self, at_s: float, valve: int, *, duty: float, is_open: bool) -> None:
         """Bring one valve to its new state, and all others to the pressure that it leaves."""
         was_active = self._duty[valve] > 0.0
+        is_edge = is_open != self._is_open[valve]
         self._duty[valve], self._is_open[valve] = duty, is_open
-        if (duty > 0.0) != was_active:
-            self._active += 1 if duty > 0.0 else -1
+        if self._parts is not None and is_edge:
+            late_s = self._parts.late_s(valve, at_s, self._is_open, is_open=is_open)
+            self._late_s[valve] = late_s
+        moves = self._parts is not None and self._parts.moves_others
+        if (duty > 0.0) != was_active or moves:
+            self._active += (duty > 0.0) - was_active
             for other, is_other_open in enumerate(self._is_open):
                 if is_other_open and other != valve:
                     self._set_level(at_s, other)
@@ -284,11 +293,12 @@ class Plant:
         is_open = self._is_open[valve]
         level_ml_s = 0.0
         if is_open:
-            level_ml_s = self._flow_ml_s(self._duty[valve]) * self._scale(valve)
+            level_ml_s = self._flow_ml_s(self._duty[valve]) * self._scale(valve, at_s)
         change_ml_s = level_ml_s - self._level_ml_s[valve]
         if change_ml_s != 0.0:
             self._level_ml_s[valve] = level_ml_s
             dead_s = self._dead_s(is_open=is_open) + self._scatter.shift_s[valve]
+            dead_s += self._late_s[valve]
             begin_s, ramp_s = at_s + max(dead_s, 0.0), self._ramp_s(is_open=is_open)
             if is_open:
                 self._opened_s[valve] = begin_s + ramp_s
@@ -300,8 +310,11 @@ class Plant:
             if self._stream is not None:
                 self._stream.step(*step)
 
-    def _scale(self, valve: int) -> float:
-        return self._scatter.flow_scale[valve] * self._opening[valve] * self._supply
+    def _scale(self, valve: int, at_s: float) -> float:
+        scale = self._scatter.flow_scale[valve] * self._opening[valve] * self._supply
+        if self._parts is None:
+            return scale
+        return scale * self._parts.scale(valve, at_s, self._duty, self._is_open)
 
     def stick(self, at_s: float, valve: int, *, is_open: bool) -> None:
         """Let a valve stay as it is told here, whatever it is ordered from now on."""

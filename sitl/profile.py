@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
+from sitl.imperfections import Imperfections
 from sitl.supply import Atomiser, Supply, read_atomiser
 
 # The flow of a nozzle set by its duty: three laws for what a table leaves open.
@@ -208,6 +209,7 @@ class PlantProfile:
     flow, and the edges are those of its shut-off valve. A `supply` is a pump with an order of its
     own, and what is not PWM is on-off; the curve of a pump that modulates is of its range.
     `flow_law` is how the flow runs between the measured points.
+    `imperfections` are those of the parts, of which the curve and the lags above know nothing.
     """
 
     name: str
@@ -227,6 +229,7 @@ class PlantProfile:
     supply: Supply | None = None
     atomisers: tuple[Atomiser, ...] = ()
     flow_law: FlowLaw = "smooth"
+    imperfections: Imperfections | None = None
 
     def __post_init__(self) -> None:
         if not self.nozzle_sets or not 0.0 < self.boom_width_m < 1000.0:
@@ -255,6 +258,8 @@ class PlantProfile:
         self._check_kinds()
 
     def _check_kinds(self) -> None:
+        if self.imperfections is not None and (self.pump is not None or self.has_sections):
+            raise ValueError("[imperfections] are those of PWM valves, and here are none")
         if self.flow_law not in FLOW_LAWS:
             raise ValueError(f"flow_law is one of {', '.join(FLOW_LAWS)}, got {self.flow_law!r}")
         if self.pump is not None and self.supply is not None:
@@ -429,6 +434,7 @@ def _profile(table: dict[str, Any]) -> PlantProfile:
     )
     pwm, meter, flow = table.pop("pwm"), table.pop("meter"), table.pop("flow")
     pump, supply = table.pop("pump", None), table.pop("supply", None)
+    imperfections = table.pop("imperfections", None)
     atomisers = tuple(read_atomiser(entry) for entry in table.pop("atomiser", ()))
     return PlantProfile(
         pwm=Pulsing(**pwm),
@@ -437,6 +443,7 @@ def _profile(table: dict[str, Any]) -> PlantProfile:
         pump=None if pump is None else Pump(**pump),
         supply=None if supply is None else Supply(**supply),
         atomisers=atomisers,
+        imperfections=None if imperfections is None else Imperfections(**imperfections),
         **flow,
         **table,
     )

@@ -79,20 +79,19 @@ def recorded(
     plant, output = sprayer(true_profile(profile, options), options, 0.0)
     count = len(setup.boom.valves)
     memory, now_s, pieces = GroundMemory(), 0.0, []
-    for valve in range(count):
-        for _ in range(course.pieces):
-            now_s += REST_S
-            began_s = now_s
-            plans, memory, now_s = _perform(course.task(valve, count), output, memory, now_s)
-            time_s, volume_ml = _readings(plant, began_s, now_s + 0.5 * REST_S)
-            record = FlowRecord(
-                orders=orders_of(plans, setup.nozzle_sets[-1]),
-                time_s=time_s,
-                volume_ml=volume_ml,
-                period_s=setup.pwm.period_s,
-                lag=setup.lag,
-            )
-            pieces.append(Piece(valve=valve, record=record))
+    for valve, _ in course.rounds(count):
+        now_s += REST_S
+        began_s = now_s
+        plans, memory, now_s = _perform(course.task(valve, count), output, memory, now_s)
+        time_s, volume_ml = _readings(plant, began_s, now_s + 0.5 * REST_S)
+        record = FlowRecord(
+            orders=orders_of(plans, setup.nozzle_sets[-1]),
+            time_s=time_s,
+            volume_ml=volume_ml,
+            period_s=setup.pwm.period_s,
+            lag=setup.lag,
+        )
+        pieces.append(Piece(valve=valve, record=record))
     return pieces, now_s
 
 

@@ -9,7 +9,7 @@ mean 1, and no dose comes from here.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import TYPE_CHECKING
@@ -22,6 +22,7 @@ from analysis.calibration.identify import (
     STEPS_MIN,
     Estimate,
     Fit,
+    Line,
     Meter,
     fit_all,
     mean_of,
@@ -85,6 +86,15 @@ class Course:
             kind=GroundKind.VALVES, phases=tuple(phases), seconds=self.piece_s, is_whole=True
         )
 
+    def rounds(self, count: int) -> Iterator[tuple[int, int]]:
+        """Yield valve and number of each piece: all valves in turn, there and back again.
+
+        So what warms up meanwhile, or a tank that empties, comes to every valve alike.
+        """
+        for number in range(1, self.pieces + 1):
+            order = range(count) if number % 2 else reversed(range(count))
+            yield from ((valve, number) for valve in order)
+
     def open_s(self, count: int) -> tuple[float, float]:
         """Return what all of it takes: seconds, and seconds of one fully open valve."""
         own_s = self.cycles * self.dwell_s * (2.0 * self.high + self.low)
@@ -107,6 +117,7 @@ def course_of(pwm: PwmLimits, lag: LagModel, *, cycles: int, is_alone: bool) -> 
             f"lags of {lag.off_end_s:.2g} s leave no time for a cycle within {PIECE_MAX_S:g} s"
         )
     pieces = max(math.ceil(cycles / fitting), 1)
+    pieces += pieces % 2  # as often there as back
     low = pwm.duty_min + LOW_SHARE * window
     return Course(
         low=low,
@@ -116,6 +127,11 @@ def course_of(pwm: PwmLimits, lag: LagModel, *, cycles: int, is_alone: bool) -> 
         cycles=math.ceil(cycles / pieces),
         pieces=pieces,
     )
+
+
+# As the changes of a cycle are taken together below.
+KINDS = (Kind.ON, Kind.OFF, Kind.UP, Kind.DOWN)
+Fits = Sequence[Fit]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -228,32 +244,38 @@ def _lags(fits: Sequence[Fit], valve: int) -> dict[Kind, Estimate]:
 
 
 def _flow(fits: Sequence[Fit]) -> Estimate:
-    """Return the flow over what the curve says, from the changes; the interval is Student's.
+    """Return the flow over what the curve says, half at the high level and half at the low one.
 
-    On and off are a change of the high flow, up and down of what is between it and the low one:
-    each kind counts by the flow that it changes. The four changes of a cycle share stretches of
-    steady flow, so that it is cycles, and not changes, that say how much the figure scatters.
+    A valve that delivers a little longer at every pulse is farther off at the low level, so one
+    alone would not do. Both are taken above what flows while the valve is closed. The changes of a
+    cycle share stretches of steady flow, so that it is cycles, and not changes, that say how much
+    the figure scatters; the interval is Student's.
     """
-    whole = math.fsum(_expected(fits, kind) for kind in Kind)
-    by_kind = []
-    for kind in Kind:
-        weight = _expected(fits, kind) / whole
-        by_kind.append(
-            [
-                weight * fit.change_ml_s / fit.step.change_ml_s
-                for fit in fits
-                if fit.step.kind is kind
-            ]
-        )
-    value = math.fsum(fmean(each) for each in by_kind)
-    cycles = [math.fsum(each) for each in zip(*by_kind, strict=False)]
+    by_kind = {kind: [fit for fit in fits if fit.step.kind is kind] for kind in Kind}
+    high_ml_s = _expected(by_kind[Kind.ON] + by_kind[Kind.OFF])
+    low_ml_s = high_ml_s - _expected(by_kind[Kind.UP] + by_kind[Kind.DOWN])
+
+    def share(on: Fits, off: Fits, up: Fits, down: Fits) -> float:
+        closed = _level([fit.before for fit in on] + [fit.after for fit in off])
+        high = _level([fit.after for fit in (*on, *up)] + [fit.before for fit in (*off, *down)])
+        low = _level([fit.after for fit in down] + [fit.before for fit in up])
+        return 0.5 * ((high - closed) / high_ml_s + (low - closed) / low_ml_s)
+
+    value = share(*(by_kind[kind] for kind in KINDS))
+    cycles = [
+        share(*((fit,) for fit in cycle))
+        for cycle in zip(*(by_kind[kind] for kind in KINDS), strict=False)
+    ]
     half = t_factor(len(cycles) - 1, CONFIDENCE) * stdev(cycles) / math.sqrt(len(cycles))
-    count = sum(len(each) for each in by_kind)
-    return Estimate(value=value, low=value - half, high=value + half, count=count)
+    return Estimate(value=value, low=value - half, high=value + half, count=len(fits))
 
 
-def _expected(fits: Sequence[Fit], kind: Kind) -> float:
-    return fmean(abs(fit.step.change_ml_s) for fit in fits if fit.step.kind is kind)
+def _level(lines: Sequence[Line]) -> float:
+    return fmean(line.slope_ml_s for line in lines)
+
+
+def _expected(fits: Sequence[Fit]) -> float:
+    return fmean(abs(fit.step.change_ml_s) for fit in fits)
 
 
 def _half(estimate: Estimate) -> float:

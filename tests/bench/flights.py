@@ -34,6 +34,7 @@ from tests.bench.sprayers import (
 
 if TYPE_CHECKING:
     from companion.core.setup import Setup
+    from sitl.profile import PlantProfile
     from sitl.trajectory import Trajectory
 
 SLOW_M_S = (2.0, 3.0, 4.0, 5.0, 6.0)
@@ -182,11 +183,11 @@ def place(task: Task, output: Output) -> tuple[Setup, Trajectory]:
     return laid_out(condition_of(task.condition), task.seed, sprayer_setup(task.plant, output))
 
 
-def perfect(task: Task) -> Evaluation | None:
+def perfect(task: Task, profile: PlantProfile | None = None) -> Evaluation | None:
     """Fly with perfect knowledge; above the speeds of the paper nothing is held against it."""
     if task.speed_m_s > SLOW_M_S[-1]:
         return None
-    profile = load_profile(task.plant)
+    profile = profile or load_profile(task.plant)
     setup, path = place(task, "gpio")
     known = known_setup(setup, profile, "gpio", task.seed)
     options = FlightOptions(seed=task.seed, knows=True)

@@ -1,6 +1,6 @@
 """Valves measured one by one: how well they are found, and what that is worth in the field.
 
-    python -m tests.bench.valves [--seeds 20] [--speeds 2,4,6] [--plant wang-2024] [--rows FILE]
+    python -m tests.bench.valves [--seeds 20] [--speeds 2,4,6] [--plant wang-2024] [--imperfect]
 
 Each seed is another sprayer whose valves scatter. It is measured by the twin's own meter through
 the companion's ground work, then flown over the example: with the set's figures alone, with those
@@ -24,7 +24,8 @@ import numpy as np
 
 from analysis.evaluation import Evaluation, evaluate
 from sitl.flight import fly
-from sitl.profile import draw_scatter, load_profile
+from sitl.imperfections import TYPICAL, Parts
+from sitl.profile import PlantProfile, draw_scatter, load_profile
 from sitl.valve_calibration import Calibrated, calibrate_valves, with_figures
 from sitl.workers import do_all
 from tests.bench.flights import Task, perfect, place
@@ -83,13 +84,19 @@ class Row:
     flights: dict[str, Flight]
 
 
-def measure(todo: tuple[str, int, float, Output, bool]) -> Row:
+def measure(todo: tuple[str, int, float, Output, bool, bool]) -> Row:
     """Calibrate one sprayer and fly it four times."""
-    plant, seed, speed_m_s, output, is_alone = todo
-    profile, options = load_profile(plant), options_of(output, seed)
-    ground = _calibrated(plant, seed, is_alone)
+    plant, seed, speed_m_s, output, is_alone, is_imperfect = todo
+    profile, options = _profile(plant, is_imperfect), options_of(output, seed)
+    ground = _calibrated(plant, seed, is_alone, is_imperfect)
     drawn = draw_scatter(profile, np.random.default_rng(seed))
     flow, shift = np.array(drawn.flow_scale), np.array(drawn.shift_s)
+    if profile.imperfections is not None:
+        parts = Parts(profile.imperfections, profile.valve_count, seed=seed, start_s=0.0)
+        flow *= [
+            parts.flow_over_nominal(valve, profile.pwm.period_s)
+            for valve in range(profile.valve_count)
+        ]
     true = zip((flow / flow.mean()).tolist(), (shift - shift.mean()).tolist(), strict=True)
     valves = tuple(
         Found(
@@ -104,7 +111,7 @@ def measure(todo: tuple[str, int, float, Output, bool]) -> Row:
     setup, path = place(task, output)
     known = with_figures(setup, ground.found)
     alike = replace(options, scatter=False)
-    best = perfect(task)
+    best = perfect(task, profile)
     flights = {
         "the set's figures": evaluate(
             fly(setup, path, profile, options, speed_m_s=speed_m_s).record
@@ -125,11 +132,18 @@ def measure(todo: tuple[str, int, float, Output, bool]) -> Row:
     )
 
 
+def _profile(plant: str, is_imperfect: bool) -> PlantProfile:
+    profile = load_profile(plant)
+    return replace(profile, imperfections=TYPICAL) if is_imperfect else profile
+
+
 @lru_cache(maxsize=32)
-def _calibrated(plant: str, seed: int, is_alone: bool) -> Calibrated:
+def _calibrated(plant: str, seed: int, is_alone: bool, is_imperfect: bool) -> Calibrated:
     """Return what a sprayer's valves are found to be; it serves all speeds and outputs."""
     setup = sprayer_setup(plant, "gpio")
-    return calibrate_valves(setup, load_profile(plant), options_of("gpio", seed), is_alone=is_alone)
+    return calibrate_valves(
+        setup, _profile(plant, is_imperfect), options_of("gpio", seed), is_alone=is_alone
+    )
 
 
 def _flight(found: Evaluation) -> Flight:
@@ -201,12 +215,13 @@ def main() -> None:
     parser.add_argument("--outputs", default="gpio,servo")
     parser.add_argument("--plant", default=PLANT)
     parser.add_argument("--others-open", action="store_true")
+    parser.add_argument("--imperfect", action="store_true", help="parts as sitl/imperfections.py")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--page", action="store_true", help="write docs/measurements/valves.md")
     asked = parser.parse_args()
     todo = [
-        (asked.plant, seed, float(speed), output, not asked.others_open)
+        (asked.plant, seed, float(speed), output, not asked.others_open, asked.imperfect)
         for output in asked.outputs.split(",")
         for speed in asked.speeds.split(",")
         for seed in range(1, asked.seeds + 1)
