@@ -11,6 +11,7 @@ from tests.reference import (
     commands,
     configuration,
     driver_board,
+    fleet,
     journal,
     map_problems,
     mavlink,
@@ -33,6 +34,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "scenarios.md": scenarios.page,
     "campaigns.md": campaigns.page,
     "driver-board.md": driver_board.page,
+    "fleet.md": fleet.page,
 }
 
 
