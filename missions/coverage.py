@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from companion.core.frame import LocalFrame
 from missions.demand import Rates, Uniform
 from missions.strips import (
     LINE_MIN_M,
@@ -25,6 +26,10 @@ from missions.strips import (
     whole,
 )
 
+# From so much ground on that is narrower than the swath a pilot is told.
+NARROW_PERCENT = 2.0
+# What is twice as broad is no crumb.
+BROAD_M = 0.25
 # Less than this is no ground but the last digits of large numbers.
 NOISE_M2 = 1e-6
 # Of the cells in which rates are looked at.
@@ -43,6 +48,7 @@ class Coverage:
     overlap_percent: float
     outside_m2: float
     largest_skip_m2: float
+    largest_skip_at: tuple[float, float] | None = None
     without_rate_m2: float = 0.0
 
 
@@ -64,7 +70,9 @@ def measure(
     inside = shapely.intersection(covered, ground)
     outside_m2 = covered.area - inside.area
     skipped = shapely.difference(ground, covered)
-    patches = shapely.area(shapely.get_parts(skipped))
+    patches = shapely.get_parts(skipped)
+    areas_m2 = shapely.area(patches)
+    largest = _in_the_midst(patches[areas_m2.argmax()]) if len(patches) else None
     reached = shapely.intersection(covered, possible).area
     return Coverage(
         percent=100.0 * inside.area / area_m2,
@@ -73,7 +81,33 @@ def measure(
         * max(float(shapely.area(strips).sum()) - covered.area, 0.0)
         / area_m2,
         outside_m2=outside_m2 if outside_m2 > NOISE_M2 else 0.0,
-        largest_skip_m2=float(np.max(patches, initial=0.0)),
+        largest_skip_m2=float(areas_m2.max(initial=0.0)),
+        largest_skip_at=None if largest is None else (largest.x, largest.y),
+    )
+
+
+def _in_the_midst(patch: BaseGeometry) -> shapely.Point:
+    """Return a place where a patch is broad: a crumb along a border may hang on to it."""
+    broad = shapely.get_parts(patch.buffer(-BROAD_M))
+    if not len(broad) or broad[0].is_empty:
+        return patch.representative_point()
+    place: shapely.Point = broad[shapely.area(broad).argmax()].representative_point()
+    return place
+
+
+def narrow_warnings(found: Coverage, frame: LocalFrame, width_m: float) -> tuple[str, ...]:
+    """Return how much of a field no whole swath fits on, where that is much, and where."""
+    narrow_percent = 100.0 * (1.0 - found.percent / max(found.reachable_percent, 1e-9))
+    if found.largest_skip_at is None or found.largest_skip_m2 < width_m**2:
+        return ()
+    if narrow_percent < NARROW_PERCENT:
+        return ()
+    latitude_deg, longitude_deg = frame.to_geographic(*found.largest_skip_at)
+    return (
+        f"{narrow_percent:.0f} % of the field is narrower than the swath of {width_m:g} m and is "
+        f"not sprayed, {found.largest_skip_m2:.0f} m2 of it near {latitude_deg:.6f}, "
+        f"{longitude_deg:.6f}; spray it by hand, or plan for a narrower boom "
+        "(mission.swath_width_m)",
     )
 
 

@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry
 from companion.core.frame import LocalFrame
 from missions.boom import Boom, boom_of, over_warnings
 from missions.corners import Motion
-from missions.coverage import measure, narrow_patches, of_rated_ground
+from missions.coverage import measure, narrow_patches, narrow_warnings, of_rated_ground
 from missions.demand import M2_PER_HA, Demand, Rates, demands, valve_places
 from missions.errors import OutOfReachError, PlanError
 from missions.field import Field, local_points
@@ -156,10 +156,9 @@ def _planned(
     else:
         sorties, places = _from_depots(field, lines, demand, settings, given, one)
     done = no_lines() if left is None else left.done
-    coverage = of_rated_ground(
-        measure(sprayed, field.limit, width_m, strips=boom.strips(sprayed)),
-        boom.strips(joined([done, flown_lines(sorties.sorties)])), field.limit, rates=rates,
-    )  # fmt: skip
+    covered = measure(sprayed, field.limit, width_m, strips=boom.strips(sprayed))
+    strips = boom.strips(joined([done, flown_lines(sorties.sorties)]))
+    coverage = of_rated_ground(covered, strips, field.limit, rates=rates)
     flights = sorties.sorties
     if not counted_before:
         flights = counted(flights, rates, settings, field.kept_in, boom)
@@ -178,6 +177,7 @@ def _planned(
             *far_warnings(sorties.sorties, places, field, has_battery=settings.battery is not None),
             *near_warnings(sorties.sorties, field.frame, apart=with_sprayer),
             *over_warnings(lines, field.limit, boom),
+            *narrow_warnings(covered, field.frame, width_m),
             *around.warnings(sorties.sorties, places, field.frame, settings),
         ),
         terrain=around.terrain,

@@ -258,3 +258,14 @@ def test_the_suggested_depot_is_near_as_it_is_flown_around_a_bay() -> None:
     found_m = suggested.home_ways_m((lines[:, :2] + lines[:, 2:]) / 2.0) @ litres
     assert float(found_m[0]) < 1.05 * home_m.min()
     assert home_m.max() > 1.5 * home_m.min()
+
+
+def test_a_pilot_is_told_how_much_is_narrower_than_the_swath_and_where() -> None:
+    broad, ditch = box(0.0, 0.0, 60.0, 60.0), box(60.0, 0.0, 260.0, 5.0)
+    plan = plan_of(Polygon([(0, 0), (260, 0), (260, 5), (60, 5), (60, 60), (0, 60)]))
+    (told,) = [text for text in plan.warnings if "narrower" in text]
+    assert told.startswith("22 % of the field is narrower than the swath of 6 m")
+    east_m, north_m = plan.coverage.largest_skip_at or (0.0, 0.0)
+    assert ditch.buffer(1.0).contains(shapely.Point(east_m, north_m))
+    assert "{:.6f}, {:.6f}".format(*FRAME.to_geographic(east_m, north_m)) in told
+    assert not [text for text in plan_of(broad).warnings if "narrower" in text]
