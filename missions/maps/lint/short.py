@@ -156,7 +156,7 @@ def _direction(survey: Survey, angle_deg: float | None) -> Floats:
         row_m = columns * np.hypot(*along_row)
         return _unit(along_row if row_m >= rows * np.hypot(*along_column) else along_column)
     hull = shapely.convex_hull(shapely.multipoints(shapely.get_coordinates(survey.local)))
-    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(hull))
+    corners = shapely.get_coordinates(shapely.oriented_envelope(hull))
     sides = np.diff(corners[:3], axis=0) if len(corners) >= 3 else np.array([[0.0, 1.0]])
     return _unit(sides[int(np.argmax(np.hypot(*sides.T)))])
 
