@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -154,25 +154,27 @@ def valves(
     names = [valve.name for valve in config.valve]
     if len(names) < 2:
         raise ConfigError(f"{config_file}: has one valve; there is none to compare it with")
+    day = datetime.now(UTC).astimezone().date().isoformat()
     if catch is not None:
-        result = as_shape(identify_caught(read_catch(catch, names)), names, None)
+        result = as_shape(identify_caught(read_catch(catch, names)), names, None, day)
     else:
         if record is not None:
-            pieces = read_record(record, names)
+            pieces, recorded_on = read_record(record, names)
+            day = recorded_on or day
         else:
             course = course_of(
                 config.pwm_limits(), config.lag_model(), cycles=cycles, is_alone=not is_among
             )
             pieces = _measured_here(config, given, course, is_lines=is_lines)
             if out is not None:
-                write_record(out, names, pieces)
+                write_record(out, names, pieces, day)
         try:
             found = identify_valves(pieces, len(names))
         except ValveCourseError as error:
             answer({"error": str(error)} if as_json else {}, (), as_json=as_json)
             note(f"error: {error}")
             raise typer.Exit(1) from error
-        result = as_shape(found, names, config.lag_model())
+        result = as_shape(found, names, config.lag_model(), day)
         if plot is not None:
             from analysis.calibrate_plots import plot_valves
 
@@ -293,12 +295,13 @@ def course_lines(config: Config, course: Course) -> Iterator[str]:
 FORMAT = "vrspray-valves-1"
 
 
-def write_record(path: Path, names: Sequence[str], pieces: Sequence[Piece]) -> None:
+def write_record(path: Path, names: Sequence[str], pieces: Sequence[Piece], day: str) -> None:
     """Write what was recorded as JSON; ConfigError where that cannot be."""
     first = pieces[0].record
     document = {
         "format": FORMAT,
         "valves": list(names),
+        "measured_on": day,
         "period_s": first.period_s,
         "lag": asdict(first.lag),
         "pieces": [
@@ -317,8 +320,8 @@ def write_record(path: Path, names: Sequence[str], pieces: Sequence[Piece]) -> N
         raise ConfigError(f"--out {path}: cannot be written ({error})") from error
 
 
-def read_record(path: Path, names: Sequence[str]) -> list[Piece]:
-    """Read what `write_record` wrote; ConfigError where it is none of these valves."""
+def read_record(path: Path, names: Sequence[str]) -> tuple[list[Piece], str | None]:
+    """Return what `write_record` wrote, and its day; ConfigError where it is of other valves."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -329,7 +332,7 @@ def read_record(path: Path, names: Sequence[str]) -> list[Piece]:
         raise ConfigError(f"--from {path}: is of other valves than the configuration has")
     try:
         lag = LagModel(**document["lag"])
-        return [
+        pieces = [
             Piece(
                 valve=list(names).index(piece["valve"]),
                 record=FlowRecord(
@@ -342,6 +345,8 @@ def read_record(path: Path, names: Sequence[str]) -> list[Piece]:
             )
             for piece in document["pieces"]
         ]
+        day = document.get("measured_on")
+        return pieces, None if day is None else date.fromisoformat(day).isoformat()
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"--from {path}: is damaged ({error!r})") from error
 
@@ -372,7 +377,7 @@ def read_catch(path: Path, names: Sequence[str]) -> list[list[float]]:
 
 
 def as_shape(
-    found: IdentifiedValves, names: Sequence[str], configured: LagModel | None
+    found: IdentifiedValves, names: Sequence[str], configured: LagModel | None, day: str
 ) -> dict[str, Any]:
     """Return the answer: each valve, the set's own lags beside the configured ones, TOML."""
     return {
@@ -391,7 +396,7 @@ def as_shape(
             for kind, lag in found.lags.items()
         },
         "volume_l": None if math.isnan(found.volume_ml) else found.volume_ml / 1000.0,
-        "toml": "\n".join(toml_lines(found, names)),
+        "toml": "\n".join(toml_lines(found, names, day)),
     }
 
 
@@ -399,14 +404,16 @@ def _figures(estimate: Any) -> dict[str, float]:
     return {"value": estimate.value, "low": estimate.low, "high": estimate.high}
 
 
-def toml_lines(found: IdentifiedValves, names: Sequence[str]) -> Iterator[str]:
-    """Yield the keys of the `[[valve]]` tables that were measured."""
+def toml_lines(found: IdentifiedValves, names: Sequence[str], day: str) -> Iterator[str]:
+    """Yield the keys of the `[[valve]]` tables that were measured on a day, with water."""
     for name, own in zip(names, found.valves, strict=True):
         yield "[[valve]]"
         yield f"name = {json.dumps(name)}"
         yield f"flow_factor = {own.factor.value:.4f}"
         for kind, lag in own.lags.items():
             yield f"lag_{kind.value}_s = {lag.value:.4f}"
+        yield f'measured_on = "{day}"'
+        yield 'measured_with = "water"'
 
 
 def lines(result: dict[str, Any]) -> Iterator[str]:

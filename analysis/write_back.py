@@ -61,7 +61,7 @@ def write_back(config: Path, measured: str) -> list[str]:
     load(config)
     before = config.read_text(encoding="utf-8-sig")
     tables = tomllib.loads(measured)
-    if "lag" in tables or "valve" in tables:
+    if "lag" in tables:
         tables.setdefault("lag", {})["measured_on"] = (
             datetime.now(tz=UTC).astimezone().date().isoformat()
         )

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from analysis.report.legal import LegalRecord
     from analysis.report.legal_fields import Told
     from analysis.report.treated import Clock, Treated
+    from companion.core.boom import Valve
+    from companion.core.schedule import LagModel
 
 
 REPORT_VERSION = 2
@@ -190,7 +192,7 @@ def _setup(flight: AppliedFlight) -> dict[str, Any]:
         "pwm": asdict(setup.pwm),
         "boom": {
             "width_m": setup.boom.width_m,
-            "valves": [asdict(valve) for valve in setup.boom.valves],
+            "valves": [valve_in_force(valve, setup.lag) for valve in setup.boom.valves],
         },
         "nozzle_sets": [
             {
@@ -217,6 +219,19 @@ def _setup(flight: AppliedFlight) -> dict[str, Any]:
         },
         "platform": meta.get("platform"),
     }
+
+
+def valve_in_force(valve: Valve, lag: LagModel) -> dict[str, Any]:
+    """Return a valve with the lags in force for it: the set's, and what it is later than that."""
+    of_set = (lag.on_s, lag.off_s, lag.up_s, lag.down_s)
+    in_force = {
+        f"{kind}_s": set_s + own_s
+        for kind, set_s, own_s in zip(
+            ("on", "off", "up", "down"), of_set, valve.lags_s, strict=True
+        )
+    }
+    is_own = valve.flow_factor != 1.0 or any(valve.lags_s)
+    return asdict(valve) | {"lags_in_force": in_force, "has_own_figures": is_own}
 
 
 def _text_sha256(meta: Mapping[str, str]) -> str | None:

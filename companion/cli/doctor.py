@@ -29,11 +29,13 @@ from companion.doctor.check import (
     Check,
     Status,
     application_check,
+    calibration_age,
     fail,
     is_ready,
     not_applicable,
     ok,
     split_advice,
+    valve_age,
     warn,
 )
 from companion.doctor.computer import (
@@ -228,8 +230,6 @@ def _verdict(checks: list[Check]) -> str:
 
 # What can be checked at a desk: configuration, map, what was measured, what was declared.
 
-# Nozzles wear, hoses age, pumps lose pressure: half a year is about one season of spraying.
-CALIBRATION_MAX_DAYS = 180
 # Lags of docs and examples, measured on simulated sprayers: on, off, up, down.
 _EXAMPLE_LAGS = frozenset({(0.10, 0.08, 0.10, 0.10), (0.1028, 0.1059, 0.1033, 0.1030)})
 
@@ -240,7 +240,8 @@ def configuration_checks(config: Config, *, today: date) -> Iterator[Check]:
     yield _output(config)
     yield _dead_man(config)
     yield _lags(config)
-    yield _age(config.lag.measured_on, today)
+    yield calibration_age(config.lag.measured_on, today)
+    yield valve_age(config, today)
     yield _signing(config)
 
 
@@ -303,27 +304,6 @@ def _lags(config: Config) -> Check:
             "measure it (vrspray calibrate lag-marks) and write it into the configuration",
         )
     return ok("lags", f"on {lag.on_s:g}, off {lag.off_s:g}, position {lag.position_s:g} s")
-
-
-def _age(measured_on: str | None, today: date) -> Check:
-    name = "calibration-age"
-    if measured_on is None:
-        return warn(
-            name,
-            "lag.measured_on is not set, so the age of flows and lags is unknown",
-            'write the date under [lag], such as measured_on = "2026-05-01"',
-        )
-    fix = "correct lag.measured_on, or the clock of this computer"
-    try:
-        days = (today - date.fromisoformat(measured_on)).days
-    except ValueError:
-        return warn(name, f"{measured_on} is not a date", fix)
-    if not days >= 0:
-        return warn(name, f"measured on {measured_on}, which is in the future", fix)
-    if not days <= CALIBRATION_MAX_DAYS:
-        fix = "measure again: vrspray calibrate flow, vrspray calibrate lag"
-        return warn(name, f"measured {days} days ago", fix)
-    return ok(name, f"measured {days} days ago")
 
 
 def _signing(config: Config) -> Check:

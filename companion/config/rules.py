@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from itertools import chain, combinations, pairwise
 from typing import TYPE_CHECKING
 
+from companion.config.sprayer_tables import own_figures
 from companion.core.nozzle import FLOW_LAWS, FlowCurve
 from companion.flight_modes import is_mode, known_modes
 
@@ -27,7 +28,6 @@ LINES_MAX = 64
 GPIO_LAST = {"lines": 1023, "spi595": LINES_MAX - 1}
 # Less than this between closed and full leaves a servo output too few steps for a duty.
 SPAN_MIN_US = 100
-FACTOR_MEAN_TOLERANCE = 0.005
 # Passes spaced by another width than the flow law's leave skips or overlaps in every pass.
 SWATH_TOLERANCE = 0.02
 
@@ -235,7 +235,8 @@ def _valves(config: Document) -> Rule:
                 text="another valve has this name; give each its own",
             )
         seen.add(valve.name)
-    yield from _flow_factors(config)
+    for key, text in own_figures(config.valve, config.lag):
+        yield Contradiction(key=key, text=text)
     for number, (left, right) in enumerate(pairwise(config.valve), start=1):
         if not left.right_m < right.right_m:
             yield Contradiction(
@@ -243,16 +244,6 @@ def _valves(config: Document) -> Rule:
                 text=f"not to the right of valve[{number - 1}] ({left.right_m:g}); "
                 "order the [[valve]] tables from left to right",
             )
-
-
-def _flow_factors(config: Document) -> Rule:
-    factors = [valve.flow_factor for valve in config.valve]
-    mean = sum(factors) / len(factors)
-    if not abs(mean - 1.0) <= FACTOR_MEAN_TOLERANCE:
-        yield Contradiction(
-            key="valve[0].flow_factor",
-            text=f"the factors of all valves have the mean {mean:.4g} and not 1; divide each by it",
-        )
 
 
 def _channels(config: Document) -> Rule:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, FiniteFloat
@@ -12,6 +12,7 @@ from companion.core.nozzle import FLOW_LAWS
 
 Lag = Annotated[FiniteFloat, Field(ge=0.0, le=30.0)]
 Offset = Annotated[FiniteFloat, Field(ge=-50.0, le=50.0)]
+Day = Annotated[str, Field(pattern=r"^\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])$")]
 OwnLag = Annotated[FiniteFloat, Field(ge=-0.1, le=0.1)]
 
 
@@ -54,6 +55,18 @@ class ValveTable(Table):
     lag_off_s: OwnLag = Field(default=0.0, description="measured: later than lag.off_s")
     lag_up_s: OwnLag = Field(default=0.0, description="measured: later than lag.up_s")
     lag_down_s: OwnLag = Field(default=0.0, description="measured: later than lag.down_s")
+    measured_on: Day | None = Field(
+        default=None, description="day on which factor and lags were measured, YYYY-MM-DD"
+    )
+    measured_with: Literal["water", "product"] | None = Field(
+        default=None, description="what was sprayed then"
+    )
+
+    @property
+    def has_own_figures(self) -> bool:
+        """Whether anything was measured of this valve by itself."""
+        lags_s = (self.lag_on_s, self.lag_off_s, self.lag_up_s, self.lag_down_s)
+        return self.flow_factor != 1.0 or any(lags_s)
 
 
 class PwmTable(Table):
@@ -138,11 +151,34 @@ class LagTable(Table):
         description="of a slow flow (a pump's): its time constant, a part of up_s; 0: not driven",
     )
     down_time_s: Lag = Field(default=0.0, description="the same, a part of down_s")
-    measured_on: str | None = Field(
+    measured_on: Day | None = Field(
         default=None,
-        pattern=r"^\d{4}-(0[1-9]|1[0-2])-(0[1-9]|[12]\d|3[01])$",
         description="day on which flows and lags were measured, YYYY-MM-DD; `doctor` tells its age",
     )
+
+
+# Factors are ratios: a mean farther from 1 would move the dose.
+FACTOR_MEAN_TOLERANCE = 0.005
+
+
+def own_figures(valves: Sequence[ValveTable], lag: LagTable) -> Iterator[tuple[str, str]]:
+    """Yield (key, what is wrong) of what was measured of single valves."""
+    factors = [valve.flow_factor for valve in valves]
+    mean = sum(factors) / len(factors)
+    if not abs(mean - 1.0) <= FACTOR_MEAN_TOLERANCE:
+        yield (
+            "valve[0].flow_factor",
+            f"the factors of all valves have the mean {mean:.4g} and not 1; divide each by it",
+        )
+    for number, valve in enumerate(valves):
+        for kind in ("on", "off", "up", "down"):
+            own_s, set_s = getattr(valve, f"lag_{kind}_s"), getattr(lag, f"{kind}_s")
+            if own_s < 0.0 and not own_s + set_s >= 0.0:
+                yield (
+                    f"valve[{number}].lag_{kind}_s",
+                    f"{own_s:g} with lag.{kind}_s = {set_s:g} is before the order; it is how much "
+                    "later than the mean valve this one is, in seconds",
+                )
 
 
 class OutputTable(Table):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import date
 from enum import StrEnum
 
 from companion.config import Config
@@ -139,3 +140,62 @@ def application_check(config: Config) -> Check:
             "write one such as Europe/Madrid",
         )
     return ok(NAME, f"{table.profile}: all there that the operator must say")
+
+
+# How old is what was measured.
+
+# Nozzles wear, hoses age, pumps lose pressure: half a year is about one season of spraying.
+CALIBRATION_MAX_DAYS = 180
+# A nozzle that gives 10 % more or less than the others is replaced (ISO 16122-2, 4.9.2).
+WORN_SHARE = 0.10
+
+
+def calibration_age(measured_on: str | None, today: date) -> Check:
+    """Return how old flows and lags are."""
+    name = "calibration-age"
+    if measured_on is None:
+        return warn(
+            name,
+            "lag.measured_on is not set, so the age of flows and lags is unknown",
+            'write the date under [lag], such as measured_on = "2026-05-01"',
+        )
+    again = "vrspray calibrate flow, vrspray calibrate lag"
+    return _judged_age(name, measured_on, today, key="lag.measured_on", again=again)
+
+
+def valve_age(config: Config, today: date) -> Check:
+    """Return how old the figures of single valves are, and with what they were measured."""
+    name, again = "valve-calibration", "vrspray calibrate valves"
+    own = [valve for valve in config.valve if valve.has_own_figures]
+    if not own:
+        return not_applicable(name, "no valve has figures of its own")
+    for valve in own:
+        if abs(valve.flow_factor - 1.0) > WORN_SHARE:
+            return warn(
+                name,
+                f"valve {valve.name} has flow_factor {valve.flow_factor:g}, more than "
+                f"{100.0 * WORN_SHARE:.0f} % off: worn or blocked",
+                f"clean or replace its nozzle, then {again}",
+            )
+    days = [valve.measured_on for valve in own if valve.measured_on is not None]
+    if len(days) < len(own):
+        fix = f"write valve.measured_on and measured_with, or measure again: {again}"
+        return warn(name, "valve.measured_on is not set, so their age is unknown", fix)
+    liquids = {valve.measured_with or "a liquid that is not said" for valve in own}
+    told = f" with {' and '.join(sorted(liquids))}"
+    return _judged_age(name, min(days), today, key="valve.measured_on", again=again, told=told)
+
+
+def _judged_age(
+    name: str, measured_on: str, today: date, *, key: str, again: str, told: str = ""
+) -> Check:
+    fix = f"correct {key}, or the clock of this computer"
+    try:
+        days = (today - date.fromisoformat(measured_on)).days
+    except ValueError:
+        return warn(name, f"{measured_on} is not a date", fix)
+    if not days >= 0:
+        return warn(name, f"measured on {measured_on}, which is in the future", fix)
+    if not days <= CALIBRATION_MAX_DAYS:
+        return warn(name, f"measured {days} days ago{told}", f"measure again: {again}")
+    return ok(name, f"measured {days} days ago{told}")

@@ -19,11 +19,18 @@ from analysis.assess.cell_maps import Histogram
 from analysis.assess.figures import figures_of
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report, embedded, page_of
-from analysis.report.contents import METRICS, contents_of, held_between, held_ground
+from analysis.report.contents import (
+    METRICS,
+    contents_of,
+    held_between,
+    held_ground,
+    valve_in_force,
+)
 from analysis.report.drawing import histogram
 from analysis.report.legal_fields import told_with
 from analysis.report.treated import clock_of, treated_of
 from companion.journal.writer import Event
+from tests import builders
 from tests.analysis.report_flight import EU_TOLD, fly
 
 # Attributes by which a page would fetch something.
@@ -332,3 +339,17 @@ def test_lost_rows_and_a_cut_are_warnings(journal: Path) -> None:
     text = page_of(contents, {})
     assert "The journal was cut" in text
     assert "7 rows of the journal are lost" in text
+
+
+def test_the_report_shows_what_is_in_force_for_each_valve(report: Report, page: Parsed) -> None:
+    assert "flow 0.980" not in page.text
+    setup = builders.setup()
+    late = replace(setup.boom.valves[0], flow_factor=0.98, lag_up_s=0.0041)
+    own = valve_in_force(late, setup.lag)
+    assert own["lags_in_force"]["up_s"] == pytest.approx(setup.lag.up_s + 0.0041)
+    assert own["lags_in_force"]["on_s"] == setup.lag.on_s
+    known = report.contents["setup"]
+    boom = {**known["boom"], "valves": [own]}
+    text = Parsed(page_of({**report.contents, "setup": {**known, "boom": boom}}, {})).text
+    assert f"{late.name}: flow 0.980, on {1000.0 * setup.lag.on_s:.1f}" in text
+    assert f"up {1000.0 * setup.lag.up_s + 4.1:.1f}" in text

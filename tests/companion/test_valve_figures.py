@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.cli.doctor import configuration_checks
 from companion.config import load
 from companion.core.boom import Boom
 from companion.core.controller import Memory, step
 from companion.core.nozzle import NozzleSet
 from companion.core.setup import Setup
+from companion.doctor.check import Status
 from companion.errors import ConfigError
 from companion.journal.layers import Ground
 from companion.journal.setup_json import calibration_sha256, setup_from_json, setup_to_json
@@ -92,6 +96,43 @@ def test_each_valve_is_ordered_by_its_own_lag() -> None:
 def test_only_the_lag_of_its_kind_counts() -> None:
     own = ordered(different((1.0,) * 6, lag_down_s=LAGS_S, lag_off_s=LAGS_S), 11.0)[1]
     assert own == pytest.approx(ordered(builders.setup(), 11.0)[1], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("lag_on_s = -0.09\n", "is before the order"),
+        ("lag_up_s = 0.3\n", r"lag_up_s"),
+        ('measured_on = "May"\n', "measured_on"),
+        ('measured_with = "milk"\n', "measured_with"),
+    ],
+)
+def test_figures_that_cannot_be_are_refused(tmp_path: Path, line: str, words: str) -> None:
+    path = configuration(tmp_path, (1.0,) * 6, line)
+    text = path.read_text(encoding="utf-8")
+    path.write_text(re.sub(r"(?m)^on_s = .*$", "on_s = 0.05", text), encoding="utf-8")
+    with pytest.raises(ConfigError, match=words):
+        load(path)
+
+
+@pytest.mark.parametrize(
+    ("factors", "more", "status", "words"),
+    [
+        ((1.0,) * 6, "", Status.NOT_APPLICABLE, "no valve has figures"),
+        (FACTORS, "", Status.WARN, "age is unknown"),
+        (FACTORS, 'measured_on = "2026-05-02"\nmeasured_with = "water"\n', Status.OK,
+         "30 days ago with water"),
+        (FACTORS, 'measured_on = "2025-05-02"\n', Status.WARN, "with a liquid that is not said"),
+        ((0.85, 1.03, 1.03, 1.03, 1.03, 1.03), "", Status.WARN, "valve 1 has flow_factor 0.85"),
+    ],
+)  # fmt: skip
+def test_doctor_names_the_age_and_the_liquid(
+    tmp_path: Path, factors: tuple[float, ...], more: str, status: Status, words: str
+) -> None:
+    config = load(configuration(tmp_path, factors, more))
+    found = {each.name: each for each in configuration_checks(config, today=date(2026, 6, 1))}
+    check = found["valve-calibration"]
+    assert (check.status, words in check.text) == (status, True)
 
 
 def test_at_the_border_a_late_valve_closes_sooner_and_an_early_one_no_later() -> None:

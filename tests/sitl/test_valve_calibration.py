@@ -144,8 +144,8 @@ def test_a_record_is_evaluated_again_and_written_into_the_configuration(
     pieces: list[Piece], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     record, config = tmp_path / "valves.json", tmp_path / "config.toml"
-    write_record(record, NAMES, pieces)
-    assert len(read_record(record, NAMES)) == len(pieces)
+    write_record(record, NAMES, pieces, "2026-05-01")
+    assert len(read_record(record, NAMES)[0]) == len(pieces)
     config.write_text(ANYANG.read_text(encoding="utf-8"), encoding="utf-8")
     (tmp_path / "prescription.csv").write_text("")
     picture = tmp_path / "valves.png"
@@ -156,6 +156,10 @@ def test_a_record_is_evaluated_again_and_written_into_the_configuration(
     for told, own in zip(result["valves"], found.valves, strict=True):
         assert told["flow_factor"]["value"] == pytest.approx(own.factor.value, abs=1e-6)
     assert picture.read_bytes().startswith(b"\x89PNG")
+    assert {(each.measured_on, each.measured_with) for each in load(config).valve} == {
+        ("2026-05-01", "water")
+    }
+    assert load(config).lag.measured_on is None
     shares = [load(config).nozzle_sets()[-1].share(valve) for valve in range(6)]
     assert shares == pytest.approx([own.factor.value for own in found.valves], abs=1e-4)
 
