@@ -62,9 +62,10 @@ def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
     """
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(
-        processes, mp_context=context, initializer=_end_with_parent, initargs=(theirs,)
-    )
+    with _environment():  # its first lock starts multiprocessing's own process
+        pool = ProcessPoolExecutor(
+            processes, mp_context=context, initializer=_end_with_parent, initargs=(theirs,)
+        )
     try:
         with _environment(), _interrupt_held_back():
             for _ in range(processes):

@@ -14,6 +14,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +28,7 @@ from companion.errors import ConfigError
 ALONE = 24
 # What has been worked out is written down so often: a cut loses no more.
 WRITE_EVERY_S = 20.0
+_SAFE_PATH = "PYTHONSAFEPATH"
 _PR_SET_PDEATHSIG = 1
 _NAMES = "flight-*.gpkg"
 
@@ -193,11 +195,12 @@ class _Pool:
         if self._processes == 1:
             yield from ((task, work(task)) for task in tasks)
             return
-        if self._pool is None:
-            self._pool = _started(self._processes)
-        futures: dict[Future[_Done], _Task] = {
-            self._pool.submit(work, each): each for each in tasks
-        }
+        with _no_module_of_this_folder():
+            if self._pool is None:
+                self._pool = _started(self._processes)
+            futures: dict[Future[_Done], _Task] = {
+                self._pool.submit(work, each): each for each in tasks
+            }
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
 
@@ -223,6 +226,20 @@ def _processes(asked: int | None, journals: int) -> int:
     if journals < ALONE:
         return 1
     return asked or len(os.sched_getaffinity(0))
+
+
+@contextmanager
+def _no_module_of_this_folder() -> Iterator[None]:
+    """As with -P: `multiprocessing` starts processes by `-c`, which looks in the working folder."""
+    before = os.environ.get(_SAFE_PATH)
+    os.environ[_SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[_SAFE_PATH]
+        else:
+            os.environ[_SAFE_PATH] = before
 
 
 def _started(processes: int) -> ProcessPoolExecutor:

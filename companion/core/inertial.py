@@ -247,8 +247,8 @@ def gained_over(samples: tuple[Sample, ...], from_s: float, to_s: float) -> Gain
 
     Straight lines between samples; before the first and after the last, held.
 
-    >>> gained_over((Sample(0.0, 2.0, 0.0), Sample(0.1, 2.0, 1.0)), 0.0, 0.1)
-    Gained(east_m_s=0.2, north_m_s=0.05, east_m=0.01, north_m=0.0016666666666666668)
+    >>> gained_over((Sample(0.0, 2.0, 0.0), Sample(0.5, 2.0, 1.0)), 0.0, 0.5)
+    Gained(east_m_s=1.0, north_m_s=0.25, east_m=0.25, north_m=0.041666666666666664)
     """
     if to_s <= from_s:
         return Gained(0.0, 0.0, 0.0, 0.0)

@@ -132,7 +132,11 @@ def test_short_help_is_the_help_and_has_one_style(name: str, capsys: Captured) -
 
 @pytest.mark.parametrize(
     ("words", "offered"),
-    [("vrspray ca", ["calibrate"]), ("vrspray map conv", ["convert"]), ("vrspray ru", ["run"])],
+    [
+        ("vrspray ca", ["calibrate", "campaign"]),
+        ("vrspray map conv", ["convert"]),
+        ("vrspray ru", ["run"]),
+    ],
 )
 def test_shell_completes_commands(words: str, offered: list[str]) -> None:
     asked = {

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from analysis.fleet.adding import ALONE, add
+from analysis.fleet.store import Store
 from companion.cli.app import _in_root
 from companion.core.nozzle import PwmLimits
 from companion.output.engine.setup import EngineSetup, Wiring
@@ -112,6 +114,15 @@ def test_the_valve_engine_runs_nothing_of_it(hostile: Path) -> None:
 @pytest.mark.parametrize("processes", [1, 2])
 def test_the_processes_of_a_demo_run_nothing_of_it(hostile: Path, processes: int) -> None:
     assert do_all(math.sqrt, [9.0, 4.0], processes=processes) == [3.0, 2.0]
+    assert not what_ran(hostile)
+
+
+def test_the_processes_of_a_fleet_run_nothing_of_it(hostile: Path, tmp_path: Path) -> None:
+    journals = [tmp_path / f"flight-{i}.gpkg" for i in range(ALONE)]
+    for journal in journals:
+        journal.write_bytes(b"no journal")
+    added = add(journals, Store.at(str(tmp_path / "fleet")), processes=2)
+    assert len(added.problems) == ALONE
     assert not what_ran(hostile)
 
 

@@ -23,6 +23,7 @@ import shapely
 
 from analysis.journals.content import read_journal
 from companion.core.controller import Memory, step
+from companion.core.inputs import AttitudeReport, ImuReport
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
 from companion.core.types import (
@@ -102,6 +103,17 @@ INPUTS: list[Input] = [
     TankReport(received_s=2.3, level_l=1 / 3),
     UtcReport(received_s=2.35, utc_s=NAN),
     BatteryReport(received_s=2.4, battery=1, consumed=4711.0, remaining_percent=None),
+    AttitudeReport(
+        received_s=0.5,
+        boot_s=INF,
+        roll_deg=-0.0,
+        pitch_deg=NAN,
+        yaw_deg=1 / 3,
+        roll_rate_deg_s=5e-324,
+        pitch_rate_deg_s=-INF,
+        yaw_rate_deg_s=0.1 + 0.2,
+    ),
+    ImuReport(received_s=0.6, boot_s=-0.0, forward_m_s2=NAN, right_m_s2=1 / 3, down_m_s2=-9.81),
 ]
 
 
