@@ -152,7 +152,7 @@ def plot_valves(found: IdentifiedValves, names: Sequence[str], path: Path) -> No
             lag_axes.text(
                 0.5,
                 0.5,
-                "a catch says nothing of lags",
+                "lags: not measured",
                 transform=lag_axes.transAxes,
                 ha="center",
                 color=FAINT,

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, date, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,12 +20,14 @@ from analysis.calibration.valves import (
     WORN_SHARE,
     Piece,
     ValveCourseError,
+    counted_course,
     course_of,
     identify_caught,
     identify_valves,
 )
 from analysis.write_back import Write, written_lines
 from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.core.inputs import AutopilotLiquid
 from companion.core.schedule import LagModel
 from companion.errors import ConfigError
 
@@ -32,13 +35,15 @@ if TYPE_CHECKING:
     from analysis.calibration.valves import Course, IdentifiedValves
     from companion.config import Config
     from companion.core.types import Input
-    from companion.ground.shell import GroundOutcome
+    from companion.ground.shell import GroundLink, GroundOutcome
     from companion.ground.work import GroundDecision, GroundTask
     from companion.sensors.flow_meter import EdgeSource, Meter
 
 MS = 1000.0
 # A piece that was broken off is done again so many times before it is given up.
 TRIES = 3
+# Counts of the autopilot come three times a second; a longer silence hides a part of the flow.
+COUNT_GAP_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,6 +102,51 @@ class PulseRecorder:
     async def close(self) -> None:
         """Let go of the line."""
         self._source.close()
+
+
+class CountRecorder:
+    """The autopilot's flow meter: keeps every count of it that the link hears in ground work."""
+
+    def __init__(self, battery: int) -> None:
+        from companion.cli.doctor_click import Readings
+
+        self._battery, self._readings = battery, Readings()
+
+    def around(self, link: GroundLink) -> GroundLink:
+        """Return the link with the counts taken down."""
+        from companion.cli.doctor_click import HeardLink
+
+        return HeardLink(link, self._readings, AutopilotLiquid(flow_battery=self._battery))
+
+    @property
+    def time_s(self) -> list[float]:
+        """Return when each count came."""
+        return [each.received_s for each in self._readings.counts]
+
+    @property
+    def volume_ml(self) -> list[float]:
+        """Return the counts."""
+        return [each.volume_ml for each in self._readings.counts]
+
+    @property
+    def fault(self) -> str:
+        """Return why the counts cannot be used."""
+        counts = self._readings.counts
+        if not counts:
+            return (
+                f"the autopilot sends no count of battery monitor {self._battery}; look at "
+                "flow_meter.battery, and at BATTn_MONITOR = 11 on ArduPilot (PX4 has no such meter)"
+            )
+        told = next((each.fault for each in counts if each.fault), "")
+        if told:
+            return told
+        for before, after in pairwise(counts):
+            if not after.volume_ml >= before.volume_ml:
+                return "flow meter: the autopilot's count has begun anew"
+            if not after.received_s - before.received_s <= COUNT_GAP_S:
+                gap_s = after.received_s - before.received_s
+                return f"flow meter: no count of the autopilot for {gap_s:.1f} s"
+        return ""
 
 
 def valves(
@@ -162,9 +212,7 @@ def valves(
             pieces, recorded_on = read_record(record, names)
             day = recorded_on or day
         else:
-            course = course_of(
-                config.pwm_limits(), config.lag_model(), cycles=cycles, is_alone=not is_among
-            )
+            course = _course(config, cycles, is_alone=not is_among)
             pieces = _measured_here(config, given, course, is_lines=is_lines)
             if out is not None:
                 write_record(out, names, pieces, day)
@@ -183,6 +231,13 @@ def valves(
     answer(result, [*lines(result), *changed], as_json=as_json)
 
 
+def _course(config: Config, cycles: int, *, is_alone: bool) -> Course:
+    """Return the course for the meter that there is."""
+    if config.flow_meter.source == "autopilot":
+        return counted_course(config.pwm_limits(), cycles=cycles, is_alone=is_alone)
+    return course_of(config.pwm_limits(), config.lag_model(), cycles=cycles, is_alone=is_alone)
+
+
 def _measured_here(
     config: Config, given: tuple[str, ...], course: Course, *, is_lines: bool
 ) -> list[Piece]:
@@ -192,27 +247,34 @@ def _measured_here(
     from companion.cli.sensor_parts import pulse_meter
 
     parts = pulse_meter(config)
-    if parts is None:
+    if parts is None and not course.is_counted:
         raise ConfigError(
-            "calibrate valves: needs a flow meter on this computer ([flow_meter] source = "
-            '"gpio"), which times every pulse; without one catch each valve by itself and give '
-            "--catch CSV"
+            'calibrate valves: needs a flow meter ([flow_meter] source = "gpio", or "autopilot" '
+            "for the flow alone); without one catch each valve by itself and give --catch CSV"
         )
     log = ready_log(config.resolve(config.journal.folder))
     descriptor = listening(is_lines)
     names = [valve.name for valve in config.valve]
     for line in course_lines(config, course):
         note(line)
+    if course.is_counted:
+        note(
+            "The autopilot counts whole millilitres, late by an unknown time: flow factors only. "
+            'Lags need the pulses themselves ([flow_meter] source = "gpio").'
+        )
     ask("spray", config, descriptor)
 
     def measure(task: GroundTask) -> Measured:
-        pulses, plans = PulseRecorder(*parts), CarriedOut(valve_count=len(names))
+        plans = CarriedOut(valve_count=len(names))
+        counts = CountRecorder(config.flow_meter.battery)
+        pulses = None if parts is None else PulseRecorder(*parts)
 
         def on_step(decision: GroundDecision) -> None:
             plans.take(decision.plan, decision.now_s)
 
         hand = Hand(descriptor, is_lines=is_lines)
-        outcome = perform(config, given, task, hand, sensors=[pulses], on_step=on_step)
+        sensors, hear = ([], counts.around) if pulses is None else ([pulses], _as_it_is)
+        outcome = perform(config, given, task, hand, sensors=sensors, on_step=on_step, hear=hear)
         if outcome.has_begun:
             entry = {
                 "ended_utc": datetime.now(UTC).isoformat(),
@@ -229,15 +291,22 @@ def _measured_here(
         if INTERRUPTED in outcome.reasons:
             raise KeyboardInterrupt
         plans.finish()
+        if pulses is None and outcome.is_done and not counts.time_s:
+            raise ValveCourseError(counts.fault)
+        meter = counts if pulses is None else pulses
         return Measured(
             outcome=outcome,
             plans=plans,
-            time_s=pulses.time_s,
-            volume_ml=pulses.volume_ml,
-            fault=pulses.fault,
+            time_s=meter.time_s,
+            volume_ml=meter.volume_ml,
+            fault=meter.fault if outcome.is_done else "",
         )
 
     return measured_pieces(config, course, measure)
+
+
+def _as_it_is(link: GroundLink) -> GroundLink:
+    return link
 
 
 def measured_pieces(config: Config, course: Course, measure: Measure) -> list[Piece]:
@@ -273,7 +342,7 @@ def measured_pieces(config: Config, course: Course, measure: Measure) -> list[Pi
             period_s=config.pwm_limits().period_s,
             lag=lag,
         )
-        pieces.append(Piece(valve=valve, record=record))
+        pieces.append(Piece(valve=valve, record=record, is_counted=course.is_counted))
     return pieces
 
 
@@ -302,6 +371,7 @@ def write_record(path: Path, names: Sequence[str], pieces: Sequence[Piece], day:
         "format": FORMAT,
         "valves": list(names),
         "measured_on": day,
+        "is_counted": pieces[0].is_counted,
         "period_s": first.period_s,
         "lag": asdict(first.lag),
         "pieces": [
@@ -334,6 +404,7 @@ def read_record(path: Path, names: Sequence[str]) -> tuple[list[Piece], str | No
         lag = LagModel(**document["lag"])
         pieces = [
             Piece(
+                is_counted=bool(document.get("is_counted", False)),
                 valve=list(names).index(piece["valve"]),
                 record=FlowRecord(
                     orders=tuple(Order(**order) for order in piece["orders"]),

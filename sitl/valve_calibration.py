@@ -14,7 +14,13 @@ import numpy as np
 
 from analysis.calibration.flow_record import CarriedOut, FlowRecord, orders_of
 from analysis.calibration.steps import Kind
-from analysis.calibration.valves import CYCLES, Piece, course_of, identify_valves
+from analysis.calibration.valves import (
+    CYCLES,
+    Piece,
+    counted_course,
+    course_of,
+    identify_valves,
+)
 from companion.core.boom import Boom
 from companion.core.nozzle import NozzleSet
 from companion.core.types import HeartbeatReport, LandedReport, OutputReport
@@ -43,6 +49,8 @@ STROKE_S = 0.03
 REST_S = 2.0
 # Edges of the meter's pulses are stamped by the kernel to this.
 STAMP_S = 0.001
+# The autopilot looks at its meter so often, tells it so often, and the link takes so long.
+LOOK_S, TOLD_S, LATE_S = 0.1, 0.33, 0.04
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,9 +70,16 @@ def calibrate_valves(
     *,
     cycles: int = CYCLES,
     is_alone: bool = True,
+    is_counted: bool = False,
 ) -> Calibrated:
-    """Return what the twin's meter says of each valve of the very sprayer of a seed."""
-    course = course_of(setup.pwm, setup.lag, cycles=cycles, is_alone=is_alone)
+    """Return what the twin's meter says of each valve of the very sprayer of a seed.
+
+    `is_counted` by the autopilot, else by its pulses.
+    """
+    if is_counted:
+        course = counted_course(setup.pwm, cycles=cycles, is_alone=is_alone)
+    else:
+        course = course_of(setup.pwm, setup.lag, cycles=cycles, is_alone=is_alone)
     pieces, now_s = recorded(setup, profile, options, course)
     found = identify_valves(pieces, len(setup.boom.valves))
     return Calibrated(
@@ -83,7 +98,8 @@ def recorded(
         now_s += REST_S
         began_s = now_s
         plans, memory, now_s = _perform(course.task(valve, count), output, memory, now_s)
-        time_s, volume_ml = _readings(plant, began_s, now_s + 0.5 * REST_S)
+        readings = _counts if course.is_counted else _readings
+        time_s, volume_ml = readings(plant, began_s, now_s + 0.5 * REST_S)
         record = FlowRecord(
             orders=orders_of(plans, setup.nozzle_sets[-1]),
             time_s=time_s,
@@ -91,7 +107,7 @@ def recorded(
             period_s=setup.pwm.period_s,
             lag=setup.lag,
         )
-        pieces.append(Piece(valve=valve, record=record))
+        pieces.append(Piece(valve=valve, record=record, is_counted=course.is_counted))
     return pieces, now_s
 
 
@@ -153,3 +169,12 @@ def _readings(plant: Plant, from_s: float, until_s: float) -> tuple[Floats, Floa
     pulses = np.flatnonzero(np.diff(counts) > 0) + 1
     chosen = np.unique(np.concatenate(([0], pulses, [len(times_s) - 1])))
     return times_s[chosen], counts[chosen] * (1000.0 / plant.profile.meter.pulses_per_l)
+
+
+def _counts(plant: Plant, from_s: float, until_s: float) -> tuple[Floats, Floats]:
+    """Return what the autopilot tells of the meter: whole millilitres, as it last looked."""
+    looked_s = np.arange(from_s, until_s, LOOK_S)
+    volume_ml = np.floor(plant.meter_count(looked_s) * 1000.0 / plant.profile.meter.pulses_per_l)
+    told_s = np.arange(from_s, until_s, TOLD_S)
+    last = np.searchsorted(looked_s, told_s, side="right") - 1
+    return told_s + LATE_S, volume_ml[last]

@@ -68,20 +68,30 @@ class Course:
     dwell_s: float
     cycles: int
     pieces: int
+    is_counted: bool = False
 
     @property
     def piece_s(self) -> float:
         """Return how long one piece takes: a steady beginning, and four changes a cycle."""
+        if self.is_counted:
+            return COUNTED_REST_S + 2.0 * self.dwell_s
         return (1 + 4 * self.cycles) * self.dwell_s
+
+    def duties(self) -> list[tuple[float, float]]:
+        """Return the valve's own course: from when on which duty."""
+        if self.is_counted:
+            begin_s = COUNTED_REST_S
+            return [(0.0, 0.0), (begin_s, self.high), (begin_s + self.dwell_s, self.low)]
+        every = [0.0, *([self.high, self.low, self.high, 0.0] * self.cycles)]
+        return [(number * self.dwell_s, duty) for number, duty in enumerate(every)]
 
     def task(self, valve: int, count: int) -> GroundTask:
         """Return one piece for a valve out of `count`."""
         phases = []
-        duties = [0.0, *([self.high, self.low, self.high, 0.0] * self.cycles)]
-        for number, own in enumerate(duties):
+        for at_s, own in self.duties():
             duty = [self.base] * count
             duty[valve] = own
-            phases.append(Phase(at_s=number * self.dwell_s, duty=tuple(duty)))
+            phases.append(Phase(at_s=at_s, duty=tuple(duty)))
         return GroundTask(
             kind=GroundKind.VALVES, phases=tuple(phases), seconds=self.piece_s, is_whole=True
         )
@@ -97,7 +107,8 @@ class Course:
 
     def open_s(self, count: int) -> tuple[float, float]:
         """Return what all of it takes: seconds, and seconds of one fully open valve."""
-        own_s = self.cycles * self.dwell_s * (2.0 * self.high + self.low)
+        highs = 1.0 if self.is_counted else 2.0
+        own_s = self.cycles * self.dwell_s * (highs * self.high + self.low)
         others_s = self.piece_s * self.base * (count - 1)
         pieces = self.pieces * count
         return self.piece_s * pieces, (own_s + others_s) * pieces
@@ -129,6 +140,33 @@ def course_of(pwm: PwmLimits, lag: LagModel, *, cycles: int, is_alone: bool) -> 
     )
 
 
+# A meter on the autopilot: whole millilitres, some three times a second, and late by a time that
+# nobody knows. One millilitre is a tenth of a second of one valve's flow, which is 30 ms (1 sd) in
+# each reading, and valves differ by 3 ms: it says nothing of lags. It says the flow of stretches.
+#
+# Closed, high and low for so long each; a count is that of up to `COUNTED_LATE_S` before it came.
+COUNTED_REST_S, COUNTED_DWELL_S, COUNTED_LATE_S = 4.0, 12.5, 1.0
+READINGS_MIN = 5
+# Of the changes that are asked for, one stretch of steady flow is worth several.
+CYCLES_PER_PIECE, COUNTED_PIECES_MIN = 3.4, 6
+
+
+def counted_course(pwm: PwmLimits, *, cycles: int, is_alone: bool) -> Course:
+    """Return the course for a meter that the autopilot counts: long steady stretches."""
+    window = pwm.duty_max - pwm.duty_min
+    pieces = max(math.ceil(cycles / CYCLES_PER_PIECE), COUNTED_PIECES_MIN)
+    low = pwm.duty_min + LOW_SHARE * window
+    return Course(
+        low=low,
+        high=pwm.duty_min + HIGH_SHARE * window,
+        base=0.0 if is_alone else low,
+        dwell_s=COUNTED_DWELL_S,
+        cycles=1,
+        pieces=pieces + pieces % 2,
+        is_counted=True,
+    )
+
+
 # As the changes of a cycle are taken together below.
 KINDS = (Kind.ON, Kind.OFF, Kind.UP, Kind.DOWN)
 Fits = Sequence[Fit]
@@ -140,6 +178,7 @@ class Piece:
 
     valve: int
     record: FlowRecord
+    is_counted: bool = False  # by the autopilot, in whole millilitres
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,11 +206,13 @@ class IdentifiedValves:
 def identify_valves(
     pieces: Sequence[Piece], count: int, *, meter_lag_s: float = METER_LAG_S
 ) -> IdentifiedValves:
-    """Return flow and lags of each of `count` valves, with 95 % intervals.
+    """Return flow and lags of each of `count` valves, with 95 % intervals; no lags of counts.
 
     Raises:
         ValveCourseError: naming the valve of which there are too few good changes.
     """
+    if pieces[0].is_counted:
+        return _identify_counted(pieces, count)
     fits: list[list[Fit]] = [[] for _ in range(count)]
     volume_ml = 0.0
     for piece in pieces:
@@ -180,14 +221,12 @@ def identify_valves(
             volume_ml += float(piece.record.volume_ml[-1] - piece.record.volume_ml[0])
     own = [_lags(of_valve, valve) for valve, of_valve in enumerate(fits)]
     flows = [_flow(of_valve) for of_valve in fits]
-    mean_flow = fmean(flow.value for flow in flows)
-    factors = [_scaled(flow, 1.0 / mean_flow) for flow in flows]
     found = [
         ValveFigures(
-            factor=_against_mean(factors, valve, 1.0),
+            factor=factor,
             lags={kind: _against_mean([each[kind] for each in own], valve, 0.0) for kind in Kind},
         )
-        for valve in range(count)
+        for valve, factor in enumerate(_factors(flows))
     ]
     lags = {kind: _mean([each[kind] for each in own]) for kind in Kind}
     output_s = pieces[0].record.lag.output_s
@@ -266,7 +305,7 @@ def _flow(fits: Sequence[Fit]) -> Estimate:
         share(*((fit,) for fit in cycle))
         for cycle in zip(*(by_kind[kind] for kind in KINDS), strict=False)
     ]
-    half = t_factor(len(cycles) - 1, CONFIDENCE) * stdev(cycles) / math.sqrt(len(cycles))
+    half = _half(_mean_with_interval(cycles))
     return Estimate(value=value, low=value - half, high=value + half, count=len(fits))
 
 
@@ -280,6 +319,70 @@ def _expected(fits: Sequence[Fit]) -> float:
 
 def _half(estimate: Estimate) -> float:
     return 0.5 * (estimate.high - estimate.low)
+
+
+def _factors(flows: Sequence[Estimate]) -> list[Estimate]:
+    """Return flows as ratios with the mean 1."""
+    mean = fmean(flow.value for flow in flows)
+    ratios = [_scaled(flow, 1.0 / mean) for flow in flows]
+    return [_against_mean(ratios, valve, 1.0) for valve in range(len(ratios))]
+
+
+def _mean_with_interval(values: Sequence[float]) -> Estimate:
+    mean = fmean(values)
+    half = t_factor(len(values) - 1, CONFIDENCE) * stdev(values) / math.sqrt(len(values))
+    return Estimate(value=mean, low=mean - half, high=mean + half, count=len(values))
+
+
+def _flows_only(flows: Sequence[Estimate], volume_ml: float) -> IdentifiedValves:
+    own = tuple(ValveFigures(factor=factor, lags={}) for factor in _factors(flows))
+    return IdentifiedValves(valves=own, lags={}, volume_ml=volume_ml)
+
+
+def _identify_counted(pieces: Sequence[Piece], count: int) -> IdentifiedValves:
+    """Return the flow factors by the autopilot's counts; the pieces' scatter is the interval."""
+    shares: list[list[float]] = [[] for _ in range(count)]
+    volume_ml = 0.0
+    for piece in pieces:
+        shares[piece.valve].append(_counted_share(piece))
+        volume_ml += float(piece.record.volume_ml[-1] - piece.record.volume_ml[0])
+    if min(len(own) for own in shares) < 2:
+        raise ValveCourseError("an interval needs two pieces of every valve or more")
+    return _flows_only([_mean_with_interval(own) for own in shares], volume_ml)
+
+
+def _counted_share(piece: Piece) -> float:
+    """Return the flow over what the curve says, half at the high level and half at the low one."""
+    record = piece.record
+    own = [order for order in record.orders if order.valve == piece.valve]
+    if len(own) != 3:
+        raise ValveCourseError(f"valve {piece.valve + 1}: {len(own)} changes in a piece, not 3")
+    settle = settle_s(record.lag) + COUNTED_LATE_S
+    opened, lowered, closed = (order.at_s for order in own)
+    rest_s = opened - COUNTED_REST_S
+    spans_s = ((rest_s, opened), (opened, lowered), (lowered, closed))
+    rest, high, low = (
+        _counted_flow(piece, from_s + settle, until_s) for from_s, until_s in spans_s
+    )
+    if not high - rest > 0.0:
+        raise ValveCourseError(
+            f"valve {piece.valve + 1}: the count does not grow faster while it sprays; look "
+            "whether it opens, and whether flow_meter.battery is the flow meter"
+        )
+    return 0.5 * ((high - rest) / own[0].after_ml_s + (low - rest) / own[1].after_ml_s)
+
+
+def _counted_flow(piece: Piece, from_s: float, until_s: float) -> float:
+    """Return the slope of the counts within a steady stretch [mL/s], by least squares."""
+    time_s, volume_ml = piece.record.time_s, piece.record.volume_ml
+    within = (time_s >= from_s) & (time_s <= until_s)
+    if int(within.sum()) < READINGS_MIN:
+        raise ValveCourseError(
+            f"valve {piece.valve + 1}: {int(within.sum())} counts of the autopilot within "
+            f"{until_s - from_s:.1f} s of steady flow, {READINGS_MIN} are needed"
+        )
+    away_s = time_s[within] - time_s[within].mean()
+    return float((away_s * volume_ml[within]).sum() / (away_s**2).sum())
 
 
 def _scaled(estimate: Estimate, by: float) -> Estimate:
@@ -316,18 +419,4 @@ def identify_caught(caught: Sequence[Sequence[float]]) -> IdentifiedValves:
 
     `caught` is the flow of each valve in each of its catches, in any unit: two catches or more.
     """
-    flows = []
-    for own in caught:
-        mean = fmean(own)
-        half = t_factor(len(own) - 1, CONFIDENCE) * stdev(own) / math.sqrt(len(own))
-        flows.append(Estimate(value=mean, low=mean - half, high=mean + half, count=len(own)))
-    middle = fmean(flow.value for flow in flows)
-    factors = [_scaled(flow, 1.0 / middle) for flow in flows]
-    return IdentifiedValves(
-        valves=tuple(
-            ValveFigures(factor=_against_mean(factors, valve, 1.0), lags={})
-            for valve in range(len(factors))
-        ),
-        lags={},
-        volume_ml=math.nan,
-    )
+    return _flows_only([_mean_with_interval(own) for own in caught], math.nan)

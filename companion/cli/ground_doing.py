@@ -34,7 +34,7 @@ from companion.cli.sensor_parts import build_sensors
 from companion.config import Config
 from companion.errors import ActuatorError, JournalError
 from companion.ground import shell
-from companion.ground.shell import GroundOutcome
+from companion.ground.shell import GroundLink, GroundOutcome
 from companion.ground.work import GroundDecision, GroundKind, GroundReason, GroundTask
 from companion.ports import Sensor
 from companion.sensors.estop import EstopSwitch
@@ -158,8 +158,12 @@ def perform(
     *,
     sensors: Sequence[Sensor] = (),
     on_step: Callable[[GroundDecision], None] = lambda _: None,
+    hear: Callable[[GroundLink], GroundLink] = lambda link: link,
 ) -> GroundOutcome:
-    """Do one piece with the configured link and outputs; `sensors` are read beside the stops."""
+    """Do one piece with the configured link and outputs; `sensors` are read beside the stops.
+
+    `hear` puts something around the link that takes down what comes in.
+    """
     options = component_options(config, training="ground", watch_mission=True)
     link = build_link(config, given, options)
     executor = build_executor(config, link)
@@ -170,7 +174,7 @@ def perform(
             return await shell.perform(
                 task,
                 ground_setup(config),
-                link=link,
+                link=hear(link),
                 executor=executor,
                 hand=hand,
                 sensors=[*stops, *sensors],

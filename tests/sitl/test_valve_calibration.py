@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from analysis.calibrate_valves import (
+    CountRecorder,
     Measured,
     PulseRecorder,
     measured_pieces,
@@ -19,9 +20,11 @@ from analysis.calibrate_valves import (
 from analysis.calibration.flow_record import CarriedOut
 from analysis.calibration.steps import Kind
 from analysis.calibration.valves import (
+    READINGS_MIN,
     Course,
     Piece,
     ValveCourseError,
+    counted_course,
     course_of,
     identify_caught,
     identify_valves,
@@ -29,14 +32,18 @@ from analysis.calibration.valves import (
 from companion.cli.app import execute
 from companion.config import load
 from companion.core.setup import Setup
+from companion.core.types import BatteryReport, Input
 from companion.ground.shell import GroundOutcome
 from companion.ground.work import PIECE_MAX_S, GroundReason, GroundTask
+from companion.link.component import Component, ComponentOptions
 from companion.sensors.flow_meter import Meter, VirtualEdges
 from sitl.flight import FlightOptions
 from sitl.imperfections import Imperfections, Parts
 from sitl.profile import PlantProfile, draw_scatter, load_profile
+from sitl.stub.liquid import FLIGHT_BATTERY, Battery
 from sitl.valve_calibration import calibrate_valves, recorded, with_figures
 from tests.bench.sprayers import options_of, sprayer_setup
+from tests.sitl import stub_bench
 
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang" / "config.toml"
 NAMES = ("1", "2", "3", "4", "5", "6")
@@ -90,6 +97,24 @@ def test_among_open_valves_it_is_found_less_well_but_as_true(
     for own, true in zip(found.valves, flow, strict=True):
         assert own.factor.value == pytest.approx(true, abs=0.03)
         assert own.factor.high - own.factor.low < 0.06
+
+
+def test_the_count_of_the_autopilot_finds_the_flow_and_claims_no_lag(
+    setup: Setup, profile: PlantProfile
+) -> None:
+    errors, held, widths = [], [], []
+    for seed in (1, 2, 4):
+        flow, _ = truth(profile, seed)
+        done = calibrate_valves(setup, profile, FlightOptions(seed=seed), is_counted=True)
+        assert done.found.lags == {}
+        for own, true in zip(done.found.valves, flow, strict=True):
+            assert own.lags == {}
+            errors.append(abs(own.factor.value - true))
+            held.append(own.factor.low <= true <= own.factor.high)
+            widths.append(own.factor.high - own.factor.low)
+    assert np.quantile(errors, 0.95) < 0.005
+    assert np.mean(held) > 0.85
+    assert np.mean(widths) < 0.005
 
 
 def test_factors_have_the_mean_one_and_lags_the_mean_nought(pieces: list[Piece]) -> None:
@@ -319,3 +344,101 @@ async def test_every_pulse_keeps_its_time_and_a_lost_one_is_said() -> None:
     assert "pulses lost" in recorder.fault
     await recorder.close()
     assert not source.is_open
+
+
+# ---------------------------------------------------------------------- the autopilot's flow meter
+
+
+class Wire:
+    """The link of ground work to the stub, in the stub's own time."""
+
+    def __init__(self, battery: int, ml_s: float) -> None:
+        self.bench = stub_bench.Bench(autopilot="ardupilot")
+        self.recorder = CountRecorder(battery)
+        self._heard: list[Input] = []
+        self.bench.autopilot.batteries = lambda now_s: [
+            FLIGHT_BATTERY,
+            Battery(number=1, consumed=int(ml_s * now_s), remaining_percent=None),
+        ]
+        self._channel = self.bench.autopilot.attach("companion", self._take)
+        self._component = Component(ComponentOptions(use_battery=True), self._send)
+        self._link = self.recorder.around(self)  # type: ignore[arg-type]
+
+    def _send(self, frame: bytes) -> bool:
+        self.bench.autopilot.receive(self._channel, frame, self.bench.now_s)
+        return True
+
+    def _take(self, frame: bytes) -> None:
+        self._heard += self._component.receive(frame, self.bench.now_s)
+
+    def receive(self) -> list[Input]:
+        heard, self._heard = self._heard, []
+        return heard
+
+    def run(self, duration_s: float) -> None:
+        for _ in range(round(duration_s / 0.1)):
+            self.bench.run(0.1)
+            self._component.tick(None, self.bench.now_s)
+            self._link.receive()
+
+
+def test_the_count_of_the_autopilot_comes_over_the_wire_often_enough() -> None:
+    wire = Wire(battery=1, ml_s=8.0)
+    wire.run(14.0)
+    time_s, volume_ml = wire.recorder.time_s, wire.recorder.volume_ml
+    assert wire.recorder.fault == ""
+    steady = [at_s > time_s[0] + 4.0 for at_s in time_s]
+    assert sum(steady) >= 2 * READINGS_MIN
+    slope = np.polyfit(np.array(time_s)[steady], np.array(volume_ml)[steady], 1)[0]
+    assert slope == pytest.approx(8.0, rel=0.02)
+
+
+def test_a_monitor_that_is_not_the_meter_is_said() -> None:
+    wire = Wire(battery=3, ml_s=8.0)
+    wire.run(5.0)
+    assert wire.recorder.time_s == []
+    assert "battery monitor 3" in wire.recorder.fault
+    assert "BATTn_MONITOR" in wire.recorder.fault
+
+
+def counted(reports: list[tuple[float, float | None]]) -> str:
+    """Return what is said of these counts."""
+    recorder = CountRecorder(1)
+
+    class Link:
+        def receive(self) -> list[Input]:
+            return [
+                BatteryReport(received_s=at_s, battery=1, consumed=ml, remaining_percent=None)
+                for at_s, ml in reports
+            ]
+
+    recorder.around(Link()).receive()  # type: ignore[arg-type]
+    return recorder.fault
+
+
+def test_counts_that_cannot_be_used_are_said() -> None:
+    assert counted([(0.0, 5.0), (0.3, 5.0), (0.6, 8.0)]) == ""
+    assert "begun anew" in counted([(0.0, 5.0), (0.3, 0.0)])
+    assert "for 3.0 s" in counted([(0.0, 5.0), (3.0, 30.0)])
+    assert "no count" in counted([(0.0, None)])
+
+
+def test_counts_that_do_not_say_the_flow_are_refused(
+    setup: Setup, profile: PlantProfile, tmp_path: Path
+) -> None:
+    course = counted_course(setup.pwm, cycles=6, is_alone=True)
+    pieces, _ = recorded(setup, profile, FlightOptions(seed=5), course)
+    record = tmp_path / "counts.json"
+    write_record(record, NAMES, pieces, "2026-05-01")
+    again = identify_valves(read_record(record, NAMES)[0], 6)
+    assert again.valves[0].factor.value == pytest.approx(
+        identify_valves(pieces, 6).valves[0].factor.value, abs=1e-4
+    )
+    still = replace(pieces[0].record, volume_ml=0.0 * pieces[0].record.volume_ml)
+    with pytest.raises(ValveCourseError, match="does not grow faster while it sprays"):
+        identify_valves([replace(pieces[0], record=still), *pieces[1:]], 6)
+    few = replace(
+        still, time_s=pieces[0].record.time_s[::20], volume_ml=pieces[0].record.volume_ml[::20]
+    )
+    with pytest.raises(ValveCourseError, match="counts of the autopilot within"):
+        identify_valves([replace(pieces[0], record=few), *pieces[1:]], 6)
