@@ -6,6 +6,7 @@ ends are borders too, and all that falls between them is beyond.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from companion.core.prescription import Prescription
+    from companion.core.types import TimedChange
 
 # Flow has ended below this part of what it was.
 ENDED_BELOW = 0.02
@@ -31,6 +33,11 @@ ELEMENT_M = 0.1
 # may reach further, but not over a hold of the border; whether a change was missed is judged by the
 # whole of both stretches.
 AROUND_S = 1.0
+# No sprayer takes longer; what was ordered before that was not ordered for this border.
+DELAY_MAX_S = 3.0
+# So many crossings of one valve and kind before their delays say how far they scatter.
+ALIKE_MIN = 3
+POSITION_SDS = 2.33
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,12 +46,15 @@ class BorderCrossing:
 
     `margin_m` is from the strip's first contact with the outside back to where the flow ended, or
     from its last contact on to where the flow began; >= 0 means that nothing fell outside.
+    `delay_s` is from the order to that end or beginning of the flow, None where none is known.
     """
 
     valve: int
     kind: Literal["closing", "opening"]
     time_s: float
     margin_m: float
+    speed_m_s: float = 0.0
+    delay_s: float | None = None
 
 
 class _Candidate(NamedTuple):
@@ -61,6 +71,7 @@ def border_crossings(strip: Strip, prescription: Prescription) -> list[BorderCro
     track = strip.track
     candidates = list(_candidates(strip))
     contacts_s = _contacts_s(strip, prescription, candidates)
+    switches = _switches(strip.orders)
     found: list[BorderCrossing] = []
     for candidate, contact_s in zip(candidates, contacts_s.tolist(), strict=True):
         flow_s = _flow_end_s(track, candidate.near_s, candidate.far_s)
@@ -74,9 +85,64 @@ def border_crossings(strip: Strip, prescription: Prescription) -> list[BorderCro
                 kind=candidate.kind,
                 time_s=candidate.cross_s,
                 margin_m=-margin_m if candidate.kind == "opening" else margin_m,
+                speed_m_s=track.value(track.speed_m_s, flow_s),
+                delay_s=_delay_s(switches, flow_s, is_opening=candidate.kind == "opening"),
             )
         )
     return found
+
+
+def _switches(orders: Sequence[TimedChange]) -> list[tuple[float, bool]]:
+    """Return when a valve was ordered to open (True) or to close."""
+    found: list[tuple[float, bool]] = []
+    for order in orders:
+        is_open = order.duty > 0.0
+        if is_open != (found[-1][1] if found else False):
+            found.append((order.at_s, is_open))
+    return found
+
+
+def _delay_s(
+    switches: Sequence[tuple[float, bool]], flow_s: float, *, is_opening: bool
+) -> float | None:
+    """Return how long before a flow began, or ended, it was ordered to."""
+    last = bisect_right(switches, (flow_s, True)) - 1
+    if last < 0 or switches[last][1] != is_opening:
+        return None
+    delay_s = flow_s - switches[last][0]
+    return delay_s if delay_s <= DELAY_MAX_S else None
+
+
+def margin_bound_m(crossings: Sequence[BorderCrossing], *, position_sd_m: float) -> float | None:
+    """Return the mean margin that nobody can go below who lets nothing fall outside.
+
+    Between an order, as carried out at the output, and the end of its flow lies a delay d that
+    differs from one crossing to the next: the valve's own scatter, the phase of its pulses. (The
+    jitter of what comes before the output is not in it, so the bound is rather too small.) Whoever
+    orders does not know d beforehand, so the order must come early enough for the slowest: at the
+    speed v a crossing then ends v (d_max - d) inside. At an opening it is the quickest that must
+    not begin outside: v (d - d_min). Which valve it is can be known, so d_max and d_min are those
+    of one valve and one kind in this flight, from `ALIKE_MIN` crossings on.
+
+    The aircraft is not where it believes to be either, by s = `position_sd_m` along its path: with
+    z = `POSITION_SDS` one crossing in a hundred would reach over. Both are independent:
+    bound = sqrt(mean(v |d - d_extreme|)^2 + (z s)^2). None where nothing tells the delays.
+    """
+    alike: dict[tuple[int, str], list[BorderCrossing]] = {}
+    for crossing in crossings:
+        if crossing.delay_s is not None:
+            alike.setdefault((crossing.valve, crossing.kind), []).append(crossing)
+    slack_m: list[float] = []
+    for group in alike.values():
+        if len(group) < ALIKE_MIN:
+            continue
+        delays_s = np.array([crossing.delay_s for crossing in group], dtype=np.float64)
+        speeds_m_s = np.array([crossing.speed_m_s for crossing in group])
+        extreme_s = delays_s.max() if group[0].kind == "closing" else delays_s.min()
+        slack_m += (speeds_m_s * np.abs(delays_s - extreme_s)).tolist()
+    if not slack_m:
+        return None
+    return float(np.hypot(np.mean(slack_m), POSITION_SDS * position_sd_m))
 
 
 def _candidates(strip: Strip) -> Iterator[_Candidate]:

@@ -14,7 +14,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from analysis.border import BorderCrossing, border_crossings, held_by_border, off_target_ml
+from analysis.border import (
+    BorderCrossing,
+    border_crossings,
+    held_by_border,
+    margin_bound_m,
+    off_target_ml,
+)
 from analysis.changes import Run, find_runs, stretches_of
 from analysis.dose import misapplied_percent, section_error_percent, volume_error_percent
 from analysis.flight_record import FlightMeta, FlightRecord, whole_boom
@@ -141,6 +147,7 @@ class Evaluation:
     starting_accuracy_percent: float | None
     misapplied_percent: float | None
     border_margin_m: Distances
+    border_bound_m: float | None
     off_target_ml: float
     gap_m2: float
     overlap_m2: float
@@ -166,7 +173,7 @@ class Evaluation:
             "limit_ratio": limit_ratio,
             "settled_accuracy_percent": self.settled_accuracy_percent,
             "starting_accuracy_percent": self.starting_accuracy_percent,
-            "border_margin_m": asdict(self.border_margin_m),
+            "border_margin_m": asdict(self.border_margin_m) | {"bound": self.border_bound_m},
             "off_target_ml": self.off_target_ml,
             "missed": self.missed,
             "apart": self.apart,
@@ -214,6 +221,7 @@ def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation
         starting_accuracy_percent=accuracy.starting_percent,
         misapplied_percent=misapplied_percent(strips),
         border_margin_m=Distances.of(crossing.margin_m for crossing in crossings),
+        border_bound_m=margin_bound_m(crossings, position_sd_m=record.position_sd_m),
         off_target_ml=off_target_ml(strips, record.prescription),
         gap_m2=sum(switch.gap_m2 for switch in switches),
         overlap_m2=sum(switch.overlap_m2 for switch in switches),

@@ -44,7 +44,7 @@ from sitl.drives import DrivenOutput, DriveTruth, Motors, Ranges
 from sitl.earth import Earth
 from sitl.knowledge import KnowingOutput, WaitingForDuties, WaitingForEdges, pwm_limits
 from sitl.liquid_faults import LiquidFault, LiquidSensors
-from sitl.navigation import SPEED_REPORT_RATE_HZ, Navigation
+from sitl.navigation import SPEED_REPORT_RATE_HZ, WANDER_SD_M, Navigation
 from sitl.outputs import WIRE_S, AveragedOutput, Output, PlanFollower, ServoOutput, TakesEdges
 from sitl.own_method import MakeController, OwnFlight, Sprayer, made
 from sitl.plants import duty_plant, edge_plant
@@ -183,6 +183,8 @@ def fly(
         duty_limits=limits,
         nozzle_sets=() if profile.has_sections else setup.nozzle_sets,
         orders=tuple(output.orders),
+        # White noise averages out over some messages; what wanders does not.
+        position_sd_m=WANDER_SD_M if options.noise and not options.knows else 0.0,
         meta=FlightMeta(
             speed_m_s=speed_m_s,
             method=method or (setup.method.value if own is None else own.__name__),

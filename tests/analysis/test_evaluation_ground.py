@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from shapely import Polygon, box
 
+from analysis.border import BorderCrossing, margin_bound_m
 from analysis.evaluation import evaluate, limit_ratio
+from analysis.flight_record import FlightRecord
 from companion.core.prescription import Prescription
+from companion.core.types import TimedChange
 from tests.analysis.test_evaluation_flights import PERIOD_S, SWATH_M, Flight, field_of, record_of
 
 FIELD = Flight(rates=[[20.0, 26.0, 20.0, 14.0], [20.0, 14.0, 26.0, 18.0]], valves=6)
@@ -67,6 +71,58 @@ def test_spray_that_keeps_off_the_border_shows_its_margin(border_m: float) -> No
     assert evaluation.border_margin_m.min == pytest.approx(border_m, abs=0.011)
     assert evaluation.off_target_ml == 0.0
     assert evaluation.gap_m2 == pytest.approx(4 * SWATH_M * border_m, rel=0.01)
+
+
+def crossing(kind: str, delay_s: float | None, valve: int = 0) -> BorderCrossing:
+    return BorderCrossing(
+        valve=valve,
+        kind=kind,  # type: ignore[arg-type]
+        time_s=0.0,
+        margin_m=0.2,
+        speed_m_s=5.0,
+        delay_s=delay_s,
+    )
+
+
+def test_the_bound_of_the_margin_is_what_the_slowest_closing_and_quickest_opening_ask_for() -> None:
+    closing = [crossing("closing", delay_s) for delay_s in (0.10, 0.12, 0.14)]
+    # The slowest decides: 5 m/s times (0.04, 0.02, 0) s.
+    assert margin_bound_m(closing, position_sd_m=0.0) == pytest.approx(0.1)
+    opening = [crossing("opening", delay_s) for delay_s in (0.10, 0.10, 0.16)]
+    assert margin_bound_m(opening, position_sd_m=0.0) == pytest.approx(0.1)
+    # Valves that differ are known to differ; what scatters is each by itself.
+    steady = [crossing("closing", 0.1 + 0.05 * valve, valve) for valve in (0, 1) for _ in range(3)]
+    assert margin_bound_m(steady, position_sd_m=0.0) == 0.0
+    assert margin_bound_m(steady, position_sd_m=0.02) == pytest.approx(0.0466)
+    assert margin_bound_m(closing, position_sd_m=0.02) == pytest.approx(math.hypot(0.1, 0.0466))
+    assert margin_bound_m(closing[:2], position_sd_m=0.02) is None
+    assert margin_bound_m([crossing("closing", None)] * 3, position_sd_m=0.02) is None
+
+
+def test_delays_are_from_the_order_to_the_flow() -> None:
+    record, _ = record_of(replace(FIELD, border_m=0.25))
+    flown = evaluate(replace(record, orders=()))
+    assert flown.border_bound_m is None
+    orders = []
+    for each in flown.crossings:
+        duty = 0.5 if each.kind == "opening" else 0.0
+        orders.append(TimedChange(at_s=flow_s(each, record) - 0.1, valve=each.valve, duty=duty))
+    orders.sort(key=lambda order: order.at_s)
+    found = evaluate(replace(record, orders=tuple(orders)))
+    assert [each.delay_s for each in found.crossings] == pytest.approx(
+        [0.1] * len(found.crossings), abs=0.005
+    )
+    entry = found.as_json()["border_margin_m"]
+    assert isinstance(entry, dict)
+    assert entry["bound"] == found.border_bound_m
+
+
+def flow_s(each: BorderCrossing, record: FlightRecord) -> float:
+    """Return when the flow of a crossing begins or ends."""
+    flows = np.diff(record.volume_ml[:, each.valve]) > 1e-9
+    edges = np.flatnonzero(np.diff(flows.astype(int))) + 1
+    times_s = record.time_s[edges]
+    return float(times_s[np.argmin(np.abs(times_s - each.time_s))])
 
 
 def test_spray_beyond_the_border_is_off_target_to_the_millilitre() -> None:

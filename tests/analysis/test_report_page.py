@@ -353,3 +353,14 @@ def test_the_report_shows_what_is_in_force_for_each_valve(report: Report, page: 
     text = Parsed(page_of({**report.contents, "setup": {**known, "boom": boom}}, {})).text
     assert f"{late.name}: flow 0.980, on {1000.0 * setup.lag.on_s:.1f}" in text
     assert f"up {1000.0 * setup.lag.up_s + 4.1:.1f}" in text
+
+
+@pytest.mark.parametrize(("bound_m", "words"), [(0.0357, "0.036 m are owed"), (None, "")])
+def test_the_margin_stands_beside_its_bound(
+    report: Report, bound_m: float | None, words: str
+) -> None:
+    assert "bound" in report.contents["border_margin_m"]
+    margin = report.contents["border_margin_m"] | {"bound": bound_m}
+    text = Parsed(page_of({**report.contents, "border_margin_m": margin}, {})).text
+    assert words in text
+    assert ("are owed" in text) == bool(words)

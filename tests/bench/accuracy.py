@@ -242,5 +242,6 @@ def summary(flown: Sequence[Flown]) -> dict[str, Any]:
         "apart": sum(each.apart for each in flown),
         "off_target_ml": most_of(each.off_target_ml for each in flown),
         "border_margin_m": mean_of(each.border_margin_m for each in flown),
+        "border_bound_m": mean_of(each.border_bound_m for each in flown),
         "seeds": len(flown),
     }

@@ -78,6 +78,7 @@ class Flown:
     limit_ratio: float | None
     off_target_ml: float
     border_margin_m: float | None
+    border_bound_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,4 +231,5 @@ def kept(
         limit_ratio=None if perfect is None else limit_ratio(found, perfect),
         off_target_ml=found.off_target_ml,
         border_margin_m=found.border_margin_m.mean,
+        border_bound_m=found.border_bound_m,
     )

@@ -39,7 +39,7 @@ def page() -> str:
     fields = ", ".join(f"`{name}`" for name in Distances.__dataclass_fields__)
     parts.append(
         f"\nThe distances (`lag_distance_m`, `settled_lag_distance_m`, `border_margin_m`) are objects with "
-        f"{fields}. The settled one has `apart` and `missed` of its own.\n"
+        f"{fields}. The settled one has `apart` and `missed` of its own, the margin the `bound` of physics.\n"
     )
     parts.append("## Causes\n\nWhy ground got another dose, as the report names it.\n")
     parts.append("| Key | In the report |\n|---|---|")
