@@ -279,18 +279,22 @@ def _shortest(direct_m: Floats) -> Floats:
     count = len(direct_m)
     between = direct_m.copy()
     np.fill_diagonal(between, 0.0)
+    # Each part lies together in memory: so it takes little more than half of the time.
     parts = [
-        (slice(start, start + TOGETHER), between[start : start + TOGETHER, start:])
+        (start, between[start : start + TOGETHER, start:].copy())
         for start in range(0, count, TOGETHER)
     ]
-    through = np.empty((TOGETHER, count))
+    through = np.empty(TOGETHER * count)
     for station in range(count):
-        begun = station - station % TOGETHER
-        to = np.concatenate([between[:begun, station], between[station, begun:]])
+        block, row = divmod(station, TOGETHER)
+        above = [part[:, station - start] for start, part in parts[:block]]
+        to = np.concatenate([*above, parts[block][1][row]])
         on = to + STATION_M
-        for rows, part in parts:
-            over = through[: part.shape[0], : part.shape[1]]
-            np.add.outer(to[rows], on[rows.start :], out=over)
+        for start, part in parts:
+            over = through[: part.size].reshape(part.shape)
+            np.add.outer(to[start : start + len(part)], on[start:], out=over)
             np.minimum(part, over, out=part)
+    for start, part in parts:
+        between[start : start + len(part), start:] = part
     whole: Floats = np.where(np.tri(count, dtype=np.bool_), between.T, between)
     return whole

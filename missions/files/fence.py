@@ -23,7 +23,7 @@ from shapely.geometry.polygon import orient
 
 from companion.wording import counted
 from missions.errors import FenceError, PlanError
-from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
+from missions.fewer_corners import around_with_fewer_corners, each_inside
 from missions.field import Field
 from missions.files.fence_corners import with_corners
 from missions.files.plan_rules import FENCE_CORNERS_MAX, NAMES
@@ -312,8 +312,8 @@ class Fences:
         near = [each for each, inside in zip(obstacles, is_near, strict=True) if inside]
         best = fence
         for simpler_m in OBSTACLE_SIMPLER_M:
-            drawn = [self._simpler_obstacle(each, simpler_m) for each in obstacles]
-            wanted = sum(_bytes_of([self._simpler_obstacle(each, simpler_m)[0] for each in near]))
+            drawn = self._simpler_obstacles(obstacles, simpler_m)
+            wanted = sum(_bytes_of([part for part, _ in self._simpler_obstacles(near, simpler_m)]))
             most = (self.room_bytes - wanted - POLYGON_BYTES) // CORNER_BYTES
             border, outside_m = self._with_corners(fence, whole, most)
             found = self._with_obstacles(border, outside_m, drawn)
@@ -335,17 +335,18 @@ class Fences:
             self._fewer[key] = border, _outside_m(border, whole)
         return self._fewer[key]
 
-    def _simpler_obstacle(self, shape: Shape, simpler_m: float) -> Shape:
-        """Return an obstacle with fewer corners, within itself; most of its ground stays."""
-        key = (id(shape), simpler_m)  # they are those of this plan, and stay
-        if key not in self._simpler:
-            inside = max(
-                polygons_of(inside_with_fewer_corners(shape[0], simpler_m)),
-                key=lambda part: part.area,
-            )
+    def _simpler_obstacles(self, shapes: Sequence[Shape], simpler_m: float) -> list[Shape]:
+        """Return obstacles with fewer corners, within themselves; most of their ground stays."""
+        keys = [(id(shape), simpler_m) for shape in shapes]  # they are those of this plan, and stay
+        new = {
+            key: each for key, each in zip(keys, shapes, strict=True) if key not in self._simpler
+        }
+        drawn = each_inside([part for part, _ in new.values()], simpler_m)
+        for (key, shape), found in zip(new.items(), drawn, strict=True):
+            inside = max(polygons_of(found), key=lambda part: part.area)
             kept = inside.area >= OBSTACLE_SHARE * shape[0].area
             self._simpler[key] = (inside, shape[1]) if kept else shape
-        return self._simpler[key]
+        return [self._simpler[key] for key in keys]
 
     def _fitting(
         self,

@@ -19,7 +19,11 @@ from companion.cli.app import execute
 from companion.errors import MapError
 from missions.demand import Uniform
 from missions.errors import PlanError
-from missions.fewer_corners import around_with_fewer_corners, inside_with_fewer_corners
+from missions.fewer_corners import (
+    around_with_fewer_corners,
+    each_inside,
+    inside_with_fewer_corners,
+)
 from missions.field import Field, build_field
 from missions.files.fence import Fences, fence_warnings
 from missions.files.fence_corners import with_corners
@@ -130,6 +134,17 @@ def test_a_tree_is_drawn_around_with_few_corners(radius_m: float) -> None:
     assert found.covers(tree)
     assert corners(found) <= 13
     assert found.hausdorff_distance(tree) <= 0.75
+
+
+def test_many_areas_together_get_the_corners_that_each_gets_by_itself() -> None:
+    # More of them than are looked at together, of two counts of corners; one with a hole.
+    made = [shapely.Point(20.0 * at, at).buffer(2.0 + at, quad_segs=16 + at % 2) for at in range(9)]
+    made.append(made[8].difference(made[8].centroid.buffer(3.0)))
+    together = each_inside(made, 0.4)
+    assert shapely.to_wkb(together).tolist() == [
+        shapely.to_wkb(inside_with_fewer_corners(area, 0.4)) for area in made
+    ]
+    assert all(area.covers(found) for area, found in zip(made, together, strict=True))
 
 
 def test_ways_over_ground_with_very_many_corners_are_found() -> None:
