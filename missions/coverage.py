@@ -71,6 +71,8 @@ def measure(
     outside_m2 = covered.area - inside.area
     skipped = shapely.difference(ground, covered)
     patches = shapely.get_parts(skipped)
+    # Nothing skipped is an empty part, which lies nowhere.
+    patches = patches[~shapely.is_empty(patches)]
     areas_m2 = shapely.area(patches)
     largest = _in_the_midst(patches[areas_m2.argmax()]) if len(patches) else None
     reached = shapely.intersection(covered, possible).area
