@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 import shlex
 import subprocess
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from analysis.fleet.adding import ALONE, add
+from analysis.fleet.adding import ALONE, _no_module_of_this_folder, add
 from analysis.fleet.store import Store
 from companion.cli.app import _in_root
 from companion.core.nozzle import PwmLimits
@@ -124,6 +125,19 @@ def test_the_processes_of_a_fleet_run_nothing_of_it(hostile: Path, tmp_path: Pat
     added = add(journals, Store.at(str(tmp_path / "fleet")), processes=2)
     assert len(added.problems) == ALONE
     assert not what_ran(hostile)
+    assert "PYTHONSAFEPATH" not in os.environ  # others start processes, too
+
+
+@pytest.mark.parametrize("before", [None, "0"])
+def test_an_error_leaves_the_environment_as_it_was(
+    monkeypatch: pytest.MonkeyPatch, before: str | None
+) -> None:
+    if before is not None:
+        monkeypatch.setenv("PYTHONSAFEPATH", before)
+    with pytest.raises(OSError), _no_module_of_this_folder():
+        assert os.environ["PYTHONSAFEPATH"] == "1"
+        raise OSError
+    assert os.environ.get("PYTHONSAFEPATH") == before
 
 
 def test_the_service_and_its_closer_run_nothing_of_it(hostile: Path) -> None:
