@@ -162,7 +162,7 @@ tbody {{ border-bottom: 1px solid #ccc; }}
 .ours {{ font-weight: 600; color: #0072b2; }} .published {{ color: #666; font-style: italic; }}
 figure {{ margin: 2rem 0; }} img {{ width: 100%; }} figcaption, .note {{ color: #555; }}
 </style></head><body>
-<h1>The field of Wang et al. 2024, with four methods</h1>
+<h1>The field of Wang et al. 2024, method by method</h1>
 <p>{sentence}</p>
 <table><thead><tr>{head}</tr></thead>{groups}</table>
 {notes}

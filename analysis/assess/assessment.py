@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -237,7 +237,7 @@ def _intervals(evaluation: Evaluation, strips: Sequence[Strip]) -> dict[str, Int
     wrong = misapplied_parts(strips)
     return {
         "lag_distance_m": _of(lags),
-        "lag_distance_abs_m": _of((at_s, abs(lag_m)) for at_s, lag_m in lags),
+        "lag_distance_abs_m": _no_less_than_0(_of((at_s, abs(lag_m)) for at_s, lag_m in lags)),
         "settled_lag_distance_m": _of(settled),
         "border_margin_m": _of(margins),
         "spraying_accuracy_percent": mean_interval(samples.accuracy_percent, ways),
@@ -245,6 +245,11 @@ def _intervals(evaluation: Evaluation, strips: Sequence[Strip]) -> dict[str, Int
             100.0 * wrong.wrong_ml, wrong.asked_ml, ways_between(evaluation, wrong.time_s)
         ),
     }
+
+
+def _no_less_than_0(interval: Interval) -> Interval:
+    """Return an interval of what cannot be negative: few measurements make it symmetric."""
+    return interval if interval.low is None else replace(interval, low=max(interval.low, 0.0))
 
 
 def _of(pairs: Iterable[tuple[float, float]]) -> Interval:

@@ -102,7 +102,7 @@ NOTHING_L_HA = 1e-6
 def prescribed_and_applied(sheet: Sheet) -> Drawn:
     """Draw both maps with one scale of colours."""
     asked, given = sheet.cells.commanded_l_ha, sheet.cells.measured_l_ha
-    least, most = _rates_shown(asked)
+    least, most = _rates_shown(asked, given)
     figure, panels, bar = sheet.panels(2)
     colours = colormaps[RATES_MAP].with_extremes(under=NOTHING_COLOUR)
     nothing = (asked <= NOTHING_L_HA) & (given <= NOTHING_L_HA)
@@ -127,12 +127,18 @@ def prescribed_and_applied(sheet: Sheet) -> Drawn:
     )
 
 
-def _rates_shown(asked: Floats) -> tuple[float, float]:
-    """Return the rates at both ends of the scale; from 0 where the least is not far from it."""
+def _rates_shown(asked: Floats, given: Floats) -> tuple[float, float]:
+    """Return the rates at both ends of the scale; from 0 where the least is not far from it.
+
+    It reaches down to what was applied: ground that got too little is paler than the lowest rate.
+    """
     known = asked[np.isfinite(asked) & (asked > 0.0)]
     if not len(known):
         return 0.0, 1.0
     least, most = (float(each) for each in np.percentile(known, [1.0, 99.9]))
+    applied = given[np.isfinite(given) & (given > NOTHING_L_HA) & (asked > 0.0)]
+    if len(applied):
+        least = min(least, float(np.percentile(applied, 1.0)))
     return (least if 0.5 * most < least < most else 0.0), most
 
 

@@ -97,6 +97,9 @@ def _parse(content: bytes, path: Path) -> dict[str, object]:
     try:
         document = json.loads(content.decode("utf-8-sig"), object_pairs_hook=_members)
     except UnicodeDecodeError as error:
+        if b"\0" in content:
+            text = "this is no text, so it cannot be GeoJSON"
+            raise map_error(path, text, fix=_EXPORT_AGAIN, code="encoding") from None
         text = f"its text is not in UTF-8, as GeoJSON has to be ({error.reason})"
         raise map_error(path, text, fix="save it as UTF-8", code="encoding") from None
     except _DuplicateError as error:

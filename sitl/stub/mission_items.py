@@ -219,6 +219,8 @@ def read_mission(path: Path) -> tuple[MissionItem, ...]:
     """Return the items of a mission file, home first."""
     try:
         text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: there is no such file; check the path") from error
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as a mission ({error})") from error
     items = _plan_items(path, text) if path.suffix == ".plan" else _waypoint_items(path, text)

@@ -13,11 +13,11 @@ import shapely.affinity
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from analysis.assess.assessment import Assessment, assess, balance_of
+from analysis.assess.assessment import Assessment, _no_less_than_0, assess, balance_of
 from analysis.assess.breakdowns import speed_bin
 from analysis.assess.causes import Cause
 from analysis.assess.cell_maps import cell_maps
-from analysis.assess.intervals import crossings_of, mean_interval, ratio_interval
+from analysis.assess.intervals import NOTHING, Interval, crossings_of, mean_interval, ratio_interval
 from analysis.flown.applied_flight import Series
 from analysis.flown.applied_record import record_of
 from analysis.strips import strips_of
@@ -357,6 +357,13 @@ def test_everything_is_json_without_nan(good: Assessment) -> None:
     assert set(found["intervals"]["lag_distance_m"]) == {"mean", "low", "high", "count", "clusters"}
     shares = sum(found["causes"]["share"].values())
     assert shares == pytest.approx(1.0 if found["causes"]["off_m2"] > 0.0 else 0.0)
+
+
+def test_an_interval_of_distances_without_sign_does_not_reach_below_0() -> None:
+    few = Interval(mean=0.02, low=-0.005, high=0.046, count=9, clusters=3)
+    assert _no_less_than_0(few) == replace(few, low=0.0)
+    assert _no_less_than_0(replace(few, low=0.01)).low == 0.01
+    assert _no_less_than_0(NOTHING) == NOTHING
 
 
 def test_a_flight_that_never_sprayed_has_figures_of_nothing() -> None:

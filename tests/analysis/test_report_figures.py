@@ -20,6 +20,7 @@ from analysis.assess.worst import bound_m, uncertainty_m, worst_of
 from analysis.flown.applied_flight import AppliedFlight, Series
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import ReportOptions, build_report
+from analysis.report.drawing import _rates_shown
 from companion.config.application_table import PROFILES
 from companion.core.prescription import Prescription, Zone
 from companion.errors import VrsprayError
@@ -135,3 +136,11 @@ def test_squares_that_a_slanted_edge_cuts_count_with_their_geometry(turned_deg: 
     # The place of each is in the field, so that its rate is that of the ground and not of none.
     inside = shapely.contains_xy(field.buffer(1e-6), east_m[share > 0.0], north_m[share > 0.0])
     assert inside.all()
+
+
+def test_the_scale_of_rates_reaches_down_to_what_was_applied() -> None:
+    asked = np.array([15.0, 20.0, 28.0, np.nan, 0.0])
+    assert _rates_shown(asked, asked)[0] == pytest.approx(15.1, abs=0.2)
+    # A third of the rate along a border is paler than the least that was asked for.
+    assert _rates_shown(asked, np.array([5.0, 20.0, 28.0, np.nan, 0.0]))[0] == 0.0
+    assert _rates_shown(np.array([np.nan, 0.0]), np.array([np.nan, 0.0])) == (0.0, 1.0)

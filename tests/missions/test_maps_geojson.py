@@ -305,6 +305,13 @@ def test_text_that_is_not_in_utf_8_is_refused(tmp_path: Path) -> None:
     assert refused(path) == "encoding"
 
 
+def test_what_is_no_text_is_not_to_be_saved_in_another_coding(tmp_path: Path) -> None:
+    path = tmp_path / "field.geojson"
+    path.write_bytes(bytes(range(256)))
+    with pytest.raises(MapError, match="no text, so it cannot be GeoJSON; export the map again"):
+        read_geojson(path)
+
+
 def test_half_a_letter_becomes_a_mark_that_can_be_written(tmp_path: Path) -> None:
     (column, *_) = read_geojson(
         saved(tmp_path, '{"type": "Feature", "properties": {"a\\ud800": "b\\udfff"}}')

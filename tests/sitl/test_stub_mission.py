@@ -179,6 +179,11 @@ def test_a_plan_is_read_home_first_and_with_the_items_of_its_survey(tmp_path: Pa
     assert (items[0].x_e7, items[2].x_e7) == (360_000_000, 360_004_000)
 
 
+def test_a_mission_that_is_not_there_is_said_to_be_missing(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="there is no such file; check the path"):
+        read_mission(tmp_path / "none.plan")
+
+
 @pytest.mark.parametrize(
     ("name", "text", "said"),
     [
