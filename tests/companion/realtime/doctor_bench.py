@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 STROKE_S = 0.1
+BROKEN_OFF = b"broken off ("
 
 
 @dataclass
@@ -40,10 +41,17 @@ class Guided:
         os.write(self.hand, text.encode())
 
     async def hold_until(self, question: str) -> None:
-        """Hold the space bar until `question` is asked, or the process ends."""
+        """Hold the space bar until `question` is asked, or the process ends.
+
+        A hand that a busy computer holds up has let go: what is broken off is begun again.
+        """
         waiting = asyncio.create_task(self.until_told(question))
         over = asyncio.create_task(self.process.wait())
+        broken_off = self.told.count(BROKEN_OFF)
         while not (waiting.done() or over.done()):
+            if self.told.count(BROKEN_OFF) > broken_off:
+                broken_off += 1
+                os.write(self.hand, b"\n")
             os.write(self.hand, b" ")
             await asyncio.sleep(STROKE_S)
         for task in (waiting, over):
