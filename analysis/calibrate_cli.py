@@ -26,6 +26,7 @@ OTHERS = {
     "flow": Command(target="analysis.calibrate_flow:flow", help=""),
     "valves": Command(target="analysis.calibrate_valves:valves", help=""),
     "drift": Command(target="analysis.calibrate_drift:drift", help=""),
+    "swath": Command(target="analysis.calibrate_swath:swath", help=""),
 }
 MISSION = "sitl.calibration_mission"
 
@@ -47,7 +48,7 @@ class Commands(TyperGroup):
 
 app = typer.Typer(
     cls=Commands,
-    help="Measure a sprayer: lags (from flow or marks), flow curves, and each valve by itself.",
+    help="Measure a sprayer: lags (from flow or marks), flow curves, each valve, the swath.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from analysis.csv_rows import TableError
+from analysis.swath import lanes
 from companion.wording import install_command
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from analysis.bucket import BucketCurve
     from analysis.calibration.valves import IdentifiedValves
     from analysis.marks import Mark, MarksFit
+    from analysis.swath import Found
 
 # Okabe and Ito's colours, told apart by all kinds of eyes.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
@@ -159,6 +161,68 @@ def plot_valves(found: IdentifiedValves, names: Sequence[str], path: Path) -> No
             )
 
 
+def plot_swath(found: Found, path: Path, *, one_way: bool) -> None:
+    """Draw the passes and their mean, the overlapped pattern, and the CV against lane spacing."""
+    with _figure(path, height_in=7.6) as figure:
+        pattern_axes, overlap_axes, cv_axes = figure.subplots(3, 1)
+        shown = 100.0 / max(found.mean.deposit)
+        for one in found.passes:
+            pattern_axes.plot(
+                one.right_m, [shown * each for each in one.deposit], color=FAINT, lw=0.8
+            )
+        pattern_axes.plot(
+            found.mean.right_m, [shown * each for each in found.mean.deposit], color=INK, lw=1.6,
+            label="mean, without wind",
+        )  # fmt: skip
+        pattern_axes.set_title("Deposit across the track")
+        pattern_axes.set_xlabel("right of the track [m]")
+        pattern_axes.set_ylabel("% of the mean's peak")
+        pattern_axes.legend(loc="upper left")
+        swath_m = found.swath_m["one_way" if one_way else "to_and_fro"]
+        if swath_m is not None:
+            _plot_lanes(overlap_axes, found, swath_m, one_way=one_way)
+        for name, label, colour in (
+            ("to_and_fro", "to and fro", COLOURS[0]),
+            ("one_way", "one way", COLOURS[1]),
+        ):
+            wide = found.swath_m[name]
+            text = "none" if wide is None else f"{wide:.2f} m"
+            cv_axes.plot(found.spacing_m, found.cv[name], color=colour, label=f"{label}: {text}")
+            if wide is not None:
+                cv_axes.plot([wide, wide], [0.0, found.cv_max], color=colour, lw=0.8, ls=":")
+        cv_axes.axhline(found.cv_max, color=INK, lw=0.8, ls="--")
+        cv_axes.set_ylim(0.0, min(max(4.0 * found.cv_max, 20.0), 100.0))
+        cv_axes.set_xlim(0.0, float(found.spacing_m[-1]))
+        cv_axes.set_title(f"CV against lane spacing; the line is {found.cv_max:g} %")
+        cv_axes.set_xlabel("lane spacing [m]")
+        cv_axes.set_ylabel("CV [%]")
+        cv_axes.legend()
+
+
+def _plot_lanes(axes: Axes, found: Found, swath_m: float, *, one_way: bool) -> None:
+    """Draw three passes at the effective swath, and their sum with all others."""
+    mean = found.mean
+    shown = 100.0 / max(mean.deposit)
+    for lane in (-1, 0, 1):
+        turn = 1.0 if one_way or lane == 0 else -1.0
+        axes.plot(
+            [lane * swath_m + turn * at for at in mean.right_m],
+            [shown * each for each in mean.deposit], color=FAINT, lw=0.8,
+        )  # fmt: skip
+        axes.axvline(lane * swath_m, color=FAINT, lw=0.6, ls=":")
+    edges, left, right = lanes(mean, swath_m, to_and_fro=not one_way)
+    at = np.repeat(edges, 2)[1:-1]
+    total = shown * np.column_stack([left, right]).ravel()
+    period = float(edges[-1])
+    for lane in (-1, 0, 1):
+        axes.plot(at + lane * period, total, color=COLOURS[0], lw=1.4)
+    axes.set_xlim(-1.5 * swath_m, 1.5 * swath_m)
+    axes.set_ylim(bottom=0.0)
+    axes.set_title(f"Passes {swath_m:.2f} m apart, and their sum")
+    axes.set_xlabel("right of the middle track [m]")
+    axes.set_ylabel("% of one pass's peak")
+
+
 @contextmanager
 def _axes(path: Path) -> Iterator[Axes]:
     """Give axes to draw on, and write them to `path` at the end."""
@@ -167,7 +231,7 @@ def _axes(path: Path) -> Iterator[Axes]:
 
 
 @contextmanager
-def _figure(path: Path) -> Iterator[Figure]:
+def _figure(path: Path, height_in: float = 4.2) -> Iterator[Figure]:
     """Give a figure to draw on, and write it to `path` at the end."""
     if importlib.util.find_spec("matplotlib") is None:
         raise TableError(f"no picture without matplotlib; {install_command('office')}")
@@ -178,7 +242,7 @@ def _figure(path: Path) -> Iterator[Figure]:
     if path.suffix.casefold() != ".png":
         raise TableError(f"{path}: a picture is a .png")
     with rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+        figure = Figure(figsize=(6.4, height_in), layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
         try:
