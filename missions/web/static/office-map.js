@@ -13,6 +13,7 @@ export class OfficeMap {
     this.draws = false;
     this.works = false;
     this.shown = {};
+    this.fitting = 0;
     this.ready = this.make(onClick, onMove).then(() => { this.works = true; }, (error) => console.warn("no map:", error.message ?? error));
   }
 
@@ -32,6 +33,8 @@ export class OfficeMap {
     map.addLayer({ id: "lines", type: "line", source: "lines", paint: { "line-color": ["match", ["get", "kind"], "spray", look.pass, look.ferry], "line-width": ["match", ["get", "kind"], "spray", 2.5, 1.5] } });
     map.addLayer({ id: "draw", type: "line", source: "draw", paint: { "line-color": look.draw, "line-width": 3, "line-dasharray": [2, 1] } });
     map.addLayer({ id: "corners", type: "circle", source: "draw", filter: ["==", ["geometry-type"], "Point"], paint: { "circle-radius": 9, "circle-color": look.draw, "circle-stroke-color": look.ground, "circle-stroke-width": 2 } });
+    // For tests: `data-settled` is there once the map shows what it was given last.
+    map.on("idle", () => { if (!this.fitting) this.element.dataset.settled = ""; });
     this.map = map;
     this.pointers(onClick, onMove);
   }
@@ -56,6 +59,7 @@ export class OfficeMap {
     const key = JSON.stringify([zones, field, lines, rates]);
     if (key === this.shown.key && !lines && !zones) return;
     this.shown.key = key;
+    delete this.element.dataset.settled;
     this.map.getSource("zones").setData(zones ?? NOTHING);
     this.map.getSource("field").setData(field ?? NOTHING);
     this.map.getSource("lines").setData(lines ?? NOTHING);
@@ -65,15 +69,19 @@ export class OfficeMap {
   }
 
   async fit() {
+    this.fitting += 1;
     const bounds = await Promise.all(["field", "zones", "lines"].map((name) => this.map.getSource(name).getBounds().catch(() => null)));
     const found = bounds.find((one) => one && !one.isEmpty());
     if (found) this.map.fitBounds(found, { padding: 40, duration: 0, maxZoom: 20 });
+    this.fitting -= 1;
+    this.map.triggerRepaint();
   }
 
   showCorners(corners) {
     if (!this.works) return;
     const points = corners.map((one, index) => ({ type: "Feature", properties: { index }, geometry: { type: "Point", coordinates: one } }));
     const line = corners.length > 1 ? [{ type: "Feature", properties: {}, geometry: { type: "LineString", coordinates: [...corners, corners[0]] } }] : [];
+    delete this.element.dataset.settled;
     this.map.getSource("draw").setData({ type: "FeatureCollection", features: [...line, ...points] });
   }
 }

@@ -11,12 +11,14 @@ from typing import Literal
 import pytest
 import pytest_asyncio
 from axe_playwright_python.async_playwright import Axe
+from playwright.async_api import expect
 
 from tests.analysis.report_flight import fly
 from tests.companion.realtime.test_operators_page import (
     CHROMIUM,
     SERIOUS,
     WITHOUT_WEBGL,
+    answered,
     chromium,
 )
 from tests.companion.web_site import Site, served, until
@@ -55,10 +57,9 @@ async def test_a_flight_is_reported_by_keyboard_and_the_page_is_accessible(
         page.on("pageerror", lambda error: troubles.append(str(error)))
         await page.goto(f"http://127.0.0.1:{site.port}/flights/")
         await page.wait_for_function("() => 'flights' in document.body.dataset")
-        await page.get_by_role("button", name="Report of flight-0001.gpkg").press("Enter")
-        await page.wait_for_function("() => document.getElementById('report').textContent")
-        await page.wait_for_function("() => !document.body.dataset.busy")
-        assert "L applied" in await page.locator("#report").inner_text()
+        async with answered(page, "flights/report"):
+            await page.get_by_role("button", name="Report of flight-0001.gpkg").press("Enter")
+        await expect(page.locator("#report")).to_contain_text("L applied")
         assert await page.evaluate("() => document.documentElement.scrollWidth") == 360
         found = await Axe().run(page)
         bad = [one for one in found.response["violations"] if one["impact"] in SERIOUS]

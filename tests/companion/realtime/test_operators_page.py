@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import re
 import shutil
 import signal
 import socket
@@ -20,7 +21,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from axe_playwright_python.async_playwright import Axe
-from playwright.async_api import Browser, Page, async_playwright
+from playwright.async_api import Browser, Page, async_playwright, expect
 
 from companion.cli.web_parts import Watched, obeying
 from companion.link.component import ComponentOptions
@@ -48,6 +49,7 @@ ARGUMENTS = [
     "--disable-sync",
 ]
 WITHOUT_WEBGL = [*ARGUMENTS, "--disable-gpu", "--disable-3d-apis", "--disable-software-rasterizer"]
+expect.set_options(timeout=30_000)
 SERIOUS = ("serious", "critical")
 # From the touch to the last valve's order on the wire.
 STOP_WITHIN_S = 0.3
@@ -122,13 +124,31 @@ async def chromium(arguments: list[str] = ARGUMENTS) -> AsyncIterator[Browser]:
             await browser.close()
 
 
-async def press(page: Page, name: str) -> None:
-    """Hold a button for as long as it wants."""
-    await page.locator(name).hover()
+@contextlib.asynccontextmanager
+async def answered(page: Page, place: str) -> AsyncIterator[None]:
+    """Wait until the page has been answered what is asked inside, and shows it."""
+    async with page.expect_response(lambda found: found.url.endswith(f"/api/v1/{place}")):
+        yield
+    await page.wait_for_function("() => !document.body.dataset.busy")
+
+
+async def enable(page: Page) -> None:
+    """Hold the button that enables, once the page offers that, for as long as it wants."""
+    await _hold(page, "Hold to enable")
+
+
+async def release(page: Page) -> None:
+    """Hold the button that releases STOP, once the page offers that, for as long as it wants."""
+    await _hold(page, "Hold to release STOP")
+
+
+async def _hold(page: Page, label: str) -> None:
+    button = page.locator("#enable")
+    await expect(button).to_have_text(label)
+    await expect(button).to_be_enabled()
+    await button.hover()
     await page.mouse.down()
-    await page.wait_for_function(
-        "(name) => !document.querySelector(name).classList.contains('pressed')", arg=name
-    )
+    await expect(button).not_to_have_class(re.compile("pressed"))
     await page.mouse.up()
 
 
@@ -142,7 +162,7 @@ async def test_a_flight_is_watched_stopped_released_and_enabled_from_the_page(
         second = await flight.open(browser, viewport={"width": 1280, "height": 800})
         peer.place(east_m=2.0)
         await shows(page, "ready")
-        await press(page, "#enable")
+        await enable(page)
 
         async def closing_s() -> float:
             if not peer.is_spraying:
@@ -158,17 +178,17 @@ async def test_a_flight_is_watched_stopped_released_and_enabled_from_the_page(
             await shows(page, "estop")
             await shows(second, "estop")
             peer.enable()  # latched: enabling by another way opens nothing
-            await press(page, "#enable")  # releases
+            await release(page)
             peer.place(east_m=2.0)
             await shows(page, "ready")
             assert all(order.pulse_us == 1000 for order in peer.orders[closed:])
-            await press(page, "#enable")
+            await enable(page)
             return took_s
 
         assert await quickest(closing_s, within_s=STOP_WITHIN_S, tries=3) <= STOP_WITHIN_S
         await flight.until_spraying()
-        await page.wait_for_function(
-            "() => /Applied in all0[.][1-9]/.test(document.getElementById('numbers').textContent)"
+        await expect(page.locator("#numbers")).to_contain_text(
+            re.compile("Applied in all0[.][1-9]")
         )
         await page.wait_for_function("() => document.getElementById('n-target').textContent > '10'")
         hosts = {urlsplit(url).netloc for url in flight.requests}
@@ -183,19 +203,19 @@ async def test_without_webgl_the_page_draws_on_a_canvas_and_keyboard_alone_stops
     async with chromium(WITHOUT_WEBGL) as browser:
         page = await flight.open(browser, viewport={"width": 360, "height": 740})
         assert await page.evaluate("() => document.getElementById('map').dataset.kind") == "canvas"
-        width = await page.evaluate("() => document.documentElement.scrollWidth")
-        assert width == 360
         flight.peer.enable()
         await flight.until_spraying()
         await shows(page, "spraying")
+        width = await page.evaluate("() => document.documentElement.scrollWidth")
+        assert width == 360
         await page.locator("#stop").focus()
         await page.keyboard.press("Enter")
         await flight.peer.until(lambda: flight.peer.is_all_closed)
         await shows(page, "estop")
         await page.locator("#units").select_option("us")
-        assert "gal/ac" in await page.locator("#rates").inner_text()
+        await expect(page.locator("#rates")).to_contain_text("gal/ac")
         await page.locator("#theme").select_option("night")
-        assert await page.evaluate("() => document.documentElement.dataset.theme") == "night"
+        await expect(page.locator("html")).to_have_attribute("data-theme", "night")
         assert not flight.troubles
 
 
@@ -206,12 +226,10 @@ async def test_a_page_without_news_says_so_and_greys_what_is_old(flight: Flight)
         await shows(page, "ready")
         flight.child.send_signal(signal.SIGSTOP)
         await page.wait_for_function("() => document.body.classList.contains('stale')")
-        assert await page.locator("#lost").is_visible()
-        assert await page.locator("#state-word").inner_text() == "LINK LOST"
+        await expect(page.locator("#lost")).to_be_visible()
+        await expect(page.locator("#state-word")).to_have_text("LINK LOST")
         await page.locator("#stop").click()
-        await page.wait_for_function(
-            "() => document.getElementById('answer').textContent.includes('NOT CONFIRMED')"
-        )
+        await expect(page.locator("#answer")).to_contain_text("NOT CONFIRMED")
         flight.child.send_signal(signal.SIGCONT)
         await page.wait_for_function("() => !document.body.classList.contains('stale')")
 
@@ -252,12 +270,11 @@ async def test_a_whole_flight_on_the_stub_is_watched_from_enable_to_landing(
         page.set_default_timeout(40_000)
         await bench.until(lambda: "link up" in bench.said, within_s=30.0)
         await page.goto(f"http://127.0.0.1:{port}/")
-        await page.wait_for_function("() => document.body.dataset.map === 'ready'")
-        assert "SIMULATED" in await page.locator("#training").inner_text()
+        await expect(page.locator("#training")).to_contain_text("SIMULATED")
         flight = bench.stub.flight
         flight.set_items(passes("ardupilot"), time.monotonic())
         await shows(page, "ready")
-        await press(page, "#enable")
+        await enable(page)
         assert flight.arm(time.monotonic())
         assert flight.start_mission(time.monotonic())
         await shows(page, "spraying")
@@ -266,13 +283,11 @@ async def test_a_whole_flight_on_the_stub_is_watched_from_enable_to_landing(
         await shows(page, "armed")
         # Each screen keeps nothing of its own: one that comes now is told the same.
         second = await browser.new_page()
+        second.set_default_timeout(40_000)
         await second.goto(f"http://127.0.0.1:{port}/")
-        await second.wait_for_function("() => document.body.dataset.map === 'ready'")
         await shows(second, "armed")
-        texts = [await one.locator("#numbers").inner_text() for one in (page, second)]
-        done = [text.partition("Area done")[2].strip()[:4] for text in texts]
-        assert done[0] == done[1]
-        assert float(done[0]) == pytest.approx(0.01, abs=0.005)  # 16 m by 6 m
+        for one in (page, second):  # 16 m by 6 m
+            await expect(one.locator("#numbers")).to_contain_text("Area done0.01ha")
         found = bench.judged(tmp_path / "truth")
     assert found["missed"] == 0
     assert found["volume_l"] == pytest.approx(prescribed_l(), rel=0.15)

@@ -6,6 +6,7 @@ Needs Chromium (`apt-get install chromium`); without it these tests are skipped.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Literal
@@ -13,18 +14,20 @@ from urllib.parse import urlsplit
 
 import pytest
 from axe_playwright_python.async_playwright import Axe
-from playwright.async_api import Page
+from playwright.async_api import Page, expect
 
 from tests.companion.realtime.test_operators_page import (
     CHROMIUM,
     SERIOUS,
     WITHOUT_WEBGL,
+    answered,
     chromium,
 )
 from tests.companion.web_site import Site, served
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
 ANYANG = Path(__file__).resolve().parents[3] / "examples" / "anyang"
+FOUR_LINES = re.compile(r"^([^\n]+\n){3}[^\n]+$")
 FILES = [*sorted(ANYANG.glob("prescription.*")), ANYANG / "boundary.geojson"]
 
 
@@ -50,16 +53,14 @@ async def ready(page: Page, site: Site) -> list[str]:
     return asked
 
 
-async def idle(page: Page) -> None:
-    await page.wait_for_function("() => !document.body.dataset.busy")
+async def settled(page: Page) -> None:
+    """Wait until the map shows what it was given last: it can be drawn on."""
+    await expect(page.locator("#map")).to_have_attribute("data-settled", "")
 
 
 async def load(page: Page) -> None:
     await page.locator("#pick").set_input_files(FILES)
-    await page.wait_for_function(
-        "(count) => document.getElementById('files').children.length === count", arg=len(FILES)
-    )
-    await idle(page)
+    await expect(page.locator("#files li")).to_have_count(len(FILES))
 
 
 def file_type(path: Path) -> str:
@@ -78,27 +79,33 @@ async def test_a_field_is_loaded_checked_drawn_on_and_planned(site: Site, tmp_pa
         await page.get_by_text("40 zones").wait_for()
         await page.locator("#field").select_option("boundary.geojson")
         await page.get_by_role("button", name="No-spray area", exact=True).click()
+        await settled(page)
         box = await page.locator("#map").bounding_box()
         assert box is not None
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
         for right, down in ((-12, -12), (12, -12), (12, 12), (-12, 12)):
             await page.mouse.click(x + right, y + down)
+        corners = page.locator("#corners")
+        await expect(corners).to_have_value(FOUR_LINES)
+        third = (await corners.input_value()).splitlines()[2]
+        await settled(page)
         await page.mouse.move(x + 12, y + 12)
         await page.mouse.down()
         await page.mouse.move(x + 20, y + 20, steps=4)
         await page.mouse.up()
-        assert len((await page.locator("#corners").input_value()).splitlines()) == 4
+        await expect(corners).not_to_have_value(re.compile(re.escape(third)))
+        await expect(corners).to_have_value(FOUR_LINES)
         await page.get_by_role("button", name="Save the area").click()
-        await page.wait_for_function("() => document.getElementById('no_spray').value")
+        await expect(page.locator("#no_spray")).to_have_value("drawn-no-spray.geojson")
         (drawn,) = (tmp_path / "office" / "given").glob("drawn-*")
         ring = json.loads(drawn.read_text())["features"][0]["geometry"]["coordinates"][0]
         assert len(ring) == 5
         assert all(114.543 < lng < 114.545 and 35.995 < lat < 35.998 for lng, lat in ring)
-        await idle(page)
         await page.locator("#tank_l").fill("4")
-        await page.get_by_role("button", name="Plan", exact=True).click()
-        await page.get_by_text("sorties,").wait_for()
-        assert await page.locator("#plan tr").count() >= 3
+        async with answered(page, "office/plan"):
+            await page.get_by_role("button", name="Plan", exact=True).click()
+        await expect(page.locator("#plan")).to_contain_text("sorties,")
+        await expect(page.locator("#plan tr").nth(2)).to_be_visible()
         async with page.expect_download() as loading:
             await page.get_by_role("link", name="field.plan").click()
         download = await loading.value
@@ -124,9 +131,8 @@ async def test_the_office_is_accessible_without_webgl_and_draws_by_keyboard(
         await page.locator("#draw-boundary").press("Enter")
         await page.locator("#corners").fill("47, 8\n47, 8.001\n47.0005, 8.001\n47.0005, 8")
         await page.locator("#draw-save").press("Enter")
-        await page.wait_for_function("() => document.getElementById('field').value")
+        await expect(page.locator("#field")).to_have_value("drawn-boundary.geojson")
         assert (tmp_path / "office" / "given" / "drawn-boundary.geojson").is_file()
-        await idle(page)
         found = await Axe().run(page)
         bad = [one for one in found.response["violations"] if one["impact"] in SERIOUS]
         assert not bad, [(one["id"], one["nodes"][0]["html"]) for one in bad]

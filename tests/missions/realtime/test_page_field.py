@@ -6,6 +6,7 @@ Needs Chromium (`apt-get install chromium`); without it this test is skipped.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import socket
 import time
@@ -16,7 +17,7 @@ from urllib.parse import urlsplit
 
 import pytest
 import shapely
-from playwright.async_api import Page
+from playwright.async_api import Page, expect
 from shapely.geometry.base import BaseGeometry
 
 from tests.companion.realtime.client_bench import (
@@ -30,8 +31,10 @@ from tests.companion.realtime.test_operators_page import (
     CHROMIUM,
     STOP_WITHIN_S,
     WITHOUT_WEBGL,
+    answered,
     chromium,
-    press,
+    enable,
+    release,
     shows,
 )
 from tests.companion.wire_peer import free_port
@@ -90,30 +93,24 @@ def two_zones() -> list[tuple[Box, float]]:
     return list(zip(boxes, RATES_L_HA, strict=True))
 
 
-async def idle(page: Page) -> None:
-    await page.wait_for_function("() => !document.body.dataset.busy")
-
-
 async def plan_and_upload(page: Page) -> None:
     """Plan what is chosen on the office's page, and put it on the vehicle."""
-    await page.get_by_role("button", name="Plan", exact=True).click()
-    await page.wait_for_function("() => document.getElementById('plan').textContent")
-    await idle(page)
-    assert "% covered" in await page.locator("#plan").inner_text()
-    await page.get_by_role("button", name="Upload field.plan to the vehicle").click()
-    await page.wait_for_function("() => document.body.dataset.busy")
-    await idle(page)
-    said = await page.locator("#plan").inner_text()
-    assert "field.plan: on the vehicle, read back and the same" in said
+    plan = page.locator("#plan")
+    async with answered(page, "office/plan"):
+        await page.get_by_role("button", name="Plan", exact=True).click()
+    await expect(plan).to_contain_text("% covered")
+    async with answered(page, "office/upload"):
+        await page.get_by_role("button", name="Upload field.plan to the vehicle").click()
+    await expect(plan).to_contain_text("field.plan: on the vehicle, read back and the same")
 
 
 async def left_ha(page: Page) -> float:
     """Follow the link of the page to the report of its own flight; return what that left."""
     await page.get_by_role("link", name="Report, and what is left").click()
-    await page.locator("#report .verdict").wait_for()
-    await idle(page)
-    assert "SIMULATED" in await page.locator("#report .mark-text").first.inner_text()
-    assert " L applied" in await page.locator("#report .verdict").inner_text()
+    # Until then it may show the report of an earlier flight.
+    await page.wait_for_function("() => 'flights' in document.body.dataset")
+    await expect(page.locator("#report .mark-text").first).to_contain_text("SIMULATED")
+    await expect(page.locator("#report .verdict")).to_contain_text(" L applied")
     text = await page.get_by_text("are left.").inner_text()
     return float(text.partition("treated; ")[2].split()[0])
 
@@ -153,19 +150,16 @@ class Day:
         page = self.page
         await self.open("office/", "office")
         await page.locator("#pick").set_input_files(files)
-        await page.wait_for_function("() => document.querySelectorAll('#files li')[1]")
-        await idle(page)
+        await expect(page.locator("#files li")).to_have_count(len(files))
         await page.locator("#unit").fill("L/ha")
         await page.get_by_role("button", name="Check the map").click()
-        await page.wait_for_function("() => document.getElementById('check').textContent")
-        assert " zones" in await page.locator("#check").inner_text()
-        await idle(page)
+        await expect(page.locator("#check")).to_contain_text(" zones")
         await page.locator("#speed_m_s").fill("5")
 
     async def take_off(self) -> None:
         """Enable on the page; the pilot arms and starts the mission."""
         await shows(self.page, "ready")
-        await press(self.page, "#enable")
+        await enable(self.page)
         flight = self.bench.stub.flight
         await self.bench.until(lambda: flight.arm(time.monotonic()))
         assert flight.start_mission(time.monotonic())
@@ -178,8 +172,8 @@ class Day:
 
         async def closing_s() -> float:
             if not is_open(bench):  # an earlier try, on a computer that had much to do
-                await press(page, "#enable")  # releases
-                await press(page, "#enable")
+                await release(page)
+                await enable(page)
                 await bench.until(lambda: is_open(bench), within_s=30.0)
             count, tapped_s = len(bench.sprayer.orders), time.monotonic()
             await page.locator("#stop").tap()
@@ -200,14 +194,13 @@ class Day:
         """Follow the report's link: what is left is planned on the same maps."""
         await self.page.get_by_role("link", name="Plan what is left").click()
         await self.is_ready("office")
-        assert (await self.page.locator("#done").input_value()).startswith("flight-")
+        await expect(self.page.locator("#done")).to_have_value(re.compile("^flight-"))
         await self.page.locator("#speed_m_s").fill("5")
         await plan_and_upload(self.page)
 
     async def release(self) -> None:
         await self.open()
-        await shows(self.page, "estop")
-        await press(self.page, "#enable")
+        await release(self.page)
 
 
 @pytest.mark.timeout(400)
@@ -245,7 +238,7 @@ async def test_a_field_is_loaded_planned_flown_stopped_continued_and_reported(
                 await page.get_by_role("link", name="Open the report").click()
             report = await loading.value
             await report.get_by_role("heading", level=1).wait_for()
-            assert "SIMULATED" in await report.title()
+            await expect(report).to_have_title(re.compile("SIMULATED"))
         assert {urlsplit(url).netloc for url in day.requests} == {f"127.0.0.1:{port}"}
         assert not day.troubles
     assert bench.truth.summary()["volume_l"] == pytest.approx(PRESCRIBED_L, rel=0.15)
