@@ -28,6 +28,11 @@ WSP = Command(
     help="Measure coverage and drop sizes on water-sensitive paper.",
     haste="patient",
 )
+TRIAL = Command(
+    target="analysis.trial_cli:trial",
+    help="Evaluate a field trial: what each plot got, and yields by treatment.",
+    haste="patient",
+)
 FLIGHTS_SHOW = Command(
     target="analysis.journals.cli:SHOW",
     help="Show what a journal records about its flight, and how much it holds.",

@@ -5,40 +5,39 @@ from __future__ import annotations
 import importlib.util
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import typer
-from shapely import MultiPolygon
 
-from companion.assembly import flow_range
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object, progress
-from companion.config import Config, load
-from companion.config.tables import PrescriptionTable
-from companion.core.frame import LocalFrame
-from companion.core.nozzle import rate_for_flow
-from companion.errors import ConfigError
+from companion.config import load
 from companion.flight_map import is_flight_map
 from companion.problem import Problem
 from companion.wording import counted, install_command
 from missions.errors import PlanError
-from missions.layouts import spray_lines
 from missions.make.classes import Method
 from missions.make.cleaning import STEPS, Step
 from missions.make.data import INDICES, Values, Wanted, filled, read_values
-from missions.make.passes import Passes, Places, by_valve, passes_of, places_in
+from missions.make.flown import (
+    FlownField,
+    bounded,
+    flown_field,
+    limits_of,
+    map_target,
+    numbers,
+    problems_of,
+    written,
+)
+from missions.make.passes import Places, places_in
+from missions.make.trial_cli import trial
 from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
-from missions.maps.cli.plan import plan_of, sprayer_problems
-from missions.maps.compiling import MapOrder, compile_map, write_flight_map
-from missions.maps.convert.formats import write_map, writer_for
+from missions.maps.convert.formats import writer_for
 from missions.maps.layer import digest, read_bytes
-from missions.maps.lint import Sprayer, check_map
 from missions.maps.model import MapFile, map_error
-from missions.maps.registry import read_area
-from missions.maps.whole_file import check_folder, not_written
-from missions.reading import Asked, Task, read_task
+from missions.maps.whole_file import check_folder
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
@@ -176,11 +175,11 @@ def zones(
             data[0], "making zones takes the library scipy, which is not installed",
             fix=f"install it with: {install_command('office')}", code="missing-library",
         )  # fmt: skip
-    config = _bounded(load(config_file), boundary)
+    config = bounded(load(config_file), boundary)
     wish = _wish(rates, law, litres_max, count, method, smooth_m, step_percent)
     if as_is and is_flight_map(out):
         raise typer.BadParameter("--as-is is to compare, not to fly: name another format")
-    target = _target(out)
+    target = map_target(out)
     writer = writer_for(target, format_name)
     for path in (out, *([] if png is None else [png])):
         check_folder(path)
@@ -193,11 +192,13 @@ def zones(
     )  # fmt: skip
     with progress(after_s=BAR_AFTER_S) as tell:
         tell("planning the passes", 0, 4)
-        field = _field(config, no_spray or [], angle_deg, across)
+        field = flown_field(config, no_spray or [], angle_deg, across)
         tell("reading the data", 1, 4)
         read = [read_values(path, one, field.frame) for path, one in zip(data, wanted, strict=True)]
-        limits = None if as_is else _limits(config, field.sprayer, margin)
-        places = _places(field, read, limits or _limits(config, field.sprayer, margin), as_is, out)
+        limits = None if as_is else limits_of(config, field.sprayer, margin)
+        places = _places(
+            field, read, limits or limits_of(config, field.sprayer, margin), as_is, out
+        )
         layers, missing = [], 0.0
         for path, values in zip(data, read, strict=True):
             whole, share = filled(values.at(places), places, path)
@@ -207,8 +208,8 @@ def zones(
         made = make_zones(np.array(layers), places, wish, limits)
         tell("writing the map", 3, 4)
         map_file = _map_file(made, field, target, data, as_is)
-        problems = _problems(map_file, config, field)
-        files = _written(map_file, out, target, config, field, problems, writer.name, force=force)
+        problems = problems_of(map_file, config, field)
+        files = written(map_file, out, target, config, field, problems, writer.name, force=force)
     if png is not None:
         from missions.maps.picture.draw import draw
 
@@ -220,19 +221,13 @@ def zones(
     raise typer.Exit(0 if result["ok"] else 1)
 
 
+app.command(
+    epilog="Example: vrspray make trial --config field.toml --rates 15,20,25 --check 10 --rest 20 "
+    "--out trial.gpkg"
+)(trial)
+
+
 # What is asked.
-
-
-def _numbers(text: str, option: str) -> list[float]:
-    try:
-        found = [float(part) for part in text.split(",")]
-    except ValueError:
-        raise typer.BadParameter(
-            f"{option} takes numbers with commas between, not {text!r}"
-        ) from None
-    if not all(math.isfinite(one) for one in found):
-        raise typer.BadParameter(f"{option} takes finite numbers, not {text!r}")
-    return found
 
 
 def _wish(
@@ -243,7 +238,7 @@ def _wish(
         raise typer.BadParameter(f"--method is one of {', '.join(get_args(Method))}")
     if (rates is None) == (law is None):
         raise typer.BadParameter("give the rates, either with --rates or with --law")
-    table = [] if rates is None else _numbers(rates, "--rates")
+    table = [] if rates is None else numbers(rates, "--rates")
     points = [] if law is None else _law(law)
     for rate in (*table, *(rate for _, rate in points)):
         if not 0.0 <= rate < 10_000.0:
@@ -264,7 +259,7 @@ def _law(text: str) -> list[tuple[float, float]]:
     pairs = [part.split(":") for part in text.split(",")]
     if any(len(pair) != 2 for pair in pairs):
         raise typer.BadParameter(f"--law takes value:rate with commas between, not {text!r}")
-    points = [tuple(_numbers(",".join(pair), "--law")) for pair in pairs]
+    points = [tuple(numbers(",".join(pair), "--law")) for pair in pairs]
     points.sort()
     if len({at for at, _ in points}) < max(len(points), 2):
         raise typer.BadParameter("--law takes two or more different values")
@@ -302,103 +297,8 @@ def _wanted(data: Sequence[Path], values: Sequence[str], of_all: Wanted) -> list
     return [replace(of_all, value=name) for name in names]
 
 
-def _target(out: Path) -> Path:
-    """Return the map that is written: beside a flight map, the one that it is compiled from."""
-    if not is_flight_map(out):
-        return out
-    return out.with_name(out.name.removesuffix(".flightmap.gpkg") + ".gpkg")
-
-
-# The field as it will be flown.
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Field:
-    boundary: MultiPolygon
-    boundary_file: Path
-    task: Task
-    passes: Passes
-    sprayer: Sprayer
-
-    @property
-    def frame(self) -> LocalFrame:
-        return self.task.field.frame
-
-
-def _bounded(config: Config, boundary: Path | None) -> Config:
-    """Return the configuration with the outline that the command line names."""
-    if boundary is None:
-        return config
-    changes: dict[str, Any] = {"boundary": str(boundary.absolute())}
-    table = config.prescription
-    if table is None:
-        changed = PrescriptionTable.model_validate({"file": "made", **changes})
-    else:
-        changed = table.model_copy(update=changes)
-    return config.model_copy(update={"prescription": changed})
-
-
-def _by_valve(passes: Passes, config: Config) -> Passes:
-    """Return the bands of single valves, which only mean the same to and fro on an even boom."""
-    valves = sorted((valve.right_m, valve.width_m) for valve in config.boom().valves)
-    widths = [width_m for _, width_m in valves]
-    if not np.allclose(widths, widths[::-1], atol=0.01):
-        raise ConfigError(
-            f"{config.path}: [[valve]] width_m: the boom's left half is no mirror of its right "
-            "one, so that zones as wide as a valve fit one direction alone; leave out --across"
-        )
-    return by_valve(passes, widths)
-
-
-def _field(
-    config: Config, no_spray: Sequence[Path], angle_deg: float | None, across: str
-) -> _Field:
-    """Return the field with its passes, those that `vrspray plan` lays over it."""
-    table = config.prescription
-    path = None if table is None or table.boundary is None else config.resolve(table.boundary)
-    if path is None:
-        raise ConfigError(
-            f"{config.path}: prescription.boundary: missing; where the field ends is not in the "
-            "data, so name its outline there or with --boundary"
-        )
-    asked = Asked(field=path, rate_l_ha=1.0, no_spray=tuple(no_spray))
-    task = read_task(asked, config, {"angle_deg": angle_deg})
-    lines, course_deg = spray_lines(task.field, task.settings, task.settings.motion)
-    if not len(lines):
-        raise PlanError(f"{path}: no pass of {task.settings.swath_width_m:g} m fits into the field")
-    sprayer = plan_of(config, None)[0].sprayer
-    if sprayer is None:
-        raise ConfigError(f"{config.path}: mission: missing; write at least swath_width_m, speed")
-    passes = passes_of(lines, course_deg, task.field.limit, task.settings.swath_width_m)
-    return _Field(
-        boundary=read_area(path, repairs=[]),
-        boundary_file=path,
-        task=task,
-        passes=_by_valve(passes, config) if across == "valve" else passes,
-        sprayer=replace(sprayer, angle_deg=course_deg),
-    )
-
-
-def _limits(config: Config, sprayer: Sprayer, margin: float) -> Limits:
-    width_m, speed = config.boom_table.width_m, sprayer.speed_m_s
-    low, high = flow_range(config.nozzle_sets(), config.pwm_limits())
-    label = config.product.rate_max_l_ha
-    high_l_ha = rate_for_flow(high, speed, width_m)
-    low_l_ha = rate_for_flow(low, speed, width_m)
-    if label is not None and label < low_l_ha:
-        raise ConfigError(
-            f"{config.path}: product.rate_max_l_ha = {label:g}: below the {low_l_ha:.2f} L/ha that "
-            f"the nozzles deliver at least at {speed:g} m/s; fly faster or fit smaller nozzles"
-        )
-    return Limits(
-        least_m=margin * sprayer.length_min_m,
-        low_l_ha=low_l_ha,
-        high_l_ha=high_l_ha if label is None else min(high_l_ha, label),
-    )
-
-
 def _places(
-    field: _Field, read: Sequence[Values], limits: Limits, as_is: bool, out: Path
+    field: FlownField, read: Sequence[Values], limits: Limits, as_is: bool, out: Path
 ) -> Places:
     grain_m = min(values.grain_m for values in read)
     size_m = min(max(grain_m / 8.0, limits.least_m / 6.0), grain_m, PLACE_MAX_M)
@@ -420,7 +320,7 @@ def _places(
 
 
 def _map_file(
-    made: Made, field: _Field, target: Path, data: Sequence[Path], as_is: bool
+    made: Made, field: FlownField, target: Path, data: Sequence[Path], as_is: bool
 ) -> MapFile:
     found: dict[str, Any] = (
         {"zones": (), "cells": cells(made, field.frame)}
@@ -438,41 +338,8 @@ def _map_file(
     )  # fmt: skip
 
 
-def _problems(map_file: MapFile, config: Config, field: _Field) -> list[Problem]:
-    """Return what `map check` says of the map, flown as it was made for."""
-    plan, found = plan_of(config, None)
-    plan = replace(plan, boundary=field.boundary, sprayer=field.sprayer)
-    return [
-        *check_map(map_file, overlap="error", plan=plan),
-        *found,
-        *sprayer_problems(config, map_file, plan),
-    ]
-
-
-def _written(
-    map_file: MapFile, out: Path, target: Path, config: Config, field: _Field,
-    problems: Sequence[Problem], format_name: str, *, force: bool,
-) -> list[Path]:  # fmt: skip
-    """Write the map, and beside it the flight map if that is asked for."""
-    files = write_map(
-        map_file, target, format=format_name, force=force,
-        flow_width_m=config.boom_table.width_m, flow_speed_m_s=field.sprayer.speed_m_s,
-    )  # fmt: skip
-    if not is_flight_map(out):
-        return files
-    order = MapOrder.of(config)
-    changes = {"file": str(target.absolute()), "rate_field": None, "unit": None, "layer": None,
-               "sha256": None, "boundary": str(field.boundary_file.absolute())}  # fmt: skip
-    order = replace(order, table=order.table.model_copy(update=changes))
-    try:
-        write_flight_map(out, compile_map(order, findings=problems))
-    except OSError as error:
-        raise not_written(out, error) from None
-    return [out, *files]
-
-
 def _result(
-    made: Made, read: Sequence[Values], field: _Field, limits: Limits | None, missing: float,
+    made: Made, read: Sequence[Values], field: FlownField, limits: Limits | None, missing: float,
     problems: Sequence[Problem], files: Sequence[Path],
 ) -> dict[str, Any]:  # fmt: skip
     ok = not any(problem.severity == "error" for problem in problems)
