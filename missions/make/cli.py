@@ -32,6 +32,7 @@ from missions.make.flown import (
     written,
 )
 from missions.make.passes import Places, places_in
+from missions.make.spots_cli import spots
 from missions.make.trial_cli import trial
 from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
 from missions.maps.convert.formats import writer_for
@@ -221,6 +222,10 @@ def zones(
     raise typer.Exit(0 if result["ok"] else 1)
 
 
+app.command(
+    epilog="Example: vrspray make spots weeds.csv --config field.toml --rate 20 --out spots.gpkg "
+    "--mission spots.waypoints"
+)(spots)
 app.command(
     epilog="Example: vrspray make trial --config field.toml --rates 15,20,25 --check 10 --rest 20 "
     "--out trial.gpkg"

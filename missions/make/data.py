@@ -97,7 +97,7 @@ def read_values(path: Path, wanted: Wanted, frame: LocalFrame) -> Values:
         table = read_point_table(path)
         if table is not None:
             points, crs, columns = table
-            return _points(path, _in_degrees(points, crs, wanted.crs, path), columns, wanted, frame)
+            return _points(path, in_degrees(points, crs, wanted.crs, path), columns, wanted, frame)
     found = read_layer(path, layer=wanted.layer)
     if isinstance(found, Grid):
         return _of_grid(path, found, wanted, frame)
@@ -123,7 +123,8 @@ def _numbers(columns: Sequence[Column]) -> dict[str, Floats]:
     return found
 
 
-def _in_degrees(points: Floats, crs: CRS | None, asked: str | None, path: Path) -> Floats:
+def in_degrees(points: Floats, crs: CRS | None, asked: str | None, path: Path) -> Floats:
+    """Return points (x, y) of a file as longitude and latitude."""
     if crs is None:
         if asked is None:
             raise map_error(

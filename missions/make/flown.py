@@ -51,6 +51,8 @@ class FlownField:
     task: Task
     passes: Passes
     sprayer: Sprayer
+    lines: Floats
+    swath_m: float
 
     @property
     def frame(self) -> LocalFrame:
@@ -127,6 +129,8 @@ def flown_field(
         task=task,
         passes=_by_valve(passes, config) if across == "valve" else passes,
         sprayer=replace(sprayer, angle_deg=course_deg),
+        lines=lines,
+        swath_m=task.settings.swath_width_m,
     )
 
 
