@@ -49,6 +49,7 @@ class Commands(TyperGroup):
 app = typer.Typer(
     cls=Commands,
     help="Measure a sprayer: lags (from flow or marks), flow curves, each valve, the swath.",
+    epilog="Example: vrspray calibrate flow bucket.csv --config config.toml",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -69,7 +70,9 @@ def lag(
     is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure on, off, up and down lags from a flight's orders and flow meter.
+    """Measure the lags by kind, from the flow meter of a flight.
+
+    Of on, off, up and down, by what was ordered when.
 
     Exit 0: all lags; 1: too few good steps of a kind; 2: the file or an option cannot be used.
     """
@@ -136,9 +139,10 @@ def mission(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write the mission and map that `calibrate lag` needs: twelve changes of each kind.
+    """Write the mission and map that `calibrate lag` needs.
 
-    Beside the mission lie its map and a copy of the configuration that flies it.
+    Twelve changes of each kind. Beside the mission lie its map and a copy of the configuration
+    that flies it.
     """
     from importlib import import_module
 

@@ -75,10 +75,12 @@ def drift(
     ] = 0.001,
     as_json: AsJson = False,
 ) -> None:
-    """Name valves that have drifted from the others: a nozzle that blocks or wears.
+    """Name valves that have drifted: nozzles that block or wear.
 
     From the total flow meter, wherever the valves sprayed differently. Exit 0: none is further
     than 5 % off; 1: one is, or the flights do not tell; 2: a journal cannot be used.
+
+    Example: vrspray calibrate drift flights/*.gpkg
     """
     from analysis.journals.content import read_journal
     from companion.errors import ConfigError

@@ -56,7 +56,9 @@ def lag_marks(
     is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure position_s, boom.forward_m and the map offset from marks on the ground.
+    """Measure the position's lag and offsets by marks on the ground.
+
+    They are lag.position_s, boom.forward_m and the offset of the map.
 
     Fly one boundary inside the field to and fro at two speeds, and measure how far beyond it each
     change of rate fell. What the marks cannot tell apart is refused (exit 1).

@@ -189,9 +189,11 @@ def valves(
     is_write: Write = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure each valve by itself: its flow against the others', and its lags.
+    """Measure each valve by itself: its flow and its lags.
 
     With water, disarmed, on the ground, while you hold a key. Exit 1: the measurement failed.
+
+    Example: vrspray calibrate valves --config config.toml --plot valves.png --write
     """
     from companion.cli.link_parts import load_with_kept
 

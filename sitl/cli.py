@@ -48,6 +48,7 @@ class Corners(StrEnum):
 
 app = typer.Typer(
     help="The simulated flight: stub autopilot and twin.",
+    epilog="Example: vrspray sitl serve --autopilot px4",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -206,7 +207,9 @@ def fly(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
 ) -> None:
-    """Simulate a mission in closed loop, faster than real time, and evaluate it.
+    """Simulate a mission in closed loop, and evaluate it.
+
+    Faster than real time.
 
     Example: vrspray sitl fly --config examples/anyang/config.toml --mission
     examples/anyang/mission.waypoints

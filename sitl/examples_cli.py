@@ -91,7 +91,7 @@ def copy(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Copy an example into a folder of its own, with the examples that it needs.
+    """Copy an example, with the examples that it needs.
 
     Without --to the commands of the documentation work as they stand there. Exit 2: no such
     example, or the folder is there already.

@@ -139,7 +139,10 @@ def query(
     ] = 300,
     as_json: AsJson = False,
 ) -> None:
-    """Ask the flights by SQL (DuckDB): tables flights, closings, faults, valves, damaged."""
+    """Ask the flights by SQL (DuckDB).
+
+    Tables: flights, closings, faults, valves, damaged.
+    """
     from analysis.fleet.asking import asked
     from analysis.fleet.store import Store
     from analysis.fleet.tables import check_out, lines_of, rows_of, write_table
@@ -170,7 +173,10 @@ def forget(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Remove an operator from every file, and keep him out when journals come again."""
+    """Remove an operator from every file.
+
+    It stays so when the journals come again.
+    """
     from analysis.fleet.flight_row import operator_number
     from analysis.fleet.store import STORE_ERRORS, Store
 
@@ -205,7 +211,10 @@ def report(
     kind: Kinds = None,
     as_json: AsJson = False,
 ) -> None:
-    """Sum the fleet up by machine, field, product, operator and month: page, JSON, CSV, Parquet."""
+    """Sum the fleet up, as page, JSON, CSV or Parquet.
+
+    By machine, field, product, operator and month.
+    """
     from analysis.fleet.asking import asked
     from analysis.fleet.page import files_of
     from analysis.fleet.store import Store

@@ -48,7 +48,8 @@ def note(line: str) -> None:
 
 def problem_line(problem: Mapping[str, Any]) -> str:
     """Return a problem as one line."""
-    where = f" ({problem['where']})" if problem["where"] else ""
+    is_said = str(problem["text"]).endswith(f": {problem['where']}")
+    where = f" ({problem['where']})" if problem["where"] and not is_said else ""
     fix = f"; {problem['fix']}" if problem["fix"] else ""
     return f"{problem['severity']}: {problem['text']}{where}{fix}"
 

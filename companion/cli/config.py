@@ -123,7 +123,8 @@ def new(
 ) -> None:
     """Write a first configuration: six questions, or --yes.
 
-    What it cannot know is marked MEASURE in the file. Exit 0: `config check` accepts it.
+    What it cannot know is marked MEASURE in the file. Exit 0: `config check` accepts it; 2: it
+    would not, and nothing is written.
     """
     from companion.cli import new_config
 
@@ -147,19 +148,20 @@ def new(
         )
         answers = given if yes else new_config.ask_all(given, _ask, note)
         text = new_config.text_of(answers, map_name=new_config.map_seen_from(out, answers.map_file))
-    new_config.write_checked(out, text)
-    problems = [problem_object(problem) for problem in problems_of(load(out))]
-    ok = not any(problem["severity"] == "error" for problem in problems)
-    then = (
-        f"vrspray doctor --config {out}" if ok else f"correct it, then vrspray config check {out}"
-    )
+    config, found = new_config.write_checked(out, text, problems_of)
+    problems = [problem_object(problem) for problem in found]
+    notes = [f"{each.key}: {each.text}" for each in remarks(config)]
     measure = [line[2:] for line in text.splitlines() if line.startswith("# MEASURE")]
     answer(
-        {"ok": ok, "path": str(out), "problems": problems, "measure": measure},
-        [f"written: {out}", *map(problem_line, problems), f"next: {then}"],
+        {"ok": True, "path": str(out), "problems": problems, "notes": notes, "measure": measure},
+        [
+            f"written: {out}",
+            *map(problem_line, problems),
+            *(f"note: {each}" for each in notes),
+            f"next: vrspray doctor --config {out}",
+        ],
         as_json=as_json,
     )
-    raise typer.Exit(0 if ok else 2)
 
 
 def _ask(question: str, default: str) -> str:
@@ -170,7 +172,10 @@ def _ask(question: str, default: str) -> str:
 
 @app.command(epilog="Example: vrspray config show field.toml --set lag.on_s=0.12")
 def show(file: File, overrides: Overrides = None, as_json: AsJson = False) -> None:
-    """Print every effective setting and where it comes from: file, override or default."""
+    """Print every effective setting and where it comes from.
+
+    That is the file, an override or the default.
+    """
     settings = load(file, overrides=overrides or ()).settings()
     answer(
         {

@@ -259,7 +259,7 @@ def _agreement(config: Config) -> Check:
     if idle:
         keys = ", ".join(found.key for found in idle)
         return warn(name, f"these keys have no effect in this version: {keys}", "remove them")
-    return ok(name, f"{config.path} is valid")
+    return ok(name, f"{config.path}: its settings are valid")
 
 
 def _output(config: Config) -> Check:

@@ -91,7 +91,10 @@ def catch(
     seconds: Seconds = None,
     is_water: Water = False,
 ) -> None:
-    """Catch test: open valves at one duty for an exact time; print the expected volume."""
+    """Catch test: open valves for an exact time.
+
+    All at one duty; the volume to be expected is printed.
+    """
     wish = Wish(kind=GroundKind.CATCH, valves=tuple(valves or ()), duty=duty, seconds=seconds)
     do(asked, wish, is_water=is_water)
 

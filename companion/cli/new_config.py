@@ -15,15 +15,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 from companion.atomic_write import write_atomically
+from companion.cli.answer import problem_line, problem_object
 from companion.cli.app import find_command, load_command
-from companion.config import load
+from companion.config import Config, load
 from companion.errors import ConfigError, VrsprayError
+from companion.problem import Problem
 
 Ask = Callable[[str, str], str]
 AUTOPILOTS = ("ardupilot", "px4")
 OUTPUTS = ("servo", "gpio")
 UNITS = ("L/ha", "gal/ac", "mL/m2", "L/mu")
 VALVES_MAX = 64
+_FROM_PROFILE = """\
+# Written by `vrspray config new` from a profile. Its figures and the lines below are of the sprayer
+# that the profile was made for: check each against yours, and measure yours."""
 # ISO 10625: the size is the flow in tenths of a US gallon a minute at 40 psi (2.76 bar).
 _ISO_L_MIN, _ISO_BAR = 0.37854, 2.758
 _ISO = re.compile(r"(?:iso )?0*(\d{1,2}(?:\.\d)?) at (\d{1,2}(?:\.\d+)?) ?bar")
@@ -411,7 +416,11 @@ def _folders() -> list[Path]:
 
 
 def profile_text(text: str, *, map_name: str, unit: str = "") -> str:
-    """Return a profile with another map; without one, for `plan` and without a map."""
+    """Return a profile with another map; without one, for `plan` and without a map.
+
+    What a profile says of its wiring stays; it is of the sprayer that the profile was made for.
+    """
+    text = f"{_FROM_PROFILE}\n#\n{text}"
     table = f"{_prescription(map_name, unit)}\n\n" if map_name else ""
     found = re.sub(
         r"(?m)(^#[^\n]*\n)*^\[prescription\]\n(?:(?!\[)[^\n]*\n)*", lambda _: table, text, count=1
@@ -419,8 +428,12 @@ def profile_text(text: str, *, map_name: str, unit: str = "") -> str:
     return found if table == "" or "[prescription]" in found else f"{found}\n{table}"
 
 
-def write_checked(out: Path, text: str) -> None:
-    """Write a configuration that can be read as one; of any other nothing is left.
+def write_checked(
+    out: Path, text: str, problems_of: Callable[[Config], list[Problem]]
+) -> tuple[Config, list[Problem]]:
+    """Write a configuration that `config check` accepts, with what it warns of.
+
+    Of any other nothing is left.
 
     Raises:
         ConfigError: where it cannot be written, or would be refused.
@@ -428,8 +441,13 @@ def write_checked(out: Path, text: str) -> None:
     draft = out.with_name(f".{out.name}.{os.getpid()}.toml")
     try:
         write_atomically(draft, text.encode())
-        load(draft)
+        found = problems_of(load(draft))
+        wrong = [problem for problem in found if problem.severity == "error"]
+        if wrong:
+            line = problem_line(problem_object(wrong[0])).removeprefix("error: ")
+            raise ConfigError(f"{line}; {out} is not written", problems=wrong)
         draft.replace(out)
+        return load(out), found
     except OSError as error:
         reason = (error.strerror or "cannot be written").lower()
         raise ConfigError(f"{out}: {reason}; give another file") from error

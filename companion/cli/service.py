@@ -63,7 +63,10 @@ def install(
     ),
     as_json: AsJson = False,
 ) -> None:
-    """Install the service to start with the computer; does not start it now."""
+    """Install the service, to start with the computer.
+
+    Does not start it now.
+    """
     config = load(config_file)
     who = account or os.environ.get("SUDO_USER") or getpass.getuser()
     unit = build_unit(config, is_user=user, account=who, is_realtime=realtime)

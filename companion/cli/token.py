@@ -25,14 +25,20 @@ ConfigFile = Annotated[
 
 @app.command(epilog="Example: vrspray token show --config config.toml")
 def show(config_file: ConfigFile, overrides: Overrides = None, as_json: AsJson = False) -> None:
-    """Show the links again, the first as a QR code: whoever has one is let in."""
+    """Show the links again, the first as a QR code.
+
+    Whoever has one is let in.
+    """
     config = load(config_file, overrides=overrides or ())
     _say(config, kept_tokens(tokens_file(config)), as_json=as_json)
 
 
 @app.command(epilog="Example: vrspray token rotate --config config.toml")
 def rotate(config_file: ConfigFile, overrides: Overrides = None, as_json: AsJson = False) -> None:
-    """Make new tokens; from the next start of `run` old links and logins are worth nothing."""
+    """Make new tokens instead of all old ones.
+
+    Old links and logins end at the next start of `run`.
+    """
     config = load(config_file, overrides=overrides or ())
     _say(config, new_tokens(tokens_file(config)), as_json=as_json)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import sys
 import time
 from collections.abc import AsyncIterator
@@ -15,6 +16,7 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 from companion.cli.live import DRAWN_EVERY_S, PLAIN_EVERY_S, Shown, drawn
 from companion.core.types import SprayerState
+from companion.errors import LinkError
 
 if TYPE_CHECKING:
     from companion.link.overhear import Overheard
@@ -23,6 +25,11 @@ if TYPE_CHECKING:
 # waits for the heartbeats of a station and must not take ours for one.
 _SYSTEM, _COMPONENT = 254, 191
 _BEAT_S = 1.0
+_TAKEN = (
+    "another program listens there, and if it is `vrspray run`, both cannot; let the router or the "
+    "autopilot send to a second port as well (mavproxy.py --out udp:127.0.0.1:14551) and give "
+    "that one: udpin:127.0.0.1:14551"
+)
 _TRAINING = {1.0: "water", 2.0: "dry", 3.0: "ground"}
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
@@ -105,12 +112,18 @@ async def _turns(heard: Overheard, link: str) -> AsyncIterator[float]:
     from companion.link.vehicle_link import open_transport
 
     encoder = Encoder(system_id=_SYSTEM, component_id=_COMPONENT)
-    transport = await open_transport(
-        link,
-        lambda data: heard.take(data, time.monotonic()),
-        lambda is_up: note(f"link {'up' if is_up else 'lost'}: {link}"),
-        lambda text: note(f"waiting: {text}"),
-    )
+    try:
+        transport = await open_transport(
+            link,
+            lambda data: heard.take(data, time.monotonic()),
+            lambda is_up: note(f"link {'up' if is_up else 'lost'}: {link}"),
+            lambda text: note(f"waiting: {text}"),
+        )
+    except LinkError as error:
+        what = str(error).replace("link.url = ", "--link ")
+        if not isinstance(error.__cause__, OSError) or error.__cause__.errno != errno.EADDRINUSE:
+            raise LinkError(what) from error
+        raise LinkError(f"--link {link!r}: {_TAKEN}") from error
     beat_s = float("-inf")
     try:
         while True:

@@ -193,6 +193,11 @@ def _off_centre(config: Document) -> Rule:
 
 def remarks(config: Document) -> Rule:
     """Yield what a reader should know of a configuration in which nothing is wrong."""
+    if config.prescription is None:
+        yield Contradiction(
+            key="prescription.file",
+            text="not set: there is no map yet; `vrspray run` refuses to start until one is named",
+        )
     yield from unbounded(config)
     if config.flow_meter.source == "none" and config.lag.measured_on is None:
         yield Contradiction(

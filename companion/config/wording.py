@@ -86,6 +86,8 @@ class Found(NamedTuple):
         """Return it as `config check` lists it."""
         got = "" if self.value is None else f": {self.value}"
         text = self.wrong if self.code == "contradiction" else f"{self.wrong}{got}"
+        if self.code == "unknown-key":  # its value is not what is wrong
+            text = f"{self.wrong}: {self.key}"
         return Problem(severity="error", code=self.code, text=text, where=self.key, fix=self.fix)
 
 

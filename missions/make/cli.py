@@ -43,6 +43,7 @@ from missions.maps.whole_file import check_folder
 app = typer.Typer(
     add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,
     no_args_is_help=True, help="Make prescriptions from a field's data.",
+    epilog="Example: vrspray make zones ndvi.tif --value NDVI --out field.gpkg",
 )  # fmt: skip
 
 # A zone is this much longer than a change takes: for wind, and for the aircraft's own speed.
@@ -167,7 +168,7 @@ def zones(
     force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make zones that the sprayer can follow, and say what its limits cost.
+    """Make zones that the sprayer can follow; say what that costs.
 
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """

@@ -97,7 +97,7 @@ def trial(
     force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Lay out a randomised trial: blocks of plots that the sprayer can follow.
+    """Lay out a randomised trial that the sprayer can follow.
 
     Beside the map NAME.trial.geojson holds plots, inner parts, treatments, blocks and the seed,
     for `vrspray trial`, which evaluates the flight.

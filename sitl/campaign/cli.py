@@ -224,7 +224,9 @@ def show(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show each figure of a campaign by setting, with its interval, and what matters for it.
+    """Show each figure of a campaign by setting, with its interval.
+
+    And which settings matter for it.
 
     Exit 0: shown; 2: the folder or an option is wrong.
     """

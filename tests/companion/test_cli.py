@@ -6,12 +6,15 @@ import os
 import socket
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import click
 import pytest
+import typer
 
-from companion.cli.app import COMMANDS, execute, load_command, main
+from companion.cli.app import COMMANDS, app, execute, load_command, main
 from companion.cli.run import build_executor, component_options
 from companion.commands import Command, all_registered
 from companion.config import load
@@ -583,3 +586,18 @@ def test_port_in_use_is_one_line_and_exit_2(capsys: Captured, tmp_path: Path) ->
         code, found = run_json(capsys, *run_arguments(tmp_path, port), "--duration-s", "0.2")
     assert code == 2
     assert f"port {port} is in use" in found["error"]
+
+
+def every_command(command: Any, above: click.Context | None = None) -> Iterator[click.Context]:
+    context = click.Context(command, above, command.name, terminal_width=80, max_content_width=80)
+    yield context
+    for name in command.list_commands(context) if hasattr(command, "list_commands") else ():
+        yield from every_command(command.get_command(context, name), context)
+
+
+def test_every_command_has_an_example_and_is_told_whole_in_the_list_of_its_group() -> None:
+    for context in every_command(typer.main.get_command(app)):
+        told = context.get_help()
+        assert "Example" in told, context.command_path
+        _, _, listed = told.partition("\nCommands:")
+        assert not [line for line in listed.splitlines() if line.endswith("...")]

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from companion.cli.app import execute
 from companion.config import Config, load
 from companion.config.rules import mismatches, without_effect
 from companion.core.nozzle import choose_set
@@ -475,3 +476,9 @@ def test_number_is_bounded_on_both_sides() -> None:
         )
     ]
     assert not unbounded
+
+
+def test_an_unknown_key_is_named_and_not_its_value(capsys: pytest.CaptureFixture[str]) -> None:
+    assert execute(["config", "check", str(EXAMPLE), "--set", "boom.widht_m=6.0"]) == 2
+    said = capsys.readouterr().out
+    assert "error: unknown key: boom.widht_m; did you mean boom.width_m?" in said

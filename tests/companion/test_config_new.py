@@ -32,7 +32,10 @@ def test_what_is_written_passes_the_check(
     assert (said["ok"], said["problems"]) == (True, [])
     assert any("bucket" in line or "flow" in line for line in said["measure"])
     assert execute(["config", "check", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["problems"] == []
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["problems"] == []
+    assert [note for note in checked["notes"] if "there is no map yet" in note]
+    assert checked["notes"] == said["notes"]
     assert load(out).safety.modes == ("MISSION" if autopilot == "px4" else "AUTO",)
 
 
@@ -111,8 +114,9 @@ def test_a_map_without_a_unit_needs_one(
     words = ["config", "new", "--yes", "--out", str(out), "--map", str(zone), "--force", *profile]
     assert execute(words) == 2
     said = capsys.readouterr()
-    assert "no unit is given" in said.out
-    assert f"vrspray config check {out}" in said.out
+    assert "no unit is given" in said.err
+    assert f"{out} is not written" in said.err
+    assert {path.name for path in tmp_path.iterdir()} <= {zone.name, "state"}  # maps kept
     assert execute([*words, "--unit", "L/ha"]) == 0
     assert load(out).prescription.unit == "L/ha"  # type: ignore[union-attr]
     assert execute([*words, "--unit", "furlongs"]) == 2
@@ -172,3 +176,24 @@ def test_guesses_are_marked() -> None:
     text = text_of(Answers())
     assert text.count("# MEASURE") == 2
     assert "[prescription]" not in text
+
+
+def test_a_file_from_a_profile_says_that_it_is_of_another_sprayer(tmp_path: Path) -> None:
+    out = tmp_path / "field.toml"
+    words = ["config", "new", "--yes", "--profile", "wang-2024-normally-open", "--out", str(out)]
+    assert execute(words) == 0
+    first, *rest = out.read_text().splitlines()
+    assert "from a profile" in first
+    assert "a relay that cuts the pump" in " ".join(rest)
+
+
+@pytest.mark.parametrize("broken", ["not a map", '{"type": "FeatureCollection", "features": []}'])
+def test_a_map_that_cannot_be_flown_is_refused_before_anything_is_written(
+    broken: str, tmp_path: Path, capsys: Captured
+) -> None:
+    out, field = tmp_path / "field.toml", tmp_path / "field.geojson"
+    field.write_text(broken)
+    assert execute(["config", "new", "--yes", "--out", str(out), "--map", str(field)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "field.geojson" in line
+    assert {path.name for path in tmp_path.iterdir()} <= {field.name, "state"}  # maps kept

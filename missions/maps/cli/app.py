@@ -65,7 +65,9 @@ def compile_(
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compile a map, its boundary, exclusions and planned lines into a flight map.
+    """Compile a map and what belongs to it into a flight map.
+
+    That is its boundary, exclusions and planned lines.
 
     Exit 0: compiled; 1: compiled, and the check of the map found errors; 2: it cannot be flown.
     """
@@ -168,7 +170,7 @@ def offset(
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Measure the offset between map and receiver from one mark that both know.
+    """Measure the offset between map and receiver by one mark.
 
     Read the mark (a corner of the field, a pole) out of the map, survey it with the receiver and
     the base that will fly, and paste the two lines into [prescription].

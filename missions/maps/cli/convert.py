@@ -76,7 +76,9 @@ def convert(
     force: _Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write a map in another format, read it back and compare both at 1000 places.
+    """Write a map in another format, and verify it.
+
+    It is read back and compared at 1000 places.
 
     Exit 1, and nothing written, where a rate would change by more than 0.01 L/ha. A text map in
     L/min is for the width and speed of --flow-width-m and --flow-speed-m-s.

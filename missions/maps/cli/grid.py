@@ -39,7 +39,10 @@ def grid(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Show the cells of a text map, by P2's equations; write them as points of a CSV file."""
+    """Show the cells of a text map, by P2's equations.
+
+    They are written as points of a CSV file where one is named.
+    """
     if merge not in MERGES:
         raise typer.BadParameter(f"--merge is {merge!r}; take one of {', '.join(MERGES)}")
     place = None if origin is None else parse_place(origin, "--origin")

@@ -265,7 +265,10 @@ def new(
     force: Force = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a map for a trial: points in L/min (.txt), or plots in L/ha in any other format."""
+    """Make a map for a trial: points or plots.
+
+    Points in L/min (.txt), or plots in L/ha in any other format.
+    """
     given = {
         "points": points,
         "east_m": east_m,

@@ -89,3 +89,21 @@ def test_reasons_and_errors_are_those_that_were_told_last() -> None:
     assert heard.state(60.0) is None
     heard.take(encoder.named_value("SPR_STATE", float("nan"), 61.0), 61.0)
     assert heard.state(61.0) is None
+
+
+def test_a_port_that_the_companion_has_is_said_with_what_to_do() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        link = f"udpin:127.0.0.1:{taken.getsockname()[1]}"
+        done = subprocess.run(
+            [*PROGRAM, "top", "--link", link],
+            capture_output=True,
+            check=False,
+            timeout=60,
+            text=True,
+        )
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert f"--link '{link}'" in line
+    assert "`vrspray run`" in line
+    assert "a second port" in line
