@@ -30,7 +30,7 @@ WSP = Command(
 )
 TRIAL = Command(
     target="analysis.trial_cli:trial",
-    help="Evaluate a field trial: what each plot got, and yields by treatment.",
+    help="Evaluate a field trial: what plots got, yields by treatment.",
     haste="patient",
 )
 FLIGHTS_SHOW = Command(

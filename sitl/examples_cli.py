@@ -38,6 +38,7 @@ _BESIDE = re.compile(r'"\.\./([\w-]+)/')
 
 app = typer.Typer(
     help="List the examples of this installation, or copy one.",
+    epilog="Example: vrspray examples copy anyang --to field",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,

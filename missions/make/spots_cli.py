@@ -141,10 +141,11 @@ def spots(
     force: Annotated[bool, typer.Option("--force", help="Replace files of these names.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Spray weeds alone, with as much ground around them as errors of this sprayer ask for.
+    """Spray weeds alone, with ground around them.
 
-    Says where the errors come from, what is saved, and how many weeds will be missed. Flies from
-    spot to spot where that is quicker than the passes over the field.
+    As much as the errors of this sprayer ask for. Says where the errors come from, what is saved,
+    and how many weeds will be missed. Flies from spot to spot where that is quicker than the
+    passes over the field.
 
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """
