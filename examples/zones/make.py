@@ -8,7 +8,9 @@
 - `yield.csv`, a harvester's points with what goes wrong on it: filling and emptying, stops,
   a pass over harvested ground, and a sensor that jumps;
 - `soil.csv`, samples of electrical conductivity on a loose grid;
-- `scouted.geojson`, polygons with a score of weeds.
+- `scouted.geojson`, polygons with a score of weeds;
+- `weeds.csv`, single weeds in a dozen patches;
+- `cards.csv`, the deposit on cards across the track of four passes in different winds.
 
 The same seed makes the same files. `config.toml`, a sprayer for it, is copied beside them.
 """
@@ -151,6 +153,33 @@ def harvest(ground: Ground) -> list[tuple[float, float, float, float, str]]:
     return rows
 
 
+def weeds(ground: Ground) -> list[tuple[float, float]]:
+    """Return x and y of weeds, in patches."""
+    draw = np.random.default_rng(SEED + 4)
+    west, south, east, north = ground.bounds
+    found: list[tuple[float, float]] = []
+    for _ in range(12):
+        x, y = draw.uniform(west, east), draw.uniform(south, north)
+        for dx, dy in draw.normal(0.0, 2.0, (int(draw.integers(1, 9)), 2)).tolist():
+            if ground.contains(shapely.Point(x + dx, y + dy)):
+                found.append((x + dx, y + dy))
+    return found
+
+
+def cards() -> list[str]:
+    """Return the rows of a table of cards under four passes."""
+    draw = np.random.default_rng(SEED + 5)
+    lines = ["pass,right_m,deposit,wind_right_m_s"]
+    for number, wind in enumerate((0.4, 1.2, -0.8, 1.9), 1):
+        for right in np.arange(-8.0, 8.1, 0.5).tolist():
+            from_middle = right - 0.45 * wind
+            flat = math.exp(-((abs(from_middle) / 3.1) ** 4))
+            deposit = 10.0 * flat * (1.0 + 0.12 * math.cos(2.0 * math.pi * from_middle / 2.2))
+            deposit = max(deposit * (1.0 + 0.08 * draw.standard_normal()), 0.0)
+            lines.append(f"{number},{right:g},{deposit:.2f},{wind:g}")
+    return lines
+
+
 def main(folder: Path, given: Path | None = None) -> None:
     """Write all files."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -204,6 +233,11 @@ def main(folder: Path, given: Path | None = None) -> None:
             piece = moved(square, back)
             scouted.append({"type": "Feature", "properties": {"weeds": 4 - score},
                             "geometry": json.loads(str(shapely.to_geojson(piece)))})  # fmt: skip
+    spots = [back.transform(x, y) for x, y in weeds(ground)]
+    (folder / "weeds.csv").write_text(
+        "\n".join(["lat,lon", *(f"{lat:.8f},{lon:.8f}" for lon, lat in spots)]) + "\n"
+    )
+    (folder / "cards.csv").write_text("\n".join(cards()) + "\n")
     (folder / "soil.csv").write_text("\n".join(soil) + "\n")
     (folder / "scouted.geojson").write_text(
         json.dumps({"type": "FeatureCollection", "features": scouted}) + "\n"

@@ -25,7 +25,7 @@ ALLOWED = {
         "missions/web/office.py",
         "analysis/web/flights.py",
     ),
-    "shapefile": ("missions/maps", "analysis/exports/"),
+    "shapefile": ("missions/maps", "analysis/exports/", "analysis/trial_cli.py"),
 }
 CORE_ALLOWED = {
     "numpy": None,
