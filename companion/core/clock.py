@@ -22,7 +22,7 @@ line; above 0.1 s at once.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 from companion.core.positions import BOOT_WRAP_S, ROUND_TRIP_MAX_S
@@ -144,8 +144,7 @@ class Strays(NamedTuple):
         return self.agreeing > 1 and abs(self.off_s) > STRAY_S
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Clock:
+class Clock(NamedTuple):
     """Mean of arrival time minus the autopilot's time, and how much of it is the way here.
 
     `received_s` and `boot_s` are both times of the newest arrival, when `offset_s` holds; it
@@ -153,7 +152,7 @@ class Clock:
     """
 
     offset_s: float
-    count: int
+    heard_count: int
     delay_s: float = 0.0
     received_s: float = 0.0
     boot_s: float = 0.0
@@ -263,12 +262,12 @@ def tick(
     is_adopted = False
     if report is not None and is_measured(report, now_s) and report.received_s > clock.heard_s:
         was_astray = clock.strays is not None
-        clock = replace(_heard(clock, report, now_s, is_set=is_set), heard_s=report.received_s)
+        clock = _heard(clock, report, now_s, is_set=is_set)._replace(heard_s=report.received_s)
         is_set = is_set or clock.disagree_left == AGREE_COUNT
         is_adopted = was_astray and clock.strays is None and clock.agreed_s == report.received_s
     if is_refused or not _has_exchanges(report, clock, now_s):
         moved_s = 0.0
-        if before is not None and clock.count == 1 and not is_set:
+        if before is not None and clock.heard_count == 1 and not is_set:
             moved_s = clock.offset_s - before.offset_s - before.rate * passed_s
         return Ticked(clock, False, moved_s, is_set, is_refused)
     assert clock.exchanges is not None
@@ -281,7 +280,7 @@ def tick(
             reach_s = SLEW * min(max(passed_s, 0.0), 1.0)
             used_s = known_s + min(max(wanted_s - known_s, -reach_s), reach_s)
         moved_s = used_s - known_s
-    clock = replace(clock, delay_s=clock.offset_s - used_s, rate=rate)
+    clock = clock._replace(delay_s=clock.offset_s - used_s, rate=rate)
     return Ticked(clock, True, moved_s, is_set, is_refused)
 
 
@@ -303,18 +302,18 @@ def _arrived(
     jitter_s = max(ARRIVAL_SD_S, math.sqrt(0.95 * clock.jitter_s**2 + 0.05 * off_s2))
     if late_s < -CLOCK_STEP_S:
         # It cannot have come before it was sent: the mean rests on late ones, or the clock was set.
-        restarts = clock.restarts + 1 if clock.count < RESTART_COUNT else 0
+        restarts = clock.restarts + 1 if clock.heard_count < RESTART_COUNT else 0
         is_much = late_s < -max(LATE_DOUBT_S, JITTERS_MAX * clock.jitter_s)
         is_much = is_much or restarts >= RESTARTS_MAX
         until_s = now_s + SETTLE_S if is_much and not at_once else clock.doubtful_until_s
-        anew = replace(_anew(clock, item), jitter_s=jitter_s, doubtful_until_s=until_s)
-        return replace(anew, restarts=restarts), False
+        anew = _anew(clock, item)._replace(jitter_s=jitter_s, doubtful_until_s=until_s)
+        return anew._replace(restarts=restarts), False
     since_s = None
     if late_s > LATE_DOUBT_S:
         since_s = now_s if clock.late_since_s is None else clock.late_since_s
         if _is_set_back(clock, item, report, since_s, late_s, at_once=at_once):
             return _anew(clock, item), True
-    count = min(clock.count + 1, 100)
+    count = min(clock.heard_count + 1, 100)
     if late_s > CLOCK_STEP_S:
         line = clock.arrivals.moved(CLOCK_STEP_S / count)
     else:
@@ -323,10 +322,9 @@ def _arrived(
     strays = clock.strays
     if strays is not None:
         strays = strays._replace(least_s=min(strays.least_s, seen_s))
-    arrived = replace(
-        clock,
+    arrived = clock._replace(
         offset_s=line.at(now_s, slope),
-        count=count,
+        heard_count=count,
         received_s=now_s,
         boot_s=item.boot_s,
         rate=slope,
@@ -366,15 +364,14 @@ def _anew(clock: Clock | None, item: Telemetry) -> Clock:
     seen_s = item.received_s - item.boot_s
     anew = Clock(
         offset_s=seen_s,
-        count=1,
+        heard_count=1,
         received_s=item.received_s,
         boot_s=item.boot_s,
         arrivals=_begun(item.received_s, seen_s, ARRIVAL_SD_S),
     )
     if clock is None:
         return anew
-    return replace(
-        anew,
+    return anew._replace(
         delay_s=0.0,
         exchanges=clock.exchanges,
         round_trip_s=clock.round_trip_s,
@@ -398,18 +395,17 @@ def _heard(clock: Clock, report: ClockReport, now_s: float, *, is_set: bool) -> 
     fade_s = EXCHANGES_FADE_S + FADE_BY_ROUND_TRIP * slow_s
     begun = _begun(at_s, offset_s, sd_s)
     if line is None and is_possible:
-        return replace(clock, exchanges=begun, round_trip_s=quickest_s, agreed_s=at_s, strays=None)
+        return clock._replace(exchanges=begun, round_trip_s=quickest_s, agreed_s=at_s, strays=None)
     bound_s = 0.5 * (report.round_trip_s + quickest_s) + EXCHANGE_STEP_S
     late_s = clock.offset_s - clock.rate * (now_s - at_s) - offset_s
     if line is None:
         return _strayed(clock, report, begun, off_s=-late_s, bound_s=bound_s)
     apart_s = offset_s - line.at(at_s, line.rate(clock.rate, RATE_BY_ARRIVALS_SD))
     passed_s = at_s - line.at_s
-    wander_s = WANDER * max(passed_s, 1.0) if clock.count >= 20 else RATE_MAX * passed_s
+    wander_s = WANDER * max(passed_s, 1.0) if clock.heard_count >= 20 else RATE_MAX * passed_s
     is_apart = not abs(apart_s) <= bound_s + wander_s
     if is_possible and not is_apart:
-        return replace(
-            clock,
+        return clock._replace(
             exchanges=_longer(line, at_s, offset_s, sd_s, fade_s),
             round_trip_s=quickest_s,
             agreed_s=at_s,
@@ -420,8 +416,7 @@ def _heard(clock: Clock, report: ClockReport, now_s: float, *, is_set: bool) -> 
         )
     is_set = is_set or now_s < clock.doubtful_until_s or abs(apart_s) + bound_s > HELD_UP_MAX_S
     if is_possible and is_set:
-        return replace(
-            clock,
+        return clock._replace(
             exchanges=begun,
             round_trip_s=quickest_s,
             disagree_left=AGREE_COUNT,
@@ -445,17 +440,17 @@ def _strayed(
             strays = Strays(line, before.agreeing + 1, off_s, before.least_s)
     least_s = strays.least_s
     if strays.agreeing < AGREE_COUNT or not math.isfinite(least_s):
-        return replace(clock, strays=strays)
+        return clock._replace(strays=strays)
     late_s = least_s - strays.line.at(at_s, clock.rate)
     early_s = EARLY_MAX_S + 0.5 * report.round_trip_s
     if not -early_s <= late_s <= report.round_trip_s + WAIT_MAX_S:
-        return replace(clock, strays=strays)
-    adopted = replace(clock, exchanges=strays.line, agreed_s=at_s, disagree_left=0, strays=None)
+        return clock._replace(strays=strays)
+    adopted = clock._replace(exchanges=strays.line, agreed_s=at_s, disagree_left=0, strays=None)
     if least_s > clock.offset_s and clock.arrivals is not None:
         # The mean that hardly follows late messages did not follow these.
         by_s = least_s - clock.offset_s
-        adopted = replace(
-            adopted, offset_s=least_s, arrivals=clock.arrivals.moved(by_s), late_since_s=None
+        adopted = adopted._replace(
+            offset_s=least_s, arrivals=clock.arrivals.moved(by_s), late_since_s=None
         )
     return adopted
 
@@ -468,8 +463,8 @@ def on_time_s(received_s: float, before: Clock | None, after: Clock) -> float:
     counts of a meter a tenth of the flow, and the next two ten times the flow. Never later than
     `received_s`.
 
-    >>> calm = Clock(offset_s=100.0, count=9, received_s=110.0, boot_s=10.0)
-    >>> late = Clock(offset_s=100.0, count=9, received_s=110.7, boot_s=10.1)
+    >>> calm = Clock(offset_s=100.0, heard_count=9, received_s=110.0, boot_s=10.0)
+    >>> late = Clock(offset_s=100.0, heard_count=9, received_s=110.7, boot_s=10.1)
     >>> round(on_time_s(110.69, calm, late), 3), round(on_time_s(110.05, None, calm), 3)
     (110.099, 110.0)
     """

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 from companion.core.braking import (
     Approach,
@@ -99,8 +99,7 @@ from companion.core.types import (
 CONFIRM_COUNT = 5
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Motion:
+class Motion(NamedTuple):
     """What the filters make of the positions, true at `time_s` on our clock.
 
     `agreed` is what all of them say together; `seen` is the last message, to the east and to the
@@ -219,8 +218,7 @@ RANGE_AGE_MAX_S = 1.0
 _NOTHING_HEARD = PositionStream()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
+class Track(NamedTuple):
     """All that has been heard so far, as far as it matters."""
 
     motion: Motion | None = None
@@ -258,7 +256,7 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
         return _observe_position(track, item, setup)
     order = noted(track.order, item)
     if order is not track.order:
-        track = replace(track, order=order)
+        track = track._replace(order=order)
     by_setup = _BY_SETUP.get(type(item))
     if by_setup is not None:
         return by_setup(track, item, setup)
@@ -268,7 +266,7 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
         before = (
             track.mission_leg if _is_new_leg(track.mission_leg, told) else track.mission_leg_before
         )
-        return replace(track, leg=leg, mission_leg=told, mission_leg_before=before)
+        return track._replace(leg=leg, mission_leg=told, mission_leg_before=before)
     return _KEEP[type(item)](track, item)
 
 
@@ -281,23 +279,23 @@ def _is_new_leg(before: MissionLeg | None, now: MissionLeg | None) -> bool:
 
 # Reports of which only the last one counts.
 _KEEP: dict[type, Callable[[Track, Any], Track]] = {
-    AttitudeReport: lambda track, item: replace(
-        track, inertia=replace(track.inertia, attitude=item)
+    AttitudeReport: lambda track, item: track._replace(
+        inertia=track.inertia._replace(attitude=item)
     ),
-    SpeedReport: lambda track, item: replace(track, speed=item),
-    GnssReport: lambda track, item: replace(track, gnss=item),
-    EstimatorReport: lambda track, item: replace(track, estimator=item),
-    LandedReport: lambda track, item: replace(track, landed=item),
-    RangeReport: lambda track, item: replace(track, range=item),
-    OutputReport: lambda track, item: replace(track, output=item),
-    FlowReport: lambda track, item: replace(track, flow=item),
-    PressureReport: lambda track, item: replace(track, pressure=item),
-    TankReport: lambda track, item: replace(track, tank=item),
-    ClockReport: lambda track, item: replace(track, clock_report=item),
+    SpeedReport: lambda track, item: track._replace(speed=item),
+    GnssReport: lambda track, item: track._replace(gnss=item),
+    EstimatorReport: lambda track, item: track._replace(estimator=item),
+    LandedReport: lambda track, item: track._replace(landed=item),
+    RangeReport: lambda track, item: track._replace(range=item),
+    OutputReport: lambda track, item: track._replace(output=item),
+    FlowReport: lambda track, item: track._replace(flow=item),
+    PressureReport: lambda track, item: track._replace(pressure=item),
+    TankReport: lambda track, item: track._replace(tank=item),
+    ClockReport: lambda track, item: track._replace(clock_report=item),
     UtcReport: lambda track, _item: track,
     # What is out of bounds, or no number, leaves the rate as it was.
     RateOverride: lambda track, item: (
-        replace(track, rate_percent=item.percent) if is_override(item.percent) else track
+        track._replace(rate_percent=item.percent) if is_override(item.percent) else track
     ),
 }
 
@@ -311,7 +309,7 @@ def _observe_battery(track: Track, item: BatteryReport, setup: Setup) -> Track:
     if wiring is None:
         return track
     flow, tank = wiring.flow(item), wiring.tank(item)
-    return replace(track, counted=flow or track.counted, tank=tank or track.tank)
+    return track._replace(counted=flow or track.counted, tank=tank or track.tank)
 
 
 def _dated(track: Track, clock: Clock) -> FlowReport | None:
@@ -326,15 +324,15 @@ def _observe_consent(track: Track, item: Any, setup: Setup) -> Track:
     """Take what gives or takes back the operator's consent; of a heartbeat, the rest too."""
     consent = consented(track.consent, item, setup.limits, heartbeat=track.heartbeat)
     if isinstance(item, HeartbeatReport):
-        return replace(track, heartbeat=item, consent=consent)
-    return replace(track, consent=consent)
+        return track._replace(heartbeat=item, consent=consent)
+    return track._replace(consent=consent)
 
 
 def _observe_wind(track: Track, item: WindReport, setup: Setup) -> Track:
     """Take what is known of the wind; not to know it does not calm one that was too strong."""
     before_m_s = None if track.wind is None else track.wind.speed_m_s
     is_calm = before_m_s is None or 0.0 <= before_m_s <= setup.limits.wind_max_m_s
-    return replace(track, wind=item) if item.speed_m_s is not None or is_calm else track
+    return track._replace(wind=item) if item.speed_m_s is not None or is_calm else track
 
 
 def _observe_standstill(track: Track, item: StandstillReport, _setup: Setup) -> Track:
@@ -357,8 +355,8 @@ def _observe_standstill(track: Track, item: StandstillReport, _setup: Setup) -> 
 
 
 _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
-    ImuReport: lambda track, item, setup: replace(
-        track, inertia=track.inertia.with_imu(item, setup.lag.position_s)
+    ImuReport: lambda track, item, setup: track._replace(
+        inertia=track.inertia.with_imu(item, setup.lag.position_s)
     ),
     HeartbeatReport: _observe_consent,
     OperatorCommand: _observe_consent,
@@ -373,19 +371,19 @@ _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
 def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
     order, kind = sorted_in(track.order, item)
     if kind is Arrival.AGAIN:
-        return replace(track, order=order)  # a copy, or not yet known to be anything else
-    track = replace(track, order=order)
+        return track._replace(order=order)  # a copy, or not yet known to be anything else
+    track = track._replace(order=order)
     if kind is Arrival.ANEW:
         track = _restarted(track)
     place = place_of(item, setup.frame)
     if place is None:
-        return replace(track, position_valid=False, position_received_s=item.received_s)
+        return track._replace(position_valid=False, position_received_s=item.received_s)
     before = track.motion
     stand = _stand(track, item)
     if before is not None and stand.is_frozen:
         # It is kept out of the filters, and what comes after it has to be confirmed.
-        still = replace(before, boot_s=item.boot_s, confirm_left=CONFIRM_COUNT)
-        return replace(track, motion=still, last_place=stand)
+        still = before._replace(boot_s=item.boot_s, confirm_left=CONFIRM_COUNT)
+        return track._replace(motion=still, last_place=stand)
     at_once = not track.consent.enabled or before is None
     ticked = tick(track.clock, item, track.clock_report, at_once=at_once)
     clock = ticked.clock
@@ -395,11 +393,10 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
     if ticked.is_set:
         before = None
     if before is not None and ticked.moved_s != 0.0:
-        before = replace(before, time_s=before.time_s + ticked.moved_s)
+        before = before._replace(time_s=before.time_s + ticked.moved_s)
     time_s = item.boot_s + clock.sent_offset_s - setup.lag.position_s
     motion = begun(item, place, time_s) if before is None else followed(before, item, place, time_s)
-    return replace(
-        track,
+    return track._replace(
         motion=motion,
         inertia=track.inertia.after_position(
             motion.boot_s, motion.seen, motion.agreed.cruise, motion.likely
@@ -418,8 +415,7 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
 def _restarted(track: Track) -> Track:
     """Forget what was known by the autopilot's old clock, but an exchange with the new one."""
     exchange = track.order.exchange
-    return replace(
-        track,
+    return track._replace(
         motion=None,
         clock=None,
         clock_report=exchange,

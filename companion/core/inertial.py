@@ -12,7 +12,6 @@ Without these messages nothing here changes anything.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -77,8 +76,7 @@ class Gained(NamedTuple):
     north_m: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Inertia:
+class Inertia(NamedTuple):
     """What was heard of attitude and accelerometer, and the motion by it at the last position."""
 
     attitude: AttitudeReport | None = None
@@ -98,13 +96,13 @@ class Inertia:
         if last is not None and not 0.0 < sample.at_s - last.at_s <= GAP_MAX_S:
             # An older one is a copy of what is known; after a gap all begins anew.
             begun = (sample,) if abs(sample.at_s - last.at_s) > GAP_MAX_S else self.samples
-            return replace(self, samples=begun, recent=recent_of(begun))
+            return self._replace(samples=begun, recent=recent_of(begun))
         kept = self.samples
         if len(kept) >= SAMPLES_MAX or (kept and sample.at_s - kept[0].at_s > 2.0 * KEPT_S):
             kept = tuple(each for each in kept if sample.at_s - each.at_s <= KEPT_S)
             kept = kept[-SAMPLES_MAX // 2 :]
         samples = (*kept, sample)
-        return replace(self, samples=samples, recent=recent_of(samples))
+        return self._replace(samples=samples, recent=recent_of(samples))
 
     def after_position(
         self, at_s: float, seen: tuple[Seen, Seen], agreed: Belief, likely: float | None
@@ -118,7 +116,7 @@ class Inertia:
         dt_s = at_s - self.at_s
         gained = None if likely is None else gained_over(self.samples, self.at_s, at_s)
         if gained is None or self.belief is None or likely is None:
-            return replace(self, at_s=at_s, belief=_begun(agreed), share=SHARE_MIN)
+            return self._replace(at_s=at_s, belief=_begun(agreed), share=SHARE_MIN)
         east, north = seen
         found = follow(
             ASTRAY,
@@ -128,7 +126,7 @@ class Inertia:
             _less(north, gained.north_m, gained.north_m_s),
         )
         if found is None:
-            return replace(self, at_s=at_s, belief=_begun(agreed), share=SHARE_MIN)
+            return self._replace(at_s=at_s, belief=_begun(agreed), share=SHARE_MIN)
         belief, own = found
         evidence = own - likely
         said = min(max(evidence, -SPEAKS_AGAINST_MAX), SPEAKS_FOR_MAX)
@@ -141,7 +139,7 @@ class Inertia:
             _more(belief.east, gained.east_m, gained.east_m_s),
             _more(belief.north, gained.north_m, gained.north_m_s),
         )
-        return replace(self, at_s=at_s, belief=moved_on, share=share, trust=trust)
+        return self._replace(at_s=at_s, belief=moved_on, share=share, trust=trust)
 
     def after(self, dt_s: float, fade_s: float) -> tuple[Axis, Axis] | None:
         """Return the motion `dt_s` after the last position; None where nothing is known of it.

@@ -21,7 +21,6 @@ that an autopilot has forgotten what was asked of it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -101,8 +100,7 @@ class Lateness(NamedTuple):
 NO_COPIES = Lateness()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PositionStream:
+class PositionStream(NamedTuple):
     """The stream of positions so far, and what may be another run of the autopilot's clock."""
 
     boot_s: float | None = None
@@ -128,9 +126,9 @@ def noted(order: PositionStream, item: Input) -> PositionStream:
     """Return the order with one more piece of evidence; most inputs are none."""
     if isinstance(item, ClockReport):
         is_sound = 0.0 <= item.round_trip_s <= ROUND_TRIP_MAX_S and math.isfinite(item.offset_s)
-        return replace(order, exchange=item) if is_sound else order
+        return order._replace(exchange=item) if is_sound else order
     if isinstance(item, HeartbeatReport):
-        return order if item.armed else replace(order, disarmed_s=item.received_s)
+        return order if item.armed else order._replace(disarmed_s=item.received_s)
     if isinstance(item, UtcReport):
         return _noted_utc(order, item)
     return order
@@ -141,10 +139,10 @@ def _noted_utc(order: PositionStream, item: UtcReport) -> PositionStream:
         return order
     epoch_s = item.utc_s - item.boot_s
     if order.epoch_s is not None and not abs(epoch_s - order.epoch_s) <= STEP_MAX_S:
-        order = replace(order, utc=item)
+        order = order._replace(utc=item)
     in_step = abs(item.received_s - item.boot_s - order.offset_s) <= STEP_MAX_S
     if order.boot_s is not None and in_step:
-        order = replace(order, epoch_s=epoch_s)
+        order = order._replace(epoch_s=epoch_s)
     return order
 
 
@@ -162,7 +160,7 @@ def sorted_in(order: PositionStream, item: Telemetry) -> tuple[PositionStream, A
         return _followed(order, item, seen_s), Arrival.NEXT
     late_s = seen_s - order.offset_s
     if late_s > 0.0 and item.boot_s != order.boot_s:
-        order = replace(order, lateness=order.lateness.seen(late_s))
+        order = order._replace(lateness=order.lateness.seen(late_s))
     waits = item.received_s <= order.received_s + order.lateness.wait_s
     if waits or item.boot_s == order.boot_s:
         return order, Arrival.AGAIN
@@ -172,14 +170,13 @@ def sorted_in(order: PositionStream, item: Telemetry) -> tuple[PositionStream, A
         if exchange is not None and exchange.received_s <= run.first_s:
             exchange = None  # with the clock as it was
         lateness = order.lateness._replace(pending_s=0.0)  # that was no copies
-        anew = replace(order, exchange=exchange, epoch_s=None, utc=None, lateness=lateness)
+        anew = order._replace(exchange=exchange, epoch_s=None, utc=None, lateness=lateness)
         return _followed(anew, item, run.offset_s), Arrival.ANEW
-    return replace(order, runs=(*others, run)[-_RUNS_MAX:]), Arrival.AGAIN
+    return order._replace(runs=(*others, run)[-_RUNS_MAX:]), Arrival.AGAIN
 
 
 def _followed(order: PositionStream, item: Telemetry, offset_s: float) -> PositionStream:
-    return replace(
-        order,
+    return order._replace(
         boot_s=item.boot_s,
         received_s=item.received_s,
         offset_s=offset_s,

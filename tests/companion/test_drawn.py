@@ -193,7 +193,7 @@ def test_only_a_velocity_that_is_doubted_is_added_to() -> None:
     motion = begun(item, (0.0, 0.0), item.boot_s)
     by = Drawn(0.2, 0.1, 1.0)
     for doubt_share in (0.0, 0.5, 1.0):
-        one = replace(motion, drawn=(by, NOT_DRAWN), doubt_share=doubt_share)
+        one = motion._replace(drawn=(by, NOT_DRAWN), doubt_share=doubt_share)
         east, north = one.after(0.0)
         plain, _ = motion.after(0.0)
         added_m_s = east.velocity_m_s - plain.velocity_m_s
@@ -204,7 +204,7 @@ def test_only_a_velocity_that_is_doubted_is_added_to() -> None:
 
 def test_without_a_told_velocity_nothing_is_drawn() -> None:
     item = position(0.0, 0.0, 0.0)
-    before = replace(begun(item, (0.0, 0.0), 0.0), drawn=(Drawn(0.2, 0.1, 1.0),) * 2)
+    before = begun(item, (0.0, 0.0), 0.0)._replace(drawn=(Drawn(0.2, 0.1, 1.0),) * 2)
     dumb = replace(item, boot_s=DT_S, velocity_east_m_s=None, velocity_north_m_s=None)
     motion = moved_on(before, dumb, (0.0, 0.0), DT_S)
     assert motion.drawn == (NOT_DRAWN, NOT_DRAWN)

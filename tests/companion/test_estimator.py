@@ -70,8 +70,8 @@ def test_two_predictions_in_a_row_are_one_and_none_is_identity() -> None:
         Belief(carried(model, belief.east, 0.2), carried(model, belief.north, 0.2))
         for model, belief in ((CRUISE, agreed.cruise), (MANOEUVRE, agreed.manoeuvre))
     ]
-    later = replace(motion, time_s=at + 0.2, agreed=Pair(*carried_on, agreed.share))
-    moved = replace(track, motion=later)
+    later = motion._replace(time_s=at + 0.2, agreed=Pair(*carried_on, agreed.share))
+    moved = track._replace(motion=later)
     once, twice = estimate(track, at + 0.5), estimate(moved, at + 0.5)
     assert once is not None
     assert twice is not None
@@ -199,7 +199,7 @@ def test_a_late_copy_changes_nothing(late_s: float) -> None:
     track = eastwards()
     late = replace(position(13.0 - late_s, 5.0 * (3.0 - late_s)), received_s=13.0)
     after = heard(late, track=track)
-    assert replace(after, order=track.order) == track
+    assert after._replace(order=track.order) == track
 
 
 def test_the_reported_ground_speed_stands_in_for_an_unknown_velocity() -> None:
@@ -423,7 +423,7 @@ def test_an_answer_that_cannot_be_true_is_not_believed(change: dict[str, float])
     assert told.motion == plain.motion
     assert told.clock is not None
     # That it came is known, for the one after it to be judged by; nothing else is.
-    assert replace(told.clock, heard_s=-math.inf, strays=None) == plain.clock
+    assert told.clock._replace(heard_s=-math.inf, strays=None) == plain.clock
 
 
 def test_a_reboot_forgets_what_was_known_of_the_clock() -> None:
@@ -437,7 +437,7 @@ def test_a_reboot_forgets_what_was_known_of_the_clock() -> None:
     assert track.clock_report is not None
     assert track.clock_report.offset_s == 6.7
     assert track.clock is not None
-    assert track.clock.count == 1
+    assert track.clock.heard_count == 1
     assert track.clock.delay_s == pytest.approx(WAY_S)
 
 

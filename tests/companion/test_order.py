@@ -95,7 +95,7 @@ def test_copies_are_dropped_and_change_nothing(name: str) -> None:
         assert state is not None
         assert state.clock_agrees
         assert state.position_valid or item.received_s < 0.6
-    assert replace(mixed, order=plain.order) == plain
+    assert mixed._replace(order=plain.order) == plain
 
 
 def test_the_slow_radio_alone_is_no_restart_and_its_positions_are_old() -> None:
@@ -205,7 +205,7 @@ def test_copies_at_random_change_no_decision(delays: list[tuple[list[float], flo
         plain = observe(plain, item, SETUP)
     for heard in (item for item in arrived([*clean, *copies]) if item.received_s < 12.0):
         mixed = observe(mixed, heard, SETUP)
-    assert replace(mixed, order=plain.order) == plain
+    assert mixed._replace(order=plain.order) == plain
 
 
 @given(delays=DELAYS)
