@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from axe_playwright_python.async_playwright import Axe
-from playwright.async_api import Browser, Page, async_playwright, expect
+from playwright.async_api import Browser, Locator, Page, async_playwright, expect
 
 from companion.cli.web_parts import Watched, obeying
 from companion.link.component import ComponentOptions
@@ -50,6 +50,7 @@ ARGUMENTS = [
 ]
 WITHOUT_WEBGL = [*ARGUMENTS, "--disable-gpu", "--disable-3d-apis", "--disable-software-rasterizer"]
 expect.set_options(timeout=30_000)
+PRESSED = re.compile(r"\bpressed\b")
 SERIOUS = ("serious", "critical")
 # From the touch to the last valve's order on the wire.
 STOP_WITHIN_S = 0.3
@@ -142,13 +143,31 @@ async def release(page: Page) -> None:
     await _hold(page, "Hold to release STOP")
 
 
-async def _hold(page: Page, label: str) -> None:
+async def hold_key(page: Page, label: str, key: str) -> None:
+    """Press a key on the button too short, then as long as it wants, as it repeats by itself."""
+    button = await _offered(page, label)
+    await button.focus()
+    await page.keyboard.press(key)
+    await expect(page.locator("#answer")).to_have_text("Keep the button pressed for a second.")
+    await expect(button).to_have_text(label)
+    await page.keyboard.down(key)
+    await page.keyboard.down(key)
+    await expect(button).not_to_have_class(PRESSED)
+    await page.keyboard.up(key)
+
+
+async def _offered(page: Page, label: str) -> Locator:
     button = page.locator("#enable")
     await expect(button).to_have_text(label)
     await expect(button).to_be_enabled()
+    return button
+
+
+async def _hold(page: Page, label: str) -> None:
+    button = await _offered(page, label)
     await button.hover()
     await page.mouse.down()
-    await expect(button).not_to_have_class(re.compile("pressed"))
+    await expect(button).not_to_have_class(PRESSED)
     await page.mouse.up()
 
 
@@ -197,13 +216,14 @@ async def test_a_flight_is_watched_stopped_released_and_enabled_from_the_page(
 
 
 @pytest.mark.timeout(120)
-async def test_without_webgl_the_page_draws_on_a_canvas_and_keyboard_alone_stops(
+async def test_without_webgl_the_page_draws_on_a_canvas_and_the_keyboard_is_enough(
     flight: Flight,
 ) -> None:
     async with chromium(WITHOUT_WEBGL) as browser:
         page = await flight.open(browser, viewport={"width": 360, "height": 740})
         assert await page.evaluate("() => document.getElementById('map').dataset.kind") == "canvas"
-        flight.peer.enable()
+        flight.peer.place(east_m=2.0)
+        await hold_key(page, "Hold to enable", " ")
         await flight.until_spraying()
         await shows(page, "spraying")
         width = await page.evaluate("() => document.documentElement.scrollWidth")
@@ -212,6 +232,8 @@ async def test_without_webgl_the_page_draws_on_a_canvas_and_keyboard_alone_stops
         await page.keyboard.press("Enter")
         await flight.peer.until(lambda: flight.peer.is_all_closed)
         await shows(page, "estop")
+        await hold_key(page, "Hold to release STOP", "Enter")
+        await expect(page.locator("#enable")).to_have_text("Hold to enable")
         await page.locator("#units").select_option("us")
         await expect(page.locator("#rates")).to_contain_text("gal/ac")
         await page.locator("#theme").select_option("night")
