@@ -486,7 +486,8 @@ def _flow(assessment: Assessment | None, why_not: str) -> Iterator[Caution]:
         )
     if evaluation.missed:
         changes = "change" if evaluation.missed == 1 else "changes"
-        yield _warning("missed", f"{evaluation.missed} {changes} of rate never happened.")
+        text = f"{evaluation.missed} {changes} of rate, on and off at borders included,"
+        yield _warning("missed", f"{text} never happened by what the journal holds.")
     if evaluation.off_target_ml > 1.0:
         yield _warning("outside", f"{evaluation.off_target_ml:.1f} mL fell outside the border.")
 
@@ -567,7 +568,7 @@ DEFINITIONS: dict[str, tuple[str, str, str]] = {
         "not measured: below 8 %, too close together, at the end of the valves' range, or at the "
         "border",
     ),
-    "missed": ("Missed", "changes", "never happened"),
+    "missed": ("Missed", "changes", "never happened, on and off at borders included"),
 }  # fmt: skip
 
 CAUSES: dict[str, str] = {
