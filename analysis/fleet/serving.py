@@ -13,7 +13,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
-import uvicorn
 from fastapi import FastAPI, HTTPException, Query, Response
 from fastapi.exceptions import RequestValidationError
 
@@ -22,7 +21,7 @@ from analysis.fleet.page import body_of, files_of, stylesheet
 from analysis.fleet.store import Store
 from analysis.fleet.summary import Chosen, summary_of
 from companion.errors import VrsprayError
-from companion.web.entrance import REFUSED, Guarded, add_sessions, unusable
+from companion.web.entrance import REFUSED, Guarded, add_sessions, server_of, unusable
 from companion.web.guard import API, Guard
 
 LOGIN_S = 12 * 3600
@@ -139,24 +138,6 @@ def _static(name: str) -> Response:
 
 def serve(app: Guarded, listener: socket.socket, *, tls: tuple[str, str] | None = None) -> None:
     """Serve until Ctrl-C, or a signal to end."""
-    certificate, key = tls or (None, None)
-    server = uvicorn.Server(
-        uvicorn.Config(
-            app,
-            http="h11",
-            ws="none",
-            lifespan="off",
-            log_level="warning",
-            access_log=False,
-            server_header=False,
-            proxy_headers=False,
-            limit_concurrency=100,
-            timeout_keep_alive=15,
-            timeout_graceful_shutdown=2,
-            h11_max_incomplete_event_size=16_384,
-            ssl_certfile=certificate,
-            ssl_keyfile=key,
-        )
-    )
+    server = server_of(app, tls=tls, connections_max=100, shutdown_within_s=2)
     with suppress(KeyboardInterrupt):
         server.run(sockets=[listener])

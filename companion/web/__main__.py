@@ -15,9 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import uvicorn
-
-from companion.web.entrance import Guarded
+from companion.web.entrance import Guarded, server_of
 from companion.web.guard import Doors, Guard, Tokens
 from companion.web.live import Live
 from companion.web.parts import registered, uploads
@@ -56,23 +54,9 @@ async def _serve(
     guard = Guard(doors=doors, tokens=Tokens(**about["tokens"]), uploads=uploads(parts))
     site = Site(live, orders, guard, about)
     app = Guarded(build_app(site, parts), guard, ancestors=tuple(about["frame_ancestors"]))
-    server = uvicorn.Server(
-        uvicorn.Config(
-            app,
-            http="h11",
-            ws="none",
-            lifespan="off",
-            log_level="warning",
-            access_log=False,
-            server_header=False,
-            proxy_headers=False,
-            limit_concurrency=200,
-            timeout_keep_alive=15,
-            h11_max_incomplete_event_size=16_384,
-            ssl_certfile=about["tls_certificate"] or None,
-            ssl_keyfile=about["tls_key"] or None,
-        )
-    )
+    certificate, key = about["tls_certificate"], about["tls_key"]
+    tls = (certificate, key) if certificate else None
+    server = server_of(app, tls=tls, connections_max=200)
 
     def read() -> None:
         os.eventfd_read(wake)

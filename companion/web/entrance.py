@@ -10,6 +10,7 @@ import time
 from contextlib import suppress
 from typing import Annotated, Any
 
+import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -166,3 +167,32 @@ def add_sessions(app: FastAPI, guard: Guard, *, login_s: int, is_tls: bool) -> N
             secure=is_tls,
         )
         return Access(scope=scope, needs_token=guard.doors.needs_token)
+
+
+def server_of(
+    app: Guarded,
+    *,
+    tls: tuple[str, str] | None,
+    connections_max: int,
+    shutdown_within_s: int | None = None,
+) -> uvicorn.Server:
+    """Return what serves a page on a socket of ours; it says nothing of itself to strangers."""
+    certificate, key = tls or (None, None)
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http="h11",
+            ws="none",
+            lifespan="off",
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            limit_concurrency=connections_max,
+            timeout_keep_alive=15,
+            timeout_graceful_shutdown=shutdown_within_s,
+            h11_max_incomplete_event_size=16_384,
+            ssl_certfile=certificate,
+            ssl_keyfile=key,
+        )
+    )

@@ -1,35 +1,9 @@
 // Flights on the page: their list, a flight's report, what it left, and how to go on.
 
-import { stopping } from "../static/orders.js";
-import { useUnits, withUnit } from "../static/units.js";
+import { API, ask, begin, byId, make, say } from "../static/part.js";
+import { withUnit } from "../static/units.js";
 
-const API = "../api/v1/";
-const byId = (id) => document.getElementById(id);
 let state = {}, facts = {};
-
-function make(tag, text, className) {
-  const element = document.createElement(tag);
-  if (text !== undefined) element.textContent = text;
-  if (className) element.className = className;
-  return element;
-}
-
-let saying = 0;
-function say(what, isTrouble = false) {
-  const box = byId("answer");
-  box.textContent = what;
-  box.hidden = false;
-  clearTimeout(saying);
-  saying = setTimeout(() => { box.hidden = true; }, isTrouble ? 8000 : 3000);
-}
-
-async function ask(place, body) {
-  const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
-  const response = await fetch(`${API}${place}`, { credentials: "same-origin", ...options });
-  const answer = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(typeof answer.detail === "string" ? answer.detail : `refused (${response.status})`);
-  return answer;
-}
 
 async function doing(word, work) {
   document.body.dataset.busy = word;
@@ -137,12 +111,8 @@ function show() {
   showFlights(); showReport();
 }
 
-let chosen = null;
-try { chosen = localStorage.getItem("vrspray-theme"); useUnits(localStorage.getItem("vrspray-units") ?? "si"); } catch { /* private mode */ }
-const isNight = matchMedia("(prefers-color-scheme: dark)").matches;
-document.documentElement.dataset.theme = chosen === "night" || (chosen !== "day" && isNight) ? "night" : "day";
+begin();
 
-stopping(byId("stop"), say);
 byId("look").addEventListener("click", () => doing("Looking", () => ask("flights/look", {})));
 
 state = await ask("flights").catch((error) => { say(error.message, true); return state; });

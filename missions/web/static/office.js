@@ -1,39 +1,13 @@
 // The office on the page: files in, the map's check, areas drawn, the plan, and what to do with it.
 
-import { stopping } from "../static/orders.js";
-import { toSi, unitOf, useUnits, withUnit } from "../static/units.js";
+import { API, ask, begin, byId, make, say } from "../static/part.js";
+import { toSi, unitOf, withUnit } from "../static/units.js";
 import { OfficeMap } from "./office-map.js";
 
-const API = "../api/v1/";
-const byId = (id) => document.getElementById(id);
 const KINDS = { swath_m: "length", speed_m_s: "speed", tank_l: "volume", rate_l_ha: "rate", border_m: "length" };
 const ROLES = { boundary: "drawn-boundary.geojson", "no-spray": "drawn-no-spray.geojson" };
 const chosenBy = {}; // by the operator: which file is what
 let state = { files: [], made: [] }, corners = [], role = null;
-
-function make(tag, text, className) {
-  const element = document.createElement(tag);
-  if (text !== undefined) element.textContent = text;
-  if (className) element.className = className;
-  return element;
-}
-
-let saying = 0;
-function say(what, isTrouble = false) {
-  const box = byId("answer");
-  box.textContent = what;
-  box.hidden = false;
-  clearTimeout(saying);
-  saying = setTimeout(() => { box.hidden = true; }, isTrouble ? 8000 : 3000);
-}
-
-async function ask(place, body, kind = "application/json") {
-  const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": kind }, body: kind === "application/json" ? JSON.stringify(body) : body };
-  const response = await fetch(`${API}${place}`, { credentials: "same-origin", ...options });
-  const answer = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(typeof answer.detail === "string" ? answer.detail : `refused (${response.status})`);
-  return answer;
-}
 
 // One thing at a time; what comes back is the whole state of the office.
 async function doing(word, work) {
@@ -205,11 +179,7 @@ function planned() {
   return body;
 }
 
-const isNight = matchMedia("(prefers-color-scheme: dark)").matches;
-let chosen = null;
-try { chosen = localStorage.getItem("vrspray-theme"); useUnits(localStorage.getItem("vrspray-units") ?? "si"); } catch { /* private mode */ }
-const theme = chosen === "night" || (chosen !== "day" && isNight) ? "night" : "day";
-document.documentElement.dataset.theme = theme;
+const theme = begin();
 for (const element of document.querySelectorAll("[data-unit]")) element.textContent = unitOf(element.dataset.unit);
 // From the report of a flight: what it left is planned.
 let wanted = new URLSearchParams(location.hash.slice(1)).get("done") ?? "";
@@ -218,7 +188,6 @@ const map = new OfficeMap(byId("map"), theme, {
   onClick(place) { if (role) draw([...corners, place]); },
   onMove(index, place) { draw(corners.map((one, k) => (k === index ? place : one))); },
 });
-stopping(byId("stop"), say);
 byId("pick").addEventListener("change", async (event) => { await load([...event.target.files]); event.target.value = ""; });
 byId("check-form").addEventListener("submit", (event) => { event.preventDefault(); if (byId("prescription").value) doing("Checking", () => ask("office/check", { file: byId("prescription").value, ...reading() })); });
 byId("plan-form").addEventListener("submit", (event) => { event.preventDefault(); if (byId("field").value) doing("Planning", () => ask("office/plan", planned())); });
