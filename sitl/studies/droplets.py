@@ -301,10 +301,6 @@ def droplets(
     answer(result, tables(shifts, grounds), as_json=as_json)
 
 
-if __name__ == "__main__":
-    sys.exit(app())
-
-
 # Droplets as the twin has them: points with drag, from a moving nozzle through moving air.
 #
 # Independent of the controller's model (`companion/core/options/drift.py`): three dimensions
@@ -428,3 +424,7 @@ def _wind_share(up_m: Floats, height_m: float, roughness_m: float) -> Floats:
     up = np.clip(up_m, roughness_m, height_m)
     share: Floats = np.log(up / roughness_m) / math.log(height_m / roughness_m)
     return share
+
+
+if __name__ == "__main__":
+    sys.exit(app())

@@ -192,10 +192,6 @@ def main() -> int:
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 # How the costs of errors are shown: lines for a terminal, a page, a picture.
 
 COMMAND = "python -m sitl.studies.sensitivity"
@@ -321,3 +317,7 @@ def _row(label: str, figures: Figures, row: Row | None) -> tuple[str, ...]:
         "" if row is None else f"{row.misapplied_cost_points.mean:+.2f}",
         f"{figures.off_target_ml:.0f}",
     )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -168,6 +169,23 @@ def test_project_package_and_changelog_agree_on_the_version() -> None:
 
 def test_changelog_tells_what_changed_in_flight() -> None:
     assert "### Changed behaviour in flight" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_a_module_that_is_run_has_all_of_itself_by_then() -> None:
+    """What stands below `if __name__ == "__main__"` is not there yet when the command runs."""
+    early = []
+    for package in ("companion", "missions", "sitl", "analysis", "tests"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            text = path.read_text(encoding="utf-8")
+            if "__main__" not in text:
+                continue
+            *before, _ = ast.parse(text).body
+            early += [
+                f"{path.relative_to(ROOT)}:{node.lineno}"
+                for node in before
+                if isinstance(node, ast.If) and "'__main__'" in ast.unparse(node.test)
+            ]
+    assert not early
 
 
 def test_no_file_of_the_project_names_a_place_on_somebodys_machine() -> None:
