@@ -270,10 +270,16 @@ def _lines_of_part(part: Polygon, width_m: float) -> Floats:
     count = count_across(high - low, width_m)
     step_m = (high - low) / count
     floors = low + step_m * np.arange(count)
-    ends = np.full(count, west - 1.0), np.full(count, east + 1.0)
-    across = np.column_stack([ends[0], floors + step_m / 2.0, ends[1], floors + step_m / 2.0])
-    bands = rectangles(across, step_m)
-    cuts, band_of = shapely.get_parts(shapely.intersection(part, bands), return_index=True)
+    # GEOS clips in a fifth of the time that an intersection takes, but does not promise to be right
+    # where a side of the part lies on a band's edge: all together must be the part.
+    bands = [
+        shapely.clip_by_rect(part, west - 1.0, floor, east + 1.0, floor + step_m)
+        for floor in floors.tolist()
+    ]
+    if not abs(shapely.area(bands).sum() - part.area) <= CRUMB_M2:
+        across = [[west - 1.0, floor, east + 1.0, floor] for floor in floors + step_m / 2.0]
+        bands = shapely.intersection(part, rectangles(np.array(across), step_m)).tolist()
+    cuts, band_of = shapely.get_parts(bands, return_index=True)
     keep = shapely.area(cuts) > CRUMB_M2
     bounds = shapely.bounds(cuts[keep])
     if not len(bounds):

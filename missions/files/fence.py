@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
@@ -432,7 +432,7 @@ class Fences:
 
     def _check(self, fence: Fence, way: BaseGeometry, sortie: Sortie) -> None:
         """Refuse a fence that the sortie itself would break."""
-        kept = [*fence.polygons, *(shapely.Point(x, y).buffer(r) for x, y, r in fence.circles)]
+        kept = [*fence.polygons, *(_disc(*circle) for circle in fence.circles)]
         if fence.border.covers(way) and not bool(shapely.intersects(way, kept).any()):
             return
         raise PlanError(
@@ -493,6 +493,17 @@ def fence_warnings(plan: Plan, fences: Fences) -> tuple[str, ...]:
 
 def _points(sortie: Sortie) -> Way:
     return tuple(leg.points for leg in sortie.legs)
+
+
+@lru_cache(maxsize=1024)
+def _disc(east_m: float, north_m: float, radius_m: float) -> Polygon:
+    """Return the ground of a circle: those around the same obstacle are asked for by many sorties.
+
+    >>> round(_disc(0.0, 0.0, 1.0).area, 2)
+    3.14
+    """
+    found: Polygon = shapely.Point(east_m, north_m).buffer(radius_m)
+    return found
 
 
 def _beside(way: BaseGeometry, aside_m: float) -> BaseGeometry:
