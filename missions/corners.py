@@ -13,7 +13,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -41,6 +40,8 @@ LEAST_M_S = 1e-3
 OVERLAP_STEPS = 240
 # A plan is timed more than once, most of its corners as they were.
 CORNERS_KNOWN = 1 << 15
+# So many are looked at together: the tables on the way stay small.
+CORNERS_TOGETHER = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,10 +104,12 @@ def parts_s(
     legs = [_Leg.of(length, course) for length, course in zip(lengths_m, courses, strict=True)]
     seconds = [leg.seconds for leg in legs]
     if rule == "ardupilot":
-        for number, ((one, other), bend_deg) in enumerate(
-            zip(pairwise(legs), bends_deg, strict=True), start=1
+        bends = [math.radians(bend_deg) for bend_deg in bends_deg]
+        overlaps_s = _overlaps_s(list(zip(legs, legs[1:], bends, strict=False)))
+        for number, (overlap_s, bend_deg) in enumerate(
+            zip(overlaps_s, bends_deg, strict=True), start=1
         ):
-            seconds[number] -= _overlap_s(one, other, math.radians(bend_deg))
+            seconds[number] -= overlap_s
             seconds[number] += LAGS_S if abs(bend_deg) > LAGGING_DEG else 0.0
     return seconds
 
@@ -134,48 +137,85 @@ class _Leg:
             seconds=2.0 * reaching_s + cruise_s,
         )  # fmt: skip
 
-    def speeding_up(self, after_s: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return way, speed and acceleration after a time up to `reaching_s`."""
-        peak, whole_s = self.peak_m_s, self.reaching_s
-        # A jerk of one sign for `jerk_s`, a steady acceleration, the jerk of the other sign.
-        jerk_s = whole_s / 2.0
-        if self.course.jerk_m_s3 is None:
-            jerk_s = 1e-6 * whole_s
-        elif peak >= self.course.acceleration_m_s2**2 / self.course.jerk_m_s3:
-            jerk_s = (whole_s - peak / self.course.acceleration_m_s2) / 2.0 + JERK_COMES_S / 2.0
-            jerk_s = min(jerk_s, whole_s / 2.0)
-        steady = peak / (whole_s - jerk_s)
-        jerk = steady / jerk_s
-        first = np.minimum(after_s, jerk_s)
-        middle = np.clip(after_s - jerk_s, 0.0, whole_s - 2.0 * jerk_s)
-        last = np.clip(after_s - (whole_s - jerk_s), 0.0, jerk_s)
-        speed_1 = jerk * first**2 / 2.0
-        speed_2 = speed_1 + steady * middle
-        way = jerk * first**3 / 6.0 + speed_1 * middle + steady * middle**2 / 2.0
-        way = way + speed_2 * last + steady * last**2 / 2.0 - jerk * last**3 / 6.0
-        speed = speed_2 + steady * last - jerk * last**2 / 2.0
-        return way, speed, jerk * (first - last)
+    @property
+    def jerk_s(self) -> float:
+        """Return how long the acceleration comes, and goes again, on the way to the peak."""
+        jerk = self.course.jerk_m_s3
+        if jerk is None:
+            return 1e-6 * self.reaching_s
+        if self.peak_m_s < self.course.acceleration_m_s2**2 / jerk:
+            return self.reaching_s / 2.0
+        steady_s = self.peak_m_s / self.course.acceleration_m_s2
+        jerk_s = (self.reaching_s - steady_s) / 2.0 + JERK_COMES_S / 2.0
+        return min(jerk_s, self.reaching_s / 2.0)
 
 
-@lru_cache(maxsize=CORNERS_KNOWN)
-def _overlap_s(one: _Leg, other: _Leg, bend: float) -> float:
-    """Return how long before the end of a leg ArduCopter begins the next one."""
-    most_s = min(one.reaching_s, other.reaching_s, other.seconds / 2.0)
+def _speeding_up(legs: Sequence[_Leg], after_s: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return way, speed and acceleration of legs after times up to `reaching_s`, a row for each."""
+    known = np.array([(leg.peak_m_s, leg.reaching_s, leg.jerk_s) for leg in legs])
+    # A jerk of one sign for `jerk_s`, a steady acceleration, the jerk of the other sign.
+    peak, whole_s, jerk_s = known.T[..., None]
+    steady = peak / (whole_s - jerk_s)
+    jerk = steady / jerk_s
+    first = np.minimum(after_s, jerk_s)
+    middle = np.clip(after_s - jerk_s, 0.0, whole_s - 2.0 * jerk_s)
+    last = np.clip(after_s - (whole_s - jerk_s), 0.0, jerk_s)
+    speed_1 = jerk * first**2 / 2.0
+    speed_2 = speed_1 + steady * middle
+    way = jerk * first**3 / 6.0 + speed_1 * middle + steady * middle**2 / 2.0
+    way = way + speed_2 * last + steady * last**2 / 2.0 - jerk * last**3 / 6.0
+    speed = speed_2 + steady * last - jerk * last**2 / 2.0
+    return way, speed, jerk * (first - last)
+
+
+_Corner = tuple[_Leg, _Leg, float]
+
+
+@lru_cache(maxsize=1)
+def _known_overlaps_s() -> dict[_Corner, float]:
+    """Return what `_overlaps_s` has found."""
+    return {}
+
+
+def _overlaps_s(corners: Sequence[_Corner]) -> list[float]:
+    """Return how long before the end of a leg ArduCopter begins the next one, at each corner.
+
+    A corner is two legs and the bend between them; those not known yet are looked at together.
+    """
+    known_s = _known_overlaps_s()
+    new = [corner for corner in dict.fromkeys(corners) if corner not in known_s]
+    if len(known_s) + len(new) > CORNERS_KNOWN:
+        known_s.clear()
+        new = list(dict.fromkeys(corners))
+    for first in range(0, len(new), CORNERS_TOGETHER):
+        some = new[first : first + CORNERS_TOGETHER]
+        known_s.update(zip(some, _new_overlaps_s(some), strict=True))
+    return [known_s[corner] for corner in corners]
+
+
+def _new_overlaps_s(corners: Sequence[_Corner]) -> list[float]:
+    ones, others = [one for one, _, _ in corners], [other for _, other, _ in corners]
+    least = [
+        (
+            min(one.reaching_s, other.reaching_s, other.seconds / 2.0),
+            math.cos(bend),
+            min(one.course.speed_m_s, other.course.speed_m_s) + 1e-6,
+            CORNER_ACCELERATIONS * one.course.acceleration_m_s2,
+        )
+        for one, other, bend in corners
+    ]
+    most_s, cosine, most_m_s, most_m_s2 = np.array(least).T[..., None]
     overlap_s = most_s * np.arange(1, OVERLAP_STEPS + 1) / OVERLAP_STEPS
-    way_1, speed_1, gain_1 = one.speeding_up(overlap_s / 2.0)
-    way_2, speed_2, gain_2 = other.speeding_up(overlap_s / 2.0)
-    cosine = math.cos(bend)
-    radius = _sum(way_1, way_2, -cosine)
-    speed = _sum(speed_1, speed_2, cosine)
-    gain = _sum(gain_1, gain_2, -cosine)
-    acceleration = one.course.acceleration_m_s2
-    allowed = radius < RADIUS_M
-    allowed &= speed <= min(one.course.speed_m_s, other.course.speed_m_s) + 1e-6
-    allowed &= gain < CORNER_ACCELERATIONS * acceleration
-    return float(overlap_s[allowed].max(initial=0.0))
+    way_1, speed_1, gain_1 = _speeding_up(ones, overlap_s / 2.0)
+    way_2, speed_2, gain_2 = _speeding_up(others, overlap_s / 2.0)
+    allowed = _sum(way_1, way_2, -cosine) < RADIUS_M
+    allowed &= _sum(speed_1, speed_2, cosine) <= most_m_s
+    allowed &= _sum(gain_1, gain_2, -cosine) < most_m_s2
+    found: list[float] = np.where(allowed, overlap_s, 0.0).max(axis=1).tolist()
+    return found
 
 
-def _sum(one: Floats, other: Floats, cosine: float) -> Floats:
+def _sum(one: Floats, other: Floats, cosine: Floats) -> Floats:
     """Return the length of the sum of two vectors with this cosine between them."""
     square = one**2 + other**2 + 2.0 * one * other * cosine
     length: Floats = np.sqrt(np.maximum(square, 0.0))
