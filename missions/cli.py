@@ -205,6 +205,8 @@ def plan(
     """Plan the passes over a field, sortie by sortie, and write the mission.
 
     A .plan or .waypoints file holds one sortie; the second and later ones are numbered beside it.
+    "Covered" is what the passes reach with the whole boom open. A report says of a flight what was
+    left untreated: that includes what the valves kept dry, along the border for example.
     """
     start = perf_counter()
     _check_outputs(out, png, pilot_sheet, first, force=force)
