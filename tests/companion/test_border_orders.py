@@ -130,6 +130,20 @@ def test_ground_closed_for_two_reasons_is_closed_for_the_border_whichever_comes_
         assert opened.at_s == pytest.approx(4.0 - 0.05)
 
 
+@pytest.mark.parametrize("bare_m", [0.05, 0.4])
+def test_ground_without_a_rate_does_not_hide_the_border_behind_it(bare_m: float) -> None:
+    # By volume the valve would close 0.1 s before the bare ground; its last flow ends after 0.3 s.
+    zone = Zone(name="1", polygon=shapely.box(0.0, -3.0, 12.0, 9.0), rate_l_ha=20.0)
+    ground = shapely.box(0.0, -3.0, 12.0 + bare_m, 9.0)
+    made = setup(
+        lag=replace(LATE_LAG, on_start_s=0.1, on_s=0.15, off_s=0.1, off_end_s=0.3),
+        border_buffer_m=0.0,
+        prescription=Prescription([zone], boundary=ground),
+    )
+    way = Way(east_m=-10.0, speed_m_s=5.0, **EASTWARDS)
+    assert spilled_by_valve(made, ground, way, 6.0) == []
+
+
 def test_a_valve_that_opens_at_the_border_is_not_driven_past_its_target() -> None:
     law = Overdrive(
         up_time_s=1.0, down_time_s=1.0, duty_min=0.0, duty_max=1.0, flow_for=lambda duty: duty
