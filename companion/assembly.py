@@ -23,6 +23,7 @@ from companion.core.options.lines import Lines
 from companion.core.options.liquid_evidence import BIN_S, UNSTEADY_SHARE, Detection
 from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump
+from companion.core.options.valve_tracking import ValveTracking
 from companion.core.setup import Setup
 from companion.errors import ConfigError, MapError
 from companion.flight_map import (
@@ -128,6 +129,7 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
         lease_s=config.output.lease_s,
         flow_trim=_flow_trim(config),
         detection=_detection(config),
+        valve_tracking=_valve_tracking(config),
         autopilot_liquid=_autopilot_liquid(config),
         drift=config.drift_law(),
         rate_max_l_ha=config.product.rate_max_l_ha,
@@ -226,6 +228,19 @@ def _flow_trim(config: Config) -> FlowTrim | None:
         limit=table.limit,
         meter_minimum_l_min=table.meter_minimum_l_min,
         settle_s=table.settle_s,
+    )
+
+
+def _valve_tracking(config: Config) -> ValveTracking | None:
+    """Return how each valve's flow is tracked in flight, if it is to be."""
+    table = config.valve_tracking
+    if not table.enabled:
+        return None
+    return ValveTracking(
+        limit=table.limit,
+        tau_s=table.tau_s,
+        meter_delay_s=table.meter_delay_s,
+        meter_minimum_l_min=config.flow_trim.meter_minimum_l_min,
     )
 
 

@@ -40,6 +40,7 @@ class Document(tables.Table):
     product: tables.ProductTable = tables.ProductTable()
     application: application_table.ApplicationTable = application_table.ApplicationTable()
     flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
+    valve_tracking: tables.ValveTrackingTable = tables.ValveTrackingTable()
     flow_meter: sensor_tables.FlowMeterTable = sensor_tables.FlowMeterTable()
     pressure: sensor_tables.PressureTable = sensor_tables.PressureTable()
     tank: sensor_tables.TankTable = sensor_tables.TankTable()

@@ -26,8 +26,8 @@ from companion.core.dose import (
     speed_soon,
 )
 from companion.core.frame import Offset
-from companion.core.nozzle import flow_for_rate, overridden
-from companion.core.options import flow_trim, treated_area
+from companion.core.nozzle import NozzleSet, flow_for_rate, overridden
+from companion.core.options import flow_trim, treated_area, valve_tracking
 from companion.core.options.atomisers import flows_ahead, spinning
 from companion.core.options.coverage import Coverage
 from companion.core.options.drift import is_same, landed, offset
@@ -36,6 +36,7 @@ from companion.core.options.lines import add_off_lines
 from companion.core.options.overlap import guarded, treated_before
 from companion.core.options.pump import constant_drive, liquid_of, modulated, on_off, sections
 from companion.core.options.treated_area import TreatedArea
+from companion.core.options.valve_tracking import TrackMemory
 from companion.core.safety import UNASKED, Permission, closed_plan, guard, permit, shown
 from companion.core.schedule import Dosing, ValveSchedule, rate_at, schedule, sticky_border_s
 from companion.core.setup import Setup
@@ -56,12 +57,14 @@ if TYPE_CHECKING:
 class Watched(NamedTuple):
     """What came of the plans so far: faults of the liquid, and the ground that was treated.
 
-    `ran_s` is when something was last to flow, where a motor wants to know.
+    `ran_s` is when something was last to flow, where a motor wants to know; `track` is how far
+    single valves have drifted.
     """
 
     watch: WatchMemory | None = None
     area: TreatedArea | None = None
     ran_s: float = -math.inf
+    track: TrackMemory | None = None
 
 
 class Ordering(NamedTuple):
@@ -124,7 +127,7 @@ def step(
     routes = _routes(setup, state, memory.routes, watched.area, now_s)
     orders = _orders(
         setup, state, routes.routes, ordering, liquid,
-        in_force=in_force, ran_s=watched.ran_s, now_s=now_s,
+        nozzle_sets=_nozzles(setup, watched), in_force=in_force, ran_s=watched.ran_s, now_s=now_s,
     )  # fmt: skip
     plan = SprayPlan(
         sequence=sequence,
@@ -158,7 +161,7 @@ def _watch(
     now_s: float,
 ) -> Watched:
     """Return what flow, pressure and tank say of the plan until now, and what it treated."""
-    watch, area, ran_s = before
+    watch, area, ran_s, track = before
     if setup.watching is not None:
         # With the set-up it was loaded: here it is only looked up.
         from companion.core.options.liquid_faults import follow
@@ -173,7 +176,21 @@ def _watch(
     has_motors = setup.pump is not None or bool(setup.atomisers)
     if has_motors and liquid is not None and any(liquid.duty_at(now_s)):
         ran_s = now_s
-    return Watched(watch, area, ran_s)
+    if setup.tracking is not None:
+        report = None if state is None else state.flow
+        track = valve_tracking.follow(setup.tracking, track, plan, report, now_s=now_s)
+    return Watched(watch, area, ran_s, track)
+
+
+def _nozzles(setup: Setup, watched: Watched) -> tuple[NozzleSet, ...]:
+    """Return the nozzle sets, with the shares of the valves as they are known now."""
+    return setup.nozzle_sets if watched.track is None else (watched.track.nozzles,)
+
+
+def _all_findings(setup: Setup, watched: Watched) -> tuple[Finding, ...]:
+    """Return what is wrong with the liquid, and the valves that have drifted."""
+    found = _findings(setup, watched.watch)
+    return found if watched.track is None else found + watched.track.findings
 
 
 def _findings(setup: Setup, watch: WatchMemory | None) -> tuple[Finding, ...]:
@@ -230,7 +247,7 @@ def _closed(
         flow_l_min=0.0,
         flow_trim=None if trim is None else trim.sets[trim.set_index].trim,
         flow_trim_state=None if trim is None else trim.state,
-        findings=_findings(setup, watched.watch),
+        findings=_all_findings(setup, watched),
         sprayer=shown(permission.sprayer, is_open=False),
     )
     return decision, Memory(
@@ -307,6 +324,7 @@ def _orders(
     before: Ordering,
     liquid: SprayPlan | None,
     *,
+    nozzle_sets: tuple[NozzleSet, ...],
     in_force: tuple[float, ...],
     ran_s: float,
     now_s: float,
@@ -321,7 +339,7 @@ def _orders(
         own = share if trim is None else share * trim.sets[number].trim
         return dosing_of(setup, number, skew / own, state.rate_percent)
 
-    dosing = dosing_by_valve(setup.nozzle_sets, index, set_of_rate, dose)
+    dosing = dosing_by_valve(nozzle_sets, index, set_of_rate, dose)
     soon_m_s = speed_soon(setup, state, speed_m_s)
     overdrive = overdrive_of(setup, index)
     sticky_s = sticky_border_s(setup.border_buffer_m, speed_m_s)
@@ -492,7 +510,8 @@ def _decision(
     for of_valve in orders.valves:
         late += of_valve.late
         unresolved += of_valve.unresolved_count
-    flow_l_min = _flow(setup, plan, index)
+    sets = setup.doses.nozzle_sets if watched.track is None else _nozzles(setup, watched)
+    flow_l_min = _flow(setup, plan, sets[index])
     if setup.trimming is not None and trim is not None:
         trim = flow_trim.ordered(
             setup.trimming, trim, flow_l_min=flow_l_min, index=index, now_s=now_s
@@ -509,16 +528,15 @@ def _decision(
         unresolved_count=unresolved,
         flow_trim=None if trim is None else trim.sets[index].trim,
         flow_trim_state=None if trim is None else trim.state,
-        findings=_findings(setup, watched.watch),
+        findings=_all_findings(setup, watched),
         sprayer=shown(permission.sprayer, is_open=plan.opens),
         out_of_range_count=sum([flow in too_much for flow in flows]) if too_much else 0,
     )
     return decision, ordering._replace(trim=trim)
 
 
-def _flow(setup: Setup, plan: SprayPlan, index: int) -> float:
+def _flow(setup: Setup, plan: SprayPlan, nozzles: NozzleSet) -> float:
     """Return the flow [L/min] that the table says of the duties in force from now on."""
-    nozzles = setup.doses.nozzle_sets[index]
     now = _in_force(setup, liquid_of(setup.pumping, plan), plan.issued_s)
     flows = {duty: nozzles.curve.flow_for(duty) for duty in set(now)}
     shares = nozzles.shares or (1.0,) * len(nozzles.valves)

@@ -19,6 +19,7 @@ from companion.core.options.liquid_evidence import Detection, Watching
 from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump, Pumping
 from companion.core.options.treated_area import Lags, TreatedAreaSettings
+from companion.core.options.valve_tracking import Tracking, ValveTracking
 from companion.core.prescription import Prescription
 from companion.core.safety import Limits
 from companion.core.schedule import LagModel, Timing
@@ -55,6 +56,7 @@ class Setup:
     overlap: OverlapGuard | None = None  # None: treated ground is sprayed again
     # What earlier flights treated; not compared by hash: tiles are a mapping.
     treated: Coverage | None = field(default=None, repr=False, hash=False)
+    valve_tracking: ValveTracking | None = None  # None: valves stay as configured
     timing: Timing = field(init=False, repr=False, compare=False)
     timings: tuple[Timing, ...] = field(init=False, repr=False, compare=False)  # of each valve
     # The longest lead of any order: of valves, pump and atomisers.
@@ -66,6 +68,7 @@ class Setup:
     pumping: Pumping | None = field(init=False, repr=False, compare=False)
     trimming: Trimming | None = field(init=False, repr=False, compare=False)
     watching: Watching | None = field(init=False, repr=False, compare=False)
+    tracking: Tracking | None = field(init=False, repr=False, compare=False)
     recording: TreatedAreaSettings | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -102,6 +105,7 @@ class Setup:
 
             watching = Watching.of(self.detection, doses.nozzle_sets, doses.lag, doses.pwm)
         object.__setattr__(self, "watching", watching)
+        object.__setattr__(self, "tracking", self._tracking())
         object.__setattr__(self, "recording", self._recording() if self.records_coverage else None)
 
     def _timing(self, lag: LagModel) -> Timing:
@@ -116,6 +120,13 @@ class Setup:
             is_pumped=self.pumping is not None,
             treated=self.treated,
         )
+
+    def _tracking(self) -> Tracking | None:
+        if self.valve_tracking is None:
+            return None
+        if self.pumping is not None:
+            raise ValueError("where a pump makes the flow no valve is dosed by itself")
+        return Tracking.of(self.valve_tracking, self.boom, self.nozzle_sets, self.lag, self.pwm)
 
     def _pumping(self) -> Pumping | None:
         if self.pump is None:

@@ -32,16 +32,21 @@ APART_SHARE = 0.2
 FACTOR_SPREAD = 0.05
 GAIN_SPREAD, PRESSURE_SPREAD, BEND_SPREAD, LAG_SPREAD_S = 0.10, 0.30, 0.10, 0.03
 # Of a window: meter and its pulses, and each valve's own lag where it opens or closes.
-NOISE_SHARE, NOISE_ML, EDGE_S = 0.01, 0.3, 0.02
+NOISE_SHARE, NOISE_ML, EDGE_S = 0.008, 0.1, 0.006
 # A window further off than this is a fault or a burst of pulses; it counts no more than one here.
 OUTLIER_SPREADS = 3.0
 # A valve is named where it is surely this far from the others: half of what the trade's rule
 # replaces a nozzle at (ISO 16122-2), and in so many standard deviations, as it is asked all the
 # time.
-NAMED_SHARE, NAMED_SPREADS = 0.05, 4.0
-# How fast the residuals' scale follows: so many windows.
-SCALE_WINDOWS = 200.0
-_COMMON = (GAIN_SPREAD, PRESSURE_SPREAD, BEND_SPREAD, *(LAG_SPREAD_S,) * 4)
+NAMED_SHARE, NAMED_SPREADS = 0.05, 3.0
+# Of a deviation, so many standard deviations are taken for noise: the dose follows the rest.
+SURE_SPREADS = 2.0
+# What is off for so many windows on end, about the time in a small zone, is our model and no noise:
+# their variance is scaled by it. Never by less than this, by which factors of scattered valves on
+# the twin err as their spreads say; it follows over so many such blocks.
+BLOCK_WINDOWS = 8
+SCALE_LEAST, SCALE_BLOCKS = 3.0, 25.0
+_COMMON = (GAIN_SPREAD, PRESSURE_SPREAD, PRESSURE_SPREAD, BEND_SPREAD, *(LAG_SPREAD_S,) * 4)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,7 +54,7 @@ class ValveTracking:
     """How far a factor may go from 1, how slowly, and when the meter can be believed."""
 
     limit: float = 0.10
-    tau_s: float = 600.0
+    tau_s: float = 3600.0
     meter_delay_s: float = 0.001
     meter_minimum_l_min: float = 0.5
 
@@ -123,11 +128,15 @@ class Valves(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Deviations of the valves, then what is common; their covariance; scale of the residuals."""
+    """Deviations of the valves, then what is common; their covariance; scale of the variance.
+
+    `block` is what the windows since the last whole block were off by, in standard deviations.
+    """
 
     values: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
-    scale: float = 1.0
+    scale: float = SCALE_LEAST
+    block: tuple[float, ...] = ()
 
 
 class TrackMemory(NamedTuple):
@@ -140,10 +149,6 @@ class TrackMemory(NamedTuple):
     begun_s: float | None = None
     begun_ml: float = 0.0
     findings: tuple[Finding, ...] = ()
-
-    def factors(self, tracking: Tracking) -> tuple[float, ...]:
-        """Return each valve's factor on its configured share, in the order of the set."""
-        return _factors(tracking, self.estimate.values)
 
 
 class Window(NamedTuple):
@@ -211,8 +216,9 @@ def _counted(
         begun_s, begun_ml, valves = end_s, end_ml, _folded(valves, end_s)
     nozzles, findings = memory.nozzles, memory.findings
     if estimate is not memory.estimate:
-        nozzles = _tracked(tracking, estimate.values)
-        findings = _named(tracking, estimate, findings, at_s=report.received_s)
+        found = deviations(tracking, estimate)
+        nozzles = _tracked(tracking, found)
+        findings = _named(tracking, found, findings, at_s=report.received_s)
     return TrackMemory(valves, estimate, nozzles, report, begun_s, begun_ml, findings)
 
 
@@ -320,8 +326,9 @@ def window_of(
     curve = nozzles.curve
     middle_ml = 0.5 * (curve.flow_l_min[0] + curve.flow_l_min[-1]) * ML_S_PER_L_MIN * length_s
     bend = min(max(total_ml / opened / middle_ml - 1.0, -1.0), 1.0)
-    common_ml = (total_ml, total_ml * (1.0 - opened), total_ml * bend, *lags_ml)
-    variance += (NOISE_ML + NOISE_SHARE * total_ml) ** 2
+    shut = 1.0 - opened
+    common_ml = (total_ml, total_ml * shut, total_ml * shut * shut, total_ml * bend, *lags_ml)
+    variance += NOISE_ML**2 + (NOISE_SHARE * total_ml) ** 2
     return Window(apart_ml + common_ml, metered_ml - total_ml, variance)
 
 
@@ -336,14 +343,17 @@ def updated(tracking: Tracking, before: Estimate, window: Window) -> Estimate:
     row = window.row
     used = [index for index in range(size) if row[index]]
     seen = [math.fsum([line[index] * row[index] for index in used]) for line in covariance]
-    variance = window.variance + math.fsum([row[index] * seen[index] for index in used])
+    told = math.fsum([row[index] * seen[index] for index in used])
+    variance = window.variance * max(before.scale, SCALE_LEAST) + told
     wrong = window.beyond_ml - math.fsum([row[index] * values[index] for index in used])
-    off = wrong * wrong / variance
-    if off > OUTLIER_SPREADS**2:
-        wrong *= OUTLIER_SPREADS / math.sqrt(off)
-        off = OUTLIER_SPREADS**2
+    off = wrong / math.sqrt(variance)
+    if abs(off) > OUTLIER_SPREADS:
+        wrong, off = wrong * OUTLIER_SPREADS / abs(off), math.copysign(OUTLIER_SPREADS, off)
     gain = [each / variance for each in seen]
-    scale = before.scale + (max(off, 0.0) - before.scale) / SCALE_WINDOWS
+    scale, block = before.scale, (*before.block, wrong / math.sqrt(window.variance + told))
+    if len(block) == BLOCK_WINDOWS:
+        scale += (math.fsum(block) ** 2 / BLOCK_WINDOWS - scale) / SCALE_BLOCKS
+        block = ()
     return Estimate(
         tuple(value + each * wrong for value, each in zip(values, gain, strict=True)),
         tuple(
@@ -351,50 +361,69 @@ def updated(tracking: Tracking, before: Estimate, window: Window) -> Estimate:
             for line, factor in zip(covariance, gain, strict=True)
         ),
         scale,
+        block,
     )
 
 
 # ------------------------------------------------------------------------------ what follows of it
 
 
-def _deviations(tracking: Tracking, values: tuple[float, ...]) -> list[float]:
-    """Return how far each valve is from the others: their flow at one duty stays what it was."""
-    count = len(tracking.nozzles.valves)
-    shares = tracking.nozzles.shares or (1.0,) * count
-    own = values[:count]
-    mean = math.fsum([share * value for share, value in zip(shares, own, strict=True)]) / count
-    return [value - mean for value in own]
+def deviations(tracking: Tracking, estimate: Estimate) -> list[tuple[float, float]]:
+    """Return how far each valve is from the mean of all, and one standard deviation of that.
+
+    What all have in common no meter can tell from its own gain, so it counts for neither.
+    """
+    nozzles = tracking.nozzles
+    count = len(nozzles.valves)
+    weights = [share / count for share in nozzles.shares or (1.0,) * count]
+    values = estimate.values[:count]
+    mean = math.fsum([weight * value for weight, value in zip(weights, values, strict=True)])
+    rows = [line[:count] for line in estimate.covariance[:count]]
+    with_mean = [
+        math.fsum([weight * each for weight, each in zip(weights, row, strict=True)])
+        for row in rows
+    ]
+    of_mean = math.fsum([weight * each for weight, each in zip(weights, with_mean, strict=True)])
+    return [
+        (value - mean, math.sqrt(max(rows[own][own] - 2.0 * with_mean[own] + of_mean, 0.0)))
+        for own, value in enumerate(values)
+    ]
 
 
-def _factors(tracking: Tracking, values: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the factors, of mean 1; all are drawn in where one is beyond the limit."""
-    deviations = _deviations(tracking, values)
-    largest, limit = max(map(abs, deviations)), tracking.settings.limit
+def _tracked(tracking: Tracking, found: list[tuple[float, float]]) -> NozzleSet:
+    """Return the nozzle set with the shares in force: of a deviation only what is sure counts.
+
+    All are drawn in where one is beyond the limit, so that their mean stays 1.
+    """
+    nozzles = tracking.nozzles
+    count = len(found)
+    shares = nozzles.shares or (1.0,) * count
+    sure = [math.copysign(max(abs(off) - SURE_SPREADS * sd, 0.0), off) for off, sd in found]
+    if not any(sure):
+        return nozzles
+    mean = math.fsum([share * off for share, off in zip(shares, sure, strict=True)]) / count
+    sure = [off - mean for off in sure]
+    largest, limit = max(map(abs, sure)), tracking.settings.limit
     drawn = limit / largest if largest > limit else 1.0
-    return tuple(1.0 + drawn * deviation for deviation in deviations)
-
-
-def _tracked(tracking: Tracking, values: tuple[float, ...]) -> NozzleSet:
-    """Return the nozzle set with its shares as they are now."""
-    nozzles, factors = tracking.nozzles, _factors(tracking, values)
-    shares = nozzles.shares or (1.0,) * len(factors)
-    own = tuple(share * factor for share, factor in zip(shares, factors, strict=True))
+    own = tuple(share * (1.0 + drawn * off) for share, off in zip(shares, sure, strict=True))
     return NozzleSet(valves=nozzles.valves, curve=nozzles.curve, shares=own)
 
 
 def _named(
-    tracking: Tracking, estimate: Estimate, told: tuple[Finding, ...], *, at_s: float
+    tracking: Tracking,
+    found: list[tuple[float, float]],
+    told: tuple[Finding, ...],
+    *,
+    at_s: float,
 ) -> tuple[Finding, ...]:
     """Return the findings with the valves that are surely off; each is named once a flight."""
-    deviations = _deviations(tracking, estimate.values)
     known = {finding.valve for finding in told}
-    scale = max(estimate.scale, 1.0)
-    for place, (valve, off) in enumerate(zip(tracking.nozzles.valves, deviations, strict=True)):
-        spread = math.sqrt(scale * max(estimate.covariance[place][place], 0.0))
-        if valve in known or not abs(off) - NAMED_SPREADS * spread > NAMED_SHARE:
+    of_others = len(found) / (len(found) - 1.0)
+    for valve, (off, sd) in zip(tracking.nozzles.valves, found, strict=True):
+        if valve in known or not of_others * (abs(off) - NAMED_SPREADS * sd) > NAMED_SHARE:
             continue
         more = "more" if off > 0.0 else "less"
-        text = f"gives {abs(off):.0%} {more} than the others, see its nozzle"
+        text = f"gives {of_others * abs(off):.0%} {more} than the others, see its nozzle"
         finding = Finding(kind=FaultKind.VALVE_DRIFT, at_s=at_s, text=text, valve=valve)
         told = (*told, finding)
     return told
