@@ -539,10 +539,6 @@ def sensor_contradictions(config: Document) -> Found:
             "detection.enabled",
             'needs a flow meter to detect faults; set flow_meter.source = "gpio", or write false',
         )
-    yield from _valve_tracking(config)
-
-
-def _valve_tracking(config: Document) -> Found:
     sets, why = config.nozzle_set, ""
     if config.flow_meter.source != "gpio":
         why = 'needs a meter that this computer reads; set flow_meter.source = "gpio"'
