@@ -81,6 +81,12 @@ class Document(tables.Table):
         return self.pump is not None and self.pump.control == "modulates"
 
     @property
+    def can_track_valves(self) -> bool:
+        """Whether a meter that is read here can tell valves apart that are dosed one by one."""
+        sets, is_read = self.nozzle_set, self.flow_meter.source == "gpio"
+        return is_read and not self.makes_flow and len(sets) == 1 and len(sets[0].valves) > 1
+
+    @property
     def planned_lines(self) -> str | None:
         """Return the file of the lines that alone are sprayed, as it is named."""
         return None if self.mission is None else self.mission.lines

@@ -539,13 +539,9 @@ def sensor_contradictions(config: Document) -> Found:
             "detection.enabled",
             'needs a flow meter to detect faults; set flow_meter.source = "gpio", or write false',
         )
-    sets, why = config.nozzle_set, ""
-    if config.flow_meter.source != "gpio":
-        why = 'needs a meter that this computer reads; set flow_meter.source = "gpio"'
-    elif config.makes_flow or len(sets) > 1 or len(sets[0].valves) < 2:
-        why = "needs one nozzle set of valves that are dosed one by one"
-    if config.valve_tracking.enabled and why:
-        yield "valve_tracking.enabled", f"{why}, or write false"
+    if config.valve_tracking.enabled and not config.can_track_valves:
+        why = 'needs flow_meter.source = "gpio" and one nozzle set of valves dosed one by one'
+        yield "valve_tracking.enabled", f"{why}; or write false"
 
 
 def _meter(config: Document) -> Found:
