@@ -137,7 +137,7 @@ def test_neither_noise_nor_the_meters_gain_moves_a_factor(gain: float) -> None:
     for seed in range(4):
         sprayer = Sprayer(list(HEALTHY), gain=gain, seed=seed).run(120.0)
         assert sprayer.named() == []
-        assert sprayer.shares() == pytest.approx(HEALTHY, abs=0.006)
+        assert sprayer.shares() == pytest.approx(HEALTHY, abs=0.001)
 
 
 def test_a_factor_stops_at_its_limit_and_the_mean_stays_1() -> None:
