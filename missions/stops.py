@@ -101,7 +101,8 @@ def _without_runs(stops: list[Stop]) -> list[Stop]:
         )
         if after is not None and goes_on:
             ends = (kept[-1].place, here.place, after.place)
-            if is_run(*ends) or (here.on_line and is_passed(*ends, passed)):
+            # One place of a short gap stays: a leg far beyond a line is taken for a ferry.
+            if (not passed and is_run(*ends)) or (here.on_line and is_passed(*ends, passed)):
                 passed.append(here.place)
                 continue
         kept.append(here)

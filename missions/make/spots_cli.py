@@ -56,8 +56,8 @@ POSITION_M = {"rtk-fixed": 0.02, "rtk-float": 0.3, "dgps": 0.6, "3d": 1.5}
 LAG_SHARE, SERVO_S = 0.05, 0.020 / math.sqrt(12.0)
 # What corrected wind leaves: how far wind is known, 1 sd.
 WIND_SD_M_S = 0.5
-# The settling way is in each opening; a stretch is flown from so much before it.
-LEAD_M = 2.0
+# A stretch begins so much before the way that the aircraft takes to its speed.
+LEAD_M = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,8 +227,11 @@ def spots(
         "expected_misses_percent": 100.0 * float(chances.mean()),
         "route": best,
         "flight_s": {name: plan.flight_s for name, plan in plans.items()},
+        "warnings": list(plans[best].warnings),
         "problems": [problem_object(problem) for problem in problems],
     }  # fmt: skip
+    for warning in result["warnings"]:
+        note(f"warning: {warning}")
     for problem in result["problems"]:
         note(problem_line(problem))
     answer(result, _lines(result), as_json=as_json)
@@ -359,7 +362,9 @@ def _plans(
     rates = _OnSpots(MultiPolygon([one for one in shapely.get_parts(local)
                                    if one.geom_type == "Polygon"]), rate)  # fmt: skip
     whole = passes_of(field.lines, passes.angle_deg, task.field.limit, field.swath_m)
-    rows = pieces(opened, passes.edges_m, whole.edges_m, LEAD_M)
+    # At the planned speed over the first spot, and over the last one still.
+    lead_m = task.settings.speed_m_s**2 / (2.0 * task.settings.acceleration_m_s2)
+    rows = pieces(opened, passes.edges_m, whole.edges_m, lead_m + LEAD_M)
     spans: dict[float, tuple[float, float]] = {}
     for start, end, right in rows:
         low, high = spans.get(right, (start, end))
