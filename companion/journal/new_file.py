@@ -15,7 +15,7 @@ from pathlib import Path
 
 from companion.core.setup import Setup
 from companion.journal.coverage_table import write_treated
-from companion.journal.geopackage import JOURNAL_VERSION, SCHEMA
+from companion.journal.geopackage import JOURNAL_VERSION, RESERVE, SCHEMA
 from companion.journal.layers import write_layers
 from companion.journal.setup_json import calibration_sha256, setup_to_json
 
@@ -55,6 +55,12 @@ def computing() -> dict[str, str]:
     return here
 
 
+# The first time that a table outgrows its page, SQLite moves all its rows to a new page at the end
+# of the file, the part that a cut takes first. So `meta`, with the set-up in it, has outgrown its
+# page (4,096 bytes) from the start: by a row that fills nearly all of one and says nothing.
+RESERVE_BYTES = 3_900
+
+
 def new_file(folder: Path, setup: Setup, meta: Mapping[str, str]) -> Path:
     """Make a complete, empty journal beside its place and move it there under the next number.
 
@@ -91,7 +97,8 @@ def _write_schema(path: Path, setup: Setup, meta: Mapping[str, str]) -> None:
         connection.executescript(SCHEMA)
         write_layers(connection, setup.frame, setup.prescription)
         write_treated(connection, setup.treated)
-        connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", meta.items())
+        rows = [*meta.items(), (RESERVE, " " * RESERVE_BYTES)]
+        connection.executemany("INSERT INTO meta (key, value) VALUES (?, ?)", rows)
     with path.open("rb") as file:
         os.fsync(file.fileno())
 

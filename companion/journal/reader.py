@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from companion.core.setup import Setup
 from companion.errors import NoMapError, UnreadableError
 from companion.journal.coverage_table import read_treated
 from companion.journal.distrust import allow_damaged_list, check_programs
-from companion.journal.geopackage import APPLICATION_ID
+from companion.journal.geopackage import APPLICATION_ID, RESERVE
 from companion.journal.layers import read_ground
 from companion.journal.read_only import (
     DAMAGE,
@@ -145,13 +145,17 @@ def _meta(
         return {}
     try:
         rows = connection.execute("SELECT key, value FROM meta").fetchall()
-        return {str(key): str(value) for key, value in rows if value is not None}
+        return _told(rows)
     except sqlite3.DatabaseError as error:
         if unread is None or "locked" in str(error):
             raise
         unread.append(f"meta: {one_line(error)}")
     kept = readable_rows(connection, "meta", [True])
-    return {str(row[-2]): str(row[-1]) for row in kept if row[-1] is not None}
+    return _told([row[-2:] for row in kept])
+
+
+def _told(rows: Iterable[tuple[Any, Any]]) -> dict[str, str]:
+    return {str(key): str(value) for key, value in rows if value is not None and key != RESERVE}
 
 
 # What of a damaged journal can be read.
