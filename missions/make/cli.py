@@ -18,12 +18,24 @@ from companion.flight_map import is_flight_map
 from companion.problem import Problem
 from companion.wording import counted, install_command
 from missions.errors import PlanError
+from missions.make.arguments import (
+    MARGIN,
+    Boundary,
+    ConfigFile,
+    CourseDeg,
+    FormatName,
+    Margin,
+    NoSpray,
+    OutFile,
+    Picture,
+)
 from missions.make.classes import Method
 from missions.make.cleaning import STEPS, Step
 from missions.make.data import INDICES, Values, Wanted, filled, read_values
 from missions.make.flown import (
     FlownField,
     bounded,
+    draw_picture,
     flown_field,
     limits_of,
     map_target,
@@ -46,8 +58,6 @@ app = typer.Typer(
     epilog="Example: vrspray make zones ndvi.tif --value NDVI --out field.gpkg",
 )  # fmt: skip
 
-# A zone is this much longer than a change takes: for wind, and for the aircraft's own speed.
-MARGIN = 1.5
 BAR_AFTER_S = 2.0
 # Places are finer than the data and than a run, and never so many that they take the memory.
 PLACE_MAX_M, PLACES_MAX = 1.0, 12_000_000
@@ -68,12 +78,8 @@ def zones(
     data: Annotated[
         list[Path], typer.Argument(metavar="DATA...", help="Raster, points or polygons.")
     ],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="The map; its suffix says the format.")
-    ],
-    config_file: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="Configuration of the flight.")
-    ],
+    out: OutFile,
+    config_file: ConfigFile,
     rates: Annotated[
         str | None,
         typer.Option(metavar="R,R,...", help="L/ha of each zone, lowest values first."),
@@ -109,27 +115,16 @@ def zones(
     band_offset: Annotated[
         float, typer.Option(metavar="D", help="Added to bands; Sentinel-2 since 2022: -1000.")
     ] = 0.0,
-    boundary: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Field outline; default: prescription.boundary."),
-    ] = None,
-    no_spray: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
-    ] = None,
-    angle_deg: Annotated[
-        float | None,
-        typer.Option(metavar="DEG", help="Course of the passes; default: as vrspray plan."),
-    ] = None,
+    boundary: Boundary = None,
+    no_spray: NoSpray = None,
+    angle_deg: CourseDeg = None,
     smooth_m: Annotated[
         float,
         typer.Option(
             metavar="M", help="Most common zone within so many metres.", min=0.0, max=500.0
         ),
     ] = 0.0,
-    margin: Annotated[
-        float,
-        typer.Option(metavar="X", help="Times the length that a change takes.", min=1.0, max=20.0),
-    ] = MARGIN,
+    margin: Margin = MARGIN,
     across: Annotated[
         Literal["swath", "valve"],
         typer.Option(help="Zones at least as wide as a swath, or as one valve's strip."),
@@ -158,13 +153,8 @@ def zones(
     layer: Annotated[
         str | None, typer.Option(metavar="L", help="Of DATA, where there are several.")
     ] = None,
-    png: Annotated[
-        Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
-    ] = None,
-    format_name: Annotated[
-        str | None,
-        typer.Option("--format", metavar="F", help="Where the suffix can hold several."),
-    ] = None,
+    png: Picture = None,
+    format_name: FormatName = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -213,9 +203,7 @@ def zones(
         problems = problems_of(map_file, config, field)
         files = written(map_file, out, target, config, field, problems, writer.name, force=force)
     if png is not None:
-        from missions.maps.picture.draw import draw
-
-        draw(map_file, png, title=out.name)
+        draw_picture(map_file, png, title=out.name)
     result = _result(made, read, field, limits, missing, problems, files)
     for problem in result["problems"]:
         note(problem_line(problem))

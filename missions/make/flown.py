@@ -193,6 +193,22 @@ def written(
     return [out, *files]
 
 
+def draw_picture(map_file: MapFile, path: Path, *, title: str) -> None:
+    """Draw the map that was made."""
+    from missions.maps.picture.draw import draw  # matplotlib, which not everybody has
+
+    draw(map_file, path, title=title)
+
+
+def check_rate(rate_l_ha: float, limits: Limits, *, said: str) -> None:
+    """Refuse a rate that the sprayer would not put down; `said` is how the user gave it."""
+    if not limits.low_l_ha <= rate_l_ha <= limits.high_l_ha:
+        raise PlanError(
+            f"{said}: nozzles and label allow {limits.low_l_ha:.2f} to "
+            f"{limits.high_l_ha:.2f} L/ha at the planned speed; change the rate or the speed"
+        )
+
+
 def numbers(text: str, option: str) -> list[float]:
     """Return the numbers of an option, with commas between."""
     try:

@@ -20,10 +20,21 @@ from companion.core.frame import LocalFrame
 from companion.wording import counted
 from missions.errors import PlanError
 from missions.files.write import check_suffix, write_fleet
+from missions.make.arguments import (
+    Boundary,
+    ConfigFile,
+    CourseDeg,
+    FormatName,
+    NoSpray,
+    OutFile,
+    Picture,
+)
 from missions.make.data import in_degrees
 from missions.make.flown import (
     FlownField,
     bounded,
+    check_rate,
+    draw_picture,
     flown_field,
     limits_of,
     map_target,
@@ -85,12 +96,8 @@ class _OnSpots:
 
 def spots(
     weeds: Annotated[Path, typer.Argument(metavar="WEEDS", help="Points or small polygons.")],
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="The map; its suffix says the format.")
-    ],
-    config_file: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="Configuration of the flight.")
-    ],
+    out: OutFile,
+    config_file: ConfigFile,
     rate: Annotated[float, typer.Option(metavar="R", help="L/ha on the spots.", min=0.001)],
     weeds_m: Annotated[
         float,
@@ -114,30 +121,17 @@ def spots(
         Path | None,
         typer.Option(metavar="FILE", help="Also the quickest mission: .plan, .waypoints, ..."),
     ] = None,
-    boundary: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Field outline; default: prescription.boundary."),
-    ] = None,
-    no_spray: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
-    ] = None,
-    angle_deg: Annotated[
-        float | None,
-        typer.Option(metavar="DEG", help="Course of the passes; default: as vrspray plan."),
-    ] = None,
+    boundary: Boundary = None,
+    no_spray: NoSpray = None,
+    angle_deg: CourseDeg = None,
     crs: Annotated[
         str | None, typer.Option(metavar="C", help="Of WEEDS, where it does not say.")
     ] = None,
     layer: Annotated[
         str | None, typer.Option(metavar="L", help="Of WEEDS, where there are several.")
     ] = None,
-    png: Annotated[
-        Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
-    ] = None,
-    format_name: Annotated[
-        str | None,
-        typer.Option("--format", metavar="F", help="Where the suffix can hold several."),
-    ] = None,
+    png: Picture = None,
+    format_name: FormatName = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files of these names.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -162,11 +156,7 @@ def spots(
         tell("planning the passes", 0, 4)
         field = flown_field(config, no_spray or [], angle_deg, "valve")
         limits = limits_of(config, field.sprayer, 1.0)
-        if not limits.low_l_ha <= rate <= limits.high_l_ha:
-            raise PlanError(
-                f"--rate {rate:g}: nozzles and label allow {limits.low_l_ha:.2f} to "
-                f"{limits.high_l_ha:.2f} L/ha at the planned speed; change it or the speed"
-            )
+        check_rate(rate, limits, said=f"--rate {rate:g}")
         tell("reading the weeds", 1, 4)
         found, beyond = _inside(read_weeds(weeds, field.frame, radius_m, crs, layer), field, weeds)
         budget = Budget(
@@ -194,9 +184,7 @@ def spots(
             more, marks = write_fleet(plans[best], mission)
             files = [*files, *more, *marks]
     if png is not None:
-        from missions.maps.picture.draw import draw
-
-        draw(map_file, png, title=out.name)
+        draw_picture(map_file, png, title=out.name)
     ground_m2 = field.turned().area
     result: dict[str, Any] = {
         "ok": not any(problem.severity == "error" for problem in problems),

@@ -14,9 +14,22 @@ from companion.atomic_write import write_atomically
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
 from companion.config import load
 from missions.errors import PlanError
+from missions.make.arguments import (
+    MARGIN,
+    Boundary,
+    ConfigFile,
+    CourseDeg,
+    FormatName,
+    Margin,
+    NoSpray,
+    OutFile,
+    Picture,
+)
 from missions.make.flown import (
     FlownField,
     bounded,
+    check_rate,
+    draw_picture,
     flown_field,
     limits_of,
     map_target,
@@ -25,7 +38,6 @@ from missions.make.flown import (
     written,
 )
 from missions.make.trial import Design, Plot, lay_out
-from missions.make.zones import Limits
 from missions.maps.convert.formats import writer_for
 from missions.maps.layer import digest, read_bytes
 from missions.maps.model import MapFile, MapZone
@@ -36,12 +48,8 @@ BLOCKS_MAX, TREATMENTS_MAX = 50, 20
 
 
 def trial(
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="The map; its suffix says the format.")
-    ],
-    config_file: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="Configuration of the flight.")
-    ],
+    out: OutFile,
+    config_file: ConfigFile,
     rates: Annotated[str, typer.Option(metavar="R,R,...", help="L/ha of the treatments.")],
     rest: Annotated[
         float, typer.Option(metavar="R", help="L/ha on the ground around the plots.", min=0.0)
@@ -69,31 +77,15 @@ def trial(
         float | None,
         typer.Option(metavar="M", help="Kept off the border; default: one swath.", min=0.0),
     ] = None,
-    margin: Annotated[
-        float,
-        typer.Option(metavar="X", help="Times the length that a change takes.", min=1.0, max=20.0),
-    ] = 1.5,
+    margin: Margin = MARGIN,
     seed: Annotated[
         int, typer.Option(metavar="N", help="Of the random order; it is recorded.", min=0)
     ] = 1,
-    boundary: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Field outline; default: prescription.boundary."),
-    ] = None,
-    no_spray: Annotated[
-        list[Path] | None, typer.Option(metavar="FILE", help="Ground not to spray; repeatable.")
-    ] = None,
-    angle_deg: Annotated[
-        float | None,
-        typer.Option(metavar="DEG", help="Course of the passes; default: as vrspray plan."),
-    ] = None,
-    png: Annotated[
-        Path | None, typer.Option("--png", metavar="FILE", help="Picture: .png, .svg or .pdf.")
-    ] = None,
-    format_name: Annotated[
-        str | None,
-        typer.Option("--format", metavar="F", help="Where the suffix can hold several."),
-    ] = None,
+    boundary: Boundary = None,
+    no_spray: NoSpray = None,
+    angle_deg: CourseDeg = None,
+    png: Picture = None,
+    format_name: FormatName = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -115,8 +107,8 @@ def trial(
     treatments = _treatments(rates, check)
     field = flown_field(config, no_spray or [], angle_deg, "swath")
     limits = limits_of(config, field.sprayer, margin)
-    for rate in (*treatments, rest):
-        _check_rate(rate, limits)
+    for rate in filter(None, (*treatments, rest)):
+        check_rate(rate, limits, said=f"{rate:g} L/ha")
     if not strips and plot_m < 3.0 * limits.least_m:
         raise PlanError(
             f"--plot-m {plot_m:g}: rates take {limits.least_m:.2f} m to settle at each end of a "
@@ -144,9 +136,7 @@ def trial(
     except OSError as error:
         raise not_written(record, error) from None
     if png is not None:
-        from missions.maps.picture.draw import draw
-
-        draw(map_file, png, title=out.name)
+        draw_picture(map_file, png, title=out.name)
     ok = not any(problem.severity == "error" for problem in problems)
     result = {
         "ok": ok,
@@ -171,15 +161,6 @@ def _treatments(rates: str, check: float | None) -> tuple[float, ...]:
     if len(given) > TREATMENTS_MAX:
         raise typer.BadParameter(f"a trial has at most {TREATMENTS_MAX} treatments")
     return tuple(given)
-
-
-def _check_rate(rate: float, limits: Limits) -> None:
-    """Refuse what the sprayer would not put down: a trial is of the rates that it names."""
-    if rate != 0.0 and not limits.low_l_ha <= rate <= limits.high_l_ha:
-        raise PlanError(
-            f"{rate:g} L/ha: nozzles and label allow {limits.low_l_ha:.2f} to "
-            f"{limits.high_l_ha:.2f} L/ha at the planned speed; change the rate or the speed"
-        )
 
 
 def _map_file(

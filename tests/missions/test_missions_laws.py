@@ -70,6 +70,16 @@ def test_passes_and_inner_lines_cover_and_stay_inside(seed: int, angle_deg: floa
     assert inner.difference(covered).area <= 2e-4 * ground.area + 0.2
 
 
+@pytest.mark.parametrize("angle_deg", [0.0, 37.0])
+def test_a_clipping_that_loses_ground_is_not_believed(
+    angle_deg: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inner = inner_ground(ground_of(3), WIDTH_M)
+    by_clipping = inner_lines(inner, WIDTH_M, angle_deg)
+    monkeypatch.setattr(shapely, "clip_by_rect", lambda *_: shapely.Polygon())
+    assert np.allclose(inner_lines(inner, WIDTH_M, angle_deg), by_clipping, atol=1e-6)
+
+
 @given(seed=seeds, angle_deg=angles)
 @settings(max_examples=15)
 def test_lines_from_border_to_border_cover_and_stay_inside(seed: int, angle_deg: float) -> None:

@@ -89,6 +89,16 @@ def test_ends_of_two_lines_that_are_near_are_flown_as_waypoints_apart(following:
         assert max(way.distance(shapely.Point(place)) for place in line.points) < 0.3
 
 
+@pytest.mark.parametrize("gap_m", [3.0, 12.0, 20.0])
+def test_a_short_gap_between_short_lines_on_one_course_keeps_one_waypoint(gap_m: float) -> None:
+    # Without one the leg over both goes so far beyond the first line that it counts as a ferry.
+    first = ((0.0, 10.0), (15.0, 10.0))
+    second = ((15.0 + gap_m, 10.0), (30.0 + gap_m, 10.0))
+    stops = [stop.place for stop in waypoints_of(sortie_of(first, second))]
+    kept = [place for place in stops if place in (first[1], second[0])]
+    assert len(kept) == 1
+
+
 def test_a_line_shorter_than_a_leg_may_be_is_flown_longer() -> None:
     lines = (((0.0, 10.0), (40.0, 10.0)), ((60.0, 30.0), (60.0, 31.2)), ((0.0, 50.0), (40.0, 50.0)))
     sortie = sortie_of(*lines)

@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+from companion.core.arithmetic import exp
 from companion.core.nozzle import NozzleSet, PwmLimits
 from companion.core.options.flow_meter import ML_S_PER_L_MIN, is_usable
 from companion.core.schedule import LagModel
@@ -334,7 +335,7 @@ def window_of(
 
 def updated(tracking: Tracking, before: Estimate, window: Window) -> Estimate:
     """Return the estimate after a window: faded towards the prior, then corrected."""
-    kept = math.exp(-tracking.window_s / tracking.settings.tau_s)
+    kept = exp(-tracking.window_s / tracking.settings.tau_s)
     values = [kept * value for value in before.values]
     faded, size = kept * kept, len(values)
     covariance = [[faded * each for each in row] for row in before.covariance]
