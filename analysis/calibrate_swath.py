@@ -11,6 +11,7 @@ import typer
 
 from analysis.write_back import Write, check_asked, written_lines
 from companion.cli.answer import AsJson, answer, note
+from companion.wording import counted
 
 if TYPE_CHECKING:
     from analysis.swath import Found, Pattern
@@ -166,7 +167,7 @@ def _warnings(
 ) -> list[str]:
     said = []
     if len(found.passes) < PASSES_MIN:
-        said.append(f"{len(found.passes)} pass(es): fly {PASSES_MIN} or more, they differ")
+        said.append(f"{counted(len(found.passes), 'pass')}: fly {PASSES_MIN} or more, they differ")
     cut = [one.name for one in found.passes if one.is_cut_off]
     if cut:
         said.append(

@@ -15,8 +15,11 @@ def counted(count: int, name: str) -> str:
 
     >>> counted(1, "hole"), counted(2, "hole")
     ('1 hole', '2 holes')
+    >>> counted(2, "pass")
+    '2 passes'
     """
-    return f"{count} {name}{'' if count == 1 else 's'}"
+    plural = "es" if name.endswith("s") else "s"
+    return f"{count} {name}{'' if count == 1 else plural}"
 
 
 def install_command(role: Role, prefix: str = sys.prefix) -> str:

@@ -108,7 +108,9 @@ def spots(
     ] = 0.1,
     position_m: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Of the aircraft, 1 sd; default: by safety.fix.", min=0.0),
+        typer.Option(
+            metavar="M", help="Of the aircraft, 1 sd; default: by safety.fix.", min=0.0, max=10.0
+        ),
     ] = None,
     wind_m_s: Annotated[
         float, typer.Option(metavar="V", help="Wind to allow for.", min=0.0, max=20.0)
@@ -211,6 +213,7 @@ def spots(
         "litres": treated.area / 1e4 * rate,
         "saved_litres": (ground_m2 - treated.area) / 1e4 * rate,
         "saved_percent": 100.0 * (1.0 - treated.area / ground_m2),
+        "exposed": int((chances > budget.miss_share + 1e-9).sum()),
         "expected_misses": float(chances.sum()),
         "expected_misses_percent": 100.0 * float(chances.mean()),
         "route": best,
@@ -413,6 +416,11 @@ def _lines(result: dict[str, Any]) -> list[str]:
             for name, seconds in result["flight_s"].items()
         ),
     ]
+    if result["exposed"]:
+        lines.append(
+            f"{counted(result['exposed'], 'weed')} of them so near to ground that is not sprayed "
+            "that errors miss more often"
+        )
     if result["beyond"]:
         lines.append(f"{counted(result['beyond'], 'weed')} outside of the field left out")
     return [*lines, *(f"written: {name}" for name in result["files"])]

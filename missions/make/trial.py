@@ -15,6 +15,7 @@ import shapely
 from shapely import Polygon
 from shapely.geometry.base import BaseGeometry
 
+from companion.wording import counted
 from missions.errors import PlanError
 from missions.maps.local import polygons_of
 from missions.strips import Floats
@@ -76,8 +77,8 @@ def lay_out(ground: BaseGeometry, edges_m: Floats, design: Design) -> list[Plot]
         length = "" if design.plot_m is None else f" {design.plot_m:g} m long and"
         raise PlanError(
             f"{design.blocks} blocks of {len(design.rates_l_ha)} plots,{length} "
-            f"{design.wide} pass(es) wide, do not fit into the field: {len(slots)} would; lower "
-            "--blocks, --plot-m, --passes or --headland-m"
+            f"{counted(design.wide, 'pass')} wide, do not fit into the field: {len(slots)} would; "
+            "lower --blocks, --plot-m, --passes or --headland-m"
         )
     draw = np.random.default_rng(design.seed)
     found: list[Plot] = []

@@ -62,7 +62,8 @@ def trial(
         int, typer.Option(metavar="N", help="Repeats of all treatments.", min=2, max=BLOCKS_MAX)
     ] = 4,
     plot_m: Annotated[
-        float, typer.Option(metavar="M", help="Length of a plot along the passes.", min=1.0)
+        float,
+        typer.Option(metavar="M", help="Length of a plot along the passes.", min=1.0, max=10_000.0),
     ] = 30.0,
     strips: Annotated[
         bool, typer.Option("--strips", help="Plots as long as the field, side by side.")
@@ -71,11 +72,16 @@ def trial(
         int, typer.Option(metavar="N", help="Width of a plot in passes.", min=1, max=20)
     ] = 1,
     guard_m: Annotated[
-        float, typer.Option(metavar="M", help="At both sides of a plot, not harvested.", min=0.0)
+        float,
+        typer.Option(
+            metavar="M", help="At both sides of a plot, not harvested.", min=0.0, max=100.0
+        ),
     ] = 0.5,
     headland_m: Annotated[
         float | None,
-        typer.Option(metavar="M", help="Kept off the border; default: one swath.", min=0.0),
+        typer.Option(
+            metavar="M", help="Kept off the border; default: one swath.", min=0.0, max=1000.0
+        ),
     ] = None,
     margin: Margin = MARGIN,
     seed: Annotated[

@@ -202,6 +202,21 @@ def test_what_cannot_be_sprayed_is_refused(
         made(capsys, data, tmp_path / "spots.gpkg", *arguments)
 
 
+def test_weeds_at_the_border_are_said_to_be_missed_more_often(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field = shapely.from_geojson((data / "boundary.geojson").read_text())
+    ground = next(part for part in shapely.get_parts(field) if part.area)
+    corner, middle = shapely.get_coordinates(ground)[0], shapely.get_coordinates(ground.centroid)[0]
+    edge = corner + 1e-3 * (middle - corner)
+    weeds = tmp_path / "weeds.csv"
+    rows = [f"{at[1]:.8f},{at[0]:.8f}" for at in (middle, edge)]
+    weeds.write_text("\n".join(["lat,lon", *rows]) + "\n")
+    words = [weeds, "--config", data / "config.toml", "--out", tmp_path / "s.gpkg", "--rate", "20"]
+    typer.main.get_command(app).main([str(one) for one in words], standalone_mode=False)
+    assert "1 weed of them so near to ground that is not sprayed" in capsys.readouterr().out
+
+
 def test_weeds_of_another_field_are_refused(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
