@@ -358,3 +358,11 @@ def test_a_long_frame_that_carries_others_is_not_cut_short_by_them() -> None:
         if (cut - 13) % len(position()) != 0:  # cut exactly between two of them: not told apart
             assert codec.decode(carrier[:cut], 2.0) == [], cut
             assert codec.decode(carrier[cut:], 2.0) == [], cut
+
+
+@pytest.mark.parametrize(("status", "active"), [(3, False), (4, True), (5, False), (6, False)])
+def test_only_a_vehicle_in_its_active_state_is_active(status: int, active: bool) -> None:
+    """5 is critical and 6 an emergency: a failsafe is under way."""
+    message = one(frame("heartbeat", QUADROTOR, ARDUPILOT, 129, 3, status))
+    assert isinstance(message, HeartbeatReport)
+    assert message.active is active

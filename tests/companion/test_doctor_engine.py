@@ -5,8 +5,10 @@ from dataclasses import replace
 import pytest
 
 from companion.core.nozzle import PwmLimits
+from companion.doctor import engine_trial
 from companion.doctor.check import Status
 from companion.doctor.engine_trial import engine_checks, read_engine
+from companion.errors import ActuatorError
 from companion.output.engine.selftest import SelfTest
 from companion.output.engine.setup import EngineSetup, Wiring
 
@@ -37,3 +39,23 @@ def test_the_engine_is_started_without_its_lines() -> None:
     found = read_engine(setup)
     assert found.outputs == 2
     assert found.wakes >= 100
+
+
+def test_an_engine_that_did_not_start_is_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[str] = []
+
+    class Lame:
+        self_test = None
+
+        def __init__(self, _setup: EngineSetup) -> None:
+            made.append("made")
+
+        async def start(self) -> None:
+            raise ActuatorError("it did not answer")
+
+        async def stop(self) -> None:
+            made.append("stopped")
+
+    monkeypatch.setattr(engine_trial, "GpioExecutor", Lame)
+    assert read_engine(EngineSetup(wiring=Wiring(valves=(17,)), pwm=PWM)).fault
+    assert made == ["made", "stopped"]

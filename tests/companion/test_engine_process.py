@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import socket
 import subprocess
 import sys
 import textwrap
@@ -17,9 +18,10 @@ import pytest
 from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ActuatorError
-from companion.output.engine.selftest import WAKES
+from companion.output.engine import process
+from companion.output.engine.selftest import WAKES, SelfTest
 from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.wire import CHANGES_MAX
+from companion.output.engine.wire import CHANGES_MAX, Kind, pack
 from companion.output.gpio import LATE_MAX_S, GpioExecutor
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
@@ -291,3 +293,29 @@ async def test_edges_that_are_late_for_long_are_a_fault(bench: Bench) -> None:
     await until(lambda: bench.executor.fault is not None)
     assert "late" in str(bench.executor.fault)
     await until(lambda: bench.levels == 0)
+
+
+def test_an_error_in_the_engine_closes_the_lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    class Lines:
+        def close(self) -> None:
+            done.append("closed")
+
+    def broken(*_given: object) -> None:
+        raise ValueError("broken")
+
+    for name, instead in {
+        "die_with_parent": lambda _parent: True, "_end_wakes": lambda: None,
+        "open_lines": lambda _setup: None, "be_on_time": lambda **_: [],
+        "self_test": lambda *_, **__: SelfTest(), "Engine": lambda *_, **__: Lines(),
+        "_run": broken,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(process, name, instead)
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    setup = EngineSetup(wiring=Wiring(valves=(17,)), pwm=PWM, backend="memory")
+    with near, far:
+        near.send(pack(Kind.SETUP, setup.as_bytes()))
+        with pytest.raises(ValueError, match="broken"):
+            process.serve(far, parent=os.getpid())
+    assert done == ["closed"]

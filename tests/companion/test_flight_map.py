@@ -315,10 +315,10 @@ def test_a_flight_map_that_was_changed_is_refused(sql: str, tmp_path: Path) -> N
 CELL_DEG = 1e-4
 
 
-def map_of_cells() -> FlightMap:
+def file_of_cells() -> MapFile:
     rates = np.arange(12.0).reshape(3, 4)
     rates[0, 0] = np.nan
-    map_file = MapFile(
+    return MapFile(
         path=Path("grid.tif"),
         format="GeoTIFF",
         crs="EPSG:4326",
@@ -332,6 +332,10 @@ def map_of_cells() -> FlightMap:
             crs=CRS.from_epsg(4326),
         ),
     )
+
+
+def map_of_cells() -> FlightMap:
+    map_file = file_of_cells()
     frame = frame_for(map_file)
     return FlightMap(
         path=map_file.path,
@@ -342,6 +346,16 @@ def map_of_cells() -> FlightMap:
         source_rates_l_ha=map_file.rates_l_ha,
         polylines=(((0.0, 0.0), (5.0, 5.0)),),
     )
+
+
+@pytest.mark.parametrize("has_boundary", [False, True])
+def test_cells_are_bounded_where_somebody_drew_a_border(has_boundary: bool) -> None:
+    map_file = file_of_cells()
+    field = shapely.MultiPolygon([shapely.box(114.5, 35.9997, 114.5004, 36.0)])
+    if has_boundary:
+        map_file = replace(map_file, boundary=field)
+    order = MapOrder(table=PrescriptionTable.model_validate({"file": "grid.tif"}))
+    assert compile_map(order, map_file=map_file).is_bounded is has_boundary
 
 
 def test_cells_without_a_border_have_none_from_the_file_either(tmp_path: Path) -> None:

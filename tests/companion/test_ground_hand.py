@@ -251,3 +251,11 @@ def test_ctrl_c_just_before_the_waiting_ends_it(pipe: tuple[int, int]) -> None:
         is_over.set()
         other.join()
     assert not keys, "it waited for a key"
+
+
+async def test_signals_are_given_back_after_an_error_too(pipe: tuple[int, int]) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(ValueError, match="broken"), Hand(pipe[0], is_lines=True).attending():
+        assert signal.getsignal(signal.SIGTERM) != before
+        raise ValueError("broken")
+    assert signal.getsignal(signal.SIGTERM) == before

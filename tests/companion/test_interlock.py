@@ -16,11 +16,13 @@ from companion.core.safety import (
     MARGIN_SHARE_MAX,
     SPEED_MARGIN_M_S,
     WIND_MARGIN_M_S,
+    Consent,
     Limits,
+    consented,
     held,
     inhibits,
 )
-from companion.core.types import Decision, Fix, Inhibit, VehicleState
+from companion.core.types import Decision, EstopReport, Fix, Inhibit, VehicleState
 from tests.builders import SPRAYING, flying, setup
 
 NAN = math.nan
@@ -310,3 +312,16 @@ def test_a_margin_is_for_its_own_limit_only_and_a_tenth_of_the_room_at_most() ->
     assert after == replace(limits, height_min_m=5.1)
     after = held(limits, frozenset({Inhibit.SPEED_ABOVE_MAX, Inhibit.NOT_ARMED}))
     assert after == replace(limits, speed_max_m_s=11.9)
+
+
+def test_a_stop_takes_the_consent_back_and_its_release_gives_none() -> None:
+    given = Consent(enabled=True, wishes=1)
+    for source in ("line", "command"):
+        pressed, released = (
+            EstopReport(received_s=1.0, pressed=is_pressed, source=source)
+            for is_pressed in (True, False)
+        )
+        stopped = consented(given, pressed, setup().limits, heartbeat=None)
+        assert (stopped.enabled, stopped.is_stopped) == (False, True)
+        after = consented(stopped, released, setup().limits, heartbeat=None)
+        assert (after.enabled, after.is_stopped) == (False, False)

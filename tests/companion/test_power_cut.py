@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -205,3 +206,25 @@ def test_a_link_stays_a_link_and_a_pipe_a_pipe(tmp_path: Path, kind: str) -> Non
     finally:
         os.close(reader)
     assert path.is_fifo()
+
+
+@pytest.mark.parametrize("fails", [None, "file", "folder"])
+def test_no_file_stays_open(
+    fails: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sync = os.fsync
+
+    def fsync(descriptor: int) -> None:
+        is_folder = stat.S_ISDIR(os.fstat(descriptor).st_mode)
+        if fails == ("folder" if is_folder else "file"):
+            raise OSError("broken")
+        sync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    path, before = tmp_path / "a.txt", len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(5):
+        with suppress(OSError):
+            write_atomically(path, b"whole")
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    # A folder that cannot be synced is no reason to have no file.
+    assert [each.name for each in tmp_path.iterdir()] == ([] if fails == "file" else ["a.txt"])

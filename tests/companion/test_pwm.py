@@ -340,3 +340,22 @@ def test_wrong_arguments_are_refused() -> None:
         PulseEngine(PWM, 0, start_s=0.0)
     with pytest.raises(ValueError, match="overrun_s"):
         PulseEngine(PWM, 1, start_s=0.0, overrun_s=math.nan)
+
+
+@pytest.mark.parametrize(("share", "pulse"), [(0.4, 0.0), (0.6, 1.0), (1.4, 1.4)])
+def test_a_pulse_too_short_for_the_valve_is_the_shortest_or_none(
+    share: float, pulse: float
+) -> None:
+    engine = PulseEngine(PWM, 1, start_s=0.0)
+    engine.submit(plan([share * PWM.min_on_s / T]), now_s=0.0)
+    found = pulses(engine.advance(0.999 * T), until_s=T)
+    assert sum(b - a for a, b in found) == pytest.approx(pulse * PWM.min_on_s)
+
+
+def test_a_gap_too_short_for_the_valve_is_the_shortest() -> None:
+    # A period that is shortened up to a restart has a shorter gap than the duty asks for.
+    duty, restart_s = 1.0 - 1.1 * PWM.min_off_s / T, 0.62 * T
+    engine = PulseEngine(PWM, 1, start_s=0.0)
+    engine.submit(plan([duty], change(restart_s, 0.5)), now_s=0.0)
+    found = pulses(engine.advance(restart_s - 1e-6), until_s=restart_s)
+    assert restart_s - sum(b - a for a, b in found) == pytest.approx(PWM.min_off_s)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import NoReturn
 
@@ -13,6 +15,7 @@ import pytest
 import shapely
 from shapely import box
 
+import missions.cli
 import missions.planner
 import missions.search
 from companion.cli import app
@@ -105,3 +108,16 @@ def test_an_undisturbed_plan_says_nothing_of_it(
     assert code == 0
     assert json.loads(said.out)["stopped"] is False
     assert SAID not in said.err
+
+
+@pytest.mark.parametrize("around", [missions.cli._seldom_collected, missions.cli._undisturbed])
+@pytest.mark.parametrize("breaks", [False, True])
+def test_what_a_plan_changes_of_the_process_is_as_before(
+    around: Callable[[], AbstractContextManager[None]], breaks: bool
+) -> None:
+    before = gc.get_threshold(), signal.getsignal(signal.SIGINT)
+    with suppress(ValueError), around():
+        assert (gc.get_threshold(), signal.getsignal(signal.SIGINT)) != before
+        if breaks:
+            raise ValueError("broken")
+    assert (gc.get_threshold(), signal.getsignal(signal.SIGINT)) == before
