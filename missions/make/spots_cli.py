@@ -178,10 +178,11 @@ def spots(
         chances = misses(field.passes.turned(found.middles), treated, budget)
         map_file = _map_file(field, treated, target, weeds, rate)
         problems = problems_of(map_file, config, field)
-        files = written(map_file, out, target, config, field, problems, writer.name, force=force)
         tell("planning the mission", 2, 4)
         plans = _plans(field, opened, treated, rate)
         best = min(plans, key=lambda name: plans[name].flight_s)
+        tell("writing", 3, 4)
+        files = written(map_file, out, target, config, field, problems, writer.name, force=force)
         if mission is not None:
             more, marks = write_fleet(plans[best], mission)
             files = [*files, *more, *marks]
