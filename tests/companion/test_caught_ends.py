@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import math
 import os
 import signal
+import socket
 import sqlite3
+import subprocess
 import threading
-from collections.abc import Callable
+import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fastapi import HTTPException
 
 from companion.core.types import Decision, HeartbeatReport, Input, Method, SprayPlan
 from companion.errors import JournalError
 from companion.journal.journal import Journal
 from companion.journal.writer import Writer
 from companion.runtime import run
-from companion.web.server import _either
+from companion.web import OperatorPage, Order, Outcome, listen
+from companion.web.server import EventStream, Orders, _either
 from sitl.serve import ServeOptions, _Run
 from sitl.stub.server import _TcpServer
 from sitl.workers import (
@@ -333,3 +340,80 @@ async def test_a_browser_that_is_given_up_leaves_nobody_waiting_for_news() -> No
         await waits
     await asyncio.sleep(0)
     assert asyncio.all_tasks() == before
+
+
+@pytest.mark.parametrize("answered", [True, False])
+async def test_an_order_of_the_page_is_forgotten_however_it_went(answered: bool) -> None:
+    near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with near, far:
+        orders = Orders(near)
+        orders.attach(lambda: None)
+        if not answered:
+            far.close()
+        given = asyncio.ensure_future(orders.give("stop"))
+        await asyncio.sleep(0)
+        if answered:
+            number = json.loads(far.recv(4096))["number"]
+            far.send(json.dumps({"number": number, "accepted": True, "text": "done"}).encode())
+        with suppress(HTTPException):
+            assert (await given).accepted
+        asyncio.get_running_loop().remove_reader(near)
+        assert orders._waiting == {}
+
+
+@pytest.mark.parametrize("breaks", [True, False])
+async def test_a_browser_that_went_is_no_client_any_more(breaks: bool) -> None:
+    class State:
+        clients = 0
+
+        async def events(self, _since: int, _gone: object) -> AsyncIterator[bytes]:
+            assert self.clients == 1
+            yield b"data: 1\n\n"
+
+    async def send(_message: object) -> None:
+        if breaks:
+            raise ConnectionResetError
+
+    async def receive() -> dict[str, str]:
+        await asyncio.get_running_loop().create_future()
+        raise AssertionError
+
+    state, before = State(), asyncio.all_tasks()
+    with suppress(ConnectionResetError):
+        await EventStream(state, 0)({}, receive, send)  # type: ignore[arg-type]
+    await asyncio.sleep(0)
+    assert state.clients == 0
+    assert asyncio.all_tasks() == before
+
+
+@pytest.mark.parametrize("starts", [True, False])
+def test_a_page_that_cannot_be_started_leaves_no_file_open_and_is_tried_again(
+    starts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = OperatorPage(listen("127.0.0.1", 0), {"map": {}}, obey=never, horizon_s=0.5)
+
+    def no_process(*_given: object, **_named: object) -> None:
+        raise OSError("no process")
+
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    monkeypatch.setattr(subprocess, "Popen", no_process)
+    page._start()
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+    def start() -> None:
+        if not starts:
+            raise ValueError("broken")
+
+    page._is_open, page._started_s = True, -math.inf
+    monkeypatch.setattr(page, "_start", start)
+    monkeypatch.setattr(threading, "excepthook", lambda _of: None)
+    page._restart(time.monotonic())
+    for thread in threading.enumerate():
+        if thread.name == "page":
+            thread.join()
+    assert not page._is_starting
+    asyncio.run(page.close())
+
+
+def never(_order: Order, _now_s: float) -> Outcome:
+    raise AssertionError

@@ -367,6 +367,16 @@ def test_a_rate_that_changes_between_two_counts_is_no_difference(changed_s: floa
         assert each.metered_ml == pytest.approx(each.all_ml, rel=1e-9)
 
 
+def test_no_bin_ends_while_nothing_was_heard() -> None:
+    orders, silence = (Order(-1.0, (40.0,), None),), (0.35, 0.55)
+    state, bins = Collecting(orders=orders, silences=(silence,)), []
+    for at_s in (0.0, 0.1, 0.3, 0.5, 0.7, 0.9):
+        report = FlowReport(received_s=at_s, volume_ml=40.0 * at_s)
+        state, filled = collected(state, report, bin_s=0.4, delay_s=0.0, now_s=at_s)
+        bins += [] if filled is None else [filled]
+    assert [round(each.end_s, 6) for each in bins] == [0.8]
+
+
 @pytest.mark.parametrize("begin_s", [1.0, 1.1, 1.2, 1.3])
 def test_a_valve_that_opens_while_all_is_closed_is_no_small_leak(begin_s: float) -> None:
     rig = healthy()

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import textwrap
 import threading
-from datetime import UTC, datetime
 from itertools import count
 from pathlib import Path
 from typing import cast, get_args
@@ -56,7 +55,7 @@ from companion.core.types import (
 from companion.errors import JournalError
 from companion.journal.codec import decode, encode
 from companion.journal.journal import Journal
-from companion.journal.new_file import about, open_for_flight
+from companion.journal.new_file import open_for_flight
 from companion.journal.writer import Event, Writer
 from tests.builders import flying, setup
 from tests.companion.journal_edit import with_body
@@ -527,9 +526,3 @@ def test_what_cannot_be_used_is_refused_in_one_line(case: str, tmp_path: Path) -
         list(read_journal(path).items())
     assert str(refused.value).startswith(str(path))
     assert "\n" not in str(refused.value)
-
-
-def test_the_method_is_that_of_the_set_up() -> None:
-    made = setup(method="none")
-    told = about(made, datetime.fromtimestamp(1.8e9, UTC), 5.0)
-    assert told["method"] == "none"

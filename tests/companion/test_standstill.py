@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
 import pytest
@@ -20,7 +21,7 @@ from companion.core.types import (
     SprayPlan,
     StandstillReport,
 )
-from companion.runtime import DEAF_S, STANDSTILL_S, ControlLoop, NoRecorder
+from companion.runtime import DEAF_S, STANDSTILL_S, ControlLoop, NoRecorder, boot_time_s
 from tests.builders import position, setup
 
 
@@ -156,3 +157,11 @@ def test_a_short_delay_is_no_standstill() -> None:
     bench.now_s += STANDSTILL_S - 0.05
     bench.fly(0.05, east_m)
     assert not bench.texts
+
+
+def test_the_computers_sleep_is_time_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    # On a computer that has not slept both clocks say the same.
+    clocks = {time.CLOCK_BOOTTIME: 107.0, time.CLOCK_MONOTONIC: 7.0}
+    monkeypatch.setattr(time, "clock_gettime", clocks.__getitem__)
+    monkeypatch.setattr(time, "monotonic", lambda: 7.0)
+    assert boot_time_s() == 107.0
