@@ -26,7 +26,6 @@ from tests.companion.wire_peer import free_port
 from tests.missions.realtime.test_page_field import (
     Box,
     Day,
-    idle,
     plan_and_upload,
     planned,
     write_maps,
@@ -121,7 +120,7 @@ async def drawn(out: Path, folder: Path) -> None:
             await day.land(within_s=300.0)
             await phone.get_by_role("link", name="Report, and what is left").click()
             await phone.locator("#report .verdict").wait_for()
-            await idle(phone)
+            await phone.wait_for_function("() => !document.body.dataset.busy")
             await kept(phone, out / "operators-page-report.png")
 
 
