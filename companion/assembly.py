@@ -75,7 +75,9 @@ def flight_map_of(config: Config, overrides: Sequence[str] = ()) -> FlightMap:
 
 def _refuse_changed(config: Config, table: PrescriptionTable, flight_map: FlightMap) -> None:
     """Refuse a boundary, an exclusion or a plan that lies here and is not the compiled one."""
-    for key, path in named_files(table, config.planned_lines, config.path.parent).items():
+    for key, path in named_files(
+        table, config.planned_lines, config.path.parent, config.buffers
+    ).items():
         if key == "prescription.file" or not path.exists():
             continue
         from companion.flight_map.child import sources_of
@@ -132,7 +134,7 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
         valve_tracking=_valve_tracking(config),
         autopilot_liquid=_autopilot_liquid(config),
         drift=config.drift_law(),
-        rate_max_l_ha=config.product.rate_max_l_ha,
+        rate_max_l_ha=config.rate_max_l_ha(),
         mission_braking_m_s2=(
             config.prediction.braking_m_s2 if config.prediction.use_mission else None
         ),
@@ -304,17 +306,34 @@ def above_label(
 
     `rates_l_ha` are those of the map called `name`, and `default_rate_l_ha` what holds elsewhere.
     """
-    limit_l_ha = config.product.rate_max_l_ha
+    limit_l_ha = config.rate_max_l_ha()
     rates = [*rates_l_ha, *([] if default_rate_l_ha is None else [default_rate_l_ha])]
+    least_l_ha = None if config.label is None else config.label.rate_min_l_ha
+    low = min((rate for rate in rates if rate > 0.0), default=math.inf)
+    if least_l_ha is not None and low < least_l_ha:
+        return Problem(
+            severity="error",
+            code="below-label",
+            text=f"{name} asks for {low:g} L/ha, below rate_min_l_ha = {least_l_ha:g} of "
+            f"{config.limits_table.file}",
+            fix="raise the map's low rates, or set them to 0: not sprayed",
+        )
     if limit_l_ha is None or not rates or max(rates) <= limit_l_ha:
         return None
     return Problem(
         severity="error",
         code="above-label",
         text=f"{name} asks for up to {max(rates):g} L/ha, above "
-        f"product.rate_max_l_ha = {limit_l_ha:g}",
+        f"{_rate_key(config, limit_l_ha)} = {limit_l_ha:g}",
         fix="lower the map's rates or correct the limit to what the label says",
     )
+
+
+def _rate_key(config: Config, limit_l_ha: float) -> str:
+    own = config.product.rate_max_l_ha
+    if own is not None and own <= limit_l_ha:
+        return "product.rate_max_l_ha"
+    return f"{config.limits_table.file}: rate_max_l_ha"
 
 
 def deliverable(setup: Setup, speed_m_s: float) -> list[Problem]:

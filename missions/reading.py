@@ -33,6 +33,8 @@ from missions.reading_ground import (
     NOTHING_ASKED,
     GroundAsked,
     autopilot_of,
+    buffered,
+    check_label,
     no_spray_buffer_m,
     run_in_of,
     spacing_m,
@@ -114,6 +116,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         PlanError, MapError, ConfigError: in one line, what is wrong and what to do.
     """
     settings = _spaced(_settings(config, changes), asked, config, changes)
+    check_label(config, settings)
     if asked.with_sprayer:
         # The autopilot's own sprayer knows no treated ground.
         settings = replace(settings, switch_off_percent=None)
@@ -128,12 +131,15 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
     closed = [near_area(path, frame, asked.opens) for path in asked.no_spray]
     if config is not None and table is not None:
         closed += _exclusions(asked, config, table, frame)
+    keeps_m = no_spray_buffer_m(asked.ground, config)
+    if config is not None:
+        closed += buffered(config, keeps_m, frame, asked.opens)
     ground = build_field(
         boundary,
         obstacles=_obstacles(asked, frame),
         no_spray=closed,
         obstacle_buffer_m=2.0 if mission is None else mission.obstacle_buffer_m,
-        no_spray_buffer_m=no_spray_buffer_m(asked.ground, config),
+        no_spray_buffer_m=keeps_m,
         wind=wind_of(asked.ground, config, has_areas=bool(closed)),
         swath_width_m=settings.swath_width_m,
         frame=frame,
@@ -366,6 +372,10 @@ def _rates(
         if rate is None:
             rate = RATE_L_HA if mission is None else mission.rate_l_ha
         _check_bounds("rate_l_ha", rate)
+        if config is not None:
+            label = above_label(config, "the plan", rates_l_ha=(rate,), default_rate_l_ha=None)
+            if label is not None:
+                raise PlanError(f"{label.text}; plan for a rate that the label allows")
         return Uniform(rate_l_ha=rate)
     if config is not None:
         label = above_label(

@@ -10,14 +10,17 @@ from typing import Literal
 
 import numpy as np
 import shapely
+from shapely import MultiPolygon
 
 from companion.config import Config
 from companion.config.tables import MissionTable
 from companion.core.frame import LocalFrame
 from missions.errors import PlanError
 from missions.field import Field, WindBuffer, local_area
+from missions.maps.local import grown
 from missions.maps.registry import read_area
-from missions.reading_outline import told
+from missions.plan import Settings
+from missions.reading_outline import near_area, told
 from missions.run_in import RunIn
 from missions.terrain import Terrain, read_dem
 
@@ -105,6 +108,40 @@ def wind_of(
 def no_spray_buffer_m(asked: GroundAsked, config: Config | None) -> float:
     """Return the buffer of no-spray areas: never less than the configuration's."""
     return max(asked.no_spray_buffer_m or 0.0, _table(config).no_spray_buffer_m)
+
+
+def buffered(
+    config: Config, kept_m: float, frame: LocalFrame, opens: Mapping[str, str | None]
+) -> list[MultiPolygon]:
+    """Return what the label keeps away from, as wide as needed around what keeps `kept_m`."""
+    return [
+        grown(near_area(config.resolve(name), frame, opens), each.distance_m - kept_m, frame)
+        for each in config.buffers
+        for name in each.files
+    ]
+
+
+def check_label(config: Config | None, settings: Settings) -> None:
+    """Refuse a speed or height of passes that label or permit do not allow.
+
+    Raises:
+        PlanError: in one line, what is outside and what to change.
+    """
+    label = None if config is None else config.label
+    if config is None or label is None:
+        return
+    speeds_m_s = (settings.speed_m_s, max(settings.speed_m_s, settings.speeds_m_s[1]))
+    for name, values, unit, what in (
+        ("speed_m_s", speeds_m_s, "m/s", "speed"),
+        ("height_m", (settings.height_m, settings.height_m), "m", "height"),
+    ):
+        span = label.span(name)
+        if span is not None and not span[0] <= values[0] <= values[1] <= span[1]:
+            wrong = values[0] if not span[0] <= values[0] <= span[1] else values[1]
+            raise PlanError(
+                f"{config.limits_table.file}: {what} {label.words(name, unit)}, and passes are "
+                f"planned at {wrong:g} {unit}; change mission.{name} or its option"
+            )
 
 
 def run_in_of(

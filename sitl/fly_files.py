@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from companion.config.limits import limits_meta
 from companion.core.types import Decision
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
@@ -87,7 +88,10 @@ def write_journal(flown: Flown, folder: Path) -> Path:
     with Journal.create(
         folder,
         setup=flown.task.setup,
-        setup_text={"config_toml": flown.task.config.source_text},
+        setup_text={
+            "config_toml": flown.task.config.source_text,
+            **limits_meta(flown.task.config.label),
+        },
         started_s=float(flown.trajectory.time_s[0]),
         waits=True,
         training=SIMULATED,

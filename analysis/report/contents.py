@@ -15,6 +15,7 @@ from analysis.flown.unknown import GAP_S
 from analysis.journals.content import content_sha256
 from analysis.published import P1_RESULTS
 from analysis.report.facts import wind_note
+from analysis.report.label import label_of
 from analysis.report.treated import duration_text
 from companion.core.types import Inhibit
 from companion.simulated import SIMULATED
@@ -57,6 +58,7 @@ def contents_of(
     why_not_evaluated: str = "",
 ) -> dict[str, Any]:
     """Return the whole content of a report."""
+    label = label_of(flight, treated, clock, told)
     warnings = warnings_of(
         flight,
         assessment,
@@ -90,6 +92,7 @@ def contents_of(
              "text": event.text}
             for event in flight.events
         ],
+        "label": label,
         "application": {record.profile: record.as_json() for record in records},
         "setup": _setup(flight),
         "definitions": {

@@ -91,10 +91,10 @@ def _wind(flight: AppliedFlight, treated: Treated) -> float | None:
     if series is None or treated.first_s is None or treated.last_s is None:
         return None
     inside = (series.time_s >= treated.first_s) & (series.time_s <= treated.last_s)
-    return _mean(series.value[inside & _is_estimate(series.value)])
+    return _mean(series.value[inside & is_estimate(series.value)])
 
 
-def _is_estimate(wind_m_s: Floats) -> NDArray[np.bool_]:
+def is_estimate(wind_m_s: Floats) -> NDArray[np.bool_]:
     """Return which winds are estimates: not exactly 0, and not the same as the one before.
 
     The companion says so itself now; journals of before hold what the autopilot told.
@@ -106,7 +106,7 @@ def _is_estimate(wind_m_s: Floats) -> NDArray[np.bool_]:
 def wind_note(flight: AppliedFlight) -> str:
     """Return that the autopilot told winds and knew none; empty where it told none, or knew it."""
     series = flight.wind_m_s
-    if series is None or _is_estimate(series.value).any():
+    if series is None or is_estimate(series.value).any():
         return ""
     return "the wind in flight is not known: the autopilot told exactly 0, or always the same"
 

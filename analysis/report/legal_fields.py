@@ -359,6 +359,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "application.wind_from_deg": ("Wind from", "deg"),
     "application.temperature_c": ("Temperature", "deg C"),
     "application.humidity_percent": ("Relative humidity", "%"),
+    "application.inversion": ("Temperature inversion", ""),
     "product.name": ("Product", ""),
     "product.registration": ("Authorisation or registration number", ""),
     "product.droplet_class": ("Droplet class", ""),

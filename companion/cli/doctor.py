@@ -32,6 +32,7 @@ from companion.doctor.check import (
     calibration_age,
     fail,
     is_ready,
+    label_check,
     not_applicable,
     ok,
     split_advice,
@@ -243,6 +244,7 @@ def configuration_checks(config: Config, *, today: date) -> Iterator[Check]:
     yield calibration_age(config.lag.measured_on, today)
     yield valve_age(config, today)
     yield _signing(config)
+    yield label_check(config)
 
 
 def refused_configuration(error: ConfigError) -> Check:

@@ -26,6 +26,7 @@ from companion.cli.output_parts import build_outputs
 from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
 from companion.config import Config
 from companion.config.application_table import missing, told
+from companion.config.limits import limits_meta
 from companion.config.rules import unbounded, without_effect
 from companion.core.setup import Setup
 from companion.errors import ActuatorError, LinkError, SensorError
@@ -101,7 +102,7 @@ def run_companion(
     executor = build_executor(config, link)
     sensors = _sensors(config, link)
     page = _page(config, given, setup, link, training=training)
-    for line in (*_warnings(config), *_application_notes(config, training)):
+    for line in (*_warnings(config), *_label_notes(config), *_application_notes(config, training)):
         note(line)
     if config.mission is not None:
         for problem in deliverable(setup, config.mission.speed_m_s):
@@ -283,8 +284,21 @@ def _about(config: Config, overrides: Sequence[str], flight_map: FlightMap) -> d
         "config_toml": config.source_text,
         "config_overrides": "\n".join(overrides),
         "application_json": json.dumps(told(config.application, config.product)),
+        **limits_meta(config.label),
         "flight_map_json": json.dumps(flight_map.as_object()),
     }
+
+
+def _label_notes(config: Config) -> list[str]:
+    """Return which limits of label and permit were not declared, or not kept: nothing opens."""
+    if config.label is None:
+        return []
+    return [
+        f"warning: {each.key} = {'nothing' if each.value is None else each.value}: the label asks "
+        f"for {each.words}; the valves stay closed until it is declared so (--set {each.key}=...)"
+        for each in config.label.declared(config.told())
+        if not each.is_kept
+    ]
 
 
 def _application_notes(config: Config, training: str) -> list[str]:

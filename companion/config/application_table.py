@@ -123,6 +123,9 @@ class ApplicationTable(Table):
     humidity_percent: Annotated[FiniteFloat, Field(ge=0, le=100)] | None = Field(
         default=None, description="of the air, relative"
     )
+    inversion: Literal["no", "yes"] | None = Field(
+        default=None, description="whether the air lies in a temperature inversion, as seen"
+    )
     start_time: Annotated[str, _is_some(datetime.fromisoformat, "no such time")] | None = Field(
         default=None,
         pattern=_MOMENT,

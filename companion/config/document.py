@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, PrivateAttr
 
 from companion.config import application_table, sensor_tables, sprayer_tables, tables
+from companion.config.limits import Buffer, LimitsFile
 from companion.core.boom import Boom, Valve
 
 Origin = Literal["file", "override", "default"]
@@ -39,6 +40,7 @@ class Document(tables.Table):
     mission: tables.MissionTable | None = None
     product: tables.ProductTable = tables.ProductTable()
     application: application_table.ApplicationTable = application_table.ApplicationTable()
+    limits_table: tables.LimitsTable = Field(default=tables.LimitsTable(), alias="limits")
     flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
     valve_tracking: tables.ValveTrackingTable = tables.ValveTrackingTable()
     flow_meter: sensor_tables.FlowMeterTable = sensor_tables.FlowMeterTable()
@@ -52,11 +54,20 @@ class Document(tables.Table):
     web: tables.WebTable = tables.WebTable()
 
     _path: Path = PrivateAttr(default=Path("config.toml"))
+    _label: LimitsFile | None = PrivateAttr(default=None)
     _source_text: str = PrivateAttr(default="")
     _origins: dict[str, Origin] = PrivateAttr(default_factory=dict)
 
-    def came_from(self, path: Path, *, source_text: str, origins: dict[str, Origin]) -> Self:
+    def came_from(
+        self,
+        path: Path,
+        *,
+        source_text: str,
+        origins: dict[str, Origin],
+        label: LimitsFile | None = None,
+    ) -> Self:
         """Note the file that this was read from and which of its keys are whose; return self."""
+        self._label = label
         self._path, self._source_text, self._origins = path, source_text, origins
         return self
 
@@ -64,6 +75,17 @@ class Document(tables.Table):
     def path(self) -> Path:
         """Return the file that this was read from."""
         return self._path
+
+    @property
+    def label(self) -> LimitsFile | None:
+        """Return what label and permit ask for; None where no limits file is named."""
+        return self._label
+
+    @property
+    def buffers(self) -> tuple[Buffer, ...]:
+        """Return the ground that label and permit keep away from."""
+        file = self.limits_table.file
+        return () if self._label is None or file is None else self._label.buffers(file)
 
     @property
     def source_text(self) -> str:

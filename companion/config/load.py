@@ -11,6 +11,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from companion.config.document import Origin, leaves
+from companion.config.limits import read_limits
 from companion.config.model import Config
 from companion.config.wording import findings, one_line, say_syntax, show_value
 from companion.errors import ConfigError
@@ -43,7 +44,10 @@ def load(path: Path, *, overrides: Sequence[str] = ()) -> Config:
         raise ConfigError(
             f"{path}: {one_line(found)}", problems=[each.problem() for each in found]
         ) from error
-    return config.came_from(path, source_text=text, origins=origins)
+    name, label = config.limits_table.file, None
+    if name is not None:
+        label = read_limits(path.parent / name, f"{path}: limits.file: {path.parent / name}")
+    return config.came_from(path, source_text=text, origins=origins, label=label)
 
 
 def _read(path: Path) -> str:

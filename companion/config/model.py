@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Any, Self
 
 from pydantic import model_validator
 from pydantic_core import PydanticCustomError
 
+from companion.config.application_table import told
 from companion.config.document import Document
 from companion.config.rules import contradictions
 from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
@@ -126,6 +127,7 @@ class Config(Document):
             rc_channel=safety.rc_channel,
             accuracy_max_m=self._accuracy_max_m(),
             estop_required=safety.estop_line is not None,
+            label=None if self.label is None else self.label.flown(self.told()),
         )
 
     def _accuracy_max_m(self) -> float | None:
@@ -144,6 +146,16 @@ class Config(Document):
         if percent is None:
             return ON_LINES_PERCENT if on_lines else None
         return None if percent == "never" else percent
+
+    def told(self) -> dict[str, Any]:
+        """Return what the operator says for the record, by dotted key."""
+        return told(self.application, self.product)
+
+    def rate_max_l_ha(self) -> float | None:
+        """Return the most that product and label allow; None where neither says."""
+        label = None if self.label is None else self.label.rate_max_l_ha
+        said = [each for each in (self.product.rate_max_l_ha, label) if each is not None]
+        return min(said, default=None)
 
     def drift_law(self) -> Drift | None:
         """Return where droplets are expected to land; None unless it is to be corrected for."""

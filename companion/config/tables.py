@@ -340,6 +340,14 @@ class ProductTable(Table):
     droplet_class: Text | None = Field(default=None, description="for the record")
 
 
+class LimitsTable(Table):
+    """What label and permit ask for, as data."""
+
+    file: Text | None = Field(
+        default=None, description="TOML file of label and permit, relative to this file"
+    )
+
+
 class JournalTable(Table):
     """The record of each flight."""
 

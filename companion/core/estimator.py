@@ -213,7 +213,6 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
 SPEED_REPORT_AGE_MAX_S = 1.0
 # Fix, estimator and landed state come at 1 to 5 Hz; older than this they count as not known.
 STATUS_AGE_MAX_S = 5.0
-# Asked for at 5 to 10 Hz, of which a slowed-down link leaves a quarter.
 RANGE_AGE_MAX_S = 1.0
 _NOTHING_HEARD = PositionStream()
 
@@ -248,6 +247,7 @@ class Track(NamedTuple):
     braking_m_s2: float | None = None  # as seen at the ends of legs so far
     rate_percent: float = 100.0
     consent: Consent = NO_CONSENT
+    utc: UtcReport | None = None  # only where a label has hours
 
 
 def observe(track: Track, item: Input, setup: Setup) -> Track:
@@ -263,9 +263,8 @@ def observe(track: Track, item: Input, setup: Setup) -> Track:
     if isinstance(item, LegReport):
         leg = leg_of(item, setup.frame, setup.mission_braking_m_s2)
         told = None if setup.lines is None else mission_leg_of(item, setup.frame)
-        before = (
-            track.mission_leg if _is_new_leg(track.mission_leg, told) else track.mission_leg_before
-        )
+        is_new = _is_new_leg(track.mission_leg, told)
+        before = track.mission_leg if is_new else track.mission_leg_before
         return track._replace(leg=leg, mission_leg=told, mission_leg_before=before)
     return _KEEP[type(item)](track, item)
 
@@ -292,7 +291,6 @@ _KEEP: dict[type, Callable[[Track, Any], Track]] = {
     PressureReport: lambda track, item: track._replace(pressure=item),
     TankReport: lambda track, item: track._replace(tank=item),
     ClockReport: lambda track, item: track._replace(clock_report=item),
-    UtcReport: lambda track, _item: track,
     # What is out of bounds, or no number, leaves the rate as it was.
     RateOverride: lambda track, item: (
         track._replace(rate_percent=item.percent) if is_override(item.percent) else track
@@ -331,7 +329,7 @@ def _observe_consent(track: Track, item: Any, setup: Setup) -> Track:
 def _observe_wind(track: Track, item: WindReport, setup: Setup) -> Track:
     """Take what is known of the wind; not to know it does not calm one that was too strong."""
     before_m_s = None if track.wind is None else track.wind.speed_m_s
-    is_calm = before_m_s is None or 0.0 <= before_m_s <= setup.limits.wind_max_m_s
+    is_calm = before_m_s is None or 0.0 <= before_m_s <= setup.limits.calm_max_m_s
     return track._replace(wind=item) if item.speed_m_s is not None or is_calm else track
 
 
@@ -364,6 +362,7 @@ _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
     RcReport: _observe_consent,
     StandstillReport: _observe_standstill,
     WindReport: _observe_wind,
+    UtcReport: lambda track, item, setup: track._replace(utc=setup.limits.asked_utc(item)),
     BatteryReport: _observe_battery,
 }
 
@@ -493,6 +492,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         stop_ahead=_stop_ahead(track, east, north, now_s),
         mission_leg=track.mission_leg,
         mission_leg_before=track.mission_leg_before,
+        utc_offset_s=None if track.utc is None else track.utc.offset_s(now_s),
     )
 
 

@@ -12,6 +12,8 @@ from enum import IntEnum
 
 # The modes that fly the mission, as ArduPilot and PX4 call them.
 MISSION_MODES = frozenset({"AUTO", "MISSION"})
+# SYSTEM_TIME comes at 1 Hz; over a minute our own clock is as good.
+UTC_AGE_MAX_S = 60.0
 
 
 class Fix(IntEnum):
@@ -266,6 +268,12 @@ class UtcReport:
     received_s: float
     utc_s: float
     boot_s: float | None = None
+
+    def offset_s(self, now_s: float) -> float | None:
+        """Return what makes a time of day of our clock; None once this is too old for that."""
+        if not -0.1 <= now_s - self.received_s <= UTC_AGE_MAX_S:
+            return None
+        return self.utc_s - self.received_s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,7 +15,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from companion.core.inputs import EstopReport, HeartbeatReport, OperatorCommand, RcReport
+from companion.core.inputs import EstopReport, HeartbeatReport, OperatorCommand, RcReport, UtcReport
+from companion.core.label import LabelLimits, label_broken
 from companion.core.types import Fix, Inhibit, SprayerState, SprayPlan, VehicleState
 
 # -------------------------------------------------------------- limits, and the reasons that follow
@@ -70,6 +71,17 @@ class Limits:
     estop_required: bool = False
     # Heartbeats that stayed away for longer take the operator's consent along.
     consent_gap_max_s: float = 10.0
+    label: LabelLimits | None = None
+
+    @property
+    def calm_max_m_s(self) -> float:
+        """Return the wind above which it has to be measured to have dropped."""
+        span = None if self.label is None else self.label.wind_m_s
+        return self.wind_max_m_s if span is None else min(self.wind_max_m_s, span[1])
+
+    def asked_utc(self, report: UtcReport) -> UtcReport | None:
+        """Return the time of day where a label has hours; None where nobody asks for it."""
+        return report if self.label is not None and self.label.needs_utc else None
 
     def allows(self, mode: str | None) -> bool:
         """Whether spraying is allowed in a mode; AUTO is also what PX4 calls MISSION."""
@@ -95,6 +107,7 @@ def inhibits(
             *_wind(state, limits, now_s),
             *_position(state, limits, field_bounds_m, now_s),
             *_speed_and_height(state, limits),
+            *_label(state, limits, before, now_s),
         ]
     )
 
@@ -224,6 +237,23 @@ def _speed_and_height(state: VehicleState, limits: Limits) -> list[Inhibit]:
     if not state.height_m <= limits.height_max_m:
         found.append(Inhibit.HEIGHT_ABOVE_MAX)
     return found
+
+
+def _label(
+    state: VehicleState, limits: Limits, before: frozenset[Inhibit], now_s: float
+) -> list[Inhibit]:
+    """Check what label and permit ask for, where they are given as data."""
+    if limits.label is None:
+        return []
+    margins = {
+        Inhibit.LABEL_SPEED: SPEED_MARGIN_M_S,
+        Inhibit.LABEL_HEIGHT: HEIGHT_MARGIN_M,
+        Inhibit.LABEL_WIND: WIND_MARGIN_M_S,
+    }
+    held_by = {reason: margin for reason, margin in margins.items() if reason in before}
+    return label_broken(
+        state, limits.label, held_by, wind_age_max_s=limits.wind_age_max_s, now_s=now_s
+    )
 
 
 # Reasons that stay, and until when.
@@ -387,6 +417,8 @@ ENVELOPE = frozenset(
         Inhibit.SPEED_ABOVE_MAX,
         Inhibit.HEIGHT_BELOW_MIN,
         Inhibit.HEIGHT_ABOVE_MAX,
+        Inhibit.LABEL_SPEED,
+        Inhibit.LABEL_HEIGHT,
     }
 )
 # What a sprayer on the ground, fit to fly, waits for.

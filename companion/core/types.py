@@ -281,6 +281,15 @@ class Inhibit(StrEnum):
     HEIGHT_ABOVE_MAX = "height-above-max"
     WIND_ABOVE_MAX = "wind-above-max"
     WIND_UNKNOWN = "wind-unknown"
+    LABEL_SPEED = "label-speed"
+    LABEL_HEIGHT = "label-height"
+    LABEL_WIND = "label-wind"
+    LABEL_WIND_DIRECTION = "label-wind-direction"
+    LABEL_TIME = "label-time"
+    LABEL_TEMPERATURE = "label-temperature"
+    LABEL_HUMIDITY = "label-humidity"
+    LABEL_INVERSION = "label-inversion"
+    LABEL_DROPLETS = "label-droplets"
     RC_SWITCH = "rc-switch"
     OUTPUT_FAULT = "output-fault"
     LINK_LOST = "link-lost"
@@ -320,6 +329,15 @@ _WORDS = {
     Inhibit.HEIGHT_BELOW_MIN: "too low",
     Inhibit.HEIGHT_ABOVE_MAX: "too high",
     Inhibit.WIND_ABOVE_MAX: "too much wind",
+    Inhibit.LABEL_SPEED: "speed not by label",
+    Inhibit.LABEL_HEIGHT: "height not by label",
+    Inhibit.LABEL_WIND: "wind not by label",
+    Inhibit.LABEL_WIND_DIRECTION: "wind direction not by label",
+    Inhibit.LABEL_TIME: "not the label's hours",
+    Inhibit.LABEL_TEMPERATURE: "temperature not by label",
+    Inhibit.LABEL_HUMIDITY: "humidity not by label",
+    Inhibit.LABEL_INVERSION: "inversion not ruled out",
+    Inhibit.LABEL_DROPLETS: "droplets not by label",
     Inhibit.RC_SWITCH: "RC switch off",
 }
 
@@ -442,6 +460,8 @@ class VehicleState:
     mission_leg: MissionLeg | None = None  # None: it is not used, or nothing was heard of it
     mission_leg_before: MissionLeg | None = None  # the one that it was before, last heard of then
     clock_agrees: bool = True  # what is known of the autopilot's clock goes together
+    # Seconds since 1970 less our clock; None: not known, or nothing is limited to hours.
+    utc_offset_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

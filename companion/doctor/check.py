@@ -142,6 +142,41 @@ def application_check(config: Config) -> Check:
     return ok(NAME, f"{table.profile}: all there that the operator must say")
 
 
+def label_check(config: Config) -> Check:
+    """Return whether what the operator answers for keeps the limits of label and permit."""
+    name, label = "label-limits", config.label
+    if label is None:
+        return not_applicable(name, "no limits file: label and permit are not checked")
+    rows = list(label.declared(config.told()))
+    file = config.limits_table.file
+    speed = None if config.mission is None else config.mission.speed_m_s
+    height = None if config.mission is None else config.mission.height_m
+    for key, value, unit in (("speed_m_s", speed, "m/s"), ("height_m", height, "m")):
+        span = label.span(key)
+        if span is not None and value is not None and not span[0] <= value <= span[1]:
+            text = f"mission.{key} = {value:g}, and {file} allows {label.words(key, unit)}"
+            return fail(name, text, f"change mission.{key}, and plan again")
+    asked = [row for row in rows if row.value is None]
+    if asked:
+        keys = ", ".join(row.key for row in asked)
+        return fail(
+            name,
+            f"{label.title}: not declared: {keys}; the valves stay closed",
+            f"measure, then start with --set {asked[0].key}=VALUE",
+        )
+    broken = [row for row in rows if not row.is_kept]
+    if broken:
+        first = broken[0]
+        return fail(
+            name,
+            f"{label.title}: {first.key} = {first.value}, allowed is {first.words}",
+            "wait until it is so, then declare it again",
+        )
+    return ok(
+        name, f"{label.title}: {len(rows)} limits declared and kept; the rest is checked in flight"
+    )
+
+
 # How old is what was measured.
 
 # Nozzles wear, hoses age, pumps lose pressure: half a year is about one season of spraying.

@@ -55,7 +55,7 @@ def compiled(config: Config, table: PrescriptionTable, overrides: Sequence[str] 
     Raises:
         ConfigError, MapError: where a file cannot be used.
     """
-    settings = frozen_settings(table, config.planned_lines)
+    settings = frozen_settings(table, config.planned_lines, config.buffers)
     known_by = json.dumps(
         [VERSION, version("vrspray"), str(config.resolve(table.file)), settings], sort_keys=True
     )
@@ -88,7 +88,7 @@ def _still_good(kept: Path, config: Config, table: PrescriptionTable) -> FlightM
         found = read_flight_map(kept)
     except MapError:
         return None
-    here = sources_of(named_files(table, config.planned_lines, config.path.parent))
+    here = sources_of(named_files(table, config.planned_lines, config.path.parent, config.buffers))
     return found if here == found.sources else None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path, PurePosixPath
@@ -12,6 +12,7 @@ import shapely
 from shapely import Geometry, MultiPolygon, Polygon
 
 from companion.config import Config
+from companion.config.limits import Buffer
 from companion.config.tables import PrescriptionTable
 from companion.core.cells import CellGrid, Warp
 from companion.core.frame import LocalFrame
@@ -173,13 +174,20 @@ _FROZEN = ("overlap", "default_rate_l_ha", "unit", "density_kg_l", "boundary", "
 # How the source was read: a configuration that says nothing of it does not object.
 _READING = ("rate_field", "crs", "layer", "flow_width_m", "flow_speed_m_s", "merge", "origin")
 _LINES = "mission.lines"
+_BUFFERS = "limits.buffer"
 
 
-def frozen_settings(table: PrescriptionTable, lines: str | None) -> dict[str, object]:
-    """Return the settings that are frozen in a flight map, as JSON has them."""
+def frozen_settings(
+    table: PrescriptionTable, lines: str | None, buffers: Sequence[Buffer] = ()
+) -> dict[str, object]:
+    """Return the settings that are frozen in a flight map, as JSON has them.
+
+    Buffers stand in it where there are any: a map without them is the same as ever.
+    """
     found = table.model_dump(mode="json", include={*_FROZEN, *_READING})
     named = {f"prescription.{name}": found[name] for name in (*_FROZEN, *_READING)}
-    return {**named, _LINES: lines}
+    kept = [[each.kind, each.distance_m, list(each.files)] for each in buffers]
+    return {**named, _LINES: lines, **({_BUFFERS: kept} if kept else {})}
 
 
 def difference(flight_map: FlightMap, config: Config) -> tuple[str, object, object] | None:
@@ -190,7 +198,9 @@ def difference(flight_map: FlightMap, config: Config) -> tuple[str, object, obje
     """
     if config.prescription is None:
         return None
-    for key, wanted in frozen_settings(config.prescription, config.planned_lines).items():
+    for key, wanted in frozen_settings(
+        config.prescription, config.planned_lines, config.buffers
+    ).items():
         compiled = flight_map.frozen.get(key)
         is_hint = key.removeprefix("prescription.") in _READING
         if is_hint and wanted is None:
@@ -205,10 +215,17 @@ def _comparable(key: str, value: object) -> object:
         return PurePosixPath(value).name
     if key == "prescription.exclusions" and isinstance(value, list):
         return [PurePosixPath(str(name)).name for name in value]
+    if key == _BUFFERS and isinstance(value, list):
+        return [
+            [kind, distance_m, [PurePosixPath(str(name)).name for name in files]]
+            for kind, distance_m, files in value
+        ]
     return value
 
 
-def named_files(table: PrescriptionTable, lines: str | None, folder: Path) -> dict[str, Path]:
+def named_files(
+    table: PrescriptionTable, lines: str | None, folder: Path, buffers: Sequence[Buffer] = ()
+) -> dict[str, Path]:
     """Return every file that a flight map is compiled from, by the setting that names it."""
     named: dict[str, str | None] = {
         "prescription.file": table.file,
@@ -218,5 +235,10 @@ def named_files(table: PrescriptionTable, lines: str | None, folder: Path) -> di
             for number, name in enumerate(table.exclusions)
         },
         "mission.lines": lines,
+        **{
+            f"{_BUFFERS}[{number}].files[{at}]": name
+            for number, each in enumerate(buffers)
+            for at, name in enumerate(each.files)
+        },
     }
     return {key: folder / name for key, name in named.items() if name is not None}

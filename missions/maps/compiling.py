@@ -22,6 +22,7 @@ from shapely import Geometry, LineString, MultiPolygon
 from companion.assembly import build_setup, check_mark
 from companion.atomic_write import write_atomically
 from companion.config import Config
+from companion.config.limits import Buffer
 from companion.config.tables import PrescriptionTable
 from companion.config.wording import show_value
 from companion.core.frame import LocalFrame, Place
@@ -38,7 +39,7 @@ from companion.journal.layers import register_frame, write_ground
 from companion.problem import Problem
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.layer import read_bytes
-from missions.maps.local import make_valid, project
+from missions.maps.local import grown, make_valid, project
 from missions.maps.model import MapFile, map_error
 from missions.maps.registry import read_area, read_map
 
@@ -52,6 +53,7 @@ class MapOrder:
 
     table: PrescriptionTable
     lines: str | None = None
+    buffers: tuple[Buffer, ...] = ()
     folder: Path = Path()
     config: Path | None = None
 
@@ -66,6 +68,7 @@ class MapOrder:
         return cls(
             table=config.prescription,
             lines=None if config.mission is None else config.mission.lines,
+            buffers=config.buffers,
             folder=config.path.parent,
             config=config.path,
         )
@@ -76,7 +79,7 @@ class MapOrder:
 
     def files(self) -> dict[str, Path]:
         """Return every file, by the setting that names it."""
-        return named_files(self.table, self.lines, self.folder)
+        return named_files(self.table, self.lines, self.folder, self.buffers)
 
     def refused(self, text: str) -> ConfigError:
         """Return the refusal of a setting."""
@@ -160,6 +163,11 @@ def compile_map(
         _area(order, f"prescription.exclusions[{number}]", name)
         for number, name in enumerate(table.exclusions)
     ]
+    exclusions += [
+        grown(_area(order, f"limits.buffer[{number}].files", name), each.distance_m, frame)
+        for number, each in enumerate(order.buffers)
+        for name in each.files
+    ]
     prescription = build_prescription(
         map_file,
         frame,
@@ -188,7 +196,7 @@ def compile_map(
             area if area.is_valid else (make_valid(area) or MultiPolygon()) for area in local
         ),
         polylines=_polylines(order, frame, prescription),
-        frozen=frozen_settings(table, order.lines),
+        frozen=frozen_settings(table, order.lines, order.buffers),
         sources=sources_of(order.files()),
         findings=tuple(findings),
     )

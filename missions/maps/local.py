@@ -59,6 +59,18 @@ def places(points: Sequence[tuple[float, float]], frame: LocalFrame) -> Floats:
     return np.column_stack(_transformer(frame).transform(degrees[:, 1], degrees[:, 0]))
 
 
+def grown(area: Area, distance_m: float, frame: LocalFrame) -> MultiPolygon:
+    """Return an area in longitude and latitude with all ground within a distance of it."""
+    wider = project(area, frame).buffer(max(distance_m, 0.0))
+
+    def back(points: Floats) -> Floats:
+        latitude_deg, longitude_deg = frame.to_geographic_all(*points.T.tolist())
+        return np.column_stack([longitude_deg, latitude_deg])
+
+    found = shapely.transform(wider, back)
+    return MultiPolygon([part for part in shapely.get_parts(found) if isinstance(part, Polygon)])
+
+
 def project(
     geometry: AnyArea, frame: LocalFrame, *, offset_m: tuple[float, float] = (0.0, 0.0)
 ) -> AnyArea:

@@ -10,6 +10,7 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
+from companion.core.label import LabelLimits
 from companion.core.safety import (
     HEIGHT_MARGIN_M,
     HOLD_S,
@@ -22,10 +23,12 @@ from companion.core.safety import (
     held,
     inhibits,
 )
-from companion.core.types import Decision, EstopReport, Fix, Inhibit, VehicleState
+from companion.core.types import Decision, EstopReport, Fix, Inhibit, VehicleState, WindReport
 from tests.builders import SPRAYING, flying, setup
 
 NAN = math.nan
+DAY = 86_400.0
+LABELS = [reason for reason in Inhibit if reason.name.startswith("LABEL_")]
 CASES: dict[Inhibit, list[dict[str, object] | None]] = {
     Inhibit.NOT_ENABLED: [{"enabled": False}],
     Inhibit.NO_POSITION: [None],
@@ -66,6 +69,26 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
         {"wind_received_s": 10.2},
         {"wind_received_s": NAN},
     ],
+    Inhibit.LABEL_SPEED: [
+        {"velocity_east_m_s": 0.99, "checked_speed_m_s": 1.0},
+        {"velocity_east_m_s": 12.01, "checked_speed_m_s": 12.0},
+    ],
+    Inhibit.LABEL_HEIGHT: [{"height_m": 0.99}, {"height_m": 10.01}],
+    Inhibit.LABEL_WIND: [{"wind_m_s": 6.01}, {"wind_m_s": NAN}],
+    Inhibit.LABEL_WIND_DIRECTION: [
+        {"wind": None},
+        {"wind": WindReport(received_s=9.9, speed_m_s=3.0, east_m_s=0.0, north_m_s=-3.0)},
+        {"wind": WindReport(received_s=9.9, speed_m_s=3.0, east_m_s=NAN, north_m_s=0.0)},
+        {"wind": WindReport(received_s=9.9, speed_m_s=3.0, east_m_s=0.0, north_m_s=0.0)},
+    ],
+    Inhibit.LABEL_TIME: [
+        {"utc_offset_s": None},
+        {"utc_offset_s": NAN},
+        {"utc_offset_s": math.inf},
+        {"utc_offset_s": DAY + 6 * 3600.0 - 10.01},
+        {"utc_offset_s": DAY + 9 * 3600.0 - 10.0},
+        {"utc_offset_s": 2 * DAY + 7 * 3600.0},
+    ],
     Inhibit.RC_SWITCH: [{"rc_switch_on": False}, {"rc_switch_on": None}],
     Inhibit.OUTPUT_FAULT: [{"output_healthy": False}],
     Inhibit.LINK_LOST: [{"link_up": False}],
@@ -79,6 +102,14 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
 }
 
 
+LABEL = LabelLimits(
+    speed_m_s=(1.0, 12.0),
+    height_m=(1.0, 10.0),
+    wind_m_s=(0.0, 6.0),
+    wind_from_deg=((225.0, 315.0),),
+    hours_s=((6 * 3600.0, 9 * 3600.0),),
+    days_s=(DAY, 2 * DAY),
+)
 # Everything that can be asked for is, and all of it is there.
 STRICT = Limits(
     wind_required=True,
@@ -86,11 +117,14 @@ STRICT = Limits(
     rc_channel=7,
     accuracy_max_m=0.3,
     estop_required=True,
+    label=LABEL,
 )
 READY = replace(
     SPRAYING,
     wind_m_s=3.0,
     wind_received_s=9.9,
+    wind=WindReport(received_s=9.9, speed_m_s=3.0, east_m_s=3.0, north_m_s=0.0),
+    utc_offset_s=DAY + 7 * 3600.0,
     rc_switch_on=True,
     estop=False,
     horizontal_accuracy_m=0.02,
@@ -102,6 +136,28 @@ def decide(change: dict[str, object] | None, limits: Limits = STRICT) -> Decisio
     if change is not None:
         state = replace(READY, **change)  # type: ignore[arg-type]
     return step(setup(limits=limits), state, Memory(), 10.0)[0]
+
+
+BOTH = (
+    "speed-below-min",
+    "speed-above-max",
+    "height-below-min",
+    "height-above-max",
+    "wind-above-max",
+)
+SAME = {reason for reason in Inhibit if reason.value in BOTH}
+# What is outside of both, or unknown to both, is said twice.
+ALSO = {
+    Inhibit.LABEL_SPEED: SAME,
+    Inhibit.LABEL_HEIGHT: SAME,
+    Inhibit.LABEL_WIND: SAME,
+    Inhibit.SPEED_BELOW_MIN: {Inhibit.LABEL_SPEED},
+    Inhibit.SPEED_ABOVE_MAX: {Inhibit.LABEL_SPEED},
+    Inhibit.HEIGHT_BELOW_MIN: {Inhibit.LABEL_HEIGHT},
+    Inhibit.HEIGHT_ABOVE_MAX: {Inhibit.LABEL_HEIGHT},
+    Inhibit.WIND_ABOVE_MAX: {Inhibit.LABEL_WIND},
+    Inhibit.WIND_UNKNOWN: {Inhibit.LABEL_WIND, Inhibit.LABEL_WIND_DIRECTION},
+}
 
 
 def test_nothing_inhibits_the_reference_step() -> None:
@@ -121,8 +177,25 @@ OF_THE_LIQUID = {
 }
 
 
+# Those that the operator declares before the flight.
+DECLARED = {
+    Inhibit.LABEL_TEMPERATURE,
+    Inhibit.LABEL_HUMIDITY,
+    Inhibit.LABEL_INVERSION,
+    Inhibit.LABEL_DROPLETS,
+}
+
+
 def test_every_inhibit_has_a_case() -> None:
-    assert set(CASES) | OF_THE_LIQUID | {Inhibit.REARM_NEEDED} == set(Inhibit)
+    assert set(CASES) | OF_THE_LIQUID | DECLARED | {Inhibit.REARM_NEEDED} == set(Inhibit)
+
+
+@pytest.mark.parametrize("inhibit", sorted(DECLARED))
+def test_what_was_declared_against_the_label_closes_every_valve(inhibit: Inhibit) -> None:
+    label = replace(LABEL, broken=frozenset({inhibit}))
+    decision = decide({}, replace(STRICT, label=label))
+    assert decision.inhibits == {inhibit}
+    assert decision.plan.is_off
 
 
 @pytest.mark.parametrize(
@@ -133,8 +206,12 @@ def test_inhibit_alone_closes_every_valve(
     inhibit: Inhibit, change: dict[str, object] | None
 ) -> None:
     decision = decide(change)
-    assert decision.inhibits == {inhibit}
+    also = ALSO.get(inhibit, set())
+    assert {inhibit} <= decision.inhibits <= {inhibit} | also
     assert decision.plan.is_off
+    # Without a label all else is as it was.
+    bare = decide(change, replace(STRICT, label=None)).inhibits
+    assert bare <= {inhibit, *SAME} - set(LABELS)
 
 
 @pytest.mark.parametrize("name", ["velocity_east_m_s", "velocity_north_m_s", "height_m"])
@@ -325,3 +402,36 @@ def test_a_stop_takes_the_consent_back_and_its_release_gives_none() -> None:
         assert (stopped.enabled, stopped.is_stopped) == (False, True)
         after = consented(stopped, released, setup().limits, heartbeat=None)
         assert (after.enabled, after.is_stopped) == (False, False)
+
+
+def test_a_wind_that_the_operator_measures_need_not_be_heard_but_must_agree() -> None:
+    limits = replace(STRICT, label=replace(LABEL, wind_required=False), wind_required=False)
+    unheard = {"wind_m_s": None, "wind_received_s": None, "wind": None}
+    assert not decide(unheard, limits).inhibits
+    calm = replace(limits, label=replace(limits.label, wind_m_s=(0.0, 5.0)))  # type: ignore[type-var]
+    assert decide({"wind_m_s": 5.01, "wind_received_s": 1.0}, calm).inhibits == {Inhibit.LABEL_WIND}
+
+
+def test_hours_and_sectors_go_over_midnight_and_north() -> None:
+    label = replace(
+        LABEL, hours_s=((22 * 3600.0, 2 * 3600.0),), days_s=None, wind_from_deg=((260.0, 10.0),)
+    )
+    limits = replace(STRICT, label=label)
+    for hour, allowed in ((21.9, False), (22.1, True), (1.9, True), (2.1, False)):
+        found = decide({"utc_offset_s": DAY + hour * 3600.0}, limits).inhibits
+        assert found == (set() if allowed else {Inhibit.LABEL_TIME})
+
+
+def test_what_the_label_closed_opens_a_margin_inside_it() -> None:
+    low = replace(LABEL, height_m=(1.0, 5.0))
+    given, memory, found = setup(limits=Limits(label=low)), Memory(), []
+    for number, height_m in enumerate((4.8, 5.01, 4.8, 4.69, 4.8)):
+        now_s = 10.0 + 0.05 * number
+        wind = replace(READY.wind, received_s=now_s)  # type: ignore[type-var]
+        state = flying(
+            now_s, 6.0, height_m=height_m, wind=wind, wind_m_s=3.0, wind_received_s=now_s,
+            utc_offset_s=READY.utc_offset_s,
+        )  # fmt: skip
+        decision, memory = step(given, state, memory, now_s)
+        found.append(bool(decision.inhibits))
+    assert found == [False, True, True, False, False]

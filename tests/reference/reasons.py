@@ -20,6 +20,7 @@ not open and close the valves.
 _POSITION = "`safety.position_age_max_s` (0.8 s)"
 _BEAT = "`safety.heartbeat_age_max_s` (2.5 s)"
 _LIQUID = ("flow meter, pressure, tank", "-", "as a latch")
+_DECLARED = ("the operator", "-", "declared anew, and started again")
 # Condition to spray; source; maximum age; when the valves may open again.
 CONDITIONS: dict[Inhibit, tuple[str, str, str, str]] = {
     Inhibit.ESTOP: (
@@ -122,6 +123,31 @@ CONDITIONS: dict[Inhibit, tuple[str, str, str, str]] = {
         "with `safety.wind_required`: the wind is known; exactly 0, and a wind that never changes, do "
         "not count", "WIND, WIND_COV", "`safety.wind_age_max_s` (5 s)", "at once",
     ),
+    Inhibit.LABEL_SPEED: (
+        "with `[limits]`: the speed lies within the file's", "GLOBAL_POSITION_INT", _POSITION,
+        "0.1 m/s inside",
+    ),
+    Inhibit.LABEL_HEIGHT: (
+        "with `[limits]`: the height lies within the file's", "DISTANCE_SENSOR, GLOBAL_POSITION_INT",
+        f"1 s; {_POSITION}", "0.3 m inside",
+    ),
+    Inhibit.LABEL_WIND: (
+        "with `[limits]`: the wind lies within the file's; unknown is not within, unless "
+        '`wind_by = "operator"`', "WIND, WIND_COV", "`safety.wind_age_max_s`", "0.5 m/s inside",
+    ),
+    Inhibit.LABEL_WIND_DIRECTION: (
+        "with `[limits]`: the wind comes from one of the file's sectors", "WIND, WIND_COV",
+        "`safety.wind_age_max_s`", "at once",
+    ),
+    Inhibit.LABEL_TIME: (
+        "with `[limits]`: it is one of the file's days and hours", "SYSTEM_TIME", "60 s", "at once",
+    ),
+    Inhibit.LABEL_TEMPERATURE: ("with `[limits]`: `application.temperature_c` is within", *_DECLARED),
+    Inhibit.LABEL_HUMIDITY: ("with `[limits]`: `application.humidity_percent` is within", *_DECLARED),
+    Inhibit.LABEL_INVERSION: (
+        'with `[limits]`: `application.inversion = "no"` where the file forbids one', *_DECLARED,
+    ),
+    Inhibit.LABEL_DROPLETS: ("with `[limits]`: `product.droplet_class` is one of the file's", *_DECLARED),
     Inhibit.RC_SWITCH: (
         "with `safety.rc_channel`: the channel is at 1300 to 2300 µs, whoever enabled", "RC_CHANNELS",
         "2 s", "switch on, then enable",

@@ -111,7 +111,13 @@ def _order(file: Path, config: Config | None, overlap: str | None) -> MapOrder:
     if config is None:
         return MapOrder(table=table)
     lines = None if config.mission is None else config.mission.lines
-    return MapOrder(table=table, lines=lines, folder=config.path.parent, config=config.path)
+    return MapOrder(
+        table=table,
+        lines=lines,
+        buffers=config.buffers,
+        folder=config.path.parent,
+        config=config.path,
+    )
 
 
 def _is_same(one: Path, other: Path) -> bool:

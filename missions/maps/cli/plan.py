@@ -112,6 +112,7 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
     positive = [rate for rate in rates if rate > 0.0]
     where = {
         "above-label": max(positive, default=0.0),
+        "below-label": min(positive, default=0.0),
         "rate-too-high": max(positive, default=0.0),
         "rate-too-low": min(positive, default=0.0),
     }
