@@ -16,12 +16,13 @@ from companion.config import Config
 from companion.config.rules import tank_capacity_l
 from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
-from companion.core.types import Decision, Input
+from companion.core.types import Decision, GnssReport, Input
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from companion.link.vehicle_link import VehicleLink
 from companion.ports import Recorder
 from companion.web import Obey, OperatorPage, Order, Outcome, listen, map_object
+from companion.web.frames import number
 from companion.web.guard import Doors, Tokens, is_loopback, kept_tokens
 from companion.wording import install_command
 
@@ -203,9 +204,12 @@ class Watched:
 
     def __init__(self, journal: Recorder, page: OperatorPage) -> None:
         self._journal, self._page = journal, page
+        self.satellites: int | None = None
 
     def record_input(self, item: Input) -> None:
         """Take down one input."""
+        if isinstance(item, GnssReport):
+            self.satellites = item.satellites
         self._journal.record_input(item)
 
     def record_coverage(self, coverage: Coverage) -> None:
@@ -229,10 +233,22 @@ def watched(page: OperatorPage, journal: Journal, link: VehicleLink) -> Recorder
     link.on_event(both.record_event)
 
     def extras() -> dict[str, Any]:
-        statistics = link.statistics
+        statistics, clock = link.statistics, link.component.clock
+        free_bytes = journal.free_bytes
         found: dict[str, Any] = {
-            "journal": {"fault": journal.fault, "lost": journal.lost, "name": journal.path.name},
+            "journal": {
+                "fault": journal.fault,
+                "lost": journal.lost,
+                "name": journal.path.name,
+                "saved_age_s": round(journal.saved_age_s, 1),
+                "free_gb": number(None if free_bytes is None else free_bytes / 1e9),
+            },
             "tank_counted_l": None if link.tank_l is None else round(link.tank_l, 2),
+            "satellites": both.satellites,
+            "clock": {
+                "answers": clock.is_known,
+                "round_trip_s": number(clock.round_trip_s, 4),
+            },
         }
         if statistics is not None:
             found["link"] = {

@@ -93,6 +93,7 @@ class GnssReport:
     received_s: float
     fix: Fix
     horizontal_accuracy_m: float | None = None
+    satellites: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -60,6 +60,7 @@ class Journal:
         self._waits = waits
         self._free_min_bytes = free_min_bytes
         self._commit_every_s = commit_every_s
+        self._free_bytes: int | None = None
         self._space_fault: str | None = None
         self._written_s = time.monotonic()
         self._sequence = count(1)
@@ -152,6 +153,16 @@ class Journal:
             return f"nothing was written for {stands_s:.0f} s"
         return self._writer.fault or self._space_fault
 
+    @property
+    def saved_age_s(self) -> float:
+        """Return how long ago the file was written to."""
+        return time.monotonic() - self._written_s
+
+    @property
+    def free_bytes(self) -> int | None:
+        """Return what the disk had free at the last look; None before it."""
+        return self._free_bytes
+
     def record_input(self, item: Input) -> None:
         """Take down one input as the core saw it."""
         self._put(item)
@@ -236,12 +247,11 @@ class Journal:
 
     def _look_at_space(self) -> None:
         """Note in time that the disk fills up."""
-        if not self._free_min_bytes:
-            return
         try:
-            free_bytes = shutil.disk_usage(self.path.parent).free
+            free_bytes = self._free_bytes = shutil.disk_usage(self.path.parent).free
         except OSError as error:
-            self._space_fault = str(error)
+            self._free_bytes = None
+            self._space_fault = str(error) if self._free_min_bytes else None
             return
         is_short = free_bytes < self._free_min_bytes
         self._space_fault = f"only {free_bytes / 1e6:.0f} MB are free" if is_short else None

@@ -324,7 +324,7 @@ _ACTIVE = 4  # MAV_STATE: 3 is standby, 5 and above critical, emergency and the 
 _LOOKS_DOWN = 25  # MAV_SENSOR_ROTATION_PITCH_270
 _INT16_LIMIT = 32767
 _HEADING_MAX_CDEG = 36_000  # UINT16_MAX is not known, and so is any other above a circle
-_UINT16_MAX = 65535
+_UINT8_MAX, _UINT16_MAX = 255, 65535
 # The time of satellites lies between the beginnings of 2021 and 2100, or it is none yet.
 _UTC_MIN_S, _UTC_MAX_S = 1_609_459_200.0, 4_102_444_800.0
 # EKF_STATUS_FLAGS: what must be set, and what must not. ArduPilot documents that variances below
@@ -369,7 +369,12 @@ def _gnss(m: Any, received_s: float) -> GnssReport:
     known = Fix.FIX_3D if m.fix_type in (7, 8) else Fix.NONE
     fix = Fix(m.fix_type) if m.fix_type <= Fix.RTK_FIXED else known
     accuracy_m = m.h_acc / 1000.0 if m.h_acc else None
-    return GnssReport(received_s=received_s, fix=fix, horizontal_accuracy_m=accuracy_m)
+    return GnssReport(
+        received_s=received_s,
+        fix=fix,
+        horizontal_accuracy_m=accuracy_m,
+        satellites=None if m.satellites_visible == _UINT8_MAX else m.satellites_visible,
+    )
 
 
 def _ekf(m: Any, received_s: float) -> EstimatorReport:

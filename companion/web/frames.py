@@ -62,7 +62,7 @@ def frame_of(decision: Decision, *, horizon_s: float) -> dict[str, Any]:
     }
     if state is not None:
         found["vehicle"] = _vehicle(state, decision.now_s, horizon_s)
-        found["liquid"] = _liquid(state)
+        found["liquid"] = _liquid(state, decision.now_s)
     return found
 
 
@@ -91,11 +91,12 @@ def _vehicle(state: VehicleState, now_s: float, horizon_s: float) -> dict[str, A
     }
 
 
-def _liquid(state: VehicleState) -> dict[str, Any]:
+def _liquid(state: VehicleState, now_s: float) -> dict[str, Any]:
     flow, pressure, tank = state.flow, state.pressure, state.tank
     return {
         "meter_ml": None if flow is None else number(flow.volume_ml, 1),
         "meter_s": None if flow is None else number(flow.received_s, 3),
+        "meter_age_s": None if flow is None else number(now_s - flow.received_s),
         "meter_fault": "" if flow is None else flow.fault,
         "pressure_kpa": None if pressure is None else number(pressure.pressure_kpa, 1),
         "pressure_fault": "" if pressure is None else pressure.fault,
@@ -132,6 +133,8 @@ def map_object(setup: Setup) -> dict[str, Any]:
             }
             for zone in prescription.zones
         ],
+        # How far orders lead the ground.
+        "ahead_s": round(setup.longest_s, 3),
         "default_rate_l_ha": prescription.default_rate_l_ha,
         "boom": {
             "width_m": boom.width_m,

@@ -101,6 +101,9 @@ _WORDS = {
     SprayerState.FAULT: "FAULT",
     SprayerState.ESTOP: "STOPPED",
 }
+# In the air it may spray, and holds: nothing is prescribed here, or it is too slow or too high.
+_HOLD = "HOLD"
+_OUTSIDE_LINE = "Outside the map: valves open over a zone."
 _ENABLED_LINE = "Valves open when the vehicle is over a zone, at speed and height."
 
 
@@ -144,8 +147,8 @@ class Way:
             return None
         duty = frame.get("duty") or []
         bits = "".join("1" if share > 0.0 else "0" for share in duty)
-        rate = actual_rate(frame, self.valves)
-        return self.add([round(now_s, 2), east, north, heading, bits, rate])
+        rate, wanted = actual_rate(frame, self.valves), wanted_rate(frame, self.valves)
+        return self.add([round(now_s, 2), east, north, heading, bits, rate, wanted])
 
     def add(self, point: list[Any]) -> list[Any] | None:
         """Add a point where it is news; return it then."""
@@ -274,6 +277,20 @@ def actual_rate(
     return round(float(flow) * 10_000.0 / (60.0 * width_m * float(speed)), 1)
 
 
+def wanted_rate(
+    frame: dict[str, Any], valves: Sequence[tuple[float, float, float]]
+) -> float | None:
+    """Return what the map asks for under the open valves in L/ha, by width; None: nothing."""
+    duty, rates = frame.get("duty") or [], frame.get("rates_l_ha") or []
+    open_ = [
+        (valve[2], rate)
+        for valve, share, rate in zip(valves, duty, rates, strict=False)
+        if share > 0.0 and rate is not None
+    ]
+    width_m = sum(width for width, _ in open_)
+    return round(sum(width * rate for width, rate in open_) / width_m, 1) if width_m else None
+
+
 class Live:
     """The newest state for all browsers."""
 
@@ -289,6 +306,7 @@ class Live:
         self.version = 0
         self.urgent = 0
         self._meter: list[tuple[float, float]] = []
+        self._since_s: dict[str, float] = {}
         self._file: IO[str] | None = None
         self.way_id = round(utc_s, 1)
         self._way_file, self._begun_s = way_file, (utc_s, time.monotonic())
@@ -310,8 +328,12 @@ class Live:
         if frame.pop("urgent", False):
             self.urgent = self.version
         frame["meter_l_min"] = self._metered(frame.get("liquid") or {})
-        frame["word"] = _WORDS[SprayerState(frame["state"])]
+        is_held = frame["state"] == SprayerState.ARMED and (frame.get("vehicle") or {}).get(
+            "in_air"
+        )
+        frame["word"] = _HOLD if is_held else _WORDS[SprayerState(frame["state"])]
         frame["reasons"] = reasons_of(frame.pop("inhibits", ()))
+        self._date(frame)
         frame["line"] = self._line(frame)
         frame["actual_l_ha"] = actual_rate(frame, self.way.valves)
         rates = [rate for rate in frame.get("rates_l_ha") or [] if rate]
@@ -339,11 +361,29 @@ class Live:
         if self._way_file is not None:
             self._open(self._way_file)
 
+    def _date(self, frame: dict[str, Any]) -> None:
+        """Say since when each reason and alarm holds, on the clock of the frames."""
+        dated = {f"reason {one['code']}": one for one in frame["reasons"]}
+        for one in frame.get("findings") or []:
+            dated[f"finding {one['kind']} {one['valve']}"] = one
+        others = {
+            "record": (frame.get("journal") or {}).get("fault"),
+            "range": frame.get("out_of_range"),
+        }
+        holding = [*dated, *(name for name, is_so in others.items() if is_so)]
+        self._since_s = {name: self._since_s.get(name, frame["now_s"]) for name in holding}
+        for name, one in dated.items():
+            one["since_s"] = self._since_s[name]
+        frame["since_s"] = {name: self._since_s[name] for name in others if name in self._since_s}
+
     def _line(self, frame: dict[str, Any]) -> str:
         if frame["state"] == SprayerState.SPRAYING.value:
             return ""
         if not frame["reasons"]:
-            return _ENABLED_LINE
+            is_outside = frame["word"] == _HOLD and all(
+                rate is None for rate in frame.get("rates_l_ha") or [0.0]
+            )
+            return _OUTSIDE_LINE if is_outside else _ENABLED_LINE
         return ", ".join(reason["text"] for reason in frame["reasons"][:3])
 
     def _metered(self, liquid: dict[str, Any]) -> float | None:
@@ -397,7 +437,7 @@ class Live:
         for line in file:
             with suppress(ValueError, TypeError, IndexError):
                 point = json.loads(line)
-                if len(point) == 7 and isinstance(point[4], str):
+                if len(point) == 8 and isinstance(point[4], str):
                     self.way.volume_l = float(point.pop())
                     self.way.add([float(number) for number in point[:4]] + point[4:])
 

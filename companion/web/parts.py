@@ -47,6 +47,9 @@ class Host:
 class Part:
     """A part of the page: a title for its link, its files, and what adds its interface.
 
+    Of its files `main.html` is what its page has between header and end; a part NAME brings
+    NAME.js and NAME.css for it, and may use `static/part.js`.
+
     `files_at` is the path below its interface at which the body of a POST is a file.
     """
 

@@ -16,6 +16,7 @@ import time
 from asyncio.subprocess import DEVNULL, PIPE
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from html import escape
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -259,6 +260,20 @@ class Site:
             self._files[path] = (gzip.compress(path.read_bytes(), 6), kind)
         return self._files[path]
 
+    def page_of(self, name: str, part: Part) -> tuple[bytes, str]:
+        """Return the page of a part: what it has of its own, within what all parts have alike."""
+        path = part.static / "main.html"
+        if path not in self._files:
+            if not path.is_file():
+                raise HTTPException(404, "not found")
+            words = {"name": name, "title": part.title, "TITLE": part.title.upper()}
+            text = (STATIC / "part.html").read_text(encoding="utf-8")
+            for word, value in words.items():
+                text = text.replace(f"{{{word}}}", escape(value))
+            text = text.replace("{main}", path.read_text(encoding="utf-8"))
+            self._files[path] = (gzip.compress(text.encode(), 6), _TYPES[".html"])
+        return self._files[path]
+
     def flying(self) -> str | None:
         """Return why nothing may be worked out beside the flight now; None on the ground."""
         vehicle = self.live.state.get("vehicle") or {}
@@ -446,4 +461,5 @@ def _add_part(app: FastAPI, site: Site, name: str, part: Part) -> None:
 
     @app.get(f"/{name}/{{file:path}}", include_in_schema=False)
     async def file(file: str, request: Request) -> Response:
-        return _compressed(request, *site.file(part.static, file or "index.html"))
+        found = site.file(part.static, file) if file else site.page_of(name, part)
+        return _compressed(request, *found)

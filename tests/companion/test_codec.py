@@ -144,13 +144,16 @@ def test_reports_keep_their_meaning() -> None:
 )
 def test_a_fix_keeps_its_rank(fix_type: int, fix: Fix) -> None:
     gps = frame("gps_raw_int", 0, fix_type, 0, 0, 0, 0, 0, 0, 0, 12, h_acc=14)
-    assert one(gps) == GnssReport(received_s=2.5, fix=fix, horizontal_accuracy_m=0.014)
+    assert one(gps) == GnssReport(
+        received_s=2.5, fix=fix, horizontal_accuracy_m=0.014, satellites=12
+    )
 
 
-def test_an_accuracy_that_was_not_sent_is_none() -> None:
-    message = one(frame("gps_raw_int", 0, 6, 0, 0, 0, 0, 0, 0, 0, 12))
+def test_accuracy_and_satellites_that_were_not_sent_are_none() -> None:
+    message = one(frame("gps_raw_int", 0, 6, 0, 0, 0, 0, 0, 0, 0, 255))
     assert isinstance(message, GnssReport)
     assert message.horizontal_accuracy_m is None
+    assert message.satellites is None
 
 
 HEALTHY = 1 | 2 | 4 | 16 | 32

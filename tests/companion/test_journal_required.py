@@ -120,6 +120,8 @@ def test_a_disk_that_fills_up_is_a_fault(tmp_path: Path, monkeypatch: pytest.Mon
         tmp_path, setup=setup(), free_min_bytes=10**8, commit_every_s=0.02
     ) as journal:
         wait_for("space", "only 2 MB are free", journal)
+        assert journal.free_bytes == 2_000_000
+        assert 0.0 <= journal.saved_age_s < 60.0
 
 
 def test_a_writer_that_stands_still_is_a_fault(

@@ -21,7 +21,16 @@ from companion.errors import ConfigError
 from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
 from companion.web.frames import frame_of, packed
-from companion.web.live import ADVICE, Live, Way, actual_rate, map_parts, quads_between, reasons_of
+from companion.web.live import (
+    ADVICE,
+    Live,
+    Way,
+    actual_rate,
+    map_parts,
+    quads_between,
+    reasons_of,
+    wanted_rate,
+)
 from companion.web.page import ORDER_BYTES_MAX, parse_order
 from companion.web.ring import PAYLOAD_MAX, SLOTS, RingReader, RingWriter, new_memory
 from tests.companion.web_site import SETUP, Site, about, aged, served, until
@@ -94,6 +103,47 @@ def test_the_applied_rate_follows_flow_width_and_speed() -> None:
     # 1.2 L/min over 2 m at 5 m/s: 600 m2 a minute.
     assert actual_rate(frame, valves) == pytest.approx(20.0)
     assert actual_rate(frame | {"duty": [0.0, 0.0]}, valves) is None
+
+
+def test_what_is_wanted_is_the_maps_rate_under_the_open_valves() -> None:
+    valves = ((-1.0, 0.0, 2.0), (1.0, 0.0, 1.0), (2.0, 0.0, 1.0))
+    frame = {"duty": [0.5, 0.4, 0.0], "rates_l_ha": [10.0, 40.0, 90.0]}
+    assert wanted_rate(frame, valves) == pytest.approx(20.0)  # twice as wide at 10 L/ha
+    assert wanted_rate(frame | {"duty": [0.0, 0.0, 0.0]}, valves) is None
+    assert wanted_rate(frame | {"rates_l_ha": [None, None, None]}, valves) is None
+
+
+def test_in_the_air_an_enabled_sprayer_over_no_zone_holds_and_says_why() -> None:
+    live = Live(about(), way_file=None, utc_s=0.0)
+
+    def shown(*, in_air: bool, rates: list[float | None]) -> tuple[str, str]:
+        frame = _frame(1.0, 0.0, bits="000000") | {"state": "armed", "rates_l_ha": rates}
+        frame["vehicle"]["in_air"] = in_air  # type: ignore[index]
+        live.take(json.dumps(frame).encode())
+        return live.state["word"], live.state["line"]
+
+    assert shown(in_air=False, rates=[None, None])[0] == "ENABLED"
+    word, line = shown(in_air=True, rates=[None, None])
+    assert (word, line[:15]) == ("HOLD", "Outside the map")
+    assert shown(in_air=True, rates=[0.0, None]) == ("HOLD", shown(in_air=False, rates=[None])[1])
+
+
+def test_reasons_and_alarms_say_since_when_they_hold() -> None:
+    live = Live(about(), way_file=None, utc_s=0.0)
+
+    def since(now_s: float, *codes: str, fault: str | None = None) -> dict[str, float]:
+        leak = {"kind": "leak", "text": "leak", "valve": None}
+        frame = _frame(now_s, 0.0) | {"inhibits": codes, "findings": [leak]}
+        live.take(json.dumps(frame | {"journal": {"fault": fault}}).encode())
+        found = {one["code"]: one["since_s"] for one in live.state["reasons"]}
+        assert live.state["findings"][0]["since_s"] == 1.0
+        return found | live.state["since_s"]
+
+    assert since(1.0, "not-armed") == {"not-armed": 1.0}
+    found = since(2.0, "not-armed", "no-flow", fault="disk full")
+    assert found == {"not-armed": 1.0, "no-flow": 2.0, "record": 2.0}
+    assert since(3.0, "no-flow", fault="disk full") == {"no-flow": 2.0, "record": 2.0}
+    assert since(4.0, "not-armed") == {"not-armed": 4.0}  # it came back
 
 
 def test_the_ground_between_two_points_lies_under_the_open_valves() -> None:

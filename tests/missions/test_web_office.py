@@ -284,6 +284,17 @@ async def _with_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
     monkeypatch.setattr(module, "TIMES", {"check": Limits(cpu_s=1, wait_s=100.0)})
 
 
+async def test_the_page_of_the_office_has_the_head_that_all_parts_have() -> None:
+    async with served() as site:
+        page = (await site.asked("GET", "/office/")).body.decode()
+        assert "<title>Field and plan · vrspray</title>" in page
+        assert '<strong id="state-word">FIELD AND PLAN</strong>' in page
+        assert 'id="stop"' in page
+        assert page.index('src="office.js"') < page.index('<main id="main">')
+        assert page.rstrip().endswith("</html>")
+        assert (await site.asked("GET", "/office/static")).status == 404
+
+
 def test_the_page_finds_the_office_by_its_entry_point() -> None:
     parts = registered()
     assert parts["office"] is module.PART

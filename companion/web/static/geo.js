@@ -76,7 +76,7 @@ function tip(point, right, forward) {
   return [point[1] + sin * forward + cos * right, point[2] + cos * forward - sin * right];
 }
 
-// What the boom treated between two points: quadrilaterals, neighbours joined, with the rate.
+// What the boom treated between two points: quadrilaterals, neighbours joined.
 export function strips(valves, before, after) {
   const found = [];
   const gone = Math.hypot(after[1] - before[1], after[2] - before[2]);
@@ -94,7 +94,6 @@ export function strips(valves, before, after) {
     const right = valves[last].right_m + valves[last].width_m / 2;
     const forward = valves[first].forward_m;
     found.push({
-      rate: before[5],
       ring: [tip(before, left, forward), tip(before, right, forward), tip(after, right, forward), tip(after, left, forward)],
     });
     first = last;
@@ -121,14 +120,46 @@ function mix(a, b, share) {
   return `rgb(${part(1)},${part(3)},${part(5)})`;
 }
 
-// Rates as colours, from the map's least to its largest rate above nothing.
+// How far the rate at a point of the way is from the map's, as a share; null where there is none.
+// Orders lead the ground by up to `aheadS`, and points are a metre apart: a change under way is no error.
+export function offBy(points, index, aheadS) {
+  const [time, , , , , rate] = points[index];
+  let off = null;
+  for (let k = index; rate > 0 && k < points.length && (k === index || points[k - 1][0] <= time + aheadS); k += 1) {
+    const wanted = points[k][6];
+    if (wanted > 0 && (off === null || Math.abs(rate / wanted - 1) < Math.abs(off))) off = rate / wanted - 1;
+  }
+  return off;
+}
+
+// Too little is red, too much is blue, as in the report.
+const STEPS = [-0.2, -0.1, 0.1, 0.2];
+const OFF_WORDS = ["< −20", "−20 to −10", "± 10", "10 to 20", "> 20"];
+const OFF_DAY = ["#b2182b", "#ef8a62", "#8f9a92", "#67a9cf", "#2166ac"];
+const OFF_NIGHT = ["#e04a4a", "#f4a582", "#66747a", "#92c5de", "#4393f0"];
+
+// Rates as colours, from the map's least to its largest rate above nothing; or what is off from it.
 export class Scale {
-  constructor(rates, theme) {
+  constructor(rates, theme, { aheadS = 0, byError = false } = {}) {
+    this.aheadS = aheadS;
+    this.byError = byError;
+    this.off = theme === "night" ? OFF_NIGHT : OFF_DAY;
     const above = rates.filter((rate) => rate > 0);
     this.low = Math.min(...(above.length ? above : [0]));
     this.high = Math.max(...(above.length ? above : [1]));
     this.stops = theme === "night" ? NIGHT : DAY;
     this.none = theme === "night" ? "rgb(42,52,58)" : "rgb(205,210,203)";
+  }
+
+  // What was treated from a point of the way on.
+  treated(points, index) {
+    if (!this.byError) return this.color(points[index][5]);
+    const off = offBy(points, index, this.aheadS);
+    return off === null ? this.none : this.off[STEPS.filter((step) => off > step).length];
+  }
+
+  errors() {
+    return this.off.map((color, k) => [color, OFF_WORDS[k]]);
   }
 
   color(rate) {

@@ -64,8 +64,9 @@ export async function create(element, ground, scale, theme, onView) {
   const treatedFeatures = (from, to) => {
     const found = [];
     for (let i = Math.max(from, 1); i < to; i += 1) {
+      const color = colors.treated(points, i - 1);
       for (const strip of strips(ground.boom.valves, points[i - 1], points[i])) {
-        found.push({ type: "Feature", properties: { color: colors.color(strip.rate) }, geometry: { type: "Polygon", coordinates: [ring(strip.ring)] } });
+        found.push({ type: "Feature", properties: { color }, geometry: { type: "Polygon", coordinates: [ring(strip.ring)] } });
       }
     }
     return found;

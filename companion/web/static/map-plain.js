@@ -7,6 +7,8 @@ const LOOK = {
   night: { ground: "#0b1114", field: "#e9efe9", zone: "#6b7a80", ahead: "#ffb04d", closed: "#aab6b0", open: "#7dd3fc", halo: "#05080a", craft: "#ffffff" },
 };
 
+const AGAIN = 10; // points whose error what came later may make smaller
+
 export async function create(element, ground, scale, theme, onView) {
   const response = await fetch("api/v1/zones", { credentials: "same-origin" });
   const zones = await response.json();
@@ -38,7 +40,7 @@ export async function create(element, ground, scale, theme, onView) {
     under.globalAlpha = 0.92;
     for (let i = Math.max(from, 1); i < points.length; i += 1) {
       for (const strip of strips(ground.boom.valves, points[i - 1], points[i])) {
-        under.fillStyle = under.strokeStyle = colors.color(strip.rate);
+        under.fillStyle = colors.treated(points, i - 1);
         under.beginPath();
         strip.ring.forEach(([e, n], k) => (k ? under.lineTo(x(e), y(n)) : under.moveTo(x(e), y(n))));
         under.closePath();
@@ -144,7 +146,7 @@ export async function create(element, ground, scale, theme, onView) {
   return {
     kind: "canvas",
     setWay(all) { points = all; redraw(); },
-    addPoints(all) { points = all; treated(drawn); paint(); },
+    addPoints(all) { points = all; treated(drawn - (colors.byError ? AGAIN : 0)); paint(); },
     setVehicle(next, nextDuty) {
       vehicle = next; duty = nextDuty;
       ahead = next.ahead_east_m === null || !next.in_air ? -1 : index.at(next.ahead_east_m, next.ahead_north_m);

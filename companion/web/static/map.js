@@ -20,6 +20,7 @@ export class FieldMap {
     this.points = [];
     this.vehicle = null;
     this.theme = "day";
+    this.byError = false;
   }
 
   async load(ground, theme) {
@@ -27,8 +28,7 @@ export class FieldMap {
     this.theme = theme;
     this.rates = [...ground.rates_l_ha];
     if (ground.default_rate_l_ha) this.rates.push(ground.default_rate_l_ha);
-    this.scale = new Scale(this.rates, theme);
-    this.legend();
+    this.colors();
     const onView = (metersPerPixel, follows) => this.viewed(metersPerPixel, follows);
     const wantsPlain = new URLSearchParams(location.search).has("plain");
     if (!wantsPlain && hasWebGl()) {
@@ -56,6 +56,12 @@ export class FieldMap {
       const yes = follow.getAttribute("aria-pressed") !== "true";
       follow.setAttribute("aria-pressed", String(yes));
       this.back.follow(yes);
+    });
+    const error = document.getElementById("map-error");
+    error.addEventListener("click", () => {
+      this.byError = !this.byError;
+      error.setAttribute("aria-pressed", String(this.byError));
+      this.setTheme(this.theme);
     });
     document.getElementById("map-fit").addEventListener("click", () => { follow.setAttribute("aria-pressed", "false"); this.back.fit(); });
     document.getElementById("map-in").addEventListener("click", () => this.back.zoom(1));
@@ -97,9 +103,23 @@ export class FieldMap {
       return row;
     }));
     const note = document.createElement("b");
-    note.textContent = "map · done";
+    note.textContent = this.byError ? "map" : "map · done";
     box.append(note);
+    if (this.byError) this.errorLegend(box);
     this.scaleBar();
+  }
+
+  errorLegend(box) {
+    const title = document.createElement("b");
+    title.textContent = "% off";
+    box.append(title, ...this.scale.errors().map(([color, words]) => {
+      const row = document.createElement("div"), swatch = document.createElement("canvas");
+      swatch.width = 26; swatch.height = 13;
+      const pen = swatch.getContext("2d");
+      pen.fillStyle = color; pen.fillRect(0, 0, 26, 13);
+      row.append(swatch, words);
+      return row;
+    }));
   }
 
   setWay(points) { this.points = points; this.back?.setWay(points); }
@@ -114,8 +134,12 @@ export class FieldMap {
   setTheme(theme) {
     this.theme = theme;
     if (!this.back) return;
-    this.scale = new Scale(this.rates, theme);
-    this.legend();
+    this.colors();
     this.back.setTheme(theme, this.scale);
+  }
+
+  colors() {
+    this.scale = new Scale(this.rates, this.theme, { aheadS: this.ground.ahead_s, byError: this.byError });
+    this.legend();
   }
 }

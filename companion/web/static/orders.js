@@ -1,21 +1,11 @@
 // Orders: STOP at the first touch; what opens valves only after a press of a second.
 
+import { ask } from "./api.js";
+
 const ANSWER_MS = 2500;
 const STOP_TRIES = 6;
 
-// Relative to this file: a part of the page below it stops as well as the page itself.
-async function post(name, body = {}) {
-  const response = await fetch(new URL(`../api/v1/${name}`, import.meta.url), {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify(body),
-    credentials: "same-origin",
-    signal: AbortSignal.timeout(ANSWER_MS),
-  });
-  const answer = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(typeof answer.detail === "string" ? answer.detail : `refused (${response.status})`);
-  return answer;
-}
+const post = (name, body = {}) => ask(name, body, { withinMs: ANSWER_MS });
 
 export function stopping(button, say) {
   let touched = -Infinity; // a key in the first second counts, too
@@ -116,6 +106,5 @@ export async function logIn() {
       console.warn(error.message);
     }
   }
-  const response = await fetch("api/v1/session", { credentials: "same-origin" });
-  return response.json();
+  return ask("session");
 }

@@ -5,26 +5,12 @@ import { Feed } from "./feed.js";
 import { FieldMap } from "./map.js";
 import { Orders, logIn } from "./orders.js";
 import * as panels from "./panels.js";
+import { ask, byId, kept, light, make, say } from "./part.js";
 import { toSi, useUnits } from "./units.js";
-
-const byId = (id) => document.getElementById(id);
-const kept = {
-  get(name, otherwise) { try { return localStorage.getItem(`vrspray-${name}`) ?? otherwise; } catch { return otherwise; } },
-  set(name, value) { try { localStorage.setItem(`vrspray-${name}`, value); } catch { /* private mode */ } },
-};
 
 let facts = {}, ground = null, state = null, scope = "none", checks = [];
 const map = new FieldMap();
 const chart = new FlowChart(byId("chart"));
-
-let saying = 0;
-function say(what, isTrouble = false) {
-  const box = byId("answer");
-  box.textContent = what;
-  box.hidden = false;
-  clearTimeout(saying);
-  saying = setTimeout(() => { box.hidden = true; }, isTrouble ? 6000 : 3000);
-}
 
 const orders = new Orders(say);
 
@@ -72,11 +58,7 @@ let begun = 0;
 document.addEventListener("visibilitychange", () => { if (!document.hidden) show(); });
 
 function theme() {
-  const wanted = byId("theme").value;
-  const isNight = wanted === "night" || (wanted === "auto" && matchMedia("(prefers-color-scheme: dark)").matches);
-  const name = isNight ? "night" : "day";
-  document.documentElement.dataset.theme = name;
-  map.setTheme(name);
+  map.setTheme(light());
   chart.restyle();
 }
 
@@ -99,12 +81,6 @@ function settings() {
   });
 }
 
-async function json(path) {
-  const response = await fetch(path, { credentials: "same-origin" });
-  if (!response.ok) throw new Error(`${path}: ${response.status}`);
-  return response.json();
-}
-
 async function begin() {
   const access = await logIn();
   scope = access.scope;
@@ -118,18 +94,17 @@ async function begin() {
   }
   begun = performance.now();
   feed.open();
-  [facts, ground] = await Promise.all([json("api/v1/facts"), json("api/v1/map")]);
+  [facts, ground] = await Promise.all([ask("facts"), ask("map")]);
   byId("parts").replaceChildren(...(facts.parts ?? []).map(({ name, title }) => {
-    const link = document.createElement("a");
+    const link = make("a", title);
     link.href = `${name}/`;
-    link.textContent = title;
     return link;
   }));
   show();
   await map.load(ground, document.documentElement.dataset.theme);
   document.body.dataset.map = "ready";
   show();
-  checks = await json("api/v1/checks").then((found) => found.checks, () => []);
+  checks = await ask("checks").then((found) => found.checks, () => []);
   show();
 }
 

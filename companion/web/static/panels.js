@@ -1,19 +1,13 @@
 // Everything beside the map: state, numbers, alarms, links, checklist, tank, events.
 
+import { byId, make } from "./part.js";
 import { unitOf, value, withUnit } from "./units.js";
 
+const DUTIES_MAX = 8; // more figures do not fit on a phone
 const FIXES = ["no GNSS", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed"];
-const byId = (id) => document.getElementById(id);
 
 function text(element, content) {
   if (element.textContent !== content) element.textContent = content;
-}
-
-function make(tag, className, content) {
-  const element = document.createElement(tag);
-  if (className) element.className = className;
-  if (content !== undefined) element.textContent = content;
-  return element;
 }
 
 // Builds a list anew only when what it shows has changed: screen readers and touches stay calm.
@@ -52,6 +46,12 @@ export function showRates(state) {
   const duty = state.duty ?? [];
   const box = byId("valves");
   if (box.children.length !== duty.length) box.replaceChildren(...duty.map(() => { const one = make("div"); one.append(make("span")); return one; }));
+  const figures = byId("duties");
+  figures.hidden = duty.length > DUTIES_MAX;
+  if (!figures.hidden) {
+    if (figures.children.length !== duty.length) figures.replaceChildren(...duty.map(() => make("span")));
+    duty.forEach((share, k) => text(figures.children[k], `${Math.round(share * 100)} %`));
+  }
   duty.forEach((share, k) => { const height = `${Math.round(share * 100)}%`; const bar = box.children[k].firstElementChild; if (bar.style.height !== height) bar.style.height = height; });
   byId("key-metered").hidden = state.meter_l_min === null || state.meter_l_min === undefined;
   const open = duty.filter((share) => share > 0);
@@ -77,26 +77,32 @@ export function showNumbers(state, facts, ground) {
   ].map(([name, kind, number]) => [name, value(kind, number), number === null || number === undefined ? "" : unitOf(kind)]);
   rows.splice(4, 0, ["Mean duty", open.length ? String(Math.round((open.reduce((a, b) => a + b, 0) / open.length) * 100)) : "–", open.length ? "%" : ""]);
   if (vehicle.rate_percent !== undefined && vehicle.rate_percent !== 100) rows.push(["Rate override", String(vehicle.rate_percent), "%"]);
-  rows.push(["Mode", vehicle.mode ?? "–", ""]);
+  rows.push(["Mode", vehicle.mode ?? "–", vehicle.armed === false ? "disarmed" : vehicle.armed ? "armed" : ""]);
   const box = byId("numbers");
   if (box.children.length !== rows.length) {
-    box.replaceChildren(...rows.map(([name]) => { const row = make("div"); const cell = make("dd"); cell.append(make("span"), make("i", "unit")); row.append(make("dt", "", name), cell); return row; }));
+    box.replaceChildren(...rows.map(([name]) => { const row = make("div"); const cell = make("dd"); cell.append(make("span"), make("i", undefined, "unit")); row.append(make("dt", name), cell); return row; }));
   }
   rows.forEach(([name, number, unit], k) => { const row = box.children[k]; text(row.children[0], name); text(row.children[1].children[0], number); text(row.children[1].children[1], unit); });
 }
 
 export function showAlarms(state) {
-  const findings = (state.findings ?? []).map((one) => ({ text: one.text, advice: one.valve === null ? "" : `Valve ${one.valve + 1}.`, is_alarm: true }));
+  const findings = (state.findings ?? []).map((one) => ({ ...one, advice: one.valve === null ? "" : `Valve ${one.valve + 1}.`, is_alarm: true }));
   const extra = [];
-  if (state.journal?.fault) extra.push({ text: `record: ${state.journal.fault}`, advice: "Free the disk, or set journal.folder to another one.", is_alarm: true });
-  if (state.out_of_range) extra.push({ text: `${state.out_of_range} valves cannot deliver the rate at this speed`, advice: "Fly slower for more, faster for less.", is_alarm: true });
+  if (state.journal?.fault) extra.push({ text: `record: ${state.journal.fault}`, advice: "Free the disk, or set journal.folder to another one.", is_alarm: true, since_s: state.since_s?.record });
+  if (state.out_of_range) extra.push({ text: `${state.out_of_range} valves cannot deliver the rate at this speed`, advice: "Fly slower for more, faster for less.", is_alarm: true, since_s: state.since_s?.range });
   const items = [...findings, ...extra, ...(state.reasons ?? [])];
   list("alarms", items.length ? items : [{ text: "None. Nothing keeps the valves closed.", advice: "", is_alarm: false }], (one) => {
-    const item = make("li", one.is_alarm ? "alarm" : "");
-    item.append(make("b", "", one.text.charAt(0).toUpperCase() + one.text.slice(1)));
-    if (one.advice) item.append(make("span", "small", one.advice));
+    const item = make("li", undefined, one.is_alarm ? "alarm" : "");
+    item.append(make("b", one.text.charAt(0).toUpperCase() + one.text.slice(1)));
+    item.append(make("time", undefined, "small"));
+    if (one.advice) item.append(make("span", one.advice, "small"));
     return item;
   });
+  items.forEach((one, k) => { if (one.since_s !== undefined) text(byId("alarms").children[k].children[1], `for ${lasting(state.now_s - one.since_s)}`); });
+}
+
+function lasting(seconds) {
+  return seconds < 90 ? `${Math.max(Math.round(seconds), 0)} s` : seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
 }
 
 function age(seconds) {
@@ -111,16 +117,17 @@ export function showLinks(state, facts, pageAge) {
     ["Page to companion", within(pageAge, 2), calm(pageAge), ""],
     ["Autopilot", vehicle.link_up !== false && within(vehicle.heartbeat_age_s, facts.heartbeat_age_max_s), calm(vehicle.heartbeat_age_s), link.position_hz ? `${Math.round(link.position_hz)} positions a second` : ""],
     ["Position", within(vehicle.position_age_s, facts.position_age_max_s), calm(vehicle.position_age_s), ""],
-    ["GNSS", vehicle.fix !== null && vehicle.fix >= facts.fix, FIXES[vehicle.fix] ?? "–", vehicle.accuracy_m ? `± ${vehicle.accuracy_m.toFixed(2)} m` : ""],
-    ["Record", Boolean(journal.name) && !journal.fault && !journal.lost, journal.fault ? "fault" : journal.lost ? `${journal.lost} rows lost` : "writing", journal.name ?? ""],
+    ["GNSS", vehicle.fix !== null && vehicle.fix >= facts.fix, FIXES[vehicle.fix] ?? "–", [state.satellites === null || state.satellites === undefined ? "" : `${state.satellites} satellites`, vehicle.accuracy_m ? `± ${vehicle.accuracy_m.toFixed(2)} m` : ""].filter(Boolean).join(", ")],
+    ["Autopilot's clock", Boolean(state.clock?.answers), state.clock ? (state.clock.answers ? "TIMESYNC" : "by arrival") : "–", state.clock?.round_trip_s ? `round trip ${Math.max(Math.round(state.clock.round_trip_s * 1000), 1)} ms` : ""],
+    ["Record", Boolean(journal.name) && !journal.fault && !journal.lost, journal.fault ? "fault" : journal.lost ? `${journal.lost} rows lost` : journal.saved_age_s === undefined ? "writing" : calm(journal.saved_age_s), [journal.name, journal.free_gb === null || journal.free_gb === undefined ? "" : `${journal.free_gb < 10 ? journal.free_gb.toFixed(1) : Math.round(journal.free_gb)} GB free`].filter(Boolean).join(", ")],
   ];
-  if (facts.has_meter) items.push(["Flow meter", !state.liquid?.meter_fault && state.liquid?.meter_ml !== null, state.liquid?.meter_fault ? "fault" : "counting", state.liquid?.meter_fault ?? ""]);
+  if (facts.has_meter) items.push(["Flow meter", !state.liquid?.meter_fault && state.liquid?.meter_ml !== null, state.liquid?.meter_fault ? "fault" : calm(state.liquid?.meter_age_s), state.liquid?.meter_fault ?? ""]);
   list("links", items, ([name, isOk, number, note]) => {
-    const item = make("li", isOk ? "ok" : "bad");
-    const mark = make("span", "mark", isOk ? "✓" : "✗");
+    const item = make("li", undefined, isOk ? "ok" : "bad");
+    const mark = make("span", isOk ? "✓" : "✗", "mark");
     mark.setAttribute("role", "img"); mark.setAttribute("aria-label", isOk ? "good" : "bad");
-    item.append(mark, make("b", "", name), make("span", "value", number));
-    if (note) item.append(make("span", "small", note));
+    item.append(mark, make("b", name), make("span", number, "value"));
+    if (note) item.append(make("span", note, "small"));
     return item;
   });
 }
@@ -142,11 +149,11 @@ export function showChecklist(state, facts, ground, checks) {
   ];
   const items = [...live, ...(checks ?? []).filter((one) => one.status !== "ok" && one.status !== "n/a").map((one) => [one.name, one.status === "fail" ? false : null, one.fix ? `${one.text}; ${one.fix}` : one.text])];
   list("checklist", items, ([name, isOk, note]) => {
-    const item = make("li", isOk === null ? "wait" : isOk ? "ok" : "bad");
-    const mark = make("span", "mark", isOk === null ? "•" : isOk ? "✓" : "✗");
+    const item = make("li", undefined, isOk === null ? "wait" : isOk ? "ok" : "bad");
+    const mark = make("span", isOk === null ? "•" : isOk ? "✓" : "✗", "mark");
     mark.setAttribute("role", "img"); mark.setAttribute("aria-label", isOk === null ? "to see to" : isOk ? "good" : "bad");
-    item.append(mark, make("b", "", name));
-    if (note) item.append(make("span", "small", note));
+    item.append(mark, make("b", name));
+    if (note) item.append(make("span", note, "small"));
     return item;
   });
 }
@@ -174,7 +181,7 @@ export function showLanded(state, facts) {
   text(byId("landed-text"), `${withUnit("area", state.area_ha)} treated with ${withUnit("volume", state.volume_l)} ordered; ${withUnit("area", state.left_ha)} left.`);
   const box = byId("landed-link"), name = state.journal?.name;
   if (box.firstChild || !name || !(facts.parts ?? []).some((one) => one.name === "flights")) return;
-  const link = make("a", "", "Report, and what is left");
+  const link = make("a", "Report, and what is left");
   link.href = `flights/#report=${encodeURIComponent(name)}`;
   box.append(link);
 }
@@ -183,7 +190,7 @@ export function showEvents(state) {
   list("events", (state.events ?? []).slice().reverse(), ([at, kind, what]) => {
     const item = make("li");
     const gone = Math.max(state.now_s - at, 0);
-    item.append(make("time", "", gone < 90 ? `${Math.round(gone)} s ago` : `${Math.round(gone / 60)} min`), make("span", "", what || kind));
+    item.append(make("time", gone < 90 ? `${Math.round(gone)} s ago` : `${Math.round(gone / 60)} min`), make("span", what || kind));
     return item;
   });
 }

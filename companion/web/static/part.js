@@ -1,9 +1,9 @@
-// What the parts of the page have in common: their elements, what they say and ask, STOP and the light.
+// What the page and its parts have in common: their elements, what they say, what is kept, STOP and the light.
 
 import { stopping } from "./orders.js";
 import { useUnits } from "./units.js";
 
-export const API = "../api/v1/";
+export { API, ask } from "./api.js";
 export const byId = (id) => document.getElementById(id);
 
 export function make(tag, text, className) {
@@ -12,6 +12,11 @@ export function make(tag, text, className) {
   if (className) element.className = className;
   return element;
 }
+
+export const kept = {
+  get(name, otherwise) { try { return localStorage.getItem(`vrspray-${name}`) ?? otherwise; } catch { return otherwise; } },
+  set(name, value) { try { localStorage.setItem(`vrspray-${name}`, value); } catch { /* private mode */ } },
+};
 
 let saying = 0;
 export function say(what, isTrouble = false) {
@@ -22,21 +27,18 @@ export function say(what, isTrouble = false) {
   saying = setTimeout(() => { box.hidden = true; }, isTrouble ? 8000 : 3000);
 }
 
-export async function ask(place, body, kind = "application/json") {
-  const options = body === undefined ? {} : { method: "POST", headers: { "Content-Type": kind }, body: kind === "application/json" ? JSON.stringify(body) : body };
-  const response = await fetch(`${API}${place}`, { credentials: "same-origin", ...options });
-  const answer = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Error(typeof answer.detail === "string" ? answer.detail : `refused (${response.status})`);
-  return answer;
+// Day or night, as it was chosen here or as the device has it.
+export function light() {
+  const chosen = kept.get("theme", "auto");
+  const isNight = chosen === "night" || (chosen !== "day" && matchMedia("(prefers-color-scheme: dark)").matches);
+  const theme = isNight ? "night" : "day";
+  document.documentElement.dataset.theme = theme;
+  return theme;
 }
 
-// The light and the units that were chosen on the page; STOP works from here on. Returns the light.
+// For a part: light and units as chosen on the page; STOP works from here on. Returns the light.
 export function begin() {
-  let chosen = null;
-  try { chosen = localStorage.getItem("vrspray-theme"); useUnits(localStorage.getItem("vrspray-units") ?? "si"); } catch { /* private mode */ }
-  const isNight = matchMedia("(prefers-color-scheme: dark)").matches;
-  const theme = chosen === "night" || (chosen !== "day" && isNight) ? "night" : "day";
-  document.documentElement.dataset.theme = theme;
+  useUnits(kept.get("units", "si"));
   stopping(byId("stop"), say);
-  return theme;
+  return light();
 }

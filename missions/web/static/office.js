@@ -146,7 +146,7 @@ async function save() {
   let name = ROLES[role];
   for (let k = 2; role === "no-spray" && state.files.some((file) => file.name === name); k += 1) name = `drawn-no-spray-${k}.geojson`;
   const chosen = role;
-  await doing("Saving", () => ask(`office/files/${name}`, JSON.stringify(data), "application/octet-stream"));
+  await doing("Saving", () => ask(`office/files/${name}`, JSON.stringify(data), { kind: "application/octet-stream" }));
   if (chosen === "boundary") chosenBy.field = name;
   else for (const one of byId("no_spray").options) if (one.value === name) one.selected = true;
   startDrawing(null);
@@ -166,7 +166,7 @@ function reading() {
 }
 
 async function load(list) {
-  for (const file of list) await doing(`Loading ${file.name}`, () => ask(`office/files/${encodeURIComponent(file.name)}`, file, "application/octet-stream"));
+  for (const file of list) await doing(`Loading ${file.name}`, () => ask(`office/files/${encodeURIComponent(file.name)}`, file, { kind: "application/octet-stream" }));
 }
 
 function planned() {
