@@ -30,6 +30,7 @@ from missions.files.write import check_suffix, older_sorties, write_fleet
 from missions.maps.cli.grid import parse_mark
 from missions.maps.cli.options import Reading, reading_options
 from missions.maps.whole_file import check_folder
+from missions.mix import mix_lines, mix_of
 from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
@@ -266,6 +267,7 @@ def plan(
     asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT
     if asks and task.left is None and not isinstance(task.rates, UntreatedRates):
         choices = list(prices(planned, task.rates, depots=task.depots, around=task.around))
+    mix = mix_of(reading.config, planned, task.rates)
     with _undisturbed():
         files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
     removed = _removed(older_sorties(out, files))
@@ -284,6 +286,7 @@ def plan(
         "prices": [asdict(price) for price, _ in choices],
         "assumed": assumed(task, asked, reading.config, changes),
         "removed": [str(path) for path in removed],
+        "mix": mix,
     }
     if pilot_sheet is not None:
         write_sheet(
@@ -471,4 +474,4 @@ def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str
             f"only they are sprayed{_once(planned)}"
         )
     lines += sortie_lines(planned, result)
-    return lines
+    return lines if result["mix"] is None else [*lines, *mix_lines(result["mix"])]

@@ -28,9 +28,7 @@ def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict
     overlap_l = {} if once else _overlap_l(plan)
     found["overlap_l"] = sum(overlap_l.values())
     found["overlap_litres_percent"] = 100.0 * found["overlap_l"] / plan.volume_l
-    aboard = _Aboard(plan)
-    in_time = sorted(plan.sorties, key=lambda each: (each.start_s, each.number))
-    filled = {sortie.number: aboard.fill(sortie) for sortie in in_time}
+    filled = filled_of(plan)
     for row, sortie in zip(found["sorties"], plan.sorties, strict=True):
         row["items"] = len(items_of(plan, sortie, with_sprayer=with_sprayer))
         row["land_s"] = sortie.start_s + row["airborne_s"]
@@ -42,6 +40,13 @@ def sheet(plan: Plan, *, with_sprayer: bool = False, once: bool = False) -> dict
         found["aircraft"] = _crafts(plan)
         found["separation_m"] = separation_m(plan)
     return found
+
+
+def filled_of(plan: Plan) -> dict[int, dict[str, Any]]:
+    """Return by its number what each sortie finds in tank and battery, and what is put in."""
+    aboard = _Aboard(plan)
+    in_time = sorted(plan.sorties, key=lambda each: (each.start_s, each.number))
+    return {sortie.number: aboard.fill(sortie) for sortie in in_time}
 
 
 class _Aboard:

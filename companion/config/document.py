@@ -39,6 +39,7 @@ class Document(tables.Table):
     safety: tables.SafetyTable = tables.SafetyTable()
     mission: tables.MissionTable | None = None
     product: tables.ProductTable = tables.ProductTable()
+    mix: Annotated[tuple[tables.MixTable, ...], Field(strict=False, max_length=20)] = ()
     application: application_table.ApplicationTable = application_table.ApplicationTable()
     limits_table: tables.LimitsTable = Field(default=tables.LimitsTable(), alias="limits")
     flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()

@@ -8,9 +8,18 @@ corrections and of the sensors have files of their own.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 Text = Annotated[str, Field(min_length=1, max_length=500)]
 Texts = Annotated[tuple[Text, ...], Field(strict=False, max_length=1000)]
@@ -21,6 +30,14 @@ Latitude = Annotated[FiniteFloat, Field(ge=-90.0, le=90.0)]
 Longitude = Annotated[FiniteFloat, Field(ge=-180.0, le=180.0)]
 
 Altitude = Annotated[FiniteFloat, Field(ge=-1000.0, le=10_000.0)]
+# How products are sold, by the two letters of their labels (CropLife International's codes).
+Formulation = Literal[
+    "conditioner", "SG", "SP", "WG", "WP", "CS", "SC", "ZC", "SE", "OD", "EC", "EW", "ME", "SL",
+    "surfactant", "oil", "fertilizer",
+]  # fmt: skip
+DoseUnit = Literal[
+    "L/ha", "mL/ha", "kg/ha", "g/ha", "%", "L/100 L", "mL/100 L", "kg/100 L", "g/100 L"
+]
 Place = Annotated[tuple[Latitude, Longitude], Field(strict=False)]
 
 
@@ -236,6 +253,13 @@ class MissionTable(Table):
     reserve_l: float = Field(
         default=1.0, ge=0, le=1_000, description="left in the tank at its refill"
     )
+    rinses: int = Field(default=3, ge=1, le=10, description="of the tank after the last sortie")
+    rinse_l: float | None = Field(
+        default=None,
+        gt=0,
+        le=1_000,
+        description="clean water for all of them; absent: ten times reserve_l (ISO 16119)",
+    )
     rate_l_ha: Rate = Field(default=20.0, description="where no prescription is given")
     depots: Annotated[
         tuple[Annotated[tuple[Latitude, Longitude], Field(strict=False)], ...],
@@ -346,6 +370,30 @@ class LimitsTable(Table):
     file: Text | None = Field(
         default=None, description="TOML file of label and permit, relative to this file"
     )
+
+
+class MixTable(Table):
+    """One product of the tank mix, for the sheet that `vrspray plan` writes."""
+
+    name: Text = Field(description="as its label says")
+    registration: Text | None = Field(default=None, description="for the sheet")
+    formulation: Formulation | None = Field(
+        default=None, description="says when it is mixed in; absent: last, in the file's order"
+    )
+    amount: float = Field(gt=0, le=10_000, description="of the product, in unit")
+    unit: DoseUnit = Field(description="for each hectare, or for so much of what is sprayed")
+    at_l_ha: Annotated[FiniteFloat, Field(gt=0, le=10_000)] | None = Field(
+        default=None,
+        description="spray rate for which an amount per hectare is meant; absent: map's average",
+    )
+
+    @model_validator(mode="after")
+    def _says_one_thing(self) -> Self:
+        if self.at_l_ha is not None and not self.unit.endswith("/ha"):
+            raise PydanticCustomError(
+                "no_rate", "at_l_ha is for an amount for each hectare; leave it out"
+            )
+        return self
 
 
 class JournalTable(Table):

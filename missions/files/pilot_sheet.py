@@ -16,18 +16,21 @@ from typing import Any
 from companion.config import Config
 from missions.errors import PlanError
 from missions.maps.whole_file import write_whole
+from missions.mix import amount_words, product_words, rinse_words, scale_of
 from missions.plan import Plan
 
 SUFFIXES = (".html", ".txt")
 PICTURES = {".png": "image/png", ".svg": "image/svg+xml"}
 _DAY_MIN = 24 * 60
+# The columns that are read from a distance.
+_LARGE = ("fill to\nL", "water up to\nL")
 _STYLE = """@page { size: A4 landscape; margin: 10mm; }
 body { font: 10pt sans-serif; margin: 8mm; color: #000; }
 h1 { font-size: 16pt; margin: 0 0 2mm; }
 ul { margin: 0 0 4mm; padding: 0; list-style: none; columns: 2; }
 li { break-inside: avoid; padding-left: 34mm; text-indent: -34mm; }
 li b { display: inline-block; min-width: 34mm; text-indent: 0; }
-table { border-collapse: collapse; width: 100%; }
+table { border-collapse: collapse; width: 100%; margin-bottom: 4mm; }
 th, td { border: 0.2mm solid #777; padding: 0.8mm 1.5mm; text-align: right; }
 th { background: #eee; font-size: 8.5pt; }
 thead { display: table-header-group; }
@@ -117,12 +120,15 @@ def write_sheet(
     """Write the sheet of a plan, with the figures of `missions.sheet`; HTML holds its picture."""
     check_sheet(out)
     facts = _facts(plan, found, product)
-    table = _table(plan, found, product, start_min)
+    tables = [_table(plan, found, product, start_min)]
     notes = _notes(plan, start_min)
+    if found.get("mix") is not None:
+        tables.append(_mix_table(found["mix"]))
+        notes = [*_mix_notes(found["mix"]), *notes]
     if out.suffix.casefold() == ".html":
-        text = _html(title, facts, table, notes, _shown(picture))
+        text = _html(title, facts, tables, notes, _shown(picture))
     else:
-        text = _text(title, facts, table, notes)
+        text = _text(title, facts, tables, notes)
     write_whole(out, text.encode("utf-8"))
 
 
@@ -138,9 +144,24 @@ def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
         ("Field", f"{found['coverage_percent']:.2f} % covered of {ground_text(found)}"),
         ("To mix", f"{adds_l:.1f} L: {found['volume_l']:.1f} L to spray, the rest is reserve"),
     ]
-    if product.words is not None:
+    mix = found.get("mix")
+    if mix is not None:
+        facts += [
+            (
+                f"Product {number}",
+                f"{product_words(each)}: {amount_words(each['total'], each['measure'])} in all, "
+                f"{amount_words(each['leftover'], each['measure'])} of it in what is left",
+            )
+            for number, each in enumerate(mix["products"], start=1)
+        ]  # fmt: skip
+        facts += [
+            ("Water", f"{mix['water_l']:.1f} L; solids take the place of some"),
+            ("Left over", f"{mix['leftover_l']:.2f} L of the mix"),
+            ("Rinse", rinse_words(mix["rinse"])),
+        ]
+    elif product.words is not None:
         facts.append(("Product", product.words))
-    if product.per_l is not None:
+    if mix is None and product.per_l is not None:
         facts.append(("Dose", f"{adds_l * product.per_l:.2f} {product.unit} of it in that mix"))
     facts += [
         ("Time", f"{clock(found['total_s'])} (h:min) from first take-off to last landing"),
@@ -192,7 +213,7 @@ def _table(plan: Plan, found: dict[str, Any], product: Product, start_min: int |
         ("fill to\nL", [f"{row['fill_l']:.1f}" for row in rows], ""),
         ("new in it\nL", [f"{row['add_l']:.1f}" for row in rows], _sum(rows, "add_l", 1)),
     ]
-    if product.per_l is not None:
+    if found.get("mix") is None and product.per_l is not None:
         doses = [row["add_l"] * product.per_l for row in rows]
         columns.append(
             (f"product\n{product.unit}", [f"{dose:.2f}" for dose in doses], f"{sum(doses):.2f}")
@@ -227,6 +248,34 @@ def _table(plan: Plan, found: dict[str, Any], product: Product, start_min: int |
     return [list(head), *(list(row) for row in zip(*cells, strict=True)), list(sums)]
 
 
+def _mix_table(mix: dict[str, Any]) -> Table:
+    """Return what is poured before each sortie, in this order, and the sums."""
+    rows, products = mix["sorties"], mix["products"]
+    columns = [
+        ("mix for\nsortie", [str(row["number"]) for row in rows], "all"),
+        ("water first\nL", [f"{row['water_l'] / 2.0:.2f}" for row in rows], ""),
+    ]
+    for at, each in enumerate(products):
+        amounts = [row["amounts"][at] for row in rows]
+        unit, factor, digits = scale_of(max(amounts), each["measure"])
+        shown = [f"{amount * factor:.{digits}f}" for amount in (*amounts, each["total"])]
+        columns.append((f"{at + 1}. {each['name']}\n{unit}", shown[:-1], shown[-1]))
+    columns.append(
+        ("water up to\nL", [f"{row['mix_l']:.2f}" for row in rows], f"{mix['mix_l']:.2f}")
+    )
+    head, cells, sums = zip(*columns, strict=True)
+    return [list(head), *(list(row) for row in zip(*cells, strict=True)), list(sums)]
+
+
+def _mix_notes(mix: dict[str, Any]) -> list[str]:
+    return [
+        "Mix: half of the water, then the products from left to right, each well stirred in before "
+        "the next, then water up to the last figure. The labels come first. Try a mix that is new "
+        "to you in a jar.",
+        *mix["notes"],
+    ]
+
+
 def _sum(rows: list[dict[str, Any]], name: str, digits: int) -> str:
     return f"{sum(row[name] for row in rows):.{digits}f}"
 
@@ -244,8 +293,17 @@ def _notes(plan: Plan, start_min: int | None) -> list[str]:
     return [*notes, *plan.warnings]
 
 
-def _text(title: str, facts: Facts, table: Table, notes: list[str]) -> str:
+def _text(title: str, facts: Facts, tables: list[Table], notes: list[str]) -> str:
     """Return the sheet in plain text; units stand below the heads."""
+    lines = [title, "=" * len(title), ""]
+    lines += [f"{name:<14} {value}" for name, value in facts]
+    for table in tables:
+        lines += ["", *_text_table(table)]
+    lines += ["", *notes]
+    return "\n".join(line.rstrip() for line in lines) + "\n"
+
+
+def _text_table(table: Table) -> list[str]:
     heads = [head.split("\n") for head in table[0]]
     high = max(len(head) for head in heads)
     rows = [
@@ -254,12 +312,8 @@ def _text(title: str, facts: Facts, table: Table, notes: list[str]) -> str:
     body, sums = table[1:-1], table[-1]
     widths = [max(map(len, column)) for column in zip(*rows, *body, sums, strict=True)]
     rule = "  ".join("-" * width for width in widths)
-    lines = [title, "=" * len(title), ""]
-    lines += [f"{name:<14} {value}" for name, value in facts]
-    lines += ["", *(_row(row, widths) for row in rows), rule]
-    lines += [_row(row, widths) for row in body]
-    lines += [rule, _row(sums, widths), "", *notes]
-    return "\n".join(line.rstrip() for line in lines) + "\n"
+    lines = [*(_row(row, widths) for row in rows), rule]
+    return [*lines, *(_row(row, widths) for row in body), rule, _row(sums, widths)]
 
 
 def _row(cells: list[str], widths: list[int]) -> str:
@@ -275,11 +329,10 @@ def _shown(picture: Path | None) -> list[str]:
     return [f'<img alt="plan" src="data:{kind};base64,{content}">']
 
 
-def _html(title: str, facts: Facts, table: Table, notes: list[str], picture: list[str]) -> str:
+def _html(
+    title: str, facts: Facts, tables: list[Table], notes: list[str], picture: list[str]
+) -> str:
     """Return the sheet as a page of its own, without a script and without a file beside it."""
-    head = "".join(f"<th>{escape(name).replace(chr(10), '<br>')}</th>" for name in table[0])
-    fill = table[0].index("fill to\nL")
-    body = "\n".join(f"<tr>{_cells(row, fill)}</tr>" for row in table[1:-1])
     lines = [
         "<!doctype html>",
         f'<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>',
@@ -288,14 +341,23 @@ def _html(title: str, facts: Facts, table: Table, notes: list[str], picture: lis
         "<ul>",
         *(f"<li><b>{escape(name)}</b> {escape(value)}</li>" for name, value in facts),
         "</ul>",
-        f"<table><thead><tr>{head}</tr></thead>",
-        f"<tbody>{body}</tbody>",
-        f"<tfoot><tr>{_cells(table[-1])}</tr></tfoot></table>",
+        *(line for table in tables for line in _html_table(table)),
         *(f"<p>{escape(note)}</p>" for note in notes),
         *picture,
         "</body></html>",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _html_table(table: Table) -> list[str]:
+    head = "".join(f"<th>{escape(name).replace(chr(10), '<br>')}</th>" for name in table[0])
+    fill = next(at for at, name in enumerate(table[0]) if name in _LARGE)
+    body = "\n".join(f"<tr>{_cells(row, fill)}</tr>" for row in table[1:-1])
+    return [
+        f"<table><thead><tr>{head}</tr></thead>",
+        f"<tbody>{body}</tbody>",
+        f"<tfoot><tr>{_cells(table[-1])}</tr></tfoot></table>",
+    ]
 
 
 def _cells(row: list[str], fill: int | None = None) -> str:
