@@ -12,9 +12,13 @@ from companion.core.schedule import LagModel
 from companion.core.setup import Setup
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE, RUN_OUT_M, anyang_lag, anyang_route
+from sitl.profile import PROFILES
 from sitl.trajectory import Route, Trajectory
 from sitl.vehicle import Vehicle
 
+# The example's sprayer, and lags of others on its boom.
+PLANT = "wang-2024"
+LAGS = PROFILES / "lags"
 # P1 flew its rates at 5 m/s; the example's map is for this speed.
 MAP_SPEED_M_S = 5.0
 START_S = 100.0
@@ -60,9 +64,13 @@ def scaled(prescription: Prescription, factor: float) -> Prescription:
     )
 
 
-def demo_lags(output: str) -> LagModel:
-    """Return the lags measured beforehand, on another sprayer of the make."""
-    return anyang_lag(output)
+def demo_lags(output: str, plant: str = PLANT) -> LagModel:
+    """Return the lags measured beforehand, on another sprayer of the make.
+
+    Raises:
+        ConfigError: no sprayer of this make was measured.
+    """
+    return anyang_lag(output) if plant == PLANT else anyang_lag(f"{plant}-{output}", LAGS)
 
 
 @cache

@@ -53,6 +53,11 @@ def measured_sets(profile: PlantProfile) -> tuple[NozzleSet, ...]:
     )
 
 
+def with_sprayer(setup: Setup, profile: PlantProfile) -> Setup:
+    """Return a set-up that knows another sprayer's curve and PWM; the boom is the same."""
+    return replace(setup, nozzle_sets=measured_sets(profile), pwm=pwm_limits(profile))
+
+
 def true_sets(profile: PlantProfile) -> tuple[NozzleSet, ...]:
     """Return the nozzle sets as nobody can measure them: the law itself, in many points."""
     found = []

@@ -25,7 +25,9 @@ from companion.errors import ConfigError
 from companion.wording import install_command
 from sitl.anyang import EXAMPLE
 from sitl.campaign.settings import (
-    ON_P1S_FIELD,
+    NOT_IN_CONDITIONS,
+    NOT_OF_FILES,
+    P1S_FIELD,
     Settings,
     Value,
     check_name,
@@ -278,9 +280,14 @@ def _check_settings(found: Campaign) -> None:
                 "them for P1's field"
             )
         if "flight.config" in given:
-            for name in ON_P1S_FIELD:
+            for name in NOT_OF_FILES:
                 if name in given:
                     raise ConfigError(f"{name}: on P1's field only; leave it out, or flight.config")
+        field = given.get("flight.field", P1S_FIELD)
+        if field != P1S_FIELD:
+            for name in NOT_IN_CONDITIONS:
+                if name in given:
+                    raise ConfigError(f"{name}: '{field}' has its own; leave it out")
         if "method.controller" in given and {"method.name", "method.look_ahead_s"} & set(given):
             raise ConfigError(
                 "method.controller: stands alone; leave out the other method. settings"

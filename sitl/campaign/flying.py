@@ -1,7 +1,7 @@
 """One flight of a campaign: its settings and its seed in, its figures out, and nothing else.
 
 The same arguments give the same row, in any process and in any order. Without `flight.config` and
-`flight.mission` it is P1's field that is flown, as `vrspray demo` does.
+`flight.mission` it is P1's field that is flown, as `vrspray demo` does, or a hard condition.
 """
 
 from __future__ import annotations
@@ -21,12 +21,23 @@ from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
 from sitl.anyang import EXAMPLE
 from sitl.board import SERVO_FRAME_S
-from sitl.campaign.settings import Settings, Value, overrides_of, with_plant
-from sitl.demo_field import ACCELERATION_M_S2, START_S, at_speed, demo_lags, demo_route, scaled
+from sitl.campaign.settings import P1S_FIELD, Settings, Value, overrides_of, with_plant
+from sitl.demo_field import (
+    ACCELERATION_M_S2,
+    LAGS,
+    MAP_SPEED_M_S,
+    PLANT,
+    START_S,
+    at_speed,
+    demo_lags,
+    demo_route,
+    scaled,
+)
 from sitl.disturbances import RATE_HZ, Disturbance, displaced, drifted, shortened
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.fly import DEFAULT_ACCELERATION_M_S2, FlyOptions, Task, prepare, with_faults
-from sitl.knowledge import perfect_setup
+from sitl.hard_fields import Condition, condition_of, laid_out
+from sitl.knowledge import perfect_setup, with_sprayer
 from sitl.motor_parts import ranges_us
 from sitl.outputs import WIRE_S
 from sitl.own_method import MakeController, load_controller
@@ -47,8 +58,6 @@ if TYPE_CHECKING:
     from companion.core.types import Input
     from sitl.trajectory import Trajectory
 
-PROFILE = "wang-2024"
-SPEED_M_S = 5.0
 # P1's controller by its look-ahead, as the demo flies it.
 LOOK_AHEADS_S = {
     "none": 0.0,
@@ -63,7 +72,7 @@ OF_DISTANCES = ("mean", "mean_abs", "max_abs", "min", "max")
 NUMBERS = (
     "spraying_accuracy_percent", "settled_accuracy_percent", "starting_accuracy_percent",
     "misapplied_percent", "limit_ratio", "off_target_ml", "gap_m2", "overlap_m2",
-    "volume_error_percent", "applied_ml", "simulated_s",
+    "volume_error_percent", "applied_ml", "border_bound_m", "simulated_s",
 )  # fmt: skip
 COUNTS = ("apart", "missed", "settled_apart", "settled_missed", "steps", "late", "unresolved")
 BY_RATE = ("rate_l_ha", "rate_accuracy_percent", "rate_settled_lag_mean_m")
@@ -93,7 +102,9 @@ class _Scene:
 
     task: Task
     output: Literal["gpio", "servo"]
+    # The example's configuration, sprayer and board; `condition`: over a field of its own.
     on_p1s_field: bool
+    condition: Condition | None = None
 
 
 def fly_flight(settings: Settings, seed: int, folder: Path) -> Row:
@@ -103,12 +114,7 @@ def fly_flight(settings: Settings, seed: int, folder: Path) -> Row:
         VrsprayError, ValueError: what cannot be flown.
     """
     given = dict(settings)
-    scene = _scene(
-        _only(settings, ("config.", "flight.", "map.", "plant.", "vehicle.speed")), folder
-    )
-    path = _path(
-        _only(settings, ("config.", "flight.", "map.", "plant.", "vehicle.")), seed, folder
-    )
+    scene, path = _placed(settings, seed, folder)
     what = _error(given)
     options = _options(scene, given, seed)
     began_s = process_time()
@@ -175,6 +181,18 @@ def _by_rate(found: Evaluation, accuracy: Any) -> dict[str, Any]:
 # What is flown over, and what with.
 
 
+def _placed(settings: Settings, seed: int, folder: Path) -> tuple[_Scene, Trajectory]:
+    """Return the field with the sprayer over it, and the true path; a hard one is a seed's own."""
+    scene = _scene(
+        _only(settings, ("config.", "flight.", "map.", "plant.", "vehicle.speed")), folder
+    )
+    if scene.condition is None:
+        names = ("config.", "flight.", "map.", "plant.", "vehicle.")
+        return scene, _path(_only(settings, names), seed, folder)
+    setup, path = laid_out(scene.condition, seed, scene.task.setup)
+    return replace(scene, task=replace(scene.task, setup=setup)), path
+
+
 @lru_cache(maxsize=SCENES)
 def _scene(settings: Settings, folder: Path) -> _Scene:
     given = dict(settings)
@@ -190,26 +208,40 @@ def _scene(settings: Settings, folder: Path) -> _Scene:
         task=replace(task, setup=setup, profile=profile),
         output=cast(Literal["gpio", "servo"], output),
         on_p1s_field="flight.config" not in given,
+        condition=_condition(given),
     )
+
+
+def _condition(given: Mapping[str, Value]) -> Condition | None:
+    name = str(given.get("flight.field", P1S_FIELD))
+    return None if name == P1S_FIELD else condition_of(name)
 
 
 def _task_of_p1(given: Mapping[str, Value]) -> Task:
     """Return P1's field with the lags of the output path, measured beforehand."""
-    speed_m_s = cast(float, given.get("vehicle.speed_m_s", SPEED_M_S))
-    lag = demo_lags(cast(str, given.get("flight.output", "gpio")))
+    speed_m_s = cast(float, given.get("vehicle.speed_m_s", MAP_SPEED_M_S))
+    profile = load_profile(str(given.get("plant.profile", PLANT)))
+    is_known = bool(given.get("plant.known")) and profile.name != PLANT
+    if is_known and not (LAGS / f"{profile.name}-gpio.toml").is_file():
+        raise ConfigError(
+            f"plant.known: no lags were measured of {profile.name}; leave it out, or give "
+            "flight.config and flight.mission of this sprayer"
+        )
+    lag = demo_lags(str(given.get("flight.output", "gpio")), profile.name if is_known else PLANT)
     names = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s", "output_s", "position_s")
     measured = tuple(f"lag.{name}={getattr(lag, name)!r}" for name in names)
     config = load(EXAMPLE / "config.toml", overrides=(*measured, *overrides_of(given)))
     setup = at_speed(
         compiled_setup(config), speed_m_s, scale=given.get("map.rates", "by-speed") == "by-speed"
     )
+    condition = _condition(given)
     acceleration = cast(float, given.get("vehicle.acceleration_m_s2", ACCELERATION_M_S2))
     return Task(
         config=config,
-        setup=setup,
-        profile=load_profile(cast(str, given.get("plant.profile", PROFILE))),
+        setup=with_sprayer(setup, profile) if is_known else setup,
+        profile=profile,
         route=demo_route(speed_m_s, setup.frame, acceleration_m_s2=acceleration),
-        speed_m_s=speed_m_s,
+        speed_m_s=speed_m_s if condition is None else condition.speed_m_s,
         warnings=(),
         faults=(),
     )
@@ -354,7 +386,7 @@ def _wang(
     setup: Setup, look_ahead_s: float, given: Mapping[str, Value], task: Task
 ) -> tuple[WangController, Setup]:
     """Return P1's controller, and the set-up by which its flight is judged."""
-    is_p1s = task.profile.name == load_profile(PROFILE).name
+    is_p1s = task.profile.name == PLANT
     dose = given.get("method.dose", "eq-2" if is_p1s else "curve")
     wang = WangController(
         setup=setup,

@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args
 
 from companion.errors import ConfigError
 from sitl.disturbances import BORDER, INSIDE
+from sitl.hard_fields import CONDITIONS
 from sitl.profile import FlowLaw, Meter, PlantProfile, Pulsing, Pump
 from sitl.supply import Supply
 from sitl.vehicle import Corners
@@ -23,6 +24,7 @@ Value = bool | int | float | str | tuple[Any, ...]
 # The settings of one flight, in the order of their names.
 Settings = tuple[tuple[str, Value], ...]
 
+P1S_FIELD = "published"
 Method = Literal["scheduled", "none", "look-ahead", "look-ahead-stated", "calibrated", "perfect"]
 
 
@@ -48,6 +50,7 @@ KINDS: dict[str, Kind] = {
     "flight.config": Kind(str, is_file=True),
     "flight.mission": Kind(str, is_file=True),
     "flight.scenario": Kind(str, is_file=True),
+    "flight.field": Kind(str, (P1S_FIELD, *(each.name for each in CONDITIONS))),
     "flight.fidelity": Kind(str, ("averaged", "pulsed")),
     "flight.output": Kind(str, ("gpio", "servo")),
     "flight.board": Kind(str, ("restarting", "free-running")),
@@ -70,6 +73,7 @@ KINDS: dict[str, Kind] = {
     "plant.profile": Kind(str),
     "plant.flow_law": Kind(str, get_args(FlowLaw)),
     "plant.scatter": Kind(bool),
+    "plant.known": Kind(bool),
     "error.lag_short_s": _number(-5.0, 5.0),
     "error.lags": Kind(list, (*INSIDE, *BORDER)),
     "error.behind_m": _number(-100.0, 100.0),
@@ -83,6 +87,12 @@ TABLES = ("config", "plant", "vehicle", "map", "method", "flight", "error")
 ON_P1S_FIELD = (
     "error.along_m", "error.across_m", "error.drift_along_m", "error.drift_across_m", "map.rates",
 )  # fmt: skip
+# A hard condition has its own rates and its own way of flying; files have their own field.
+NOT_IN_CONDITIONS = (
+    *ON_P1S_FIELD, "map.rate_factor", "vehicle.speed_m_s", "vehicle.acceleration_m_s2",
+    "vehicle.gust_m_s", "vehicle.gust_time_s", "vehicle.corners",
+)  # fmt: skip
+NOT_OF_FILES = (*ON_P1S_FIELD, "flight.field", "plant.known")
 
 
 def check_name(name: str) -> None:

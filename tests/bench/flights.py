@@ -1,4 +1,4 @@
-"""Accuracy over many flights: the twin over the example's field or a hard one, two processes.
+"""Accuracy over many flights: campaigns over the example's field and over hard ones.
 
 The perfect-knowledge run has the same path and the same scattered sprayer, the true position and
 each valve's own lag and flow, and no driver board between core and valves: the strictest that a
@@ -7,36 +7,38 @@ flight can be compared with.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import product
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from analysis.evaluation import Evaluation, evaluate, limit_ratio, whole_boom
+from analysis.evaluation import Evaluation, evaluate, limit_ratio
+from companion.errors import VrsprayError
+from sitl.anyang import EXAMPLE
+from sitl.campaign.bundle import Bundle, bundle_of, unpack
+from sitl.campaign.dataset import open_dataset, read_columns
+from sitl.campaign.design import Campaign, read_campaign
+from sitl.campaign.executors import Done, Workers, pool_of
+from sitl.campaign.running import Tally, fly_missing
 from sitl.demo_field import demo_trajectory
 from sitl.flight import FlightOptions, fly
-from sitl.own_method import load_controller
+from sitl.hard_fields import CONDITIONS, condition_of, laid_out
 from sitl.profile import load_profile
-from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
-from sitl.workers import do_all
-from tests.bench.conditions import CONDITIONS, condition_of, laid_out
-from tests.bench.sprayers import (
-    BOTH,
-    OUTPUTS,
-    PLANT,
-    PLANTS,
-    Output,
-    known_setup,
-    options_of,
-    sprayer_setup,
-)
+from tests.bench.sprayers import PLANT, Output, known_setup, sprayer_setup
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from companion.core.setup import Setup
     from sitl.profile import PlantProfile
     from sitl.trajectory import Trajectory
 
+CAMPAIGNS = EXAMPLE.parent / "campaigns"
+ACCURACY, HARD_CONDITIONS = CAMPAIGNS / "accuracy.toml", CAMPAIGNS / "hard-conditions.toml"
+SPEED, CONDITION = "vehicle.speed_m_s", "flight.field"
 SLOW_M_S = (2.0, 3.0, 4.0, 5.0, 6.0)
 FAST_M_S = (8.0, 10.0, 12.0, 15.0)
 PINPOINT_M_S = (3.0, 5.0, 6.0, 8.0, 15.0)
@@ -45,7 +47,9 @@ PAPER_M_S = 5.0
 # sprayer of the other make in the hard conditions.
 FREE_RUNNING_M_S = (3.0, 5.0)
 PINPOINT_SHARE = 2
-PAPER_METHODS = {"none": 0.0, "look-ahead": LOOK_AHEAD_S, "look-ahead-stated": LOOK_AHEAD_STATED_S}
+PAPER_METHODS = ("none", "look-ahead", "look-ahead-stated")
+OURS, PERFECT = ("gpio", "servo"), "perfect"
+PINPOINT = tuple(f"pinpoint, {case}" for case in (*OURS, PERFECT))
 FIELD = "field"
 NOMINAL, IDENTIFIED = "nominal", "identified"
 
@@ -82,56 +86,76 @@ class Flown:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Task:
-    """All flights of one seed at one speed: they share the path."""
+class Flights:
+    """Which flights of a campaign file are flown: cases and seeds, and values of what is varied.
 
-    plant: str = PLANT
-    condition: str = FIELD
-    speed_m_s: float = PAPER_M_S
-    seed: int
-    outputs: tuple[Output, ...]
-    with_paper: bool = False
-    # One's own method, `module:Class`, flown instead of all others.
+    With a `controller` of one's own, `module:Class`, that flies instead of ours.
+    """
+
+    file: Path
+    cases: tuple[str, ...]
+    seeds: tuple[int, ...]
+    values: Mapping[str, Sequence[Any]]
     controller: str | None = None
 
+    def campaign(self) -> Campaign:
+        """Return the campaign cut down to them."""
+        whole = read_campaign(self.file)
+        cases = {name: settings for name, settings in whole.cases if name in self.cases}
+        assert cases.keys() == set(self.cases), self.cases
+        if self.controller is not None:
+            file, colon, name = self.controller.rpartition(":")
+            place = str(Path(file).resolve()) if file.endswith(".py") else file
+            own = {"method.controller": f"{place}{colon}{name}"}
+            cases = {n: s if PERFECT in n else {**s, **own} for n, s in cases.items()}
+        factors = [
+            replace(each, values=tuple(self.values.get(each.name, each.values)))
+            for each in whole.factors
+        ]
+        return replace(whole, seeds=self.seeds, cases=tuple(cases.items()), factors=tuple(factors))
 
-def tasks(seeds: Iterable[int], *, is_quick: bool) -> list[Task]:
-    """Return what there is to fly over the example with P1's sprayer, the longest flights first."""
-    seeds = list(seeds)
-    speeds = (PAPER_M_S,) if is_quick else SLOW_M_S
-    slow = [
-        Task(
-            speed_m_s=speed,
-            seed=seed,
-            outputs=OUTPUTS if speed in FREE_RUNNING_M_S else BOTH,
-            with_paper=speed == PAPER_M_S,
-        )
-        for speed, seed in product(speeds, seeds)
+    @property
+    def count(self) -> int:
+        """Return how many flights they are."""
+        return self.campaign().flights
+
+
+def field_flights(seeds: Iterable[int], *, is_quick: bool) -> list[Flights]:
+    """Return what there is to fly over the example with P1's sprayer."""
+    slow = (PAPER_M_S,) if is_quick else SLOW_M_S
+    fast = () if is_quick else FAST_M_S
+    free = tuple(speed for speed in FREE_RUNNING_M_S if speed in slow)
+    found = [
+        _flights(ACCURACY, (*OURS, PERFECT), seeds, {SPEED: slow}),
+        _flights(ACCURACY, ("free-running",), seeds, {SPEED: free}),
+        _flights(ACCURACY, PAPER_METHODS, seeds, {SPEED: (PAPER_M_S,)}),
     ]
-    fast = [
-        Task(speed_m_s=speed, seed=seed, outputs=BOTH) for speed, seed in product(FAST_M_S, seeds)
-    ]
-    return slow if is_quick else slow + fast
+    # Above the speeds of the paper nothing is held against perfect knowledge.
+    return [*found, _flights(ACCURACY, OURS, seeds, {SPEED: fast})] if fast else found
 
 
-def pinpoint_tasks(seeds: Iterable[int], *, is_quick: bool) -> list[Task]:
+def pinpoint_flights(seeds: Iterable[int], *, is_quick: bool) -> list[Flights]:
     """Return what there is to fly over the example with valves at the nozzles."""
     speeds = (PAPER_M_S,) if is_quick else PINPOINT_M_S
-    return [
-        Task(plant="pinpoint", speed_m_s=speed, seed=seed, outputs=BOTH)
-        for speed, seed in product(speeds, seeds)
-    ]
+    slow = tuple(speed for speed in speeds if speed <= SLOW_M_S[-1])
+    fast = tuple(speed for speed in speeds if speed > SLOW_M_S[-1])
+    found = [_flights(ACCURACY, PINPOINT, seeds, {SPEED: slow})]
+    return [*found, _flights(ACCURACY, PINPOINT[:-1], seeds, {SPEED: fast})] if fast else found
 
 
-def condition_tasks(name: str, seeds: Iterable[int]) -> list[Task]:
+def condition_flights(name: str, seeds: Iterable[int]) -> list[Flights]:
     """Return what there is to fly in one hard condition."""
-    speed_m_s = condition_of(name).speed_m_s
-    seeds = list(seeds)
+    seeds, values = list(seeds), {CONDITION: (name,)}
     return [
-        Task(plant=plant, condition=name, speed_m_s=speed_m_s, seed=seed, outputs=BOTH)
-        for plant in PLANTS
-        for seed in (seeds if plant == PLANT else seeds[::PINPOINT_SHARE])
+        _flights(HARD_CONDITIONS, (*OURS, PERFECT), seeds, values),
+        _flights(HARD_CONDITIONS, PINPOINT, seeds[::PINPOINT_SHARE], values),
     ]
+
+
+def _flights(
+    file: Path, cases: tuple[str, ...], seeds: Iterable[int], values: Mapping[str, Sequence[Any]]
+) -> Flights:
+    return Flights(file=file, cases=cases, seeds=tuple(seeds), values=values)
 
 
 def condition_names() -> list[str]:
@@ -140,40 +164,107 @@ def condition_names() -> list[str]:
 
 
 def fly_all(
-    todo: Sequence[Task], *, processes: int, progress: Callable[[], None] = lambda: None
+    todo: Sequence[Flights], *, processes: int, progress: Callable[[], None] = lambda: None
 ) -> list[Flown]:
     """Fly everything, in `processes` processes where that is more than one."""
-    found = do_all(fly_task, todo, processes=processes, on_done=progress)
-    return [flown for several in found for flown in several]
+    rows = [row for each in todo for row in _rows(each, processes, progress)]
+    perfect = {_place_of(row): row for row in rows if row["method"] == PERFECT}
+    return [_flown_of(row, perfect.get(_place_of(row))) for row in rows if row["method"] != PERFECT]
 
 
-def fly_task(task: Task) -> list[Flown]:
-    """Fly one path with every output, and with the paper's controller where it is asked for.
+def _rows(flights: Flights, processes: int, progress: Callable[[], None]) -> list[dict[str, Any]]:
+    campaign = flights.campaign()
+    bundle = bundle_of(campaign)
+    with tempfile.TemporaryDirectory(prefix="vrspray-bench-") as folder:
+        dataset = open_dataset(campaign, bundle, Path(folder) / "flown")
+        here = _here(bundle) if processes == 1 else pool_of(processes, bundle)
+        with here as workers:
+            fly_missing(dataset, bundle, workers, Tally(), tell=lambda _: progress())
+        rows: list[dict[str, Any]] = read_columns(dataset.folder, None).to_pylist()
+    fixed = {**{each.name: each.values[0] for each in campaign.factors}, **campaign.fixed}
+    for row in rows:
+        assert row["error"] is None, row["error"]
+    return [{**fixed, **row} for row in rows]
 
-    With a method of one's own that flies instead, as often as ours.
-    """
-    profile, seed = load_profile(task.plant), task.seed
-    keep = partial(kept, task=task, perfect=perfect(task))
-    own = None if task.controller is None else load_controller(task.controller)
-    results = []
-    for output in task.outputs:
-        setup, path = place(task, output)
-        options = options_of(output, seed)
-        ours = fly(setup, path, profile, options, speed_m_s=task.speed_m_s, own=own)
-        results.append(keep(evaluate(ours.record), output=output))
-    setup, path = place(task, "gpio")
-    for method, look_ahead_s in PAPER_METHODS.items() if task.with_paper else ():
-        theirs = fly(
-            replace(setup, nozzle_sets=table_2_sets()),
-            path,
-            profile,
-            options_of("gpio", seed),
-            speed_m_s=task.speed_m_s,
-            wang=WangController(setup=setup, look_ahead_s=look_ahead_s),
-            method=method,
-        )
-        results.append(keep(evaluate(whole_boom(theirs.record)), output="gpio"))
-    return results
+
+def _place_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Return what a flight shares with that of perfect knowledge: sprayer, field, speed, seed."""
+    return row["plant"], row.get(CONDITION), row["speed_m_s"], row["seed"]
+
+
+def _flown_of(row: Mapping[str, Any], perfect: Mapping[str, Any] | None) -> Flown:
+    best: Mapping[str, Any] = perfect or {}
+    misapplied, least = row["misapplied_percent"], best.get("misapplied_percent")
+    board = "free-running" if row["case"] == "free-running" else row["output"]
+    return Flown(
+        plant=row["plant"],
+        condition=row.get(CONDITION, FIELD),
+        speed_m_s=row["speed_m_s"],
+        method=row["method"],
+        output=board,
+        seed=row["seed"],
+        mean_m=row["lag_distance_mean_m"],
+        mean_abs_m=row["lag_distance_mean_abs_m"],
+        max_abs_m=row["lag_distance_max_abs_m"],
+        count=row["lag_distance_count"],
+        apart=row["apart"],
+        missed=row["missed"],
+        settled_mean_m=row["settled_lag_distance_mean_m"],
+        settled_mean_abs_m=row["settled_lag_distance_mean_abs_m"],
+        accuracy_percent=row["spraying_accuracy_percent"],
+        settled_accuracy_percent=row["settled_accuracy_percent"],
+        perfect_accuracy_percent=best.get("spraying_accuracy_percent"),
+        perfect_mean_abs_m=best.get("lag_distance_mean_abs_m"),
+        perfect_max_abs_m=best.get("lag_distance_max_abs_m"),
+        misapplied_percent=misapplied,
+        limit_ratio=misapplied / least if misapplied is not None and least else None,
+        off_target_ml=row["off_target_ml"],
+        border_margin_m=row["border_margin_mean_m"],
+        border_bound_m=row["border_bound_m"],
+    )
+
+
+@contextmanager
+def _here(bundle: Bundle) -> Iterator[Workers]:
+    """Yield a worker that is this process."""
+    with tempfile.TemporaryDirectory(prefix="vrspray-bench-") as root:
+        yield _Here(unpack(bundle, Path(root)))
+
+
+class _Here:
+    deaths = 1
+
+    def __init__(self, folder: Path) -> None:
+        self.folder: Path | None = folder
+
+    def count(self) -> int:
+        return 1
+
+    def submit(self, function: Callable[..., Done], *given: Any) -> Future[Done]:
+        done: Future[Done] = Future()
+        try:
+            done.set_result(function(*given))
+        except VrsprayError as error:
+            done.set_exception(error)
+        return done
+
+    def lost(self, error: BaseException) -> bool:
+        return False
+
+    def renew(self) -> None: ...
+
+
+# Single flights of other benches, whose controller is measured anew before each.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Task:
+    """A path: over the example at one speed, or over a hard field."""
+
+    plant: str = PLANT
+    condition: str = FIELD
+    speed_m_s: float = PAPER_M_S
+    seed: int
 
 
 def place(task: Task, output: Output) -> tuple[Setup, Trajectory]:

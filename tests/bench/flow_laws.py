@@ -49,7 +49,7 @@ def tasks(seeds: Iterable[int]) -> list[Task]:
 
 def fly_task(task: Task) -> Judged:
     """Fly with the measured points, and with perfect knowledge."""
-    same = flights.Task(seed=task.seed, outputs=("gpio",))
+    same = flights.Task(seed=task.seed)
     profile = replace(load_profile(PLANT), flow_law=task.law)
     setup, path = flights.place(same, "gpio")
     options = FlightOptions(seed=task.seed)

@@ -87,7 +87,7 @@ def unknown_tasks(seeds: Iterable[int]) -> list[Task]:
 
 def fly_task(task: Task) -> Done:
     """Calibrate, then fly the field."""
-    field = FlightTask(plant=task.plant, seed=task.seed, outputs=BOTH)
+    field = FlightTask(plant=task.plant, seed=task.seed)
     best = None if task.is_unknown else perfect(field)
     flown, rows = [], {}
     for output in BOTH:
@@ -110,7 +110,7 @@ def fly_task(task: Task) -> Done:
 
 
 def _fly(task: Task, setup: Setup, output: Output) -> Evaluation:
-    field = FlightTask(plant=task.plant, seed=task.seed, outputs=BOTH)
+    field = FlightTask(plant=task.plant, seed=task.seed)
     profile = scaled_flow(load_profile(task.plant), task.gain)
     _, path = place(field, output)
     rate_hz = METER_RATE_HZ if setup.flow_trim is not None else 0.0

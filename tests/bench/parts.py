@@ -21,13 +21,14 @@ from tests.bench import (
 from tests.bench.accuracy import UNKNOWN_FACTOR, accuracy
 from tests.bench.figures import Figure
 from tests.bench.flights import (
+    PAPER_METHODS,
+    Flights,
     Flown,
-    Task,
+    condition_flights,
     condition_names,
-    condition_tasks,
+    field_flights,
     fly_all,
-    pinpoint_tasks,
-    tasks,
+    pinpoint_flights,
 )
 from tests.bench.timings import TIMINGS, arrival_times, core_times, edge_times, map_times
 
@@ -96,41 +97,45 @@ def _each(
     return do_all(function, works, processes=options.processes, on_done=told)
 
 
-def _flown(works: Sequence[Task], options: Options, name: str) -> list[Flown]:
-    done = 0
+def _flown(todo: Sequence[Flights], options: Options, name: str) -> list[Flown]:
+    done, count = 0, sum(each.count for each in todo)
 
     def told() -> None:
         nonlocal done
         done += 1
-        if done % 10 == 0 or done == len(works):
-            options.say(f"{name}: {done} of {len(works)} paths")
+        if done % 50 == 0 or done == count:
+            options.say(f"{name}: {done} of {count} flights")
 
-    return fly_all(works, processes=options.processes, progress=told)
+    return fly_all(todo, processes=options.processes, progress=told)
 
 
-def _flights(works: Sequence[Task], options: Options, name: str, *, section: str) -> list[Figure]:
-    """Return our accuracy over these paths, and that of one's own method beside it."""
-    figures = accuracy(_flown(works, options, name), section=section)
+def _flights(todo: Sequence[Flights], options: Options, name: str, *, section: str) -> list[Figure]:
+    """Return our accuracy over these flights, and that of one's own method beside it."""
+    figures = accuracy(_flown(todo, options, name), section=section)
     if options.controller is None:
         return figures
-    again = [replace(work, controller=options.controller, with_paper=False) for work in works]
+    again = [
+        replace(each, controller=options.controller)
+        for each in todo
+        if not set(each.cases) & set(PAPER_METHODS)
+    ]
     own = _unjudged(accuracy(_flown(again, options, f"{name}, own"), section=OWN_SECTION))
     return figures + [replace(one, key=f"own_{one.key}") for one in own]
 
 
 def _field(options: Options) -> list[Figure]:
-    works = tasks(options.seeds, is_quick=options.is_quick)
-    return _flights(works, options, "field", section=FIELD_SECTION)
+    todo = field_flights(options.seeds, is_quick=options.is_quick)
+    return _flights(todo, options, "field", section=FIELD_SECTION)
 
 
 def _pinpoint(options: Options) -> list[Figure]:
-    works = pinpoint_tasks(options.seeds, is_quick=options.is_quick)
-    return _flights(works, options, "pinpoint", section=FIELD_SECTION)
+    todo = pinpoint_flights(options.seeds, is_quick=options.is_quick)
+    return _flights(todo, options, "pinpoint", section=FIELD_SECTION)
 
 
 def _condition(options: Options, *, name: str) -> list[Figure]:
-    works = condition_tasks(name, options.seeds)
-    return _flights(works, options, name, section=CONDITIONS_SECTION)
+    todo = condition_flights(name, options.seeds)
+    return _flights(todo, options, name, section=CONDITIONS_SECTION)
 
 
 def _identified(options: Options) -> list[Figure]:

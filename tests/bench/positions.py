@@ -17,9 +17,9 @@ from statistics import fmean
 
 from analysis.evaluation import Evaluation, evaluate
 from sitl.flight import FlightOptions, fly
+from sitl.hard_fields import condition_of
 from sitl.profile import load_profile
 from sitl.workers import do_all
-from tests.bench.conditions import condition_of
 from tests.bench.flights import FIELD, Task, place
 from tests.bench.sprayers import PLANT, known_setup, options_of
 
@@ -44,7 +44,6 @@ def measure(todo: tuple[str, int, tuple[float, ...]]) -> Row:
         condition=FIELD if is_field else name,
         speed_m_s=float(name.partition("-")[2]) if is_field else condition_of(name).speed_m_s,
         seed=seed,
-        outputs=("gpio",),
     )
     profile = replace(load_profile(PLANT), lag_scatter=0.0, flow_scatter=0.0)
     setup, path = place(task, "gpio")

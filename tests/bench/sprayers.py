@@ -1,29 +1,25 @@
 """The sprayers that are flown: each with its own curve, PWM and lags behind one controller.
 
 The nominal lags were measured beforehand on other sprayers of the make: `examples/anyang/lags` and
-`tests/bench/lags` say how. `identified_lag` takes those of one sprayer from its own meter instead.
+`sitl/profiles/lags` say how.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
-from sitl.anyang import anyang_lag
-from sitl.demo_field import MAP_SPEED_M_S, demo_setup
+from sitl.demo_field import MAP_SPEED_M_S, PLANT, demo_lags, demo_setup
 from sitl.flight import FlightOptions
-from sitl.knowledge import measured_sets, perfect_setup, pwm_limits
+from sitl.knowledge import perfect_setup, with_sprayer
 from sitl.profile import PlantProfile, load_profile
 
 Output = Literal["gpio", "servo", "free-running"]
 BOTH: tuple[Literal["gpio", "servo"], ...] = ("gpio", "servo")
 OUTPUTS: tuple[Output, ...] = ("gpio", "servo", "free-running")
-PLANT = "wang-2024"
 PLANTS = (PLANT, "pinpoint")
-LAGS = Path(__file__).parent / "lags"
 KINDS = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s")
 
 
@@ -33,17 +29,9 @@ def sprayer_setup(plant: str, output: Output, speed_m_s: float = MAP_SPEED_M_S) 
     return setup if plant == PLANT else with_sprayer(setup, load_profile(plant))
 
 
-def with_sprayer(setup: Setup, profile: PlantProfile) -> Setup:
-    """Return a set-up that knows another sprayer's curve and PWM; the boom is the same."""
-    return replace(setup, nozzle_sets=measured_sets(profile), pwm=pwm_limits(profile))
-
-
 def nominal_lag(plant: str, output: Output) -> LagModel:
     """Return the lags measured beforehand for an output path."""
-    path = "gpio" if output == "gpio" else "servo"
-    if plant == PLANT:
-        return anyang_lag(path)
-    return anyang_lag(f"{plant}-{path}", LAGS)
+    return demo_lags("gpio" if output == "gpio" else "servo", plant)
 
 
 def known_setup(setup: Setup, profile: PlantProfile, output: Output, seed: int) -> Setup:

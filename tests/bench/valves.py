@@ -107,7 +107,7 @@ def measure(todo: tuple[str, int, float, Output, bool, bool]) -> Row:
         )
         for own, (factor, late_s) in zip(ground.found.valves, true, strict=True)
     )
-    task = Task(plant=plant, speed_m_s=speed_m_s, seed=seed, outputs=(output,))
+    task = Task(plant=plant, speed_m_s=speed_m_s, seed=seed)
     setup, path = place(task, output)
     known = with_figures(setup, ground.found)
     alike = replace(options, scatter=False)

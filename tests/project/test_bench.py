@@ -11,23 +11,35 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from analysis.evaluation import evaluate
 from companion.core.nozzle import flow_for_rate
+from sitl.campaign.design import read_campaign
 from sitl.demo_field import demo_trajectory
+from sitl.flight import fly
+from sitl.hard_fields import CONDITIONS, condition_of, laid_out
+from sitl.profile import load_profile
 from tests.bench import __main__ as bench
 from tests.bench import parts
 from tests.bench.accuracy import accuracy
 from tests.bench.arrival import arrivals
-from tests.bench.conditions import condition_of, laid_out
 from tests.bench.fields import example, grid_setup
 from tests.bench.figures import Figure, rounded, short, table
 from tests.bench.flights import (
+    ACCURACY,
+    CONDITION,
+    HARD_CONDITIONS,
+    SPEED,
+    Flights,
     Flown,
     Task,
-    condition_tasks,
+    condition_flights,
+    condition_names,
+    field_flights,
     fly_all,
-    pinpoint_tasks,
+    kept,
+    perfect,
+    pinpoint_flights,
     place,
-    tasks,
 )
 from tests.bench.identification_figures import Compared
 from tests.bench.identification_figures import figures as identification_figures
@@ -36,7 +48,7 @@ from tests.bench.loading import loading
 from tests.bench.lookup import linear_scan, lookups
 from tests.bench.parts import Options, Part, chosen
 from tests.bench.report import page
-from tests.bench.sprayers import PLANT, PLANTS, nominal_lag, scaled_lag, sprayer_setup
+from tests.bench.sprayers import PLANT, PLANTS, nominal_lag, options_of, scaled_lag, sprayer_setup
 from tests.bench.steps import growth, large_field
 from tests.bench.timings import TIMINGS
 
@@ -239,34 +251,49 @@ def test_arrivals_are_measured_with_and_without_a_journal() -> None:
         assert figure.alternative["without a journal"] is not None
 
 
-def test_a_task_flies_one_path_by_every_way() -> None:
-    task = Task(condition="arc-40", seed=3, outputs=("gpio",), with_paper=True)
-    flown = fly_all([task], processes=1)
-    assert [each.method for each in flown] == [
-        "scheduled",
-        "none",
-        "look-ahead",
-        "look-ahead-stated",
+def test_one_path_is_flown_by_every_method_and_held_against_perfect_knowledge() -> None:
+    flights = Flights(
+        file=ACCURACY, cases=("gpio", "perfect", "none"), seeds=(3,), values={SPEED: (5.0,)}
+    )
+    flown = fly_all([flights], processes=1)
+    assert [(each.method, each.output) for each in flown] == [
+        ("scheduled", "gpio"),
+        ("none", "gpio"),
     ]
     assert all(each.seed == 3 and each.speed_m_s == 5.0 for each in flown)
     assert flown[0].count > 50
+    assert flown[0].perfect_mean_abs_m == flown[1].perfect_mean_abs_m is not None
     figures = by_key(accuracy(flown, section="a"))
-    lag = figures["lag_arc-40_gpio_5_m_s"]
-    assert lag.alternative.keys() == {
-        "paper's none",
-        "paper's look-ahead",
-        "paper's look-ahead-stated",
-        "perfect knowledge",
-    }
+    lag = figures["lag_gpio_5_m_s"]
+    assert lag.alternative.keys() == {"paper's none", "perfect knowledge"}
     assert lag.value is not None
     assert lag.value < (lag.alternative["paper's none"] or 0.0)
     assert figures["paper_none"].value is not None
-    assert {"limit_ratio_arc-40_gpio_5_m_s", "missed_arc-40_gpio_5_m_s"} <= figures.keys()
+    assert {"limit_ratio_gpio_5_m_s", "missed_gpio_5_m_s"} <= figures.keys()
+
+
+def test_a_flight_of_the_bench_is_the_flight_that_its_setup_flies() -> None:
+    flights = Flights(
+        file=HARD_CONDITIONS,
+        cases=("pinpoint, servo", "pinpoint, perfect"),
+        seeds=(3,),
+        values={CONDITION: ("arc-40",)},
+    )
+    (flown,) = fly_all([flights], processes=1)
+    task = Task(plant="pinpoint", condition="arc-40", seed=3)
+    setup, path = place(task, "servo")
+    again = fly(
+        setup, path, load_profile("pinpoint"), options_of("servo", 3), speed_m_s=task.speed_m_s
+    )
+    kept_so = kept(evaluate(again.record), task=task, output="servo", perfect=perfect(task))
+    assert flown == kept_so
 
 
 def test_a_method_of_ones_own_is_flown_beside_ours(monkeypatch: pytest.MonkeyPatch) -> None:
-    task = Task(condition="arc-40", seed=3, outputs=("gpio",), with_paper=True)
-    monkeypatch.setattr(parts, "condition_tasks", lambda _name, _seeds: [task])
+    flights = Flights(
+        file=HARD_CONDITIONS, cases=("gpio", "perfect"), seeds=(3,), values={CONDITION: ("arc-40",)}
+    )
+    monkeypatch.setattr(parts, "condition_flights", lambda _name, _seeds: [flights])
     options = parts.Options(count=1, processes=1, controller=f"{OWN_METHOD}:Wang2024")
     (part,) = (part for part in parts.PARTS if part.name == "arc-40")
     figures = by_key(part.run(options))
@@ -277,12 +304,10 @@ def test_a_method_of_ones_own_is_flown_beside_ours(monkeypatch: pytest.MonkeyPat
     assert own.value > 2.0 * ours.value
     assert own.target is None
     assert own.section == parts.OWN_SECTION != ours.section
-    assert "paper_none" in figures
-    assert "own_paper_none" not in figures
 
 
 def test_over_the_example_its_own_path_is_flown() -> None:
-    setup, path = place(Task(speed_m_s=6.0, seed=3, outputs=("gpio",)), "servo")
+    setup, path = place(Task(speed_m_s=6.0, seed=3), "servo")
     assert path is demo_trajectory(6.0, 3)
     assert setup.lag == nominal_lag(PLANT, "servo")
 
@@ -305,12 +330,13 @@ def test_a_sprayer_that_is_not_known_is_wrong_both_ways() -> None:
 
 
 def test_quick_flies_at_one_speed_only() -> None:
-    quick = tasks(range(1, 4), is_quick=True)
-    assert {task.speed_m_s for task in quick} == {5.0}
-    assert len(quick) == 3
-    full = tasks(range(1, 21), is_quick=False)
-    assert {task.speed_m_s for task in full} >= {2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0}
-    assert {task.seed for task in full} == set(range(1, 21))
+    quick = field_flights(range(1, 4), is_quick=True)
+    assert {speed for each in quick for speed in each.values[SPEED]} == {5.0}
+    assert [each.count for each in quick] == [9, 3, 9]
+    full = field_flights(range(1, 21), is_quick=False)
+    speeds = {speed for each in full for speed in each.values[SPEED]}
+    assert speeds == {2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0}
+    assert all(each.seeds == tuple(range(1, 21)) for each in full)
 
 
 def test_the_worst_seed_is_found() -> None:
@@ -424,12 +450,20 @@ def test_the_speed_sways_and_brakes_as_it_is_said() -> None:
 
 
 def test_every_plant_is_flown_in_every_condition() -> None:
-    todo = condition_tasks("braking", range(1, 21))
-    assert {task.plant for task in todo} == set(PLANTS)
-    assert [task.plant for task in todo].count(PLANT) == 20
-    assert all(task.outputs == ("gpio", "servo") and task.speed_m_s == 6.0 for task in todo)
-    slow = {task.speed_m_s for task in pinpoint_tasks([1], is_quick=False)}
-    assert slow >= {3.0, 5.0, 6.0}
+    todo = condition_flights("braking", range(1, 21))
+    assert [each.count for each in todo] == [3 * 20, 3 * 10]
+    assert {name for each in todo for name, _ in each.campaign().cases} == {
+        *("gpio", "servo", "perfect"),
+        *("pinpoint, gpio", "pinpoint, servo", "pinpoint, perfect"),
+    }
+    pinpoint = pinpoint_flights([1], is_quick=False)
+    assert {speed for each in pinpoint for speed in each.values[SPEED]} >= {3.0, 5.0, 6.0}
+
+
+def test_every_hard_condition_is_in_the_campaign() -> None:
+    (field,) = read_campaign(HARD_CONDITIONS).factors
+    assert field.name == CONDITION
+    assert list(field.values) == condition_names() == [each.name for each in CONDITIONS]
 
 
 def test_identified_lags_are_judged_by_error_and_by_interval() -> None:

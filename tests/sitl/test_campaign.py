@@ -32,7 +32,7 @@ from sitl.campaign.sensitivity import sensitivity_of
 from sitl.campaign.show import groups_of, read_rows
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
-from sitl.profile import load_profile
+from sitl.profile import PROFILES, load_profile
 from tests.sitl.campaign_files import files_of, fly_here, opened, write_campaign
 
 VARIED = """
@@ -272,6 +272,7 @@ def test_an_address_where_nobody_is_is_refused_in_one_line(
         ('[design]\nkind = "sobol"\nsamples = 8', "nothing is varied; add [[vary]] tables"),
         ('[[case]]\nname = "a"\n[[case]]\nname = "a"', "another case has this name"),
         ("[[case]]\nerror.along_m = 0.1", "error.along_m: on P1's field only"),
+        ("[[case]]\nplant.known = true", "plant.known: on P1's field only"),
         ('[[case]]\nflight.scenario = "no.toml"', "no such file"),
         ("seeds = [1", "Unclosed array"),
         ('seeds = 4000\n[[vary]]\nset = "vehicle.gust_m_s"\nlow = 0\nhigh = 9\nsteps = 5000',
@@ -286,6 +287,37 @@ def test_a_file_that_cannot_be_flown_is_refused_in_one_line(
     line = capsys.readouterr().err.strip()
     assert line.startswith(f"error: {file}: ") or said == "no such file"
     assert said in line and "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            'flight.field = "sway"\nvehicle.speed_m_s = 5',
+            "vehicle.speed_m_s: 'sway' has its own; leave it out",
+        ),
+        ('flight.field = "swing"', "choose of published, edges-15"),
+    ],
+)
+def test_a_hard_condition_is_flown_in_its_own_way(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+) -> None:
+    file = tmp_path / "hard.toml"
+    file.write_text(f"version = 1\n[fixed]\n{text}\n", "utf-8")
+    assert execute(["campaign", str(file), "--dry-run"]) == 2
+    line = capsys.readouterr().err.strip()
+    assert said in line and "\n" not in line
+
+
+def test_a_sprayer_whose_lags_nobody_measured_cannot_be_known(tmp_path: Path) -> None:
+    name = next(
+        path.stem
+        for path in sorted(PROFILES.glob("*.toml"))
+        if path.stem != "wang-2024" and not (PROFILES / "lags" / f"{path.stem}-gpio.toml").exists()
+    )
+    given = (("plant.known", True), ("plant.profile", name))
+    with pytest.raises(ConfigError, match=f"no lags were measured of {name}; leave it out"):
+        fly_flight(given, 1, tmp_path)
 
 
 def designed(folder: Path, kind: str, samples: int) -> Campaign:
