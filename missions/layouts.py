@@ -36,7 +36,7 @@ from missions.strips import (
     whole,
 )
 from missions.worth import LEFT_SHARE as WORTH_LEFT
-from missions.worth import LINES_MAX, WORTH, Tour, tour_of, worthwhile
+from missions.worth import LINES_MAX, WORTH, Tour, tour_of, without_stubs, worthwhile
 
 # Of the best courses so many are drawn in full; of the layouts so many are gone through line by
 # line, and only the best one where it has more lines than this.
@@ -212,6 +212,17 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
                 angle_deg = main_course_deg(found.lines)
             return found.lines, angle_deg
     return tour.lines, angle_deg
+
+
+def flyable(lines: Floats, field: Field, settings: Settings) -> Floats:
+    """Return lines without those too short for a leg, where what they cover may be left out."""
+    return without_stubs(
+        lines,
+        field.fly,
+        reachable(field.spray, settings.swath_width_m),
+        boom_of(settings, field),
+        left_share=_spare(field, settings),
+    )
 
 
 def is_small(field: Field, settings: Settings) -> bool:

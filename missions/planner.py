@@ -24,15 +24,16 @@ from missions.files.items import count_of, stops_of
 from missions.files.plan_rules import ITEMS_MAX
 from missions.fleet import fleet_sorties
 from missions.free_space import free_space
-from missions.layouts import is_small, spray_lines
+from missions.layouts import flyable, is_small, spray_lines
 from missions.paced import Paced, in_room, range_warnings
 from missions.plan import Leg, Plan, Settings, Sortie, flown_lines, nose_s, sortie_wh
 from missions.remaining import Remaining
 from missions.schedule import scheduled
 from missions.searching import lines_are_drawn
 from missions.sorties import Flying, SortieSearch
-from missions.spacing import Spacing, near_warnings
+from missions.spacing import Spacing
 from missions.speeds import choices, chosen, short_warnings, stretches_of
+from missions.stops import near_warnings
 from missions.strips import (
     Bools,
     Extents,
@@ -111,6 +112,7 @@ def _planned(
     if left is None:
         lines, angle_deg = spray_lines(field, settings, motion)
         lines = joined([lines, narrow_patches(lines, field.spray, field.limit, width_m)])
+        lines = flyable(lines, field, settings)
         sprayed = lines
     else:
         lines, angle_deg = left.lines, left.angle_deg

@@ -9,24 +9,25 @@ left out, as long as it stays on free ground. What is straight on from a line is
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import islice, pairwise, product
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from companion.core.frame import LocalFrame
-from companion.wording import counted
 from missions.plan import Leg, Place, Settings, Sortie, is_high
 from missions.stops import NEAR_M, SAME_M, is_passed, near_pairs, waypoints_of
 from missions.strips import Floats
 from missions.ways import Ways
 
-# A little more than the least distance: places are rounded when they are written.
-APART_M = NEAR_M + 0.01
+Pair = tuple[Place, Place]
+NOWHERE = frozenset[int]()
+
+# A little more than the least distance: places are rounded when they are written, by 8 mm each.
+APART_M = NEAR_M + 0.016
 # So far a way may go on straight from one line, or straight into the next.
 BEYOND_M = (0.0, 0.5, 1.0, 1.5, 2.02, 2.5, 3.0, 4.0)
 # Room is used but for so much, and where that is more than other tries by so much.
@@ -40,8 +41,8 @@ RING = 12
 CROWDED_M, SKIPPED_MAX = 4.0, 3
 # A waypoint more is worth so much way, and one that is too near more than any detour tried here.
 WAYPOINT_M, TOO_NEAR_M = 6.0, 1000.0
-# So many pairs that stay too near are looked at one by one.
-PAIRS_MAX, TOUCH_M = 20, 1e-6
+# So many pairs that stay too near are looked at one by one, with so many legs around them.
+PAIRS_MAX, AROUND, TOUCH_M = 20, 6, 1e-6
 # Cosine of what is straight on.
 STRAIGHT = 1.0 - 1e-6
 
@@ -154,18 +155,79 @@ class Spacing:
 
     def _spaced(self, sortie: Sortie) -> Sortie:
         known = _Crowded()
-        best = replace(sortie, legs=self._legs(sortie.legs, known))
-        near = near_pairs(waypoints_of(best, apart=self.apart))
+        best, near = self._mended(sortie, known)
         for pair in near[:PAIRS_MAX]:
             # What is thought of the ends of short lines in a row, that they are passed or straight
             # on, need not come so: once more as if not. Then with corners anywhere.
             for crowded in known.with_more(_at(best.legs, pair)):
-                again = replace(sortie, legs=self._legs(sortie.legs, crowded))
-                left = near_pairs(waypoints_of(again, apart=self.apart))
+                again, left = self._mended(sortie, crowded)
                 if len(left) < len(near):
                     best, near, known = again, left, crowded
                     break
         return best
+
+    def _mended(self, sortie: Sortie, crowded: _Crowded) -> tuple[Sortie, list[Pair]]:
+        """Return the sortie spaced, ways changed one by one where pairs stay near, and the rest."""
+        best = replace(sortie, legs=self._legs(sortie.legs, crowded))
+        near = self._near(best)
+        for pair in near[:PAIRS_MAX]:
+            again = replace(best, legs=self._with_another_way(sortie.legs, best.legs, pair))
+            left = self._near(again)
+            if len(left) < len(near):
+                best, near = again, left
+        return best, near
+
+    def _near(self, sortie: Sortie) -> list[Pair]:
+        """Return the waypoints that are too near to the one before, or will be once rounded."""
+        return near_pairs(waypoints_of(sortie, apart=self.apart), within_m=APART_M)
+
+    def _with_another_way(
+        self, given: tuple[Leg, ...], legs: tuple[Leg, ...], pair: Pair
+    ) -> tuple[Leg, ...]:
+        """Return legs with another way, such that a pair is no longer too near; else as they are.
+
+        Each is looked at as it will be written, whatever was thought of the ways one by one: which
+        ends are passed in a row of short lines depends on more than the ways beside them.
+        """
+        at = _at(legs, pair)
+        ways = [
+            number
+            for number in range(max(min(at, default=0) - 2, 0), max(at, default=-1) + 3)
+            if number < len(legs) and legs[number].kind != "spray"
+        ]
+        # Enough around them that what is passed there is as in the whole sortie.
+        first, last = max(min(ways, default=0) - AROUND, 0), max(ways, default=0) + AROUND
+        first -= first > 0 and legs[first].kind == "spray"
+
+        def near(number: int, leg: Leg) -> int:
+            shown = (*legs[first:number], leg, *legs[number + 1 : last + 1])
+            return len(self._near(Sortie(number=1, depot=0, legs=shown)))
+
+        now = near(first, legs[first])
+        for is_straight, are_few in product((False, True), repeat=2):
+            found = []
+            for number in ways:
+                here = frozenset({number})
+                kind = _Crowded(
+                    straight=here if is_straight else NOWHERE, few=here if are_few else NOWHERE
+                )
+                changed = self._changes(given[number], self._others(given, number, kind))
+                better = (leg for leg in changed if near(number, leg) < now)
+                found += [
+                    (leg.length_m - legs[number].length_m, number, leg) for leg in islice(better, 1)
+                ]
+            if found:
+                _, number, leg = min(found, key=lambda each: each[:2])
+                return (*legs[:number], leg, *legs[number + 1 :])
+        return legs
+
+    @staticmethod
+    def _changes(given: Leg, options: Sequence[_Option]) -> Iterator[Leg]:
+        """Yield a way as it was given, and with each of the options, the best first."""
+        yield given
+        for option in options:
+            if option.points != given.points:
+                yield replace(given, points=option.points, through=False)
 
     def _legs(self, legs: tuple[Leg, ...], crowded: _Crowded) -> tuple[Leg, ...]:
         joins = [number for number, leg in enumerate(legs) if leg.kind != "spray"]
@@ -260,26 +322,6 @@ class Spacing:
         return space
 
 
-def near_warnings(
-    sorties: Sequence[Sortie], frame: LocalFrame, *, apart: bool = False
-) -> tuple[str, ...]:
-    """Return how many waypoints are too near to the one before all the same, and where."""
-    pairs = [pair for each in sorties for pair in near_pairs(waypoints_of(each, apart=apart))]
-    if not pairs:
-        return ()
-    nearest = min(pairs, key=lambda pair: math.dist(*pair))
-    latitude_deg, longitude_deg = frame.to_geographic(*nearest[1])
-    why = (
-        "DO_SPRAYER needs one at both ends of each line; plan without --sprayer"
-        if apart
-        else "lines and free ground leave no room there; leave that nook out of the outline"
-    )
-    return (
-        f"{counted(len(pairs), 'waypoint')} less than {NEAR_M:g} m from the one before, the "
-        f"nearest {math.dist(*nearest):.1f} m near {latitude_deg:.6f}, {longitude_deg:.6f}: {why}",
-    )
-
-
 def _beside(legs: Sequence[Leg], number: int) -> tuple[Leg | None, Leg | None]:
     """Return the lines before and after a way."""
     before = legs[number - 1] if number else None
@@ -321,7 +363,7 @@ def _run_m(points: Sequence[Place], along: Place) -> float:
     return far_m if east_m * along[0] + north_m * along[1] > STRAIGHT * far_m > 0.0 else 0.0
 
 
-def _at(legs: Sequence[Leg], pair: tuple[Place, Place]) -> frozenset[int]:
+def _at(legs: Sequence[Leg], pair: Pair) -> frozenset[int]:
     """Return the ways between lines that have waypoints at one of two places."""
     return frozenset(
         number

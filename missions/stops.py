@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+from companion.core.frame import LocalFrame
+from companion.wording import counted
 from missions.corners import Course, parts_s
 from missions.plan import Leg, Place, Settings, Sortie
 
@@ -70,7 +72,7 @@ def waypoints_of(sortie: Sortie, *, apart: bool = False) -> list[Stop]:
     return stops if apart else _without_runs(stops)
 
 
-def near_pairs(stops: Sequence[Stop]) -> list[tuple[Place, Place]]:
+def near_pairs(stops: Sequence[Stop], *, within_m: float = NEAR_M) -> list[tuple[Place, Place]]:
     """Return the waypoints that are too near to the one before, each with that one.
 
     The take-off is none. One above another is far enough from it: the way between is a climb.
@@ -78,8 +80,28 @@ def near_pairs(stops: Sequence[Stop]) -> list[tuple[Place, Place]]:
     return [
         (one.place, other.place)
         for one, other in pairwise(stops[1:])
-        if math.dist(one.place, other.place) < NEAR_M and one.height_m == other.height_m
+        if math.dist(one.place, other.place) < within_m and one.height_m == other.height_m
     ]
+
+
+def near_warnings(
+    sorties: Sequence[Sortie], frame: LocalFrame, *, apart: bool = False
+) -> tuple[str, ...]:
+    """Return how many waypoints are too near to the one before all the same, and where."""
+    pairs = [pair for each in sorties for pair in near_pairs(waypoints_of(each, apart=apart))]
+    if not pairs:
+        return ()
+    nearest = min(pairs, key=lambda pair: math.dist(*pair))
+    latitude_deg, longitude_deg = frame.to_geographic(*nearest[1])
+    why = (
+        "DO_SPRAYER needs one at both ends of each line; plan without --sprayer"
+        if apart
+        else "lines and free ground leave no room there; leave that nook out of the outline"
+    )
+    return (
+        f"{counted(len(pairs), 'waypoint')} less than {NEAR_M:g} m from the one before, the "
+        f"nearest {math.dist(*nearest):.1f} m near {latitude_deg:.6f}, {longitude_deg:.6f}: {why}",
+    )
 
 
 def _changed(before: Leg, leg: Leg) -> list[Stop]:

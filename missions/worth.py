@@ -18,6 +18,7 @@ from missions.corners import Motion
 from missions.demand import Pieces
 from missions.free_space import FreeSpace
 from missions.network import JOIN_M, Network, build_network
+from missions.stops import NEAR_M
 from missions.strips import LINE_MIN_M, Floats, Objects, directions, lengths_m, whole
 from missions.tour import Ring, Sortie, by_savings, cost_s, one_chain, shortest_tour
 
@@ -29,6 +30,8 @@ WORTH = 0.1
 TRIED_MAX = 16
 # Ground beside a strip that is nothing but rounding, and a part of a line not worth cutting off.
 CRUMB_M2, LEAST_M = 0.02, 0.5
+# What ways that go on from a line keep from walls, and rounding.
+MARGINS_M, SAME_M = 0.03, 1e-3
 
 
 def worthwhile(
@@ -64,6 +67,36 @@ def worthwhile(
         if ground.kept[at]:
             ground.trim(at)
     return ground.lines[ground.kept]
+
+
+def without_stubs(
+    lines: Floats, space: BaseGeometry, target: BaseGeometry, boom: Boom, *, left_share: float
+) -> Floats:
+    """Return lines without those that no way makes as long as a leg has to be.
+
+    They lie between two walls, where no strip fits the other way. Those stay whose ground may not
+    be left out.
+    """
+    stubs = np.flatnonzero(lengths_m(lines) < NEAR_M)
+    along = directions(lines[stubs])
+    ends = lines[stubs] + np.hstack([-along, along]) * NEAR_M
+    ways = shapely.intersection(shapely.linestrings(ends.reshape(-1, 2, 2)), space)
+    middles = np.asarray(shapely.points((lines[stubs, :2] + lines[stubs, 2:]) / 2.0))
+    parts, way_of = shapely.get_parts(ways, return_index=True)
+    own = shapely.distance(parts, middles[way_of]) < SAME_M
+    room_m = np.bincount(way_of[own], shapely.length(parts[own]), minlength=len(stubs))
+    stubs = stubs[room_m < NEAR_M + MARGINS_M]
+    if not len(stubs) or len(stubs) == len(lines):
+        return lines
+    ground = _Ground(lines, target, boom)
+    spare_m2 = left_share * target.area - target.difference(boom.united(lines)).area
+    alone_m2 = {at: ground.alone_m2(at) for at in stubs.tolist()}
+    for at in sorted(alone_m2, key=lambda each: alone_m2[each]):
+        lost_m2 = ground.alone_m2(at)
+        if lost_m2 <= spare_m2:
+            ground.kept[at] = False
+            spare_m2 -= lost_m2
+    return lines[ground.kept]
 
 
 def _change_s(ring: Ring, piece: int) -> float:
