@@ -306,8 +306,16 @@ def above_label(
 
     `rates_l_ha` are those of the map called `name`, and `default_rate_l_ha` what holds elsewhere.
     """
-    limit_l_ha = config.rate_max_l_ha()
     rates = [*rates_l_ha, *([] if default_rate_l_ha is None else [default_rate_l_ha])]
+    limit_l_ha = config.rate_max_l_ha()
+    if limit_l_ha is not None and rates and not max(rates) <= limit_l_ha:
+        return Problem(
+            severity="error",
+            code="above-label",
+            text=f"{name} asks for up to {max(rates):g} L/ha, above "
+            f"{_rate_key(config, limit_l_ha)} = {limit_l_ha:g}",
+            fix="lower the map's rates or correct the limit to what the label says",
+        )
     least_l_ha = None if config.label is None else config.label.rate_min_l_ha
     low = min((rate for rate in rates if rate > 0.0), default=math.inf)
     if least_l_ha is not None and low < least_l_ha:
@@ -318,15 +326,36 @@ def above_label(
             f"{config.limits_table.file}",
             fix="raise the map's low rates, or set them to 0: not sprayed",
         )
-    if limit_l_ha is None or not rates or max(rates) <= limit_l_ha:
-        return None
-    return Problem(
-        severity="error",
-        code="above-label",
-        text=f"{name} asks for up to {max(rates):g} L/ha, above "
-        f"{_rate_key(config, limit_l_ha)} = {limit_l_ha:g}",
-        fix="lower the map's rates or correct the limit to what the label says",
-    )
+    return None
+
+
+def beyond_label(config: Config) -> list[Problem]:
+    """Return where the configuration itself goes beyond label and permit, before any flight."""
+    label, mission, file = config.label, config.mission, config.limits_table.file
+    if label is None:
+        return []
+    found = []
+    for code, key, unit in (("label-speed", "speed_m_s", "m/s"), ("label-height", "height_m", "m")):
+        value, span = getattr(mission, key, None), label.span(key)
+        if value is not None and span is not None and not span[0] <= value <= span[1]:
+            found.append(Problem(
+                severity="error",
+                code=code,
+                text=f"mission.{key} = {value:g}, and {file} allows {label.words(key, unit)}",
+                where=f"mission.{key}",
+                fix=f"change mission.{key}, and plan again",
+            ))  # fmt: skip
+    droplets = config.product.droplet_class
+    if droplets is not None and not label.is_droplet_class(droplets):
+        found.append(Problem(
+            severity="error",
+            code="label-droplets",
+            text=f"product.droplet_class = {droplets}, and {file} allows "
+            + " or ".join(label.droplet_classes),
+            where="product.droplet_class",
+            fix="fit nozzles of that class at the pressure that is flown",
+        ))  # fmt: skip
+    return found
 
 
 def _rate_key(config: Config, limit_l_ha: float) -> str:

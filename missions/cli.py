@@ -7,6 +7,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
 from types import FrameType
@@ -37,7 +38,7 @@ from missions.planner import plan_mission
 from missions.prices import closing_hint, overlap_warnings, prices
 from missions.reading import Asked, Task, assumed, names_of, read_task
 from missions.reading_fleet import BreakAsked
-from missions.reading_ground import Autopilot, GroundAsked, parse_run_in, parse_wind
+from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
 from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
 from missions.searching import Watch, watched
 from missions.sheet import sheet, sortie_lines
@@ -261,7 +262,9 @@ def plan(
             planned, fences = _fenced(
                 task, with_sprayer=sprayer, looks=out.suffix.casefold() == ".plan"
             )
-    planned = replace(planned, warnings=(*task.said, *planned.warnings), wind=task.wind)
+    flown_s = [sortie.flight_s for sortie in planned.sorties]
+    by_label = label_warnings(reading.config, flown_s, datetime.now(tz=UTC).timestamp())
+    planned = replace(planned, warnings=(*task.said, *by_label, *planned.warnings), wind=task.wind)
     took_s = perf_counter() - start
     choices = []
     asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT

@@ -116,7 +116,7 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         PlanError, MapError, ConfigError: in one line, what is wrong and what to do.
     """
     settings = _spaced(_settings(config, changes), asked, config, changes)
-    check_label(config, settings)
+    check_label(config, settings, asked.ground)
     if asked.with_sprayer:
         # The autopilot's own sprayer knows no treated ground.
         settings = replace(settings, switch_off_percent=None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,15 +13,17 @@ import numpy as np
 import shapely
 from shapely import MultiPolygon
 
+from companion.assembly import beyond_label
 from companion.config import Config
 from companion.config.tables import MissionTable
 from companion.core.frame import LocalFrame
+from companion.core.label import DAY_S, is_from
 from missions.errors import PlanError
 from missions.field import Field, WindBuffer, local_area
 from missions.maps.local import grown
 from missions.maps.registry import read_area
 from missions.plan import Settings
-from missions.reading_outline import near_area, told
+from missions.reading_outline import near_features, told
 from missions.run_in import RunIn
 from missions.terrain import Terrain, read_dem
 
@@ -115,14 +118,16 @@ def buffered(
 ) -> list[MultiPolygon]:
     """Return what the label keeps away from, as wide as needed around what keeps `kept_m`."""
     return [
-        grown(near_area(config.resolve(name), frame, opens), each.distance_m - kept_m, frame)
+        grown(near_features(config.resolve(name), frame, opens), each.distance_m - kept_m, frame)
         for each in config.buffers
         for name in each.files
     ]
 
 
-def check_label(config: Config | None, settings: Settings) -> None:
-    """Refuse a speed or height of passes that label or permit do not allow.
+def check_label(
+    config: Config | None, settings: Settings, asked: GroundAsked = NOTHING_ASKED
+) -> None:
+    """Refuse speed, height, droplets and wind of a plan that label or permit do not allow.
 
     Raises:
         PlanError: in one line, what is outside and what to change.
@@ -142,6 +147,40 @@ def check_label(config: Config | None, settings: Settings) -> None:
                 f"{config.limits_table.file}: {what} {label.words(name, unit)}, and passes are "
                 f"planned at {wrong:g} {unit}; change mission.{name} or its option"
             )
+    for problem in beyond_label(config):
+        if problem.code == "label-droplets":
+            raise PlanError(f"{problem.text}; {problem.fix}")
+    wind, span = asked.wind or _table(config).wind, label.span("wind_m_s")
+    if wind is not None and span is not None and not span[0] <= wind[0] <= span[1]:
+        raise PlanError(
+            f"{config.limits_table.file}: wind {label.words('wind_m_s', 'm/s')}, and this plan is "
+            f"for {wind[0]:g} m/s; plan for another day"
+        )
+    if wind is not None and label.wind_from_deg and not is_from(wind[1], label.wind_from_deg):
+        raise PlanError(
+            f"{config.limits_table.file}: wind {label.wind_words()}, and this plan is for a wind "
+            f"from {wind[1]:g} deg; plan for another day"
+        )
+
+
+def label_warnings(config: Config | None, sorties_s: Sequence[float], now_s: float) -> list[str]:
+    """Return what days and hours of label and permit have against a plan.
+
+    `sorties_s` is how long each sortie flies; `now_s` is today, in seconds since 1970.
+    """
+    label = None if config is None else config.label
+    if config is None or label is None:
+        return []
+    flown, found = label.flown({}), []
+    if flown.days_s is not None and not now_s < flown.days_s[1]:
+        found.append(f"{config.limits_table.file}: the permit ended on {label.last_day}")
+    longest_s = max(((last - first) % DAY_S for first, last in flown.hours_s), default=math.inf)
+    if max(sorties_s, default=0.0) > longest_s:
+        found.append(
+            f"{config.limits_table.file}: a sortie of {max(sorties_s) / 60.0:.0f} min does not fit "
+            f"into its hours, of {longest_s / 60.0:.0f} min at most; plan shorter sorties"
+        )
+    return found
 
 
 def run_in_of(

@@ -125,6 +125,16 @@ def near_area(path: Path, frame: LocalFrame, asked: Mapping[str, str | None]) ->
     return area
 
 
+def near_features(
+    path: Path, frame: LocalFrame, asked: Mapping[str, str | None]
+) -> list[BaseGeometry]:
+    """Return areas, lines and points of a file, which must lie near the field."""
+    found = [record.geometry for record in told(partial(read_records, path), asked)]
+    west, south, east, north = shapely.total_bounds(np.array(found, dtype=object)).tolist()
+    check_near(str(path), (south + north) / 2.0, (west + east) / 2.0, frame)
+    return found
+
+
 # Whether what a task names lies near its field; a forgotten sign puts it on another continent.
 
 # Fields are refused beyond 20 km of extent, and so are depots beyond as much: this is no field's.

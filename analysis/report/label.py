@@ -127,9 +127,7 @@ def _times(label: LimitsFile, flight: AppliedFlight, treated: Treated) -> Iterat
     limits = label.flown({})
     if not limits.needs_utc:
         return
-    words = ", ".join(label.hours) or "all day"
-    days = f"{label.first_day or 'any day'} to {label.last_day or 'any day'}"
-    limit = f"{words} ({label.utc_offset}), {days}"
+    limit = label.when()
     if treated.first_s is None or treated.last_s is None or flight.utc_source != "autopilot":
         yield _row("hours", limit, "not known by the autopilot's clock", None)
         return

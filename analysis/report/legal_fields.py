@@ -6,6 +6,7 @@ import json
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import date, time
 from typing import TYPE_CHECKING, Any
 
 from companion.config.application_table import Profile, check, is_number, is_told, known
@@ -131,7 +132,8 @@ def _parsed(change: str) -> tuple[str, Any]:
         parsed = tomllib.loads(f"value = {text}")
     except (tomllib.TOMLDecodeError, RecursionError):
         return key, text
-    value = parsed["value"] if list(parsed) == ["value"] else text
+    is_value = list(parsed) == ["value"] and not isinstance(parsed["value"], date | time)
+    value = parsed["value"] if is_value else text
     # A certificate's number and a growth stage are digits, and no numbers.
     return key, value if isinstance(value, str) or is_number(key) else text
 
@@ -359,6 +361,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "application.wind_from_deg": ("Wind from", "deg"),
     "application.temperature_c": ("Temperature", "deg C"),
     "application.humidity_percent": ("Relative humidity", "%"),
+    "application.observed_at": ("Weather observed at", ""),
     "application.inversion": ("Temperature inversion", ""),
     "product.name": ("Product", ""),
     "product.registration": ("Authorisation or registration number", ""),

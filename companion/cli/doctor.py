@@ -118,6 +118,7 @@ def doctor(
 def _all(config: Config, given: tuple[str, ...], *, wait_s: float | None) -> Iterator[Check]:
     yield from configuration_checks(config, today=datetime.now(tz=UTC).astimezone().date())
     yield application_check(config)
+    yield label_check(config, datetime.now(tz=UTC))
     found, setup = map_checks(config, given, now=datetime.now(tz=UTC))
     yield from found
     yield from _computer(config)
@@ -244,7 +245,6 @@ def configuration_checks(config: Config, *, today: date) -> Iterator[Check]:
     yield calibration_age(config.lag.measured_on, today)
     yield valve_age(config, today)
     yield _signing(config)
-    yield label_check(config)
 
 
 def refused_configuration(error: ConfigError) -> Check:

@@ -126,6 +126,11 @@ class ApplicationTable(Table):
     inversion: Literal["no", "yes"] | None = Field(
         default=None, description="whether the air lies in a temperature inversion, as seen"
     )
+    observed_at: Annotated[str, _is_some(datetime.fromisoformat, "no such time")] | None = Field(
+        default=None,
+        pattern=_MOMENT,
+        description="when this weather was observed, such as 2026-05-01T06:30:00+02:00",
+    )
     start_time: Annotated[str, _is_some(datetime.fromisoformat, "no such time")] | None = Field(
         default=None,
         pattern=_MOMENT,

@@ -42,6 +42,9 @@ Degrees = Annotated[FiniteFloat, Field(ge=0, le=360)]
 Celsius = Annotated[FiniteFloat, Field(ge=-40, le=60)]
 Percent = Annotated[FiniteFloat, Field(ge=0, le=100)]
 Hours = Annotated[str, Field(pattern=f"^{CLOCK}-{CLOCK}$")]
+OBSERVED_AT = "application.observed_at"
+# Observed this long after the autopilot's time is still now: nobody's watch is right.
+WATCH_S = 300.0
 _PAIRS = ("rate_l_ha", "wind_m_s", "height_m", "speed_m_s", "temperature_c", "humidity_percent")
 
 
@@ -82,6 +85,10 @@ class LimitsFile(Table):
     humidity_max_percent: Percent | None = Field(default=None, description="of the air, relative")
     inversion: Literal["forbidden"] | None = Field(
         default=None, description="no spraying in one: the operator declares that there is none"
+    )
+    observed_max_h: Annotated[FiniteFloat, Field(gt=0, le=24)] = Field(
+        default=2.0,
+        description="weather that the operator declares counts so long after observed_at",
     )
     hours: Annotated[tuple[Hours, ...], Field(strict=False, max_length=20)] = Field(
         default=(), description='["06:00-10:00", ...] of each day'
@@ -139,6 +146,16 @@ class LimitsFile(Table):
             for each in self.buffer
         )
 
+    def wind_words(self) -> str:
+        """Return where the wind may come from in words."""
+        return "from " + ", ".join(f"{a:g} to {b:g} deg" for a, b in self.wind_from_deg)
+
+    def when(self) -> str:
+        """Return days and hours in words."""
+        hours = ", ".join(self.hours) or "all day"
+        days = f"{self.first_day or 'any day'} to {self.last_day or 'any day'}"
+        return f"{hours} ({self.utc_offset}), {days}"
+
     def words(self, name: str, unit: str) -> str:
         """Return the span of a quantity in words."""
         low, high = self.ends(name)
@@ -166,11 +183,43 @@ class LimitsFile(Table):
             wind_from_deg=self.wind_from_deg,
             hours_s=hours_s,
             days_s=days_s,
+            observed_s=self._observed_s(values),
             broken=frozenset(each.reason for each in self.declared(values) if not each.is_kept),
         )
 
+    def _observed_s(self, values: Mapping[str, object]) -> Span | None:
+        """Return how long what the operator observed counts; None where nothing has to be."""
+        told = values.get(OBSERVED_AT)
+        if told is None or not any(row.key == OBSERVED_AT for row in self.declared(values)):
+            return None
+        seen_s = (datetime.fromisoformat(str(told)) - _EPOCH) / timedelta(seconds=1)
+        return (seen_s - WATCH_S, seen_s + self.observed_max_h * 3600.0)
+
     def declared(self, values: Mapping[str, object]) -> Iterator[Declared]:
         """Yield each limit that the operator answers for, with what was declared by dotted key."""
+        weather = list(self._weather(values))
+        yield from weather
+        if weather:
+            value = values.get(OBSERVED_AT)
+            yield Declared(
+                Inhibit.LABEL_WEATHER_AGE, "observed_at", OBSERVED_AT,
+                f"its time, at most {self.observed_max_h:g} h before spraying", value,
+                value is not None,
+            )  # fmt: skip
+        if self.droplet_classes:
+            value = values.get("product.droplet_class")
+            yield Declared(
+                Inhibit.LABEL_DROPLETS, "droplet_class", "product.droplet_class",
+                " or ".join(self.droplet_classes), value, self.is_droplet_class(value),
+            )  # fmt: skip
+
+    def is_droplet_class(self, value: object) -> bool:
+        """Return whether droplets of a class, as people write it, are allowed."""
+        name = str(value or "").strip().lower().replace(" ", "-")
+        return not self.droplet_classes or name in self.droplet_classes
+
+    def _weather(self, values: Mapping[str, object]) -> Iterator[Declared]:
+        """Yield what the operator has to observe; it counts for a while."""
         rows: list[tuple[Inhibit, str, str, str]] = [
             (Inhibit.LABEL_TEMPERATURE, "temperature_c", "application.temperature_c", "deg C"),
             (Inhibit.LABEL_HUMIDITY, "humidity_percent", "application.humidity_percent", "%"),
@@ -187,20 +236,14 @@ class LimitsFile(Table):
             key = "application.wind_from_deg"
             value = values.get(key)
             kept = isinstance(value, int | float) and is_from(float(value), self.wind_from_deg)
-            words = "from " + ", ".join(f"{a:g} to {b:g} deg" for a, b in self.wind_from_deg)
-            yield Declared(Inhibit.LABEL_WIND_DIRECTION, "wind_from_deg", key, words, value, kept)
+            yield Declared(
+                Inhibit.LABEL_WIND_DIRECTION, "wind_from_deg", key, self.wind_words(), value, kept
+            )
         if self.inversion is not None:
             value = values.get("application.inversion")
             yield Declared(
                 Inhibit.LABEL_INVERSION, "inversion", "application.inversion", "none seen: no",
                 value, value == "no",
-            )  # fmt: skip
-        if self.droplet_classes:
-            value = values.get("product.droplet_class")
-            name = str(value or "").strip().lower().replace(" ", "-")
-            yield Declared(
-                Inhibit.LABEL_DROPLETS, "droplet_class", "product.droplet_class",
-                " or ".join(self.droplet_classes), value, name in self.droplet_classes,
             )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Sequence
+from datetime import date, time
 from pathlib import Path
 from typing import Any
 
@@ -107,13 +108,14 @@ def _steps(key: str) -> list[str | int]:
 
 
 def _parse(text: str) -> Any:
-    """Return a value as TOML has it; what TOML does not know is text.
+    """Return a value as TOML has it; what TOML does not know is text, and so is a time.
 
-    >>> _parse("0.12"), _parse("none"), _parse('["AUTO"]')
-    (0.12, 'none', ['AUTO'])
+    >>> _parse("0.12"), _parse("none"), _parse('["AUTO"]'), _parse("2026-05-01T06:30:00Z")
+    (0.12, 'none', ['AUTO'], '2026-05-01T06:30:00Z')
     """
     try:
         parsed = tomllib.loads(f"value = {text}")
     except (tomllib.TOMLDecodeError, RecursionError):
         return text
-    return parsed["value"] if list(parsed) == ["value"] else text
+    is_value = list(parsed) == ["value"] and not isinstance(parsed["value"], date | time)
+    return parsed["value"] if is_value else text

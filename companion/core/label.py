@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from companion.core.types import Inhibit, VehicleState
+from companion.core.types import Inhibit, VehicleState, WindReport
 
 # Never more margin than this share of the room between two limits.
 MARGIN_SHARE_MAX = 0.1
@@ -23,6 +23,7 @@ class LabelLimits:
 
     Spans are from least to most. `wind_from_deg` are the directions that the wind may come from,
     clockwise; `hours_s` are spans of the day (UTC), over midnight where the first is the later.
+    `observed_s` is how long the weather counts that the operator observed, from when to when.
     `broken` is what the operator declared otherwise, or did not declare, before the flight.
     """
 
@@ -33,12 +34,13 @@ class LabelLimits:
     wind_from_deg: tuple[Span, ...] = ()
     hours_s: tuple[Span, ...] = ()
     days_s: Span | None = None  # seconds since 1970, from the first to the end of the last
+    observed_s: Span | None = None  # seconds since 1970
     broken: frozenset[Inhibit] = frozenset()
 
     @property
     def needs_utc(self) -> bool:
         """Whether the time of day has to be known."""
-        return bool(self.hours_s) or self.days_s is not None
+        return bool(self.hours_s) or self.days_s is not None or self.observed_s is not None
 
 
 def label_broken(
@@ -66,11 +68,13 @@ def label_broken(
     if label.wind_required or state.wind_m_s is not None:
         check(Inhibit.LABEL_WIND, state.wind_m_s if counts else None, label.wind_m_s)
     if label.wind_from_deg and (label.wind_required or state.wind is not None):
-        from_deg = _wind_from_deg(state) if counts else None
+        from_deg = wind_from_deg(state.wind) if counts else None
         if not is_from(from_deg, label.wind_from_deg):
             found.append(Inhibit.LABEL_WIND_DIRECTION)
-    if label.needs_utc and not _is_hour(label, state.utc_offset_s, now_s):
-        found.append(Inhibit.LABEL_TIME)
+    if label.needs_utc:
+        utc_s = math.nan if state.utc_offset_s is None else now_s + state.utc_offset_s
+        found += [] if is_hour(label, utc_s) else [Inhibit.LABEL_TIME]
+        found += [] if _is_recent(label, utc_s) else [Inhibit.LABEL_WEATHER_AGE]
     return found
 
 
@@ -81,9 +85,8 @@ def _is_inside(value: float | None, span: Span, margin: float) -> bool:
     return value is not None and low + (margin if low > 0.0 else 0.0) <= value <= high - margin
 
 
-def _wind_from_deg(state: VehicleState) -> float | None:
+def wind_from_deg(wind: WindReport | None) -> float | None:
     """Return where the wind comes from; None without a direction."""
-    wind = state.wind
     if wind is None or wind.east_m_s is None or wind.north_m_s is None:
         return None
     if not 0.0 < math.hypot(wind.east_m_s, wind.north_m_s) < math.inf:
@@ -96,17 +99,29 @@ def is_from(from_deg: float | None, sectors: tuple[Span, ...]) -> bool:
 
     >>> is_from(350.0, ((270.0, 10.0),)), is_from(11.0, ((270.0, 10.0),))
     (True, False)
+    >>> is_from(11.0, ((0.0, 360.0),)), is_from(11.0, ((10.0, 10.0),))
+    (True, False)
     """
     return from_deg is not None and any(
-        (from_deg - first) % 360.0 <= (last - first) % 360.0 for first, last in sectors
+        (from_deg - first) % 360.0 <= (360.0 if last - first == 360.0 else (last - first) % 360.0)
+        for first, last in sectors
     )
 
 
-def _is_hour(label: LabelLimits, utc_offset_s: float | None, now_s: float) -> bool:
-    """Return whether it is one of the label's days and hours; unknown is none."""
-    if utc_offset_s is None:
-        return False
-    utc_s = now_s + utc_offset_s
+def _is_recent(label: LabelLimits, utc_s: float) -> bool:
+    """Return whether the weather that the operator observed still counts."""
+    span = label.observed_s
+    return span is None or span[0] <= utc_s < span[1]
+
+
+def is_hour(label: LabelLimits, utc_s: float) -> bool:
+    """Return whether a time, in seconds since 1970, is in the label's days and hours; NaN is not.
+
+    >>> is_hour(LabelLimits(hours_s=((3600.0, 7200.0),)), 3600.0), is_hour(LabelLimits(), math.nan)
+    (True, True)
+    """
+    if not label.hours_s and label.days_s is None:
+        return True
     if not 0.0 <= utc_s < math.inf:
         return False
     if label.days_s is not None and not label.days_s[0] <= utc_s < label.days_s[1]:

@@ -100,16 +100,16 @@ def inhibits(
     if state is None:
         return frozenset({Inhibit.NO_POSITION})
     limits = held(limits, before)
-    return frozenset(
-        [
-            *_operator(state, limits),
-            *_vehicle(state, limits, now_s),
-            *_wind(state, limits, now_s),
-            *_position(state, limits, field_bounds_m, now_s),
-            *_speed_and_height(state, limits),
-            *_label(state, limits, before, now_s),
-        ]
-    )
+    found = [
+        *_operator(state, limits),
+        *_vehicle(state, limits, now_s),
+        *_wind(state, limits, now_s),
+        *_position(state, limits, field_bounds_m, now_s),
+        *_speed_and_height(state, limits),
+    ]
+    if limits.label is not None:
+        found += _label(state, limits, limits.label, before, now_s)
+    return frozenset(found)
 
 
 def held(limits: Limits, before: frozenset[Inhibit]) -> Limits:
@@ -240,20 +240,20 @@ def _speed_and_height(state: VehicleState, limits: Limits) -> list[Inhibit]:
 
 
 def _label(
-    state: VehicleState, limits: Limits, before: frozenset[Inhibit], now_s: float
+    state: VehicleState,
+    limits: Limits,
+    label: LabelLimits,
+    before: frozenset[Inhibit],
+    now_s: float,
 ) -> list[Inhibit]:
     """Check what label and permit ask for, where they are given as data."""
-    if limits.label is None:
-        return []
     margins = {
         Inhibit.LABEL_SPEED: SPEED_MARGIN_M_S,
         Inhibit.LABEL_HEIGHT: HEIGHT_MARGIN_M,
         Inhibit.LABEL_WIND: WIND_MARGIN_M_S,
     }
     held_by = {reason: margin for reason, margin in margins.items() if reason in before}
-    return label_broken(
-        state, limits.label, held_by, wind_age_max_s=limits.wind_age_max_s, now_s=now_s
-    )
+    return label_broken(state, label, held_by, wind_age_max_s=limits.wind_age_max_s, now_s=now_s)
 
 
 # Reasons that stay, and until when.

@@ -286,6 +286,7 @@ class Inhibit(StrEnum):
     LABEL_WIND = "label-wind"
     LABEL_WIND_DIRECTION = "label-wind-direction"
     LABEL_TIME = "label-time"
+    LABEL_WEATHER_AGE = "label-weather-age"
     LABEL_TEMPERATURE = "label-temperature"
     LABEL_HUMIDITY = "label-humidity"
     LABEL_INVERSION = "label-inversion"
@@ -334,6 +335,7 @@ _WORDS = {
     Inhibit.LABEL_WIND: "wind not by label",
     Inhibit.LABEL_WIND_DIRECTION: "wind direction not by label",
     Inhibit.LABEL_TIME: "not the label's hours",
+    Inhibit.LABEL_WEATHER_AGE: "weather not seen lately",
     Inhibit.LABEL_TEMPERATURE: "temperature not by label",
     Inhibit.LABEL_HUMIDITY: "humidity not by label",
     Inhibit.LABEL_INVERSION: "inversion not ruled out",

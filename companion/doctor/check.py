@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import date
+from datetime import date, datetime
 from enum import StrEnum
 
+from companion.assembly import beyond_label
 from companion.config import Config
 from companion.config.application_table import missing, told, zone_named
+from companion.config.limits import LimitsFile
+from companion.core.label import is_hour
 
 
 class Status(StrEnum):
@@ -142,20 +145,19 @@ def application_check(config: Config) -> Check:
     return ok(NAME, f"{table.profile}: all there that the operator must say")
 
 
-def label_check(config: Config) -> Check:
-    """Return whether what the operator answers for keeps the limits of label and permit."""
+def label_check(config: Config, now: datetime) -> Check:
+    """Return whether what is known before the flight keeps the limits of label and permit."""
     name, label = "label-limits", config.label
     if label is None:
         return not_applicable(name, "no limits file: label and permit are not checked")
-    rows = list(label.declared(config.told()))
-    file = config.limits_table.file
-    speed = None if config.mission is None else config.mission.speed_m_s
-    height = None if config.mission is None else config.mission.height_m
-    for key, value, unit in (("speed_m_s", speed, "m/s"), ("height_m", height, "m")):
-        span = label.span(key)
-        if span is not None and value is not None and not span[0] <= value <= span[1]:
-            text = f"mission.{key} = {value:g}, and {file} allows {label.words(key, unit)}"
-            return fail(name, text, f"change mission.{key}, and plan again")
+    for problem in beyond_label(config):
+        return fail(name, f"{label.title}: {problem.text}", problem.fix)
+    return _declared_check(name, label, config.told()) or _time_check(name, label, config, now)
+
+
+def _declared_check(name: str, label: LimitsFile, values: Mapping[str, object]) -> Check | None:
+    """Return which limit was not declared, or declared not to be kept; None where all are."""
+    rows = list(label.declared(values))
     asked = [row for row in rows if row.value is None]
     if asked:
         keys = ", ".join(row.key for row in asked)
@@ -172,9 +174,27 @@ def label_check(config: Config) -> Check:
             f"{label.title}: {first.key} = {first.value}, allowed is {first.words}",
             "wait until it is so, then declare it again",
         )
-    return ok(
-        name, f"{label.title}: {len(rows)} limits declared and kept; the rest is checked in flight"
-    )
+    return None
+
+
+def _time_check(name: str, label: LimitsFile, config: Config, now: datetime) -> Check:
+    """Return whether what was declared still counts, at an hour that is allowed."""
+    flown = label.flown(config.told())
+    seen_s = flown.observed_s
+    if seen_s is not None and not seen_s[0] <= now.timestamp() < seen_s[1]:
+        return fail(
+            name,
+            f"{label.title}: the weather was observed at {config.application.observed_at}; it "
+            f"counts for {label.observed_max_h:g} h",
+            "observe it again, and declare it with its time",
+        )
+    if not is_hour(flown, now.timestamp()):
+        return fail(
+            name,
+            f"{label.title}: now is none of its days and hours ({label.when()})",
+            "wait for them; by the autopilot's clock the valves stay closed until then",
+        )
+    return ok(name, f"{label.title}: what is declared is kept; the rest is checked in flight")
 
 
 # How old is what was measured.

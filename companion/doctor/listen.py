@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TypeVar
 
+from companion.core.label import wind_from_deg
 from companion.core.types import (
     EstimatorReport,
     GnssReport,
@@ -235,6 +236,8 @@ def _heard(
         else Position(latitude_deg=position.latitude_deg, longitude_deg=position.longitude_deg),
         rc_pulse_us=() if rc is None else rc.pulse_us,
         has_wind=wind is not None and wind.speed_m_s is not None,
+        wind_m_s=None if wind is None else wind.speed_m_s,
+        wind_from_deg=wind_from_deg(wind),
         is_clock_known=link.component.clock.is_known,
         outputs_us=ear.outputs_us(),
         is_closed_ordered=is_ordered,

@@ -7,7 +7,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from companion.config import Config
+from companion.config.limits import LimitsFile
 from companion.config.model import FIXES
+from companion.core.label import is_from
 from companion.core.setup import Setup
 from companion.core.types import Fix
 from companion.doctor.check import Check, fail, not_applicable, ok, split_advice, warn
@@ -43,7 +45,7 @@ def link_checks(heard: Heard, config: Config, setup: Setup | None) -> Iterator[C
     yield _estimator(heard)
     yield _place(heard, setup)
     yield _rc_switch(heard, config)
-    yield _wind(heard, required=config.safety.wind_required)
+    yield wind_check(heard, config)
 
 
 def no_link(why: str) -> Iterator[Check]:
@@ -159,16 +161,41 @@ def _rc_switch(heard: Heard, config: Config) -> Check:
     return ok(name, f"RC channel {channel} reads {pulse_us} us")
 
 
-def _wind(heard: Heard, *, required: bool) -> Check:
-    if not required:
+def wind_check(heard: Heard, config: Config) -> Check:
+    """Return whether the wind is known where it must be, and one that the label allows."""
+    label = config.label
+    limits = () if label is None else (label.span("wind_m_s"), label.wind_from_deg)
+    must = any(limits) and label is not None and label.wind_by == "autopilot"
+    if heard.has_wind and label is not None and any(limits):
+        return _wind_by_label(heard, label, must=must)
+    if not (config.safety.wind_required or must):
         return not_applicable("wind", "safety.wind_required is false")
     if not heard.has_wind:
         fix = (
-            "have the autopilot estimate it (exactly 0 is no estimate), or write "
-            "safety.wind_required = false and measure it"
+            'write wind_by = "operator" in the limits file and measure it'
+            if must
+            else "write safety.wind_required = false and measure it"
         )
-        return fail("wind", "no wind is known, without which nothing is sprayed", fix)
+        return fail(
+            "wind",
+            "no wind is known, without which nothing is sprayed",
+            f"have the autopilot estimate it (exactly 0 is no estimate), or {fix}",
+        )
     return ok("wind", "reported by the autopilot")
+
+
+def _wind_by_label(heard: Heard, label: LimitsFile, *, must: bool) -> Check:
+    """Return whether the wind that was heard is one that label and permit allow."""
+    span, from_deg = label.span("wind_m_s"), heard.wind_from_deg
+    speed_m_s = math.nan if heard.wind_m_s is None else heard.wind_m_s
+    if span is not None and not span[0] <= speed_m_s <= span[1]:
+        text = f"{speed_m_s:.1f} m/s, and {label.title} allows {label.words('wind_m_s', 'm/s')}"
+        return fail("wind", text, "wait for such a wind")
+    asked = label.wind_from_deg and (must or from_deg is not None)
+    if asked and not is_from(from_deg, label.wind_from_deg):
+        text = "no direction is reported" if from_deg is None else f"from {from_deg:.0f} deg"
+        return fail("wind", f"{text}, and {label.title} allows it {label.wind_words()}", "wait")
+    return ok("wind", f"{speed_m_s:.1f} m/s: allowed by {label.title}")
 
 
 # What was heard of the vehicle in some seconds of listening; judged in `vehicle.py`.
@@ -219,6 +246,8 @@ class Heard:
     position: Position | None = None
     rc_pulse_us: tuple[int, ...] = ()
     has_wind: bool = False
+    wind_m_s: float | None = None
+    wind_from_deg: float | None = None
     is_clock_known: bool = False
     parameters: Mapping[str, float | None] | None = None
     # By channel: what the outputs read after closed was ordered; None where nothing is known.

@@ -64,6 +64,7 @@ ADVICE: dict[Inhibit, str] = {
     Inhibit.LABEL_WIND: "Wait for the wind that the label allows; it must be measured.",
     Inhibit.LABEL_WIND_DIRECTION: "Wait for the wind to turn; its direction must be measured.",
     Inhibit.LABEL_TIME: "Wait for the label's hours; the autopilot must know the time.",
+    Inhibit.LABEL_WEATHER_AGE: "Observe the weather again, declare it with its time, start again.",
     Inhibit.LABEL_TEMPERATURE: "Measure, set application.temperature_c, start again.",
     Inhibit.LABEL_HUMIDITY: "Measure, set application.humidity_percent, start again.",
     Inhibit.LABEL_INVERSION: "Look for an inversion, set application.inversion, start again.",

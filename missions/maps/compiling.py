@@ -41,7 +41,7 @@ from missions.maps.build import build_prescription, frame_for
 from missions.maps.layer import read_bytes
 from missions.maps.local import grown, make_valid, project
 from missions.maps.model import MapFile, map_error
-from missions.maps.registry import read_area, read_map
+from missions.maps.registry import read_area, read_map, read_records
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,7 +164,7 @@ def compile_map(
         for number, name in enumerate(table.exclusions)
     ]
     exclusions += [
-        grown(_area(order, f"limits.buffer[{number}].files", name), each.distance_m, frame)
+        grown(_kept_from(order, f"limits.buffer[{number}].files", name), each.distance_m, frame)
         for number, each in enumerate(order.buffers)
         for name in each.files
     ]
@@ -239,6 +239,12 @@ def _area(order: MapOrder, key: str, name: str) -> MultiPolygon:
     """Return the ground that a file of the configuration covers."""
     with order.naming(key, name):
         return read_area(order.resolve(name))
+
+
+def _kept_from(order: MapOrder, key: str, name: str) -> list[Geometry]:
+    """Return the areas, lines and points of a file that a buffer is kept from."""
+    with order.naming(key, name):
+        return [record.geometry for record in read_records(order.resolve(name))]
 
 
 def _polylines(order: MapOrder, frame: LocalFrame, ground: Prescription) -> tuple[Polyline, ...]:

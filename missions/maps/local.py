@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -59,9 +60,18 @@ def places(points: Sequence[tuple[float, float]], frame: LocalFrame) -> Floats:
     return np.column_stack(_transformer(frame).transform(degrees[:, 1], degrees[:, 0]))
 
 
-def grown(area: Area, distance_m: float, frame: LocalFrame) -> MultiPolygon:
-    """Return an area in longitude and latitude with all ground within a distance of it."""
-    wider = project(area, frame).buffer(max(distance_m, 0.0))
+# Corners to a quarter of a circle.
+ROUND_SEGMENTS = 16
+# A point or a line is ground too.
+WIDTH_MIN_M = 0.01
+
+
+def grown(geometries: Sequence[Geometry], distance_m: float, frame: LocalFrame) -> MultiPolygon:
+    """Return all ground within a distance of areas, lines and points in longitude and latitude."""
+    local = project_all(np.array(list(geometries), dtype=object), frame)
+    # A circle drawn with corners lies inside of the true one; never less than the distance.
+    far_m = max(distance_m, WIDTH_MIN_M) / math.cos(math.pi / (4 * ROUND_SEGMENTS))
+    wider = shapely.union_all(shapely.buffer(local, far_m, quad_segs=ROUND_SEGMENTS))
 
     def back(points: Floats) -> Floats:
         latitude_deg, longitude_deg = frame.to_geographic_all(*points.T.tolist())

@@ -89,6 +89,10 @@ CASES: dict[Inhibit, list[dict[str, object] | None]] = {
         {"utc_offset_s": DAY + 9 * 3600.0 - 10.0},
         {"utc_offset_s": 2 * DAY + 7 * 3600.0},
     ],
+    Inhibit.LABEL_WEATHER_AGE: [
+        {"utc_offset_s": DAY + 6.5 * 3600.0 - 10.01},
+        {"utc_offset_s": DAY + 8.5 * 3600.0 - 10.0},
+    ],
     Inhibit.RC_SWITCH: [{"rc_switch_on": False}, {"rc_switch_on": None}],
     Inhibit.OUTPUT_FAULT: [{"output_healthy": False}],
     Inhibit.LINK_LOST: [{"link_up": False}],
@@ -109,6 +113,7 @@ LABEL = LabelLimits(
     wind_from_deg=((225.0, 315.0),),
     hours_s=((6 * 3600.0, 9 * 3600.0),),
     days_s=(DAY, 2 * DAY),
+    observed_s=(DAY + 6.5 * 3600.0, DAY + 8.5 * 3600.0),
 )
 # Everything that can be asked for is, and all of it is there.
 STRICT = Limits(
@@ -151,6 +156,7 @@ ALSO = {
     Inhibit.LABEL_SPEED: SAME,
     Inhibit.LABEL_HEIGHT: SAME,
     Inhibit.LABEL_WIND: SAME,
+    Inhibit.LABEL_TIME: {Inhibit.LABEL_WEATHER_AGE},
     Inhibit.SPEED_BELOW_MIN: {Inhibit.LABEL_SPEED},
     Inhibit.SPEED_ABOVE_MAX: {Inhibit.LABEL_SPEED},
     Inhibit.HEIGHT_BELOW_MIN: {Inhibit.LABEL_HEIGHT},
@@ -414,7 +420,11 @@ def test_a_wind_that_the_operator_measures_need_not_be_heard_but_must_agree() ->
 
 def test_hours_and_sectors_go_over_midnight_and_north() -> None:
     label = replace(
-        LABEL, hours_s=((22 * 3600.0, 2 * 3600.0),), days_s=None, wind_from_deg=((260.0, 10.0),)
+        LABEL,
+        hours_s=((22 * 3600.0, 2 * 3600.0),),
+        days_s=None,
+        observed_s=None,
+        wind_from_deg=((260.0, 10.0),),
     )
     limits = replace(STRICT, label=label)
     for hour, allowed in ((21.9, False), (22.1, True), (1.9, True), (2.1, False)):

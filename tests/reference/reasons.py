@@ -142,6 +142,11 @@ CONDITIONS: dict[Inhibit, tuple[str, str, str, str]] = {
     Inhibit.LABEL_TIME: (
         "with `[limits]`: it is one of the file's days and hours", "SYSTEM_TIME", "60 s", "at once",
     ),
+    Inhibit.LABEL_WEATHER_AGE: (
+        "with `[limits]`: what the operator declares of the weather is not older than the file's "
+        "`observed_max_h`", "`application.observed_at`, SYSTEM_TIME", "60 s",
+        "observed anew, and started again",
+    ),
     Inhibit.LABEL_TEMPERATURE: ("with `[limits]`: `application.temperature_c` is within", *_DECLARED),
     Inhibit.LABEL_HUMIDITY: ("with `[limits]`: `application.humidity_percent` is within", *_DECLARED),
     Inhibit.LABEL_INVERSION: (

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from shapely import MultiPolygon
 
-from companion.assembly import above_label, undelivered
+from companion.assembly import above_label, beyond_label, undelivered
 from companion.cli.answer import note
 from companion.config import Config
 from companion.errors import MapError
 from missions.maps.lint import Plan, Sprayer
 from missions.maps.lint.survey import Survey
+from missions.maps.local import frame_around, grown
 from missions.maps.model import MapFile, Problem
-from missions.maps.registry import read_area
+from missions.maps.registry import read_area, read_records
 
 # The rates between the least and the largest say nothing more of a sprayer's range.
 RATES_MAX = 1_000
+# Less than this is what rounding moves.
+KEPT_MIN_M2 = 0.01
 
 
 def plan_of(config: Config | None, home: tuple[float, float] | None) -> tuple[Plan, list[Problem]]:
@@ -30,6 +33,7 @@ def plan_of(config: Config | None, home: tuple[float, float] | None) -> tuple[Pl
         homes = mission.depots
     problems: list[Problem] = []
     boundary, exclusions = None, []
+    buffers = list(_buffers(config, problems))
     if table is not None:
         if table.boundary is not None:
             boundary = _area(config, table.boundary, "prescription.boundary", problems)
@@ -38,7 +42,8 @@ def plan_of(config: Config | None, home: tuple[float, float] | None) -> tuple[Pl
             exclusions += [] if area is None else [area]
     plan = Plan(
         boundary=boundary,
-        exclusions=tuple(exclusions),
+        exclusions=(*exclusions, *buffers),
+        buffers=tuple(buffers),
         default_rate_l_ha=None if table is None else table.default_rate_l_ha,
         homes=homes,
         sprayer=_sprayer(config),
@@ -59,8 +64,21 @@ def _area(config: Config, name: str, key: str, problems: list[Problem]) -> Multi
     return None
 
 
+def _buffers(config: Config, problems: list[Problem]) -> Iterator[MultiPolygon]:
+    """Yield the ground that the label keeps free; what cannot be read is an error."""
+    for number, each in enumerate(config.buffers):
+        for name in each.files:
+            try:
+                kept = [record.geometry for record in read_records(config.resolve(name))]
+            except MapError as error:
+                problems.append(_refused_area(error, f"limits.buffer[{number}].files"))
+            else:
+                yield grown(kept, each.distance_m, frame_around(kept))
+
+
 def _refused_area(error: MapError, key: str) -> Problem:
-    what = "the boundary" if key == "prescription.boundary" else "an exclusion"
+    what = {"prescription.boundary": "the boundary"}.get(key, "an exclusion")
+    what = "a buffer's file" if key.startswith("limits.") else what
     return Problem(
         severity="error",
         code=error.code,
@@ -90,6 +108,7 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
     rates = rates_in_force(map_file, plan)
     if config is None or not rates:
         return []
+    of_label = [*beyond_label(config), *_kept_free(config, map_file, plan)]
     label = above_label(
         config,
         map_file.path,
@@ -107,7 +126,7 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
             speeds_m_s=(config.safety.speed_min_m_s, config.safety.speed_max_m_s),
         )
     if not found:
-        return []
+        return of_label
     survey = Survey(map_file)
     positive = [rate for rate in rates if rate > 0.0]
     where = {
@@ -116,10 +135,33 @@ def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> li
         "rate-too-high": max(positive, default=0.0),
         "rate-too-low": min(positive, default=0.0),
     }
-    return [
+    return of_label + [
         replace(problem, where=problem.where or _where(survey, where[problem.code], plan))
         for problem in found
     ]
+
+
+def _kept_free(config: Config, map_file: MapFile, plan: Plan) -> list[Problem]:
+    """Return how much that has a rate is not sprayed for the label's buffers."""
+    if not plan.buffers:
+        return []
+    others = plan.exclusions[: -len(plan.buffers)]
+    areas_m2 = []
+    for exclusions in (others, plan.exclusions):
+        survey = Survey(map_file, boundary=plan.boundary, exclusions=exclusions)
+        areas_m2.append(float(survey.inside_m2[survey.rates > 0.0].sum()))
+    kept_m2 = areas_m2[0] - areas_m2[1]
+    if not kept_m2 > KEPT_MIN_M2:
+        return []
+    kinds = ", ".join(f"{each.distance_m:g} m from {each.kind}" for each in config.buffers)
+    return [Problem(
+        severity="warning",
+        code="label-buffer",
+        text=f"{kept_m2 / 1e4:.4f} ha with a rate are not sprayed for the buffers of "
+        f"{config.limits_table.file}: {kinds}",
+        where="limits.buffer",
+        fix="set these places to 0 in the map, or count on less spray",
+    )]  # fmt: skip
 
 
 def _default(config: Config, map_file: MapFile) -> float | None:

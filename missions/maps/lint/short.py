@@ -291,6 +291,7 @@ class Plan:
 
     boundary: MultiPolygon | None = None
     exclusions: tuple[MultiPolygon, ...] = ()
+    buffers: tuple[MultiPolygon, ...] = ()  # those of the exclusions that the label asks for
     default_rate_l_ha: float | None = None
     homes: tuple[tuple[float, float], ...] = ()
     sprayer: Sprayer | None = None
