@@ -313,6 +313,7 @@ def record_csv(record: LegalRecord) -> bytes:
         "complete": "yes" if record.is_complete else "no",
         "simulated": record.simulated.word,
         "missing": "; ".join(record.missing),
+        "keep_until": record.keep_until or "",
     }
     for entry in record.entries:
         row[entry.name] = "" if entry.value is None else entry.value

@@ -19,6 +19,7 @@ class Law(StrEnum):
 
     EU = "eu"
     US = "us"
+    AUSTRALIA = "australia"
     GENERIC = "generic"
 
 
@@ -29,7 +30,8 @@ def report_flight(
     profile: Annotated[
         list[Law] | None,
         typer.Option(
-            help="Legal record: eu, us, generic; may be repeated. Default: the journal's."
+            help="Legal record: eu, us, australia, generic; may be repeated. "
+            "Default: the journal's."
         ),
     ] = None,
     time_zone: Annotated[

@@ -2,6 +2,19 @@
 
 A record is complete only when every field of its profile has a value, and then only if the flight
 was an application at all. Who said what, and when, stands beside each value.
+
+Sources, by profile:
+
+- `eu`: Commission Implementing Regulation (EU) 2023/564 of 10 March 2023 (OJ L 74, 13.3.2023,
+  p. 4), Article 1 and annex, with Article 67(1) of Regulation (EC) No 1107/2009: product with its
+  authorisation number, use, crop by EPPO code, BBCH stage where the authorisation limits it, area
+  as geodata, dose, date and start; electronic and machine-readable. The annex was read only in
+  summaries (Landwirtschaftskammer Schleswig-Holstein; Trifolio-M).
+- `us`: 14 CFR 137.71(a)(1) to (4) and (b), eCFR of 2026-04.
+- `australia`: Pesticides Regulation 2017 (New South Wales), clause 26(4), for aerial and RPA
+  applicator business licences, its paragraphs after (e) in the summary of XAG Australia (2024-08);
+  Agricultural Chemicals Distribution Control Act 1966 (Queensland), as business.qld.gov.au lists
+  the records of aerial distribution. Other states, and labels, may ask for more.
 """
 
 from __future__ import annotations
@@ -22,13 +35,19 @@ LAWS: dict[Profile, str] = {
     "eu": "Commission Implementing Regulation (EU) 2023/564, with Article 67(1) of Regulation (EC) "
     "No 1107/2009",
     "us": "14 CFR 137.71, records of a commercial agricultural aircraft operator",
+    "australia": "Pesticides Regulation 2017 (NSW), clause 26(4), and the records of aerial "
+    "distribution under the Agricultural Chemicals Distribution Control Act 1966 (Queensland)",
     "generic": "no law's own form: what labels, authorities and buyers commonly ask for",
 }
 KEEP: dict[Profile, str] = {
     "eu": "keep it for at least three years (Article 67(1) of Regulation (EC) No 1107/2009)",
     "us": "keep it for at least 12 months (14 CFR 137.71(b))",
+    "australia": "make it within 48 hours of the application and keep it for at least three years "
+    "(NSW, clause 26; Queensland two)",
     "generic": "keep it for as long as your authority asks, commonly two or three years",
 }
+# The same in years; None where no law says how long.
+KEEP_YEARS: dict[Profile, int | None] = {"eu": 3, "us": 1, "australia": 3, "generic": None}
 BEFORE, AFTER, FLIGHT = "before the flight", "after the flight", "flight"
 
 
@@ -60,6 +79,21 @@ class LegalRecord:
     remarks: tuple[str, ...]
     simulated: Simulated
     treated_area: dict[str, Any]
+    date: str | None = None
+
+    @property
+    def keep_until(self) -> str | None:
+        """Return the first day on which it need not be kept; None where no law or date says.
+
+        Of the 29th of February that is the 1st of March.
+        """
+        years = KEEP_YEARS[self.profile]
+        if years is None or self.date is None:
+            return None
+        year, month, day = (int(part) for part in self.date.split("-"))
+        if (month, day) == (2, 29):
+            month, day = 3, 1
+        return f"{year + years:04d}-{month:02d}-{day:02d}"
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -82,6 +116,8 @@ class LegalRecord:
             "profile": self.profile,
             "law": LAWS[self.profile],
             "retention": KEEP[self.profile],
+            "retention_years": KEEP_YEARS[self.profile],
+            "keep_until": self.keep_until,
             "complete": self.is_complete,
             "simulated": self.simulated.word,
             "simulated_because": self.simulated.because,
@@ -116,6 +152,7 @@ def legal_record(profile: Profile, told: Told, facts: Facts) -> LegalRecord:
         remarks=tuple(_remarks(told, facts)),
         simulated=facts.simulated,
         treated_area=facts.treated_area,
+        date=facts.date,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, time
 from typing import TYPE_CHECKING, Any
 
@@ -268,6 +268,23 @@ RATE = Field(
     unit=_in("L/ha"),
 )
 
+DOSE = Field(
+    name="dose",
+    label="Dose of the product, mean",
+    value=_dose,
+    unit=lambda told: f"{_product_unit(told)}/ha" if _product_unit(told) else "",
+)
+GEODATA = Field(
+    name="geodata",
+    label="Treated area as geodata",
+    value=lambda f, _: "treated_area in the JSON, WGS84" if f.has_area else None,
+)
+HOW = (
+    _measured("boom_width_m", "Effective width of the boom", "m", 2, lambda f: f.boom_width_m),
+    _measured("height_m", "Height while spraying, mean", "m", 1, lambda f: f.height_m),
+    _measured("speed_m_s", "Speed while spraying, mean", "m/s", 1, lambda f: f.speed_m_s),
+)
+
 FIELDS: dict[Profile, tuple[Field, ...]] = {
     "eu": (
         Field(
@@ -278,19 +295,10 @@ FIELDS: dict[Profile, tuple[Field, ...]] = {
         DATE,
         START,
         END,
-        Field(
-            name="dose",
-            label="Dose of the product, mean",
-            value=_dose,
-            unit=lambda told: f"{_product_unit(told)}/ha" if _product_unit(told) else "",
-        ),
+        DOSE,
         AREA,
         PLACE,
-        Field(
-            name="geodata",
-            label="Treated area as geodata",
-            value=lambda f, _: "treated_area in the JSON, WGS84" if f.has_area else None,
-        ),
+        GEODATA,
         PRODUCT,
         VOLUME,
         RATE,
@@ -315,6 +323,19 @@ FIELDS: dict[Profile, tuple[Field, ...]] = {
         ),
         PLACE,
     ),
+    "australia": (
+        DATE,
+        START,
+        END,
+        PLACE,
+        AREA,
+        GEODATA,
+        RATE,
+        VOLUME,
+        replace(PRODUCT, is_optional=False),
+        DOSE,
+        *HOW,
+    ),
     "generic": (
         DATE,
         START,
@@ -327,9 +348,7 @@ FIELDS: dict[Profile, tuple[Field, ...]] = {
         _measured(
             "asked_rate_l_ha", "Mixture prescribed, mean", "L/ha", 2, lambda f: f.asked_rate_l_ha
         ),
-        _measured("boom_width_m", "Effective width of the boom", "m", 2, lambda f: f.boom_width_m),
-        _measured("height_m", "Height while spraying, mean", "m", 1, lambda f: f.height_m),
-        _measured("speed_m_s", "Speed while spraying, mean", "m/s", 1, lambda f: f.speed_m_s),
+        *HOW,
         Field(
             name="map_sha256",
             label="Prescription map, SHA-256",
@@ -344,17 +363,21 @@ LABELS: dict[str, tuple[str, str]] = {
     "application.licence": ("Licence of the operator", ""),
     "application.customer": ("Customer", ""),
     "application.customer_address": ("Address of the customer", ""),
+    "application.customer_contact": ("Contact of the customer", ""),
     "application.pilot": ("Pilot", ""),
     "application.pilot_address": ("Address of the pilot", ""),
     "application.pilot_certificate": ("Certificate of the pilot", ""),
     "application.pilot_skills_date": ("Knowledge and skill met, 137.19(e)", ""),
     "application.field_name": ("Field", ""),
+    "application.land_address": ("Address of the land", ""),
     "application.parcel": ("Parcel", ""),
+    "application.purpose": ("Purpose", ""),
     "application.crop": ("Crop", ""),
     "application.crop_eppo": ("Crop, EPPO code", ""),
     "application.growth_stage_bbch": ("Growth stage, BBCH", ""),
     "application.product_per_l": ("Product in one litre of mixture", ""),
     "application.product_unit": ("Unit of the product", ""),
+    "application.diluent": ("Water and additives", ""),
     "application.aircraft": ("Aircraft", ""),
     "application.nozzles": ("Nozzles", ""),
     "application.wind_m_s": ("Wind speed", "m/s"),
@@ -365,6 +388,7 @@ LABELS: dict[str, tuple[str, str]] = {
     "application.inversion": ("Temperature inversion", ""),
     "product.name": ("Product", ""),
     "product.registration": ("Authorisation or registration number", ""),
+    "product.active_constituents": ("Active constituents", ""),
     "product.droplet_class": ("Droplet class", ""),
     "application.real_flight": ("A real flight, as the operator says", ""),
 }

@@ -19,7 +19,7 @@ from companion.config.tables import ProductTable, Table, Text
 from companion.config.wording import say
 from companion.errors import ConfigError
 
-Profile = Literal["eu", "us", "generic"]
+Profile = Literal["eu", "us", "australia", "generic"]
 PROFILES: tuple[Profile, ...] = get_args(Profile)
 
 # Figures are those of ASCII: in a pattern \d is a figure of any script.
@@ -71,7 +71,8 @@ class ApplicationTable(Table):
 
     profile: Profile | None = Field(
         default=None,
-        description="whose record: eu (2023/564), us (14 CFR 137.71), generic; absent: none",
+        description="whose record: eu (2023/564), us (14 CFR 137.71), australia, generic; "
+        "absent: none",
     )
     time_zone: Annotated[Text, AfterValidator(_a_zone)] | None = Field(
         default=None, description="of the times in record and report, such as Europe/Madrid"
@@ -82,6 +83,9 @@ class ApplicationTable(Table):
     licence: Text | None = Field(default=None, description="of the operator, number")
     customer: Text | None = Field(default=None, description="for whom it is applied, by name")
     customer_address: Text | None = Field(default=None, description="of the customer")
+    customer_contact: Text | None = Field(
+        default=None, description="of the customer: telephone or e-mail"
+    )
     pilot: Text | None = Field(default=None, description="in command, by name")
     pilot_address: Text | None = Field(default=None, description="of the pilot")
     pilot_certificate: Text | None = Field(default=None, description="of the pilot, number")
@@ -91,10 +95,12 @@ class ApplicationTable(Table):
         description="day on which the pilot met the requirements of 137.19(e), YYYY-MM-DD",
     )
     field_name: Text | None = Field(default=None, description="what the farm calls the field")
+    land_address: Text | None = Field(default=None, description="of the treated land")
     parcel: Text | None = Field(
         default=None, description="the parcel's number in the register of the aid application"
     )
-    crop: Text | None = Field(default=None, description="by its name")
+    purpose: Text | None = Field(default=None, description="against what, or what for")
+    crop: Text | None = Field(default=None, description="by its name, or what else is treated")
     crop_eppo: str | None = Field(
         default=None, pattern=r"^[A-Z0-9]{5,6}$", description="its EPPO code, such as TRZAW"
     )
@@ -109,7 +115,12 @@ class ApplicationTable(Table):
     product_unit: Literal["L", "kg"] | None = Field(
         default=None, description="unit of product_per_l, and of the dose for each hectare"
     )
-    aircraft: Text | None = Field(default=None, description="make and registration")
+    diluent: Text | None = Field(
+        default=None, description="water and additives of the mixture, with their amounts"
+    )
+    aircraft: Text | None = Field(
+        default=None, description="make, and registration or serial number"
+    )
     nozzles: Text | None = Field(default=None, description="make and size")
     wind_m_s: Annotated[FiniteFloat, Field(ge=0, le=60)] | None = Field(
         default=None, description="measured on the ground before the flight"
@@ -164,6 +175,33 @@ ASKED: dict[Profile, tuple[str, ...]] = {
         "application.pilot_address",
         "application.pilot_certificate",
         "application.pilot_skills_date",
+    ),
+    # Pesticides Regulation 2017 (NSW), clause 26(4), for those with an aerial or RPA applicator
+    # business licence; and what Queensland asks of an aerial distribution contractor besides.
+    "australia": (
+        "application.operator",
+        "application.pilot",
+        "application.pilot_address",
+        "application.customer",
+        "application.customer_address",
+        "application.customer_contact",
+        "application.land_address",
+        "application.field_name",
+        "application.crop",
+        "application.purpose",
+        "product.name",
+        "product.active_constituents",
+        "product.registration",
+        "application.product_per_l",
+        "application.product_unit",
+        "application.diluent",
+        "application.aircraft",
+        "application.nozzles",
+        "application.wind_m_s",
+        "application.wind_from_deg",
+        "application.temperature_c",
+        "application.humidity_percent",
+        "application.inversion",
     ),
     "generic": (
         "application.operator",

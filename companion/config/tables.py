@@ -361,6 +361,9 @@ class ProductTable(Table):
     name: Text | None = Field(default=None, description="for the record")
     registration: Text | None = Field(default=None, description="for the record")
     rate_max_l_ha: Rate | None = Field(default=None, description="a map above it is refused")
+    active_constituents: Text | None = Field(
+        default=None, description="of the product, with their content, for the record"
+    )
     droplet_class: Text | None = Field(default=None, description="for the record")
 
 

@@ -127,7 +127,7 @@ def application_check(config: Config) -> Check:
         return warn(
             NAME,
             "application.profile is not set: no legal record is asked for",
-            'write profile = "eu", "us" or "generic" under [application]',
+            'write profile = "eu", "us", "australia" or "generic" under [application]',
         )
     absent = missing(table.profile, told(config.application, config.product))
     if absent:
