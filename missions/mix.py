@@ -139,6 +139,7 @@ def mix_of(config: Config | None, plan: Plan, rates: Rates) -> dict[str, Any] | 
                 "number": number,
                 "mix_l": add_l,
                 "water_l": add_l * (1.0 - liquid),
+                "water_first_l": add_l * (1.0 - liquid) / 2.0,
                 "amounts": [each["per_l"] * add_l for each in products],
             }
             for number, add_l in adds_l

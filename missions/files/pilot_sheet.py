@@ -253,7 +253,7 @@ def _mix_table(mix: dict[str, Any]) -> Table:
     rows, products = mix["sorties"], mix["products"]
     columns = [
         ("mix for\nsortie", [str(row["number"]) for row in rows], "all"),
-        ("water first\nL", [f"{row['water_l'] / 2.0:.2f}" for row in rows], ""),
+        ("water first\nL", [f"{row['water_first_l']:.2f}" for row in rows], ""),
     ]
     for at, each in enumerate(products):
         amounts = [row["amounts"][at] for row in rows]

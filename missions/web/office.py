@@ -1,4 +1,4 @@
-"""The office's interface: files come in, are checked and planned by children, and go out.
+"""The office's interface: files come in; children make zones, check and plan; files go out.
 
 No file of a stranger is read here: each is handed to `vrspray` itself in a child process with
 limits of time and memory, whose one line of refusal is the answer. One child runs at a time, at low
@@ -37,8 +37,14 @@ SUFFIXES = (
     *(".shp", ".shx", ".dbf", ".prj", ".cpg", ".geojson", ".json", ".gpkg", ".kml", ".kmz"),
     *(".xml", ".bin", ".tif", ".tiff", ".parquet", ".geoparquet", ".csv", ".txt", ".zip"),
 )
-TIMES = {"check": Limits(cpu_s=60, wait_s=180.0), "plan": Limits(cpu_s=300, wait_s=900.0)}
+TIMES = {
+    "make": Limits(cpu_s=300, wait_s=900.0),
+    "check": Limits(cpu_s=60, wait_s=180.0),
+    "plan": Limits(cpu_s=300, wait_s=900.0),
+}
 UPLOAD = Limits(cpu_s=60, wait_s=120.0)
+# What is made of data: a map like those that are loaded.
+MADE_MAP = "made-prescription.gpkg"
 
 Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", max_length=80)]
 Places = Annotated[list[Name], Field(max_length=8)]
@@ -68,6 +74,35 @@ class Check(Reading):
     """A prescription map to look at."""
 
     file: Name
+
+
+class Making(_Body):
+    """A field's data, and what zones to make of them."""
+
+    data: Name
+    value: Annotated[str, Field(max_length=60)] | None = None
+    rates_l_ha: Annotated[
+        list[Annotated[float, Field(ge=0.0, le=1000.0)]], Field(min_length=1, max_length=20)
+    ]
+    litres_max: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
+    across: Literal["swath", "valve"] = "swath"
+    field: Name
+    no_spray: Places = []
+    angle_deg: Annotated[float, Field(ge=0.0, lt=360.0)] | None = None
+    crs: Annotated[str, Field(max_length=60)] | None = None
+
+    def words(self) -> list[str]:
+        """Return the arguments that say so; a value never reads as an option."""
+        rates = ",".join(f"{rate:g}" for rate in self.rates_l_ha)
+        words = [f"--rates={rates}", f"--across={self.across}", f"--boundary=given/{self.field}"]
+        words += [f"--no-spray=given/{name}" for name in self.no_spray]
+        for name in ("litres_max", "angle_deg"):
+            number = getattr(self, name)
+            words += [] if number is None else [f"--{name.replace('_', '-')}={number:g}"]
+        for name in ("value", "crs"):
+            text = getattr(self, name)
+            words += [f"--{name}={text}"] if text else []
+        return words
 
 
 class Planning(Reading):
@@ -196,6 +231,32 @@ class Office:
 
     # ------------------------------------------------------------------------- what is worked out
 
+    async def make(self, asked: Making) -> dict[str, Any]:
+        """Make zones of a field's data, as a map among those that were loaded."""
+        self.refuse_now()
+        for name in (asked.data, asked.field, *asked.no_spray):
+            self.path(name)
+        if not self.host.config:
+            raise HTTPException(409, "zones fit a sprayer: start vrspray run with a configuration")
+        room = self._room(MADE_MAP)
+        made = self.made / MADE_MAP
+        with self._working("make", MADE_MAP):
+            (self.given / MADE_MAP).unlink(missing_ok=True)  # of other data, or other rates
+            out = ["--out", f"made/{MADE_MAP}", "--force", *self.host.config[:2], "--json"]
+            done = await self.run(
+                "make", ["make", "zones", f"given/{asked.data}", *asked.words(), *out]
+            )
+            error = done.error
+            if error is None and made.stat().st_size > room:
+                error = f"{MADE_MAP}: larger than the room for more files: remove some"
+            if error is None:
+                made.replace(self.given / MADE_MAP)
+            self.results.clear()
+            self.results["make"] = {
+                "data": asked.data, "file": MADE_MAP, "error": error, "found": done.found,
+            }  # fmt: skip
+        return self.state()
+
     async def check(self, asked: Check) -> dict[str, Any]:
         """Return what `map check` finds, and have the zones written for the page's map."""
         self.refuse_now()
@@ -258,7 +319,13 @@ class Office:
         file, out = f"given/{asked.prescription}", "made/field.flightmap.gpkg"
         command = ["map", "compile", file, "--out", out, *self.host.config, *words, "--json"]
         done = await self.run("plan", command)
-        return {"error": done.error, "problems": done.found.get("problems", [])}
+        flown = {**sets, "prescription.file": folder / out}
+        return {
+            "error": done.error,
+            "problems": done.found.get("problems", []),
+            # What the configuration has to say, for `run` to fly what was planned here.
+            "settings": {key: str(value) for key, value in flown.items()},
+        }
 
     async def send(self, asked: Sent) -> dict[str, Any]:
         """Put a planned sortie on the vehicle by the office's second link, and read it back."""
@@ -358,6 +425,11 @@ def add(router: APIRouter, host: Host) -> None:
         office.path(named.file).unlink()
         office.results.clear()
         return office.state()
+
+    @router.post("/make", responses=busy)
+    async def make(asked: Making) -> dict[str, Any]:
+        """Make zones of a field's data in a child, as a map among the files."""
+        return await office.make(asked)
 
     @router.post("/check", responses=busy)
     async def check(asked: Check) -> dict[str, Any]:

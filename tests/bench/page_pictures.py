@@ -27,7 +27,7 @@ from tests.missions.realtime.test_page_field import (
     Box,
     Day,
     plan_and_upload,
-    planned,
+    settings_told,
     write_maps,
 )
 
@@ -83,12 +83,13 @@ async def drawn(out: Path, folder: Path) -> None:
             await day.load_and_check(files)
             await page.locator("#angle_deg").fill("0")
             await plan_and_upload(page)
+            settings = await settings_told(page)
             await page.locator("#plan").scroll_into_view_if_needed()
             await page.locator("#answer").wait_for(state="hidden")
             await kept(page, out / "operators-page-plan.png")
             await page.close()
         bench.said = ""
-        async with companion_of(bench, *web, *planned(folder)):
+        async with companion_of(bench, *web, *settings):
             await bench.until(lambda: "link up" in bench.said, within_s=60.0)
             phone = await browser.new_page(viewport={"width": 390, "height": 844})
             day = Day(bench, phone, day.place)

@@ -97,6 +97,70 @@ async def test_a_field_is_loaded_checked_planned_and_its_files_downloaded(site: 
     assert sheet.headers["content-disposition"].startswith("attachment")
 
 
+def samples() -> bytes:
+    """Return points over the field of Anyang: low in the south, high in the north."""
+    rows = ["lat,lon,vigour"]
+    for north in range(25):
+        for east in range(9):
+            lat, lon = 35.99595 + north * 5e-5, 114.54340 + east * 8e-5
+            rows.append(f"{lat:.6f},{lon:.6f},{1.0 if lat < 35.9966 else 2.0}")
+    return "\n".join([*rows, ""]).encode()
+
+
+@IN_LOOP
+async def test_zones_are_made_of_data_and_are_then_a_map_like_any_other(site: Site) -> None:
+    await load_anyang(site)
+    assert (await load(site, "samples.csv", samples())).status == 200
+    asked = {"data": "samples.csv", "value": "vigour", "field": "boundary.geojson"}
+    state = await do(site, "make", **asked, rates_l_ha=[24, 16])
+    made = state["make"]
+    assert (made["error"], made["file"]) == (None, "made-prescription.gpkg")
+    assert [zone["rate_l_ha"] for zone in made["found"]["zones"]] == [24, 16]
+    assert [zone["mean_value"] for zone in made["found"]["zones"]] == pytest.approx([1, 2], abs=0.1)
+    assert made["file"] in [one["name"] for one in state["files"]]
+    assert made["file"] not in [one["name"] for one in state["made"]]
+    state = await do(site, "check", file=made["file"])
+    assert state["check"]["error"] is None
+    assert state["check"]["found"]["rates_l_ha"] == [16, 24]
+    assert state["check"]["found"]["litres"] == pytest.approx(made["found"]["litres"], rel=1e-3)
+    state = await do(site, "make", **asked, rates_l_ha=[24, 16], litres_max=4, across="valve")
+    assert state["make"]["found"]["litres"] <= 4.0
+    assert "check" not in state, "of the map before"
+
+
+@IN_LOOP
+async def test_data_that_make_no_zones_are_refused_in_one_line_and_leave_no_map(site: Site) -> None:
+    await load_anyang(site)
+    await load(site, "samples.csv", samples())
+    asked = {"data": "samples.csv", "value": "vigour", "field": "boundary.geojson"}
+    assert (await do(site, "make", **asked, rates_l_ha=[24, 16]))["make"]["error"] is None
+    for change, said in (
+        ({"value": "--out=x"}, "--out=x"),
+        ({"value": "weeds"}, "it has no column 'weeds' of numbers; it has vigour"),
+        ({"data": "boundary.geojson", "value": "vigour"}, "given/boundary.geojson"),
+    ):
+        state = await do(site, "make", **{**asked, "rates_l_ha": [24, 16], **change})
+        error = state["make"]["error"]
+        assert error and said in error and "\n" not in error
+        assert "made-prescription.gpkg" not in [one["name"] for one in state["files"]]
+    for change, status in (
+        ({"data": "none.tif"}, 404), ({"field": "none.geojson"}, 404),
+        ({"no_spray": ["none.kml"]}, 404), ({"data": "../config.toml"}, 422),
+        ({"rates_l_ha": []}, 422), ({"rates_l_ha": [-1]}, 422), ({"angle_deg": 360}, 422),
+        ({"as_is": True}, 422),
+    ):  # fmt: skip
+        reply = await site.asked("POST", f"{OFFICE}/make", {**asked, "rates_l_ha": [1], **change})
+        assert reply.status == status, change
+
+
+async def test_without_a_configuration_no_zones_are_made(tmp_path: Path) -> None:
+    found = office(tmp_path)
+    for name in ("a.csv", "b.geojson"):
+        (found.given / name).write_text("x")
+    with pytest.raises(HTTPException, match="start vrspray run with a configuration"):
+        await found.make(module.Making(data="a.csv", field="b.geojson", rates_l_ha=[20.0]))
+
+
 @IN_LOOP
 async def test_what_the_command_line_refuses_is_refused_with_its_line(site: Site) -> None:
     assert (await load(site, "bad.geojson", b'{"type": "FeatureCollection"')).status == 200
@@ -161,6 +225,7 @@ async def test_nothing_begins_while_the_vehicle_is_armed(site: Site) -> None:
     assert (await load(site, "b.geojson", b"x")).status == 409
     for what, body in (
         ("check", {"file": "a.geojson"}), ("plan", {"field": "a.geojson"}),
+        ("make", {"data": "a.geojson", "field": "a.geojson", "rates_l_ha": [1]}),
         ("remove", {"file": "a.geojson"}), ("upload", {"file": "field.plan"}),
     ):  # fmt: skip
         reply = await site.asked("POST", f"{OFFICE}/{what}", body)
@@ -304,4 +369,4 @@ def test_the_page_finds_the_office_by_its_entry_point() -> None:
     router = APIRouter()
     host = Host(folder=os.devnull, config=[], upload_link="", journals="", flying=lambda: None)
     parts["office"].add(router, host)
-    assert len(router.routes) == 7
+    assert len(router.routes) == 8

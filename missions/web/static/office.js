@@ -1,7 +1,7 @@
 // The office on the page: files in, the map's check, areas drawn, the plan, and what to do with it.
 
 import { API, ask, begin, byId, make, say } from "../static/part.js";
-import { toSi, unitOf, withUnit } from "../static/units.js";
+import { toSi, unitOf, value, withUnit } from "../static/units.js";
 import { OfficeMap } from "./office-map.js";
 
 const KINDS = { swath_m: "length", speed_m_s: "speed", tank_l: "volume", rate_l_ha: "rate", border_m: "length" };
@@ -47,31 +47,73 @@ function showFiles() {
   const kept = (id) => (maps.includes(chosenBy[id]) || chosenBy[id] === "" ? chosenBy[id] : undefined);
   choices(byId("prescription"), [["", "none: one rate"], ...named], kept("prescription") ?? has("presc") ?? "");
   choices(byId("field"), named, kept("field") ?? has("bound") ?? maps.find((name) => name !== byId("prescription").value) ?? maps[0]);
-  choices(byId("no_spray"), named.filter(([name]) => name !== byId("prescription").value && name !== byId("field").value));
+  const isData = (name) => /[.](tiff?|csv|parquet)$/i.test(name);
+  choices(byId("no_spray"), named.filter(([name]) => !isData(name) && name !== byId("prescription").value && name !== byId("field").value));
+  choices(byId("data"), named, kept("data") ?? maps.find(isData) ?? maps[0]);
   choices(byId("done"), [["", "nothing: the whole field"], ...(state.flights ?? []).map((name) => [name, name])], byId("done").value || wanted);
 }
 
 function refused(text) { return make("p", text, "refused"); }
 
-function showCheck() {
-  const box = byId("check"), check = state.check;
-  if (!check) { box.replaceChildren(); return; }
-  const found = check.found ?? {}, items = (found.problems ?? []).map((one) => make("li", `${one.severity}: ${one.text}${one.fix ? `; ${one.fix}` : ""}`));
+function problemList(found) {
   const list = make("ul");
-  list.append(...items);
-  if (check.error) { box.replaceChildren(refused(check.error)); return; }
-  box.replaceChildren(make("p", `${check.file}: ${found.zones} zones, ${withUnit("area", found.area_ha)}, ${withUnit("volume", found.litres)}, ${withUnit("rate", Math.min(...found.rates_l_ha))} to ${withUnit("rate", Math.max(...found.rates_l_ha))}.`), items.length ? list : make("p", "Nothing wrong was found.", "small"));
+  list.append(...(found.problems ?? []).map((one) => make("li", `${one.severity}: ${one.text}${one.fix ? `; ${one.fix}` : ""}`)));
+  return list;
 }
 
-function sortieTable(found) {
+function tableOf(heads, rows) {
   const table = make("table"), head = make("tr");
-  head.append(...["Sortie", "Volume", "Fill to", "Minutes", "Passes"].map((text) => { const cell = make("th", text); cell.scope = "col"; return cell; }));
-  table.append(head, ...found.sorties.map((one) => {
+  head.append(...heads.map((text) => { const cell = make("th", text); cell.scope = "col"; return cell; }));
+  table.append(head, ...rows.map((cells) => {
     const row = make("tr");
-    row.append(...[one.number, withUnit("volume", one.volume_l), withUnit("volume", one.fill_l), (one.flight_s / 60).toFixed(1), one.swaths].map((text) => make("td", String(text))));
+    row.append(...cells.map((text) => make("td", String(text))));
     return row;
   }));
   return table;
+}
+
+function showMade() {
+  const box = byId("make"), done = state.make;
+  if (!done) { box.replaceChildren(); return; }
+  if (done.error) { box.replaceChildren(refused(done.error)); return; }
+  const found = done.found, cleaned = found.values.filter((one) => one.removed);
+  box.replaceChildren(
+    make("p", `${done.file}: ${withUnit("volume", found.litres)}; ${found.misapplied_percent.toFixed(1)} % of what the data ask for lies elsewhere, so that the sprayer can follow. Course ${found.course_deg.toFixed(1)}°. Now check the map.`),
+    tableOf(["Zone", "Rate", "Area", "Value"], found.zones.map((one, k) => [k + 1, withUnit("rate", one.rate_l_ha), withUnit("area", one.area_ha), one.mean_value.toPrecision(4)])),
+    ...cleaned.map((one) => make("p", `${one.points} points; left out: ${Object.entries(one.removed).filter(([, count]) => count).map(([why, count]) => `${why} ${count}`).join(", ") || "none"}.`, "small")),
+    ...found.steps.map((one) => make("p", `${one.name}: ${withUnit("area", one.changed_ha)} changed, ${withUnit("volume", one.moved_l)} moved.`, "small")),
+    ...found.notes.map((text) => make("p", text, "small")), problemList(found),
+  );
+}
+
+function showCheck() {
+  const box = byId("check"), check = state.check;
+  if (!check) { box.replaceChildren(); return; }
+  const found = check.found ?? {}, list = problemList(found);
+  if (check.error) { box.replaceChildren(refused(check.error)); return; }
+  box.replaceChildren(make("p", `${check.file}: ${found.zones} zones, ${withUnit("area", found.area_ha)}, ${withUnit("volume", found.litres)}, ${withUnit("rate", Math.min(...found.rates_l_ha))} to ${withUnit("rate", Math.max(...found.rates_l_ha))}.`), list.children.length ? list : make("p", "Nothing wrong was found.", "small"));
+}
+
+function sortieTable(found) {
+  return tableOf(["Sortie", "Volume", "Fill to", "Minutes", "Passes"], found.sorties.map((one) => [one.number, withUnit("volume", one.volume_l), withUnit("volume", one.fill_l), (one.flight_s / 60).toFixed(1), one.swaths]));
+}
+
+// What to pour before each sortie, from top to bottom; products in their own unit.
+function mixParts(mix) {
+  if (!mix) return [];
+  const litres = (name, of) => [`${name}, ${unitOf("volume")}`, ...mix.sorties.map((one) => value("volume", one[of]))];
+  const rows = mix.products.map((product, k) => {
+    const amounts = mix.sorties.map((one) => one.amounts[k]), isSmall = Math.max(...amounts) < 1;
+    const unit = isSmall ? { L: "mL", kg: "g" }[product.measure] : product.measure;
+    return [`${product.name}, ${unit}`, ...amounts.map((amount) => (isSmall ? (amount * 1000).toFixed(1) : amount.toFixed(3)))];
+  });
+  const wide = make("div", undefined, "wide");
+  wide.tabIndex = 0; // there may be more sorties than fit
+  wide.append(tableOf(["Mix for sortie", ...mix.sorties.map((one) => one.number)], [litres("Half of the water", "water_first_l"), ...rows, litres("Water up to", "mix_l")]));
+  return [
+    wide,
+    ...mix.notes.map((text) => make("p", text, "small")),
+  ];
 }
 
 function showPlan() {
@@ -80,9 +122,10 @@ function showPlan() {
   if (plan.error) { box.replaceChildren(refused(plan.error)); return; }
   const found = plan.found, parts = [
     make("p", `${found.sorties.length} ${found.sorties.length === 1 ? "sortie" : "sorties"}, ${withUnit("volume", found.volume_l)}, ${(found.flight_s / 60).toFixed(0)} min; ${found.coverage_percent.toFixed(1)} % covered, ${found.overlap_percent.toFixed(1)} % twice.`),
-    sortieTable(found), ...found.warnings.map((text) => make("p", text, "refused")),
+    sortieTable(found), ...mixParts(found.mix), ...found.warnings.map((text) => make("p", text, "refused")),
   ];
   if (plan.flight_map?.error) parts.push(refused(`flight map: ${plan.flight_map.error}`));
+  else if (plan.flight_map) parts.push(make("p", "To fly it, set this in the configuration, and start run again:", "small"), make("pre", Object.entries(plan.flight_map.settings).map(([key, value]) => `${key} = ${JSON.stringify(value)}`).join("\n")));
   const links = make("p");
   for (const file of state.made) {
     const link = make("a", file.name);
@@ -106,7 +149,7 @@ function show() {
   const box = byId("not-now");
   box.hidden = !state.not_now;
   box.textContent = state.not_now ? `Not now: ${state.not_now}.` : "";
-  showFiles(); showCheck(); showPlan();
+  showFiles(); showMade(); showCheck(); showPlan();
   byId("draw-save").disabled = corners.length < 3 || !role;
   byId("draw-edit").disabled = !byId("field").value.endsWith(".geojson");
   const lines = state.made.find((file) => file.name.endsWith(".lines.geojson"));
@@ -179,6 +222,27 @@ function planned() {
   return body;
 }
 
+function wish() {
+  const rates = byId("rates").value.split(/[,;\s]+/).filter(Boolean).map((text) => toSi("rate", Number(text)));
+  const body = { data: byId("data").value, rates_l_ha: rates, across: byId("across").value, field: byId("field").value, no_spray: [...byId("no_spray").selectedOptions].map((one) => one.value) };
+  if (byId("value").value.trim()) body.value = byId("value").value.trim();
+  if (byId("litres_max").value !== "") body.litres_max = toSi("volume", Number(byId("litres_max").value));
+  if (byId("angle_deg").value !== "") body.angle_deg = Number(byId("angle_deg").value);
+  return body;
+}
+
+async function makeZones() {
+  const body = wish();
+  if (!body.rates_l_ha.length || body.rates_l_ha.some(Number.isNaN)) { say("Rates are numbers, one for each zone: 26 22 18 14.", true); return; }
+  if (!body.data || !body.field || body.data === body.field) { say("Load the data and a boundary, or draw the boundary.", true); return; }
+  await doing("Making zones", () => ask("office/make", body));
+  if (!state.make || state.make.error) return;
+  // The zones fit these passes and no others.
+  chosenBy.prescription = state.make.file;
+  byId("angle_deg").value = state.make.found.course_deg;
+  show();
+}
+
 const theme = begin();
 for (const element of document.querySelectorAll("[data-unit]")) element.textContent = unitOf(element.dataset.unit);
 // From the report of a flight: what it left is planned.
@@ -189,6 +253,7 @@ const map = new OfficeMap(byId("map"), theme, {
   onMove(index, place) { draw(corners.map((one, k) => (k === index ? place : one))); },
 });
 byId("pick").addEventListener("change", async (event) => { await load([...event.target.files]); event.target.value = ""; });
+byId("make-form").addEventListener("submit", (event) => { event.preventDefault(); makeZones(); });
 byId("check-form").addEventListener("submit", (event) => { event.preventDefault(); if (byId("prescription").value) doing("Checking", () => ask("office/check", { file: byId("prescription").value, ...reading() })); });
 byId("plan-form").addEventListener("submit", (event) => { event.preventDefault(); if (byId("field").value) doing("Planning", () => ask("office/plan", planned())); });
 for (const name of Object.keys(ROLES)) byId(`draw-${name}`).addEventListener("click", () => startDrawing(role === name ? null : name));
@@ -196,7 +261,7 @@ byId("draw-undo").addEventListener("click", () => draw(corners.slice(0, -1)));
 byId("draw-save").addEventListener("click", save);
 byId("draw-edit").addEventListener("click", edit);
 byId("corners").addEventListener("input", (event) => draw(cornersOf(event.target.value), true));
-for (const id of ["prescription", "field"]) byId(id).addEventListener("change", () => { chosenBy[id] = byId(id).value; show(); });
+for (const id of ["prescription", "field", "data"]) byId(id).addEventListener("change", () => { chosenBy[id] = byId(id).value; show(); });
 
 state = await ask("office").catch((error) => { say(error.message, true); return state; });
 await map.ready;

@@ -1,4 +1,4 @@
-"""A whole field in the browser on the stub: from its map to the report, with a stop in between.
+"""A whole field in the browser on the stub: from its data to the report, with a stop in between.
 
 Needs Chromium (`apt-get install chromium`); without it this test is skipped.
 """
@@ -12,9 +12,11 @@ import socket
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 import shapely
 from playwright.async_api import Page, expect
@@ -93,6 +95,30 @@ def two_zones() -> list[tuple[Box, float]]:
     return list(zip(boxes, RATES_L_HA, strict=True))
 
 
+# A sample each so many metres of ground, and as far beyond the zones on all sides.
+EVERY_M = 2.0
+VALUES = (2.0, 1.0)
+
+
+def write_samples(path: Path) -> Path:
+    """Write what was seen on the two zones, as points: the lower value where more is needed."""
+    rows = ["lat,lon,vigour"]
+    for east in np.arange(-WIDTH_M / 2 - EVERY_M, WIDTH_M / 2 + EVERY_M + 0.1, EVERY_M):
+        for along in np.arange(-EVERY_M / 2, len(VALUES) * ZONE_M + EVERY_M, EVERY_M):
+            latitude_deg, longitude_deg = HOME.to_geographic(float(east), FIRST_M + float(along))
+            value = VALUES[min(max(int(along // ZONE_M), 0), len(VALUES) - 1)]
+            rows.append(f"{latitude_deg:.8f},{longitude_deg:.8f},{value}")
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
+def corners(zones: Iterable[tuple[Box, float]]) -> str:
+    """Return the corners of all zones together, as they are typed on the page."""
+    west, south, east, north = shapely.union_all([shapely.box(*box) for box, _ in zones]).bounds
+    ring = ((west, south), (east, south), (east, north), (west, north))
+    return "\n".join("{:.8f}, {:.8f}".format(*HOME.to_geographic(*place)) for place in ring)
+
+
 async def plan_and_upload(page: Page) -> None:
     """Plan what is chosen on the office's page, and put it on the vehicle."""
     plan = page.locator("#plan")
@@ -102,6 +128,13 @@ async def plan_and_upload(page: Page) -> None:
     async with answered(page, "office/upload"):
         await page.get_by_role("button", name="Upload field.plan to the vehicle").click()
     await expect(plan).to_contain_text("field.plan: on the vehicle, read back and the same")
+
+
+async def settings_told(page: Page) -> tuple[str, ...]:
+    """Return the settings by which a flight follows what the page has planned, as it tells them."""
+    told = (await page.locator("#plan pre").inner_text()).splitlines()
+    assert told[0].startswith("prescription.file = ")
+    return tuple(line.replace(" = ", "=", 1) for line in told)
 
 
 async def left_ha(page: Page) -> float:
@@ -156,6 +189,33 @@ class Day:
         await expect(page.locator("#check")).to_contain_text(" zones")
         await page.locator("#speed_m_s").fill("5")
 
+    async def draw_and_make(self, samples: Path, outline: str) -> None:
+        """Load data, type the corners of the boundary, and make zones within it."""
+        page = self.page
+        await self.open("office/", "office")
+        await page.locator("#pick").set_input_files(samples)
+        await expect(page.locator("#files li")).to_have_count(1)
+        await page.get_by_role("button", name="Boundary", exact=True).click()
+        await page.locator("#corners").fill(outline)
+        await page.get_by_role("button", name="Save the area").click()
+        await expect(page.locator("#field")).to_have_value("drawn-boundary.geojson")
+        await page.locator("#value").fill("weeds")
+        # The lower value comes first, and needs more.
+        await page.locator("#rates").fill(" ".join(f"{rate:g}" for rate in RATES_L_HA[::-1]))
+        made = page.locator("#make")
+        async with answered(page, "office/make"):
+            await page.get_by_role("button", name="Make zones").click()
+        await expect(made).to_contain_text("it has no column 'weeds'")
+        await page.locator("#value").fill("vigour")
+        async with answered(page, "office/make"):
+            await page.get_by_role("button", name="Make zones").click()
+        await expect(made.locator("tr")).to_have_count(1 + len(RATES_L_HA))
+        await expect(page.locator("#prescription")).to_have_value("made-prescription.gpkg")
+        async with answered(page, "office/check"):
+            await page.get_by_role("button", name="Check the map").click()
+        await expect(page.locator("#check")).to_contain_text("made-prescription.gpkg: ")
+        await page.locator("#speed_m_s").fill("5")
+
     async def take_off(self) -> None:
         """Enable on the page; the pilot arms and starts the mission."""
         await shows(self.page, "ready")
@@ -168,17 +228,17 @@ class Day:
 
     async def stop(self) -> None:
         """Tap STOP in mid-pass; the valves close on the wire in time, and stay closed."""
-        bench, page = self.bench, self.page
+        bench, page, tries = self.bench, self.page, count(1)
 
         async def closing_s() -> float:
-            if not is_open(bench):  # an earlier try, on a computer that had much to do
+            if next(tries) > 1:  # on a computer that had much to do
                 await release(page)
                 await enable(page)
-                await bench.until(lambda: is_open(bench), within_s=30.0)
-            count, tapped_s = len(bench.sprayer.orders), time.monotonic()
+            await bench.until(lambda: is_open(bench), within_s=30.0)  # it may just turn
+            before, tapped_s = len(bench.sprayer.orders), time.monotonic()
             await page.locator("#stop").tap()
             await bench.until(lambda: not is_open(bench))
-            closed_s = max(one.at_s for one in bench.sprayer.orders[count:])
+            closed_s = max(one.at_s for one in bench.sprayer.orders[before:])
             await shows(page, "estop")
             return closed_s - tapped_s
 
@@ -204,10 +264,14 @@ class Day:
 
 
 @pytest.mark.timeout(400)
-async def test_a_field_is_loaded_planned_flown_stopped_continued_and_reported(
+async def test_a_field_is_drawn_zoned_planned_flown_stopped_continued_and_reported(
     tmp_path: Path,
 ) -> None:
-    config, files = write_maps(tmp_path, two_zones())
+    config, _ = write_maps(tmp_path, two_zones())
+    # The boundary is drawn on the page, and the flight map has it.
+    text = config.read_text().replace('boundary = "boundary.geojson"\n', "")
+    config.write_text(text + '\n[[mix]]\nname = "Wetter"\namount = 1.0\nunit = "%"\n')
+    samples = write_samples(tmp_path / "samples.csv")
     port = free_port(socket.SOCK_STREAM)
     async with vehicle_bench("ardupilot", config) as bench, chromium(WITHOUT_WEBGL) as browser:
         web = (
@@ -219,11 +283,17 @@ async def test_a_field_is_loaded_planned_flown_stopped_continued_and_reported(
         day.watch()
         async with companion_of(bench, *web):
             await bench.until(lambda: "link up" in bench.said, within_s=60.0)
-            await day.load_and_check(files)
+            await day.draw_and_make(samples, corners(two_zones()))
             await plan_and_upload(page)
+            settings = await settings_told(page)
+            # What is to be poured is in the mix: one part in a hundred of what it says.
+            rows = await page.locator("#plan .wide tr").all_inner_texts()
+            wetter, mixed = (float(row.split()[-1]) for row in rows[-2:])
+            assert wetter == pytest.approx(0.01 * mixed * 1000.0, rel=0.05)
+            assert mixed > PRESCRIBED_L
         assert len(bench.stub.flight.items) >= 6
         bench.said = ""
-        async with companion_of(bench, *web, *planned(tmp_path)):
+        async with companion_of(bench, *web, *settings):
             await bench.until(lambda: "link up" in bench.said, within_s=60.0)
             await day.open()
             await day.take_off()
@@ -242,10 +312,3 @@ async def test_a_field_is_loaded_planned_flown_stopped_continued_and_reported(
         assert {urlsplit(url).netloc for url in day.requests} == {f"127.0.0.1:{port}"}
         assert not day.troubles
     assert bench.truth.summary()["volume_l"] == pytest.approx(PRESCRIBED_L, rel=0.15)
-
-
-def planned(folder: Path) -> tuple[str, ...]:
-    """Return the settings by which a flight follows what the page has planned."""
-    flight_map = next(folder.rglob("field.flightmap.gpkg"))
-    lines = flight_map.with_name("field.lines.geojson")
-    return f"prescription.file={flight_map}", f"mission.lines={lines}"
