@@ -132,6 +132,7 @@ def build_setup(config: Config, flight_map: FlightMap) -> Setup:
         flow_trim=_flow_trim(config),
         detection=_detection(config),
         valve_tracking=_valve_tracking(config),
+        centres_pulses=config.output.kind == "gpio",
         autopilot_liquid=_autopilot_liquid(config),
         drift=config.drift_law(),
         rate_max_l_ha=config.rate_max_l_ha(),

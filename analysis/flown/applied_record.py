@@ -82,7 +82,7 @@ def modelled_ml(flight: AppliedFlight, time_s: Floats) -> Floats:
         return pumped_ml(flight, time_s)
     changes = flight.changes
     lags = [setup.lag.of_valve(valve) for valve in setup.boom.valves]
-    flows = valve_flows(changes, setup.nozzle_sets, lags)
+    flows = valve_flows(changes, setup.nozzle_sets, lags, setup.timings)
     return np.stack([flow.volume_ml(time_s) for flow in flows], axis=1)
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from analysis.flown.applied_flight import AppliedFlight, Floats, Series, ValveChanges
     from companion.core.nozzle import NozzleSet
-    from companion.core.schedule import LagModel
+    from companion.core.schedule import LagModel, Timing
 
 
 Ints = NDArray[np.int64]
@@ -61,15 +61,25 @@ def ordered_s(changes: ValveChanges) -> Floats:
 
 
 def valve_flows(
-    changes: ValveChanges, nozzle_sets: Sequence[NozzleSet], lags: Sequence[LagModel]
+    changes: ValveChanges,
+    nozzle_sets: Sequence[NozzleSet],
+    lags: Sequence[LagModel],
+    timings: Sequence[Timing] = (),
 ) -> list[ValveFlow]:
-    """Return the flow of each valve that the executed changes stand for; `lags` are of each."""
+    """Return the flow of each valve that the executed changes stand for; `lags` are of each.
+
+    `timings` say how long a valve that opens rests before its first pulse.
+    """
     order_s = ordered_s(changes)
     levels = levels_ml_s(changes, nozzle_sets)
-    return [
-        ramped(order_s[changes.valve == valve], levels[changes.valve == valve], lag)
-        for valve, lag in enumerate(lags)
-    ]
+    flows = []
+    for valve, lag in enumerate(lags):
+        its = changes.valve == valve
+        rests = (
+            [timings[valve].rest_s(duty) for duty in changes.duty[its].tolist()] if timings else []
+        )
+        flows.append(ramped(order_s[its], levels[its], lag, np.array(rests or 0.0)))
+    return flows
 
 
 def levels_ml_s(changes: ValveChanges, nozzle_sets: Sequence[NozzleSet]) -> Floats:
@@ -113,12 +123,18 @@ def set_in_force(valve: Ints, duty: Floats, by_size: Sequence[NozzleSet]) -> Int
     return np.array(found, dtype=np.int64)
 
 
-def ramped(order_s: Floats, levels: Floats, lag: LagModel) -> ValveFlow:
-    """Return the flow of one valve from its orders and the levels that they ask for."""
+def ramped(
+    order_s: Floats, levels: Floats, lag: LagModel, rest_s: Floats | float = 0.0
+) -> ValveFlow:
+    """Return the flow of one valve from its orders and the levels that they ask for.
+
+    A valve that opens begins `rest_s` later, and has let through the same all the same.
+    """
     if not len(levels):
         return ValveFlow(knot_s=np.zeros(0), flow_ml_s=np.zeros(0))
     before = np.concatenate(([0.0], levels[:-1]))
     lag_s, half_s = _lags(before, levels, lag)
+    half_s = np.where(before <= 0.0, np.maximum(half_s - rest_s, 0.5 * RAMP_MIN_S), half_s)
     middle_s = order_s + lag.output_s + lag_s
     # What a later order overtakes comes no later than that one: the flow never falls below zero.
     start_s, end_s = (

@@ -133,7 +133,7 @@ class LagTable(Table):
     off_s: Lag = Field(description="measured: the same, open to closed")
     up_s: Lag = Field(description="measured: the same, to a larger flow")
     down_s: Lag = Field(description="measured: the same, to a smaller flow")
-    on_start_s: Lag = Field(description="measured: order to first flow; at most on_s")
+    on_start_s: Lag = Field(description="measured: order to first flow at full duty; at most on_s")
     off_end_s: Lag = Field(description="measured: order to less than 2 % of flow; at least off_s")
     output_s: Lag = Field(description="measured: order to the pulse, the output path's delay")
     position_s: float = Field(

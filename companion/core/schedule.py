@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 
 from companion.core.boom import Valve
 from companion.core.crossings import Crossing, Route
+from companion.core.nozzle import PwmLimits
 from companion.core.types import Method, TimedChange
 
 Reference = Literal["volume", "settled"]
@@ -44,6 +45,9 @@ STICKY_S = 0.1
 NEAR_SHARE, NEAR_STEP_SHARE = 0.03, 0.3
 # At the border this long, as a way: what the buffer leaves, or what a position is known to.
 STICKY_BORDER_M = 0.02
+# A period is up to 2 % shorter on its way back to its phase, and half as long if another change
+# follows within two and a half: then nothing is counted on.
+FIRST_GAP_SHARE, ALONE_PERIODS = 0.98, 2.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,10 +123,24 @@ class Timing:
     border_on_s: float
     border_off_s: float
     dwell_min_s: float
+    centred: PwmLimits | None = None
+    rest_max_s: float = 0.0
 
     @classmethod
-    def of(cls, method: Method, lag: LagModel, *, look_ahead_s: float, period_s: float) -> Timing:
+    def of(
+        cls,
+        method: Method,
+        lag: LagModel,
+        *,
+        look_ahead_s: float,
+        period_s: float,
+        centred: PwmLimits | None = None,
+    ) -> Timing:
         """Return the leads of a method: none, P1's one look-ahead time, or the identified lags.
+
+        `centred` are the limits of an output that opens a valve with a new period and the pulse in
+        its middle: at the border such a pulse is ordered half its off-time sooner, but not so soon
+        that the volume-equivalent step would lie outside.
 
         P1 (Wang et al. 2024) looks S = V (T1 + T2 + T3) ahead for every change: at the speed V
         that is the one lead T1 + T2 + T3.
@@ -145,12 +163,31 @@ class Timing:
             border_on_s=lag.on_start_s + lag.output_s,
             border_off_s=lag.off_end_s + lag.output_s,
             dwell_min_s=dwell_s,
+            centred=centred,
+            rest_max_s=lag.on_s - lag.on_start_s,
         )
 
     @property
     def longest_s(self) -> float:
         """Return the longest lead of all."""
-        return max(self.on_s, self.off_s, self.up_s, self.down_s, self.border_off_s)
+        opens_s = self.border_on_s + self.rest_s(0.0)
+        return max(self.on_s, self.off_s, self.up_s, self.down_s, self.border_off_s, opens_s)
+
+    def rest_s(self, duty: float) -> float:
+        """Return by how much sooner a valve may open at the border, at rest before its first pulse.
+
+        On-times below the shortest become that; above the last duty a pulse begins its period.
+        """
+        pwm = self.centred
+        if pwm is None or duty > min(pwm.duty_max, 1.0 - pwm.min_off_s / pwm.period_s):
+            return 0.0
+        on_s = max(duty * pwm.period_s, pwm.min_on_s)
+        return min(FIRST_GAP_SHARE * 0.5 * (pwm.period_s - on_s), self.rest_max_s)
+
+    @property
+    def alone_s(self) -> float:
+        """Return how long after it nothing may be ordered for that to hold."""
+        return 0.0 if self.centred is None else ALONE_PERIODS * self.centred.period_s
 
     def lead_s(self, before: float, after: float) -> float:
         """Return the lead of a change from one duty to another inside the field."""
@@ -261,8 +298,12 @@ def orders(
     than what it opens for, or keeps one open over closed ground; and the border has the last word.
     """
     made = _by_kind(route, timing, dosing, overdrive)
-    for begin_s, end_s in shut_spans(route, timing):
+    spans = shut_spans(route, timing)
+    for number, (begin_s, end_s) in enumerate(spans):
         made = _shut_between(made, begin_s, end_s)
+        if timing.centred is not None and made[-1].at_s >= end_s:
+            shut_s = spans[number + 1][0] if number + 1 < len(spans) else math.inf
+            made = _opened_sooner(made, begin_s, end_s, shut_s, timing)
     return made
 
 
@@ -333,6 +374,22 @@ def _shut_between(made: list[Order], begin_s: float, end_s: float) -> list[Order
     if stands.rate_l_ha is not None:
         held.append(Order(end_s, stands.duty, stands.rate_l_ha, bound=True))
     return held + made[following:]
+
+
+def _opened_sooner(
+    made: list[Order], begin_s: float, end_s: float, shut_s: float, timing: Timing
+) -> list[Order]:
+    """Return the orders with the opening at `end_s` sooner by the rest before its first pulse.
+
+    Where nothing else is ordered soon after it; `shut_s` is when the border next closes the valve.
+    """
+    number = next(i for i, order in enumerate(made) if order.at_s >= end_s)
+    order = made[number]
+    next_s = made[number + 1].at_s if number + 1 < len(made) else math.inf
+    if not order.bound or min(next_s, shut_s) - end_s < timing.alone_s:
+        return made
+    at_s = max(end_s - timing.rest_s(order.duty), begin_s + timing.dwell_min_s)
+    return [*made[:number], order._replace(at_s=at_s), *made[number + 1 :]]
 
 
 def schedule(

@@ -57,6 +57,8 @@ class Setup:
     # What earlier flights treated; not compared by hash: tiles are a mapping.
     treated: Coverage | None = field(default=None, repr=False, hash=False)
     valve_tracking: ValveTracking | None = None  # None: valves stay as configured
+    # The output opens a valve with a new period, the pulse in its middle: our own engine does.
+    centres_pulses: bool = False
     timing: Timing = field(init=False, repr=False, compare=False)
     timings: tuple[Timing, ...] = field(init=False, repr=False, compare=False)  # of each valve
     # The longest lead of any order: of valves, pump and atomisers.
@@ -110,7 +112,11 @@ class Setup:
 
     def _timing(self, lag: LagModel) -> Timing:
         return Timing.of(
-            self.method, lag, look_ahead_s=self.look_ahead_s, period_s=self.pwm.period_s
+            self.method,
+            lag,
+            look_ahead_s=self.look_ahead_s,
+            period_s=self.pwm.period_s,
+            centred=self.pwm if self.centres_pulses else None,
         )
 
     def _recording(self) -> TreatedAreaSettings:

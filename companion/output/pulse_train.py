@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 STRETCH_MAX = 0.02
 # How much later the begin of a period may be looked at; valves come about this often.
 LOOK_LATER_S = 0.001
+# Times that differ by less are the same, rounded.
+SAME_S = 1e-6
 
 
 class Edge(NamedTuple):
@@ -57,7 +59,7 @@ class PulseTrain:
     __slots__ = (
         "_carry_s", "_closures", "_edges", "_end_s", "_is_open", "_last_duty", "_last_s",
         "_middle_s", "_on_s", "_opened_s", "_overrun_s", "_pending", "_period_s", "_phase_s",
-        "_pwm", "_start_s", "_told", "_valve", "duty", "restart_s",
+        "_pwm", "_start_s", "_told", "_valve", "duty", "restart_closes", "restart_s",
     )  # fmt: skip
 
     def __init__(self, valve: int, pwm: PwmLimits, *, phase_s: float, overrun_s: float) -> None:
@@ -70,6 +72,7 @@ class PulseTrain:
         self._last_duty = min(pwm.duty_max, 1.0 - pwm.min_off_s / pwm.period_s)
         self.duty = 0.0
         self.restart_s = math.inf
+        self.restart_closes = False
         self._pending: float | None = None
         self._start_s = self._middle_s = self._opened_s = 0.0
         self._end_s = math.inf
@@ -245,7 +248,11 @@ class PulseTrain:
         """Return how long after its period's begin a pulse begins: it stands in the middle.
 
         Above the last duty it begins at once: between open periods half a gap would close nothing.
+        The last pulse before a closing that is planned already ends with it: the same volume, and
+        no half gap of dry ground ahead of a border.
         """
+        if self.restart_closes and abs(self._end_s - self.restart_s) < SAME_S:
+            return length_s - on_s
         if self.duty > self._last_duty:
             return 0.0
         return 0.5 * (length_s - on_s)

@@ -107,6 +107,7 @@ class PulseEngine:
         for change in reversed(self._changes):
             if change.restart:
                 self._trains[change.valve].restart_s = change.at_s
+                self._trains[change.valve].restart_closes = change.duty == 0.0
         for valve, duty in enumerate(wanted):
             ordered = self._trains[valve].ordered
             if duty != ordered:
@@ -170,7 +171,7 @@ class PulseEngine:
             if change.restart:
                 train = self._trains[change.valve]
                 train.run(at_s, self._out)
-                train.restart_s = self._next_restart_s(change.valve)
+                self._plan_restart(train, change.valve)
                 self._note_next(change.valve)
             self._order(change.valve, change.duty, at_s=at_s, restart=change.restart)
         if self._lease_s <= until_s:
@@ -190,11 +191,13 @@ class PulseEngine:
         for at_s, is_open in moves:
             self._out.append(Edge(at_s, count, is_open, 1.0 if is_open else 0.0))
 
-    def _next_restart_s(self, valve: int) -> float:
+    def _plan_restart(self, train: PulseTrain, valve: int) -> None:
+        """Tell a train of its next restart."""
+        train.restart_s = math.inf
         for change in self._changes:
             if change.valve == valve and change.restart:
-                return change.at_s
-        return math.inf
+                train.restart_s, train.restart_closes = change.at_s, change.duty == 0.0
+                return
 
     def _order(self, valve: int, duty: float, *, at_s: float, restart: bool) -> None:
         train = self._trains[valve]

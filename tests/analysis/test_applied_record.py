@@ -20,8 +20,9 @@ from analysis.flown.modelled_flow import (
     ramped,
     valve_flows,
 )
-from companion.core.nozzle import FlowCurve, NozzleSet
-from companion.core.schedule import LagModel
+from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.schedule import LagModel, Timing
+from companion.core.types import Method
 from tests.analysis.applied_flights import SPEED_M_S, changes_of, eastwards, with_meter
 from tests.builders import CURVE, LAG
 
@@ -42,6 +43,24 @@ def test_a_lone_valve_opens_by_its_lag_and_closes_by_the_other() -> None:
     assert before < 1e-12
     assert after > 0.0
     assert late == pytest.approx(flow.volume_ml(np.array([99.0]))[0])
+
+
+def test_a_valve_that_rests_before_its_first_pulse_begins_later_and_delivers_the_same() -> None:
+    pwm = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
+    lag = replace(LAG, on_start_s=LAG.on_s - 0.03)
+    timing = Timing.of(Method.SCHEDULED, lag, look_ahead_s=0.0, period_s=pwm.period_s, centred=pwm)
+    rest_s = timing.rest_s(0.7)
+    assert rest_s == pytest.approx(0.98 * 0.5 * 0.3 / 11.0)
+    changes = changes_of([(10.0, 0, 0.7), (12.0, 0, 0.0)])
+    plain, rested = (valve_flows(changes, [SET], [lag], timings)[0] for timings in ((), (timing,)))
+    first_s = 10.0 + lag.output_s + lag.on_start_s
+    assert plain.volume_ml(np.array([first_s + rest_s]))[0] > 0.0
+    before, after = rested.volume_ml(np.array([first_s + rest_s, first_s + rest_s + 0.002]))
+    assert (before, after > 0.0) == (pytest.approx(0.0, abs=1e-12), True)
+    whole_ml = plain.volume_ml(np.array([20.0]))[0]
+    assert rested.volume_ml(np.array([20.0]))[0] == pytest.approx(whole_ml, rel=1e-9)
+    # The closing is as it was.
+    assert rested.knot_s[-2:] == pytest.approx(plain.knot_s[-2:])
 
 
 @given(

@@ -25,7 +25,9 @@ KINDS = ("on_s", "off_s", "up_s", "down_s", "on_start_s", "off_end_s")
 
 def sprayer_setup(plant: str, output: Output, speed_m_s: float = MAP_SPEED_M_S) -> Setup:
     """Return the example with this sprayer, its rates scaled by 5/V, and the nominal lags."""
-    setup = replace(demo_setup(speed_m_s), lag=nominal_lag(plant, output))
+    setup = replace(
+        demo_setup(speed_m_s), lag=nominal_lag(plant, output), centres_pulses=output == "gpio"
+    )
     return setup if plant == PLANT else with_sprayer(setup, load_profile(plant))
 
 

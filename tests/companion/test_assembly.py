@@ -67,6 +67,14 @@ def test_setup_has_everything_that_the_configuration_says() -> None:
     assert len(setup.prescription.sha256) == 64
 
 
+@pytest.mark.parametrize(("kind", "centres"), [("gpio", True), ("servo", False), ("none", False)])
+def test_only_of_our_own_pulses_is_it_known_where_they_stand(kind: str, centres: bool) -> None:
+    # Whether a driver board puts them there, nobody here can tell.
+    setup = compiled_setup(load(FOLDER / "config.toml", overrides=[f"output.kind={kind}"]))
+    assert setup.centres_pulses is centres
+    assert (setup.timing.rest_s(0.5) > 0.0) is centres
+
+
 LINES = 'mission.lines="lines.geojson"'
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 
 import shapely
@@ -13,10 +14,12 @@ from hypothesis import strategies as st
 from shapely import Polygon
 
 from companion.core.crossings import Crossing, Route
-from companion.core.nozzle import FlowCurve, NozzleSet
+from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
 from companion.core.prescription import Prescription, Zone
 from companion.core.schedule import LagModel, Overdrive, Timing, orders
 from companion.core.setup import Setup
+from companion.core.types import SprayPlan, TimedChange
+from companion.output.pwm import PulseEngine
 from tests.border_flight import Ground, Way, flows, spilled_by_valve
 from tests.builders import CURVE, boom, setup
 
@@ -164,6 +167,33 @@ def test_no_order_crosses_those_of_the_border_whatever_the_leads(
         since_s = crossing.at_s if number else -math.inf
         for first_s, last_s in spans if crossing.outside else ():
             assert last_s <= since_s + 1e-9 or first_s >= end_s - 1e-9
+
+
+PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
+
+
+@given(route=routes(), timing=TIMINGS, rest_max_s=st.floats(0.0, 0.1), phase=st.floats(0.0, 1.0))
+def test_no_pulse_of_our_own_engine_reaches_over_the_border_that_opened_it_sooner(
+    route: Route, timing: Timing, rest_max_s: float, phase: float
+) -> None:
+    timing = replace(timing, centred=PWM, rest_max_s=rest_max_s)
+    first, *made = orders(route, timing, dosing)
+    begin_s = min([0.0, *(order.at_s for order in made)]) - 1.0
+    engine = PulseEngine(PWM, 1, start_s=begin_s - phase * PWM.period_s)
+    changes = tuple(TimedChange(at_s=each.at_s, valve=0, duty=each.duty) for each in made)
+    end_s = max([0.0, *(change.at_s for change in changes)]) + 1.0
+    plan = SprayPlan(
+        sequence=1, issued_s=begin_s, duty=(first.duty,), changes=changes, lease_until_s=end_s
+    )
+    engine.submit(plan, now_s=begin_s)
+    edges = [(edge.at_s, edge.is_open) for edge in engine.advance(end_s + 1.0)]
+    pulses = [(a, b) for (a, is_open), (b, _) in pairwise(edges) if is_open]
+    ends = [*(crossing.at_s for crossing in route[1:]), math.inf]
+    for number, (crossing, until_s) in enumerate(zip(route, ends, strict=True)):
+        since_s = crossing.at_s if number else -math.inf
+        for opened_s, closed_s in pulses if crossing.outside else ():
+            is_before = closed_s + timing.border_off_s <= since_s + 1e-9
+            assert is_before or opened_s + timing.border_on_s >= until_s - 1e-9
 
 
 @given(route=routes(), timing=TIMINGS, overdrive=DRIVES)

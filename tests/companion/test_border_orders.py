@@ -11,6 +11,7 @@ import shapely
 from companion.config.load import load
 from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
+from companion.core.nozzle import PwmLimits
 from companion.core.options.lines import Lines
 from companion.core.options.pump import PumpOutlet
 from companion.core.prescription import Prescription, Zone
@@ -142,6 +143,56 @@ def test_ground_without_a_rate_does_not_hide_the_border_behind_it(bare_m: float)
     )
     way = Way(east_m=-10.0, speed_m_s=5.0, **EASTWARDS)
     assert spilled_by_valve(made, ground, way, 6.0) == []
+
+
+CENTRED = replace(
+    TIMING, on_s=0.41, rest_max_s=0.05,
+    centred=PwmLimits(
+        frequency_hz=10.0, duty_min=0.1, duty_max=0.9, min_on_s=0.01, min_off_s=0.01
+    ),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("rate", "sooner_s"),
+    [(20.0, 0.98 * 0.5 * 0.05), (4.0, 0.98 * 0.5 * 0.09), (0.4, 0.98 * 0.5 * 0.09), (38.0, 0.0)],
+)
+def test_a_pulse_that_stands_in_its_middle_opens_at_the_border_half_a_gap_sooner(
+    rate: float, sooner_s: float
+) -> None:
+    # Duties of 0.5, 0.1, 0.01 (as long as the shortest pulse), and above the last: no gap at all.
+    route = (Crossing(0.0, None, True, 5.0), Crossing(2.0, rate, False, 5.0))
+    assert orders(route, CENTRED, dosing)[-1].at_s == pytest.approx(2.0 - 0.36 - sooner_s)
+    assert orders(route, TIMING, dosing)[-1].at_s == pytest.approx(2.0 - 0.36)
+    held = replace(CENTRED, rest_max_s=0.003)
+    assert orders(route, held, dosing)[-1].at_s >= 2.0 - 0.363 - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("after_s", "rate", "outside", "sooner"),
+    [(0.2, 30.0, False, False), (0.2, None, True, False), (0.6, 30.0, False, True),
+     (0.6, None, True, True)],
+)  # fmt: skip
+def test_it_opens_no_sooner_where_something_follows_that_makes_its_period_shorter(
+    after_s: float, rate: float | None, outside: bool, sooner: bool
+) -> None:
+    timing = replace(CENTRED, up_s=0.36, border_off_s=0.36)
+    route = (
+        Crossing(0.0, None, True, 5.0), Crossing(2.0, 20.0, False, 5.0),
+        Crossing(2.0 + after_s, rate, outside, 5.0),
+    )  # fmt: skip
+    opened = orders(route, timing, dosing)[1]
+    assert opened.duty == 0.5
+    assert (opened.at_s < 2.0 - 0.36 - 1e-9) is sooner
+
+
+def test_it_opens_no_sooner_than_a_closing_takes() -> None:
+    route = (
+        Crossing(0.0, 20.0, False, 5.0), Crossing(2.0, None, True, 5.0),
+        Crossing(2.1, 20.0, False, 5.0),
+    )  # fmt: skip
+    shut, opened = orders(route, replace(CENTRED, off_s=0.36, border_off_s=0.36), dosing)[1:]
+    assert opened.at_s - shut.at_s == pytest.approx(CENTRED.dwell_min_s)
 
 
 def test_a_valve_that_opens_at_the_border_is_not_driven_past_its_target() -> None:

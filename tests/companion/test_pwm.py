@@ -359,3 +359,36 @@ def test_a_gap_too_short_for_the_valve_is_the_shortest() -> None:
     engine.submit(plan([duty], change(restart_s, 0.5)), now_s=0.0)
     found = pulses(engine.advance(restart_s - 1e-6), until_s=restart_s)
     assert restart_s - sum(b - a for a, b in found) == pytest.approx(PWM.min_off_s)
+
+
+# ------------------------------------------------------------------- the last pulse before closing
+
+
+@pytest.mark.parametrize("at_s", [1.0, 1.02, 1.05, 1.08])
+@pytest.mark.parametrize("duty", [0.3, 0.6, 0.85, 0.95])
+def test_the_last_pulse_before_a_planned_closing_ends_with_it(duty: float, at_s: float) -> None:
+    # In the middle of its period half a gap of dry ground would lie ahead of every border.
+    engine = PulseEngine(PWM, 1, start_s=0.0)
+    engine.submit(plan([duty], change(at_s, 0.0)), now_s=0.0)
+    found = pulses(engine.advance(3.0))
+    assert found[-1][1] == pytest.approx(at_s, abs=1e-9)
+    assert sum(b - a for a, b in found) == pytest.approx(
+        duty * at_s, abs=1e-3 + (duty > 0.9) * 0.01
+    )
+
+
+def test_a_planned_change_of_rate_leaves_the_last_pulse_in_the_middle() -> None:
+    engine = PulseEngine(PWM, 1, start_s=0.0)
+    engine.submit(plan([0.5], change(10.0 * T, 0.7), change(11.0 * T, 0.0)), now_s=0.0)
+    found = pulses(engine.advance(3.0))
+    assert sum(found[9]) / 2.0 == pytest.approx(9.5 * T)
+    assert found[-1][1] == pytest.approx(11.0 * T)
+
+
+def test_a_closing_that_is_put_off_after_its_last_pulse_began_opens_nothing_more() -> None:
+    engine = PulseEngine(PWM, 1, start_s=0.0)
+    engine.submit(plan([0.5], change(10.0 * T, 0.0)), now_s=0.0)
+    edges = engine.advance(9.2 * T)
+    engine.submit(plan([0.5], change(10.05 * T, 0.0), sequence=1, issued_s=9.2 * T), now_s=9.2 * T)
+    found = pulses(edges + engine.advance(3.0))
+    assert found[-1] == (pytest.approx(9.5 * T), pytest.approx(10.0 * T))
