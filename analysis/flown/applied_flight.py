@@ -84,6 +84,7 @@ class AppliedFlight:
     pressure_kpa: Series | None = None
     tank_l: Series | None = None
     wind_m_s: Series | None = None
+    wind_from_deg: Series | None = None
     fix: Series | None = None
     unknown: tuple[Spans, ...] = ()
 

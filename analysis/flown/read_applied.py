@@ -145,6 +145,7 @@ def _is_offset(value: object) -> bool:
 
 
 _NAN = float("nan")
+WIND_FROM = "wind from"
 PARSED_AT_ONCE = 1000
 # Which value of which sensor's message becomes a series, and which field tells a fault.
 _SENSORS = {
@@ -210,6 +211,7 @@ def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
         pressure_kpa=sensors["PressureReport"],
         tank_l=sensors["TankReport"],
         wind_m_s=sensors["WindReport"],
+        wind_from_deg=sensors[WIND_FROM],
         fix=sensors["GnssReport"],
     )
     return _mended(flight, applied.holes, missing, unread)
@@ -294,6 +296,8 @@ def _sensors(
     journal: OpenJournal, names: FieldNames, unread: list[str] | None
 ) -> dict[str, Series | None]:
     pairs: dict[str, list[tuple[float, float | None]]] = {kind: [] for kind in _SENSORS}
+    pairs[WIND_FROM] = []
+    blown = [names.get("WindReport", ()).index(name) for name in _blown_in(names)]
     places = {
         kind: tuple(names[kind].index(name) if name else -1 for name in ("received_s", *wanted))
         for kind, wanted in _SENSORS.items()
@@ -308,11 +312,30 @@ def _sensors(
             is_sound = fault < 0 or not values[fault]
             told = values[value] if is_sound else None
             pairs[kind].append((values[at], told["Fix"] if isinstance(told, dict) else told))
+            if kind == "WindReport" and blown:
+                pairs[WIND_FROM].append((values[at], _from_deg(*(values[n] for n in blown))))
     except sqlite3.DatabaseError as error:
         if unread is None or "locked" in str(error):
             raise
         unread.append(f"what sensors said behind a damaged place: {' '.join(str(error).split())}")
     return {kind: _series(rows) for kind, rows in pairs.items()}
+
+
+def _blown_in(names: FieldNames) -> tuple[str, ...]:
+    """Return the fields of where a wind blows to; none in journals that hold only its speed."""
+    wanted = ("east_m_s", "north_m_s")
+    return wanted if set(wanted) <= set(names.get("WindReport", ())) else ()
+
+
+def _from_deg(east_m_s: float | None, north_m_s: float | None) -> float | None:
+    """Return where a wind comes from; None for one without a direction.
+
+    >>> _from_deg(3.0, 0.0), _from_deg(0.0, 0.0)
+    (270.0, None)
+    """
+    if east_m_s is None or north_m_s is None or not math.hypot(east_m_s, north_m_s) > 0.0:
+        return None
+    return math.degrees(math.atan2(-east_m_s, -north_m_s)) % 360.0
 
 
 def _messages(entries: Iterator[Entry]) -> Iterator[tuple[str, list[Any]]]:

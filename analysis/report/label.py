@@ -8,22 +8,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.report.facts import is_estimate, while_spraying
-from companion.config.limits import LimitsFile, limits_of
-from companion.core.label import DAY_S
+from companion.config.limits import WATCH_S, LimitsFile, limits_of
+from companion.core.label import DAY_S, LabelLimits, is_from
 
 if TYPE_CHECKING:
-    from analysis.flown.applied_flight import AppliedFlight, Floats
+    from analysis.flown.applied_flight import AppliedFlight, Floats, Series
     from analysis.report.legal_fields import Told
     from analysis.report.treated import Clock, Treated
 
 # Less of the spraying than this outside is noise of a filter, not a limit that was broken.
 OUTSIDE_MAX_S = 0.2
+# A wind is reported at 1 Hz and more, and closes the valves once it is too old.
+UNKNOWN_MAX_S = 1.0
 
 
 def label_of(
@@ -35,8 +38,8 @@ def label_of(
         return None
     rows = [
         *_flown(label, flight),
-        *_wind(label, flight, treated),
-        *_times(label, flight, treated),
+        *_wind(label, flight),
+        *_times(label, flight, treated, told),
         *_declared(label, told),
         *_buffers(label, flight),
     ]
@@ -97,49 +100,121 @@ def _step_s(flight: AppliedFlight) -> float:
     return float(np.median(np.diff(flight.time_s))) if len(flight.time_s) > 1 else 0.0
 
 
-def _wind(label: LimitsFile, flight: AppliedFlight, treated: Treated) -> Iterator[dict[str, Any]]:
-    """Yield the wind that was heard while spraying; what the operator measured is declared."""
-    span, series = label.span("wind_m_s"), flight.wind_m_s
-    if span is None or treated.first_s is None or treated.last_s is None:
+def _wind(label: LimitsFile, flight: AppliedFlight) -> Iterator[dict[str, Any]]:
+    """Yield the wind as it was known while spraying; what the operator measured is declared.
+
+    A wind outside that closed the valves was kept, so only samples with flow count.
+    """
+    span, by_autopilot = label.span("wind_m_s"), label.wind_by == "autopilot"
+    if span is not None:
+        known = _while_open(flight, flight.wind_m_s)
+        outside = ~((known >= span[0]) & (known <= span[1])) & np.isfinite(known)
+        yield from _blown(
+            "wind", label.words("wind_m_s", "m/s"), "m/s", known, outside,
+            flight=flight, must=by_autopilot,
+        )  # fmt: skip
+    if label.wind_from_deg:
+        known = _while_open(flight, flight.wind_from_deg)
+        outside = np.array([
+            math.isfinite(each) and not is_from(each, label.wind_from_deg)
+            for each in known.tolist()
+        ], dtype=bool)  # fmt: skip
+        yield from _blown(
+            "wind direction", label.wind_words(), "deg", known, outside,
+            flight=flight, must=by_autopilot,
+        )  # fmt: skip
+
+
+def _while_open(flight: AppliedFlight, series: Series | None) -> Floats:
+    """Return what was known of a wind at each sample with flow; NaN where nothing was.
+
+    A change closes the valves a step later, and the samples show that; what the autopilot repeats
+    is no estimate, except shortly after one.
+    """
+    at_s = flight.time_s[while_spraying(flight)]
+    if series is None or flight.wind_m_s is None:
+        return np.full(len(at_s), np.nan)
+    sound = is_estimate(flight.wind_m_s.value) & np.isfinite(series.value)
+    time_s, value = series.time_s[sound], series.value[sound]
+    if not len(time_s):
+        return np.full(len(at_s), np.nan)
+    index = np.searchsorted(time_s, at_s - OUTSIDE_MAX_S, side="right") - 1
+    age_s = at_s - time_s[np.maximum(index, 0)]
+    age_max_s = flight.setup.limits.wind_age_max_s + OUTSIDE_MAX_S
+    found: Floats = np.where((index >= 0) & (age_s <= age_max_s), value[index], np.nan)
+    return found
+
+
+def _blown(
+    name: str,
+    limit: str,
+    unit: str,
+    known: Floats,
+    outside: NDArray[np.bool_],
+    *,
+    flight: AppliedFlight,
+    must: bool,
+) -> Iterator[dict[str, Any]]:
+    heard = known[np.isfinite(known)]
+    if not len(heard):
+        if must:
+            yield _row(name, limit, "not known", None)
         return
-    limit = label.words("wind_m_s", "m/s")
-    known = np.array([])
-    if series is not None:
-        inside = (series.time_s >= treated.first_s) & (series.time_s <= treated.last_s)
-        known = series.value[inside & is_estimate(series.value)]
-    if not len(known):
-        if label.wind_by == "autopilot":
-            yield _row("wind", limit, "not known", None)
-        return
-    kept = bool(np.all((known >= span[0]) & (known <= span[1])))
-    yield _row("wind", limit, f"{known.min():.1f} to {known.max():.1f} m/s", kept)
-    if label.wind_by == "autopilot" and label.wind_from_deg:
-        # The safety stage closes on it; the journal's samples hold no direction.
-        yield _row("wind direction", "by sectors", "checked in flight", _was_checked(flight))
+    text = f"{heard.min():.1f} to {heard.max():.1f} {unit}"
+    if outside.sum() * _step_s(flight) > OUTSIDE_MAX_S:
+        yield _row(name, limit, text, kept=False)
+    elif must and (~np.isfinite(known)).sum() * _step_s(flight) > UNKNOWN_MAX_S:
+        yield _row(name, limit, f"{text}, not known all the time", None)
+    else:
+        yield _row(name, limit, text, kept=True)
 
 
-def _was_checked(flight: AppliedFlight) -> bool | None:
-    return True if flight.setup.limits.label is not None else None
-
-
-def _times(label: LimitsFile, flight: AppliedFlight, treated: Treated) -> Iterator[dict[str, Any]]:
+def _times(
+    label: LimitsFile, flight: AppliedFlight, treated: Treated, told: Told
+) -> Iterator[dict[str, Any]]:
     """Yield whether all spraying lay in the permitted days and hours, by the autopilot's clock."""
-    limits = label.flown({})
+    limits = label.flown(told.values)
     if not limits.needs_utc:
         return
-    limit = label.when()
-    if treated.first_s is None or treated.last_s is None or flight.utc_source != "autopilot":
-        yield _row("hours", limit, "not known by the autopilot's clock", None)
-        return
-    ends = [each + flight.utc_offset_s for each in (treated.first_s, treated.last_s)]
+    ends: tuple[float, float] | None = None
+    is_dated = treated.first_s is not None and flight.utc_source == "autopilot"
+    if is_dated and treated.first_s is not None and treated.last_s is not None:
+        ends = treated.first_s + flight.utc_offset_s, treated.last_s + flight.utc_offset_s
+    unknown = "not known by the autopilot's clock"
+    if limits.hours_s or limits.days_s is not None:
+        if ends is None:
+            yield _row("hours", label.when(), unknown, None)
+        else:
+            text = f"{ends[1] - ends[0]:.0f} s from {_clock_text(ends[0])} UTC"
+            yield _row("hours", label.when(), text, _in_hours(limits, ends))
+    if limits.observed_s is not None:
+        words = f"at most {label.observed_max_h:g} h before spraying"
+        if ends is None:
+            yield _row("age of the weather", words, unknown, None)
+        else:
+            seen_s = limits.observed_s[0] + WATCH_S
+            text = f"{(ends[1] - seen_s) / 3600.0:.1f} h at the end"
+            kept = limits.observed_s[0] <= ends[0] <= ends[1] < limits.observed_s[1]
+            yield _row("age of the weather", words, text, kept)
+
+
+def _clock_text(utc_s: float) -> str:
+    return datetime.fromtimestamp(utc_s, tz=UTC).strftime("%Y-%m-%d %H:%M")
+
+
+def _in_hours(limits: LabelLimits, ends: tuple[float, float]) -> bool:
+    """Return whether a flight from one end to the other lay in the days, and in one span of hours.
+
+    A flight is shorter than what lies between two spans of a day.
+    """
     kept = limits.days_s is None or limits.days_s[0] <= ends[0] <= ends[1] < limits.days_s[1]
-    if limits.hours_s:
-        # Both ends in one span: a flight is shorter than what lies between two spans of a day.
-        kept &= any(
+    return kept and (
+        not limits.hours_s
+        or any(
             (ends[0] - first) % DAY_S <= (ends[1] - first) % DAY_S < (last - first) % DAY_S
             for first, last in limits.hours_s
         )
-    yield _row("hours", limit, f"{ends[1] - ends[0]:.0f} s of spraying", kept)
+    )
 
 
 def _declared(label: LimitsFile, told: Told) -> Iterator[dict[str, Any]]:
