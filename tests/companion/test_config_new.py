@@ -123,9 +123,10 @@ def test_a_map_without_a_unit_needs_one(
     assert "write one of L/ha" in capsys.readouterr().err
     blank = tmp_path / "my zone.geojson"
     zone.rename(blank)
-    told = f"\n\n\n\n{blank} L/ha\n\n"
+    told = f"\n\n\n\n{blank}\n{blank} L/ha\n\n"
     asking = ["config", "new", "--out", str(out), "--force"]
-    assert CliRunner().invoke(app, asking, input=told).exit_code == 0
+    done = CliRunner().invoke(app, asking, input=told)
+    assert (done.exit_code, done.output.count("does not say the unit")) == (0, 1)
     assert load(out).prescription.unit == "L/ha"  # type: ignore[union-attr]
 
 
