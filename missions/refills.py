@@ -26,7 +26,7 @@ STUB_M = 10.0
 SHARES, TANKS = 8, 2
 ROUNDS = 30
 # So many places are tried at once as ends of a sortie, each with all its beginnings.
-BLOCK = 128
+BLOCK = 48
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -405,8 +405,9 @@ class _Run:
             np.searchsorted(load, load[1:] - limits.usable_l - 1e-9),
             np.searchsorted(np.maximum.accumulate(on_s), to_s - longest_s),
         )
+        # The last place first: of sorties that take the same the first is the nearest one.
         known_s = np.full(count + 1, math.inf)
-        known_s[0] = 0.0
+        known_s[count] = 0.0
         before: list[int] = []
         for block in range(0, count, BLOCK):
             end = min(block + BLOCK, count)
@@ -426,13 +427,13 @@ class _Run:
             place = np.arange(low, end)
             is_too_far = (place < first[rows, None]) | (place > np.arange(block, end)[:, None])
             seconds[is_too_far | ~(wh <= limits.usable_wh)] = math.inf
-            for at, row in enumerate(seconds, start=block):
-                whole_s = known_s[some] + row
-                # The nearest of those that take the same.
-                best = len(whole_s) - 1 - int(whole_s[::-1].argmin())
-                known_s[at + 1] = whole_s[best]
-                before.append(low + best - 1)
-        return before if math.isfinite(known_s[-1]) else None
+            begun_s = known_s[count - end + 1 : count - low + 1]
+            for at, row in enumerate(np.ascontiguousarray(seconds[:, ::-1]), start=block):
+                whole_s = begun_s + row
+                best = int(whole_s.argmin())
+                known_s[count - at - 1] = whole_s[best]
+                before.append(end - best - 2)
+        return before if math.isfinite(known_s[0]) else None
 
     @staticmethod
     def _ferries_s(outs_s: Floats, homes_s: Floats) -> tuple[Floats, Floats]:
