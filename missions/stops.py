@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 from companion.core.frame import LocalFrame
@@ -114,7 +114,7 @@ def _changed(before: Leg, leg: Leg) -> list[Stop]:
 
 
 def _without_runs(stops: list[Stop]) -> list[Stop]:
-    kept, passed = stops[:1], list[Place]()
+    kept, row = stops[:1], _Row()
     for here, after in zip(stops[1:], [*stops[2:], None], strict=True):
         goes_on = (
             after is not None
@@ -123,13 +123,37 @@ def _without_runs(stops: list[Stop]) -> list[Stop]:
         )
         if after is not None and goes_on:
             ends = (kept[-1].place, here.place, after.place)
-            # One place of a short gap stays: a leg far beyond a line is taken for a ferry.
-            if (not passed and is_run(*ends)) or (here.on_line and is_passed(*ends, passed)):
-                passed.append(here.place)
+            if row.leaves_out(ends, opens=here.opens, on_line=here.on_line):
                 continue
         kept.append(here)
-        passed = []
+        row = _Row()
     return kept
+
+
+@dataclass(slots=True)
+class _Row:
+    """Places in a row that are no waypoints, and the first of them at which a line ends."""
+
+    passed: list[Place] = field(default_factory=list)
+    ended: Place | None = None
+
+    def leaves_out(
+        self, ends: tuple[Place, Place, Place], *, opens: bool | None, on_line: bool
+    ) -> bool:
+        """Leave the middle place out where the way between the others needs no waypoint there.
+
+        A line whose leg begins or ends too far beyond it stays dry: of a gap one place stays.
+        """
+        before, here, after = ends
+        ended = here if self.ended is None and opens is False else self.ended
+        is_far = opens is True and math.dist(before, here) > RUN_M
+        is_far |= ended is not None and math.dist(ended, after) > RUN_M
+        is_straight = self.ended is None and is_run(*ends)
+        if is_far or not (is_straight or (on_line and is_passed(*ends, self.passed))):
+            return False
+        self.passed.append(here)
+        self.ended = ended
+        return True
 
 
 def is_passed(before: Place, here: Place, after: Place, passed: Sequence[Place] = ()) -> bool:
@@ -300,17 +324,22 @@ def _ways_without_runs(ways: list[_Way], sprays: Sequence[bool]) -> list[_Way]:
 
     `sprays` says of which legs are lines.
     """
-    kept, passed = ways[:1], list[Place]()
+    kept, row = ways[:1], _Row()
     for way in ways[1:]:
         last = kept[-1]
-        ends = (last.start, last.end, way.end)
-        on_line = sprays[last.legs[-1][0]] or sprays[way.legs[0][0]]
+        before, after = sprays[last.legs[-1][0]], sprays[way.legs[0][0]]
         level = not way.upright_m and not last.upright_m
-        same = level and way.speed_m_s == last.speed_m_s
-        if same and (is_run(*ends) or (on_line and is_passed(*ends, passed))):
-            passed.append(last.end)
+        if (
+            level
+            and way.speed_m_s == last.speed_m_s
+            and row.leaves_out(
+                (last.start, last.end, way.end),
+                opens=None if before == after else after,
+                on_line=before or after,
+            )
+        ):
             kept[-1] = replace(last, end=way.end, legs=(*last.legs, *way.legs))
         else:
-            passed = []
             kept.append(way)
+            row = _Row()
     return kept

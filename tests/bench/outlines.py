@@ -222,6 +222,7 @@ def _judged(drawn: Drawn, planned: Planned) -> dict[str, Any]:
         "sorties": len(rows),
         "litres_percent": 100.0
         * (sum(row["volume_l"] for row in rows) / (found["area_ha"] * RATE_L_HA) - 1.0),
+        "overlap_litres_percent": planned.told["overlap_litres_percent"],
         "flight_min": sum(flown) / 60.0,
         "time_percent": 100.0 * (sum(row["flight_s"] for row in rows) / sum(flown) - 1.0),
         "worst_time_percent": max(errors, key=abs),
@@ -459,8 +460,20 @@ def tables(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
     low, high = (pick(row["worst_time_percent"] for row in whole) for pick in (min, max))
     yield f"{'time_percent':20} of sorties {low:+.1f} to {high:+.1f}"
     yield ""
+    yield "twice: ground under two strips; litres: those that fall twice, and those above the map"
+    yield f"{'size':12} {'n':>3} | twice %, litres twice %, litres above % | median, most of each"
+    sizes = _by(whole, lambda row: size_of(row["area_ha"]), ordered=False)
+    for name, some in sizes:
+        columns = [
+            [row[key] for row in some]
+            for key in ("twice_percent", "overlap_litres_percent", "litres_percent")
+        ]
+        yield f"{name:12} {len(some):3} | " + ", ".join(
+            f"{statistics.median(each):.1f} {max(each):.1f}" for each in columns
+        )
+    yield ""
     yield from _peer_rows("kind", _by(whole, lambda row: row["kind"]))
-    yield from _peer_rows("size", _by(whole, lambda row: size_of(row["area_ha"]), ordered=False))
+    yield from _peer_rows("size", sizes)
 
 
 def _by(

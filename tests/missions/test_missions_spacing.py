@@ -16,11 +16,12 @@ from missions.field import build_field
 from missions.plan import Leg, Place, Plan, Settings, Sortie
 from missions.planner import plan_mission
 from missions.spacing import Spacing
-from missions.stops import NEAR_M, near_pairs, near_warnings, waypoints_of
+from missions.stops import NEAR_M, near_pairs, near_warnings, timed, waypoints_of
 from missions.ways import build_ways
 from missions.worth import without_stubs
 from tests.bench.missions import FRAME, to_degrees
 from tests.mission_fields import trees
+from tests.mission_flight import Way, flown_s
 
 SETTINGS = Settings(swath_width_m=6.0, speed_m_s=6.0, moves=500)
 Line = tuple[Place, Place]
@@ -135,6 +136,39 @@ def test_a_short_gap_between_short_lines_on_one_course_keeps_one_waypoint(gap_m:
     stops = [stop.place for stop in waypoints_of(sortie_of(first, second))]
     kept = [place for place in stops if place in (first[1], second[0])]
     assert len(kept) == 1
+
+
+@pytest.mark.parametrize(("first_m", "gap_m"), [(10.0, 40.0), (20.0, 28.0), (60.0, 28.0)])
+def test_no_line_before_or_behind_a_long_gap_is_taken_for_a_ferry(
+    first_m: float, gap_m: float
+) -> None:
+    lines = [
+        ((0.0, 10.0), (first_m, 10.0)),
+        ((first_m + gap_m, 10.0), (first_m + gap_m + 10.0, 10.0)),
+    ]
+    for some in (lines, [(end, start) for start, end in reversed(lines)]):
+        x = [stop.place[0] for stop in waypoints_of(sortie_of(*some))]
+        for line in some:
+            low, high = sorted(place[0] for place in line)
+            # The companion has a leg begin and end 30 m beyond its line at most.
+            assert any(
+                low - 30.0 <= min(leg) <= low and high <= max(leg) <= high + 30.0
+                for leg in pairwise(x)
+            )
+
+
+def test_a_row_of_short_lines_is_timed_as_it_is_flown() -> None:
+    # Along an outline walked with a receiver: lines of 2 to 9 m, each a little off the last one.
+    x, lines = 0.0, []
+    for number in range(16):
+        length_m, y = 2.0 + 7.0 * (number % 3) / 2.0, 10.0 + 0.02 * (number % 2)
+        lines.append(((x, y), (x + length_m, y)))
+        x += length_m + 0.05
+    sortie = sortie_of(*lines)
+    (found,) = timed([sortie], SETTINGS)
+    places = np.array([*(stop.place for stop in waypoints_of(sortie)), (0.0, 0.0)])
+    flown = flown_s(Way(places=places, speeds_m_s=np.full(len(places) - 1, SETTINGS.speed_m_s)))
+    assert sum(leg.seconds for leg in found.legs) == pytest.approx(flown, rel=0.03)
 
 
 def test_a_line_shorter_than_a_leg_may_be_is_flown_longer() -> None:
