@@ -204,6 +204,7 @@ def _scene(settings: Settings, folder: Path) -> _Scene:
     profile = with_plant(task.profile, given)
     servo = task.config.output.kind == "servo" and "flight.config" in given
     output = given.get("flight.output", "servo" if servo else "gpio")
+    setup = replace(setup, centres_pulses=output == "gpio")
     return _Scene(
         task=replace(task, setup=setup, profile=profile),
         output=cast(Literal["gpio", "servo"], output),
