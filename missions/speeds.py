@@ -15,6 +15,7 @@ import numpy as np
 
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import flow_for_rate
+from companion.wording import counted
 from missions.demand import M2_PER_HA, Rates, Uniform, valve_places
 from missions.plan import Leg, Place, Settings, Sortie
 from missions.strips import Floats
@@ -182,43 +183,58 @@ def between(leg: Leg, share: float) -> Place:
 READS = 4
 # On fields so large that this would be more places, nothing is said of short cells.
 PLACES_MAX = 2_000_000
+# Under every valve while that is a second's work; else under the valve nearest to the middle.
+EVERY_VALVE_MAX = 250_000
 
 
 def short_warnings(
     sorties: Sequence[Sortie], rates: Rates, frame: LocalFrame, settings: Settings
 ) -> tuple[str, ...]:
-    """Return how many cells under the middle of the boom are shorter than the lag, and where."""
+    """Return how many cells under a valve are shorter than the lag, and where.
+
+    Not under the middle of the boom: maps that are made for this sprayer have their edges there,
+    between two valves. Of a leg, the valve with the most of them counts.
+    """
     legs = [(sortie.number, leg) for sortie in sorties for leg in sortie.legs
             if leg.kind == "spray"]  # fmt: skip
     steps = sum(leg.length_m / max(leg.speed_m_s, 0.1) for _, leg in legs)
     if isinstance(rates, Uniform) or not settings.settle_s > 0.0:
         return ()
-    if not steps / settings.settle_s * READS <= PLACES_MAX:
+    places = steps / settings.settle_s * READS
+    if not places <= PLACES_MAX:
         return ()
+    valves = valve_places(settings.swath_width_m, settings.valves)[:, 0].tolist()
+    if places * len(valves) > EVERY_VALVE_MAX:
+        valves = [min(valves, key=abs)]
     found = [
         (length_m, number, leg, at_m)
         for number, leg in legs
-        for length_m, at_m in _short(leg, rates, settings.settle_s * leg.speed_m_s)
+        for length_m, at_m in max(
+            (_short(leg, rates, settings.settle_s * leg.speed_m_s, valve) for valve in valves),
+            key=len,
+        )
     ]
     if not found:
         return ()
     length_m, number, leg, at_m = min(found, key=lambda each: each[0] / each[2].speed_m_s)
     place = frame.to_geographic(*between(leg, at_m / leg.length_m))
     return (
-        f"{len(found)} cells are flown through in less than {settings.settle_s:.2f} s, which a "
-        f"change of rate takes: the shortest is {length_m:.1f} m at {leg.speed_m_s:g} m/s, sortie "
-        f"{number} near {place[0]:.6f}, {place[1]:.6f}; fly slower, or make the cells longer",
+        f"{counted(len(found), 'cell')} {'is' if len(found) == 1 else 'are'} flown through in less "
+        f"than {settings.settle_s:.2f} s, which a change of rate takes: the shortest is "
+        f"{length_m:.1f} m at {leg.speed_m_s:g} m/s, sortie {number} near {place[0]:.6f}, "
+        f"{place[1]:.6f}; fly slower, or make the cells longer",
     )
 
 
-def _short(leg: Leg, rates: Rates, settle_m: float) -> list[tuple[float, float]]:
-    """Return length and middle of the cells inside a line that are shorter than `settle_m`.
+def _short(leg: Leg, rates: Rates, settle_m: float, right_m: float) -> list[tuple[float, float]]:
+    """Return length and middle of the cells beside a line that are shorter than `settle_m`.
 
     The first and the last one are cut by the line itself, and no cells.
     """
     count = max(1, math.ceil(leg.length_m / settle_m * READS))
     start, end = np.array(leg.points[0]), np.array(leg.points[-1])
     middle = start + np.outer((np.arange(count) + 0.5) / count, end - start)
+    middle += right_m / leg.length_m * np.array([end[1] - start[1], start[0] - end[0]])
     rate: Floats = np.nan_to_num(rates.rates_at(middle[:, 0], middle[:, 1]), nan=0.0)
     changes = np.flatnonzero(np.diff(rate) != 0.0) + 1
     each_m = leg.length_m / count

@@ -31,7 +31,16 @@ from missions.make.arguments import (
 )
 from missions.make.classes import Method
 from missions.make.cleaning import STEPS, Step
-from missions.make.data import INDICES, Values, Wanted, filled, read_values
+from missions.make.data import (
+    INDICES,
+    POINT_SUFFIXES,
+    Points,
+    Values,
+    Wanted,
+    filled,
+    read_values,
+    write_points,
+)
 from missions.make.flown import (
     FlownField,
     bounded,
@@ -137,6 +146,10 @@ def zones(
         str | None,
         typer.Option(metavar="S,S,...", help=f"Steps for points: {', '.join(STEPS)}, or none."),
     ] = None,
+    cleaned: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write the points that are left: .csv, .geojson."),
+    ] = None,
     data_width_m: Annotated[
         float | None, typer.Option(metavar="M", help="Between passes of points.", min=0.1)
     ] = None,
@@ -173,8 +186,9 @@ def zones(
         raise typer.BadParameter("--as-is is to compare, not to fly: name another format")
     target = map_target(out)
     writer = writer_for(target, format_name)
-    for path in (out, *([] if png is None else [png])):
+    for path in (out, *(one for one in (png, cleaned) if one is not None)):
         check_folder(path)
+    _check_cleaned(cleaned, data, force=force)
     wanted = _wanted(
         data, value or [],
         Wanted(
@@ -187,6 +201,7 @@ def zones(
         field = flown_field(config, no_spray or [], angle_deg, across)
         tell("reading the data", 1, 4)
         read = [read_values(path, one, field.frame) for path, one in zip(data, wanted, strict=True)]
+        points = _points_of(read, data) if cleaned is not None else None
         limits = None if as_is else limits_of(config, field.sprayer, margin)
         places = _places(
             field, read, limits or limits_of(config, field.sprayer, margin), as_is, out
@@ -202,6 +217,9 @@ def zones(
         map_file = _map_file(made, field, target, data, as_is)
         problems = problems_of(map_file, config, field)
         files = written(map_file, out, target, config, field, problems, writer.name, force=force)
+        if cleaned is not None and points is not None:
+            write_points(cleaned, points)
+            files = [*files, cleaned]
     if png is not None:
         draw_picture(map_file, png, title=out.name)
     result = _result(made, read, field, limits, missing, problems, files)
@@ -289,6 +307,26 @@ def _wanted(data: Sequence[Path], values: Sequence[str], of_all: Wanted) -> list
     names: list[str | None] = [*values] * (len(data) if len(values) == 1 else 1)
     names = names or [None] * len(data)
     return [replace(of_all, value=name) for name in names]
+
+
+def _check_cleaned(cleaned: Path | None, data: Sequence[Path], *, force: bool) -> None:
+    if cleaned is None:
+        return
+    if cleaned.suffix.casefold() not in POINT_SUFFIXES:
+        raise typer.BadParameter(f"--cleaned is written as {' or '.join(POINT_SUFFIXES)}")
+    if cleaned in data:
+        raise PlanError(f"{cleaned}: --cleaned would replace the data; give another name")
+    if cleaned.exists() and not force:
+        raise PlanError(f"{cleaned}: exists; another --cleaned, or --force to replace it")
+
+
+def _points_of(read: Sequence[Values], data: Sequence[Path]) -> Points:
+    """Return the points that are left of the one file of points."""
+    found = [one.kept for one in read if one.kept is not None]
+    if len(found) != 1:
+        what = "no points" if not found else f"{len(found)} files of points"
+        raise PlanError(f"{data[0]}: --cleaned takes one file of points, and DATA has {what}")
+    return found[0]
 
 
 def _places(

@@ -7,6 +7,10 @@ map readers.
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,7 +22,16 @@ from pyproj import CRS, Transformer
 
 from companion.core.frame import LocalFrame
 from companion.errors import MapError
-from missions.make.cleaning import STEPS, Cleaned, Step, Track, cleaned, is_track, pass_width_m
+from missions.make.cleaning import (
+    STEPS,
+    Cleaned,
+    Ints,
+    Step,
+    Track,
+    cleaned,
+    is_track,
+    pass_width_m,
+)
 from missions.make.passes import Places
 from missions.maps.assemble import crs_of, ground_of, zone_names
 from missions.maps.cells import to_cells_of
@@ -31,6 +44,8 @@ from missions.maps.local import places as local_places
 from missions.maps.local import project_all
 from missions.maps.model import Affine, Floats, map_error
 from missions.maps.registry import read_layer
+from missions.maps.whole_file import write_whole
+from missions.strips import Objects
 
 # Indices by the bands they are made of. Normalised differences: NDVI (Rouse et al. 1974), GNDVI
 # (Gitelson et al. 1996), NDRE (Barnes et al. 2000), NDMI (Gao 1996); CIRE is a ratio less one
@@ -74,10 +89,19 @@ class Wanted:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Points:
+    """Points as longitude and latitude, with what their file says of them."""
+
+    degrees: Floats
+    columns: Mapping[str, Floats]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Values:
     """One layer of values: its name, how fine it is, and what it says at places.
 
-    `cleaned` counts the points that were removed, of `count` in all; None where there are none.
+    `removed` counts the points that were removed, of `count` in all, and `kept` are the others;
+    None where there are none.
     """
 
     name: str
@@ -86,6 +110,7 @@ class Values:
     said: tuple[str, ...] = ()
     count: int | None = None
     removed: Mapping[str, int] | None = None
+    kept: Points | None = None
 
 
 def read_values(path: Path, wanted: Wanted, frame: LocalFrame) -> Values:
@@ -104,12 +129,21 @@ def read_values(path: Path, wanted: Wanted, frame: LocalFrame) -> Values:
     crs, _ = crs_of(found, path, wanted.crs)
     numbers = _numbers(found.columns)
     if found.marks:
-        where = [index for index, mark in found.marks.items() if mark.geom_type == "Point"]
-        native = np.array([found.marks[index] for index in where], dtype=object)
+        native, where = points_of(found)
         degrees = shapely.get_coordinates(to_longitude_latitude(native, crs, path=path))
         chosen = {name: values[where] for name, values in numbers.items()}
         return _points(path, degrees, chosen, wanted, frame)
     return _areas(path, found, crs, numbers, wanted, frame)
+
+
+def points_of(layer: Layer) -> tuple[Objects, Ints]:
+    """Return the points of a layer, whether each is a feature or one of several, and their rows."""
+    rows = np.array([*layer.marks], dtype=np.int64)
+    parts, of = shapely.get_parts(
+        np.array([*layer.marks.values()], dtype=object), return_index=True
+    )
+    points = shapely.get_type_id(parts) == shapely.GeometryType.POINT
+    return parts[points], rows[of[points]]
 
 
 def _numbers(columns: Sequence[Column]) -> dict[str, Floats]:
@@ -287,7 +321,45 @@ def _points(
             code="too-few-points",
         )
     at = _average_around(points[found.kept], columns[name][found.kept], width_m)
-    return Values(name=name, grain_m=width_m, at=at, count=len(points), removed=found.removed)
+    return Values(
+        name=name, grain_m=width_m, at=at, count=len(points), removed=found.removed,
+        kept=Points(
+            degrees=degrees[found.kept],
+            columns={each: column[found.kept] for each, column in columns.items()},
+        ),
+    )  # fmt: skip
+
+
+POINT_SUFFIXES = (".csv", ".geojson")
+
+
+def write_points(path: Path, points: Points) -> None:
+    """Write points with their columns, as CSV or GeoJSON; what is no number stays empty."""
+    names = [*points.columns]
+    rows = zip(points.degrees.tolist(), *(points.columns[name].tolist() for name in names),
+               strict=True)  # fmt: skip
+    if path.suffix.casefold() == ".csv":
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(["lat", "lon", *names])
+        for (lon, lat), *values in rows:
+            shown = ["" if math.isnan(value) else repr(value) for value in values]
+            table.writerow([f"{lat:.8f}", f"{lon:.8f}", *shown])
+        write_whole(path, text.getvalue().encode("utf-8"))
+        return
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [round(lon, 8), round(lat, 8)]},
+            "properties": {
+                name: None if math.isnan(value) else value
+                for name, value in zip(names, values, strict=True)
+            },
+        }
+        for (lon, lat), *values in rows
+    ]
+    found = {"type": "FeatureCollection", "features": features}
+    write_whole(path, json.dumps(found).encode("utf-8"))
 
 
 def counts_text(found: Cleaned) -> str:

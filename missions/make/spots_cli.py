@@ -29,7 +29,7 @@ from missions.make.arguments import (
     OutFile,
     Picture,
 )
-from missions.make.data import in_degrees
+from missions.make.data import in_degrees, points_of
 from missions.make.flown import (
     FlownField,
     bounded,
@@ -65,6 +65,9 @@ BAR_AFTER_S = 2.0
 POSITION_M = {"rtk-fixed": 0.02, "rtk-float": 0.3, "dgps": 0.6, "3d": 1.5}
 # Of a lag, from one change to the next, and of a servo frame of 20 ms: as simulated.
 LAG_SHARE, SERVO_S = 0.05, 0.020 / math.sqrt(12.0)
+# What is left of the autopilot's clock once it is followed: the largest shift at 5 m/s, 5.8 mm
+# (docs/measurements/performance.md, a clock of another rate).
+CLOCK_S = 0.0012
 # What corrected wind leaves: how far wind is known, 1 sd.
 WIND_SD_M_S = 0.5
 # A stretch begins so much before the way that the aircraft takes to its speed.
@@ -250,9 +253,9 @@ def read_weeds(
                 path, "a raster is no weeds", fix="export points or polygons", code="no-polygon"
             )
         native, _ = crs_of(found, path, crs)
-        marks = [one for one in found.marks.values() if one.geom_type == "Point"]
-        if marks:
-            moved = to_longitude_latitude(np.array(marks, dtype=object), native, path=path)
+        marks, _ = points_of(found)
+        if len(marks):
+            moved = to_longitude_latitude(marks, native, path=path)
             areas += _discs(shapely.get_coordinates(moved), frame, radius_m)
         if any(one is not None for one in found.geometries):
             ground, _ = ground_of(found, native, zone_names(found), path)
@@ -312,6 +315,7 @@ def budget_parts(
         chance("place of the weeds", weeds_m, weeds_m),
         chance("position of the aircraft", here_m, here_m),
         chance("scatter of the lags", speed * jitter_s, 0.0),
+        sure("autopilot's clock", speed * CLOCK_S, 0.0),
         sure("rise and end of the flow", speed * half_s, 0.0),
         sure("half a PWM period", speed * field.sprayer.period_s / 2.0, 0.0),
         chance("wind that is left", blown_m, blown_m)

@@ -18,9 +18,10 @@ import shapely
 import typer
 from pyproj import CRS, Transformer
 
+from companion.core.frame import LocalFrame
 from companion.errors import VrsprayError
 from missions.make.spots import Budget, Part, misses, openings
-from missions.make.spots_cli import spots
+from missions.make.spots_cli import read_weeds, spots
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "zones" / "config.toml"
@@ -98,11 +99,13 @@ def missed_share(ground: Any, seed: int, *, wind_m: float, weeds_m: float) -> fl
     draw = np.random.default_rng(seed)
     weeds = places() + draw.normal(0.0, weeds_m, (40, 2))
     way = draw.uniform(0.0, 2.0 * math.pi)
+    # That of the flight: the companion follows it to so much.
+    clock_s = draw.choice([-0.0012, 0.0012])
     count = 0
     for weed in weeds:
         # Each weed is met in another pass or moment: errors of its own; the wind is that of all.
         along = draw.normal(0.0, 0.02) + SPEED_M_S * (
-            draw.normal(0.0, 0.05 * 0.118) + draw.uniform(-0.01, 0.01)
+            draw.normal(0.0, 0.05 * 0.118) + draw.uniform(-0.01, 0.01) + clock_s
         )
         across = draw.normal(0.0, 0.02)
         # An opening is full from half its rise and up to one PWM period late, and may be carried.
@@ -114,6 +117,28 @@ def missed_share(ground: Any, seed: int, *, wind_m: float, weeds_m: float) -> fl
         spots = shapely.points([at - ahead, at + ahead])
         count += not shapely.covers(ground, spots).all()
     return count / len(weeds)
+
+
+def test_weeds_as_geojson_points_or_all_in_one_feature_are_those_of_the_table(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [line.split(",") for line in (data / "weeds.csv").read_text().splitlines()[1:]]
+    places = [[float(lon), float(lat)] for lat, lon in rows]
+    single = [{"type": "Point", "coordinates": place} for place in places]
+    several = [{"type": "MultiPoint", "coordinates": places}]
+    budget = made(capsys, data, tmp_path / "a.gpkg")
+    clock = next(one for one in budget["budget"]["parts"] if "clock" in one["name"])
+    assert (clock["along_m"], clock["by_chance"]) == (pytest.approx(SPEED_M_S * 0.0012), False)
+    for geometries in (single, several):
+        features = [
+            {"type": "Feature", "properties": {}, "geometry": geometry} for geometry in geometries
+        ]
+        path = tmp_path / "weeds.geojson"
+        path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+        frame = LocalFrame(latitude_deg=48.27, longitude_deg=16.9)
+        found = read_weeds(path, frame, 0.1, None, None)
+        table = read_weeds(data / "weeds.csv", frame, 0.1, None, None)
+        assert found.middles == pytest.approx(table.middles, abs=1e-6)
 
 
 def test_a_hundred_fields_miss_no_more_than_is_said(

@@ -391,6 +391,36 @@ def test_every_kind_of_data_becomes_a_map_of_the_whole_field(
     assert areas_ha.sum() == pytest.approx(field_ha, rel=1e-4)
 
 
+def test_points_that_are_left_are_written_and_make_the_same_zones(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["--value", "yield_t_ha", "--rates", "22,14", "--angle-deg", "40"]
+    first = made_of(
+        capsys, data, tmp_path / "a.gpkg", data / "yield.csv", *words,
+        "--cleaned", tmp_path / "left.csv",
+    )  # fmt: skip
+    assert first["files"] == [str(tmp_path / "a.gpkg"), str(tmp_path / "left.csv")]
+    (of_all,) = first["values"]
+    lines = (tmp_path / "left.csv").read_text().splitlines()
+    assert lines[0] == "lat,lon,yield_t_ha,speed_m_s"
+    assert len(lines) - 1 == of_all["points"] - sum(of_all["removed"].values())
+
+    def rounded(path: Path) -> set[tuple[float, ...]]:
+        rows = np.genfromtxt(path, delimiter=",", skip_header=1)
+        return {tuple(row) for row in np.round(rows, 7).tolist()}
+
+    assert rounded(tmp_path / "left.csv") < rounded(data / "yield.csv")
+    width = ["--data-width-m", str(of_all["grain_m"])]
+    for name in ("left.csv", "left.geojson"):
+        found = made_of(
+            capsys, data, tmp_path / "b.gpkg", tmp_path / name, *words, *width,
+            "--clean", "none", "--cleaned", tmp_path / "left.geojson" if name != "left.geojson"
+            else tmp_path / "again.csv",
+        )  # fmt: skip
+        assert found["litres"] == pytest.approx(first["litres"], rel=1e-4)
+    assert rounded(tmp_path / "again.csv") == rounded(tmp_path / "left.csv")
+
+
 def test_the_flight_map_is_written_beside_the_map_that_it_is_made_from(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -415,6 +445,11 @@ def test_the_flight_map_is_written_beside_the_map_that_it_is_made_from(
         (["soil.csv", "--rates", "0,0"], "nothing would be sprayed"),
         (["soil.csv", "--rates", "9,9", "--clean", "dust"], "--clean takes speed"),
         (["nowhere.tif", "--rates", "9,9"], "there is no such file"),
+        (["soil.csv", "--rates", "9,9", "--cleaned", "a.xlsx"], "written as .csv or .geojson"),
+        (["soil.csv", "--rates", "9,9", "--cleaned", "soil.csv"], "would replace the data"),
+        (["soil.csv", "--rates", "9,9", "--cleaned", "yield.csv"], "exists; another --cleaned"),
+        (["satellite.tif", "--value", "NDVI", "--rates", "9,9", "--cleaned", "b.csv"],
+         "takes one file of points, and DATA has no points"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_made_is_said_in_one_line(

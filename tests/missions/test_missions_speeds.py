@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -142,10 +142,34 @@ def test_cells_shorter_than_the_lag_are_named_with_their_place() -> None:
     sortie = Sortie(number=3, depot=0, legs=legs)
     fine = Bands((10.0,) * 60 + (20.0,) + (10.0,) * 39)  # one metre of another rate
     (text,) = short_warnings([sortie], fine, FRAME, settings(settle_s=0.3))
-    assert text.startswith("1 cells are flown through in less than 0.30 s")
+    assert text.startswith("1 cell is flown through in less than 0.30 s")
     assert "sortie 3 near 48.000" in text
     assert short_warnings([sortie], fine, FRAME, settings(settle_s=0.1)) == ()
     assert short_warnings([sortie], Bands((10.0, 20.0)), FRAME, settings(settle_s=0.3)) == ()
+
+
+class Beside:
+    """More to the right of the line from 50 to 51 m and from 60 m on; on the line it is unclear."""
+
+    def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
+        inside = ((north_m >= 50.0) & (north_m < 51.0)) | (north_m >= 60.0)
+        unclear = np.floor(north_m * 10.0) % 2 == 0
+        return np.where(inside & ((east_m > 0.0) | ((east_m == 0.0) & unclear)), 20.0, 10.0)
+
+
+def test_short_cells_are_those_under_valves_not_under_the_edge_between_two() -> None:
+    legs = (Leg(kind="spray", points=((0.0, 0.0), (0.0, 100.0)), speed_m_s=6.0, seconds=20.0),)
+    sortie = Sortie(number=1, depot=0, legs=legs)
+    for valves in (((-1.5, 3.0), (1.5, 3.0)), ((-2.0, 2.0), (0.5, 2.0), (2.0, 2.0))):
+        (text,) = short_warnings([sortie], Beside(), FRAME, settings(settle_s=0.3, valves=valves))
+        assert text.startswith("1 cell is flown through")
+        wide = settings(settle_s=0.15, valves=valves)
+        assert short_warnings([sortie], Beside(), FRAME, wide) == ()
+    back = (Leg(kind="spray", points=((0.0, 100.0), (0.0, 0.0)), speed_m_s=6.0, seconds=20.0),)
+    for right_m, count in ((-1.5, 1), (1.5, 0)):
+        one = settings(settle_s=0.3, valves=((right_m, 3.0), (3.0 * right_m, 1.0)))
+        turned = short_warnings([replace(sortie, legs=back)], Beside(), FRAME, one)
+        assert len(turned) == count
 
 
 @pytest.mark.parametrize("rate_l_ha", [0.0, 5.0, 20.0, 200.0])
