@@ -25,6 +25,7 @@ from analysis.evaluation import Evaluation, evaluate, limit_ratio
 from analysis.strips import strips_of
 from companion.assembly import deliverable, refuse_mismatch
 from companion.config import Config, load
+from companion.core.label import LabelLimits
 from companion.core.nozzle import allowed_duty, flow_for_rate
 from companion.core.prescription import Prescription
 from companion.core.setup import Setup
@@ -33,6 +34,7 @@ from companion.core.types import (
     Fix,
     GnssReport,
     HeartbeatReport,
+    Inhibit,
     Input,
     SpeedReport,
     Telemetry,
@@ -139,7 +141,10 @@ class Flown:
         return {
             "flights": [flight],
             "warnings": warnings,
-            "notes": _notes(self.task.setup.drift),
+            "notes": [
+                *_notes(self.task.setup.drift),
+                *label_notes(self.task.setup.limits.label),
+            ],
             "wall_s": self.wall_s,
             "simulated_s": self.result.simulated_s,
             "times_real_time": self.result.simulated_s / self.wall_s,
@@ -283,6 +288,21 @@ def _notes(drift: Drift | None) -> list[str]:
         "[drift] moves the changes off their boundaries on purpose, for the wind; the figures are "
         "judged at the nozzle, where that counts as error"
     ]
+
+
+def label_notes(label: LabelLimits | None) -> list[str]:
+    """Return which limits of the label keep every valve of such a flight closed."""
+    if label is None:
+        return []
+    found = sorted(label.broken)
+    if label.wind_required and (label.wind_m_s is not None or label.wind_from_deg):
+        found.append(Inhibit.LABEL_WIND)
+    if label.needs_utc:
+        found.append(Inhibit.LABEL_TIME)
+    return [
+        f"nothing is sprayed ({', '.join(found)}): no wind and no time of day are simulated here, "
+        "and what the label asks for must be declared; fly it with sitl serve and run"
+    ] * bool(found)
 
 
 def _rates(setup: Setup) -> set[float]:

@@ -53,7 +53,9 @@ class BufferTable(Table):
 
     kind: Text = Field(description="of feature, as the label names it: water, garden, hives")
     distance_m: float = Field(ge=0, le=1000, description="kept from it")
-    files: Texts = Field(min_length=1, description="maps of it, relative to this file")
+    files: Texts = Field(
+        min_length=1, description="maps of it: areas, lines or points; relative to this file"
+    )
 
 
 class LimitsFile(Table):
@@ -103,7 +105,9 @@ class LimitsFile(Table):
     reentry_h: Annotated[FiniteFloat, Field(ge=0, le=8760)] | None = Field(
         default=None, description="nobody enters for so long after spraying"
     )
-    buffer: Annotated[tuple[BufferTable, ...], Field(strict=False, max_length=50)] = ()
+    buffer: Annotated[tuple[BufferTable, ...], Field(strict=False, max_length=50)] = Field(
+        default=(), description="ground to keep away from, one table each"
+    )
 
     @model_validator(mode="after")
     def _agree(self) -> Self:

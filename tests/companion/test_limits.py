@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import tomllib
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,6 +31,7 @@ from missions.maps.local import project
 from missions.maps.registry import read_map
 from missions.plan import Settings
 from missions.reading_ground import GroundAsked, buffered, check_label, label_warnings
+from sitl.fly import label_notes
 from tests.builders import SPRAYING, position, setup
 
 NOW = datetime(2026, 5, 1, 5, 0, tzinfo=UTC)
@@ -473,3 +475,28 @@ def test_a_flight_map_without_the_buffers_is_refused(tmp_path: Path) -> None:
     build_setup(given, made)
     with pytest.raises(ConfigError, match=r"limits\.buffer"):
         build_setup(given, bare)
+
+
+def test_the_example_has_every_key_and_holds_for_its_field(tmp_path: Path) -> None:
+    file = EXAMPLE.parent / "limits.toml"
+    assert set(tomllib.loads(file.read_text())) == set(LimitsFile.model_fields)
+    given = load(EXAMPLE, overrides=['limits.file="limits.toml"', *DECLARED])
+    assert label_check(given, datetime(2026, 5, 1, 6, 0, tzinfo=UTC)).status is Status.FAIL
+    assert label_check(given, datetime(2026, 5, 1, 4, 40, tzinfo=UTC)).status is Status.FAIL
+    seen = ("application.observed_at=2026-05-01T06:30:00+08:00", *DECLARED[:-1])
+    given = load(EXAMPLE, overrides=['limits.file="limits.toml"', *seen])
+    assert label_check(given, datetime(2026, 4, 30, 23, 0, tzinfo=UTC)).status is Status.OK
+    assert map_codes(given) == ["label-buffer"]
+    kept = compile_map(MapOrder.of(given)).prescription.field
+    whole = compile_map(MapOrder.of(load(EXAMPLE))).prescription.field
+    assert 50.0 < whole.area - kept.area < 300.0
+
+
+def test_sitl_fly_says_why_it_sprays_nothing_under_limits(tmp_path: Path) -> None:
+    def notes(limits: str) -> list[str]:
+        return label_notes(config(tmp_path, limits).limits().label)
+
+    assert label_notes(None) == notes("speed_max_m_s = 9") == []
+    (note,) = notes('wind_max_m_s = 4\ninversion = "forbidden"')
+    assert "label-inversion" in note
+    assert "label-wind" in note

@@ -6,6 +6,8 @@ import json
 import re
 from typing import Any
 
+from companion.config.application_table import ASKED
+from companion.config.limits import LimitsFile
 from companion.config.model import Config
 from companion.config.wording import allowed_text
 
@@ -61,7 +63,38 @@ def page() -> str:
         parts.append(_about(table, definition, is_list=is_list) + "\n")
         parts.append("| Key | Unit | Write | Default | Meaning |\n|---|---|---|---|---|")
         parts += [*_rows(table, definition, schema), ""]
-    return "\n".join([*parts, RULES])
+    return "\n".join([*parts, _limits(), _asked(), RULES])
+
+
+LIMITS = """## The limits file
+
+What `limits.file` names: a TOML file of its own with the limits of one label and permit. What is absent
+is not limited. [How to use it](../howto/keep-label-and-permit.md).
+
+| Key | Unit | Write | Default | Meaning |
+|---|---|---|---|---|"""
+
+
+ASKED_HEAD = """## What the record asks for
+
+By `application.profile`; the flight adds area, places, times and quantities.
+
+| Profile | Keys |
+|---|---|"""
+
+
+def _asked() -> str:
+    rows = [
+        f"| `{name}` | {', '.join(f'`{key}`' for key in keys)} |" for name, keys in ASKED.items()
+    ]
+    return "\n".join([ASKED_HEAD, *rows, ""])
+
+
+def _limits() -> str:
+    schema = LimitsFile.model_json_schema()
+    rows = [row.replace("| `limits.", "| `", 1) for row in _rows("limits", schema, schema)]
+    rows += _rows("buffer", schema["$defs"]["BufferTable"], schema)
+    return "\n".join([LIMITS, *rows, ""])
 
 
 def _reference(node: dict[str, Any]) -> tuple[str | None, bool]:
