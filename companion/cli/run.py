@@ -102,7 +102,7 @@ def run_companion(
     executor = build_executor(config, link)
     sensors = _sensors(config, link)
     page = _page(config, given, setup, link, training=training)
-    for line in (*_warnings(config), *_label_notes(config), *_application_notes(config, training)):
+    for line in (*_warnings(config), *label_notes(config), *_application_notes(config, training)):
         note(line)
     if config.mission is not None:
         for problem in deliverable(setup, config.mission.speed_m_s):
@@ -289,16 +289,19 @@ def _about(config: Config, overrides: Sequence[str], flight_map: FlightMap) -> d
     }
 
 
-def _label_notes(config: Config) -> list[str]:
+def label_notes(config: Config) -> list[str]:
     """Return which limits of label and permit were not declared, or not kept: nothing opens."""
     if config.label is None:
         return []
-    return [
-        f"warning: {each.key} = {'nothing' if each.value is None else each.value}: the label asks "
-        f"for {each.words}; the valves stay closed until it is declared so (--set {each.key}=...)"
-        for each in config.label.declared(config.told())
-        if not each.is_kept
-    ]
+    found = []
+    for each in config.label.declared(config.told()):
+        if not each.is_kept:
+            said = " is not declared" if each.value is None else f" = {each.value}"
+            found.append(
+                f"warning: {each.key}{said}, and {config.limits_table.file} allows {each.words}; "
+                f"the valves stay closed; start with --set {each.key}=VALUE once it is so"
+            )
+    return found
 
 
 def _application_notes(config: Config, training: str) -> list[str]:

@@ -207,7 +207,7 @@ class LimitsFile(Table):
             value = values.get(OBSERVED_AT)
             yield Declared(
                 Inhibit.LABEL_WEATHER_AGE, "observed_at", OBSERVED_AT,
-                f"its time, at most {self.observed_max_h:g} h before spraying", value,
+                f"a time at most {self.observed_max_h:g} h before spraying", value,
                 value is not None,
             )  # fmt: skip
         if self.droplet_classes:
@@ -246,7 +246,7 @@ class LimitsFile(Table):
         if self.inversion is not None:
             value = values.get("application.inversion")
             yield Declared(
-                Inhibit.LABEL_INVERSION, "inversion", "application.inversion", "none seen: no",
+                Inhibit.LABEL_INVERSION, "inversion", "application.inversion", "no (none was seen)",
                 value, value == "no",
             )  # fmt: skip
 

@@ -13,6 +13,7 @@ import pytest
 import shapely
 
 from companion.assembly import above_label, build_setup
+from companion.cli.run import label_notes as of_run
 from companion.config import Config, load
 from companion.config.limits import LimitsFile, limits_meta, limits_of, read_limits
 from companion.core.estimator import Track, estimate, observe
@@ -286,6 +287,8 @@ def test_what_is_kept_is_kept_and_what_is_not_declared_is_not(tmp_path: Path, na
     check = label_check(silent, NOW)
     assert check.status is Status.FAIL
     assert f"not declared: {key}" in check.text
+    assert not of_run(kept)
+    assert any(note.startswith(f"warning: {key} is not declared, and") for note in of_run(silent))
     assert case.safety in in_flight(silent, {})
 
 
