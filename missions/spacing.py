@@ -169,9 +169,11 @@ class Spacing:
     def _mended(self, sortie: Sortie, crowded: _Crowded) -> tuple[Sortie, list[Pair]]:
         """Return the sortie spaced, ways changed one by one where pairs stay near, and the rest."""
         best = replace(sortie, legs=self._legs(sortie.legs, crowded))
-        near = self._near(best)
-        for pair in near[:PAIRS_MAX]:
-            again = replace(best, legs=self._with_another_way(sortie.legs, best.legs, pair))
+        near, tried = self._near(best), set[Pair]()
+        # One that is mended may leave another one beside it.
+        while len(tried) < PAIRS_MAX and (new := [pair for pair in near if pair not in tried]):
+            tried.add(new[0])
+            again = replace(best, legs=self._with_another_way(sortie.legs, best.legs, new[0]))
             left = self._near(again)
             if len(left) < len(near):
                 best, near = again, left
