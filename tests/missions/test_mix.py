@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -15,9 +16,10 @@ from companion.cli.app import execute
 from companion.config import Config, load
 from companion.config.tables import MixTable
 from missions.demand import Uniform
-from missions.mix import STEPS, UNITS, mix_lines, mix_of
+from missions.mix import STEPS, UNITS, flown_rates, mix_lines, mix_of
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
+from missions.strips import Floats
 from tests.missions.test_missions_cli import written
 from tests.missions.test_missions_plan import field_of
 from tests.missions.test_missions_sheet import planned
@@ -216,6 +218,18 @@ def test_by_a_map_a_product_follows_the_rates_and_its_average_is_the_dose(
     mix = planned(capsys, field, "--config", held, *words, "--out", tmp_path / "m.kml")["mix"]
     assert mix["products"][1]["per_ha_max"] == pytest.approx(0.5)
     assert not any("Alpha" in note for note in mix["notes"])
+
+
+class Half:
+    """30 L/ha in the east, 0 in the west, and no rate beyond 110 m."""
+
+    def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
+        return np.where(east_m > 110.0, np.nan, np.where(east_m > 60.0, 30.0, 0.0))
+
+
+def test_ground_that_is_not_sprayed_has_no_part_in_the_average(plan: Plan) -> None:
+    found = flown_rates(plan, Half())
+    assert (found.mean_l_ha, found.low_l_ha, found.high_l_ha) == pytest.approx((30.0, 30.0, 30.0))
 
 
 def test_the_sheet_shows_what_to_pour_sortie_by_sortie(
