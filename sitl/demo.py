@@ -381,7 +381,9 @@ def jobs_of(options: DemoOptions, journal_folder: Path | None) -> list[Job]:
 def fly_one(job: Job) -> Flown:
     """Fly one flight and judge it by its truth."""
     setup, profile = demo_setup(job.speed_m_s), load_profile(PROFILE)
-    setup = replace(setup, lag=demo_lags(job.output), centres_pulses=job.output == "gpio")
+    # The averaged twin has no pulses, and nothing to rest before.
+    centres = job.output == "gpio" and job.fidelity == "pulsed"
+    setup = replace(setup, lag=demo_lags(job.output), centres_pulses=centres)
     if job.journal_folder is None:
         result = _fly(job, setup, profile)
     else:

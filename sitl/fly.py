@@ -193,6 +193,9 @@ def prepare(options: FlyOptions) -> Task:
     config = load(options.config, overrides=options.overrides)
     refuse_mismatch(config)
     setup = compiled_setup(config)
+    if options.fidelity != "pulsed" or options.output == "servo":
+        # The averaged twin has no pulses, and a board's are not ours.
+        setup = replace(setup, centres_pulses=False)
     profile = _plant(options.plant, setup)
     faults: tuple[Fault, ...] = ()
     if options.scenario is not None:

@@ -204,7 +204,8 @@ def _scene(settings: Settings, folder: Path) -> _Scene:
     profile = with_plant(task.profile, given)
     servo = task.config.output.kind == "servo" and "flight.config" in given
     output = given.get("flight.output", "servo" if servo else "gpio")
-    setup = replace(setup, centres_pulses=output == "gpio")
+    is_pulsed = given.get("flight.fidelity", "averaged") == "pulsed"
+    setup = replace(setup, centres_pulses=output == "gpio" and is_pulsed)
     return _Scene(
         task=replace(task, setup=setup, profile=profile),
         output=cast(Literal["gpio", "servo"], output),

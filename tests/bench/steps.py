@@ -78,7 +78,7 @@ def small_field(*, seed: int, repeats: int = 3) -> Figure:
 def large_field(*, seed: int, side: int = 150, length_m: float = 900.0) -> Figure:
     """Measure a step with 24 valves on a grid of `side` x `side` plots."""
     setup = grid_setup(side, side, valve_count=24, seed=seed)
-    flown = _over_grid(setup, length_m, seed=seed)
+    flown = over_grid(setup, length_m, seed=seed)
     times = step_times_us(setup, flown, repeats=1)[0]
     everything = spread(times)
     other = _intersections_us(setup, flown[:400])
@@ -102,7 +102,7 @@ def growth(*, seed: int, zones: tuple[int, ...] = (100, 1_000, 10_000, 100_000))
         rows = max(round(math.sqrt(wanted)), 2)
         columns = max(round(wanted / rows), 2)
         setup = grid_setup(rows, columns, valve_count=24, seed=seed)
-        flown = _over_grid(setup, min(columns, 10) * PLOT_LENGTH_M, seed=seed)
+        flown = over_grid(setup, min(columns, 10) * PLOT_LENGTH_M, seed=seed)
         runs = step_times_us(setup, flown, repeats=3)
         # The least of three: what else the machine does has nothing to do with the map.
         means[str(wanted)] = min(float(np.median(run)) for run in runs)
@@ -120,7 +120,7 @@ def growth(*, seed: int, zones: tuple[int, ...] = (100, 1_000, 10_000, 100_000))
     )
 
 
-def _over_grid(setup: Setup, length_m: float, *, seed: int) -> list[Moment]:
+def over_grid(setup: Setup, length_m: float, *, seed: int) -> list[Moment]:
     """Fly one pass in the middle of the grid, along a line between the plots' middles."""
     west, south, east, north = setup.prescription.bounds_m
     begin = max(0.5 * (west + east - length_m), west)

@@ -68,7 +68,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_flight_of_the_published_field_is_that_of_the_demo_to_the_bit(tmp_path: Path) -> None:
-    setup = replace(demo_setup(6.0), lag=demo_lags("gpio"), centres_pulses=True)
+    setup = replace(demo_setup(6.0), lag=demo_lags("gpio"))
     flown = fly(
         setup,
         demo_trajectory(6.0, 3),
