@@ -179,13 +179,18 @@ def forget(
     """
     from analysis.fleet.flight_row import operator_number
     from analysis.fleet.store import STORE_ERRORS, Store
+    from companion.errors import ConfigError
 
+    if not operator.strip():
+        raise ConfigError("OPERATOR: is empty; give the name, or the number op-...")
     store = Store.at(fleet).existing()
     number = operator_number(operator)
     try:
         count = store.forget(number, with_flights=with_flights)
     except STORE_ERRORS as error:
         raise store.refused(error) from error
+    if not count:
+        note("no flight here names this operator; check the spelling")
     what = "removed" if with_flights else "kept, without their operator"
     answer(
         {"operator": number, "flights": count, "flights_removed": with_flights},

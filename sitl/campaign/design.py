@@ -27,6 +27,7 @@ from sitl.anyang import EXAMPLE
 from sitl.campaign.settings import (
     NOT_IN_CONDITIONS,
     NOT_OF_FILES,
+    NOT_ON_P1S_FIELD,
     P1S_FIELD,
     Settings,
     Value,
@@ -243,7 +244,9 @@ def _campaign(path: Path, text: str, table: Mapping[str, Any]) -> Campaign:
 def _check_design(found: Campaign) -> None:
     names = [factor.name for factor in found.factors]
     for name in names:
-        if names.count(name) > 1 or any(name in case for _, case in found.cases):
+        if names.count(name) > 1 or any(
+            name in each for each in (found.fixed, *(case for _, case in found.cases))
+        ):
             raise ConfigError(f"vary.set = '{name}': varied twice; keep one of them")
     for factor in found.factors:
         if found.kind == GRID and not factor.values:
@@ -283,6 +286,8 @@ def _check_settings(found: Campaign) -> None:
             for name in NOT_OF_FILES:
                 if name in given:
                     raise ConfigError(f"{name}: on P1's field only; leave it out, or flight.config")
+        else:
+            _refuse_without_effect(given)
         field = given.get("flight.field", P1S_FIELD)
         if field != P1S_FIELD:
             for name in NOT_IN_CONDITIONS:
@@ -292,6 +297,13 @@ def _check_settings(found: Campaign) -> None:
             raise ConfigError(
                 "method.controller: stands alone; leave out the other method. settings"
             )
+
+
+def _refuse_without_effect(given: Mapping[str, Value]) -> None:
+    for name in given:
+        for start, fix in NOT_ON_P1S_FIELD.items():
+            if name.startswith(start):
+                raise ConfigError(f"{name}: changes nothing over P1's field; {fix}")
 
 
 def _check_configuration(found: Campaign) -> None:
@@ -383,13 +395,20 @@ def _seeds(given: object) -> tuple[int, ...]:
     if isinstance(given, dict):
         _refuse_unknown(given, ("first", "count"), "seeds.")
         first = _whole(given.get("first", 1), "seeds.first", least=0)
-        return tuple(range(first, first + _whole(given.get("count"), "seeds.count", least=1)))
+        return tuple(range(first, first + _seed_count(given.get("count"), "seeds.count")))
     if isinstance(given, list) and given:
         seeds = tuple(_whole(each, "seeds", least=0) for each in given)
         if len(set(seeds)) == len(seeds):
             return seeds
         raise ConfigError("seeds: one of them stands there twice")
-    return tuple(range(1, 1 + _whole(given, "seeds", least=1)))
+    return tuple(range(1, 1 + _seed_count(given, "seeds")))
+
+
+def _seed_count(given: object, where: str) -> int:
+    count = _whole(given, where, least=1)
+    if count > FLIGHTS_MAX:
+        raise ConfigError(f"{where} = {count}: more than {FLIGHTS_MAX:,} flights; take fewer seeds")
+    return count
 
 
 def _refuse_unknown(table: Mapping[str, Any], known: Sequence[str], start: str) -> None:

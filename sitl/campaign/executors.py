@@ -162,7 +162,7 @@ def cluster_at(address: str) -> Iterator[Cluster]:
         f"--cluster {address}: no Dask scheduler answers; start one with `dask scheduler` and give "
         "the tcp:// address that it prints"
     )
-    scheme, _, place = address.partition("://")
+    scheme, _, place = (address if "://" in address else f"tcp://{address}").partition("://")
     host, _, port = place.rpartition(":")
     try:
         if scheme == "tcp":  # a client that failed would leave a thread

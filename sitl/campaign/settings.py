@@ -92,6 +92,14 @@ NOT_IN_CONDITIONS = (
     *ON_P1S_FIELD, "map.rate_factor", "vehicle.speed_m_s", "vehicle.acceleration_m_s2",
     "vehicle.gust_m_s", "vehicle.gust_time_s", "vehicle.corners",
 )  # fmt: skip
+# What that field's flights take from elsewhere: varying it would show a flat line.
+NOT_ON_P1S_FIELD = {
+    "config.link.position_rate_hz": "write vehicle.position_rate_hz",
+    "config.output.kind": "write flight.output",
+    "config.mission.": "write vehicle. settings, or give flight.config and flight.mission",
+    "config.safety.speed_min_m_s": "give flight.config and flight.mission",
+    "config.safety.speed_max_m_s": "give flight.config and flight.mission",
+}
 NOT_OF_FILES = (*ON_P1S_FIELD, "flight.field", "plant.known")
 
 

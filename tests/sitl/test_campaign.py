@@ -275,6 +275,8 @@ def test_an_address_where_nobody_is_is_refused_in_one_line(
         ("[[case]]\nplant.known = true", "plant.known: on P1's field only"),
         ('[[case]]\nflight.scenario = "no.toml"', "no such file"),
         ("seeds = [1", "Unclosed array"),
+        ("seeds = 100000000000", "more than 10,000,000 flights"),
+        ('[[vary]]\nset = "flight.config"\nvalues = ["a.toml"]', "varied twice; keep one"),
         ('seeds = 4000\n[[vary]]\nset = "vehicle.gust_m_s"\nlow = 0\nhigh = 9\nsteps = 5000',
          "more than 10,000,000 flights"),
     ],
@@ -296,6 +298,7 @@ def test_a_file_that_cannot_be_flown_is_refused_in_one_line(
             'flight.field = "sway"\nvehicle.speed_m_s = 5',
             "vehicle.speed_m_s: 'sway' has its own; leave it out",
         ),
+        ("config.safety.speed_max_m_s = 2.0", "changes nothing over P1's field"),
         ('flight.field = "swing"', "choose of published, edges-15"),
     ],
 )
