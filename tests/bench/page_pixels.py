@@ -3,7 +3,7 @@
 First paint, from a valve's order on the wire to the pixels that show it, and the longest task
 of the page's main thread with 36 and with 40,000 zones, by the clock and in time of the processor.
 A busy computer makes the first longer, not the second, and so does one without a graphics card: the
-thread waits in `Commit` for the pixels, with nothing to do itself. One JSON object, in milliseconds.
+thread waits in `Commit` for the pixels, idle itself. One JSON object, in milliseconds.
 """
 
 from __future__ import annotations
