@@ -159,8 +159,8 @@ def _lag_distances_m(
     # What the border holds bounds a line as a neighbouring change does.
     floors_s = np.maximum(floors_s, [each.floor_s for each in sides])
     ceilings_s = np.minimum(ceilings_s, [each.ceiling_s - track.period_s for each in sides])
-    before = _lines(smooth, begins_s, floors_s, closed_before)
-    after = _lines(smooth, settles_s, ceilings_s, closed_after)
+    before = _lines(smooth, begins_s, np.minimum(floors_s, begins_s), closed_before)
+    after = _lines(smooth, settles_s, np.maximum(ceilings_s, settles_s), closed_after)
     rise_ml = after.volume_ml - before.volume_ml
     rise_ml += before.slope_ml_m * before.distance_m - after.slope_ml_m * after.distance_m
     bend = before.slope_ml_m - after.slope_ml_m

@@ -29,6 +29,8 @@ OUTLIER_MADS, MAD = 3.0, 1.4826
 NEIGHBOURS = 21
 # Where all neighbours agree, a value this share away from them is still none of noise.
 AGREE_SHARE = 0.05
+# Distances in a grid differ by less than this; so many points say whether they are one.
+GRID_SHARE, GRID_OF = 0.01, 5_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,12 +79,25 @@ def cleaned(track: Track, steps: tuple[Step, ...] = STEPS) -> Cleaned:
 
 
 def is_track(points: Floats) -> bool:
-    """Tell whether points follow each other, as a machine records them, and are no samples."""
-    if len(points) < 100:
+    """Tell whether points follow each other, as a machine records them, and are no samples.
+
+    Points of a square grid follow each other too, row by row; they are estimates for their places.
+    """
+    if len(points) < 100 or _is_grid(points):
         return False
     step_m = np.hypot(*np.diff(points, axis=0).T)
     typical = float(np.median(step_m))
     return bool(np.quantile(step_m, 0.9) <= 3.0 * typical)
+
+
+def _is_grid(points: Floats) -> bool:
+    """Tell whether most points have four neighbours at one distance."""
+    from scipy.spatial import cKDTree
+
+    some = points[np.isfinite(points).all(axis=1)][:GRID_OF]
+    away = cKDTree(some).query(some, k=5)[0]
+    even = away[:, 4] <= (1.0 + GRID_SHARE) * away[:, 1]
+    return bool(np.mean(even & (away[:, 1] > 0.0)) > 0.5)
 
 
 def _passes(points: Floats) -> Ints:

@@ -147,6 +147,13 @@ def test_zones_shorter_than_the_plant_can_follow_are_apart() -> None:
     assert (evaluation.apart, evaluation.missed) == (2, 0)
 
 
+def test_a_flow_still_settling_at_the_next_change_is_apart() -> None:
+    # Its line would be drawn backwards over the change itself: lags of tens of metres came of it.
+    flight = Flight(rates=[[20.0, 23.0, 40.0, 23.0, 20.0]], valves=1, tail_m=4.0)
+    verdicts = [step.verdict for step in evaluated(flight).steps if not step.change.border]
+    assert verdicts == [Verdict.CLOSE] * 4
+
+
 def saturated(duties: list[float], rates: list[float], given: list[float]) -> Evaluation:
     """Fly `rates` with the flow of `given`, both over four plots, with these orders."""
     record, _ = record_of(Flight(rates=[rates], valves=1))

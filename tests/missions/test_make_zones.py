@@ -23,7 +23,7 @@ from pyproj import CRS, Transformer
 from companion.errors import VrsprayError
 from missions.make import cli
 from missions.make.classes import classify, natural_breaks
-from missions.make.cleaning import Track, cleaned
+from missions.make.cleaning import Track, cleaned, is_track
 from missions.make.data import index_of
 from missions.make.passes import Passes, passes_of, places_in
 from missions.make.settled import settled
@@ -153,6 +153,17 @@ def test_cleaning_finds_the_faults_of_a_harvest_and_keeps_its_measurements(data:
     assert removed[faults == ""].mean() <= 0.06
     assert found.kept.sum() + sum(found.removed.values()) == len(points)
     assert list(found.removed) == ["no value", "speed", "ends", "overlap", "outliers"]
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 1.4, 45.0])
+def test_a_grid_row_by_row_is_no_machines_track(turn_deg: float) -> None:
+    # Estimates in a square grid have no ends of passes to be cut off.
+    y, x = (10.0 * index.ravel() for index in np.mgrid[:15, :20])
+    angle = np.radians(turn_deg)
+    grid = np.column_stack([x * np.cos(angle) - y * np.sin(angle),
+                            x * np.sin(angle) + y * np.cos(angle)])  # fmt: skip
+    assert not is_track(grid)
+    assert is_track(np.column_stack([0.2 * grid[:, 0], grid[:, 1]]))
 
 
 def test_points_without_speed_are_cleaned_by_their_steps() -> None:
