@@ -75,7 +75,8 @@ class FlightOptions:
     valves alike. `flow_law` says how the flow runs between measured points; None: as the profile.
     `meter_rate_hz` above 0 has the flow meter report that often, `pressure_rate_hz` the pressure
     sensor; `liquid_faults` act on sprayers with valves. `drive_ranges_us` are stop and full pulse
-    of each motor as the program has them; without them they are the plant's own.
+    of each motor as the program has them; without them they are the plant's own. Positions are
+    `position_rounded` as GLOBAL_POSITION_INT has them, or told in floats as LOCAL_POSITION_NED.
     """
 
     fidelity: Fidelity = "pulsed"
@@ -83,6 +84,7 @@ class FlightOptions:
     board: Literal["restarting", "free-running"] = "restarting"
     seed: int = 1
     position_rate_hz: float = 20.0
+    position_rounded: bool = True
     imu_rate_hz: float = 0.0
     speed_rate_hz: float = SPEED_REPORT_RATE_HZ
     estimator_lag_s: float = 0.031
@@ -278,6 +280,7 @@ def _inputs(setup: Setup, trajectory: Trajectory, options: FlightOptions) -> Ite
         position_rate_hz=options.position_rate_hz,
         imu_rate_hz=options.imu_rate_hz if is_noisy else 0.0,
         speed_rate_hz=options.speed_rate_hz,
+        rounded=options.position_rounded,
         estimator_lag_s=options.estimator_lag_s if is_noisy else 0.0,
         message_delay_s=MESSAGE_DELAY_S if is_noisy else 0.0,
         jitter_s=0.003 if is_noisy else 0.0,

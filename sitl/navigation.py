@@ -46,7 +46,8 @@ class Navigation:
     """Turns the truth into position and speed messages, in the order of their arrival.
 
     A message of the time t carries the state of `estimator_lag_s` before t and arrives
-    `message_delay_s` and a jitter after t, never before an earlier one of its kind.
+    `message_delay_s` and a jitter after t, never before an earlier one of its kind. `rounded` is as
+    GLOBAL_POSITION_INT has it; LOCAL_POSITION_NED tells the same estimate in floats.
     """
 
     def __init__(
@@ -64,10 +65,12 @@ class Navigation:
         boot_s: float = 0.0,
         imu_rate_hz: float = 0.0,
         speed_rate_hz: float = SPEED_REPORT_RATE_HZ,
+        rounded: bool = True,
     ) -> None:
         if not (0.1 <= position_rate_hz <= 1000.0 and message_delay_s >= 0.0 and jitter_s >= 0.0):
             raise ValueError("rate, delay and jitter of the position must be sensible")
         self._source = source
+        self._rounded = rounded
         self._earth = earth
         self._period_s = 1.0 / position_rate_hz
         self._lag_s, self._delay_s, self._jitter_s = estimator_lag_s, message_delay_s, jitter_s
@@ -121,15 +124,18 @@ class Navigation:
             message = Telemetry(
                 received_s=received_s,
                 boot_s=math.floor((times_s[i] - self._boot_s) * 1e3 + 1e-6) / 1e3,
-                latitude_deg=round(latitudes[i] * 1e7) / 1e7,
-                longitude_deg=round(longitudes[i] * 1e7) / 1e7,
+                latitude_deg=self._told(latitudes[i], 1e7),
+                longitude_deg=self._told(longitudes[i], 1e7),
                 relative_altitude_m=round(truth.height_m * 1e3) / 1e3,
-                velocity_north_m_s=round((truth.velocity_north_m_s + velocity[i][0]) * 1e2) / 1e2,
-                velocity_east_m_s=round((truth.velocity_east_m_s + velocity[i][1]) * 1e2) / 1e2,
+                velocity_north_m_s=self._told(truth.velocity_north_m_s + velocity[i][0], 1e2),
+                velocity_east_m_s=self._told(truth.velocity_east_m_s + velocity[i][1], 1e2),
                 velocity_down_m_s=round(velocity[i][2] * 1e2) / 1e2,
                 heading_deg=round(truth.heading_deg * 1e2) % 36_000 / 1e2,
             )
             self._put(received_s, message)
+
+    def _told(self, value: float, per_unit: float) -> float:
+        return round(value * per_unit) / per_unit if self._rounded else value
 
     def _positions(
         self, truths: list[Truth], draws: NDArray[np.float64]
