@@ -42,15 +42,18 @@ class KeptPages:
         self._file.seek((number - 1) * self.page_bytes)
         return self._file.read(self.page_bytes)
 
-    def torn(self) -> tuple[bytes, int]:
-        """Return the page that the file ends in, as SQLite sees it, and how much of it is there.
+    def torn(self) -> tuple[int, bytes, int] | None:
+        """Return the page that the file ends in: its number, itself, how much of it is there.
 
-        SQLite takes zeros for the rest.
+        As SQLite sees it, which takes zeros for the rest; None where the file ends with a page, or
+        the log has a newer version.
         """
+        number = self._in_file + 1
+        if not self._torn_bytes or number in self._in_log:
+            return None
         self._file.seek(self._in_file * self.page_bytes)
-        is_replaced = not self._torn_bytes or self._in_file + 1 in self._in_log
-        rest = b"" if is_replaced else self._file.read(self._torn_bytes)
-        return rest.ljust(self.page_bytes, b"\x00"), self._torn_bytes
+        rest = self._file.read(self._torn_bytes)
+        return number, rest.ljust(self.page_bytes, b"\x00"), self._torn_bytes
 
     def used(self) -> Iterator[bytes]:
         """Yield each page behind the first that is not given up."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 
 from analysis.journals.kept_pages import KeptPages
-from companion.journal.leaf_page import Row, cells_of, is_of, tables_of, values_of
+from companion.journal.leaf_page import Cell, Row, cells_of, is_of, tables_of, values_of
 
 # Columns with a time of the companion's clock, in seconds; in microseconds.
 _TIMES_S = {"applied": (3,), "blocks": (3, 4), "link_stats": (1,), "events": (2,)}
@@ -39,13 +39,42 @@ def stray_rows(pages: KeptPages, known: Mapping[str, set[int]]) -> list[Found]:
 
 def torn_rows(pages: KeptPages) -> set[tuple[object, object]]:
     """Return the tables and numbers of rows that a cut of the file went through."""
-    page, kept_bytes = pages.torn()
+    found = pages.torn()
+    if found is None:
+        return set()
+    number, page, kept_bytes = found
     try:
         cells = cells_of(page, pages.usable)
     except ValueError:
-        return set()
+        return set(_torn_behind(pages, number, kept_bytes))
     torn = [cell for cell in cells if cell.end > kept_bytes]
     return {(table, cell.rowid) for table in tables_of(cells) for cell in torn}
+
+
+def _torn_behind(pages: KeptPages, number: int, kept_bytes: int) -> Iterator[tuple[object, object]]:
+    """Yield the rows that go on in the torn page, behind what of it is there."""
+    for page in pages.used():
+        try:
+            cells = cells_of(page, pages.usable)
+        except ValueError:
+            continue
+        for cell in cells:
+            if _is_torn(cell, pages, number, kept_bytes):
+                yield from ((table, cell.rowid) for table in tables_of(cells))
+
+
+def _is_torn(cell: Cell, pages: KeptPages, torn: int, kept_bytes: int) -> bool:
+    missing, number = cell.size - len(cell.local), cell.overflow_page
+    while missing > 0 and number:
+        here = min(missing, pages.usable - 4)
+        if number == torn:
+            return 4 + here > kept_bytes
+        page = pages.page(number)
+        if page is None:
+            return False  # SQLite finds no way to it either
+        missing -= here
+        number = int.from_bytes(page[:4], "big")
+    return False
 
 
 def _found(pages: KeptPages, known: Mapping[str, set[int]]) -> Iterator[Found]:

@@ -115,6 +115,18 @@ def test_a_row_that_the_cut_went_through_is_left_out(path: Path, whole: Path) ->
     assert 0 < len(told) - len(rows) < 10
 
 
+@pytest.mark.parametrize("cut_bytes", [5, 500, PAGE_BYTES - 1])
+def test_a_row_that_goes_on_in_the_page_that_was_cut_is_left_out(
+    cut_bytes: int, path: Path, whole: Path
+) -> None:
+    sql = "SELECT max(pageno) FROM dbstat WHERE name = 'blocks' AND pagetype = 'overflow'"
+    page = int(str(query(path, sql)[0][0]))
+    path.write_bytes(path.read_bytes()[: page * PAGE_BYTES - cut_bytes])
+    rows, told = salvaged(path, whole)["blocks"], rows_of(whole)["blocks"]
+    assert rows.items() <= told.items()
+    assert len(rows) > 0
+
+
 def root_of(path: Path, table: str) -> int:
     return int(str(query(path, f"SELECT rootpage FROM sqlite_master WHERE name = '{table}'")[0][0]))
 
