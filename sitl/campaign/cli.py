@@ -56,7 +56,7 @@ def run(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Campaign file (TOML).")],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder of the dataset. Default: the file's name."),
+        typer.Option(metavar="DIR", help="Folder of the dataset. Default: NAME-flights of NAME.toml."),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Flights at a time. Default: one a core.")
@@ -179,8 +179,8 @@ def _time(left_s: float) -> str:
 
 def _plan_lines(campaign: Campaign) -> Iterator[str]:
     yield (
-        f"{campaign.name}: {campaign.flights} flights: {campaign.settings_count} settings, "
-        f"{len(campaign.seeds)} seeds"
+        f"{campaign.name}: {campaign.flights} flights: settings {campaign.settings_count}, "
+        f"seeds {len(campaign.seeds)}"
     )
     for factor in campaign.factors:
         if factor.values:
