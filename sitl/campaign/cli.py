@@ -56,7 +56,9 @@ def run(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="Campaign file (TOML).")],
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder of the dataset. Default: NAME-flights of NAME.toml."),
+        typer.Option(
+            metavar="DIR", help="Folder of the dataset. Default: NAME-flights for NAME.toml."
+        ),
     ] = None,
     workers: Annotated[
         int | None, typer.Option(metavar="N", help="Flights at a time. Default: one a core.")
