@@ -216,8 +216,8 @@ def read_campaign(path: Path, *, checked: bool = True) -> Campaign:
 def _campaign(path: Path, text: str, table: Mapping[str, Any]) -> Campaign:
     _refuse_unknown(table, TOP, "")
     if table.get("version") != VERSION:
-        found = f"version = {table['version']!r}" if "version" in table else "version: missing"
-        raise ConfigError(f"{found}; write version = {VERSION}")
+        said = f"version = {table['version']!r}" if "version" in table else "version: missing"
+        raise ConfigError(f"{said}; write version = {VERSION}")
     design = _table(table, "design")
     _refuse_unknown(design, OF_DESIGN, "design.")
     factors = tuple(_factor(each, n) for n, each in enumerate(_tables(table, "vary")))
