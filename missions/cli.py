@@ -262,7 +262,7 @@ def plan(
             planned, fences = _fenced(
                 task, with_sprayer=sprayer, looks=out.suffix.casefold() == ".plan"
             )
-    flown_s = [sortie.flight_s for sortie in planned.sorties]
+    flown_s = [planned.airborne_s(sortie) for sortie in planned.sorties]
     by_label = label_warnings(reading.config, flown_s, datetime.now(tz=UTC).timestamp())
     planned = replace(planned, warnings=(*task.said, *by_label, *planned.warnings), wind=task.wind)
     took_s = perf_counter() - start
@@ -456,13 +456,13 @@ def _once(planned: Plan) -> str:
 def _lines(planned: Plan, result: dict[str, Any], files: list[Path]) -> list[str]:
     """Return the plan in words."""
     coverage = planned.coverage
-    minutes = planned.flight_s / 60.0
+    minutes = sum(map(planned.airborne_s, planned.sorties)) / 60.0
     where = ", ".join(f"{lat:.6f} {lon:.6f}" for lat, lon in result["depots"])
     least_m = result["least_idle_m"]
     idle = f", both {least_m / 1000:.2f} km at least in any order" if least_m >= 50.0 else ""
     lines = [
         f"{names_of(files)}: {counted(len(planned.sorties), 'sortie')}, {planned.volume_l:.1f} L, "
-        f"{minutes:.0f} min",
+        f"{minutes:.0f} min in the air",
         f"covered   {coverage.percent:.2f} % of {ground_text(result)}, "
         f"{coverage.overlap_percent:.2f} % {_TWICE[planned.closes]}, "
         f"{coverage.outside_m2:.1f} m2 outside",

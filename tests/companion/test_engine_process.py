@@ -71,6 +71,13 @@ class Bench:
             await asyncio.sleep(0.02)
         assert self.levels == OPEN
 
+    def wait_until_it_stands(self) -> None:
+        stat = Path(f"/proc/{self.executor.engine_pid}/stat")
+        until_s = time.monotonic() + PATIENCE_S
+        while stat.read_text().rpartition(")")[2].split()[0] != "T":
+            assert time.monotonic() < until_s
+            time.sleep(0.001)
+
     def signal(self, number: int) -> None:
         assert self.executor.engine_pid is not None
         os.kill(self.executor.engine_pid, number)
@@ -126,6 +133,7 @@ async def test_an_engine_that_goes_on_after_a_stop_closes_first(tmp_path: Path) 
     try:
         await bench.is_open()
         bench.signal(signal.SIGSTOP)
+        bench.wait_until_it_stands()  # one that is not there yet is undone by what follows
         time.sleep(0.15)  # noqa: ASYNC251, the companion is held up as well, and misses nothing
         bench.signal(signal.SIGCONT)
         await until(lambda: bench.executor.status.stops > 0)

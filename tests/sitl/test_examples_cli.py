@@ -7,6 +7,7 @@ import pytest
 
 from companion.cli.app import execute
 from companion.config import load
+from companion.config.limits import read_limits
 from sitl.campaign.design import read_campaign
 from sitl.examples_cli import ABOUT, DEPLOY, all_examples
 
@@ -43,6 +44,9 @@ def test_a_copied_example_has_all_that_its_configurations_name(
     for path in folder.glob("*.toml"):
         if name == "campaigns":
             assert read_campaign(path).flights > 1
+            continue
+        if path.name == "limits.toml":
+            assert read_limits(path, "limits.toml").buffers("limits.toml")
             continue
         config = load(path)
         assert config.prescription is not None

@@ -95,7 +95,7 @@ function showCheck() {
 }
 
 function sortieTable(found) {
-  return tableOf(["Sortie", "Volume", "Fill to", "Minutes", "Passes"], found.sorties.map((one) => [one.number, withUnit("volume", one.volume_l), withUnit("volume", one.fill_l), (one.flight_s / 60).toFixed(1), one.swaths]));
+  return tableOf(["Sortie", "Volume", "Fill to", "Minutes", "Passes"], found.sorties.map((one) => [one.number, withUnit("volume", one.volume_l), withUnit("volume", one.fill_l), (one.airborne_s / 60).toFixed(1), one.swaths]));
 }
 
 // What to pour before each sortie, from top to bottom; products in their own unit.
@@ -121,7 +121,7 @@ function showPlan() {
   if (!plan) { box.replaceChildren(); return; }
   if (plan.error) { box.replaceChildren(refused(plan.error)); return; }
   const found = plan.found, parts = [
-    make("p", `${found.sorties.length} ${found.sorties.length === 1 ? "sortie" : "sorties"}, ${withUnit("volume", found.volume_l)}, ${(found.flight_s / 60).toFixed(0)} min; ${found.coverage_percent.toFixed(1)} % covered, ${found.overlap_percent.toFixed(1)} % twice.`),
+    make("p", `${found.sorties.length} ${found.sorties.length === 1 ? "sortie" : "sorties"}, ${withUnit("volume", found.volume_l)}, ${(found.sorties.reduce((sum, each) => sum + each.airborne_s, 0) / 60).toFixed(0)} min in the air; ${found.coverage_percent.toFixed(1)} % covered, ${found.overlap_percent.toFixed(1)} % twice.`),
     sortieTable(found), ...mixParts(found.mix), ...found.warnings.map((text) => make("p", text, "refused")),
   ];
   if (plan.flight_map?.error) parts.push(refused(`flight map: ${plan.flight_map.error}`));
