@@ -83,6 +83,36 @@ def valve_places(width_m: float, valves: tuple[tuple[float, float], ...]) -> Flo
     return places
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Steps:
+    """Lines in even steps: `counts` of each line, and of each step length, direction, middle."""
+
+    counts: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+    long_m: Floats
+    along: Floats
+    middle: Floats
+
+    def rates(self, rates: Rates, right_m: float) -> Floats:
+        """Return the rates so far to the right of the middles [L/ha]."""
+        return rates.rates_at(
+            self.middle[:, 0] + self.along[:, 1] * right_m,
+            self.middle[:, 1] - self.along[:, 0] * right_m,
+        )
+
+
+def steps_of(lines: Floats, valves: int, *, step_m: float = STEP_M) -> Steps:
+    """Return lines in steps of at most `step_m`, longer where many lines are read by valve."""
+    length_m = lengths_m(lines)
+    step_m = max(step_m, float(length_m.sum()) * valves / POINTS_MAX)
+    counts = np.maximum(np.ceil(length_m / step_m), 1).astype(np.int64)
+    owner = np.repeat(np.arange(len(lines)), counts)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
+    long_m = (length_m / counts)[owner]
+    along = directions(lines)[owner]
+    middle = lines[owner, :2] + along * ((number + 0.5) * long_m)[:, None]
+    return Steps(counts=counts, long_m=long_m, along=along, middle=middle)
+
+
 def demands(
     lines: Floats,
     rates: Rates,
@@ -98,32 +128,22 @@ def demands(
     if not len(lines):
         return []
     places = valve_places(width_m, valves)
-    length_m = lengths_m(lines)
-    step_m = max(STEP_M, float(length_m.sum()) * len(places) / POINTS_MAX)
-    if isinstance(rates, Uniform) and extents is None:
-        step_m = math.inf
-    counts = np.maximum(np.ceil(length_m / step_m), 1).astype(np.int64)
-    owner = np.repeat(np.arange(len(lines)), counts)
-    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    each_m = (length_m / counts)[owner]
-    along = directions(lines)[owner]
-    middle = lines[owner, :2] + along * ((number + 0.5) * each_m)[:, None]
+    is_even = isinstance(rates, Uniform) and extents is None
+    steps = steps_of(lines, len(places), step_m=math.inf if is_even else STEP_M)
+    along, middle = steps.along, steps.middle
     near = np.empty(0, dtype=np.int64)
     if extents is not None:
         near = np.flatnonzero(~extents.deep_inside(middle))
     to_right = np.column_stack([along[near, 1], -along[near, 0]])
-    flow = np.zeros(len(owner))  # litres per metre, times M2_PER_HA
+    flow = np.zeros(len(middle))  # litres per metre, times M2_PER_HA
     for right_m, strip_m in places:
-        rate = rates.rates_at(
-            middle[:, 0] + along[:, 1] * right_m, middle[:, 1] - along[:, 0] * right_m
-        )
-        rate = np.nan_to_num(rate, nan=0.0)
+        rate = np.nan_to_num(steps.rates(rates, right_m), nan=0.0)
         if extents is not None:
             rate[near] *= extents.is_open(middle[near], to_right, (float(right_m), float(strip_m)))
         flow += rate * strip_m
-    used = flow * each_m / M2_PER_HA
-    found = []
-    for index, part in enumerate(np.split(used, np.cumsum(counts)[:-1])):
+    used = flow * steps.long_m / M2_PER_HA
+    found, length_m = [], lengths_m(lines)
+    for index, part in enumerate(np.split(used, np.cumsum(steps.counts)[:-1])):
         at_m = np.linspace(0.0, length_m[index], len(part) + 1)
         found.append(Demand(at_m=at_m, litres=np.concatenate([[0.0], np.cumsum(part)])))
     return found

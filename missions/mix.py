@@ -14,11 +14,10 @@ import numpy as np
 
 from companion.config import Config
 from companion.wording import counted
-from missions.demand import STEP_M, Rates, valve_places
+from missions.demand import Rates, steps_of, valve_places
 from missions.errors import PlanError
 from missions.plan import Plan
-from missions.sheet import filled_of
-from missions.strips import directions, lengths_m
+from missions.schedule import filled_of
 
 Measure = Literal["L", "kg"]
 # Litres or kilograms of a product in one of its units; "/ha" is for each hectare, else each litre.
@@ -49,8 +48,6 @@ _PLACES = {
 # ISO 16119-2: water for rinsing is a tenth of the tank, or ten times what is left in it; and what
 # drains in the end holds at most 2 % of the mix. In three portions: ISO 16236.
 RINSE_TIMES_LEFT, RINSE_OF_TANK, THINNED_PERCENT = 10.0, 0.1, 2.0
-# A pass is looked at in so many places at most.
-PLACES_MAX = 100_000
 # A share that the record of the flight states otherwise, by more than rounding.
 SAME_SHARE = 0.01
 
@@ -76,23 +73,9 @@ def flown_rates(plan: Plan, rates: Rates) -> FlownRates:
         ]
     )
     strips = valve_places(settings.swath_width_m, settings.valves)
-    long_m = lengths_m(lines)
-    step_m = max(STEP_M, float(long_m.sum()) * len(strips) / PLACES_MAX)
-    counts = np.maximum(np.ceil(long_m / step_m), 1).astype(np.int64)
-    owner = np.repeat(np.arange(len(lines)), counts)
-    number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-    each_m = (long_m / counts)[owner]
-    along = directions(lines)[owner]
-    middle = lines[owner, :2] + along * ((number + 0.5) * each_m)[:, None]
-    found, ground = [], []
-    for right_m, strip_m in strips:
-        found.append(
-            rates.rates_at(
-                middle[:, 0] + along[:, 1] * right_m, middle[:, 1] - along[:, 0] * right_m
-            )
-        )
-        ground.append(each_m * strip_m)
-    rate, weight = np.concatenate(found), np.concatenate(ground)
+    steps = steps_of(lines, len(strips))
+    rate = np.concatenate([steps.rates(rates, right_m) for right_m, _ in strips])
+    weight = np.concatenate([steps.long_m * strip_m for _, strip_m in strips])
     sprayed = rate > 0.0
     rate, weight = rate[sprayed], weight[sprayed]
     if not len(rate):

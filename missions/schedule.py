@@ -1,4 +1,6 @@
-"""When each sortie takes off: after refill and fresh battery, and never beside another aircraft.
+"""When each sortie takes off, and what it finds in tank and battery.
+
+It takes off after refill and fresh battery, and never beside another aircraft.
 
 Two sorties of different aircraft whose ways come nearer than the gap are never in the air
 together, whatever the times turn out to be: the later one names the one that must have landed.
@@ -7,6 +9,7 @@ together, whatever the times turn out to be: the later one names the one that mu
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import shapely
 from shapely import LineString, Point
@@ -113,3 +116,43 @@ def _apart_m(plan: Plan, one: Sortie, other: Sortie, ways: dict[int, LineString]
         if first.is_empty or second.is_empty:
             return float("inf")
     return float(shapely.distance(first, second))
+
+
+def filled_of(plan: Plan) -> dict[int, dict[str, Any]]:
+    """Return by its number what each sortie finds in tank and battery, and what is put in."""
+    aboard = _Aboard(plan)
+    in_time = sorted(plan.sorties, key=lambda each: (each.start_s, each.number))
+    return {sortie.number: aboard.fill(sortie) for sortie in in_time}
+
+
+class _Aboard:
+    """What is in tank and battery of each aircraft, sortie after sortie."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._left_wh: dict[int, float] = {}
+
+    def fill(self, sortie: Sortie) -> dict[str, Any]:
+        """Return what is put in before a sortie, and what is left after it.
+
+        The reserve of the sortie before is still in the tank, and nobody pours it out.
+        """
+        reserve_l = self._plan.settings.reserve_l
+        first = sortie.aircraft not in self._left_wh
+        battery, used_wh = self._plan.settings.battery, self._plan.energy_wh(sortie)
+        capacity_wh = None if battery is None else battery.capacity_wh
+        used = left = None
+        if capacity_wh is None or used_wh is None:
+            self._left_wh[sortie.aircraft] = 0.0
+        else:
+            full = first or sortie.swaps
+            left_wh = (capacity_wh if full else self._left_wh[sortie.aircraft]) - used_wh
+            self._left_wh[sortie.aircraft] = left_wh
+            used, left = 100.0 * used_wh / capacity_wh, 100.0 * left_wh / capacity_wh
+        return {
+            "fill_l": sortie.volume_l + reserve_l,
+            "add_l": sortie.volume_l + (reserve_l if first else 0.0),
+            "first": first,
+            "battery_percent": used,
+            "battery_left_percent": left,
+        }

@@ -31,6 +31,7 @@ from analysis.flown.holes import (
 from analysis.flown.unknown import unknown_times
 from analysis.journals.blocks import Entry
 from analysis.journals.content import damages, read_entries
+from companion.core.label import from_deg
 from companion.core.types import Decision
 from companion.errors import UnreadableError
 from companion.journal.codec import FieldNames, decode
@@ -313,7 +314,7 @@ def _sensors(
             told = values[value] if is_sound else None
             pairs[kind].append((values[at], told["Fix"] if isinstance(told, dict) else told))
             if kind == "WindReport" and blown:
-                pairs[WIND_FROM].append((values[at], _from_deg(*(values[n] for n in blown))))
+                pairs[WIND_FROM].append((values[at], from_deg(*(values[n] for n in blown))))
     except sqlite3.DatabaseError as error:
         if unread is None or "locked" in str(error):
             raise
@@ -325,17 +326,6 @@ def _blown_in(names: FieldNames) -> tuple[str, ...]:
     """Return the fields of where a wind blows to; none in journals that hold only its speed."""
     wanted = ("east_m_s", "north_m_s")
     return wanted if set(wanted) <= set(names.get("WindReport", ())) else ()
-
-
-def _from_deg(east_m_s: float | None, north_m_s: float | None) -> float | None:
-    """Return where a wind comes from; None for one without a direction.
-
-    >>> _from_deg(3.0, 0.0), _from_deg(0.0, 0.0)
-    (270.0, None)
-    """
-    if east_m_s is None or north_m_s is None or not math.hypot(east_m_s, north_m_s) > 0.0:
-        return None
-    return math.degrees(math.atan2(-east_m_s, -north_m_s)) % 360.0
 
 
 def _messages(entries: Iterator[Entry]) -> Iterator[tuple[str, list[Any]]]:

@@ -213,6 +213,7 @@ def followed(before: Motion, item: Telemetry, place: tuple[float, float], time_s
 SPEED_REPORT_AGE_MAX_S = 1.0
 # Fix, estimator and landed state come at 1 to 5 Hz; older than this they count as not known.
 STATUS_AGE_MAX_S = 5.0
+# Asked for at 5 to 10 Hz, of which a slowed-down link leaves a quarter.
 RANGE_AGE_MAX_S = 1.0
 _NOTHING_HEARD = PositionStream()
 

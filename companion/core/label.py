@@ -68,8 +68,8 @@ def label_broken(
     if label.wind_required or state.wind_m_s is not None:
         check(Inhibit.LABEL_WIND, state.wind_m_s if counts else None, label.wind_m_s)
     if label.wind_from_deg and (label.wind_required or state.wind is not None):
-        from_deg = wind_from_deg(state.wind) if counts else None
-        if not is_from(from_deg, label.wind_from_deg):
+        where_deg = wind_from_deg(state.wind) if counts else None
+        if not is_from(where_deg, label.wind_from_deg):
             found.append(Inhibit.LABEL_WIND_DIRECTION)
     if label.needs_utc:
         utc_s = math.nan if state.utc_offset_s is None else now_s + state.utc_offset_s
@@ -87,14 +87,23 @@ def _is_inside(value: float | None, span: Span, margin: float) -> bool:
 
 def wind_from_deg(wind: WindReport | None) -> float | None:
     """Return where the wind comes from; None without a direction."""
-    if wind is None or wind.east_m_s is None or wind.north_m_s is None:
-        return None
-    if not 0.0 < math.hypot(wind.east_m_s, wind.north_m_s) < math.inf:
-        return None
-    return math.degrees(math.atan2(-wind.east_m_s, -wind.north_m_s)) % 360.0
+    return None if wind is None else from_deg(wind.east_m_s, wind.north_m_s)
 
 
-def is_from(from_deg: float | None, sectors: tuple[Span, ...]) -> bool:
+def from_deg(east_m_s: float | None, north_m_s: float | None) -> float | None:
+    """Return where a wind comes from that blows there; None without a direction.
+
+    >>> from_deg(3.0, 0.0), from_deg(0.0, 0.0)
+    (270.0, None)
+    """
+    if east_m_s is None or north_m_s is None:
+        return None
+    if not 0.0 < math.hypot(east_m_s, north_m_s) < math.inf:
+        return None
+    return math.degrees(math.atan2(-east_m_s, -north_m_s)) % 360.0
+
+
+def is_from(angle_deg: float | None, sectors: tuple[Span, ...]) -> bool:
     """Return whether a direction lies in one of the sectors, clockwise from first to last.
 
     >>> is_from(350.0, ((270.0, 10.0),)), is_from(11.0, ((270.0, 10.0),))
@@ -102,8 +111,8 @@ def is_from(from_deg: float | None, sectors: tuple[Span, ...]) -> bool:
     >>> is_from(11.0, ((0.0, 360.0),)), is_from(11.0, ((10.0, 10.0),))
     (True, False)
     """
-    return from_deg is not None and any(
-        (from_deg - first) % 360.0 <= (360.0 if last - first == 360.0 else (last - first) % 360.0)
+    return angle_deg is not None and any(
+        (angle_deg - first) % 360.0 <= (360.0 if last - first == 360.0 else (last - first) % 360.0)
         for first, last in sectors
     )
 

@@ -132,8 +132,7 @@ def fly_flight(settings: Settings, seed: int, folder: Path) -> Row:
     best = _perfect(scene, path, options) if given.get("flight.perfect") else None
     ratio = None if best is None else limit_ratio(found, best)
     figures = {
-        **_distances(found),
-        **{name: getattr(found, name, None) for name in (*NUMBERS, *COUNTS)},
+        **figures_of(found),
         "limit_ratio": ratio,
         "simulated_s": result.simulated_s,
         "steps": result.steps,
@@ -153,8 +152,9 @@ def _only(settings: Settings, starts: tuple[str, ...]) -> Settings:
     return tuple(each for each in settings if each[0].startswith(starts))
 
 
-def _distances(found: Evaluation) -> dict[str, Any]:
-    row: dict[str, Any] = {}
+def figures_of(found: Evaluation) -> dict[str, Any]:
+    """Return the figures of a flight as a row has them."""
+    row: dict[str, Any] = {name: getattr(found, name, None) for name in (*NUMBERS, *COUNTS)}
     for name in DISTANCES:
         lags: Distances = getattr(found, f"{name}_m")
         row |= {f"{name}_{each}_m": getattr(lags, each) for each in OF_DISTANCES}

@@ -18,7 +18,7 @@ from analysis.report.legal_fields import Facts, Told, told_with
 from analysis.report.treated import Clock, treated_of
 from companion.config.application_table import PROFILES, Profile
 from companion.simulated import Simulated
-from tests.analysis.report_flight import fly
+from tests.analysis.report_flight import EU_TOLD, fly
 
 # What a law lists, in its words, shortened; the fields of the record that answer it.
 LAWS: dict[Profile, dict[str, tuple[str, ...]]] = {
@@ -71,14 +71,7 @@ LAWS: dict[Profile, dict[str, tuple[str, ...]]] = {
         "contractor": ("operator",),
     },
 }  # fmt: skip
-SAID = {
-    "application.operator": "A. Grower",
-    "application.parcel": "ES-41-17",
-    "application.crop": "wheat",
-    "application.crop_eppo": "TRZAW",
-    "application.growth_stage_bbch": "31",
-    "application.product_per_l": 0.05,
-    "application.product_unit": "L",
+SAID = EU_TOLD | {
     "application.customer": "B. Farmer",
     "application.customer_address": "1 Farm Road",
     "application.customer_contact": "02 5550 0000",
@@ -97,7 +90,6 @@ SAID = {
     "application.temperature_c": 20.0,
     "application.humidity_percent": 60.0,
     "application.inversion": "no",
-    "product.name": "Mix 50",
     "product.registration": "12345",
     "product.active_constituents": "propiconazole 250 g/L",
 }

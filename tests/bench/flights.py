@@ -15,13 +15,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from analysis.evaluation import Evaluation, evaluate, limit_ratio
+from analysis.evaluation import Evaluation, evaluate
 from companion.errors import VrsprayError
 from sitl.anyang import EXAMPLE
 from sitl.campaign.bundle import Bundle, bundle_of, unpack
 from sitl.campaign.dataset import open_dataset, read_columns
 from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.executors import Done, Workers, pool_of
+from sitl.campaign.flying import figures_of
 from sitl.campaign.running import Tally, fly_missing
 from sitl.demo_field import demo_trajectory
 from sitl.flight import FlightOptions, fly
@@ -195,7 +196,7 @@ def _place_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
 def _flown_of(row: Mapping[str, Any], perfect: Mapping[str, Any] | None) -> Flown:
     best: Mapping[str, Any] = perfect or {}
     misapplied, least = row["misapplied_percent"], best.get("misapplied_percent")
-    board = "free-running" if row["case"] == "free-running" else row["output"]
+    board = "free-running" if row.get("case") == "free-running" else row["output"]
     return Flown(
         plant=row["plant"],
         condition=row.get(CONDITION, FIELD),
@@ -295,32 +296,13 @@ def kept(
     lags: str = NOMINAL,
 ) -> Flown:
     """Return what is kept of a flight, beside that with perfect knowledge."""
-    lag, settled = found.lag_distance_m, found.settled_lag_distance_m
-    best = None if perfect is None else perfect.lag_distance_m
-    return Flown(
-        plant=task.plant,
-        condition=task.condition,
-        lags=lags,
-        speed_m_s=found.meta.speed_m_s,
-        method=found.meta.method,
-        output=output,
-        seed=found.meta.seed,
-        mean_m=lag.mean,
-        mean_abs_m=lag.mean_abs,
-        max_abs_m=lag.max_abs,
-        count=lag.count,
-        apart=found.apart,
-        missed=found.missed,
-        settled_mean_m=settled.mean,
-        settled_mean_abs_m=settled.mean_abs,
-        accuracy_percent=found.spraying_accuracy_percent,
-        settled_accuracy_percent=found.settled_accuracy_percent,
-        perfect_accuracy_percent=None if perfect is None else perfect.spraying_accuracy_percent,
-        perfect_mean_abs_m=None if best is None else best.mean_abs,
-        perfect_max_abs_m=None if best is None else best.max_abs,
-        misapplied_percent=found.misapplied_percent,
-        limit_ratio=None if perfect is None else limit_ratio(found, perfect),
-        off_target_ml=found.off_target_ml,
-        border_margin_m=found.border_margin_m.mean,
-        border_bound_m=found.border_bound_m,
-    )
+    meta = found.meta
+    row = figures_of(found) | {
+        "plant": task.plant,
+        "speed_m_s": meta.speed_m_s,
+        "method": meta.method,
+        "output": output,
+        "seed": meta.seed,
+        **({} if task.condition == FIELD else {CONDITION: task.condition}),
+    }
+    return replace(_flown_of(row, None if perfect is None else figures_of(perfect)), lags=lags)

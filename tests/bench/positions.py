@@ -14,7 +14,6 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import fmean
 
@@ -24,6 +23,7 @@ from sitl.hard_fields import condition_of
 from sitl.profile import load_profile
 from sitl.workers import do_all
 from tests.bench.flights import FIELD, Task, place
+from tests.bench.report import made_by
 from tests.bench.sprayers import PLANT, known_setup, options_of
 
 FLIGHTS = ("field-2", "field-5", "sway", "gusts", "braking")
@@ -139,10 +139,7 @@ def main() -> None:
     ]
     told = "\n".join(table(do_all(measure, todo, processes=asked.processes)))
     if asked.page:
-        given = [word for word in sys.argv[1:] if word != "--page"]
-        command = " ".join(["python -m tests.bench.positions", *given])
-        today = datetime.now(tz=UTC).date().isoformat()
-        PAGE.write_text(PAGE_TEXT.format(command=command, today=today, table=told))
+        PAGE.write_text(PAGE_TEXT.format(**made_by("positions"), table=told))
     sys.stdout.write(f"{told}\n")
 
 

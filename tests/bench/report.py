@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
 from typing import Any
 
 from tests.bench.figures import Figure, short
@@ -169,3 +171,12 @@ def _others(figure: Figure) -> str:
 
 def _line(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cells) + " |"
+
+
+def made_by(bench: str) -> dict[str, str]:
+    """Return what a page says of how it was made: the command, but for --page, and the day."""
+    given = [word for word in sys.argv[1:] if word != "--page"]
+    return {
+        "command": " ".join([f"python -m tests.bench.{bench}", *given]),
+        "today": datetime.now(tz=UTC).date().isoformat(),
+    }

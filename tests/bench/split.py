@@ -12,7 +12,6 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from statistics import fmean
 
@@ -27,6 +26,7 @@ from sitl.trajectory import Trajectory
 from sitl.vehicle import Vehicle
 from sitl.workers import do_all
 from tests.bench.flights import Task, place
+from tests.bench.report import made_by
 from tests.bench.sprayers import PLANT, Output, known_setup, options_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "measurements" / "split.md"
@@ -236,10 +236,7 @@ def main() -> None:
     ]
     told = "\n".join(table(do_all(measure, todo, processes=asked.processes)))
     if asked.page:
-        given = [word for word in sys.argv[1:] if word != "--page"]
-        command = " ".join(["python -m tests.bench.split", *given])
-        today = datetime.now(tz=UTC).date().isoformat()
-        PAGE.write_text(PAGE_TEXT.format(command=command, today=today, tables=told))
+        PAGE.write_text(PAGE_TEXT.format(**made_by("split"), tables=told))
     sys.stdout.write(f"{told}\n")
 
 

@@ -15,7 +15,6 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from statistics import fmean
@@ -29,6 +28,7 @@ from sitl.profile import PlantProfile, draw_scatter, load_profile
 from sitl.valve_calibration import Calibrated, calibrate_valves, with_figures
 from sitl.workers import do_all
 from tests.bench.flights import Task, perfect, place
+from tests.bench.report import made_by
 from tests.bench.sprayers import PLANT, Output, options_of, sprayer_setup
 
 PAGE_TEXT = """<!-- Written by `python -m tests.bench.valves --page`; do not edit. -->
@@ -201,12 +201,6 @@ def _of_speed(rows: Sequence[Row]) -> list[str]:
     return told
 
 
-def page(rows: Sequence[Row], command: str) -> str:
-    """Return the page of the documentation."""
-    today = datetime.now(tz=UTC).date().isoformat()
-    return PAGE_TEXT.format(command=command, today=today, figures="\n".join(lines(rows)))
-
-
 def main() -> None:
     """Measure, and print what came of it."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -228,8 +222,8 @@ def main() -> None:
     ]
     rows = do_all(measure, todo, processes=asked.processes)
     if asked.page:
-        given = [word for word in sys.argv[1:] if word != "--page"]
-        PAGE.write_text(page(rows, " ".join(["python -m tests.bench.valves", *given])))
+        figures = "\n".join(lines(rows))
+        PAGE.write_text(PAGE_TEXT.format(**made_by("valves"), figures=figures))
     told = json.dumps([asdict(row) for row in rows]) if asked.json else "\n".join(lines(rows))
     sys.stdout.write(told + "\n")
 
