@@ -6,10 +6,10 @@ import json
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from datetime import date, time
 from typing import TYPE_CHECKING, Any
 
 from companion.config.application_table import Profile, check, is_number, is_told, known
+from companion.config.load import parse_value
 from companion.errors import ConfigError
 from companion.simulated import Simulated
 
@@ -128,12 +128,7 @@ def _parsed(change: str) -> tuple[str, Any]:
             f"--set {change}: no entry of the record; write one such as application.customer=NAME "
             "or product.name=NAME"
         )
-    try:
-        parsed = tomllib.loads(f"value = {text}")
-    except (tomllib.TOMLDecodeError, RecursionError):
-        return key, text
-    is_value = list(parsed) == ["value"] and not isinstance(parsed["value"], date | time)
-    value = parsed["value"] if is_value else text
+    value = parse_value(text)
     # A certificate's number and a growth stage are digits, and no numbers.
     return key, value if isinstance(value, str) or is_number(key) else text
 

@@ -75,7 +75,7 @@ def _apply(raw: dict[str, Any], override: str) -> list[str]:
         raise ConfigError(
             f"override {show_value(override)}: no setting; write KEY=VALUE such as lag.on_s=0.12"
         )
-    value = _parse(value_text.strip())
+    value = parse_value(value_text.strip())
     node: Any = raw
     for step, following in zip(steps, [*steps[1:], None], strict=True):
         if isinstance(step, int) and not (isinstance(node, list) and step < len(node)):
@@ -107,11 +107,11 @@ def _steps(key: str) -> list[str | int]:
     return steps
 
 
-def _parse(text: str) -> Any:
-    """Return a value as TOML has it; what TOML does not know is text, and so is a time.
+def parse_value(text: str) -> Any:
+    """Return what follows `--set KEY=` as TOML has it; what it does not know is text, and a time.
 
-    >>> _parse("0.12"), _parse("none"), _parse('["AUTO"]'), _parse("2026-05-01T06:30:00Z")
-    (0.12, 'none', ['AUTO'], '2026-05-01T06:30:00Z')
+    >>> [parse_value(text) for text in ("0.12", "none", '["AUTO"]', "2026-05-01T06:30:00Z")]
+    [0.12, 'none', ['AUTO'], '2026-05-01T06:30:00Z']
     """
     try:
         parsed = tomllib.loads(f"value = {text}")
