@@ -16,6 +16,7 @@ from tests.reference import (
     map_problems,
     mavlink,
     metrics,
+    plants,
     reasons,
     scenarios,
 )
@@ -32,6 +33,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "metrics.md": metrics.page,
     "journal.md": journal.page,
     "scenarios.md": scenarios.page,
+    "plants.md": plants.page,
     "campaigns.md": campaigns.page,
     "driver-board.md": driver_board.page,
     "fleet.md": fleet.page,
