@@ -7,7 +7,7 @@ missed a change. Everything is volume per metre of track, so that a change of sp
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +29,15 @@ DEBT_PERIODS = 1.0
 # of the next stretch have not.
 LEVEL_FROM = 0.50
 LEVEL_TO = 0.88
+# A change is looked for between the usual doses of its stretches, their medians: a dip of the dose
+# while the aircraft brakes moves the mean, and a step of 10 % was then found in the dip. Medians
+# that differ by less than this of what is asked do not tell where it was.
+USUAL_STEP_MIN = 0.25
+# Up to so many periods beside a change, from so many on, say how sharp it is: a flow that drifts
+# on for seconds after a sharp step makes it no slow one.
+BESIDE_PERIODS = 20
+BESIDE_FROM_PERIODS = 1.5
+BESIDE_PERIODS_MIN = 3
 # No change is looked for earlier than this before its boundary.
 SEARCH_BEFORE_S = 2.0
 # A sharp step, smoothed by three means over one period, passes a quarter and three quarters of
@@ -104,6 +113,16 @@ def levels_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
     return [float(level) for level in np.where(inside, found, 0.0)]
 
 
+def usual_doses_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
+    """Return the dose [mL/m] that the flow mostly had in each stretch; 0 outside the field."""
+    found = []
+    for stretch in stretches:
+        start_s, end_s = (stretch.start_s + at * stretch.dwell_s for at in (LEVEL_FROM, LEVEL_TO))
+        part = slice(smooth.track.sample(start_s), smooth.track.sample(end_s) + 1)
+        found.append(float(np.median(smooth.dose_ml_m[part])) if stretch.inside else 0.0)
+    return found
+
+
 def prescribed_dose_ml_m(track: Track, rate_l_ha: float, time_s: float) -> float:
     """Return the volume per metre of track that a rate asks of a strip."""
     return rate_l_ha * track.value(track.across_m, time_s) * ML_M_PER_L_HA_M
@@ -115,6 +134,8 @@ def find_transitions(
     """Return the transition of each pair of neighbouring stretches."""
     levels_before = levels_of(smooth, [each.before for each in sides])
     levels_after = levels_of(smooth, [each.after for each in sides])
+    usual_before = usual_doses_of(smooth, [each.before for each in sides])
+    usual_after = usual_doses_of(smooth, [each.after for each in sides])
     found: list[Transition] = []
     for i, change in enumerate(changes):
         before, after = sides[i].before, sides[i].after
@@ -131,7 +152,10 @@ def find_transitions(
         asked *= after.rate_l_ha - before.rate_l_ha
         progress = (pair[1] - pair[0]) / asked
         if progress > 0.0 and late_s - early_s > smooth.track.step_s:
-            found.append(_located(smooth, pair, early_s, late_s, progress=progress))
+            usual = (usual_before[i], usual_after[i])
+            is_told = (usual[1] - usual[0]) / asked >= USUAL_STEP_MIN
+            located = _located(smooth, usual if is_told else pair, early_s, late_s)
+            found.append(replace(located, progress=progress, levels_ml_m=pair))
         else:
             found.append(_nominal(smooth.track, at_s, progress, pair))
     return found
@@ -150,12 +174,7 @@ def _nominal(track: Track, at_s: float, progress: float, levels: tuple[float, fl
 
 
 def _located(
-    smooth: SmoothTrack,
-    levels: tuple[float, float],
-    early_s: float,
-    late_s: float,
-    *,
-    progress: float,
+    smooth: SmoothTrack, levels: tuple[float, float], early_s: float, late_s: float
 ) -> Transition:
     """Return the transition between two levels in a span of time.
 
@@ -168,16 +187,57 @@ def _located(
     part = (smooth.dose_ml_m[first:last] - levels[0]) / (levels[1] - levels[0])
     excess = np.cumsum((np.minimum(np.maximum(part, 0.0), 1.0) - 0.5) * smooth.metres[first:last])
     middle = first + int(np.argmin(excess))
+    middle_s = float(track.time_s[middle])
+    low_s, high_s = _quarters_s(smooth, levels, middle, early_s, late_s)
+    slow_s = _slow_s(track, low_s, high_s)
+    beside = _levels_beside(smooth, middle_s, early_s, late_s) if slow_s > 0.0 else None
+    if beside is not None and (beside[1] - beside[0]) * (levels[1] - levels[0]) > 0.0:
+        sharp_s = _quarters_s(smooth, beside, middle, early_s, late_s)
+        if not _slow_s(track, *sharp_s) > 0.0:
+            (low_s, high_s), slow_s = sharp_s, 0.0
+    return Transition(
+        begin_s=low_s - 0.35 * track.period_s - slow_s,
+        middle_s=middle_s,
+        settled_s=high_s + 1.35 * track.period_s + 3.0 * slow_s,
+        progress=1.0,
+        levels_ml_m=levels,
+        found=True,
+    )
+
+
+def _quarters_s(
+    smooth: SmoothTrack,
+    levels: tuple[float, float],
+    middle: int,
+    early_s: float,
+    late_s: float,
+) -> tuple[float, float]:
+    """Return when the flow last had a quarter of the step, and when it first had three quarters."""
+    track = smooth.track
+    first, last = track.sample(early_s), track.sample(late_s) + 1
+    part = (smooth.dose_ml_m[first:last] - levels[0]) / (levels[1] - levels[0])
     below = np.flatnonzero(part[: middle - first + 1] <= 0.25)
     above = np.flatnonzero(part[middle - first :] >= 0.75)
     low_s = track.time_s[first + below[-1]] if len(below) else early_s
     high_s = track.time_s[middle + above[0]] if len(above) else late_s
-    slow_s = max(high_s - low_s - (SHARP_QUARTERS_PERIODS + DEBT_PERIODS) * track.period_s, 0.0)
-    return Transition(
-        begin_s=float(low_s - 0.35 * track.period_s - slow_s),
-        middle_s=float(track.time_s[middle]),
-        settled_s=float(high_s + 1.35 * track.period_s + 3.0 * slow_s),
-        progress=progress,
-        levels_ml_m=levels,
-        found=True,
-    )
+    return float(low_s), float(high_s)
+
+
+def _slow_s(track: Track, low_s: float, high_s: float) -> float:
+    """Return by how much longer than a sharp step it took."""
+    sharp_s = (SHARP_QUARTERS_PERIODS + DEBT_PERIODS) * track.period_s
+    return max(high_s - low_s - sharp_s, 0.0)
+
+
+def _levels_beside(
+    smooth: SmoothTrack, middle_s: float, early_s: float, late_s: float
+) -> tuple[float, float] | None:
+    """Return the doses right before and after a change; None where there is no room for them."""
+    period_s = smooth.track.period_s
+    from_s, far_s = BESIDE_FROM_PERIODS * period_s, BESIDE_PERIODS * period_s
+    starts_s = np.array([max(middle_s - far_s, early_s), middle_s + from_s])
+    ends_s = np.array([middle_s - from_s, min(middle_s + far_s, late_s)])
+    if not bool(np.all(ends_s - starts_s >= BESIDE_PERIODS_MIN * period_s)):
+        return None
+    before, after = smooth.doses_between(starts_s, ends_s).tolist()
+    return before, after

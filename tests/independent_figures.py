@@ -172,70 +172,112 @@ class Valve:
 
 
 PERIOD = {"s": 0.0}
+Span = tuple[float, float]
+
+
+class Flow:
+    """The smoothed volume of a valve over its smoothed way, and what it was between boundaries."""
+
+    def __init__(self, valve: Valve, period_s: float) -> None:
+        self.valve, self.period_s = valve, period_s
+        self.volume = valve.mean(valve.mean(valve.volume, period_s), period_s)
+        self.way = valve.mean(valve.mean(valve.s, period_s), period_s)
+        run, rise = valve.over(self.way, period_s), valve.over(self.volume, period_s)
+        self.dose = np.divide(rise, run, out=np.zeros(len(run)), where=run > 0.1 * period_s)
+        inner = [edge[0] for edge in valve.edges]
+        self.times = [float(valve.time_s[0]), *inner, float(valve.time_s[-1])]
+
+    def between(self, start_s: float, end_s: float) -> float:
+        """Return the mean dose between two times."""
+        rises = [
+            self.valve.at(each, np.array([start_s, end_s])) for each in (self.volume, self.way)
+        ]
+        ml, metres = (float(np.diff(each)[0]) for each in rises)
+        return ml / metres
+
+    def row(self, time_s: float) -> int:
+        return int((time_s - self.valve.time_s[0]) / self.valve.step_s)
+
+    def level(self, number: int, *, usual: bool = False) -> float:
+        """Return the dose of a stretch, its mean or what it mostly was."""
+        rate = self.valve.edges[number - 1][3] if number else float(self.valve.rates[0])
+        if rate <= 0.0:
+            return 0.0
+        start_s, dwell_s = self.times[number], self.times[number + 1] - self.times[number]
+        ends_s = start_s + 0.5 * dwell_s, start_s + 0.88 * dwell_s
+        if usual:
+            return float(np.median(self.dose[self.row(ends_s[0]) : self.row(ends_s[1]) + 1]))
+        return self.between(*ends_s)
+
+    def asked(self, number: int) -> float:
+        """Return the step of the dose that a boundary asks for."""
+        time_s, _, before, after = self.valve.edges[number]
+        return (after - before) * ML_PER_M * float(self.valve.at(self.valve.across, time_s))
+
+    def change(self, number: int, after_s: float) -> tuple[float, Span]:
+        """Return the middle of a change, not before `after_s`, and from when to when it lasts."""
+        time_s, _, _, after = self.valve.edges[number]
+        low, high = self.level(number), self.level(number + 1)
+        mostly = self.level(number, usual=True), self.level(number + 1, usual=True)
+        if (mostly[1] - mostly[0]) / self.asked(number) >= 0.25:
+            low, high = mostly
+        end_s = self.times[number + 2]
+        early_s = max(self.times[number], time_s - 2.0, after_s)
+        late_s = end_s if after > 0.0 else time_s + 0.5 * (end_s - time_s)
+        first, last = self.row(early_s), self.row(late_s) + 1
+        part = (self.dose[first:last] - low) / (high - low)
+        metres = np.diff(self.way[first : last + 1], append=self.way[-1])[: len(part)]
+        middle = first + int(np.argmin(np.cumsum((np.clip(part, 0.0, 1.0) - 0.5) * metres)))
+        middle_s = float(self.valve.time_s[middle])
+
+        def quarters(low: float, high: float) -> Span:
+            part = (self.dose[first:last] - low) / (high - low)
+            below = np.flatnonzero(part[: middle - first + 1] <= 0.25)
+            above = np.flatnonzero(part[middle - first :] >= 0.75)
+            low_s = float(self.valve.time_s[first + below[-1]]) if len(below) else early_s
+            return low_s, float(self.valve.time_s[middle + above[0]]) if len(above) else late_s
+
+        period_s = self.period_s
+        low_s, high_s = quarters(low, high)
+        slow_s = max(high_s - low_s - 1.68 * period_s, 0.0)
+        # Slow by the doses of the whole stretches, it may be sharp by those right beside it.
+        left = max(middle_s - 20.0 * period_s, early_s), middle_s - 1.5 * period_s
+        right = middle_s + 1.5 * period_s, min(middle_s + 20.0 * period_s, late_s)
+        if slow_s > 0.0 and min(left[1] - left[0], right[1] - right[0]) >= 3.0 * period_s:
+            near = self.between(*left), self.between(*right)
+            span = quarters(*near) if (near[1] - near[0]) * (high - low) > 0.0 else (low_s, high_s)
+            if span[1] - span[0] <= 1.68 * period_s:
+                (low_s, high_s), slow_s = span, 0.0
+        return middle_s, (low_s - 0.35 * period_s - slow_s, high_s + 1.35 * period_s + 3.0 * slow_s)
+
+    def line(self, near_s: float, far_s: float, sign: float) -> tuple[float, float, float]:
+        """Return a point of the volume over the way near a change, and the slope away from it."""
+        periods = min(int(abs(far_s - near_s) / self.period_s) - 2, 20)
+        anchor_s = near_s + sign * self.period_s
+        ends = sorted((anchor_s, anchor_s + sign * periods * self.period_s))
+        way, volume = (float(self.valve.at(each, anchor_s)) for each in (self.way, self.volume))
+        return way, volume, self.between(*ends)
 
 
 def lags(valve: Valve, period_s: float) -> tuple[list[float], int]:
     """Return the lag distance of every change inside the field, and how many never came."""
-    volume = valve.mean(valve.mean(valve.volume, period_s), period_s)
-    way = valve.mean(valve.mean(valve.s, period_s), period_s)
-    run = valve.over(way, period_s)
-    dose = np.divide(
-        valve.over(volume, period_s), run, out=np.zeros(len(run)), where=run > 0.1 * period_s
-    )
-    times = [float(valve.time_s[0]), *[edge[0] for edge in valve.edges], float(valve.time_s[-1])]
-
-    def between(start_s: float, end_s: float) -> float:
-        metres = float(valve.at(way, end_s) - valve.at(way, start_s))
-        return float(valve.at(volume, end_s) - valve.at(volume, start_s)) / metres
-
-    def level(number: int) -> float:
-        rate = valve.edges[number - 1][3] if number else float(valve.rates[0])
-        dwell_s = times[number + 1] - times[number]
-        if rate <= 0.0:
-            return 0.0
-        return between(times[number] + 0.5 * dwell_s, times[number] + 0.88 * dwell_s)
-
-    # When the flow leaves one level and has reached the next, for every boundary.
-    spans: list[tuple[float, float]] = []
+    flow = Flow(valve, period_s)
+    spans: list[Span] = []
     middle_s, missed = -np.inf, 0
-    for i, (time_s, _, _, after) in enumerate(valve.edges):
-        low, high = level(i), level(i + 1)
-        early_s = max(times[i], time_s - 2.0, middle_s)
-        late_s = times[i + 2] if after > 0.0 else time_s + 0.5 * (times[i + 2] - time_s)
-        first = int((early_s - valve.time_s[0]) / valve.step_s)
-        last = int((late_s - valve.time_s[0]) / valve.step_s) + 1
-        part = (dose[first:last] - low) / (high - low)
-        metres = np.diff(way[first : last + 1], append=way[-1])[: len(part)]
-        middle = first + int(np.argmin(np.cumsum((np.clip(part, 0.0, 1.0) - 0.5) * metres)))
-        below = np.flatnonzero(part[: middle - first + 1] <= 0.25)
-        above = np.flatnonzero(part[middle - first :] >= 0.75)
-        low_s = float(valve.time_s[first + below[-1]]) if len(below) else early_s
-        high_s = float(valve.time_s[middle + above[0]]) if len(above) else late_s
-        slow_s = max(high_s - low_s - 1.68 * period_s, 0.0)
-        spans.append((low_s - 0.35 * period_s - slow_s, high_s + 1.35 * period_s + 3.0 * slow_s))
-        middle_s = float(valve.time_s[middle])
+    for i in range(len(valve.edges)):
+        middle_s, span = flow.change(i, middle_s)
+        spans.append(span)
     found = []
-    for i, (time_s, distance_m, before, after) in enumerate(valve.edges):
+    for i, (_, distance_m, before, after) in enumerate(valve.edges):
         if min(before, after) <= 0.0 or abs(after - before) / before < 0.08:
             continue
-        asked = (after - before) * ML_PER_M * float(valve.at(valve.across, time_s))
-        if (level(i + 1) - level(i)) / asked < 0.5:
+        if (flow.level(i + 1) - flow.level(i)) / flow.asked(i) < 0.5:
             missed += 1
             continue
         floor_s = spans[i - 1][1] if i else float(valve.time_s[0])
         ceiling_s = spans[i + 1][0] if i + 1 < len(spans) else float(valve.time_s[-1])
-        lines = []
-        for near_s, far_s, sign in (
-            (spans[i][0], floor_s, -1.0),
-            (spans[i][1], ceiling_s, 1.0),
-        ):
-            periods = min(int(abs(far_s - near_s) / period_s) - 2, 20)
-            anchor_s = near_s + sign * period_s
-            ends = sorted((anchor_s, anchor_s + sign * periods * period_s))
-            lines.append(
-                (float(valve.at(way, anchor_s)), float(valve.at(volume, anchor_s)), between(*ends))
-            )
-        (s0, v0, q0), (s1, v1, q1) = lines
+        s0, v0, q0 = flow.line(spans[i][0], floor_s, -1.0)
+        s1, v1, q1 = flow.line(spans[i][1], ceiling_s, 1.0)
         found.append((v1 - v0 + q0 * s0 - q1 * s1) / (q0 - q1) - distance_m)
     return found, missed
 

@@ -97,6 +97,33 @@ def test_a_slow_pump_is_measured_over_its_whole_rise() -> None:
     assert np.abs(errors_m(flight)).max() < 0.15
 
 
+def disturbed(flight: Flight, since_s: list[float], factor: list[float]) -> list[float]:
+    """Return the lags of a flight whose dose has a factor from times around its second boundary."""
+    record, _ = record_of(flight)
+    boundary_s = (15.0 + 2.0 * PLOT_M) / flight.speed_m_s
+    times = np.array([1.0, *factor])[np.searchsorted(since_s, record.time_s - boundary_s)]
+    drops_ml = np.diff(record.volume_ml[:, 0], prepend=0.0) * times
+    found = evaluate(replace(record, volume_ml=np.cumsum(drops_ml)[:, np.newaxis]))
+    return [s.lag_distance_m for s in found.steps if s.lag_distance_m is not None]
+
+
+def test_a_dip_of_the_dose_is_not_taken_for_the_change() -> None:
+    # Braking: too much, a dip, and then a step of 10 % that comes where it should. It was placed
+    # in the dip, and lines that are nearly parallel there met 4 m and more away.
+    flight = Flight(rates=[[20.0, 26.2, 29.0, 20.0]], valves=1, speed_m_s=4.0)
+    since_s = [-1.9, -1.5, -1.4, -1.1, 2.2, 2.7]
+    _, lag_m, _ = disturbed(flight, since_s, [1.08, 1.0, 0.78, 1.0, 0.85, 1.0])[1:4]
+    assert abs(lag_m) < 0.3
+
+
+def test_a_flow_that_drifts_on_after_a_sharp_step_makes_it_no_slow_one() -> None:
+    flight = Flight(rates=[[20.0, 14.8, 16.3, 20.0]], valves=1, speed_m_s=4.0)
+    since_s = [0.1 * number for number in range(8, 19)]
+    lags_m = disturbed(flight, since_s, [1.0 + 0.006 * number for number in range(11)])
+    assert len(lags_m) == 5
+    assert abs(lags_m[2]) < 0.4
+
+
 def test_the_boom_offset_moves_the_boundary_and_not_the_lag() -> None:
     assert np.abs(errors_m(replace(LARGE_STEPS, forward_m=0.7))).max() < 0.005
 
