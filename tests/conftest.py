@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import inspect
+import itertools
 import multiprocessing.resource_tracker
 import os
 import signal
@@ -14,6 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import pytest_asyncio
 from hypothesis import HealthCheck, settings
 
 LoopFactory = Callable[[], asyncio.AbstractEventLoop]
@@ -77,8 +80,21 @@ LONGEST = (
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the modules that take longest first."""
+    """Put the modules that take longest first, and look for tasks wherever a loop turns."""
     items.sort(key=lambda item: item.path.name not in LONGEST)
+    for item in items:
+        if isinstance(item, pytest.Function) and _has_loop(item):
+            item.fixturenames.insert(0, "no_task_left_behind")
+
+
+def _has_loop(item: pytest.Function) -> bool:
+    """Whether a test or a fixture of it is async; a loop for each other test takes 10 s in all."""
+    fixtures = itertools.chain(*item._fixtureinfo.name2fixturedefs.values())
+    return pytest_asyncio.is_async_test(item) or any(_is_async(one.func) for one in fixtures)
+
+
+def _is_async(function: Callable[..., object]) -> bool:
+    return inspect.iscoroutinefunction(function) or inspect.isasyncgenfunction(function)
 
 
 @pytest.fixture
@@ -150,7 +166,7 @@ def no_thread_left_behind(no_process_left_behind: None) -> Iterator[None]:
     assert not running, f"threads left running: {running}"
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 async def no_task_left_behind(no_thread_left_behind: None) -> AsyncIterator[None]:
     """Fail a test that leaves a task running; one that was just cancelled may end."""
     before = asyncio.all_tasks()
