@@ -214,6 +214,12 @@ FLIGHTS: dict[str, Flight] = {
     ),
     # Lines of this computer, pulses to the edge, the sensors of this computer.
     "gpio": Flight(over="twin", settings=GPIO | COVERED, places=BOTH),
+    # And a border where valves open half a gap sooner: the setting that the other journals lack.
+    "gpio-border": Flight(
+        over="twin",
+        settings=GPIO | COVERED | EXCLUDED | {"output.kind": '"gpio"'},
+        places=BOTH,
+    ),
     "gpio-trim": Flight(
         over="twin", settings=PULSES | TRIM | GPIO, places=BOTH, twin=_pulsed(), seed=3
     ),
