@@ -74,6 +74,7 @@ def add(
     store = Store.at(into)
     with progress(quiet=as_json, after_s=PROGRESS_AFTER_S) as tell:
         try:
+            store.refuse_campaign()
             done = add_all(
                 paths,
                 store,

@@ -49,6 +49,9 @@ _STATES = {"no": "cut", "salvaged": "salvaged", "recovered": "recovered", "yes":
 _M2_PER_HA = 10_000.0
 _PIECE_BYTES = 1 << 20
 _FAULT = "fault-"
+# What a file that is a stranger's says, and one of ours that lost its beginning as well.
+_NO_JOURNAL = "is no journal"
+_SQLITE = b"SQLite format 3\0"
 
 
 class Column(NamedTuple):
@@ -188,12 +191,25 @@ def recorded(
     except (JournalError, ShapelyError, *DAMAGE) as error:
         is_damaged = isinstance(error, UnreadableError) or not isinstance(error, JournalError)
         text = str(error).removeprefix(f"{path}: ")
+        if text.startswith(_NO_JOURNAL) and _is_cut_to_nothing(path):
+            is_damaged, text = True, "is damaged: nothing of it was written to the disk"
         return Problem(
             path=path,
             text=text if isinstance(error, JournalError) else f"is damaged: {text}",
             is_damaged=is_damaged,
             journal_sha256=digest,
             flight_id=flight_id,
+        )
+
+
+def _is_cut_to_nothing(path: Path) -> bool:
+    """Return whether a power cut left only the name: no byte, zeros, or not even a whole header."""
+    if path.suffix != ".gpkg":
+        return False
+    with path.open("rb") as file:
+        first = file.read(len(_SQLITE))
+        return _SQLITE.startswith(first) or not any(
+            piece.strip(b"\0") for piece in (first, *iter(lambda: file.read(_PIECE_BYTES), b""))
         )
 
 

@@ -49,6 +49,8 @@ DAMAGED_SCHEMA = pa.schema(
     [(name, pa.string()) for name in ("journal", "journal_sha256", "flight_id", "problem")]
 )
 FLIGHTS, DAMAGED, FORGOTTEN = "flights", "damaged", "forgotten"
+# What `vrspray campaign` puts beside a folder `flights` of its own.
+_CAMPAIGN = ("manifest.json", "campaign.toml")
 # A file that was listed may be gone when it is opened: somebody has joined it with others.
 TRIES = 8
 _ROWS_A_GROUP = 50_000
@@ -100,6 +102,7 @@ class Store:
     def existing(self) -> Store:
         """Return itself where flights are in it; else a ConfigError."""
         try:
+            self.refuse_campaign()
             if self._files(FLIGHTS) or self._files(DAMAGED):
                 return self
         except STORE_ERRORS as error:
@@ -108,6 +111,14 @@ class Store:
             f"{self.url}: no flights are there; add some: vrspray fleet add JOURNAL --into "
             f"{self.url}"
         )
+
+    def refuse_campaign(self) -> None:
+        """Refuse the folder of a campaign, whose `flights` are another table; a ConfigError."""
+        if all(self.fs.exists(f"{self.root}/{name}") for name in _CAMPAIGN):
+            raise ConfigError(
+                f"{self.url}: holds the flights of a campaign; give a fleet's folder, or see it "
+                f"with: vrspray campaign show {self.url}"
+            )
 
     def refused(self, error: Exception) -> ConfigError:
         """Return what a store said as the error that all commands report."""
@@ -199,17 +210,19 @@ class Store:
     def list_damaged(self, problems: Iterable[Problem]) -> None:
         """Keep which journals are damaged; one that is listed already is no news."""
         old = self._files(DAMAGED)
-        kept = self._tables(old, DAMAGED_SCHEMA).to_pylist() if old else []
-        rows = {row["journal_sha256"]: row for row in kept}
-        for each in problems:
-            if each.is_damaged:
-                rows[each.journal_sha256] = {
-                    "journal": each.path.name,
-                    "journal_sha256": each.journal_sha256,
-                    "flight_id": each.flight_id,
-                    "problem": each.text,
-                }
-        found = sorted(rows.values(), key=lambda row: (row["journal"], row["journal_sha256"]))
+        rows = self._tables(old, DAMAGED_SCHEMA).to_pylist() if old else []
+        rows += [
+            {
+                "journal": each.path.name,
+                "journal_sha256": each.journal_sha256,
+                "flight_id": each.flight_id,
+                "problem": each.text,
+            }
+            for each in problems
+            if each.is_damaged
+        ]
+        by_place = {_damaged_key(row): row for row in rows}
+        found = [by_place[key] for key in sorted(by_place)]
         if found:
             self._replace(
                 f"{self.root}/{DAMAGED}", old, pa.Table.from_pylist(found, DAMAGED_SCHEMA)
@@ -285,6 +298,11 @@ class Store:
             with suppress(FileNotFoundError):
                 return read()
         return read()
+
+
+def _damaged_key(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Return what a damaged journal is known by: empty ones have the same content."""
+    return row["journal"], row["journal_sha256"]
 
 
 def _folder(row: Mapping[str, Any]) -> str:

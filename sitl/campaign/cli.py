@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 from companion.cli.answer import AsJson, answer, note, progress
 from companion.errors import ConfigError, StoppedError
+from companion.wording import counted
 
 if TYPE_CHECKING:
     from typer._click.core import Context
@@ -205,6 +206,8 @@ def _lines(dataset: Dataset, tally: Tally | None) -> Iterator[str]:
             f"{told['flights_per_cpu_s'] or 0.0:.2f} flights a core and second, scheduling and "
             f"writing {told['overhead_percent'] or 0.0:.1f} %"
         )
+        if tally.lost_workers:
+            yield f"{counted(tally.lost_workers, 'worker')} lost; their flights were flown again"
         if tally.failed:
             yield "the failed ones have their reason in the column error; see `campaign show`"
     yield f"dataset: {dataset.folder}; see it with: vrspray campaign show {dataset.folder}"
@@ -232,17 +235,15 @@ def show(
 
     Exit 0: shown; 2: the folder or an option is wrong.
     """
-    from sitl.campaign.sensitivity import missing_note, sensitivity_lines, sensitivity_of
+    from sitl.campaign.sensitivity import notes_of, sensitivity_lines, sensitivity_of
     from sitl.campaign.show import SHOWN, groups_of, lines_of, read_rows
     from sitl.campaign.show import as_json as shown_json
 
     rows = read_rows(folder, tuple(dict.fromkeys(figure or SHOWN)))
     groups, found = groups_of(rows, by=by), sensitivity_of(rows)
-    result = shown_json(rows, groups, found)
-    lines = [*lines_of(rows, groups), *sensitivity_lines(found)]
-    said = missing_note(rows, found)
-    if said is not None:
-        lines.append(said)
+    notes = list(notes_of(rows, found))
+    result = {**shown_json(rows, groups, found), "notes": notes}
+    lines = [*lines_of(rows, groups), *sensitivity_lines(found), *notes]
     if plots is not None:
         from sitl.campaign.pictures import draw_pictures
 

@@ -6,15 +6,18 @@ what they raise when a worker is lost, and what is to be done then.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import socket
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Executor, Future
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from time import process_time
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar, cast
 
 from companion.errors import VrsprayError
 from companion.wording import install_command
@@ -27,10 +30,21 @@ from sitl.workers import process_pool
 Done = TypeVar("Done")
 WORKERS_MAX = 256
 WAIT_S = 10.0
+# Many times what a day's flights take, so that no row depends on how fast a worker is.
+CPU_MAX_S = 600.0
+# By the clock a flight may take so many times its processor time: one may wait without an end.
+WALL_TIMES = 10.0
+# One that does not stop when it is told to, such as within a library, ends its worker.
+GRACE_S = 10.0
+WATCH = "end of a flight"
 
 
 class FlightError(VrsprayError):
     """A flight that could not be flown; its text is what stands in its row."""
+
+
+class _TooLongError(BaseException):
+    """Raised within a flight that comes to no end; no Exception, which a controller may swallow."""
 
 
 class OtherCodeError(VrsprayError):
@@ -44,6 +58,8 @@ class Workers(Protocol):
     folder: Path | None
     # At how many deaths of its worker, flown alone, a flight is given up.
     deaths: int
+    # How many workers ended that nobody had sent away.
+    lost_count: int
 
     def count(self) -> int:
         """Return how many flights are flown at a time."""
@@ -69,6 +85,7 @@ class Pool:
 
     def __init__(self, processes: int, folder: Path) -> None:
         self.folder: Path | None = folder
+        self.lost_count = 0
         self._processes = processes
         self._open = ExitStack()
         self._pool: Executor = self._open.enter_context(process_pool(processes))
@@ -92,6 +109,7 @@ class Pool:
 
     def renew(self) -> None:
         """Start new processes."""
+        self.lost_count += 1
         self._open.close()
         self._pool = self._open.enter_context(process_pool(self._processes))
 
@@ -112,6 +130,9 @@ class Cluster:
 
     def __init__(self, client: Any) -> None:
         self._client = client
+        self.lost_count = 0
+        # Dask flies a lost worker's flights elsewhere, and no error tells of it.
+        client.subscribe_topic("all", self._note)
         self._executor: Executor = client.get_executor(pure=False)
 
     def count(self) -> int:
@@ -128,6 +149,11 @@ class Cluster:
 
     def renew(self) -> None:
         """Leave it to the cluster."""
+
+    def _note(self, event: tuple[float, Any]) -> None:
+        _, told = event
+        if isinstance(told, dict) and told.get("action") == "remove-worker":
+            self.lost_count += not told.get("expected")
 
 
 @contextmanager
@@ -210,8 +236,14 @@ def fly_at_worker(source: Path | str | Bundle, code: str, settings: Settings, se
         folder = source if isinstance(source, Path) else folder_of(source)
     if folder is None:
         return Answer(None, 0.0)
+    cpu_max_s = float(cast(float, dict(settings).get("flight.cpu_max_s", CPU_MAX_S)))
     try:
-        row = fly_flight(settings, seed, folder)
+        with _bounded(cpu_max_s):
+            row = fly_flight(settings, seed, folder)
+    except _TooLongError:
+        raise FlightError(
+            f"did not end within {cpu_max_s:g} s of processor time (flight.cpu_max_s)"
+        ) from None
     except Exception as error:
         # An error of any kind costs this flight and no other one. Where the files lie is of no
         # interest, and would make the rows of two runs differ.
@@ -219,3 +251,43 @@ def fly_at_worker(source: Path | str | Bundle, code: str, settings: Settings, se
         name = "" if isinstance(error, VrsprayError) else f"{type(error).__name__}: "
         raise FlightError(f"{name}{text}") from error
     return Answer(row, process_time() - began_s)
+
+
+@contextmanager
+def _bounded(cpu_max_s: float) -> Iterator[None]:
+    """Raise a _TooLongError in what takes more processor time than this, in whatever thread it is.
+
+    Dask flies in threads, where no signal arrives. What cannot be stopped so ends its worker.
+    """
+    thread, over, lock = threading.get_ident(), threading.Event(), threading.Lock()
+    clock = time.pthread_getcpuclockid(thread)
+    cpu_end_s = time.clock_gettime(clock) + cpu_max_s
+    wall_end_s = time.monotonic() + WALL_TIMES * cpu_max_s
+
+    def watch() -> None:
+        while True:
+            left_s = min(cpu_end_s - time.clock_gettime(clock), wall_end_s - time.monotonic())
+            if left_s <= 0.0:
+                break
+            if over.wait(left_s):
+                return
+        with lock:
+            if not over.is_set():
+                _raise_in(thread, _TooLongError)
+        if not over.wait(GRACE_S):
+            os._exit(1)
+
+    try:
+        threading.Thread(target=watch, name=WATCH, daemon=True).start()
+        yield
+        with lock:
+            over.set()
+            _raise_in(thread, None)  # it may have been told so in this very moment
+    finally:
+        over.set()
+
+
+def _raise_in(thread: int, error: type[BaseException] | None) -> None:
+    """Have an error raised in a thread at its next step; None takes one back that was not yet."""
+    kind = ctypes.c_void_p() if error is None else ctypes.py_object(error)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), kind)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from companion.errors import ConfigError
 from companion.wording import install_command
 from sitl.campaign.sensitivity import Index
-from sitl.campaign.show import CONFIDENCE, Floats, Group, Rows
+from sitl.campaign.show import CONFIDENCE, Floats, Group, Rows, shown_value
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 RESPONSES, PARALLEL, SENSITIVITY = "responses.png", "parallel.png", "sensitivity.png"
 POINTS_MAX, LINES_MAX = 3000, 800
+# Values of a text that are written at its axis.
+WORDS_MAX = 16
 BLUE, RED = "#0072B2", "#D55E00"
 
 
@@ -62,7 +65,7 @@ def _numeric(rows: Rows) -> dict[str, Floats]:
     """Return the settings that are numbers in every flight."""
     found = {}
     for name, column in rows.settings.items():
-        if all(isinstance(value, int | float) for value in column):
+        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in column):
             found[name] = np.array(column, dtype=np.float64)
     return found
 
@@ -121,13 +124,18 @@ def _response(
         found = group.figures[name]
         if found is None:
             continue
-        low, high = found.low, found.high
-        half = [[0.0], [0.0]]
-        if low is not None and high is not None:
-            half = [[found.mean - low], [high - found.mean]]
+        half = _halves([(found.low, found.mean, found.high)])
         axis.errorbar(
             [x], [found.mean], yerr=half, fmt="o", ms=3.5, color=BLUE, capsize=2, zorder=2
         )
+
+
+def _halves(ends: Sequence[tuple[float | None, float, float | None]]) -> Any:
+    """Return how far intervals reach to both sides; None where one has none."""
+    sides = [
+        (at - low, high - at) for low, at, high in ends if low is not None and high is not None
+    ]
+    return list(zip(*sides, strict=True)) if len(sides) == len(ends) else None
 
 
 def _short(name: str) -> str:
@@ -137,49 +145,96 @@ def _short(name: str) -> str:
     return "_".join(parts[:half]) + "\n" + "_".join(parts[half:])
 
 
+@dataclass(frozen=True, slots=True)
+class _Column:
+    """An axis of parallel coordinates: where each setting's line crosses it, 0 to 1, and its marks.
+
+    A number has its least and greatest value as marks, a text each of its values.
+    """
+
+    places: Floats
+    marks: tuple[tuple[float, str], ...]
+
+
+def _of_numbers(values: Floats) -> _Column:
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    if not high > low:
+        return _Column(np.where(np.isnan(values), np.nan, 0.5), ((0.5, f"{low:.3g}"),))
+    marks = ((0.0, f"{low:.3g}"), (1.0, f"{high:.3g}"))
+    return _Column((values - low) / (high - low), marks)
+
+
+def _of_words(values: Sequence[Any]) -> _Column:
+    words = list(dict.fromkeys(shown_value(value) for value in values))
+    at = {word: (n + 0.5) / len(words) for n, word in enumerate(words)}
+    marks = list(at.items())[:: -(-len(words) // WORDS_MAX)]
+    places = np.array([at[shown_value(value)] for value in values])
+    return _Column(places, tuple((place, word) for word, place in marks))
+
+
+def _columns(rows: Rows) -> tuple[dict[str, _Column], dict[str, _Column]]:
+    """Return an axis for each varied setting, and for each figure that there is."""
+    everything = np.ones(len(rows.point), dtype=bool)
+    _, first = np.unique(rows.point, return_index=True)
+    numeric = _numeric(rows)
+    settings = {
+        name: _of_numbers(numeric[name][first])
+        if name in numeric
+        else _of_words([column[row] for row in first.tolist()])
+        for name, column in rows.settings.items()
+    }
+    means = {name: rows.by_point(values, everything) for name, values in rows.figures.items()}
+    known = {name: values for name, values in means.items() if not np.isnan(values).all()}
+    return settings, {name: _of_numbers(values) for name, values in known.items()}
+
+
 def _parallel(rows: Rows) -> Figure | None:
     """Draw a line for each setting through all it was given and all it gave."""
     from matplotlib import colormaps
 
     from sitl.demo_style import new_figure
 
-    everything = np.ones(len(rows.point), dtype=bool)
-    columns = {name: rows.by_point(v, everything) for name, v in _numeric(rows).items()}
-    figures = {name: rows.by_point(v, everything) for name, v in rows.figures.items()}
-    figures = {name: v for name, v in figures.items() if not np.isnan(v).all()}
-    if not columns or not figures:
+    settings, figures = _columns(rows)
+    if not settings or not figures:
         return None
-    columns |= figures
-    width = 1.6 * len(columns) + 1.0
-    figure = new_figure(
-        (max(width, 7.0), 4.4),
-        *_title(rows, f"A line a setting, its colour by {next(iter(figures))}"),
-    )
-    axis = figure.add_axes((0.06, 0.2, 0.88, 0.6))
-    data = np.column_stack(list(columns.values()))
+    columns = settings | figures
+    data = np.column_stack([column.places for column in columns.values()])
     data = data[~np.isnan(data).any(axis=1)]
     data = data[:: max(-(-len(data) // LINES_MAX), 1)]
     if not len(data):
         return None
-    low, span = data.min(axis=0), np.ptp(data, axis=0)
-    scaled = np.where(span > 0.0, (data - low) / np.where(span > 0.0, span, 1.0), 0.5)
-    first = scaled[:, len(columns) - len(figures)]
-    order = np.argsort(first)
-    for line in order.tolist():
-        axis.plot(scaled[line], color=colormaps["viridis_r"](first[line]), lw=0.8, alpha=0.7)
+    figure = new_figure(
+        (max(1.6 * len(columns) + 1.0, 7.0), 4.4),
+        *_title(rows, f"A line a setting, its colour by {next(iter(figures))}"),
+    )
+    axis = figure.add_axes((0.06, 0.2, 0.88, 0.6))
+    first = data[:, len(settings)]
+    for line in np.argsort(first).tolist():
+        axis.plot(data[line], color=colormaps["viridis_r"](first[line]), lw=0.8, alpha=0.7)
     names = [_short(name) if name in figures else name.replace(".", "\n") for name in columns]
     axis.set_xticks(range(len(columns)), names, size=7)
     axis.set_xlim(0, len(columns) - 1)
     axis.set_yticks([])
-    for place, (least, width_of) in enumerate(zip(low, span, strict=True)):
+    for place, column in enumerate(columns.values()):
         axis.axvline(place, color="0.5", lw=0.8)
-        axis.text(place, 1.03, f"{least + width_of:.3g}", ha="center", va="bottom", size=7)
-        axis.text(place, -0.03, f"{least:.3g}", ha="center", va="top", size=7)
+        for height, text in column.marks:
+            _mark(axis, place, height, text)
     axis.set_ylim(0.0, 1.0)
     axis.tick_params(axis="x", length=0, pad=16)
     for spine in axis.spines.values():
         spine.set_visible(False)
     return figure
+
+
+def _mark(axis: Axes, place: float, height: float, text: str) -> None:
+    """Write a value at its axis: the ends of numbers above and below it, others beside it."""
+    if height in (0.0, 1.0):
+        up = height == 1.0
+        at, side = (1.03, "bottom") if up else (-0.03, "top")
+        axis.text(place, at, text, ha="center", va=side, size=7)
+        return
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
+    axis.text(place, height, text, ha="center", va="center", size=7, bbox=box)
 
 
 def _sensitivity(rows: Rows, found: Sequence[Index]) -> Figure | None:
@@ -195,7 +250,7 @@ def _sensitivity(rows: Rows, found: Sequence[Index]) -> Figure | None:
     width, height = 2.4 * len(figures) + 2.2, 0.5 * len(settings) + 1.6
     figure = new_figure(
         (width, height),
-        *_title(rows, f"What matters: {', '.join(kinds)} with {CONFIDENCE:.0%} intervals"),
+        *_title(rows, f"What matters: {', '.join(kinds)}{_said(shown)}"),
     )
     axes = figure.subplots(1, len(figures), squeeze=False, sharey=True)[0]
     figure.subplots_adjust(
@@ -208,7 +263,7 @@ def _sensitivity(rows: Rows, found: Sequence[Index]) -> Figure | None:
             at = [
                 settings.index(e.setting) + 0.25 * (number - 0.5 * (len(kinds) - 1)) for e in each
             ]
-            half = [[e.value - e.low for e in each], [e.high - e.value for e in each]]
+            half = _halves([(e.low, e.value, e.high) for e in each])
             colour = (BLUE, RED)[number % 2]
             axis.errorbar(
                 [e.value for e in each], at, xerr=half, fmt="o", ms=4, color=colour, capsize=2,
@@ -221,3 +276,9 @@ def _sensitivity(rows: Rows, found: Sequence[Index]) -> Figure | None:
     if len(kinds) > 1:
         axes[-1].legend(fontsize=7)
     return figure
+
+
+def _said(shown: Sequence[Index]) -> str:
+    if any(each.low is None for each in shown):
+        return ", of too few samples for intervals"
+    return f" with {CONFIDENCE:.0%} intervals"

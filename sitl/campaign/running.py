@@ -96,6 +96,7 @@ def fly_missing(
         todo = (number for part in dataset.missing() for number in dataset.flights_of(part))
         _fly(flying, todo)
     finally:
+        tally.lost_workers = workers.lost_count
         tally.wall_s = time.monotonic() - began_s
         tally.own_cpu_s = time.process_time() - began_cpu_s
 
@@ -160,7 +161,6 @@ def _lose(flying: _Flying, number: int) -> None:
 
     Anybody may end a worker: so a process pool, where one death is enough, asks twice.
     """
-    flying.tally.lost_workers += 1
     if flying.suspects and flying.suspects[0] == number:
         flying.ended[number] = flying.ended.get(number, 0) + 1
         if flying.ended[number] == flying.workers.deaths:

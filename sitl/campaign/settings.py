@@ -56,6 +56,7 @@ KINDS: dict[str, Kind] = {
     "flight.board": Kind(str, ("restarting", "free-running")),
     "flight.meter_rate_hz": _number(0.0, 1000.0),
     "flight.perfect": Kind(bool),
+    "flight.cpu_max_s": _number(1.0, 1_000_000.0),
     "vehicle.speed_m_s": _number(0.5, 30.0),
     "vehicle.acceleration_m_s2": _number(0.1, 20.0),
     "vehicle.gust_m_s": _number(0.0, 20.0),

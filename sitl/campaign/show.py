@@ -164,7 +164,7 @@ def _of_setting(rows: Rows, name: str) -> Iterator[Group]:
         order = sorted(values) if is_number else values
         for value in order:
             middle = float(value) if is_number else None
-            yield _group(rows, name, _shown(value), place == indices[value], middle)
+            yield _group(rows, name, shown_value(value), place == indices[value], middle)
         return
     numbers = np.array(column, dtype=np.float64)
     edges = np.linspace(numbers.min(), numbers.max(), BINS + 1)
@@ -176,7 +176,8 @@ def _of_setting(rows: Rows, name: str) -> Iterator[Group]:
             yield _group(rows, name, f"{low:.3g} to {high:.3g}", chosen, 0.5 * (low + high))
 
 
-def _shown(value: Any) -> str:
+def shown_value(value: Any) -> str:
+    """Return a setting's value as tables and pictures have it."""
     return f"{value:g}" if isinstance(value, float) else "-" if value is None else str(value)
 
 

@@ -176,6 +176,45 @@ def test_damaged_journals_are_listed_and_the_others_are_in(
     assert taken([bad], fleet, evaluate=False).problems == ()
 
 
+@pytest.mark.parametrize("content", [b"", b"\0" * 70_000, b"SQLite f"])
+def test_a_journal_of_which_nothing_was_written_is_listed(
+    several: list[Path], tmp_path: Path, content: bytes
+) -> None:
+    """A power cut may leave no more than a name; two of them have the same content."""
+    gone = [tmp_path / f"flight-000{number}.gpkg" for number in (8, 9)]
+    for path in gone:
+        path.write_bytes(content)
+    found = taken([several[0], *gone], tmp_path / "fleet", evaluate=False)
+    assert found.added == 1
+    assert {each.text for each in found.problems} == {
+        "is damaged: nothing of it was written to the disk"
+    }
+    taken(gone, tmp_path / "fleet", evaluate=False)
+    listed = rows(tmp_path / "fleet", "SELECT journal FROM damaged ORDER BY journal")
+    assert [each["journal"] for each in listed] == [path.name for path in gone]
+
+
+@pytest.mark.parametrize("command", ["add", "query", "report", "forget"])
+def test_the_folder_of_a_campaign_is_no_fleet(
+    several: list[Path], tmp_path: Path, capsys: Captured, command: str
+) -> None:
+    campaign = tmp_path / "lags-flights"
+    (campaign / "flights" / "part=00000").mkdir(parents=True)
+    for name in ("manifest.json", "campaign.toml", "flights/part=00000/flights.parquet"):
+        (campaign / name).touch()
+    before = contents(campaign)
+    given = {
+        "add": [str(several[0]), "--into", str(campaign)],
+        "query": ["SELECT 1", "--fleet", str(campaign)],
+        "report": ["--out", str(tmp_path / "report"), "--fleet", str(campaign)],
+        "forget": ["A. Grower", "--fleet", str(campaign)],
+    }
+    assert execute(["fleet", command, *given[command]]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "holds the flights of a campaign; give a fleet's folder" in said and "\n" not in said
+    assert contents(campaign) == before
+
+
 def test_a_journal_that_is_still_written_is_left_for_later(tmp_path: Path) -> None:
     with Journal.create(tmp_path, setup=setup(), started_s=1.0) as journal:
         found = taken([journal.path], tmp_path / "fleet")
@@ -287,6 +326,23 @@ def test_forget_removes_an_operator_for_good(
         assert GROWER not in str(path)
         if path.suffix == ".parquet":
             assert GROWER not in str(pq.ParquetFile(path).read().to_pylist())
+
+
+def test_forget_says_what_it_did(several: list[Path], tmp_path: Path, capsys: Captured) -> None:
+    taken(several, tmp_path, evaluate=False)
+
+    def said(*given: str) -> tuple[str, str]:
+        assert execute(["fleet", "forget", *given, "--fleet", str(tmp_path)]) == 0
+        told = capsys.readouterr()
+        return told.out.strip(), told.err.strip()
+
+    other = operator_number("B. Other")
+    assert said("B. Other") == (f"{other}: 1 flight kept, without their operator", "")
+    nobody = "no flight here names this operator; check the spelling"
+    assert said("B. Other") == (f"{other}: 0 flights kept, without their operator", nobody)
+    assert said(GROWER, "--flights") == (f"{GROWER}: 4 flights removed", "")
+    assert execute(["fleet", "forget", "  ", "--fleet", str(tmp_path)]) == 2
+    assert "OPERATOR: is empty; give the name, or the number op-" in capsys.readouterr().err
 
 
 def test_forget_can_remove_the_flights_too(

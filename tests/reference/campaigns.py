@@ -21,7 +21,7 @@ refused with exit code 2. Ready ones: `vrspray examples copy campaigns`.
 | `[fixed]` | settings of all flights |
 | `[[case]]` | `name`, and settings of its flights: a list of flights, or beside a design, each with all of it |
 | `[design] kind` | `grid` (default), `latin-hypercube`, `sobol` or `morris` |
-| `[design] samples` | points of a hypercube; of `sobol` a power of two, N (k + 2) points for k settings; of `morris`, trajectories of k + 1 points |
+| `[design] samples` | points of a hypercube; of `sobol` a power of two, N (k + 2) points for k settings; of `morris`, trajectories of k + 1 points. Sensitivity has intervals from 64 (`sobol`) and 16 (`morris`) on |
 | `[design] seed` | of the points that are drawn; default 1 |
 | `[design] second_order` | `sobol` with pairs: N (2k + 2) points |
 | `[[vary]] set` | a setting that the design varies |
@@ -46,6 +46,7 @@ MEANINGS: dict[str, str] = {
     "flight.board": "driver board behind servo outputs",
     "flight.meter_rate_hz": "0: no flow meter",
     "flight.perfect": "fly with perfect knowledge, too: `limit_ratio`; twice the time",
+    "flight.cpu_max_s": "processor time after which a flight is given up, a row with this error; default 600",
     "vehicle.speed_m_s": "default 5, or the mission's",
     "vehicle.acceleration_m_s2": "",
     "vehicle.gust_m_s": "1 sd along the way; default 1",

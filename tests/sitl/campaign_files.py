@@ -59,6 +59,7 @@ class OwnProcess:
     """Flies in this process, at once."""
 
     deaths = 1
+    lost_count = 0
 
     def __init__(self, folder: Path) -> None:
         self.folder: Path | None = folder

@@ -8,8 +8,11 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -21,14 +24,14 @@ from typer.testing import CliRunner
 from analysis.evaluation import evaluate
 from companion.cli.app import execute
 from companion.errors import ConfigError
-from sitl.campaign import cli
+from sitl.campaign import cli, executors, pictures
 from sitl.campaign.bundle import program_files
 from sitl.campaign.dataset import part_size
 from sitl.campaign.design import Campaign, read_campaign
 from sitl.campaign.executors import pool_of
 from sitl.campaign.flying import fly_flight
 from sitl.campaign.running import LOST, Tally, fly_missing
-from sitl.campaign.sensitivity import sensitivity_of
+from sitl.campaign.sensitivity import notes_of, sensitivity_lines, sensitivity_of
 from sitl.campaign.show import groups_of, read_rows
 from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
@@ -187,11 +190,85 @@ def test_a_flight_that_kills_its_worker_is_a_row_and_the_others_are_flown(tmp_pa
     ]
 
 
+LOOPS = """
+class Loops:
+    def __init__(self, sprayer):
+        pass
+
+    def order(self, seen):
+        while True:
+            try:
+                len("round and round")
+            except Exception:
+                pass
+"""
+LOOPING = (
+    '[[case]]\nname = "loops"\nmethod.controller = "loops.py:Loops"\nflight.cpu_max_s = 1\n'
+    '[[case]]\nname = "ours"\n'
+)
+GIVEN_UP = "did not end within 1 s of processor time (flight.cpu_max_s)"
+
+
+@pytest.mark.parametrize("is_main", [True, False])
+def test_a_flight_without_an_end_is_a_row_in_whatever_thread_it_is(
+    tmp_path: Path, is_main: bool
+) -> None:
+    """A pool flies in the main thread of its processes, Dask in another one."""
+    file = write_campaign(tmp_path, LOOPING)
+    (tmp_path / "loops.py").write_text(LOOPS)
+    if is_main:
+        fly_here(file, tmp_path / "out")
+    else:
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(fly_here, file, tmp_path / "out").result()
+    rows = rows_of(tmp_path / "out")
+    assert [(row["case"], row["error"]) for row in rows] == [("loops", GIVEN_UP), ("ours", None)]
+
+
+def test_the_bound_of_a_flight_ends_with_it() -> None:
+    with executors._bounded(0.2):
+        pass
+    until_s = process_time() + 0.5
+    while process_time() < until_s:  # nothing is raised here any more
+        pass
+    assert not [each for each in threading.enumerate() if each.name == executors.WATCH]
+
+
+WAITS = """
+import threading
+
+
+class Waits:
+    def __init__(self, sprayer):
+        pass
+
+    def order(self, seen):
+        threading.Event().wait()
+"""
+ENDLESS = """
+import sys
+from pathlib import Path
+from sitl.campaign import executors
+
+executors.WALL_TIMES, executors.GRACE_S = 1.0, 0.1
+given = (("flight.cpu_max_s", 1.0), ("method.controller", "waits.py:Waits"))
+executors.fly_at_worker(Path(sys.argv[1]), executors.code_sha256(), given, 1)
+"""
+
+
+def test_a_flight_that_waits_without_an_end_ends_its_worker(tmp_path: Path) -> None:
+    (tmp_path / "waits.py").write_text(WAITS)
+    given = [sys.executable, "-c", ENDLESS, str(tmp_path)]
+    root = str(Path(__file__).parents[2])
+    ended = subprocess.run(given, env=os.environ | {"PYTHONPATH": root}, capture_output=True)
+    assert (ended.returncode, ended.stderr) == (1, b"")
+
+
 # -------------------------------------------------------------------------------------- the cluster
 
 
 @pytest.mark.timeout(300)
-def test_a_real_dask_cluster_gives_the_same_rows(
+def test_a_real_dask_cluster_gives_the_same_rows_though_a_worker_is_killed(
     here: Path, reference: Path, tmp_path: Path
 ) -> None:
     """A scheduler and two workers as processes, none of which has the campaign's files."""
@@ -209,7 +286,15 @@ def test_a_real_dask_cluster_gives_the_same_rows(
     ]  # fmt: skip
     try:
         flown = subprocess.run(
-            [sys.executable, "-c", THROUGH_DASK, str(told), str(here), str(tmp_path / "out")],
+            [
+                sys.executable,
+                "-c",
+                THROUGH_DASK,
+                str(told),
+                str(here),
+                str(tmp_path / "out"),
+                str(started[-1].pid),
+            ],
             capture_output=True,
             text=True,
         )
@@ -218,18 +303,33 @@ def test_a_real_dask_cluster_gives_the_same_rows(
             process.kill()
             process.wait()
     assert flown.returncode == 0, flown.stderr
-    assert json.loads(flown.stdout)["workers"] == 2
+    found = json.loads(flown.stdout)
+    assert (found["workers"], found["lost_workers"]) == (2, 1)
     assert files_of(tmp_path / "out") == files_of(reference)
 
 
 # The scheduler's file tells its address; the client of it waits for the workers.
 THROUGH_DASK = """
-import json, sys, time
+import json, os, signal, sys, time
 from pathlib import Path
 from companion.cli.app import execute
 from distributed import Client
+from sitl.campaign import running
 
-told, file, out = sys.argv[1:]
+told, file, out, victim = sys.argv[1:]
+fly_missing = running.fly_missing
+
+
+def fly(*given, tell):
+    def kill(flights):
+        if flights == 7:
+            os.kill(int(victim), signal.SIGKILL)
+        tell(flights)
+
+    fly_missing(*given, tell=kill)
+
+
+running.fly_missing = fly
 for _ in range(600):
     if Path(told).exists() and Path(told).read_text().endswith("}"):
         break
@@ -465,7 +565,41 @@ def test_sensitivity_finds_the_setting_that_matters(
     matters, other = found["vehicle.gust_m_s", name], found["vehicle.gust_time_s", name]
     assert matters.value == pytest.approx(size, abs=slack)
     assert abs(other.value) < 0.15
+    assert matters.low is not None and matters.high is not None
     assert matters.low <= matters.value <= matters.high
+    assert not list(notes_of(rows, list(found.values())))
+
+
+@pytest.mark.parametrize(("kind", "samples", "needed"), [("sobol", 32, 64), ("morris", 15, 16)])
+def test_too_few_samples_give_no_interval_and_say_so(
+    reference: Path, tmp_path: Path, kind: str, samples: int, needed: int
+) -> None:
+    campaign = designed(tmp_path, kind, samples)
+    rows = replace(
+        read_rows(reference, []),
+        campaign=campaign,
+        point=np.arange(campaign.settings_count),
+        figures={"misapplied_percent": 4.0 * campaign.points[:, 0]},
+    )
+    found = sensitivity_of(rows)
+    assert found and all((each.low, each.high) == (None, None) for each in found)
+    assert list(notes_of(rows, found)) == [
+        f"no intervals of sensitivity: {samples} samples are too few for a {kind} design; write "
+        f"design.samples = {needed} or more"
+    ]
+    assert not any("[" in line for line in sensitivity_lines(found))
+    assert pictures._sensitivity(rows, found) is not None
+
+
+def test_texts_are_categories_of_the_parallel_coordinates(reference: Path) -> None:
+    rows = read_rows(reference, ["applied_ml"])
+    count = len(rows.point)
+    words = [("scheduled", "none", None, True)[point % 4] for point in rows.point.tolist()]
+    settings, figures = pictures._columns(replace(rows, settings={"method.name": words}))
+    axis = settings["method.name"]
+    assert axis.marks == ((0.125, "scheduled"), (0.375, "none"), (0.625, "-"), (0.875, "True"))
+    assert axis.places.tolist() == [0.125, 0.375, 0.625, 0.875, 0.125, 0.375]
+    assert list(figures) == ["applied_ml"] and count == 24
 
 
 def test_pictures_are_drawn(reference: Path, tmp_path: Path) -> None:
