@@ -6,6 +6,7 @@ import base64
 import csv
 import io
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -74,10 +75,15 @@ def build_report(journal: Path, options: ReportOptions, *, say: Say = lambda _: 
     say(f"reading {journal.name}")
     unread: list[str] = []
     flight = read_applied(journal, unread=unread)
-    told = told_with(flight.meta, file=options.application_file, changes=options.changes)
+    treated = treated_of(flight)
+    told = told_with(
+        flight.meta,
+        file=options.application_file,
+        changes=options.changes,
+        until_s=math.inf if treated.last_s is None else treated.last_s,
+    )
     say("evaluating")
     assessment, why_not = _assessed(flight, is_whole=not (unread or flight.lost))
-    treated = treated_of(flight)
     clock = _clock(flight, told, treated, options.time_zone)
     figures = figures_of(assessment, area_ha=treated.area_ha, is_whole=not (unread or flight.lost))
     facts = facts_of(flight, treated, clock, unread=len(unread), **_volumes(figures))

@@ -42,7 +42,7 @@ METRICS = (
     "off_target_ml", "missed", "apart", "gap_m2", "overlap_m2", "volume_error_percent",
 )  # fmt: skip
 # Of the journal's meta, what is not shown as such.
-_LONG = ("setup", "config_toml", "application_json", "flight_map_json")
+_LONG = ("setup", "config_toml", "application_json", "declared_json", "flight_map_json")
 
 
 def contents_of(

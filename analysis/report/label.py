@@ -7,7 +7,7 @@ the flight counts as declared; what was said afterwards is marked where the reco
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
@@ -174,8 +174,6 @@ def _times(
 ) -> Iterator[dict[str, Any]]:
     """Yield whether all spraying lay in the permitted days and hours, by the autopilot's clock."""
     limits = label.flown(told.values)
-    if not limits.needs_utc:
-        return
     ends: tuple[float, float] | None = None
     is_dated = treated.first_s is not None and flight.utc_source == "autopilot"
     if is_dated and treated.first_s is not None and treated.last_s is not None:
@@ -187,15 +185,32 @@ def _times(
         else:
             text = f"{ends[1] - ends[0]:.0f} s from {_clock_text(ends[0])} UTC"
             yield _row("hours", label.when(), text, _in_hours(limits, ends))
-    if limits.observed_s is not None:
-        words = f"at most {label.observed_max_h:g} h before spraying"
-        if ends is None:
+    words = f"at most {label.observed_max_h:g} h before spraying"
+    for begin_s, end_s, values in _periods(told):
+        observed_s = label.flown(values).observed_s
+        sprayed = ends and _sprayed(flight, begin_s, end_s)
+        if observed_s is not None and ends is None:
             yield _row("age of the weather", words, unknown, None)
-        else:
-            seen_s = limits.observed_s[0] + WATCH_S
-            text = f"{(ends[1] - seen_s) / 3600.0:.1f} h at the end"
-            kept = limits.observed_s[0] <= ends[0] <= ends[1] < limits.observed_s[1]
-            yield _row("age of the weather", words, text, kept)
+        elif observed_s is not None and sprayed:
+            age_h = (sprayed[1] - observed_s[0] - WATCH_S) / 3600.0
+            kept = observed_s[0] <= sprayed[0] <= sprayed[1] < observed_s[1]
+            yield _row("age of the weather", words, f"{age_h:.1f} h at the end", kept)
+
+
+def _periods(told: Told) -> Iterator[tuple[float, float, Mapping[str, Any]]]:
+    """Yield from when to when which values were declared."""
+    begins = [at_s for at_s, _ in told.periods]
+    for (begin_s, values), end_s in zip(told.periods, [*begins[1:], math.inf], strict=True):
+        yield begin_s, end_s, values
+
+
+def _sprayed(flight: AppliedFlight, begin_s: float, end_s: float) -> tuple[float, float] | None:
+    """Return first and last of the spraying between two times, in seconds since 1970."""
+    open_s = flight.time_s[while_spraying(flight)]
+    within = open_s[(open_s >= begin_s) & (open_s < end_s)]
+    if not len(within):
+        return None
+    return float(within[0]) + flight.utc_offset_s, float(within[-1]) + flight.utc_offset_s
 
 
 def _clock_text(utc_s: float) -> str:

@@ -262,5 +262,11 @@ def _remarks(told: Told, facts: Facts) -> Iterator[str]:
         yield f"not known whether simulated: {facts.simulated.because}"
     if facts.training is None:
         yield "whether product or water was sprayed is not in the journal"
+    yield from _remarks_told(told)
+
+
+def _remarks_told(told: Told) -> Iterator[str]:
+    if len(told.periods) > 1:
+        yield "weather was declared during the run; the last before the end of spraying stands"
     if is_told(told.values.get("application.remarks")):
         yield str(told.values["application.remarks"])

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from companion.config.application_table import Profile, check, is_number, is_told, known
+from companion.config.limits import declared_over
 from companion.config.load import parse_value
 from companion.errors import ConfigError
+from companion.journal.writer import DECLARED_META
 from companion.simulated import Simulated
 
 if TYPE_CHECKING:
@@ -39,10 +42,32 @@ class Told:
     values: Mapping[str, Any]
     after: frozenset[str]
     before: Mapping[str, Any]
+    # From when on which values held: the operator may declare the weather anew between flights.
+    periods: tuple[tuple[float, Mapping[str, Any]], ...]
 
 
-def told_in(meta: Mapping[str, str]) -> dict[str, Any]:
-    """Return what the journal itself says; of older ones, what its configuration's text says."""
+def told_in(meta: Mapping[str, str], *, until_s: float = math.inf) -> dict[str, Any]:
+    """Return what the journal itself says, of the weather what was declared last until a time."""
+    return _periods_in(meta, until_s)[-1][1]
+
+
+def _periods_in(meta: Mapping[str, str], until_s: float) -> list[tuple[float, dict[str, Any]]]:
+    """Return from when on which values held; the first are those of the start."""
+    found = [(-math.inf, _told_at_start(meta))]
+    try:
+        declared = json.loads(meta.get(DECLARED_META, "[]"))
+        pairs = [(float(at_s), json.loads(said)) for at_s, said in declared]
+    except (ValueError, TypeError):  # a damaged text: nothing was declared
+        return found
+    for at_s, said in pairs:
+        if at_s <= until_s and isinstance(said, dict):
+            sound = {key: value for key, value in said.items() if _is_entry(key, value)}
+            found.append((at_s, declared_over(found[0][1], sound)))
+    return found
+
+
+def _told_at_start(meta: Mapping[str, str]) -> dict[str, Any]:
+    """Return what was said before the start; of older journals, by their configuration's text."""
     try:
         if "application_json" in meta:
             found = json.loads(meta["application_json"])
@@ -71,10 +96,18 @@ def _is_entry(key: str, value: Any) -> bool:
 
 
 def told_with(
-    meta: Mapping[str, str], *, file: Path | None = None, changes: Sequence[str] = ()
+    meta: Mapping[str, str],
+    *,
+    file: Path | None = None,
+    changes: Sequence[str] = (),
+    until_s: float = math.inf,
 ) -> Told:
-    """Return what was said in all; ConfigError, in one line, for what cannot be an entry."""
-    before = told_in(meta)
+    """Return what was said in all; ConfigError, in one line, for what cannot be an entry.
+
+    What was declared after `until_s`, the end of the spraying, is of the next flight.
+    """
+    periods = _periods_in(meta, until_s)
+    before = periods[-1][1]
     later = {} if file is None else _read(file)
     later |= dict(_parsed(change) for change in changes)
     values = {**before, **later}
@@ -84,6 +117,7 @@ def told_with(
         values={key: value for key, value in values.items() if is_told(value)},
         after=frozenset(after),
         before={key: before[key] for key in after & before.keys()},
+        periods=tuple((at_s, {**told, **later}) for at_s, told in periods),
     )
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,10 +14,12 @@ from typing import Any
 
 from companion.cli.answer import note
 from companion.config import Config
+from companion.config.application_table import check
+from companion.config.limits import DROPLETS, OBSERVED_AT, WEATHER, declared_over
 from companion.config.rules import tank_capacity_l
 from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
-from companion.core.types import Decision, GnssReport, Input
+from companion.core.types import Decision, DeclarationReport, GnssReport, Input
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from companion.link.vehicle_link import VehicleLink
@@ -35,6 +38,54 @@ _DONE = {
     "disable": "disabled: all valves closed",
     "refilled": "tank noted",
 }
+
+
+class Declarations:
+    """What the operator declares on the page of a run, judged by the limits of label and permit."""
+
+    def __init__(self, config: Config, link: VehicleLink) -> None:
+        self._config, self._link = config, link
+        self._said: dict[str, Any] = {}
+        self.shown = self._shown(config.told())
+
+    def obey(self, order: Order, now_s: float) -> Outcome:
+        """Take a declaration, on the ground; nothing changes where it cannot be one."""
+        said = dict(order.said)
+        odd = [key for key in said if key not in (*WEATHER, DROPLETS)]
+        try:
+            if odd or OBSERVED_AT not in said:
+                raise ConfigError(f"{odd[0] if odd else OBSERVED_AT}: not to be declared so")
+            check(said)
+        except ConfigError as error:
+            return Outcome(accepted=False, text=str(error))
+        values = declared_over(self._config.told(), said)
+        label = self._config.label
+        rows = [] if label is None else list(label.declared(values))
+        broken = [row for row in rows if not row.is_kept]
+        report = DeclarationReport(
+            received_s=now_s,
+            broken=tuple(sorted({row.reason.value for row in broken})),
+            observed_s=None if label is None else label.flown(values).observed_s,
+            said=json.dumps(said),
+        )
+        answer = self._link.declare(report)
+        if answer.result != 0:
+            return Outcome(accepted=False, text=answer.text or "refused")
+        self._said = said
+        self.shown = self._shown(values)
+        text = "declared, for the record"
+        if label is not None:
+            text = "declared, and kept" if not broken else f"declared; allowed is {broken[0].words}"
+        return Outcome(accepted=True, text=text, inputs=answer.inputs)
+
+    def _shown(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the page shows: what was said here, and each limit with what is declared."""
+        label = self._config.label
+        rows = [] if label is None else label.declared(values)
+        return {
+            "said": self._said,
+            "rows": [[row.name, row.words, row.value, row.is_kept] for row in rows],
+        }
 
 
 def build_page(
@@ -75,7 +126,11 @@ def build_page(
     }
     for line in invitation(config, doors, tokens):
         note(line)
-    return OperatorPage(listener, about, obey=obeying(link), horizon_s=setup.longest_s)
+    declarations = Declarations(config, link)
+    obey = obeying(link, declarations)
+    return OperatorPage(
+        listener, about, obey=obey, horizon_s=setup.longest_s, declared=lambda: declarations.shown
+    )
 
 
 def tokens_file(config: Config) -> Path:
@@ -122,6 +177,9 @@ def _facts(config: Config, setup: Setup, training: str) -> dict[str, Any]:
     return {
         "training": training,
         "product": config.product.name,
+        # Whether weather is asked of the operator, for label or record, and what was said before.
+        "asks": config.label is not None or config.application.profile is not None,
+        "limits": None if config.label is None else config.label.title,
         # Whether valves stay closed over ground that is treated already.
         "spares_treated": setup.overlap is not None,
         "tank_l": tank,
@@ -144,10 +202,14 @@ def _facts(config: Config, setup: Setup, training: str) -> dict[str, Any]:
     }
 
 
-def obeying(link: VehicleLink) -> Obey:
+def obeying(link: VehicleLink, declarations: Declarations | None = None) -> Obey:
     """Return what carries the page's orders out: as commands of the ground station are."""
 
     def obey(order: Order, now_s: float) -> Outcome:
+        if order.name == "declare":
+            if declarations is None:
+                return Outcome(accepted=False, text="nothing is declared here")
+            return declarations.obey(order, now_s)
         answer = link.obey_page(order.name, order.value, now_s)
         accepted = answer.result == 0
         text = answer.text or (_DONE[order.name] if accepted else "refused")

@@ -43,6 +43,12 @@ Celsius = Annotated[FiniteFloat, Field(ge=-40, le=60)]
 Percent = Annotated[FiniteFloat, Field(ge=0, le=100)]
 Hours = Annotated[str, Field(pattern=f"^{CLOCK}-{CLOCK}$")]
 OBSERVED_AT = "application.observed_at"
+# What the operator observes, and declares anew on the page: older weather is none beside it.
+WEATHER = (
+    "application.wind_m_s", "application.wind_from_deg", "application.temperature_c",
+    "application.humidity_percent", "application.inversion", OBSERVED_AT,
+)  # fmt: skip
+DROPLETS = "product.droplet_class"
 # Observed this long after the autopilot's time is still now: nobody's watch is right.
 WATCH_S = 300.0
 _PAIRS = ("rate_l_ha", "wind_m_s", "height_m", "speed_m_s", "temperature_c", "humidity_percent")
@@ -188,6 +194,7 @@ class LimitsFile(Table):
             hours_s=hours_s,
             days_s=days_s,
             observed_s=self._observed_s(values),
+            is_observed=any(True for _ in self._weather(values)),
             broken=frozenset(each.reason for each in self.declared(values) if not each.is_kept),
         )
 
@@ -211,9 +218,9 @@ class LimitsFile(Table):
                 value is not None,
             )  # fmt: skip
         if self.droplet_classes:
-            value = values.get("product.droplet_class")
+            value = values.get(DROPLETS)
             yield Declared(
-                Inhibit.LABEL_DROPLETS, "droplet_class", "product.droplet_class",
+                Inhibit.LABEL_DROPLETS, "droplet_class", DROPLETS,
                 " or ".join(self.droplet_classes), value, self.is_droplet_class(value),
             )  # fmt: skip
 
@@ -290,6 +297,16 @@ def _day_s(text: str) -> float:
 
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def declared_over(before: Mapping[str, Any], said: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is declared after a new declaration: weather of before does not get its time.
+
+    >>> declared_over({"application.temperature_c": 20.0, "product.name": "A"},
+    ...               {"application.wind_m_s": 2.0})
+    {'product.name': 'A', 'application.wind_m_s': 2.0}
+    """
+    return {key: value for key, value in before.items() if key not in WEATHER} | dict(said)
 
 
 def limits_meta(label: LimitsFile | None) -> dict[str, str]:

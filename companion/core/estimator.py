@@ -67,6 +67,7 @@ from companion.core.types import (
     AttitudeReport,
     BatteryReport,
     ClockReport,
+    DeclarationReport,
     EstimatorReport,
     EstopReport,
     FlowReport,
@@ -364,6 +365,7 @@ _BY_SETUP: dict[type, Callable[[Track, Any, Setup], Track]] = {
     StandstillReport: _observe_standstill,
     WindReport: _observe_wind,
     UtcReport: lambda track, item, setup: track._replace(utc=setup.limits.asked_utc(item)),
+    DeclarationReport: _observe_consent,
     BatteryReport: _observe_battery,
 }
 
@@ -494,6 +496,7 @@ def estimate(track: Track, now_s: float) -> VehicleState | None:
         mission_leg=track.mission_leg,
         mission_leg_before=track.mission_leg_before,
         utc_offset_s=None if track.utc is None else track.utc.offset_s(now_s),
+        declared=track.consent.declared,
     )
 
 

@@ -278,6 +278,21 @@ class UtcReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DeclarationReport:
+    """What the operator declared on the ground, judged by the limits of label and permit.
+
+    `broken` names the reasons (`Inhibit`) for which nothing may open, `observed_s` is from when to
+    when the observation counts, in seconds since 1970; None where none is asked for. `said` is all
+    that was declared by then, as JSON by dotted key: for the record.
+    """
+
+    received_s: float
+    broken: tuple[str, ...]
+    observed_s: tuple[float, float] | None
+    said: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LegReport:
     """The leg of its mission that the vehicle now flies: from which place to which.
 
@@ -350,4 +365,5 @@ Input = (
     | ClockReport
     | LegReport
     | UtcReport
+    | DeclarationReport
 )

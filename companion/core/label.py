@@ -24,7 +24,8 @@ class LabelLimits:
     Spans are from least to most. `wind_from_deg` are the directions that the wind may come from,
     clockwise; `hours_s` are spans of the day (UTC), over midnight where the first is the later.
     `observed_s` is how long the weather counts that the operator observed, from when to when.
-    `broken` is what the operator declared otherwise, or did not declare, before the flight.
+    `broken` is what the operator declared otherwise, or did not declare, before the start; what is
+    declared later takes its place. `is_observed` is whether weather has to be observed at all.
     """
 
     speed_m_s: Span | None = None
@@ -35,12 +36,13 @@ class LabelLimits:
     hours_s: tuple[Span, ...] = ()
     days_s: Span | None = None  # seconds since 1970, from the first to the end of the last
     observed_s: Span | None = None  # seconds since 1970
+    is_observed: bool = False
     broken: frozenset[Inhibit] = frozenset()
 
     @property
     def needs_utc(self) -> bool:
         """Whether the time of day has to be known."""
-        return bool(self.hours_s) or self.days_s is not None or self.observed_s is not None
+        return bool(self.hours_s) or self.days_s is not None or self.is_observed
 
 
 def label_broken(
@@ -52,7 +54,8 @@ def label_broken(
     now_s: float,
 ) -> list[Inhibit]:
     """Return which limits are not kept; those in `margins` must be kept by so much."""
-    found = list(label.broken)
+    said = state.declared
+    found = list(label.broken) if said is None else _named(said.broken)
 
     def check(reason: Inhibit, value: float | None, span: Span | None) -> None:
         if span is not None and not _is_inside(value, span, margins.get(reason, 0.0)):
@@ -74,8 +77,19 @@ def label_broken(
     if label.needs_utc:
         utc_s = math.nan if state.utc_offset_s is None else now_s + state.utc_offset_s
         found += [] if is_hour(label, utc_s) else [Inhibit.LABEL_TIME]
-        found += [] if _is_recent(label, utc_s) else [Inhibit.LABEL_WEATHER_AGE]
+        observed_s = label.observed_s if said is None else said.observed_s
+        found += [] if _is_recent(observed_s, utc_s) else [Inhibit.LABEL_WEATHER_AGE]
     return found
+
+
+def _named(codes: tuple[str, ...]) -> list[Inhibit]:
+    """Return the reasons that are named; where none of the names is known, nothing opens either.
+
+    >>> _named(("label-wind",)), _named(("no such",)), _named(())
+    ([<Inhibit.LABEL_WIND: 'label-wind'>], [<Inhibit.LABEL_WEATHER_AGE: 'label-weather-age'>], [])
+    """
+    found = [reason for reason in Inhibit if reason in codes]
+    return found or ([Inhibit.LABEL_WEATHER_AGE] if codes else [])
 
 
 def _is_inside(value: float | None, span: Span, margin: float) -> bool:
@@ -117,9 +131,8 @@ def is_from(angle_deg: float | None, sectors: tuple[Span, ...]) -> bool:
     )
 
 
-def _is_recent(label: LabelLimits, utc_s: float) -> bool:
+def _is_recent(span: Span | None, utc_s: float) -> bool:
     """Return whether the weather that the operator observed still counts."""
-    span = label.observed_s
     return span is None or span[0] <= utc_s < span[1]
 
 

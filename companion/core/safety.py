@@ -15,7 +15,14 @@ import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from companion.core.inputs import EstopReport, HeartbeatReport, OperatorCommand, RcReport, UtcReport
+from companion.core.inputs import (
+    DeclarationReport,
+    EstopReport,
+    HeartbeatReport,
+    OperatorCommand,
+    RcReport,
+    UtcReport,
+)
 from companion.core.label import LabelLimits, label_broken
 from companion.core.types import Fix, Inhibit, SprayerState, SprayPlan, VehicleState
 
@@ -82,6 +89,10 @@ class Limits:
     def asked_utc(self, report: UtcReport) -> UtcReport | None:
         """Return the time of day where a label has hours; None where nobody asks for it."""
         return report if self.label is not None and self.label.needs_utc else None
+
+    def asked_declaration(self, report: DeclarationReport) -> DeclarationReport | None:
+        """Return what of a declaration is checked: not its words, which are for the record."""
+        return None if self.label is None else replace(report, said="")
 
     def allows(self, mode: str | None) -> bool:
         """Whether spraying is allowed in a mode; AUTO is also what PX4 calls MISSION."""
@@ -288,7 +299,8 @@ class Consent:
     """Whether the operator allows spraying, by whichever way, and which stops are pressed.
 
     `wishes` is how often somebody has enabled anew, or disabled. `estops` is None where none was
-    heard of; `switch_us` is of the operator's channel in `rc`, and 0 is no signal.
+    heard of; `switch_us` is of the operator's channel in `rc`, and 0 is no signal. `declared` is
+    what was declared for label and permit since the start, where there are any.
     """
 
     enabled: bool = False
@@ -296,6 +308,7 @@ class Consent:
     estops: frozenset[str] | None = None
     rc: RcReport | None = None
     switch_us: int = 0
+    declared: DeclarationReport | None = None
 
     @property
     def is_stopped(self) -> bool | None:
@@ -316,7 +329,7 @@ class Consent:
     def after_standstill(self, gap_s: float) -> Consent:
         """Return what is left of the consent after the companion itself stood still."""
         enabled = self.enabled and gap_s <= CONSENT_STANDSTILL_S
-        return Consent(enabled=enabled, wishes=self.wishes, estops=self.estops)
+        return replace(self, enabled=enabled, rc=None, switch_us=0)
 
 
 NO_CONSENT = Consent()
@@ -324,7 +337,7 @@ NO_CONSENT = Consent()
 
 def consented(
     consent: Consent,
-    item: HeartbeatReport | OperatorCommand | EstopReport | RcReport,
+    item: HeartbeatReport | OperatorCommand | EstopReport | RcReport | DeclarationReport,
     limits: Limits,
     *,
     heartbeat: HeartbeatReport | None,
@@ -336,6 +349,8 @@ def consented(
         return _after_command(consent, item, limits)
     if isinstance(item, EstopReport):
         return _after_estop(consent, item)
+    if isinstance(item, DeclarationReport):
+        return replace(consent, declared=limits.asked_declaration(item))
     return _after_rc(consent, item, limits)
 
 

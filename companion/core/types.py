@@ -16,6 +16,7 @@ from companion.core.inputs import (
     AttitudeReport,
     BatteryReport,
     ClockReport,
+    DeclarationReport,
     EstimatorReport,
     EstopReport,
     Fix,
@@ -45,6 +46,7 @@ __all__ = [
     "BatteryReport",
     "ClockReport",
     "Decision",
+    "DeclarationReport",
     "DriveChange",
     "DrivePlan",
     "EstimatorReport",
@@ -464,6 +466,7 @@ class VehicleState:
     clock_agrees: bool = True  # what is known of the autopilot's clock goes together
     # Seconds since 1970 less our clock; None: not known, or nothing is limited to hours.
     utc_offset_s: float | None = None
+    declared: DeclarationReport | None = None  # None: only what was declared before the start
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from companion.core.frame import LocalFrame
-from companion.core.types import Decision, Input, UtcReport
+from companion.core.types import Decision, DeclarationReport, Input, UtcReport
 from companion.journal.blocks import Block
 from companion.journal.codec import encode
 from companion.journal.coverage_table import write_coverage
@@ -88,6 +88,8 @@ SET_META = (
     "INSERT INTO meta (key, value) VALUES (?, ?) "
     "ON CONFLICT (key) DO UPDATE SET value = excluded.value"
 )
+# Where it is kept what the operator declared during the run, the newest of it.
+DECLARED_META, DECLARED_MAX = "declared_json", 50
 # What was written before the autopilot said which time it is gets that time at the end.
 _TIME_AGAIN = (
     "UPDATE {} SET time = strftime('%Y-%m-%dT%H:%M:%fZ', time_s + ?, 'unixepoch') WHERE time_s < ?"
@@ -121,6 +123,7 @@ class Writer:
         self._told_offset_s = utc_offset_s
         self._told_orders = False
         self._simulated: Simulated | None = None
+        self._declared: list[tuple[float, str]] = []
         self._applied = AppliedRows(frame, self._clock.text)
         self._block = Block()
         self.valves = ValveRows()
@@ -267,6 +270,8 @@ class Writer:
             self._add(sequence, item.received_s, encode(item))
             if isinstance(item, UtcReport):
                 self._take_time(item)
+            elif isinstance(item, DeclarationReport):
+                self._keep_declared(item)
 
     def _add(self, sequence: int, at_s: float, body: str) -> None:
         self._block.add(sequence, at_s, body)
@@ -288,6 +293,12 @@ class Writer:
             self._begin()
             self._connection.execute(SET_META, (SIMULATED, self._simulated.word))
             self._connection.execute(SET_META, (BECAUSE, self._simulated.because))
+
+    def _keep_declared(self, report: DeclarationReport) -> None:
+        """Keep in `meta` what the operator declared, and when: the record is made of it."""
+        self._declared = [*self._declared, (report.received_s, report.said)][-DECLARED_MAX:]
+        self._begin()
+        self._connection.execute(SET_META, (DECLARED_META, json.dumps(self._declared)))
 
     def _take_time(self, report: UtcReport) -> None:
         """Keep the autopilot's time of day in `meta`; a jump is an event."""

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from companion.core.types import Decision, EstopReport, Input, OperatorCommand, RateOverride
+from companion.core.types import (
+    Decision,
+    DeclarationReport,
+    EstopReport,
+    Input,
+    OperatorCommand,
+    RateOverride,
+)
 from companion.link.messages import CommandReceived, Sender, Tank
 from companion.link.parameters import RATE_PERCENT, VALUES_HZ, Parameters
 
@@ -166,6 +173,16 @@ def _refilled(desk: Desk, command: CommandReceived) -> Answer:
         return Answer(result=DENIED, text="refilled: more than tank.capacity_l")
     text = f"tank {desk.tank.level_l:g} L"
     return Answer(result=ACCEPTED, text=text, event=f"refilled, {text}")
+
+
+def declared(desk: Desk, report: DeclarationReport) -> Answer:
+    """Take what the operator observed: on the ground only, where somebody can look again."""
+    if desk.is_armed or desk.is_open:
+        return Answer(result=REJECTED_FOR_NOW, text="declare: land and disarm first")
+    text = f"declared, not kept: {len(report.broken)}" if report.broken else "declared, all kept"
+    return Answer(
+        result=ACCEPTED, inputs=(report,), text=text, event=f"declared by page: {report.said}"
+    )
 
 
 def _next_map(desk: Desk, _command: CommandReceived) -> Answer:

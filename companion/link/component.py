@@ -24,6 +24,7 @@ from companion.core.types import (
     AttitudeReport,
     ClockReport,
     Decision,
+    DeclarationReport,
     HeartbeatReport,
     ImuReport,
     Input,
@@ -195,6 +196,10 @@ class Component:
     def obey_page(self, name: str, value: float | None, received_s: float) -> Answer:
         """Carry out an order of the operator's page."""
         return self._service.obey_page(name, value, received_s)
+
+    def declare(self, report: DeclarationReport) -> Answer:
+        """Take what the operator declared on the page."""
+        return self._service.declare(report)
 
     def fault(self, text: str) -> None:
         """Tell the operator once of something that does not work."""

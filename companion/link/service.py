@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from companion.core.types import Decision, Input
+from companion.core.types import Decision, DeclarationReport, Input
 from companion.link import commands
 from companion.link.announcer import Announcer
 from companion.link.commands import Answer, Desk, rate_override
@@ -87,6 +87,12 @@ class Service:
         )
         answer = self._desk.obey(command)
         self._tell(answer, received_s)
+        return answer
+
+    def declare(self, report: DeclarationReport) -> Answer:
+        """Take what the operator declared on the page; the ground station is told of it."""
+        answer = commands.declared(self._desk, report)
+        self._tell(answer, report.received_s)
         return answer
 
     def serve(self, message: ParamAsked | ParamSet) -> tuple[Input, ...]:

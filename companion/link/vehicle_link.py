@@ -9,7 +9,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from companion.core.types import Decision, Input, OperatorCommand, RateOverride
+from companion.core.types import (
+    Decision,
+    DeclarationReport,
+    Input,
+    OperatorCommand,
+    RateOverride,
+)
 from companion.link.census import Census, Vehicle, autopilot_name
 from companion.link.commands import Answer
 from companion.link.component import Component, ComponentOptions
@@ -138,6 +144,10 @@ class VehicleLink:
     def obey_page(self, name: str, value: float | None, received_s: float) -> Answer:
         """Carry out an order of the operator's page as if the ground station had commanded it."""
         return self.component.obey_page(name, value, received_s)
+
+    def declare(self, report: DeclarationReport) -> Answer:
+        """Take what the operator declared on the page, on the ground."""
+        return self.component.declare(report)
 
     @property
     def tank_l(self) -> float | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import math
 import os
 import socket
 import subprocess
@@ -35,7 +36,7 @@ _logger = logging.getLogger(__name__)
 FRAME_S, _STEP_S = 0.1, 0.01
 # The state of the journal and the like: looked up once a second.
 EXTRA_S = 1.0
-ORDER_BYTES_MAX = 512
+ORDER_BYTES_MAX = 1024
 ORDERS_AT_ONCE = 4
 ORDERS_PER_S = 20
 # An order to open that waited for longer, in a companion that stood still, is not carried out.
@@ -46,18 +47,23 @@ END_S, END_LOOK_S = 2.0, 0.02
 EVENTS_KEPT = 40
 BIND_TRIES_S = 3.0
 
-OrderName = Literal["stop", "enable", "disable", "refilled"]
-ORDERS: tuple[OrderName, ...] = ("stop", "enable", "disable", "refilled")
+OrderName = Literal["stop", "enable", "disable", "refilled", "declare"]
+ORDERS: tuple[OrderName, ...] = ("stop", "enable", "disable", "refilled", "declare")
+DECLARED_MAX, WORD_MAX = 8, 60
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Order:
-    """What the operator wants, taken at `boot_s`; `value` is litres for `refilled`."""
+    """What the operator wants, taken at `boot_s`.
+
+    `value` is litres for `refilled`, `said` what was declared, by dotted key, for `declare`.
+    """
 
     number: int
     name: OrderName
     boot_s: float
     value: float | None = None
+    said: tuple[tuple[str, str | float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,7 +82,7 @@ def parse_order(packet: bytes) -> Order | None:
     """Return the order in a packet of the page; None for anything else.
 
     >>> parse_order(b'{"number": 1, "name": "stop", "boot_s": 5.0}')
-    Order(number=1, name='stop', boot_s=5.0, value=None)
+    Order(number=1, name='stop', boot_s=5.0, value=None, said=())
     >>> parse_order(b'{"name": "open"}') is None
     True
     """
@@ -90,9 +96,23 @@ def parse_order(packet: bytes) -> Order | None:
             name=name,
             boot_s=float(found["boot_s"]),
             value=None if value is None else float(value),
+            said=_said(found.get("said")),
         )
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
+
+
+def _said(found: object) -> tuple[tuple[str, str | float], ...]:
+    """Return what was declared, words and numbers by key; ValueError for anything else."""
+    if found is None:
+        return ()
+    if not isinstance(found, dict) or len(found) > DECLARED_MAX:
+        raise ValueError("no declaration")
+    for value in found.values():
+        is_word = isinstance(value, str) and len(value) <= WORD_MAX
+        if not (is_word or (type(value) in (int, float) and math.isfinite(value))):
+            raise ValueError("no declaration")
+    return tuple(found.items())
 
 
 def listen(
@@ -131,6 +151,7 @@ class OperatorPage:
         about: what the page has to know, as JSON has it: the map, the tokens, limits.
         obey: carries an order out as the link does with a command, and says what came of it.
         horizon_s: how far ahead orders are given, for the look-ahead point.
+        declared: what of label and weather is declared; shown with each state.
     """
 
     def __init__(
@@ -140,6 +161,7 @@ class OperatorPage:
         *,
         obey: Obey,
         horizon_s: float,
+        declared: Callable[[], dict[str, Any]] = dict,
         clock: Callable[[], float] = time.monotonic,
         boot_clock: Callable[[], float] = lambda: time.clock_gettime(time.CLOCK_BOOTTIME),
     ) -> None:
@@ -147,6 +169,7 @@ class OperatorPage:
         self._about = json.dumps(about, allow_nan=False).encode()
         self._obey = obey
         self._horizon_s = horizon_s
+        self._declared = declared
         self._clock, self._boot_clock = clock, boot_clock
         self._memory = new_memory()
         self._ring = RingWriter(self._memory)
@@ -187,6 +210,7 @@ class OperatorPage:
             self._extras_s, self._extra = now_s, self.extras()
         frame = frame_of(decision, horizon_s=self._horizon_s)
         frame |= self._extra
+        frame["declared"] = self._declared()
         frame["urgent"] = is_news
         frame["simulated"] = self._is_simulated
         frame["event_count"] = self._event_count

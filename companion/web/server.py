@@ -18,7 +18,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from html import escape
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, FastAPI, HTTPException, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
@@ -64,6 +64,24 @@ class Refilled(Body):
     litres: Annotated[float, Field(ge=0.0, le=10_000.0)]
 
 
+class Declared(Body):
+    """What the operator observed on the ground, and when; the limits file says what it must be."""
+
+    observed_at: Annotated[str, Field(min_length=16, max_length=30)]
+    wind_m_s: Annotated[float, Field(ge=0.0, le=60.0)] | None = None
+    wind_from_deg: Annotated[float, Field(ge=0.0, le=360.0)] | None = None
+    temperature_c: Annotated[float, Field(ge=-40.0, le=60.0)] | None = None
+    humidity_percent: Annotated[float, Field(ge=0.0, le=100.0)] | None = None
+    inversion: Literal["no", "yes"] | None = None
+    droplet_class: Annotated[str, Field(min_length=1, max_length=40)] | None = None
+
+    def said(self) -> dict[str, str | float]:
+        """Return what was declared, by the configuration's dotted keys."""
+        given = self.model_dump(exclude_none=True)
+        tables = {"droplet_class": "product"}
+        return {f"{tables.get(key, 'application')}.{key}": value for key, value in given.items()}
+
+
 class Done(BaseModel):
     """What came of an order, in words for the operator."""
 
@@ -91,12 +109,14 @@ class Orders:
         """Begin to read answers; `on_end` is called when the companion has ended."""
         asyncio.get_running_loop().add_reader(self._connection, self._read, on_end)
 
-    async def give(self, name: str, value: float | None = None) -> Done:
+    async def give(
+        self, name: str, value: float | None = None, said: Mapping[str, object] | None = None
+    ) -> Done:
         """Pass an order on; a 503 where the companion does not answer."""
         self._count += 1
         number = self._count
         boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
-        order = {"number": number, "name": name, "value": value, "boot_s": boot_s}
+        order = {"number": number, "name": name, "value": value, "boot_s": boot_s, "said": said}
         waiting = asyncio.get_running_loop().create_future()
         self._waiting[number] = waiting
         try:
@@ -199,6 +219,7 @@ class Site:
         self._doctor: list[str] = about["doctor"]
         self._checks: list[dict[str, Any]] = []
         self._checked_s = float("-inf")
+        self._checked_with: dict[str, Any] = {}
         self._checking = asyncio.Lock()
 
     async def checks(self) -> list[dict[str, Any]]:
@@ -208,10 +229,12 @@ class Site:
         """
         is_armed = (self.live.state.get("vehicle") or {}).get("armed") is not False
         async with self._checking:
-            is_old = time.monotonic() - self._checked_s > CHECKS_S
+            said = (self.live.state.get("declared") or {}).get("said") or {}
+            is_old = time.monotonic() - self._checked_s > CHECKS_S or said != self._checked_with
             if is_old and self._doctor and not is_armed:
-                self._checks = await _output_of(self._doctor)
-                self._checked_s = time.monotonic()
+                words = [word for item in said.items() for word in ("--set", "{}={}".format(*item))]
+                self._checks = await _output_of([*self._doctor, *words])
+                self._checked_s, self._checked_with = time.monotonic(), said
         return self._checks
 
     def told(self) -> None:
@@ -425,6 +448,11 @@ def _add_orders(app: FastAPI, site: Site) -> None:
     async def refilled(filling: Refilled) -> Done:
         """Take what is in the tank now."""
         return await site.orders.give("refilled", filling.litres)
+
+    @app.post(f"{API}declare", tags=["orders"], responses=REFUSED)
+    async def declare(declared: Declared) -> Done:
+        """Take the weather that the operator observed; while the vehicle is disarmed."""
+        return await site.orders.give("declare", said=declared.said())
 
 
 def _add_files(app: FastAPI, site: Site) -> None:

@@ -138,6 +138,18 @@ def test_each_limit_in_the_report(name: str) -> None:
         assert found["kept"], found
 
 
+@pytest.mark.parametrize(("most_h", "kept"), [(0.6, [True, True]), (0.4, [False, True])])
+def test_each_spraying_is_judged_by_the_weather_declared_before_it(
+    most_h: float, kept: list[bool]
+) -> None:
+    said = {"application.inversion": "no", "application.observed_at": "2026-05-01T05:00:00Z"}
+    meta = {"declared_json": json.dumps([[110.0, json.dumps(said)]])}
+    limits = {"inversion": "forbidden", "observed_max_h": most_h}
+    found = report(limits, said={"application.inversion": "no"}, meta=meta)
+    rows = [row["kept"] for row in found["limits"] if row["name"] == "age of the weather"]
+    assert rows == kept
+
+
 def test_without_limits_a_report_says_nothing_of_them() -> None:
     assert label_of(FLIGHT, treated_of(FLIGHT), CLOCK, told_with({})) is None
 

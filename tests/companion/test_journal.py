@@ -30,6 +30,7 @@ from companion.core.types import (
     BatteryReport,
     ClockReport,
     Decision,
+    DeclarationReport,
     EstimatorReport,
     EstopReport,
     Fix,
@@ -102,6 +103,7 @@ INPUTS: list[Input] = [
     PressureReport(received_s=2.2, pressure_kpa=None, fault="1.2 mA: wire broken"),
     TankReport(received_s=2.3, level_l=1 / 3),
     UtcReport(received_s=2.35, utc_s=NAN),
+    DeclarationReport(received_s=2.37, broken=("label-wind",), observed_s=(NAN, INF), said="{}"),
     BatteryReport(received_s=2.4, battery=1, consumed=4711.0, remaining_percent=None),
     AttitudeReport(
         received_s=0.5,

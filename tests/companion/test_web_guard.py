@@ -27,7 +27,7 @@ from tests.companion.web_site import OPERATE, VIEW, Site, served
 IN_LOOP = pytest.mark.asyncio(loop_scope="module")
 
 TOKENS = Tokens(view=VIEW, operate=OPERATE)
-ALL_ORDERS = ("stop", "hold", "enable", "disable", "refilled")
+ALL_ORDERS = ("stop", "hold", "enable", "disable", "refilled", "declare")
 
 
 def bearer(token: str) -> dict[str, str]:
@@ -179,6 +179,28 @@ async def test_bodies_are_small_json_of_the_expected_form(lan: Site) -> None:
     assert not lan.orders
     assert (await lan.asked("POST", "/api/v1/refilled", {"litres": 12.5}, operate)).json["accepted"]
     assert lan.orders[0].value == 12.5
+
+
+SEEN = {"observed_at": "2026-05-01T06:30:00Z", "wind_m_s": 2.5, "inversion": "no"}
+
+
+@IN_LOOP
+async def test_a_declaration_is_bounded_and_says_when(lan: Site) -> None:
+    operate = cookie("operate")
+    for change in (
+        {"observed_at": None}, {"observed_at": "now"}, {"wind_m_s": -1.0}, {"wind_m_s": 61.0},
+        {"wind_from_deg": 361.0}, {"temperature_c": 61.0}, {"humidity_percent": 101.0},
+        {"inversion": "perhaps"}, {"droplet_class": "x" * 41}, {"pilot": "somebody"},
+    ):  # fmt: skip
+        reply = await lan.asked("POST", "/api/v1/declare", SEEN | change, operate)
+        assert reply.status == 422, change
+    assert not lan.orders
+    given = SEEN | {"droplet_class": "coarse"}
+    assert (await lan.asked("POST", "/api/v1/declare", given, operate)).json["accepted"]
+    assert dict(lan.orders[0].said) == {
+        "application.observed_at": "2026-05-01T06:30:00Z", "application.wind_m_s": 2.5,
+        "application.inversion": "no", "product.droplet_class": "coarse",
+    }  # fmt: skip
 
 
 @IN_LOOP

@@ -69,6 +69,7 @@ META: dict[str, str] = {
     "flight_map_json": "the flight map that was flown: hash, age, sources, findings",
     "config_path, config_toml, config_overrides": "the configuration of `vrspray run`",
     "application_json": "who sprayed what",
+    "declared_json": "what the operator declared on the page, and when",
     "coverage_ahead_s": "how far ahead the treated ground is written; 0 after an orderly end",
     "machine, python, version_NAME": "what computed the flight",
 }

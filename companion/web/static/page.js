@@ -34,6 +34,7 @@ function show() {
   panels.showLinks(state, facts, feed.age());
   panels.showChecklist(state, facts, ground, checks);
   panels.showTank(state, facts);
+  panels.showDeclared(state, facts, scope);
   panels.showLanded(state, facts);
   panels.showEvents(state);
   orders.show(state, facts, scope);
@@ -53,6 +54,15 @@ const feed = new Feed({
     if (state && ground) panels.showLinks(state, facts, age);
   },
 });
+
+// What was observed: an empty field is not declared, an empty time is now, by this device's clock.
+function declaration(form) {
+  const given = Object.fromEntries([...new FormData(form)].filter(([, value]) => value !== ""));
+  const at = given.observed_at ? new Date(given.observed_at) : new Date();
+  for (const name of ["wind_m_s", "wind_from_deg", "temperature_c", "humidity_percent"]) if (name in given) given[name] = Number(given[name]);
+  if ("wind_m_s" in given) given.wind_m_s = toSi("wind", given.wind_m_s);
+  return { ...given, observed_at: `${at.toISOString().slice(0, 19)}Z` };
+}
 
 let begun = 0;
 document.addEventListener("visibilitychange", () => { if (!document.hidden) show(); });
@@ -79,6 +89,7 @@ function settings() {
     const litres = Number(byId("litres").value);
     if (litres >= 0 && (await orders.give("refilled", { litres: toSi("volume", litres) }))) byId("litres").value = "";
   });
+  byId("declare").addEventListener("submit", (event) => { event.preventDefault(); orders.give("declare", declaration(event.target)); });
 }
 
 async function begin() {

@@ -173,6 +173,23 @@ export function showTank(state, facts) {
   bar.setAttribute("aria-label", parts[0]);
 }
 
+// What the operator declares: each limit that no sensor watches, and the form, on the ground.
+export function showDeclared(state, facts, scope) {
+  byId("declare-card").hidden = !facts.asks;
+  if (!facts.asks) return;
+  list("declared", state.declared?.rows ?? [], ([name, words, value, isKept]) => {
+    const item = make("li", undefined, isKept ? "ok" : "bad");
+    const mark = make("span", isKept ? "✓" : "✗", "mark");
+    mark.setAttribute("role", "img"); mark.setAttribute("aria-label", isKept ? "kept" : "not kept");
+    item.append(mark, make("b", name), make("span", value === null ? "not declared" : String(value), "value"), make("span", words, "small"));
+    return item;
+  });
+  const may = scope === "operate" && state.vehicle?.armed !== true;
+  for (const item of byId("declare").elements) if (item.disabled === may) item.disabled = !may;
+  text(byId("declare-note"), !may ? "Declare on the ground, disarmed, with the operator's link."
+    : `${facts.limits ?? "For the record"}. Each time declare all that you observed; an empty time is now.`);
+}
+
 // After landing: what was done, and the way to the report of this flight.
 export function showLanded(state, facts) {
   const isLanded = state.vehicle?.armed === false && state.point_count > 0;

@@ -57,6 +57,10 @@ ROUNDED_HA = 0.005
 PRESCRIBED_L = sum(RATES_L_HA) * WIDTH_M * ZONE_M / 10_000.0
 
 
+LIMITS = (
+    'version = 1\ntitle = "a label"\ntemperature_max_c = 25\ninversion = "forbidden"\n'
+    "observed_max_h = 2\n"
+)
 Box = tuple[float, float, float, float]
 
 
@@ -216,6 +220,23 @@ class Day:
         await expect(page.locator("#check")).to_contain_text("made-prescription.gpkg: ")
         await page.locator("#speed_m_s").fill("5")
 
+    async def declare(self) -> None:
+        """Type what label and permit want to know: before that the sprayer is not ready."""
+        page = self.page
+        declared = page.locator("#declared")
+        await expect(declared).to_contain_text("not declared")
+        await expect(page.locator("#alarms")).to_contain_text("Inversion not ruled out")
+        await page.get_by_label("Temperature, °C").fill("31")
+        await page.get_by_label("Inversion").select_option("no")
+        await page.get_by_role("button", name="Declare").click()
+        await expect(page.locator("#answer")).to_contain_text("allowed is at most 25 deg C")
+        await expect(page.locator("#alarms")).to_contain_text("Temperature not by label")
+        await page.get_by_label("Temperature, °C").fill("19.5")
+        await page.get_by_role("button", name="Declare").click()
+        await expect(page.locator("#answer")).to_contain_text("declared, and kept")
+        await expect(declared).to_contain_text("19.5")
+        await expect(declared).not_to_contain_text("not declared")
+
     async def take_off(self) -> None:
         """Enable on the page; the pilot arms and starts the mission."""
         await shows(self.page, "ready")
@@ -225,6 +246,7 @@ class Day:
         assert flight.start_mission(time.monotonic())
         await self.bench.until(lambda: is_open(self.bench))
         await shows(self.page, "spraying")
+        await expect(self.page.get_by_role("button", name="Declare")).to_be_disabled()
 
     async def stop(self) -> None:
         """Tap STOP in mid-pass; the valves close on the wire in time, and stay closed."""
@@ -293,9 +315,14 @@ async def test_a_field_is_drawn_zoned_planned_flown_stopped_continued_and_report
             assert mixed > PRESCRIBED_L
         assert len(bench.stub.flight.items) >= 6
         bench.said = ""
-        async with companion_of(bench, *web, *settings):
+        # The weather that was observed ages by the autopilot's clock: it must be the browser's.
+        bench.stub.utc_offset_s = time.time() - time.monotonic()
+        limits = tmp_path / "limits.toml"
+        limits.write_text(LIMITS)
+        async with companion_of(bench, *web, *settings, f'limits.file="{limits}"'):
             await bench.until(lambda: "link up" in bench.said, within_s=60.0)
             await day.open()
+            await day.declare()
             await day.take_off()
             await day.stop()
             assert 0.4 * FIELD_HA < await left_ha(page) <= FIELD_HA + ROUNDED_HA
@@ -309,6 +336,7 @@ async def test_a_field_is_drawn_zoned_planned_flown_stopped_continued_and_report
             report = await loading.value
             await report.get_by_role("heading", level=1).wait_for()
             await expect(report).to_have_title(re.compile("SIMULATED"))
+            await expect(report.locator("body")).to_contain_text("declared: 19.5")
         assert {urlsplit(url).netloc for url in day.requests} == {f"127.0.0.1:{port}"}
         assert not day.troubles
     assert bench.truth.summary()["volume_l"] == pytest.approx(PRESCRIBED_L, rel=0.15)
