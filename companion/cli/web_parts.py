@@ -148,7 +148,7 @@ def _doctor(config: Config, given: Sequence[str]) -> list[str]:
     """Return the command whose checks the page shows; none where it would want our own lines."""
     if config.output.kind == "gpio" or config.reads_sensors:
         return []
-    command = [sys.executable, "-m", "companion", "doctor", "--no-link", "--json"]
+    command = [sys.executable, "-P", "-m", "companion", "doctor", "--no-link", "--json"]
     return [*command, *_config_words(config, given)]
 
 

@@ -78,7 +78,7 @@ async def run_child(
     }  # fmt: skip
     with out.open("wb") as said, err.open("wb") as told:
         child = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "companion", *words), cwd=folder, env=environment,
+            *(sys.executable, "-P", "-m", "companion", *words), cwd=folder, env=environment,
             stdin=asyncio.subprocess.DEVNULL, stdout=said, stderr=told,
             start_new_session=True, preexec_fn=partial(_limit, limits.cpu_s, os.getpid()),
         )  # fmt: skip

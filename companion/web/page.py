@@ -281,7 +281,7 @@ class OperatorPage:
                 file.write(self._about)
             passed = (self._memory, self._wake, theirs.fileno(), self._listener.fileno(), about)
             self._child = subprocess.Popen(
-                [sys.executable, "-m", "companion.web", *map(str, passed), str(os.getpid())],
+                [sys.executable, "-P", "-m", "companion.web", *map(str, passed), str(os.getpid())],
                 pass_fds=passed,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

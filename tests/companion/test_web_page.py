@@ -20,6 +20,7 @@ from companion.core.types import Inhibit, SprayerState
 from companion.errors import ConfigError
 from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
+from companion.web.child import Limits, run_child
 from companion.web.frames import frame_of, packed
 from companion.web.live import (
     ADVICE,
@@ -42,6 +43,27 @@ IN_LOOP = pytest.mark.asyncio(loop_scope="module")  # one page for all: it start
 async def site() -> AsyncIterator[Site]:
     async with served() as found:
         yield found
+
+
+# ------------------------------------------------------------------------- its process
+
+
+@pytest.mark.asyncio
+async def test_a_script_in_the_users_folder_is_never_run_in_place_of_a_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("uvicorn", "click", "typer"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('not the library')\n")
+    monkeypatch.chdir(tmp_path)
+    async with served() as site:
+        assert (await site.asked("GET", "/api/v1/state")).status == 200
+    ours = await run_child(
+        ("examples", "list", "--json"),
+        tmp_path,
+        Limits(cpu_s=30, wait_s=120.0),
+        flying=lambda: None,
+    )
+    assert ours.error is None
 
 
 # ------------------------------------------------------------------------- shared memory
