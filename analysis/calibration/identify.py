@@ -415,7 +415,9 @@ def first_flow(meter: Meter, fits: Sequence[Fit], lag: LagModel, *, lag_s: float
     """Return from steps on when the flow begins after the order of a fully open valve.
 
     A pulse stands in the middle of its period: with a duty below 1 the first one begins later by
-    half of the off-time, which is taken off.
+    half of the off-time, which is taken off. So no lag of a configuration has a gap in it,
+    whatever it was measured by: at the border the core adds that of each opening itself
+    (`Timing.rest_s`), and volume-equivalent lags do not depend on where a pulse stands.
     """
     until_s = settle_s(lag)
     curves = []
