@@ -103,10 +103,10 @@ def _what_if(result: ReplayResult) -> Iterator[str]:
 
 def _notes(result: ReplayResult) -> list[str]:
     notes = []
-    if result.training not in (None, "no"):
-        notes.append(f"training: {result.training}")
     if result.simulated == "yes":
-        notes.append("simulated: nothing was flown")
+        notes.append("a simulated flight: nothing was flown")
+    elif result.training not in (None, "no"):
+        notes.append(f"training: {result.training}")
     if result.first_difference:
         notes.append(f"first difference: {result.first_difference}")
     if result.differences and result.elsewhere and not result.is_what_if:

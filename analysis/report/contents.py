@@ -424,13 +424,29 @@ def held_ground(assessment: Assessment | None) -> Iterator[Caution]:
     causes = assessment.causes
     held_m2 = causes.by_cause[Cause.INHIBIT]
     by_reason = sorted(causes.by_inhibit.items(), key=lambda each: -each[1])
-    reasons = ", ".join(f"{name} {area_m2:.0f} m2" for name, area_m2 in by_reason if name != UNREAD)
+    reasons = ", ".join(
+        f"{area_m2:.0f} m2 ({reasons_in_words(name)})"
+        for name, area_m2 in by_reason
+        if name != UNREAD
+    )
     if not reasons or not held_m2 > HELD_SHARE * causes.judged_m2:
         return
     yield _warning(
         "held-ground",
         f"{held_m2:.0f} m2 were flown over with the valves held closed: {reasons}.",
     )
+
+
+def reasons_in_words(names: str) -> str:
+    """Return a moment's reasons as the operator's screen calls them.
+
+    >>> reasons_in_words("speed-below-min not-enabled")
+    'too slow and not enabled'
+    """
+    known = {each.value: each.words for each in Inhibit}
+    if not all(name in known for name in names.split()):
+        return names
+    return " and ".join(known[name] for name in names.split())
 
 
 def held_between(

@@ -482,7 +482,8 @@ def watchdog_trouble(known: Known, options: ServoOptions) -> tuple[str, str] | N
     if enable is None:
         return (
             "SPRW_ENABLE does not answer: the script does not run",
-            "install deploy/ardupilot/vrspray_watchdog.lua and set SCR_ENABLE to 1",
+            "set SCR_ENABLE to 1 and install deploy/ardupilot/vrspray_watchdog.lua "
+            "(vrspray examples copy deploy)",
         )
     if enable != 1.0:
         return f"SPRW_ENABLE is {enable:g}: the script does nothing", "set SPRW_ENABLE to 1"

@@ -54,6 +54,8 @@ _COLOURS = {
     "fault": "bold white on red",
     "estop": "bold white on red",
 }
+# A latched state whose fault is over: nothing is left to name, but to release.
+_NO_FAULT = {"fault": "over, but latched: disable, then enable again"}
 TRAINING = {"water": "TRAINING WITH WATER", "dry": "DRY RUN", "ground": "GROUND WORK"}
 
 
@@ -96,7 +98,7 @@ class Shown:
             ("boundary", self._next()),
             ("vehicle", ", ".join(filter(None, (self.vehicle, self._speed())))),
             ("ages", self._ages()),
-            ("faults", "; ".join(self.faults) or "none"),
+            ("faults", "; ".join(self.faults) or _NO_FAULT.get(self.state, "none")),
         ]
         if self.training:
             rows.insert(0, ("training", TRAINING.get(self.training, self.training)))

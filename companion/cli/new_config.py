@@ -259,7 +259,8 @@ def text_of(answers: Answers, *, map_name: str = "") -> str:
 
 _HEAD = """
 # Written by `vrspray config new`. Check it after every change: vrspray config check FILE
-# All keys: docs/reference/configuration.md. What is marked MEASURE is a guess until you have.
+# All keys: vrspray config schema, or "Configuration keys" in the documentation.
+# What is marked MEASURE is a guess until you have.
 
 version = 1
 """
@@ -376,7 +377,8 @@ full_us = 2000
 def _safety(answers: Answers) -> str:
     mode = "MISSION" if answers.autopilot == "px4" else "AUTO"
     return f"""
-# What must hold before a valve opens. To enable by an RC switch too: add "rc", and rc_channel = 7.
+# What must hold before a valve opens. To enable by an RC switch too: add "rc", and
+# rc_channel = 7; from the operator's page: "web".
 [safety]
 enable_by = ["command"]
 modes = ["{mode}"]

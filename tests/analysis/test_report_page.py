@@ -312,7 +312,9 @@ def test_ground_that_was_flown_over_closed_is_a_warning_with_its_reasons(journal
         return [each.text for each in held_ground(held)]
 
     (text,) = said(0.5, output_fault=2.0, rearm_needed=70.0)
-    assert text.endswith("with the valves held closed: rearm-needed 70 m2, output-fault 2 m2.")
+    assert text.endswith(
+        "the valves held closed: 70 m2 (disable, then enable again), 2 m2 (output fault)."
+    )
     assert said(0.009, rearm_needed=1.0) == []
     # Of missing rows other warnings tell.
     assert said(0.5, unread=70.0) == []

@@ -82,6 +82,12 @@ def test_the_block_says_what_an_operator_asks() -> None:
     assert "SPRAYING: too slow" in text
 
 
+def test_a_latched_fault_that_is_over_says_how_to_release_it() -> None:
+    assert "disable, then enable again" in dict(Shown(state="fault").rows())["faults"]
+    assert dict(Shown(state="fault", faults=("valve 2",)).rows())["faults"] == "valve 2"
+    assert dict(Shown(state="safe").rows())["faults"] == "none"
+
+
 def test_nothing_known_is_no_number() -> None:
     assert dict(Shown().rows())["rate"] == "- wanted, - given"
 

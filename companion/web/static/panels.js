@@ -147,7 +147,7 @@ export function showChecklist(state, facts, ground, checks) {
     ["Record", !state.journal?.fault, state.journal?.name ?? ""],
     ["Product", facts.training !== "no" ? null : Boolean(facts.product), facts.training === "no" ? facts.product || "product.name is not set" : `training: ${facts.training}`],
   ];
-  const items = [...live, ...(checks ?? []).filter((one) => one.status !== "ok" && one.status !== "n/a").map((one) => [one.name, one.status === "fail" ? false : null, one.fix ? `${one.text}; ${one.fix}` : one.text])];
+  const items = [...live, ...(checks ?? []).filter((one) => one.status === "warn" || one.status === "fail").map((one) => [one.name, one.status === "fail" ? false : null, one.fix ? `${one.text}; ${one.fix}` : one.text])];
   list("checklist", items, ([name, isOk, note]) => {
     const item = make("li", undefined, isOk === null ? "wait" : isOk ? "ok" : "bad");
     const mark = make("span", isOk === null ? "•" : isOk ? "✓" : "✗", "mark");

@@ -24,6 +24,7 @@ from axe_playwright_python.async_playwright import Axe
 from playwright.async_api import Browser, Locator, Page, async_playwright, expect
 
 from companion.cli.web_parts import Watched, obeying
+from companion.doctor.check import Status
 from companion.link.component import ComponentOptions
 from companion.link.vehicle_link import VehicleLink
 from companion.output.servo import ServoExecutor, ServoOptions
@@ -287,6 +288,23 @@ async def test_a_page_without_news_says_so_and_greys_what_is_old(flight: Flight)
         await expect(page.locator("#answer")).to_contain_text("NOT CONFIRMED")
         flight.child.send_signal(signal.SIGCONT)
         await page.wait_for_function("() => !document.body.classList.contains('stale')")
+
+
+@pytest.mark.timeout(120)
+async def test_the_checklist_names_what_to_see_to_and_nothing_else(flight: Flight) -> None:
+    checks = [
+        {"name": f"check-{status.value}", "status": status.value, "text": "said", "fix": ""}
+        for status in Status
+    ]
+    async with chromium(WITHOUT_WEBGL) as browser:
+        page = await flight.open(browser)
+        await page.route("**/api/v1/checks", lambda route: route.fulfill(json={"checks": checks}))
+        await page.reload()
+        listed = page.locator("#checklist")
+        await expect(listed).to_contain_text("check-warn")
+        await expect(listed).to_contain_text("check-fail")
+        await expect(listed).not_to_contain_text("check-ok")
+        await expect(listed).not_to_contain_text("check-not-applicable")
 
 
 @pytest.mark.timeout(120)
