@@ -356,6 +356,15 @@ def beyond_label(config: Config) -> list[Problem]:
             where="product.droplet_class",
             fix="fit nozzles of that class at the pressure that is flown",
         ))  # fmt: skip
+    own, other = config.product.rate_max_l_ha, label.rate_max_l_ha
+    if own is not None and other is not None and own != other:
+        found.append(Problem(
+            severity="warning",
+            code="label-rates-differ",
+            text=f"product.rate_max_l_ha = {own:g}, and {file} says {other:g}; the lower one holds",
+            where="product.rate_max_l_ha",
+            fix="look at the label, and write its rate in one of the two",
+        ))  # fmt: skip
     return found
 
 

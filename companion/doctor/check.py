@@ -150,9 +150,14 @@ def label_check(config: Config, now: datetime) -> Check:
     name, label = "label-limits", config.label
     if label is None:
         return not_applicable(name, "no limits file: label and permit are not checked")
-    for problem in beyond_label(config):
-        return fail(name, f"{label.title}: {problem.text}", problem.fix)
-    return _declared_check(name, label, config.told()) or _time_check(name, label, config, now)
+    problems = beyond_label(config)
+    for problem in problems:
+        if problem.severity == "error":
+            return fail(name, f"{label.title}: {problem.text}", problem.fix)
+    found = _declared_check(name, label, config.told()) or _time_check(name, label, config, now)
+    if found.status is Status.OK and problems:
+        return warn(name, f"{label.title}: {problems[0].text}", problems[0].fix)
+    return found
 
 
 def _declared_check(name: str, label: LimitsFile, values: Mapping[str, object]) -> Check | None:

@@ -12,7 +12,15 @@ from typing import Annotated, Any, Literal, get_args
 import numpy as np
 import typer
 
-from companion.cli.answer import AsJson, answer, note, problem_line, problem_object, progress
+from companion.cli.answer import (
+    AsJson,
+    Overrides,
+    answer,
+    note,
+    problem_line,
+    problem_object,
+    progress,
+)
 from companion.config import load
 from companion.flight_map import is_flight_map
 from companion.problem import Problem
@@ -169,6 +177,7 @@ def zones(
     png: Picture = None,
     format_name: FormatName = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Make zones that the sprayer can follow; say what that costs.
@@ -180,7 +189,7 @@ def zones(
             data[0], "making zones takes the library scipy, which is not installed",
             fix=f"install it with: {install_command('office')}", code="missing-library",
         )  # fmt: skip
-    config = bounded(load(config_file), boundary)
+    config = bounded(load(config_file, overrides=overrides or ()), boundary)
     wish = _wish(rates, law, litres_max, count, method, smooth_m, step_percent)
     if as_is and is_flight_map(out):
         raise typer.BadParameter("--as-is is to compare, not to fly: name another format")

@@ -138,18 +138,25 @@ def limits_of(config: Config, sprayer: Sprayer, margin: float) -> Limits:
     """Return how long a rate has to last, and the rates that nozzles and label allow."""
     width_m, speed = config.boom_table.width_m, sprayer.speed_m_s
     low, high = flow_range(config.nozzle_sets(), config.pwm_limits())
-    label = config.product.rate_max_l_ha
+    most = config.rate_max_l_ha()
+    least = None if config.label is None else config.label.rate_min_l_ha
     high_l_ha = rate_for_flow(high, speed, width_m)
     low_l_ha = rate_for_flow(low, speed, width_m)
-    if label is not None and label < low_l_ha:
+    if most is not None and most < low_l_ha:
         raise ConfigError(
-            f"{config.path}: product.rate_max_l_ha = {label:g}: below the {low_l_ha:.2f} L/ha that "
-            f"the nozzles deliver at least at {speed:g} m/s; fly faster or fit smaller nozzles"
+            f"{config.path}: rate_max_l_ha = {most:g} of product or limits file: below the "
+            f"{low_l_ha:.2f} L/ha that the nozzles deliver at least at {speed:g} m/s; fly faster "
+            "or fit smaller nozzles"
+        )
+    if least is not None and least > high_l_ha:
+        raise ConfigError(
+            f"{config.limits_table.file}: rate_min_l_ha = {least:g}: above the {high_l_ha:.2f} "
+            f"L/ha that the nozzles deliver at most at {speed:g} m/s; fly slower or fit larger ones"
         )
     return Limits(
         least_m=margin * sprayer.length_min_m,
-        low_l_ha=low_l_ha,
-        high_l_ha=high_l_ha if label is None else min(high_l_ha, label),
+        low_l_ha=low_l_ha if least is None else max(low_l_ha, least),
+        high_l_ha=high_l_ha if most is None else min(high_l_ha, most),
     )
 
 

@@ -14,7 +14,15 @@ import typer
 from shapely import MultiPolygon
 from shapely.geometry.base import BaseGeometry
 
-from companion.cli.answer import AsJson, answer, note, problem_line, problem_object, progress
+from companion.cli.answer import (
+    AsJson,
+    Overrides,
+    answer,
+    note,
+    problem_line,
+    problem_object,
+    progress,
+)
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
 from companion.wording import counted
@@ -138,6 +146,7 @@ def spots(
     png: Picture = None,
     format_name: FormatName = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files of these names.")] = False,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Spray weeds alone, with ground around them.
@@ -148,7 +157,7 @@ def spots(
 
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """
-    config = bounded(load(config_file), boundary)
+    config = bounded(load(config_file, overrides=overrides or ()), boundary)
     target = map_target(out)
     writer = writer_for(target, format_name)
     for path in (out, *(one for one in (png, mission) if one is not None)):

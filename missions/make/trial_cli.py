@@ -11,7 +11,7 @@ import shapely
 import typer
 
 from companion.atomic_write import write_atomically
-from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
+from companion.cli.answer import AsJson, Overrides, answer, note, problem_line, problem_object
 from companion.config import load
 from missions.errors import PlanError
 from missions.make.arguments import (
@@ -93,6 +93,7 @@ def trial(
     png: Picture = None,
     format_name: FormatName = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a map of this name.")] = False,
+    overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Lay out a randomised trial that the sprayer can follow.
@@ -102,7 +103,7 @@ def trial(
 
     Exit 0: made; 1: made, and the check of the map found errors; 2: refused.
     """
-    config = bounded(load(config_file), boundary)
+    config = bounded(load(config_file, overrides=overrides or ()), boundary)
     target = map_target(out)
     record = target.with_name(f"{target.stem}.trial.geojson")
     writer = writer_for(target, format_name)

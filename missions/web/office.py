@@ -242,7 +242,7 @@ class Office:
         made = self.made / MADE_MAP
         with self._working("make", MADE_MAP):
             (self.given / MADE_MAP).unlink(missing_ok=True)  # of other data, or other rates
-            out = ["--out", f"made/{MADE_MAP}", "--force", *self.host.config[:2], "--json"]
+            out = ["--out", f"made/{MADE_MAP}", "--force", *self.host.config, "--json"]
             done = await self.run(
                 "make", ["make", "zones", f"given/{asked.data}", *asked.words(), *out]
             )
@@ -381,7 +381,7 @@ def _plan_words(asked: Planning, host: Host, out: str) -> list[str]:
     for option in ("no_spray", "obstacle"):
         for name in getattr(asked, option):
             words += [f"--{option.replace('_', '-')}", f"given/{name}"]
-    return [*words, *asked.settings(), *asked.words(), *host.config[:2]]
+    return [*words, *asked.settings(), *asked.words(), *host.config]
 
 
 def _is_name(name: str) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import shapely
 
-from companion.assembly import above_label, build_setup
+from companion.assembly import above_label, beyond_label, build_setup
 from companion.cli.run import label_notes as of_run
 from companion.config import Config, load
 from companion.config.limits import LimitsFile, limits_meta, limits_of, read_limits
@@ -297,6 +297,20 @@ def test_the_lower_of_two_greatest_rates_holds_in_flight(tmp_path: Path) -> None
     lower = config(tmp_path, "rate_max_l_ha = 25", "product.rate_max_l_ha=24")
     assert lower.rate_max_l_ha() == 24.0
     assert config(tmp_path, "").rate_max_l_ha() is None
+
+
+@pytest.mark.parametrize(("own", "differs"), [("40", True), ("20", True), ("25", False)])
+def test_a_rate_that_product_and_label_say_otherwise_is_told(
+    tmp_path: Path, own: str, differs: bool
+) -> None:
+    given = config(tmp_path, "rate_max_l_ha = 25", f"product.rate_max_l_ha={own}")
+    found = {problem.code: problem for problem in beyond_label(given)}
+    assert ("label-rates-differ" in found) is differs
+    assert label_check(given, NOW).status is (Status.WARN if differs else Status.OK)
+    if differs:
+        assert found["label-rates-differ"].severity == "warning"
+        assert f"product.rate_max_l_ha = {own}" in found["label-rates-differ"].text
+    assert given.rate_max_l_ha() == min(25.0, float(own))
 
 
 @pytest.mark.parametrize("limit", ["rate_max_l_ha = 25", "rate_min_l_ha = 18"])

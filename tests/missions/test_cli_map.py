@@ -175,6 +175,25 @@ def test_what_the_sprayer_cannot_do_is_told_with_speed_and_place(
     assert found["problems"][0]["where"].startswith("60 L/ha: zone2 at ")
 
 
+def test_a_setting_is_changed_for_one_check_and_for_one_plan(
+    capsys: Captured, tmp_path: Path
+) -> None:
+    path = write(tmp_path / "rx.geojson", (cell(0), 20.0))
+    config = write_config(tmp_path)
+    given = ("--config", config, "--set", "product.rate_max_l_ha=15")
+    code, found = run_json(capsys, "check", path, *given)
+    assert (code, codes(found)[0]) == (1, "above-label")
+    out = str(tmp_path / "field.plan")
+    words = ("--config", config, "--set", "mission.tank_l=11.0", "--out", out, "--json")
+    assert execute(["plan", path, "--rate-l-ha", "20", *words]) == 0
+    planned = json.loads(capsys.readouterr().out)
+    assert max(one["fill_l"] for one in planned["sorties"]) <= 11.0
+    assert all("tank" not in text for text in planned.get("assumed", ()))
+    for command in (["map", "check", path], ["plan", path, "--out", out]):
+        assert execute([*command, "--set", "mission.tank_l=1"]) == 2
+        assert "--config" in capsys.readouterr().err
+
+
 def test_a_default_rate_that_cannot_be_delivered_is_told(capsys: Captured, tmp_path: Path) -> None:
     path = write(tmp_path / "rx.geojson", (cell(0), 20.0))
     config = write_config(tmp_path, ("[prescription]", "[prescription]\ndefault_rate_l_ha = 90.0"))

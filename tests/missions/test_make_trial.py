@@ -14,9 +14,12 @@ import shapely
 import typer
 from pyproj import CRS, Transformer
 
-from companion.errors import VrsprayError
+from companion.config import load
+from companion.errors import ConfigError, VrsprayError
+from missions.make.flown import limits_of
 from missions.make.trial import Design, lay_out
 from missions.make.trial_cli import trial
+from missions.maps.cli.plan import plan_of
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "zones"
@@ -70,6 +73,25 @@ def local(geometries: Any) -> Any:
     return shapely.transform(
         geometries, lambda at: np.column_stack(there.transform(at[:, 0], at[:, 1]))
     )
+
+
+def test_rates_of_the_limits_file_bound_what_is_made(data: Path, tmp_path: Path) -> None:
+    limits = tmp_path / "limits.toml"
+    limits.write_text('version = 1\ntitle = "a label"\nrate_min_l_ha = 12\nrate_max_l_ha = 22\n')
+    given = load(data / "config.toml", overrides=[f'limits.file="{limits}"'])
+    sprayer = plan_of(given, None)[0].sprayer
+    assert sprayer is not None
+    found = limits_of(given, sprayer, 1.5)
+    assert (found.low_l_ha, found.high_l_ha) == (12.0, 22.0)
+    for text, wrong in (
+        ("rate_max_l_ha = 0.1", "rate_max_l_ha = 0.1"),
+        ("rate_min_l_ha = 900", "900"),
+    ):
+        limits.write_text(f'version = 1\ntitle = "a label"\n{text}\n')
+        with pytest.raises(ConfigError, match=wrong):
+            limits_of(
+                load(data / "config.toml", overrides=[f'limits.file="{limits}"']), sprayer, 1.5
+            )
 
 
 def test_every_block_has_every_treatment_once_on_ground_of_its_own(

@@ -346,6 +346,15 @@ def test_labels_may_have_letters_and_columns_of_text_are_none_of_numbers(folder:
     assert [band.name for band in grid_of(write(folder, text)).bands] == ["rate"]
 
 
+def test_a_byte_of_another_encoding_is_named_with_the_way_out(folder: Path) -> None:
+    path = folder / "map.csv"
+    path.write_bytes("lat;lon;Rate\n52.1;13.1;20\n52.1;13.1;größer\n".encode("cp1252"))
+    with pytest.raises(MapError) as caught:
+        read_csv(path)
+    assert "byte 0xF6 in line 3" in str(caught.value)
+    assert "iconv -f WINDOWS-1252 -t UTF-8" in str(caught.value.fix)
+
+
 @pytest.mark.parametrize("content", ["lat,lon\n".encode("utf-16"), "lat,lon,Dosé".encode("cp1252")])
 def test_other_encodings_are_refused(folder: Path, content: bytes) -> None:
     path = folder / "encoded.csv"

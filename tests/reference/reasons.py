@@ -20,7 +20,7 @@ not open and close the valves.
 _POSITION = "`safety.position_age_max_s` (0.8 s)"
 _BEAT = "`safety.heartbeat_age_max_s` (2.5 s)"
 _LIQUID = ("flow meter, pressure, tank", "-", "as a latch")
-_DECLARED = ("the operator", "-", "declared anew, and started again")
+_DECLARED = ("the operator", "-", "declared anew on the ground")
 # Condition to spray; source; maximum age; when the valves may open again.
 CONDITIONS: dict[Inhibit, tuple[str, str, str, str]] = {
     Inhibit.ESTOP: (
@@ -145,7 +145,7 @@ CONDITIONS: dict[Inhibit, tuple[str, str, str, str]] = {
     Inhibit.LABEL_WEATHER_AGE: (
         "with `[limits]`: what the operator declares of the weather is not older than the file's "
         "`observed_max_h`", "`application.observed_at`, SYSTEM_TIME", "60 s",
-        "observed anew, and started again",
+        "observed anew, and declared",
     ),
     Inhibit.LABEL_TEMPERATURE: ("with `[limits]`: `application.temperature_c` is within", *_DECLARED),
     Inhibit.LABEL_HUMIDITY: ("with `[limits]`: `application.humidity_percent` is within", *_DECLARED),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
 
-from companion.cli.answer import Option, with_options
+from companion.cli.answer import Option, Overrides, with_options
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.core.prescription import Overlap
@@ -154,11 +155,20 @@ _OPTIONS = {
     "merge": Option(_Merge),
     "origin": Option(_Origin),
     "config_file": Option(_ConfigFile),
+    "overrides": Option(Overrides),
 }
 
 
-def _reading(*, config_file: Path | None, origin: str | None, **answers: Any) -> Reading:
-    config = None if config_file is None else load(config_file)
+def _reading(
+    *,
+    config_file: Path | None,
+    origin: str | None,
+    overrides: Sequence[str] | None,
+    **answers: Any,
+) -> Reading:
+    if overrides and config_file is None:
+        raise typer.BadParameter("--set changes a configuration: name one by --config")
+    config = None if config_file is None else load(config_file, overrides=overrides or ())
     place = None if origin is None else parse_place(origin, "--origin")
     return Reading(config=config, origin=place, **answers)
 

@@ -405,12 +405,18 @@ def _large_fields() -> Iterator[None]:
 
 
 def _text(content: bytes, path: Path) -> str:
+    where, text = "", "\0"
     try:
         text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = "\0"
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        where = f": byte 0x{content[error.start]:02X} in line {line}"
     if "\0" in text:
-        raise map_error(path, "this is no text in UTF-8", fix=_AS_CSV, code="encoding")
+        # Which letter such a byte is depends on the program that wrote it: it is not guessed.
+        raise map_error(
+            path, f"this is no text in UTF-8{where}", code="encoding",
+            fix=f"{_AS_CSV}, or: iconv -f WINDOWS-1252 -t UTF-8 FILE > NEW.csv",
+        )  # fmt: skip
     return text
 
 
