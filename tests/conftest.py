@@ -84,7 +84,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.name not in LONGEST)
     for item in items:
         if isinstance(item, pytest.Function) and _has_loop(item):
-            item.fixturenames.insert(0, "no_task_left_behind")
+            # Behind what a module or the session has once: a page of all its tests is nobody's left.
+            place = item.fixturenames.index("no_thread_left_behind") + 1
+            item.fixturenames.insert(place, "no_task_left_behind")
 
 
 def _has_loop(item: pytest.Function) -> bool:
