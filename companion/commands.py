@@ -51,10 +51,14 @@ def registered(under: str = "") -> dict[str, EntryPoint]:
     found: dict[str, EntryPoint] = {}
     for point in entry_points(group=GROUP):
         group, _, name = point.name.rpartition(".")
-        is_ours = point.dist is not None and point.dist.name == _OURS
-        if group == under and (is_ours or name not in found):
+        # Whose it is takes long to read, and matters only where two name the same one.
+        if group == under and (name not in found or _is_ours(point)):
             found[name] = point
     return dict(sorted(found.items()))
+
+
+def _is_ours(point: EntryPoint) -> bool:
+    return point.dist is not None and point.dist.name == _OURS
 
 
 def is_there(name: str) -> bool:

@@ -22,6 +22,7 @@ CURVE = FlowCurve(
     duty=(0.2, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0),
     flow_l_min=(1.476, 3.024, 3.276, 4.62, 5.052, 5.952, 6.096),
 )
+FRAME = LocalFrame(36.0, 114.5)
 LAG = LagModel(
     on_s=0.10, off_s=0.11, up_s=0.104, down_s=0.106, on_start_s=0.085, off_end_s=0.13, output_s=0.01
 )
@@ -64,7 +65,7 @@ def setup(**change: object) -> Setup:
     """Return a set-up that may spray: one row of plots of 20, 25, 15, 20 L/ha along the east."""
     zones = plots([[20.0, 25.0, 15.0, 20.0]])
     given: dict[str, object] = {
-        "frame": LocalFrame(36.0, 114.5),
+        "frame": FRAME,
         "prescription": Prescription(zones, boundary=shapely.box(0.0, -1.0, 48.0, 7.0)),
         "boom": boom(),
         "nozzle_sets": (NozzleSet(valves=tuple(range(6)), curve=CURVE),),
@@ -132,7 +133,7 @@ def along(course_deg: float, speed_m_s: float = 5.0) -> dict[str, float]:
 
 def position(received_s: float, east_m: float, north_m: float, /, **change: object) -> Telemetry:
     """Return the message of a position in the frame of `setup`, eastwards at 5 m/s."""
-    latitude, longitude = setup().frame.to_geographic(east_m, north_m)
+    latitude, longitude = FRAME.to_geographic(east_m, north_m)
     given: dict[str, object] = {
         "received_s": received_s,
         "boot_s": received_s,

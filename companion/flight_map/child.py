@@ -133,23 +133,12 @@ def _run(named: str, order: Sequence[str], out: Path) -> None:
     """
     memory_max = _memory_max_bytes()
     try:
-        with subprocess.Popen(
-            [sys.executable, "-P", "-m", "companion", *_COMPILER, *order, "--json"],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-        ) as compiler:
-            try:
-                _limit_memory(compiler.pid, memory_max)
-                stdout, _ = compiler.communicate(timeout=_TIMEOUT_S)
-            except BaseException:
-                compiler.kill()
-                raise
+        code, stdout = _ended([*_COMPILER, *order, "--json"], memory_max)
     except subprocess.TimeoutExpired as error:
         raise _failed(named, f"it took longer than {_TIMEOUT_S:.0f} s") from error
     except OSError as error:
         raise _failed(named, str(error)[:200]) from error
-    if compiler.returncode in _WRITTEN and out.exists():
+    if code in _WRITTEN and out.exists():
         return
     said = _said(stdout)
     problems = said.get("problems")
@@ -157,11 +146,28 @@ def _run(named: str, order: Sequence[str], out: Path) -> None:
     if text == NOT_ENOUGH_MEMORY:
         raise _failed(named, f"it needs more than {memory_max // 1024**2} MB of memory")
     if not isinstance(text, str):
-        raise _failed(named, f"the compiler ended with {compiler.returncode}")
+        raise _failed(named, f"the compiler ended with {code}")
     if isinstance(problems, list) and problems:
         reason, fix = (str(problems[0][key]) for key in ("code", "fix"))
         raise MapError(text, code=reason, fix=fix)
     raise ConfigError(text)
+
+
+def _ended(words: Sequence[str], memory_max: int) -> tuple[int, bytes]:
+    """Return a command's exit code and what it said; it is killed where that takes too long."""
+    with subprocess.Popen(
+        [sys.executable, "-P", "-m", "companion", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as compiler:
+        try:
+            _limit_memory(compiler.pid, memory_max)
+            stdout, _ = compiler.communicate(timeout=_TIMEOUT_S)
+        except BaseException:
+            compiler.kill()
+            raise
+    return compiler.returncode, stdout
 
 
 def _memory_max_bytes() -> int:

@@ -18,6 +18,8 @@ MAP = ROOT / "examples" / "anyang" / "prescription.shp"
 
 Captured = pytest.CaptureFixture[str]
 
+pytestmark = pytest.mark.usefixtures("compiles_here")
+
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 @pytest.mark.parametrize("output", ["servo", "gpio"])

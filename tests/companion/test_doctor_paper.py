@@ -26,6 +26,8 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang"
 TODAY = date(2026, 6, 1)
 Captured = pytest.CaptureFixture[str]
 
+pytestmark = pytest.mark.usefixtures("compiles_here")
+
 
 def paper(*overrides: str, file: Path = EXAMPLE / "config.toml") -> dict[str, Check]:
     config = load(file, overrides=overrides)

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Collection, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -66,22 +67,34 @@ def commands(page: Path, kinds: Collection[str] = ("", "sh", "text")) -> list[st
 EVERY = [(page.name, command) for page in PAGES for command in commands(page)]
 
 
+@cache
+def command_at(names: tuple[str, ...]) -> tuple[Any, Any]:
+    """Return the command of these names and its context; None where there is none."""
+    if not names:
+        root: Any = typer.main.get_command(app)
+        return root, root.make_context("vrspray", [], None, resilient_parsing=True)
+    above, context = command_at(names[:-1])
+    found = above.get_command(context, names[-1])
+    if found is None:
+        return None, None
+    return found, found.make_context(names[-1], [], context, resilient_parsing=True)
+
+
 def leaf(words: list[str]) -> tuple[tuple[str, ...], set[str], list[str]]:
     """Return the names of a command line's command, its options, and what is left for it."""
-    names: list[str] = []
-    found: Any = typer.main.get_command(app)
-    context = found.make_context("vrspray", [], None, resilient_parsing=True)
+    names: tuple[str, ...] = ()
+    found, context = command_at(names)
     while words and hasattr(found, "list_commands"):
-        below = found.get_command(context, words[0])
+        below, _ = command_at((*names, words[0]))
         if below is None and hasattr(found, "unsaid"):
             words = [found.unsaid, *words]
-            below = found.get_command(context, words[0])
+            below, _ = command_at((*names, words[0]))
         assert below is not None, f"no command {' '.join([*names, words[0]])}"
-        context = below.make_context(words[0], [], context, resilient_parsing=True)
-        found, words, names = below, words[1:], [*names, words[0]]
+        names, words = (*names, words[0]), words[1:]
+        found, context = command_at(names)
     options = {name for one in found.get_params(context) for name in one.opts}
     more = {name for one in found.get_params(context) for name in one.secondary_opts}
-    return tuple(names), options | more, words
+    return names, options | more, words
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
