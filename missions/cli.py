@@ -31,7 +31,7 @@ from missions.files.write import check_suffix, older_sorties, write_fleet
 from missions.maps.cli.grid import parse_mark
 from missions.maps.cli.options import Reading, reading_options
 from missions.maps.whole_file import check_folder
-from missions.mix import mix_lines, mix_of
+from missions.mix import mix_lines, mix_of, with_tank
 from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
@@ -199,6 +199,10 @@ def plan(
     sortie: Annotated[
         int | None, typer.Option(metavar="N", help="Sortie in which spraying stopped.", min=1)
     ] = None,
+    in_tank_l: Annotated[
+        float,
+        typer.Option(metavar="L", help="Mix in the tank now: it is not mixed again.", min=0.0),
+    ] = 0.0,
     force: Annotated[
         bool, typer.Option("--force", help="Replace a plan of this name, with all its sorties.")
     ] = False,
@@ -264,13 +268,19 @@ def plan(
             )
     flown_s = [planned.airborne_s(sortie) for sortie in planned.sorties]
     by_label = label_warnings(reading.config, flown_s, datetime.now(tz=UTC).timestamp())
-    planned = replace(planned, warnings=(*task.said, *by_label, *planned.warnings), wind=task.wind)
+    planned = replace(
+        planned,
+        warnings=(*task.said, *by_label, *planned.warnings),
+        wind=task.wind,
+        settings=with_tank(planned.settings, in_tank_l),
+    )
     took_s = perf_counter() - start
     choices = []
     asks = choices_too or overlap_max is not None or leave_max > LEAVE_PERCENT
     if asks and task.left is None and not isinstance(task.rates, UntreatedRates):
         choices = list(prices(planned, task.rates, depots=task.depots, around=task.around))
-    mix = mix_of(reading.config, planned, task.rates)
+    goes_on = resume is not None or done is not None
+    mix = mix_of(reading.config, planned, task.rates, goes_on=goes_on)
     with _undisturbed():
         files, marks = write_fleet(planned, out, with_sprayer=sprayer, fences=fences)
     removed = _removed(older_sorties(out, files))

@@ -6,8 +6,8 @@ the tank. On the ground a product then follows the map as the spray does.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from companion.config import Config
 from companion.wording import counted
 from missions.demand import Rates, steps_of, valve_places
 from missions.errors import PlanError
-from missions.plan import Plan
+from missions.plan import Plan, Settings
 from missions.schedule import filled_of
 
 Measure = Literal["L", "kg"]
@@ -87,8 +87,13 @@ def flown_rates(plan: Plan, rates: Rates) -> FlownRates:
     )
 
 
-def mix_of(config: Config | None, plan: Plan, rates: Rates) -> dict[str, Any] | None:
-    """Return the mix of each sortie; None where the configuration names no products."""
+def mix_of(
+    config: Config | None, plan: Plan, rates: Rates, *, goes_on: bool = False
+) -> dict[str, Any] | None:
+    """Return the mix of each sortie; None where the configuration names no products.
+
+    `goes_on` is whether a flight before this plan may have left some in the tank.
+    """
     if config is None or not config.mix:
         return None
     flown = flown_rates(plan, rates)
@@ -102,12 +107,14 @@ def mix_of(config: Config | None, plan: Plan, rates: Rates) -> dict[str, Any] | 
     filled = filled_of(plan)
     adds_l = [(sortie.number, filled[sortie.number]["add_l"]) for sortie in plan.sorties]
     total_l, sprayed_l = sum(add_l for _, add_l in adds_l), plan.volume_l
+    # What is in the tank already holds the products in the same shares: it is no new mix.
+    left_l = plan.settings.in_tank_l + total_l - sprayed_l
     for each in products:
         per_l = each["per_l"]
         each |= {
             "total": per_l * total_l,
             "sprayed": per_l * sprayed_l,
-            "leftover": per_l * (total_l - sprayed_l),
+            "leftover": per_l * left_l,
             "per_ha_mean": per_l * flown.mean_l_ha,
             "per_ha_min": per_l * flown.low_l_ha,
             "per_ha_max": per_l * flown.high_l_ha,
@@ -129,10 +136,20 @@ def mix_of(config: Config | None, plan: Plan, rates: Rates) -> dict[str, Any] | 
         ],
         "mix_l": total_l,
         "water_l": total_l * (1.0 - liquid),
-        "leftover_l": total_l - sprayed_l,
+        "leftover_l": left_l,
+        "in_tank_l": plan.settings.in_tank_l,
         "rinse": _rinse(config, plan),
-        "notes": list(_notes(config, products)),
+        "notes": [*_tank_notes(plan, goes_on=goes_on), *_notes(config, products)],
     }
+
+
+def with_tank(settings: Settings, in_tank_l: float) -> Settings:
+    """Return the settings with what is in the tank now; PlanError where it cannot be."""
+    if in_tank_l > 0.0 and settings.aircraft > 1:
+        raise PlanError("--in-tank-l is of one tank; plan for one aircraft, or empty the tanks")
+    if in_tank_l > settings.tank_l:
+        raise PlanError(f"--in-tank-l {in_tank_l:g}: the tank holds {settings.tank_l:g} L")
+    return replace(settings, in_tank_l=in_tank_l)
 
 
 def _product(entry: Any, flown: FlownRates) -> dict[str, Any]:
@@ -173,6 +190,17 @@ def _rinse(config: Config, plan: Plan) -> dict[str, Any]:
         "left_l": left_l,
         "left_percent": 100.0 * (left_l / (left_l + water_l / times)) ** times,
     }
+
+
+def _tank_notes(plan: Plan, *, goes_on: bool) -> Iterator[str]:
+    """Yield what the mix counts on in the tank; its shares are not measured."""
+    if plan.settings.in_tank_l > 0.0:
+        yield (
+            f"{plan.settings.in_tank_l:g} L are in the tank before the first sortie, by "
+            "--in-tank-l, and count as this same mix"
+        )
+    elif goes_on:
+        yield "the tank counts as empty before the first sortie; what is in it: --in-tank-l"
 
 
 def _notes(config: Config, products: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -41,6 +41,7 @@ class Settings:
     `leave_max_percent` of what a strip can reach may be left, `overlap_max_percent` sprayed twice.
     Valves close where `switch_off_percent` of their strip is treated, if they do. With `ends_over`
     an end of the boom may be beyond the border, where its valves are closed.
+    `in_tank_l` is the mix that is in the first aircraft's tank before its first sortie.
     Without them, `jerk_m_s3` and `return_height_m` are those that the autopilot comes with.
     """
 
@@ -73,6 +74,7 @@ class Settings:
     overlap_max_percent: float | None = None
     switch_off_percent: float | None = None
     ends_over: bool = False
+    in_tank_l: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("swath_width_m", "speed_m_s", "height_m", "acceleration_m_s2", "tank_l"):
@@ -85,6 +87,8 @@ class Settings:
             )
         if not 0.0 <= self.reserve_l < self.tank_l:
             raise ValueError(f"a reserve of {self.reserve_l} L leaves nothing of {self.tank_l} L")
+        if not 0.0 <= self.in_tank_l <= self.tank_l:
+            raise ValueError(f"{self.in_tank_l} L are not in a tank of {self.tank_l} L")
         if self.ends_over and (len(self.valves) < 2 or self.border_buffer_m is None):
             raise ValueError("ends of the boom beyond the border need valves that close there")
 

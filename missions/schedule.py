@@ -131,13 +131,18 @@ class _Aboard:
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self._left_wh: dict[int, float] = {}
+        self._left_l: dict[int, float] = {1: plan.settings.in_tank_l}
 
     def fill(self, sortie: Sortie) -> dict[str, Any]:
         """Return what is put in before a sortie, and what is left after it.
 
-        The reserve of the sortie before is still in the tank, and nobody pours it out.
+        What the sortie before left, its reserve at least, is still in the tank, and nobody pours it
+        out.
         """
         reserve_l = self._plan.settings.reserve_l
+        before_l = self._left_l.get(sortie.aircraft, 0.0)
+        add_l = max(sortie.volume_l + (reserve_l - before_l), 0.0)
+        self._left_l[sortie.aircraft] = max(reserve_l, before_l - sortie.volume_l)
         first = sortie.aircraft not in self._left_wh
         battery, used_wh = self._plan.settings.battery, self._plan.energy_wh(sortie)
         capacity_wh = None if battery is None else battery.capacity_wh
@@ -150,8 +155,8 @@ class _Aboard:
             self._left_wh[sortie.aircraft] = left_wh
             used, left = 100.0 * used_wh / capacity_wh, 100.0 * left_wh / capacity_wh
         return {
-            "fill_l": sortie.volume_l + reserve_l,
-            "add_l": sortie.volume_l + (reserve_l if first else 0.0),
+            "fill_l": max(sortie.volume_l + reserve_l, before_l),
+            "add_l": add_l,
             "first": first,
             "battery_percent": used,
             "battery_left_percent": left,

@@ -84,7 +84,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.path.name not in LONGEST)
     for item in items:
         if isinstance(item, pytest.Function) and _has_loop(item):
-            # Behind what a module or the session has once: a page of all its tests is nobody's left.
+            # Behind what a module has once: a page for all its tests is left by none of them.
             place = item.fixturenames.index("no_thread_left_behind") + 1
             item.fixturenames.insert(place, "no_task_left_behind")
 

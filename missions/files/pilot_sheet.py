@@ -144,6 +144,9 @@ def _facts(plan: Plan, found: dict[str, Any], product: Product) -> Facts:
         ("Field", f"{found['coverage_percent']:.2f} % covered of {ground_text(found)}"),
         ("To mix", f"{adds_l:.1f} L: {found['volume_l']:.1f} L to spray, the rest is reserve"),
     ]
+    if settings.in_tank_l > 0.0:
+        text = f"{adds_l:.1f} L, beside the {settings.in_tank_l:g} L that are in the tank"
+        facts[1] = ("To mix", f"{text}; {found['volume_l']:.1f} L to spray, the rest is reserve")
     mix = found.get("mix")
     if mix is not None:
         facts += [

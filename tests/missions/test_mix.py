@@ -119,6 +119,39 @@ def test_amounts_are_those_worked_out_by_hand(
         )
 
 
+def test_what_is_in_the_tank_is_not_mixed_again(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = configured(tmp_path, MISSION, MIX)
+    field = written(FIELD, tmp_path / "f.geojson")
+    out = tmp_path / "m.kml"
+
+    def made(*words: object) -> dict[str, Any]:
+        return planned(capsys, field, "--config", path, "--out", out, "--force", *words)
+
+    empty, some = made(), made("--in-tank-l", 4.0)
+    adds = [[one["add_l"] for one in found["sorties"]] for found in (empty, some)]
+    assert adds[1] == pytest.approx([adds[0][0] - 4.0, *adds[0][1:]])
+    assert some["sorties"][0]["fill_l"] == pytest.approx(empty["sorties"][0]["fill_l"])
+    for before, after in zip(empty["mix"]["products"], some["mix"]["products"], strict=True):
+        assert after["total"] == pytest.approx(before["total"] - 4.0 * after["per_l"])
+        assert after["leftover"] == pytest.approx(before["leftover"])
+    assert "4 L are in the tank" in some["mix"]["notes"][0]
+    # More than the first sortie needs serves the next one too, and nothing is poured out.
+    small = made("--in-tank-l", 9.0, "--rate-l-ha", 5.0)
+    first = small["sorties"][0]
+    assert first["add_l"] == pytest.approx(max(first["volume_l"] + RESERVE_L - 9.0, 0.0))
+    total_l = sum(one["add_l"] for one in small["sorties"])
+    assert small["mix"]["leftover_l"] == pytest.approx(9.0 + total_l - small["volume_l"])
+    sheet = tmp_path / "sheet.txt"
+    made("--in-tank-l", 4.0, "--sheet", sheet)
+    assert "beside the 4 L that are in the tank" in sheet.read_text()
+    for words in (("--in-tank-l", "9.1"), ("--in-tank-l", "1", "--aircraft", "2")):
+        given = ["plan", str(field), "--config", str(path), "--out", str(out), "--force", *words]
+        assert execute(given) == 2
+        assert "--in-tank-l" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("unit", "amount", "measure", "per_l"),
     [
