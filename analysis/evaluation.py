@@ -41,10 +41,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "P1_RESULTS",
+    "Changes",
     "Distances",
     "Evaluation",
     "FlightMeta",
     "FlightRecord",
+    "changes_of",
     "evaluate",
     "evaluate_strips",
     "limit_ratio",
@@ -128,6 +130,21 @@ class Distances:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Changes:
+    """What became of the changes of rate, and what was applied: half of the time of an evaluation.
+
+    As in an `Evaluation`, for those who judge very many flights and need no more.
+    """
+
+    lag_distance_m: Distances
+    apart: int
+    missed: int
+    off_target_ml: float
+    applied_ml: float
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Evaluation:
     """Every metric of one flight; None where the flight had nothing to measure it on.
 
@@ -194,6 +211,7 @@ def evaluate(record: FlightRecord) -> Evaluation:
 def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation:
     """Return every metric of a flight whose strips are at hand."""
     steps = [_steps(strip, record) for strip in strips]
+    changes = _changes(record, strips, steps)
     switches = [
         switch
         for strip, each in zip(strips, steps, strict=True)
@@ -206,13 +224,11 @@ def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation
     settled = _known(of_boom, stretches, [*record.unknown, *map(_spared_spans, strips)])
     accuracy = flow_accuracy(strips)
     volume_error, zone_errors = volume_error_percent(strips, record.prescription)
-    all_steps = [step for each in steps for step in each]
-    inside = [step for step in all_steps if not step.change.border]
     return Evaluation(
         meta=record.meta,
-        lag_distance_m=Distances.of(step.lag_distance_m for step in inside),
-        apart=sum(step.verdict not in (Verdict.MEASURED, Verdict.MISSED) for step in inside),
-        missed=sum(step.verdict is Verdict.MISSED for step in all_steps),
+        lag_distance_m=changes.lag_distance_m,
+        apart=changes.apart,
+        missed=changes.missed,
         settled_lag_distance_m=Distances.of(step.lag_distance_m for step in settled),
         settled_apart=sum(step.small for step in settled) + len(of_boom) - len(settled),
         settled_missed=sum(not step.small and step.lag_distance_m is None for step in settled),
@@ -222,17 +238,37 @@ def evaluate_strips(record: FlightRecord, strips: Sequence[Strip]) -> Evaluation
         misapplied_percent=misapplied_percent(strips),
         border_margin_m=Distances.of(crossing.margin_m for crossing in crossings),
         border_bound_m=margin_bound_m(crossings, position_sd_m=record.position_sd_m),
-        off_target_ml=off_target_ml(strips, record.prescription),
+        off_target_ml=changes.off_target_ml,
         gap_m2=sum(switch.gap_m2 for switch in switches),
         overlap_m2=sum(switch.overlap_m2 for switch in switches),
         volume_error_percent=volume_error,
         zone_volume_error_percent=zone_errors,
         section_volume_error_percent=section_error_percent(strips, record.boom),
-        applied_ml=float((record.volume_ml[-1] - record.volume_ml[0]).sum()),
-        steps=tuple(all_steps),
+        applied_ml=changes.applied_ml,
+        steps=changes.steps,
         settled_steps=tuple(settled),
         crossings=tuple(crossings),
         switches=tuple(switches),
+    )
+
+
+def changes_of(record: FlightRecord, strips: Sequence[Strip]) -> Changes:
+    """Return what became of the changes of a flight, and what was applied."""
+    return _changes(record, strips, [_steps(strip, record) for strip in strips])
+
+
+def _changes(
+    record: FlightRecord, strips: Sequence[Strip], steps: Sequence[Sequence[Step]]
+) -> Changes:
+    every = [step for each in steps for step in each]
+    inside = [step for step in every if not step.change.border]
+    return Changes(
+        lag_distance_m=Distances.of(step.lag_distance_m for step in inside),
+        apart=sum(step.verdict not in (Verdict.MEASURED, Verdict.MISSED) for step in inside),
+        missed=sum(step.verdict is Verdict.MISSED for step in every),
+        off_target_ml=off_target_ml(strips, record.prescription),
+        applied_ml=float((record.volume_ml[-1] - record.volume_ml[0]).sum()),
+        steps=tuple(every),
     )
 
 

@@ -13,7 +13,7 @@ from analysis.assess.cell_maps import CellMaps, cell_maps
 from analysis.assess.intervals import Interval, crossings_of, mean_interval, ratio_interval
 from analysis.assess.worst import Worst, worst_of
 from analysis.dose import misapplied_parts
-from analysis.evaluation import Evaluation, evaluate_strips
+from analysis.evaluation import Changes, Evaluation, changes_of, evaluate_strips
 from analysis.flow_accuracy import flow_samples
 from analysis.flown.applied_record import STEP_S, Source, modelled_ml, record_of
 from analysis.flown.modelled_flow import counted, ordered_s
@@ -177,6 +177,29 @@ class Assessment:
             "counts": dict(self.counts),
             "notes": list(self.notes),
         }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Essentials:
+    """Of an assessment what the figures that people quote are made of, in half of its time."""
+
+    evaluation: Changes
+    worst: Worst
+    causes: Causes
+    balance: Balance
+
+
+def essentials_of(flight: AppliedFlight) -> Essentials:
+    """Return what `figures_of` takes; EvaluationError where there is nothing to evaluate."""
+    record = record_of(flight)
+    strips = strips_of(record)
+    changes = changes_of(record, strips)
+    return Essentials(
+        evaluation=changes,
+        worst=worst_of(flight, changes.steps),
+        causes=causes_of(flight, record, strips, changes.steps),
+        balance=balance_of(flight, strips, changes.applied_ml),
+    )
 
 
 def assess(

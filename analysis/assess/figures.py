@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from analysis.assess.causes import Cause
 
 if TYPE_CHECKING:
-    from analysis.assess.assessment import Assessment
+    from analysis.assess.assessment import Assessment, Essentials
 
 By = Literal["flow meter", "model", "nothing"]
 
@@ -70,7 +70,9 @@ def nothing_sprayed(area_ha: float | None, *, is_known: bool) -> Figures:
     )
 
 
-def figures_of(assessment: Assessment | None, *, area_ha: float, is_whole: bool = True) -> Figures:
+def figures_of(
+    assessment: Assessment | Essentials | None, *, area_ha: float, is_whole: bool = True
+) -> Figures:
     """Return the figures; `area_ha` is the ground that open valves went over.
 
     What was sprayed in a flight of which too little can be read, nobody knows: None, and not zero.

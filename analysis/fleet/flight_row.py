@@ -11,7 +11,7 @@ import hashlib
 import math
 import sqlite3
 from collections import Counter, defaultdict
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -21,14 +21,15 @@ from typing import Any, Literal, NamedTuple
 
 from shapely.errors import ShapelyError
 
-from analysis.assess.assessment import assess
+from analysis.assess.assessment import essentials_of
 from analysis.assess.figures import figures_of
 from analysis.flown.applied_record import EvaluationError
-from analysis.flown.read_applied import OFFSET_S_MAX, read_applied
+from analysis.flown.read_applied import OFFSET_S_MAX, flight_of
 from analysis.flown.unknown import GAP_S
 from analysis.journals.content import damages
 from analysis.report.legal_fields import told_in
 from analysis.report.treated import treated_of
+from companion.core.setup import Setup
 from companion.errors import JournalError, UnreadableError
 from companion.journal.coverage_table import read_coverage, read_treated
 from companion.journal.read_only import DAMAGE, log_of, one_line
@@ -170,6 +171,16 @@ def recorded(
 
     Of a journal whose hash is among the `known` ones only that.
     """
+    return _read(path, machine, known, lambda _journal, _setup, row: row)
+
+
+def _read(
+    path: Path,
+    machine: str | None,
+    known: Container[str],
+    finish: Callable[[OpenJournal, Setup, Row], Row],
+) -> Row | Problem | str:
+    """Return what `finish` makes of the row of a journal, which is open meanwhile."""
     digest = ""
     flight_id = None
     try:
@@ -187,7 +198,8 @@ def recorded(
                     journal_sha256=digest,
                     flight_id=flight_id,
                 )
-            return _row(journal, digest, machine)
+            setup = journal.setup()
+            return finish(journal, setup, _row(journal, setup, digest, machine))
     except (JournalError, ShapelyError, *DAMAGE) as error:
         is_damaged = isinstance(error, UnreadableError) or not isinstance(error, JournalError)
         text = str(error).removeprefix(f"{path}: ")
@@ -220,19 +232,18 @@ def flown_by(row: Row, machine: str | None) -> Row:
 
 def evaluated(path: Path, *, machine: str | None = None) -> Row | Problem | str:
     """Return a journal's row with the figures of its report, or why there is none."""
-    row = recorded(path, machine=machine)
-    return _evaluated(row, path) if isinstance(row, dict) else row
+    return _read(path, machine, (), _evaluated)
 
 
-def _evaluated(row: Row, path: Path) -> Row:
+def _evaluated(journal: OpenJournal, setup: Setup, row: Row) -> Row:
     found = {**row, "is_evaluated": True, "evaluated_with": _own_version()}
     unread: list[str] = []
     try:
-        flight = read_applied(path, unread=unread)
-        assessment = assess(flight)
+        flight = flight_of(journal, setup, unread)
+        assessment = essentials_of(flight)
     except (EvaluationError, JournalError, ShapelyError, *DAMAGE) as error:
         # One strange flight is no reason to lose the others.
-        found["why_not_evaluated"] = one_line(error).removeprefix(f"{path}: ")
+        found["why_not_evaluated"] = one_line(error).removeprefix(f"{journal.path}: ")
         return _versioned(found)
     is_whole = not (unread or flight.lost)
     if not is_whole and not assessment.evaluation.applied_ml > 0.0:
@@ -261,9 +272,9 @@ def _evaluated(row: Row, path: Path) -> Row:
     return _versioned(found)
 
 
-def _row(journal: OpenJournal, digest: str, machine: str | None) -> Row:
+def _row(journal: OpenJournal, setup: Setup, digest: str, machine: str | None) -> Row:
     meta, connection = journal.meta, journal.connection
-    setup, told, simulated = journal.setup(), told_in(meta), simulated_in(meta)
+    told, simulated = told_in(meta), simulated_in(meta)
     training = meta.get("training")
     began_s, ended_s, entries = _extent(journal)
     started = _started(meta, began_s)

@@ -63,7 +63,8 @@ FIGURES = (
     Figure("applied_l", "sum(applied_l)", "L", 1, "litres, by the meter where there is one"),
     Figure(
         "metered_percent",
-        "100 * sum(applied_l) FILTER (applied_by = 'flow meter') / nullif(sum(applied_l), 0)",
+        "100 * coalesce(sum(applied_l) FILTER (applied_by = 'flow meter'), 0) / "
+        "nullif(sum(applied_l), 0)",
         "metered %",
         0,
         "share of the litres that a flow meter counted; the others are modelled",

@@ -32,6 +32,7 @@ from analysis.flown.unknown import unknown_times
 from analysis.journals.blocks import Entry
 from analysis.journals.content import damages, read_entries
 from companion.core.label import from_deg
+from companion.core.setup import Setup
 from companion.core.types import Decision
 from companion.errors import UnreadableError
 from companion.journal.codec import FieldNames, decode
@@ -166,15 +167,17 @@ def read_applied(path: Path, *, unread: list[str] | None = None) -> AppliedFligh
     """
     with opened(path, is_lenient=unread is not None) as journal:
         if unread is not None:
-            # A byte that is no text makes one word wrong and not a whole table.
-            journal.connection.text_factory = lambda raw: raw.decode("utf-8", errors="replace")
             unread += journal.unread
             unread += damages(journal.connection)
-        return _flight(journal, unread)
+        return flight_of(journal, journal.setup(unread), unread)
 
 
-def _flight(journal: OpenJournal, unread: list[str] | None) -> AppliedFlight:
-    setup, meta = journal.setup(unread), journal.meta
+def flight_of(journal: OpenJournal, setup: Setup, unread: list[str] | None) -> AppliedFlight:
+    """Return the flight in an open journal, whose `setup` was read; `unread` as above."""
+    if unread is not None:
+        # A byte that is no text makes one word wrong and not a whole table.
+        journal.connection.text_factory = lambda raw: raw.decode("utf-8", errors="replace")
+    meta = journal.meta
     names = field_names_of(meta["setup"])
     applied = read_samples(journal, len(setup.boom.valves), unread)
     time_s, target, flow, speed, course, heading, height = applied.columns

@@ -208,8 +208,12 @@ class Prescription:
 
     def inside(self, east_m: Floats, north_m: Floats) -> NDArray[np.bool_]:
         """Return, for each point, whether spraying is allowed there."""
-        found = self.owners_at(east_m, north_m)
-        return np.array([FIELD in owners for owners in found], dtype=np.bool_)
+        if self.cells is not None and self._is_all_cells:
+            found: NDArray[np.bool_] = self.cells.classes_at(east_m, north_m) != NO_RATE
+            return found
+        shapely.prepare(self.field)
+        found = shapely.contains_xy(self.field, east_m, north_m)
+        return np.asarray(found, dtype=np.bool_)
 
     def rates_at(self, east_m: Floats, north_m: Floats) -> Floats:
         """Return the rate at each point [L/ha]; NaN outside the field or without a rate."""

@@ -21,7 +21,7 @@ from analysis.fleet.store import Store
 from analysis.fleet.summary import FIGURES, GROUPS, summary_of
 from companion.cli.app import execute
 from companion.web.guard import Doors, Guard, Tokens
-from tests.analysis.fleet_flights import TOLD, damaged
+from tests.analysis.fleet_flights import TOLD, copied, damaged, started
 from tests.analysis.report_flight import fly
 
 Captured = pytest.CaptureFixture[str]
@@ -80,6 +80,43 @@ def run(capsys: Captured, *arguments: str) -> tuple[int, str, str]:
     code = execute(["fleet", *arguments])
     captured = capsys.readouterr()
     return code, captured.out, captured.err
+
+
+def test_each_kind_of_flight_has_its_own_part_of_the_page(
+    fleet: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    """By what the journals themselves say: product, water, dry, simulated, and nothing."""
+    flown = fly(tmp_path / "flown", told=dict(TOLD))
+    said = {
+        1: {"training": "no", "simulated": "no"},
+        2: {"training": "no", "simulated": "no"},
+        3: {"training": "water", "simulated": "no"},
+        4: {"training": "dry", "simulated": "no"},
+        5: {"training": "simulated", "simulated": "yes"},
+        6: {"training": "no", "simulated": "unknown"},
+    }
+    for day, meta in said.items():
+        copied(flown, tmp_path / "in" / f"flight-000{day}.gpkg", {**started(day), **meta})
+    place = str(tmp_path / "fleet")
+    assert run(capsys, "add", str(tmp_path / "in"), "--into", place)[0] == 0
+    out = tmp_path / "report"
+    code, text, _ = run(capsys, "report", "--fleet", place, "--out", str(out), "--json")
+    sections = {each["kind"]: each["totals"] for each in json.loads(text)["sections"]}
+    assert code == 0
+    assert {kind: sums["flights"] for kind, sums in sections.items()} == {
+        "real": 2, "unknown": 1, "training": 2, "simulated": 1,
+    }  # fmt: skip
+    litres = {kind: sums["applied_l"] / sums["flights"] for kind, sums in sections.items()}
+    assert litres == pytest.approx(dict.fromkeys(sections, litres["real"]))
+    assert sections["real"]["metered_percent"] == 0.0  # no meter is none of the litres
+    page = (out / "fleet.html").read_text()
+    for text in (
+        "Real flights (2)", "Training with water, and dry (2)", "No product: water, and of dry",
+        "SIMULATED: nothing was sprayed", "their litres may not have been sprayed",
+        "0 % of the litres metered",
+    ):  # fmt: skip
+        assert text in page, text
+    assert "in 30 days" not in page  # of two flights there is no trend
 
 
 # ------------------------------------------------------------------------------------ SQL

@@ -1,7 +1,8 @@
 """What a fleet's records cost: `python -m tests.bench.fleet_journals [--rows N] [--flown N] ...`.
 
-Flights of the twin over P1's field are flown and recorded (`--flown`), and copied as other flights
-until there are `--journals` of them: those are added. A second fleet has `--rows` synthetic flights
+Flights of the twin over P1's field are flown and recorded, each with a seed of its own (`--flown`;
+kept in `--keep` for the next time), and copied as other flights until there are `--journals` of
+them: those are added. A second fleet has `--rows` synthetic flights
 and `--real` of the journals: it is queried and reported. Each command runs in a process of its own;
 printed are its seconds by the clock, its processor time, and the peak of its memory.
 """
@@ -51,13 +52,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rows", type=int, default=10_000)
     parser.add_argument("--real", type=int, default=200)
     parser.add_argument("--journals", type=int, default=1000)
-    parser.add_argument("--flown", type=int, default=20)
+    parser.add_argument("--flown", type=int, default=200)
+    parser.add_argument("--keep", type=Path, help="where flown journals are, or are put")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--evaluate", type=int, default=200, help="journals of the second step")
     given = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        journals = _journals(folder / "journals", given.flown, given.journals, given.seed)
+        flown = _flown(given.keep or folder / "flown", given.flown, given.seed)
+        journals = _journals(folder / "journals", flown, given.journals)
         added = str(folder / "added")
         told = measured("add --quick", "fleet", "add", str(journals), "--into", added, "--quick")
         _say(f"  {told['journals'] / told['record_s']:.1f} journals a second by the clock")
@@ -152,27 +155,35 @@ def _made_up(row: Row, number: int, chance: random.Random) -> Row:
     }
 
 
-def _journals(folder: Path, flown: int, count: int, seed: int) -> Path:
-    """Fly, record, and copy as other flights."""
+def _flown(folder: Path, count: int, seed: int) -> list[Path]:
+    """Fly and record, each flight with a seed of its own; what is there already is not flown."""
     from sitl.fly import FlyOptions, fly_mission
     from sitl.fly_files import write_journal
 
-    sources = []
-    for number in range(flown):
-        options = FlyOptions(
-            config=EXAMPLE / "config.toml",
-            mission=EXAMPLE / "mission.waypoints",
-            fidelity="averaged",
-            seed=seed + number,
-            out=folder.parent / f"flown-{number}",
-        )
-        made = folder.parent / f"flown-{number}"
-        sources.append(write_journal(fly_mission(options, lambda _text: None), made))
+    found = []
+    for number in range(seed, seed + count):
+        made = folder / f"{number}"
+        path = made / "flight-0001.gpkg"
+        if not path.is_file():
+            options = FlyOptions(
+                config=EXAMPLE / "config.toml",
+                mission=EXAMPLE / "mission.waypoints",
+                fidelity="averaged",
+                seed=number,
+                out=made,
+            )
+            path = write_journal(fly_mission(options, lambda _text: None), made)
+        found.append(path)
+    return found
+
+
+def _journals(folder: Path, sources: Sequence[Path], count: int) -> Path:
+    """Copy journals as other flights."""
     for number in range(count):
         day = started(1 + number % 28, 1 + number // 28 % 12)
         text = day["started_utc"].replace("+00:00", "")[:-6] + f"{number:06d}+00:00"
         copied(
-            sources[number % flown],
+            sources[number % len(sources)],
             folder / f"flight-{number:04d}.gpkg",
             {**day, "started_utc": text},
         )
