@@ -308,24 +308,29 @@ class Office:
 
     async def _compiled(self, asked: Planning, lines: str | None) -> dict[str, Any]:
         """Compile the flight map of what was planned, by the configuration of the flight."""
-        folder = self.given.parent.resolve()
-        sets: dict[str, Path | str] = {
-            "prescription.file": folder / "given" / str(asked.prescription),
-            "prescription.boundary": folder / "given" / asked.field,
-            **({"mission.lines": folder / lines} if lines else {}),
+        sets: dict[str, str] = {
+            "prescription.file": self._beside(f"given/{asked.prescription}"),
+            "prescription.boundary": self._beside(f"given/{asked.field}"),
+            **({"mission.lines": self._beside(lines)} if lines else {}),
         }
         sets |= {f"prescription.{key}": value for key, value in _answers(asked).items()}
         words = [word for key, value in sets.items() for word in ("--set", f"{key}={value}")]
         file, out = f"given/{asked.prescription}", "made/field.flightmap.gpkg"
         command = ["map", "compile", file, "--out", out, *self.host.config, *words, "--json"]
         done = await self.run("plan", command)
-        flown = {**sets, "prescription.file": folder / out}
+        flown = {**sets, "prescription.file": self._beside(out)}
         return {
             "error": done.error,
             "problems": done.found.get("problems", []),
             # What the configuration has to say, for `run` to fly what was planned here.
-            "settings": {key: str(value) for key, value in flown.items()},
+            "settings": flown,
         }
+
+    def _beside(self, name: str) -> str:
+        """Return a file as the configuration names it: from its own folder, where it lies below."""
+        path = self.given.parent.resolve() / name
+        folder = Path(self.host.config[1]).parent
+        return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
 
     async def send(self, asked: Sent) -> dict[str, Any]:
         """Put a planned sortie on the vehicle by the office's second link, and read it back."""

@@ -171,3 +171,10 @@ export class Scale {
     return mix(this.stops[index], this.stops[index + 1], place - index);
   }
 }
+
+// The room that tools, legend and scale take around the field: the aircraft is under none of them.
+export function margins(element) {
+  return element.clientWidth < 600
+    ? { left: 14, right: 14, top: 62, bottom: 84 }
+    : { left: 120, right: 100, top: 24, bottom: 44 };
+}

@@ -1,7 +1,7 @@
 // The map by WebGL (MapLibre GL). Loaded only where WebGL 2 is there; see map.js.
 
 import * as maplibre from "./vendor/maplibre-gl/maplibre-gl.mjs";
-import { Frame, boomLines, pairs, strips } from "./geo.js";
+import { Frame, boomLines, margins, pairs, strips } from "./geo.js";
 
 const CHUNK = 300; // points of the treated way in one source: only the last one changes
 const LOOK = {
@@ -43,7 +43,7 @@ export async function create(element, ground, scale, theme, onView) {
   const [west, south, east, north] = ground.bounds_m;
   const bounds = [frame.lngLat(west, south), frame.lngLat(east, north)];
   const map = new maplibre.Map({
-    container: element, bounds, fitBoundsOptions: { padding: 36 }, attributionControl: false,
+    container: element, bounds, fitBoundsOptions: { padding: margins(element) }, attributionControl: false,
     dragRotate: false, pitchWithRotate: false, touchPitch: false, maxZoom: 23, fadeDuration: 0,
     style: { version: 8, sources: {}, layers: [{ id: "ground", type: "background", paint: { "background-color": LOOK[theme].ground } }] },
   });
@@ -151,7 +151,7 @@ export async function create(element, ground, scale, theme, onView) {
       draw(0);
     },
     follow(yes) { follows = yes; },
-    fit() { follows = false; map.fitBounds(bounds, { padding: 36, duration: 200 }); },
+    fit() { follows = false; map.fitBounds(bounds, { padding: margins(element), duration: 200 }); },
     zoom(step) { map.zoomTo(map.getZoom() + step, { duration: 150 }); },
   };
 }

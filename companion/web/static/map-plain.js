@@ -1,6 +1,6 @@
 // The map on a plain canvas: for browsers without WebGL 2. The same calls as map-gl.js.
 
-import { ZoneIndex, boomLines, strips } from "./geo.js";
+import { ZoneIndex, boomLines, margins, strips } from "./geo.js";
 
 const LOOK = {
   day: { ground: "#e2e6df", field: "#10150f", zone: "#3d4a42", ahead: "#c2410c", closed: "#10150f", open: "#0ea5e9", halo: "#ffffff", craft: "#10150f" },
@@ -37,17 +37,17 @@ export async function create(element, ground, scale, theme, onView) {
   }
 
   function treated(from) {
-    under.globalAlpha = 0.92;
+    under.lineWidth = view.ratio; // over the seam that two fills side by side leave
     for (let i = Math.max(from, 1); i < points.length; i += 1) {
       for (const strip of strips(ground.boom.valves, points[i - 1], points[i])) {
-        under.fillStyle = colors.treated(points, i - 1);
+        under.fillStyle = under.strokeStyle = colors.treated(points, i - 1);
         under.beginPath();
         strip.ring.forEach(([e, n], k) => (k ? under.lineTo(x(e), y(n)) : under.moveTo(x(e), y(n))));
         under.closePath();
         under.fill();
+        under.stroke();
       }
     }
-    under.globalAlpha = 1;
     drawn = points.length;
   }
 
@@ -101,9 +101,9 @@ export async function create(element, ground, scale, theme, onView) {
 
   function fit() {
     const [west, south, east, north] = ground.bounds_m;
-    const room = 36 * view.ratio * 2;
-    view.east = (west + east) / 2; view.north = (south + north) / 2;
-    view.perMeter = Math.max(Math.min((back.width - room) / Math.max(east - west, 1), (back.height - room) / Math.max(north - south, 1)), 0.001);
+    const { left, right, top, bottom } = margins(element), r = view.ratio;
+    view.perMeter = Math.max(Math.min((back.width - (left + right) * r) / Math.max(east - west, 1), (back.height - (top + bottom) * r) / Math.max(north - south, 1)), 0.001);
+    view.east = (west + east) / 2 - (left - right) * r / 2 / view.perMeter; view.north = (south + north) / 2 + (top - bottom) * r / 2 / view.perMeter;
     redraw();
   }
 

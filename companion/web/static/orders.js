@@ -81,6 +81,7 @@ export class Orders {
     const enabled = Boolean(state.vehicle?.enabled);
     this.releases = latched;
     this.enableButton.classList.toggle("release", latched);
+    this.enableButton.classList.toggle("given", enabled && !latched);
     const label = latched ? (state.state === "estop" ? "Hold to release STOP" : "Hold to release the fault") : enabled ? "Enabled" : "Hold to enable";
     const text = this.enableButton.firstElementChild;
     if (text.textContent !== label) text.textContent = label;
