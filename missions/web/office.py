@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from companion.web.child import Limits, Outcome, journal_to_read, run_child
 from companion.web.parts import Host, Part, or_refused
@@ -45,6 +45,8 @@ TIMES = {
 UPLOAD = Limits(cpu_s=60, wait_s=120.0)
 # What is made of data: a map like those that are loaded.
 MADE_MAP = "made-prescription.gpkg"
+# Plots and treatments, for `vrspray trial` after the harvest.
+MADE_TRIAL = "made-prescription.trial.geojson"
 
 Name = Annotated[str, Field(pattern=rf"^{NAME.pattern}$", max_length=80)]
 Places = Annotated[list[Name], Field(max_length=8)]
@@ -77,32 +79,57 @@ class Check(Reading):
 
 
 class Making(_Body):
-    """A field's data, and what zones to make of them."""
+    """What to make: zones of a field's data, spots of its weeds, or a trial, of no data."""
 
-    data: Name
+    kind: Literal["zones", "spots", "trial"] = "zones"
+    data: Name | None = None
     value: Annotated[str, Field(max_length=60)] | None = None
     rates_l_ha: Annotated[
         list[Annotated[float, Field(ge=0.0, le=1000.0)]], Field(min_length=1, max_length=20)
     ]
     litres_max: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
     across: Literal["swath", "valve"] = "swath"
+    wind_m_s: Annotated[float, Field(ge=0.0, le=20.0)] | None = None
+    rest_l_ha: Annotated[float, Field(ge=0.0, le=1000.0)] | None = None
+    blocks: Annotated[int, Field(ge=2, le=50)] | None = None
+    seed: Annotated[int, Field(ge=0, le=2**31)] | None = None
+    plot_m: Annotated[float, Field(ge=1.0, le=10_000.0)] | None = None
     field: Name
     no_spray: Places = []
     angle_deg: Annotated[float, Field(ge=0.0, lt=360.0)] | None = None
     crs: Annotated[str, Field(max_length=60)] | None = None
 
+    @model_validator(mode="after")
+    def _goes_together(self) -> Making:
+        if (self.data is None) != (self.kind == "trial"):
+            raise ValueError("zones and spots are made of data, a trial of none")
+        if self.kind == "spots" and len(self.rates_l_ha) != 1:
+            raise ValueError("spots have one rate")
+        if self.kind == "trial" and self.rest_l_ha is None:
+            raise ValueError("a trial needs the rate of the ground around its plots")
+        return self
+
     def words(self) -> list[str]:
-        """Return the arguments that say so; a value never reads as an option."""
+        """Return the command's arguments; a value never reads as an option."""
         rates = ",".join(f"{rate:g}" for rate in self.rates_l_ha)
-        words = [f"--rates={rates}", f"--across={self.across}", f"--boundary=given/{self.field}"]
+        words = ["make", self.kind, *([] if self.data is None else [f"given/{self.data}"])]
+        words += [f"--rate{'' if self.kind == 'spots' else 's'}={rates}"]
+        words += [f"--across={self.across}"] if self.kind == "zones" else []
+        words += [f"--boundary=given/{self.field}"]
         words += [f"--no-spray=given/{name}" for name in self.no_spray]
-        for name in ("litres_max", "angle_deg"):
-            number = getattr(self, name)
-            words += [] if number is None else [f"--{name.replace('_', '-')}={number:g}"]
-        for name in ("value", "crs"):
-            text = getattr(self, name)
-            words += [f"--{name}={text}"] if text else []
+        options = {"angle_deg": "angle-deg", **_OPTIONS[self.kind]}
+        for name, option in options.items():
+            value = getattr(self, name)
+            words += [] if value is None or value == "" else [f"--{option}={value}"]
         return words
+
+
+# Options of their own, by what is made; what another kind takes is left out.
+_OPTIONS: dict[str, dict[str, str]] = {
+    "zones": {"litres_max": "litres-max", "value": "value", "crs": "crs"},
+    "spots": {"wind_m_s": "wind-m-s", "crs": "crs"},
+    "trial": {"rest_l_ha": "rest", "blocks": "blocks", "seed": "seed", "plot_m": "plot-m"},
+}
 
 
 class Planning(Reading):
@@ -232,20 +259,18 @@ class Office:
     # ------------------------------------------------------------------------- what is worked out
 
     async def make(self, asked: Making) -> dict[str, Any]:
-        """Make zones of a field's data, as a map among those that were loaded."""
+        """Make zones, spots or a trial, as a map among those that were loaded."""
         self.refuse_now()
-        for name in (asked.data, asked.field, *asked.no_spray):
+        for name in (*([asked.data] if asked.data else []), asked.field, *asked.no_spray):
             self.path(name)
         if not self.host.config:
             raise HTTPException(409, "zones fit a sprayer: start vrspray run with a configuration")
         room = self._room(MADE_MAP)
         made = self.made / MADE_MAP
-        with self._working("make", MADE_MAP):
+        with self._working("make", MADE_MAP, MADE_TRIAL):
             (self.given / MADE_MAP).unlink(missing_ok=True)  # of other data, or other rates
             out = ["--out", f"made/{MADE_MAP}", "--force", *self.host.config, "--json"]
-            done = await self.run(
-                "make", ["make", "zones", f"given/{asked.data}", *asked.words(), *out]
-            )
+            done = await self.run("make", [*asked.words(), *out])
             error = done.error
             if error is None and made.stat().st_size > room:
                 error = f"{MADE_MAP}: larger than the room for more files: remove some"
@@ -253,7 +278,8 @@ class Office:
                 made.replace(self.given / MADE_MAP)
             self.results.clear()
             self.results["make"] = {
-                "data": asked.data, "file": MADE_MAP, "error": error, "found": done.found,
+                "kind": asked.kind, "data": asked.data, "file": MADE_MAP, "error": error,
+                "found": done.found,
             }  # fmt: skip
         return self.state()
 
@@ -433,7 +459,7 @@ def add(router: APIRouter, host: Host) -> None:
 
     @router.post("/make", responses=busy)
     async def make(asked: Making) -> dict[str, Any]:
-        """Make zones of a field's data in a child, as a map among the files."""
+        """Make zones, spots or a trial in a child, as a map among the files."""
         return await office.make(asked)
 
     @router.post("/check", responses=busy)

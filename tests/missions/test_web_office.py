@@ -129,6 +129,43 @@ async def test_zones_are_made_of_data_and_are_then_a_map_like_any_other(site: Si
 
 
 @IN_LOOP
+async def test_spots_and_a_trial_are_made_checked_and_planned_as_zones_are(site: Site) -> None:
+    await load_anyang(site)
+    weeds = samples().decode().splitlines()[:1] + samples().decode().splitlines()[110:116]
+    assert (await load(site, "weeds.csv", "\n".join([*weeds, ""]).encode())).status == 200
+    asked = {"kind": "spots", "data": "weeds.csv", "field": "boundary.geojson"}
+    state = await do(site, "make", **asked, rates_l_ha=[20], wind_m_s=0.5)
+    made = state["make"]
+    assert (made["error"], made["kind"], made["found"]["weeds"] > 0) == (None, "spots", True)
+    assert 0.0 < made["found"]["litres"] < 2.0
+    more = await do(site, "make", **asked, rates_l_ha=[20], wind_m_s=3)
+    assert more["make"]["found"]["treated_ha"] > made["found"]["treated_ha"]
+    trial = {"kind": "trial", "field": "boundary.geojson", "rates_l_ha": [15, 25], "rest_l_ha": 20}
+    state = await do(site, "make", **trial, blocks=2, seed=7)
+    assert "do not fit into the field" in state["make"]["error"]
+    state = await do(site, "make", **trial, blocks=2, seed=7, plot_m=15)
+    assert state["make"]["error"] is None
+    assert [len(state["make"]["found"]["plots"]), state["make"]["found"]["seed"]] == [4, 7]
+    name = "made-prescription.trial.geojson"
+    assert name in [one["name"] for one in state["made"]]
+    record = json.loads((await site.asked("GET", f"{OFFICE}/made/{name}")).body)
+    assert record["trial"]["treatments_l_ha"] == [15, 25]
+    checked = await do(site, "check", file="made-prescription.gpkg")
+    assert checked["check"]["found"]["rates_l_ha"] == [15, 20, 25]
+    planned = await do(
+        site, "plan", field="boundary.geojson", prescription="made-prescription.gpkg",
+        angle_deg=state["make"]["found"]["course_deg"],
+    )  # fmt: skip
+    assert planned["plan"]["error"] is None
+    for change in (
+        {**asked, "rates_l_ha": [20, 30]}, {**asked, "data": None, "rates_l_ha": [20]},
+        {**trial, "data": "weeds.csv"}, {**trial, "rest_l_ha": None}, {**trial, "blocks": 1},
+        {**trial, "kind": "report"},
+    ):  # fmt: skip
+        assert (await site.asked("POST", f"{OFFICE}/make", change)).status == 422, change
+
+
+@IN_LOOP
 async def test_data_that_make_no_zones_are_refused_in_one_line_and_leave_no_map(site: Site) -> None:
     await load_anyang(site)
     await load(site, "samples.csv", samples())

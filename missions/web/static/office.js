@@ -76,7 +76,10 @@ function showMade() {
   const box = byId("make"), done = state.make;
   if (!done) { box.replaceChildren(); return; }
   if (done.error) { box.replaceChildren(refused(done.error)); return; }
-  const found = done.found, cleaned = found.values.filter((one) => one.removed);
+  const found = done.found;
+  if (done.kind === "spots") { box.replaceChildren(...spotParts(done.file, found)); return; }
+  if (done.kind === "trial") { box.replaceChildren(...trialParts(done.file, found)); return; }
+  const cleaned = found.values.filter((one) => one.removed);
   box.replaceChildren(
     make("p", `${done.file}: ${withUnit("volume", found.litres)}; ${found.misapplied_percent.toFixed(1)} % of what the data ask for lies elsewhere, so that the sprayer can follow. Course ${found.course_deg.toFixed(1)}°. Now check the map.`),
     tableOf(["Zone", "Rate", "Area", "Value"], found.zones.map((one, k) => [k + 1, withUnit("rate", one.rate_l_ha), withUnit("area", one.area_ha), one.mean_value.toPrecision(4)])),
@@ -84,6 +87,29 @@ function showMade() {
     ...found.steps.map((one) => make("p", `${one.name}: ${withUnit("area", one.changed_ha)} changed, ${withUnit("volume", one.moved_l)} moved.`, "small")),
     ...found.notes.map((text) => make("p", text, "small")), problemList(found),
   );
+}
+
+function spotParts(file, found) {
+  return [
+    make("p", `${file}: ${found.weeds} weeds in ${found.spots} spots, ${withUnit("area", found.treated_ha)} treated with ${withUnit("volume", found.litres)}; ${found.saved_percent.toFixed(1)} % saved. ${found.expected_misses.toFixed(1)} weeds may be missed. Course ${found.course_deg.toFixed(1)}°. Now check the map.`),
+    make("p", `Around each weed ${withUnit("length", found.budget.along_m)} along and ${withUnit("length", found.budget.across_m)} across: ${found.budget.parts.map((one) => one.name).join(", ")}.`, "small"),
+    ...(found.beyond ? [make("p", `${found.beyond} weeds lie outside and are left out.`, "refused")] : []),
+    ...found.warnings.map((text) => make("p", text, "refused")), problemList(found),
+  ];
+}
+
+function trialParts(file, found) {
+  const blocks = [...new Set(found.plots.map((one) => one.block))];
+  const link = make("a", "Keep its plots for the evaluation");
+  link.href = `${API}office/made/made-prescription.trial.geojson`;
+  link.download = "made-prescription.trial.geojson";
+  const kept = make("p");
+  kept.append(link);
+  return [
+    make("p", `${file}: ${found.plots.length} plots in ${found.blocks} blocks, seed ${found.seed}. Course ${found.course_deg.toFixed(1)}°. Now check the map.`),
+    tableOf(["Block", "Plot: rate"], blocks.map((block) => [block, found.plots.filter((one) => one.block === block).map((one) => `${one.plot}: ${value("rate", one.rate_l_ha)}`).join(", ")])),
+    kept, problemList(found),
+  ];
 }
 
 function showCheck() {
@@ -224,9 +250,13 @@ function planned() {
 
 function wish() {
   const rates = byId("rates").value.split(/[,;\s]+/).filter(Boolean).map((text) => toSi("rate", Number(text)));
-  const body = { data: byId("data").value, rates_l_ha: rates, across: byId("across").value, field: byId("field").value, no_spray: [...byId("no_spray").selectedOptions].map((one) => one.value) };
-  if (byId("value").value.trim()) body.value = byId("value").value.trim();
-  if (byId("litres_max").value !== "") body.litres_max = toSi("volume", Number(byId("litres_max").value));
+  const kind = byId("make-kind").value;
+  const body = { kind, rates_l_ha: rates, field: byId("field").value, no_spray: [...byId("no_spray").selectedOptions].map((one) => one.value) };
+  if (kind !== "trial") body.data = byId("data").value;
+  if (kind === "zones") body.across = byId("across").value;
+  if (kind === "zones" && byId("value").value.trim()) body.value = byId("value").value.trim();
+  const numbers = { zones: { litres_max: "volume" }, spots: { wind_m_s: "wind" }, trial: { rest_l_ha: "rate", plot_m: "length", blocks: null, seed: null } }[kind];
+  for (const [id, unit] of Object.entries(numbers)) if (byId(id).value !== "") body[id] = unit ? toSi(unit, Number(byId(id).value)) : Number(byId(id).value);
   if (byId("angle_deg").value !== "") body.angle_deg = Number(byId("angle_deg").value);
   return body;
 }
@@ -234,8 +264,9 @@ function wish() {
 async function makeZones() {
   const body = wish();
   if (!body.rates_l_ha.length || body.rates_l_ha.some(Number.isNaN)) { say("Rates are numbers, one for each zone: 26 22 18 14.", true); return; }
-  if (!body.data || !body.field || body.data === body.field) { say("Load the data and a boundary, or draw the boundary.", true); return; }
-  await doing("Making zones", () => ask("office/make", body));
+  if (!body.field || (body.kind !== "trial" && (!body.data || body.data === body.field))) { say("Load the data and a boundary, or draw the boundary.", true); return; }
+  if (body.kind === "trial" && body.rest_l_ha === undefined) { say("Say which rate the ground around the plots gets.", true); return; }
+  await doing(byId("make-button").textContent.replace("Make", "Making"), () => ask("office/make", body));
   if (!state.make || state.make.error) return;
   // The zones fit these passes and no others.
   chosenBy.prescription = state.make.file;
@@ -253,6 +284,12 @@ const map = new OfficeMap(byId("map"), theme, {
   onMove(index, place) { draw(corners.map((one, k) => (k === index ? place : one))); },
 });
 byId("pick").addEventListener("change", async (event) => { await load([...event.target.files]); event.target.value = ""; });
+byId("make-kind").addEventListener("change", () => {
+  const kind = byId("make-kind").value;
+  for (const one of document.querySelectorAll("#make-form [data-for]")) one.hidden = !one.dataset.for.split(" ").includes(kind);
+  byId("make-button").textContent = { zones: "Make zones", spots: "Make spots", trial: "Make a trial" }[kind];
+  byId("rates").placeholder = { zones: "lowest value first: 26 22 18", spots: "20", trial: "15 20 25" }[kind];
+});
 byId("make-form").addEventListener("submit", (event) => { event.preventDefault(); makeZones(); });
 byId("check-form").addEventListener("submit", (event) => { event.preventDefault(); if (byId("prescription").value) doing("Checking", () => ask("office/check", { file: byId("prescription").value, ...reading() })); });
 byId("plan-form").addEventListener("submit", (event) => { event.preventDefault(); if (byId("field").value) doing("Planning", () => ask("office/plan", planned())); });
