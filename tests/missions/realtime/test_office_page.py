@@ -118,6 +118,39 @@ async def test_a_field_is_loaded_checked_drawn_on_and_planned(site: Site, tmp_pa
 
 
 @pytest.mark.timeout(300)
+async def test_a_trial_is_made_and_checked_in_the_browser(site: Site, tmp_path: Path) -> None:
+    async with chromium(WITHOUT_WEBGL) as browser:
+        page = await browser.new_page(viewport={"width": 390, "height": 844})
+        await ready(page, site)
+        await load(page)
+        await page.locator("#field").select_option("boundary.geojson")
+        await page.locator("#make-kind").select_option("spots")
+        await expect(page.locator("#wind_m_s")).to_be_visible()
+        await expect(page.locator("#value")).to_be_hidden()
+        await expect(page.locator("#make-button")).to_have_text("Make spots")
+        await page.locator("#make-kind").select_option("trial")
+        await expect(page.locator("#data")).to_be_hidden()
+        for name, value in (
+            ("rates", "15 25"),
+            ("rest_l_ha", "20"),
+            ("plot_m", "15"),
+            ("blocks", "2"),
+        ):
+            await page.locator(f"#{name}").fill(value)
+        async with answered(page, "office/make"):
+            await page.get_by_role("button", name="Make a trial").click()
+        await expect(page.locator("#make")).to_contain_text("4 plots in 2 blocks, seed 1")
+        await expect(page.locator("#prescription")).to_have_value("made-prescription.gpkg")
+        async with page.expect_download() as loading:
+            await page.get_by_role("link", name="Keep its plots").click()
+        record = json.loads((await (await loading.value).path()).read_text())
+        assert record["trial"]["rest_l_ha"] == 20
+        async with answered(page, "office/check"):
+            await page.get_by_role("button", name="Check the map").click()
+        await expect(page.locator("#check")).to_contain_text("5 zones")
+
+
+@pytest.mark.timeout(300)
 @pytest.mark.parametrize("theme", ["light", "dark"])
 async def test_the_office_is_accessible_without_webgl_and_draws_by_keyboard(
     site: Site, theme: Literal["light", "dark"], tmp_path: Path
