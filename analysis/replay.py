@@ -46,10 +46,10 @@ from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import ConfigError, UnreadableError
 from companion.journal.codec import FIELD_NAMES, FieldNames, encode
-from companion.journal.coverage_table import read_coverage
-from companion.journal.new_file import computing
+from companion.journal.coverage import read_coverage
+from companion.journal.journal import computing
 from companion.journal.reader import opened
-from companion.journal.valve_rows import Row, ValveRows
+from companion.journal.rows import Row, ValveRows
 from companion.runtime import COVERAGE_EVERY_S, STEP_MAX_S
 from companion.simulated import Word
 

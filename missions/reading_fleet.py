@@ -17,7 +17,7 @@ from shapely.geometry.base import BaseGeometry
 from companion.config.tables import MissionTable
 from companion.core.frame import LocalFrame
 from companion.journal.continuing import is_journal, read_treated_ground, rest_of
-from companion.journal.coverage_area import carried, carried_places
+from companion.journal.coverage import carried, carried_places
 from missions.energy import Battery
 from missions.errors import PlanError
 from missions.field import MARGIN_M, Field, local_area

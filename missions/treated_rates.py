@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.core.options.coverage import Coverage
 from companion.journal.continuing import is_journal, read_treated_ground
-from companion.journal.coverage_area import moved
+from companion.journal.coverage import moved
 from missions.demand import Demand, Rates, demands
 from missions.field import Field, local_area
 from missions.maps.registry import read_area

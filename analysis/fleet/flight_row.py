@@ -31,10 +31,10 @@ from analysis.report.legal_fields import told_in
 from analysis.report.treated import treated_of
 from companion.core.setup import Setup
 from companion.errors import JournalError, UnreadableError
-from companion.journal.coverage_table import read_coverage, read_treated
+from companion.journal.coverage import read_coverage, read_treated
 from companion.journal.read_only import DAMAGE, log_of, one_line
 from companion.journal.reader import OpenJournal, opened
-from companion.journal.totals import applied_l
+from companion.journal.writer import applied_l
 from companion.simulated import simulated_in
 
 Row = dict[str, Any]

@@ -35,10 +35,9 @@ from companion.core.label import from_deg
 from companion.core.setup import Setup
 from companion.core.types import Decision
 from companion.errors import UnreadableError
-from companion.journal.codec import FieldNames, decode
+from companion.journal.codec import FieldNames, decode, field_names_of
 from companion.journal.reader import OpenJournal, opened
-from companion.journal.setup_json import field_names_of
-from companion.journal.valve_rows import ValveRows
+from companion.journal.rows import ValveRows
 from companion.journal.versions import migrated
 from companion.journal.writer import Event
 

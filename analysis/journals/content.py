@@ -14,12 +14,10 @@ from analysis.journals.unpacking import inflated
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import UnreadableError
-from companion.journal.codec import FieldNames, decode
+from companion.journal.codec import FieldNames, decode, field_names_of
 from companion.journal.read_only import log_of, one_line
 from companion.journal.reader import OpenJournal, damaged_pages, opened
-from companion.journal.setup_json import field_names_of
-from companion.journal.totals import missing_rows
-from companion.journal.writer import Event
+from companion.journal.writer import Event, missing_rows
 from companion.simulated import Simulated, simulated_in
 
 _BLOCKS = (

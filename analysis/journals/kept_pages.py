@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from companion.journal.log_frames import (
+from companion.journal.log import (
     FILE_MAGIC,
     Frame,
     Log,

@@ -22,9 +22,9 @@ from companion.core.prescription import Prescription
 from companion.errors import VrsprayError
 from companion.flight_map.child import flight_map_of_file
 from companion.journal.continuing import Treated, rest_of, treated_ground_of
-from companion.journal.coverage_area import moved
+from companion.journal.coverage import moved
 from companion.journal.reader import opened
-from companion.journal.totals import missing_rows
+from companion.journal.writer import missing_rows
 
 M2_PER_HA = 10_000.0
 # The mean rate of the rest is taken at so many places of it.

@@ -16,14 +16,6 @@ from analysis.journals.stray_rows import stray_rows, torn_rows
 from companion.atomic_write import sync_folder
 from companion.core.frame import LocalFrame
 from companion.journal import recovery
-from companion.journal.distrust import (
-    TABLES,
-    check_beside,
-    columns_of,
-    empty_tables,
-    known_tables,
-    own_tables,
-)
 from companion.journal.geopackage import (
     APPLICATION_ID,
     JOURNAL_VERSION,
@@ -35,15 +27,20 @@ from companion.journal.layers import box_of_points, set_box
 from companion.journal.leaf_page import COLUMNS, Row, is_of
 from companion.journal.read_only import (
     DAMAGE,
+    TABLES,
+    check_beside,
+    columns_of,
+    empty_tables,
+    known_tables,
     one_line,
+    own_tables,
     read_only,
     salvaged_name,
 )
 from companion.journal.reader import readable_rows, tolerate_damage
 from companion.journal.recovery import Recovery, Told
-from companion.journal.totals import LITRES_KEY, applied_l
 from companion.journal.versions import missing_tables
-from companion.journal.writer import SET_META
+from companion.journal.writer import LITRES_KEY, SET_META, applied_l
 
 # Without a row of any of these a file is no journal, or nothing of one.
 _OF_A_FLIGHT = ("meta", "applied", "blocks", "valve_changes")

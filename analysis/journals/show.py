@@ -13,9 +13,8 @@ from analysis.journals.content import read_entries
 from companion.errors import UnreadableError
 from companion.journal.read_only import DAMAGE, one_line
 from companion.journal.reader import OpenJournal, damaged_pages, opened, readable_rows
-from companion.journal.refusals import SEE_SHOW
-from companion.journal.totals import missing_rows
-from companion.journal.versions import OtherVersionError
+from companion.journal.versions import SEE_SHOW, OtherVersionError
+from companion.journal.writer import missing_rows
 from companion.wording import counted
 
 # In `meta` for programs, or shown elsewhere.

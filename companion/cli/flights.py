@@ -18,9 +18,8 @@ from companion.cli.record_parts import rules_of
 from companion.commands import all_registered, command_named, registered
 from companion.config.load import load
 from companion.errors import ConfigError
-from companion.journal.folder import Flight, journals, look_at, set_pinned
+from companion.journal.folder import Flight, Rules, journals, look_at, prune, set_pinned, space_of
 from companion.journal.geopackage import time_text
-from companion.journal.retention import Rules, prune, space_of
 
 if TYPE_CHECKING:
     from typer._click.core import Command as ClickCommand

@@ -17,7 +17,7 @@ from companion.output.timed import DryRunExecutor, TimedExecutor
 from companion.ports import PlanExecutor
 
 if TYPE_CHECKING:
-    from companion.journal.retention import Rules
+    from companion.journal.folder import Rules
 
 # Three hours of a journal; with less a flight does not begin.
 FREE_MIN_BYTES = 100_000_000
@@ -25,7 +25,7 @@ FREE_MIN_BYTES = 100_000_000
 
 def rules_of(journal: JournalTable) -> Rules:
     """Return the rules of retention as they are configured."""
-    from companion.journal.retention import Rules
+    from companion.journal.folder import Rules
 
     return Rules(
         free_percent=journal.keep_free_percent or None,
@@ -43,8 +43,8 @@ def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
     if not folder.is_dir():
         return
     # Who has not flown yet has nothing to look after.
+    from companion.journal.folder import WARN_FREE_PERCENT, prune, space_of
     from companion.journal.recovery import recover_folder
-    from companion.journal.retention import WARN_FREE_PERCENT, prune, space_of
 
     try:
         for found in recover_folder(folder):

@@ -2,7 +2,7 @@
 
 Here it is read; the office writes it (`missions/maps/compiling.py`).
 Whoever reads one does not know who made it: a hash is no signature. So it is read as a stranger's
-database is (`journal/distrust.py`), and everything in it is looked at before it is used.
+database is (`journal/read_only.py`), and everything in it is looked at before it is used.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from companion.core.options.lines import Polyline
 from companion.core.prescription import Overlap, Prescription, Zone
 from companion.errors import MapError
 from companion.flight_map.model import Area, FlightMap, SourceFile
-from companion.journal.distrust import check_programs, distrust
 from companion.journal.geopackage import (
     APPLICATION_ID,
     GROUND_TABLES,
@@ -36,7 +35,7 @@ from companion.journal.geopackage import (
     wkb_of,
 )
 from companion.journal.layers import Ground, read_ground
-from companion.journal.read_only import DAMAGE, one_line
+from companion.journal.read_only import DAMAGE, check_programs, distrust, one_line
 from companion.problem import Problem
 
 VERSION = "1"

@@ -19,12 +19,10 @@ from companion.core.options.coverage import CELL_M, Coverage
 from companion.core.options.overlap import OverlapGuard
 from companion.core.setup import Setup
 from companion.errors import JournalError, UnreadableError, VrsprayError
-from companion.journal.coverage_area import as_polygons, moved, polygons
-from companion.journal.coverage_table import read_coverage
-from companion.journal.distrust import distrust
+from companion.journal.coverage import as_polygons, moved, polygons, read_coverage
 from companion.journal.folder import journals
 from companion.journal.geopackage import wkb_of
-from companion.journal.read_only import DAMAGE, one_line
+from companion.journal.read_only import DAMAGE, distrust, one_line
 from companion.journal.reader import OpenJournal, opened
 from companion.simulated import UNMARKED, Simulated, simulated_in
 

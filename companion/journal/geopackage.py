@@ -68,7 +68,7 @@ CREATE TABLE field (id INTEGER PRIMARY KEY NOT NULL, geom GEOMETRY);
 META_TABLE = (
     "CREATE TABLE meta (id INTEGER PRIMARY KEY NOT NULL, key TEXT NOT NULL UNIQUE, value TEXT);\n"
 )
-# The key of the row of `meta` that says nothing and takes room (`new_file.py`).
+# The key of the row of `meta` that says nothing and takes room (`journal.py`).
 RESERVE = "reserve"
 # All tables at once: one that came in the flight would have its entry in the list of tables far
 # behind, and nothing of a file that is cut off before it could be read.

@@ -11,23 +11,28 @@ from typing import Any
 
 from companion.core.setup import Setup
 from companion.errors import NoMapError, UnreadableError
-from companion.journal.coverage_table import read_treated
-from companion.journal.distrust import allow_damaged_list, check_programs
+from companion.journal.codec import setup_from_json
+from companion.journal.coverage import read_treated
 from companion.journal.geopackage import APPLICATION_ID, RESERVE
 from companion.journal.layers import read_ground
 from companion.journal.read_only import (
     DAMAGE,
+    allow_damaged_list,
+    check_programs,
     log_of,
     one_line,
     read_only,
 )
-from companion.journal.refusals import check_kind, extent, no_file, refused, why_no_setup
-from companion.journal.setup_json import setup_from_json
 from companion.journal.versions import (
     as_far_as_said,
+    check_kind,
     check_said,
     check_version,
+    extent,
     migrated,
+    no_file,
+    refused,
+    why_no_setup,
 )
 
 

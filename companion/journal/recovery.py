@@ -17,21 +17,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 from companion.errors import JournalError
-from companion.journal.distrust import check_beside, check_programs, distrust
 from companion.journal.folder import journals
 from companion.journal.geopackage import APPLICATION_ID
 from companion.journal.layers import box_of_points, set_box
 from companion.journal.read_only import (
     DAMAGE,
+    check_beside,
+    check_programs,
+    distrust,
     kept_log_of,
     log_of,
     one_line,
     read_only,
     salvaged_name,
 )
-from companion.journal.totals import totals_of
 from companion.journal.versions import OtherVersionError, check_version
-from companion.journal.writer import SET_META, tell_times_again
+from companion.journal.writer import SET_META, tell_times_again, totals_of
 
 _KNOWN = "SELECT min(time_s) FROM events WHERE kind = 'clock'"
 
@@ -126,7 +127,7 @@ def _recovered(path: Path, of_damaged: OfDamaged) -> Told | None:
 
 def _folded_in(path: Path, ending: _Ending | None) -> Told:
     # Only where a flight was cut: who recovers nothing need not know how a log is made.
-    from companion.journal.log_damage import keep_log, log_damage, mark
+    from companion.journal.log import keep_log, log_damage, mark
 
     try:
         damage = log_damage(path)

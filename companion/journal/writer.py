@@ -7,33 +7,85 @@ next second is tried anew.
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from companion.core.frame import LocalFrame
-from companion.core.types import Decision, DeclarationReport, Input, UtcReport
-from companion.journal.blocks import Block
+from companion.core.frame import LocalFrame, course_deg
+from companion.core.types import (
+    Decision,
+    DeclarationReport,
+    Inhibit,
+    Input,
+    SprayerState,
+    UtcReport,
+    VehicleState,
+)
 from companion.journal.codec import encode
-from companion.journal.coverage_table import write_coverage
+from companion.journal.coverage import write_coverage
+from companion.journal.geopackage import point_blob, time_text
 from companion.journal.layers import set_box
-from companion.journal.totals import totals_of
-from companion.journal.valve_rows import Row, ValveOrder, ValveRows
+from companion.journal.read_only import one_line
+from companion.journal.rows import Block, Row, ValveOrder, ValveRows
 from companion.simulated import BECAUSE, SIMULATED, Simulated, parsed
 
 if TYPE_CHECKING:
     from companion.core.options.coverage import Coverage
 
+# Behind the name of a table: how many rows it has.
+_COUNTED = {"rows_applied": "applied", "rows_valve_changes": "valve_changes"}
+LITRES_KEY = "applied_l"
+_GAP_MAX_S = 1.0
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
-from companion.core.frame import course_deg
-from companion.core.types import Inhibit, SprayerState, VehicleState
-from companion.journal.geopackage import point_blob, time_text
+def totals_of(connection: sqlite3.Connection) -> dict[str, str]:
+    """Return what `meta` says of the tables as they are now."""
+    found = {key: str(_count(connection, table)) for key, table in _COUNTED.items()}
+    return {**found, LITRES_KEY: repr(_summed_l(connection))}
+
+
+def applied_l(connection: sqlite3.Connection, meta: Mapping[str, str]) -> float:
+    """Return what the ordered duties stand for in litres: not a measurement."""
+    try:
+        told_l = float(meta[LITRES_KEY])
+    except (KeyError, TypeError, ValueError):
+        return _summed_l(connection)
+    return told_l if math.isfinite(told_l) else _summed_l(connection)
+
+
+def missing_rows(connection: sqlite3.Connection, meta: Mapping[str, str]) -> Iterator[str]:
+    """Yield a line for each table that has not the rows that it had at the flight's end."""
+    for key, table in _COUNTED.items():
+        told = meta.get(key)
+        if told is None:  # a flight that was cut, or an older journal
+            continue
+        try:
+            found = _count(connection, table)
+        except sqlite3.DatabaseError as error:
+            yield f"{table}: {one_line(error)}"
+            continue
+        if str(found) != told:
+            yield f"{table}: {found} rows, {told} were written"
+
+
+def _count(connection: sqlite3.Connection, table: str) -> int:
+    (count,) = connection.execute(f"SELECT count(*) FROM {table}").fetchone()
+    return int(count)
+
+
+def _summed_l(connection: sqlite3.Connection) -> float:
+    summed_l, before_s, flow_l_min = 0.0, None, 0.0
+    rows = connection.execute("SELECT time_s, flow_l_min FROM applied ORDER BY sequence")
+    for at_s, flow in rows:
+        if before_s is not None and at_s is not None and 0.0 < at_s - before_s < _GAP_MAX_S:
+            summed_l += flow_l_min * (at_s - before_s) / 60.0
+        before_s, flow_l_min = at_s, flow or 0.0
+    return summed_l
+
 
 __all__ = ["Event", "Item", "Writer"]
 

@@ -33,8 +33,7 @@ from analysis.journals.salvage import recover
 from companion.core.options.coverage import Coverage
 from companion.core.setup import Setup
 from companion.journal.codec import encode
-from companion.journal.journal import Journal
-from companion.journal.new_file import open_for_flight
+from companion.journal.journal import Journal, open_for_flight
 from companion.journal.writer import LinkSample, Writer
 from companion.runtime import SWITCH_S
 from tests.bench.journal_flight import START_S, Flight, Turn, example_setup, open_setup

@@ -34,7 +34,7 @@ from companion.core.types import (
     UtcReport,
     WindReport,
 )
-from companion.journal.valve_rows import ValveOrder, ValveRows
+from companion.journal.rows import ValveOrder, ValveRows
 from companion.journal.writer import LinkSample
 from missions.maps.compiling import compiled_setup
 

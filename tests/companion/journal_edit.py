@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from analysis.journals.blocks import Entry, read_blocks
-from companion.journal.blocks import Block
+from companion.journal.rows import Block
 
 
 def edit_rows(path: Path, edit: Callable[[list[Entry]], list[Entry]]) -> None:

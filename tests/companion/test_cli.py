@@ -66,8 +66,8 @@ NOT_OF_EVERY_FLIGHT = (
     "companion.core.options.liquid_faults", "companion.flight_map.child",
     "companion.link.signing", "companion.output.engine",
     "companion.output.gpio", "companion.output.hardware_pwm", "companion.journal.continuing",
-    "companion.journal.leaf_page", "companion.journal.log_damage", "companion.journal.reader",
-    "companion.journal.recovery", "companion.journal.retention", "companion.sensors",
+    "companion.journal.leaf_page", "companion.journal.log", "companion.journal.reader",
+    "companion.journal.recovery", "companion.journal.folder", "companion.sensors",
 )  # fmt: skip
 
 

@@ -47,8 +47,9 @@ from companion.journal.continuing import (
     treated_by,
     unfinished,
 )
-from companion.journal.coverage_area import moved, polygons
-from companion.journal.coverage_table import (
+from companion.journal.coverage import (
+    moved,
+    polygons,
     read_coverage,
     read_treated,
     write_coverage,

@@ -20,7 +20,7 @@ from companion.core.options.drift import Drift, fall_s
 from companion.core.prescription import Prescription, Zone
 from companion.core.safety import Limits
 from companion.core.types import Inhibit, Input, VehicleState, WindReport
-from companion.journal.setup_json import field_names_of, setup_to_json
+from companion.journal.codec import field_names_of, setup_to_json
 from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, fly
 from sitl.knowledge import lags as true_lags

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.journal.new_file import open_for_flight
+from companion.journal.journal import open_for_flight
 from companion.output.engine.lines import FileLines
 from companion.output.engine.spi595 import SpiDevice
 from companion.output.gpio import EngineChild

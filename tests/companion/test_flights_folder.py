@@ -13,10 +13,17 @@ from companion.cli.app import execute
 from companion.cli.record_parts import made_ready
 from companion.config.tables import JournalTable
 from companion.errors import JournalError
-from companion.journal import retention
-from companion.journal.folder import Flight, journals, look_at, set_pinned
+from companion.journal.folder import (
+    Flight,
+    Rules,
+    Space,
+    chosen,
+    journals,
+    look_at,
+    prune,
+    set_pinned,
+)
 from companion.journal.journal import Journal
-from companion.journal.retention import Rules, Space, chosen, prune
 from tests.builders import setup
 from tests.companion.test_journal import change, closed_journal
 
@@ -38,7 +45,7 @@ def flight(number: int, **changes: Any) -> Flight:
     return Flight(**{**given, **changes})
 
 
-def numbers(removals: list[retention.Removal]) -> list[int]:
+def numbers(removals: list[folder.Removal]) -> list[int]:
     return [int(each.flight.path.stem[-4:]) for each in removals]
 
 
@@ -99,7 +106,7 @@ def test_a_flight_that_is_recovered_may_go() -> None:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a folder of three flights, as if one were already too many."""
-    monkeypatch.setattr(retention, "ALWAYS_KEPT", 0)
+    monkeypatch.setattr("companion.journal.folder.ALWAYS_KEPT", 0)
     for _ in range(3):
         closed_journal(tmp_path, 25)
     return tmp_path
@@ -143,7 +150,7 @@ def test_what_is_pinned_meanwhile_is_neither_removed_nor_listed(
         set_pinned(folder / "flight-0001.gpkg", is_pinned=True)
         return ROOMY
 
-    monkeypatch.setattr(retention, "space_of", space)
+    monkeypatch.setattr("companion.journal.folder.space_of", space)
     assert numbers(prune(folder, Rules(free_percent=None, count=1), now_utc_s=0.0)) == [2]
     assert (folder / "flight-0001.gpkg").exists()
 
@@ -268,6 +275,6 @@ def test_a_full_disk_is_refused_before_the_flight(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = Space(total_bytes=10**12, free_bytes=10**6)
-    monkeypatch.setattr("companion.journal.retention.space_of", lambda _folder: full)
+    monkeypatch.setattr("companion.journal.folder.space_of", lambda _folder: full)
     with pytest.raises(JournalError, match="only 1 MB are free"):
         list(made_ready(folder, JournalTable()))

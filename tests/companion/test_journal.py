@@ -55,8 +55,7 @@ from companion.core.types import (
 )
 from companion.errors import JournalError
 from companion.journal.codec import decode, encode
-from companion.journal.journal import Journal
-from companion.journal.new_file import open_for_flight
+from companion.journal.journal import Journal, open_for_flight
 from companion.journal.writer import Event, Writer
 from tests.builders import flying, setup
 from tests.companion.journal_edit import with_body

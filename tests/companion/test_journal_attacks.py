@@ -18,10 +18,9 @@ from analysis.journals.salvage import recover, salvage
 from companion.cli.app import execute
 from companion.errors import VrsprayError
 from companion.journal.continuing import is_journal, read_treated_ground
-from companion.journal.distrust import distrust, known_tables
 from companion.journal.folder import look_at
 from companion.journal.geopackage import PAGE_BYTES
-from companion.journal.read_only import salvaged_name
+from companion.journal.read_only import distrust, known_tables, salvaged_name
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import example_setup
 
@@ -238,7 +237,7 @@ def test_nothing_of_a_strangers_journal_is_run(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("companion.journal.distrust._VALUE_BYTES_MAX", 2_000_000)
+    monkeypatch.setattr("companion.journal.read_only._VALUE_BYTES_MAX", 2_000_000)
     ATTACKS[attack](path)
     if damage and path.is_file():
         with path.open("r+b") as file:  # within a page: what is left is salvaged

@@ -22,10 +22,10 @@ from companion.config.tables import JournalTable
 from companion.core.types import UtcReport
 from companion.errors import JournalError, NoMapError
 from companion.journal.folder import journals, look_at
-from companion.journal.new_file import open_for_flight
+from companion.journal.journal import open_for_flight
 from companion.journal.read_only import log_of, salvaged_name
 from companion.journal.reader import opened
-from companion.journal.valve_rows import ValveOrder
+from companion.journal.rows import ValveOrder
 from companion.journal.writer import Writer
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import example_setup

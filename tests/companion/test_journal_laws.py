@@ -29,8 +29,7 @@ from companion.core.types import (
 )
 from companion.errors import JournalError
 from companion.journal.codec import FIELD_NAMES, decode, encode
-from companion.journal.journal import Journal
-from companion.journal.new_file import open_for_flight
+from companion.journal.journal import Journal, open_for_flight
 from companion.journal.writer import Writer
 from tests.builders import flying, setup
 

@@ -16,9 +16,8 @@ from companion.cli.app import execute
 from companion.cli.record_parts import made_ready
 from companion.config.tables import JournalTable
 from companion.journal.geopackage import PAGE_BYTES
-from companion.journal.log_damage import EVENT_KIND, META_KEY, log_damage
-from companion.journal.log_frames import log_from
-from companion.journal.new_file import open_for_flight
+from companion.journal.journal import open_for_flight
+from companion.journal.log import EVENT_KIND, META_KEY, log_damage, log_from
 from companion.journal.read_only import kept_log_of, log_of
 from tests.bench.journal import crashed
 from tests.bench.journal_flight import START_S, example_setup

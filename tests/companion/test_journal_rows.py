@@ -13,7 +13,7 @@ from analysis.journals.content import read_journal
 from companion.core.types import SprayPlan, TimedChange, UtcReport
 from companion.journal.folder import look_at
 from companion.journal.journal import Journal
-from companion.journal.valve_rows import ValveOrder, ValveRows
+from companion.journal.rows import ValveOrder, ValveRows
 from companion.journal.writer import FlightClock
 from companion.link.codec import FROM_VEHICLE
 from companion.output.engine.wire import Issued

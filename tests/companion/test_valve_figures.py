@@ -20,8 +20,8 @@ from companion.core.nozzle import NozzleSet
 from companion.core.setup import Setup
 from companion.doctor.check import Status
 from companion.errors import ConfigError
+from companion.journal.codec import calibration_sha256, setup_from_json, setup_to_json
 from companion.journal.layers import Ground
-from companion.journal.setup_json import calibration_sha256, setup_from_json, setup_to_json
 from tests import builders
 
 FACTORS = (0.97, 1.01, 1.03, 0.99, 1.02, 0.98)

@@ -25,7 +25,7 @@ from companion.core.setup import Setup
 from companion.core.types import Decision
 from companion.journal import codec
 from companion.journal.codec import FieldNames, encode
-from companion.journal.coverage_table import read_coverage
+from companion.journal.coverage import read_coverage
 from companion.journal.reader import opened
 
 FOLDER = Path(__file__).parent / "journals"
