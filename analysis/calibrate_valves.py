@@ -244,8 +244,15 @@ def _measured_here(
     config: Config, given: tuple[str, ...], course: Course, *, is_lines: bool
 ) -> list[Piece]:
     """Do all pieces with the configured outputs and the meter, while a key is held."""
-    from companion.cli.ground_doing import append, ask, listening, perform, ready_log
-    from companion.cli.hand import INTERRUPTED, Hand
+    from companion.cli.ground_doing import (
+        INTERRUPTED,
+        Hand,
+        append,
+        ask,
+        listening,
+        perform,
+        ready_log,
+    )
     from companion.cli.sensor_parts import pulse_meter
 
     parts = pulse_meter(config)

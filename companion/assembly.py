@@ -25,7 +25,7 @@ from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump
 from companion.core.options.valve_tracking import ValveTracking
 from companion.core.setup import Setup
-from companion.errors import ConfigError, MapError
+from companion.errors import ConfigError, MapError, Problem
 from companion.flight_map import (
     FlightMap,
     difference,
@@ -33,7 +33,6 @@ from companion.flight_map import (
     named_files,
     read_flight_map,
 )
-from companion.problem import Problem
 
 # The autopilot tells whole millilitres ten times a second, up to a tenth of a second old: over half
 # a second that is a quarter of the flow, from one bin to the next.

@@ -18,8 +18,26 @@ A wrong argument inside our own code is a `ValueError`: a bug, not a condition.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
-from companion.problem import Problem
+Severity = Literal["error", "warning"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """One thing that is wrong or remarkable, where it is, and what the operator can do."""
+
+    severity: Severity
+    code: str
+    text: str
+    where: str = ""
+    fix: str = ""
+
+    def __post_init__(self) -> None:
+        if self.severity not in ("error", "warning"):
+            raise ValueError(f"no severity: {self.severity}")
+
 
 # What the command line says of a `MemoryError`.
 NOT_ENOUGH_MEMORY = "not enough memory; use a smaller file or another computer"

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from companion.problem import Problem
+    from companion.errors import Problem
 
 
 import inspect

@@ -15,8 +15,7 @@ from companion.cli.app import refusal
 from companion.config import Config, load
 from companion.config.rules import mismatches, remarks, without_effect
 from companion.config.wording import show_value
-from companion.errors import ConfigError, MapError
-from companion.problem import Problem
+from companion.errors import ConfigError, MapError, Problem
 
 app = typer.Typer(
     add_completion=False,

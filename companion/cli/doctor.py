@@ -47,8 +47,7 @@ from companion.doctor.computer import (
     serial_check,
     service_checks,
 )
-from companion.doctor.engine_trial import engine_checks, read_engine
-from companion.doctor.gpio import gpio_checks, read_chip, read_register
+from companion.doctor.gpio import engine_checks, gpio_checks, read_chip, read_engine, read_register
 from companion.doctor.listen import listen, rest_pulses
 from companion.doctor.sensors import Read, read_sensors, sensor_check
 from companion.doctor.vehicle import Heard, link_checks, no_link

@@ -12,9 +12,8 @@ from statistics import fmean
 
 from companion import runtime
 from companion.cli.answer import note
-from companion.cli.ground_doing import in_words
+from companion.cli.ground_doing import INTERRUPTED, Hand, in_words, read_line
 from companion.cli.ground_tasks import ground_setup
-from companion.cli.hand import INTERRUPTED, Hand, read_line
 from companion.cli.link_parts import build_link
 from companion.cli.run import build_executor, component_options
 from companion.cli.sensor_parts import build_sensors

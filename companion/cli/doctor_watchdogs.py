@@ -11,9 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from companion.cli.answer import note
-from companion.cli.ground_doing import in_words
+from companion.cli.ground_doing import in_words, read_line
 from companion.cli.ground_tasks import ground_setup
-from companion.cli.hand import read_line
 from companion.cli.link_parts import build_link
 from companion.cli.output_parts import engine_setup, servo_options
 from companion.cli.run import component_options
@@ -22,7 +21,7 @@ from companion.config import Config
 from companion.core.types import Decision, Inhibit, SprayPlan
 from companion.doctor.check import Check, Status, fail, not_applicable, ok, warn
 from companion.doctor.computer import WATCHDOG_MAX_S, hardware_watchdog_check, read_computer
-from companion.doctor.engine_trial import EngineTrial, try_engine
+from companion.doctor.gpio import EngineTrial, try_engine
 from companion.errors import LinkError
 from companion.ground.work import (
     GroundReason,

@@ -18,8 +18,7 @@ from companion.atomic_write import write_atomically
 from companion.cli.answer import problem_line, problem_object
 from companion.cli.app import find_command, load_command
 from companion.config import Config, load
-from companion.errors import ConfigError, MapError, VrsprayError
-from companion.problem import Problem
+from companion.errors import ConfigError, MapError, Problem, VrsprayError
 
 Ask = Callable[[str, str], str]
 AUTOPILOTS = ("ardupilot", "px4")

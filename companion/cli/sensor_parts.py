@@ -9,11 +9,11 @@ from typing import Any, Protocol
 
 from companion.config import Config
 from companion.config.rules import tank_capacity_l
-from companion.config.sensor_tables import ConverterTable
+from companion.config.sprayer_tables import ConverterTable
 from companion.core.types import Input, PressureReport, TankReport
 from companion.errors import SensorError
-from companion.gpio_chip import find_chip, load_gpiod
 from companion.link.vehicle_link import VehicleLink
+from companion.output.engine.lines import find_chip, load_gpiod
 from companion.ports import Sensor
 from companion.sensors.estop import EstopSwitch
 from companion.sensors.flow_meter import Edge, EdgeSource, FlowMeter, Meter

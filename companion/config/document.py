@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, PrivateAttr
 
-from companion.config import application_table, sensor_tables, sprayer_tables, tables
+from companion.config import application_table, sprayer_tables, tables
 from companion.config.limits import Buffer, LimitsFile
 from companion.core.boom import Boom, Valve
 
@@ -44,10 +44,10 @@ class Document(tables.Table):
     limits_table: tables.LimitsTable = Field(default=tables.LimitsTable(), alias="limits")
     flow_trim: tables.FlowTrimTable = tables.FlowTrimTable()
     valve_tracking: tables.ValveTrackingTable = tables.ValveTrackingTable()
-    flow_meter: sensor_tables.FlowMeterTable = sensor_tables.FlowMeterTable()
-    pressure: sensor_tables.PressureTable = sensor_tables.PressureTable()
-    tank: sensor_tables.TankTable = sensor_tables.TankTable()
-    detection: sensor_tables.DetectionTable = sensor_tables.DetectionTable()
+    flow_meter: sprayer_tables.FlowMeterTable = sprayer_tables.FlowMeterTable()
+    pressure: sprayer_tables.PressureTable = sprayer_tables.PressureTable()
+    tank: sprayer_tables.TankTable = sprayer_tables.TankTable()
+    detection: sprayer_tables.DetectionTable = sprayer_tables.DetectionTable()
     drift: tables.DriftTable = tables.DriftTable()
     prediction: tables.PredictionTable = tables.PredictionTable()
     coverage: tables.CoverageTable = tables.CoverageTable()

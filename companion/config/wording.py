@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
-from companion.problem import Problem
+from companion.errors import Problem
 
 VALUE_LENGTH_MAX = 60
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")

@@ -25,7 +25,7 @@ from companion.core.cells import CellGrid
 from companion.core.frame import LocalFrame
 from companion.core.options.lines import Polyline
 from companion.core.prescription import Overlap, Prescription, Zone
-from companion.errors import MapError
+from companion.errors import MapError, Problem
 from companion.flight_map.model import Area, FlightMap, SourceFile
 from companion.journal.geopackage import (
     APPLICATION_ID,
@@ -36,7 +36,6 @@ from companion.journal.geopackage import (
 )
 from companion.journal.layers import Ground, read_ground
 from companion.journal.read_only import DAMAGE, check_programs, distrust, one_line
-from companion.problem import Problem
 
 VERSION = "1"
 # Bounds on what a stranger may hand over; those of any map file (missions/maps/layer.py).

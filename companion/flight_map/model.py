@@ -18,7 +18,7 @@ from companion.core.cells import CellGrid, Warp
 from companion.core.frame import LocalFrame
 from companion.core.options.lines import Polyline
 from companion.core.prescription import Prescription, Zone
-from companion.problem import Problem
+from companion.errors import Problem
 
 Area = Polygon | MultiPolygon
 SUFFIX = ".flightmap.gpkg"

@@ -7,10 +7,12 @@ sender decides whether they are still worth sending later. Old orders are not qu
 from __future__ import annotations
 
 import asyncio
+import errno
+import socket
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 from companion.errors import LinkError
 
@@ -168,3 +170,232 @@ class Reconnecting:
                 self.is_up = True
                 self._said = None
                 self._on_change(True)
+
+
+_PEERS_MAX = 4
+# A peer that has said nothing valid for so long may lose its place; heartbeats come every second.
+_SILENT_S = 5.0
+
+
+@dataclass(slots=True)
+class _Peer:
+    """When an address last said something valid, and whether the vehicle speaks from it."""
+
+    heard_s: float
+    is_vehicle: bool
+
+
+class UdpTransport(asyncio.DatagramProtocol):
+    """One socket. `udpin` sends to the addresses that were adopted, four at most.
+
+    Anyone can send a datagram here, so nobody becomes a peer by that alone: the link adopts an
+    address once a frame from it has been found valid. A newcomer never displaces a peer that is
+    still heard, but for the vehicle, which displaces a stranger.
+    """
+
+    def __init__(self, on_bytes: OnBytes, *, is_connected: bool) -> None:
+        self._on_bytes = on_bytes
+        self._is_connected = is_connected
+        self._peers: dict[Any, _Peer] = {}
+        self.speaker: Any = None
+        self._socket: asyncio.DatagramTransport | None = None
+        self._closed = asyncio.get_running_loop().create_future()
+        self.is_up = True
+        self._is_full = False
+        self.error_count = 0
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Take the socket over."""
+        self._socket = cast(asyncio.DatagramTransport, transport)
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        """Hand the bytes over; `speaker` says meanwhile where they came from."""
+        self.speaker = addr
+        self._on_bytes(data)
+
+    def adopt(self, speaker: Any, now_s: float, *, is_vehicle: bool) -> None:
+        """Send to an address from now on, if there is a place for it."""
+        if self._is_connected or speaker is None:
+            return
+        known = self._peers.get(speaker)
+        if known is None:
+            if len(self._peers) >= _PEERS_MAX and not self._make_room(now_s, is_vehicle):
+                return
+            self._peers[speaker] = _Peer(now_s, is_vehicle)
+            return
+        known.heard_s = now_s
+        known.is_vehicle = known.is_vehicle or is_vehicle
+
+    def _make_room(self, now_s: float, is_vehicle: bool) -> bool:
+        """Let go of a peer that has fallen silent, or of a stranger where the vehicle speaks."""
+        by_age = sorted(self._peers, key=lambda address: self._peers[address].heard_s)
+        for address in by_age:
+            if now_s - self._peers[address].heard_s > _SILENT_S:
+                del self._peers[address]
+                return True
+        strangers = [address for address in by_age if not self._peers[address].is_vehicle]
+        if not (is_vehicle and strangers):
+            return False
+        del self._peers[strangers[0]]
+        return True
+
+    def error_received(self, _exc: Exception) -> None:
+        """Count what the network reports: nobody listens yet, or no longer."""
+        self.error_count += 1
+
+    def pause_writing(self) -> None:
+        """Note that the system takes no more: what is sent now would be old when it leaves."""
+        self._is_full = True
+
+    def resume_writing(self) -> None:
+        """Note that the system takes datagrams again."""
+        self._is_full = False
+
+    def connection_lost(self, _exc: Exception | None) -> None:
+        """Note that the socket is gone."""
+        self.is_up = False
+        if not self._closed.done():
+            self._closed.set_result(None)
+
+    def send(self, data: bytes) -> bool:
+        """Send a datagram to the peer or the peers; False where there is none."""
+        socket = self._socket
+        if socket is None or socket.is_closing() or self._is_full:
+            return False
+        if self._is_connected:
+            socket.sendto(data)
+            return True
+        for peer in self._peers:
+            socket.sendto(data, peer)
+        return bool(self._peers)
+
+    async def close(self) -> None:
+        """Close the socket; a datagram that was sent has left already."""
+        if self._socket is not None:
+            self._socket.close()
+            await self._closed
+
+    @property
+    def port(self) -> int:
+        """Return the local port: the one asked for, or the one that the system chose for 0."""
+        assert self._socket is not None
+        return int(self._socket.get_extra_info("sockname")[1])
+
+
+async def open_udp(url: LinkUrl, on_bytes: OnBytes) -> UdpTransport:
+    """Open the socket or say why not."""
+    address = (url.place, url.number)
+    listens = url.kind == "udpin"
+    try:
+        _, transport = await asyncio.get_running_loop().create_datagram_endpoint(
+            lambda: UdpTransport(on_bytes, is_connected=not listens),
+            local_addr=address if listens else None,
+            remote_addr=None if listens else address,
+        )
+    except OSError as error:
+        raise LinkError(f"link.url = {url.text!r}: {_reason(url, error)}") from error
+    return transport
+
+
+def _reason(url: LinkUrl, error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return (
+            f"port {url.number} is in use; stop the program that has it "
+            "(another companion, a ground station), or write another port"
+        )
+    if error.errno == errno.EACCES:
+        return f"port {url.number} is not allowed to this user; write one above 1023"
+    if error.errno == errno.EADDRNOTAVAIL:
+        return f"{url.place} is no address of this computer; write 127.0.0.1 or 0.0.0.0"
+    return f"cannot be opened ({error.strerror or error}); check host and port"
+
+
+_PENDING_MAX = 8 * 1024
+# Short of the five seconds within which the operator is told what is wrong.
+_CONNECT_WAIT_S = 3.0
+# A peer that vanished without a word is given up when what we sent stays unanswered this long;
+# otherwise the system would go on trying for a quarter of an hour.
+_UNANSWERED_MS = 5000
+
+
+class _Connection(asyncio.Protocol):
+    """One connection; it reports its own end once."""
+
+    def __init__(self, owner: TcpTransport, on_bytes: OnBytes) -> None:
+        self._owner = owner
+        self._on_bytes = on_bytes
+        self.ended = asyncio.get_running_loop().create_future()
+
+    def data_received(self, data: bytes) -> None:
+        self._on_bytes(data)
+
+    def connection_lost(self, _exc: Exception | None) -> None:
+        if not self.ended.done():
+            self.ended.set_result(None)
+        self._owner.connection_ended(self)
+
+
+class TcpTransport(Reconnecting):
+    """A client; a peer that reads too slowly gets nothing rather than old orders."""
+
+    def __init__(
+        self,
+        url: LinkUrl,
+        on_bytes: OnBytes,
+        on_change: OnChange,
+        on_trouble: OnTrouble | None = None,
+    ) -> None:
+        super().__init__(url, on_bytes, on_change, on_trouble)
+        self._transport: asyncio.Transport | None = None
+        self._connection: _Connection | None = None
+
+    async def _connect(self) -> None:
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(_CONNECT_WAIT_S):
+                transport, connection = await loop.create_connection(
+                    lambda: _Connection(self, self._on_bytes), self.url.place, self.url.number
+                )
+        except ConnectionRefusedError as error:
+            raise LinkNotYetError(
+                f"link.url = {self.url.text!r}: connection refused; nobody listens at "
+                f"{self.url.place} port {self.url.number}: start the autopilot or its router first"
+            ) from error
+        except (OSError, TimeoutError) as error:
+            raise LinkNotYetError(
+                f"link.url = {self.url.text!r}: cannot connect "
+                f"({error or 'no answer'}); check host, port and cable"
+            ) from error
+        if transport.is_closing():
+            raise LinkNotYetError(f"link.url = {self.url.text!r}: the other end hung up at once")
+        tcp: socket.socket = transport.get_extra_info("socket")
+        tcp.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _UNANSWERED_MS)
+        self._transport, self._connection = transport, connection
+
+    def connection_ended(self, connection: _Connection) -> None:
+        """Take the end of a connection; only that of the present one matters."""
+        if connection is self._connection:
+            self._transport = None
+            self._lost()
+
+    def send(self, data: bytes) -> bool:
+        """Send now, unless the peer is behind."""
+        transport = self._transport
+        if transport is None or transport.is_closing():
+            return False
+        if transport.get_write_buffer_size() > _PENDING_MAX:
+            return False
+        transport.write(data)
+        return True
+
+    async def _let_go(self) -> None:
+        transport, connection = self._transport, self._connection
+        if transport is None or connection is None:
+            return
+        transport.close()
+        try:
+            async with asyncio.timeout(CLOSE_WAIT_S):
+                await asyncio.shield(connection.ended)
+        except TimeoutError:
+            transport.abort()
+            await connection.ended

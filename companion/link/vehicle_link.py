@@ -29,7 +29,9 @@ from companion.link.transport import (
     OnChange,
     OnTrouble,
     Reconnecting,
+    TcpTransport,
     Transport,
+    open_udp,
     parse_url,
 )
 from companion.simulated import SIMULATED
@@ -376,18 +378,14 @@ async def open_transport(
     themselves, UDP has nothing to lose. With `on_trouble` a link for which waiting can help is
     not refused: its one line goes there, and it is tried until it opens.
     """
-    # The kinds are imported where they are needed: pyserial is of no use to a UDP link.
     parts = parse_url(url)
     if parts.kind in ("udpin", "udpout"):
-        from companion.link.udp import open_udp
-
         return await open_udp(parts, on_bytes)
     link: Reconnecting
     if parts.kind == "tcp":
-        from companion.link.tcp import TcpTransport
-
         link = TcpTransport(parts, on_bytes, on_change, on_trouble)
     else:
+        # Imported where it is needed: pyserial is of no use to a UDP link.
         from companion.link.serial_port import SerialTransport
 
         link = SerialTransport(parts, on_bytes, on_change, on_trouble)

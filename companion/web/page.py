@@ -1,6 +1,6 @@
 """The control loop's end of the operator's page: it writes the newest state, and takes orders.
 
-The page is a process of its own. What it shows goes through shared memory (`ring.py`), which is
+The page is a process of its own. What it shows goes through shared memory (`frames.py`), which is
 never full and never waited for; what it orders comes back in small packets, of which a few are
 read in each step. So nothing that a browser does, or the page's own end, can delay a valve. A page
 that ends is started again.
@@ -27,8 +27,7 @@ from typing import Any, Literal
 from companion.core.types import Decision, Input
 from companion.errors import ConfigError
 from companion.simulated import SIMULATED
-from companion.web.frames import frame_of, packed, shown_key
-from companion.web.ring import PAYLOAD_MAX, RingWriter, new_memory
+from companion.web.frames import PAYLOAD_MAX, RingWriter, frame_of, new_memory, packed, shown_key
 
 _logger = logging.getLogger(__name__)
 

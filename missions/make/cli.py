@@ -22,8 +22,8 @@ from companion.cli.answer import (
     progress,
 )
 from companion.config import load
+from companion.errors import Problem
 from companion.flight_map import is_flight_map
-from companion.problem import Problem
 from companion.wording import counted, install_command
 from missions.errors import PlanError
 from missions.make.arguments import (

@@ -23,9 +23,8 @@ from companion.config import Config
 from companion.config.tables import PrescriptionTable
 from companion.core.frame import LocalFrame
 from companion.core.nozzle import rate_for_flow
-from companion.errors import ConfigError
+from companion.errors import ConfigError, Problem
 from companion.flight_map import is_flight_map
-from companion.problem import Problem
 from missions.errors import PlanError
 from missions.layouts import spray_lines
 from missions.make.passes import Passes, by_valve, passes_of

@@ -16,8 +16,7 @@ from pyproj import CRS
 from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
-from companion.errors import MapError
-from companion.problem import Problem, Severity
+from companion.errors import MapError, Problem, Severity
 
 __all__ = [
     "Affine", "MapCells", "MapFile", "MapZone", "Problem", "Severity", "map_error",

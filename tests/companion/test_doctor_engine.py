@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 
 from companion.core.nozzle import PwmLimits
-from companion.doctor import engine_trial
+from companion.doctor import gpio
 from companion.doctor.check import Status
-from companion.doctor.engine_trial import engine_checks, read_engine
+from companion.doctor.gpio import engine_checks, read_engine
 from companion.errors import ActuatorError
 from companion.output.engine.selftest import SelfTest
 from companion.output.engine.setup import EngineSetup, Wiring
@@ -56,6 +56,6 @@ def test_an_engine_that_did_not_start_is_stopped(monkeypatch: pytest.MonkeyPatch
         async def stop(self) -> None:
             made.append("stopped")
 
-    monkeypatch.setattr(engine_trial, "GpioExecutor", Lame)
+    monkeypatch.setattr(gpio, "GpioExecutor", Lame)
     assert read_engine(EngineSetup(wiring=Wiring(valves=(17,)), pwm=PWM)).fault
     assert made == ["made", "stopped"]

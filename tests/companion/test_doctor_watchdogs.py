@@ -23,9 +23,9 @@ from companion.cli.doctor_watchdogs import (
 )
 from companion.core.nozzle import PwmLimits
 from companion.core.types import HeartbeatReport, Input, LandedReport, SprayPlan
-from companion.doctor import engine_trial
+from companion.doctor import gpio
 from companion.doctor.check import Check, Status, is_ready
-from companion.doctor.engine_trial import EngineTrial, try_engine
+from companion.doctor.gpio import EngineTrial, try_engine
 from companion.ground.work import GroundSetup
 from companion.output.autopilot_options import ServoOptions
 from companion.output.engine.setup import EngineSetup, Wiring
@@ -97,7 +97,7 @@ class Deaf(GpioExecutor):
 async def test_an_engine_that_opens_nothing_is_said_and_is_stopped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(engine_trial, "GpioExecutor", Deaf)
+    monkeypatch.setattr(gpio, "GpioExecutor", Deaf)
     wiring = Wiring(valves=(3, 4))
     found = await try_engine(EngineSetup(wiring=wiring, pwm=PWM, realtime=False), lease_s=0.3)
     assert found.problem == "the engine opened nothing"

@@ -11,11 +11,16 @@ import pytest
 
 from companion.core.nozzle import PwmLimits
 from companion.errors import ActuatorError
-from companion.output.engine import closer, gpiod_lines, lines
-from companion.output.engine.gpiod_lines import GpiodLines, find_chip, keeps_levels, load_gpiod
-from companion.output.engine.lines import open_lines
+from companion.output.engine import closer, lines
+from companion.output.engine.lines import (
+    GpiodLines,
+    SpiRegister,
+    find_chip,
+    keeps_levels,
+    load_gpiod,
+    open_lines,
+)
 from companion.output.engine.setup import EngineSetup, Wiring
-from companion.output.engine.spi595 import SpiRegister
 from tests.fake_gpiod import FakeChip, FakeGpiod
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)
@@ -28,7 +33,7 @@ def chip(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakeChip:
     path = tmp_path / "gpiochip0"
     path.touch()
     fake = FakeGpiod({str(path): chip})
-    monkeypatch.setattr(gpiod_lines, "DEV", tmp_path)
+    monkeypatch.setattr(lines, "DEV", tmp_path)
     monkeypatch.setattr(importlib, "import_module", lambda name: fake)
     return chip
 
@@ -208,7 +213,7 @@ def test_a_real_port_is_asked_for_with_its_speed(monkeypatch: pytest.MonkeyPatch
         asked.append((path, speed_hz))
         return port
 
-    monkeypatch.setattr("companion.output.engine.spi595.open_port", open_port)
+    monkeypatch.setattr("companion.output.engine.lines.open_port", open_port)
     given = EngineSetup(wiring=Wiring(valves=(1,)), pwm=PWM, backend="spi595", device="spidev0.0")
     assert isinstance(lines.open_lines(given), SpiRegister)
     assert asked == [("spidev0.0", 1_000_000)]

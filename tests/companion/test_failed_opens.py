@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from companion.journal.journal import open_for_flight
-from companion.output.engine.lines import FileLines
-from companion.output.engine.spi595 import SpiDevice
+from companion.output.engine.lines import FileLines, SpiDevice
 from companion.output.gpio import EngineChild
 from sitl.stub.protocol import Channel
 from sitl.stub.server import open_link

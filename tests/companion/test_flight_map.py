@@ -22,7 +22,7 @@ from companion.cli.app import execute
 from companion.config import load
 from companion.config.tables import PrescriptionTable
 from companion.core.prescription import Prescription
-from companion.errors import ConfigError, MapError
+from companion.errors import ConfigError, MapError, Problem
 from companion.flight_map import (
     FlightMap,
     difference,
@@ -31,7 +31,6 @@ from companion.flight_map import (
 from companion.flight_map import child as child_module
 from companion.flight_map import file as file_module
 from companion.journal.geopackage import LOCAL_ID, geometry_blob
-from companion.problem import Problem
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.compiling import (
     MapOrder,

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion import gpio_chip
 from companion.cli.sensor_parts import GpiodEdges
 from companion.core.types import FlowReport
 from companion.errors import SensorError
+from companion.output.engine import lines
 from companion.sensors.flow_meter import Edge, FlowMeter, Meter, PulseCounter, VirtualEdges
 
 PERIOD_S = 1.0 / 11.0
@@ -204,7 +204,7 @@ def fake_gpiod(request: FakeRequest | OSError, version: str = "2.3.0") -> Module
 def dev(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return the folder of devices of a computer with one chip."""
     (tmp_path / "gpiochip0").touch()
-    monkeypatch.setattr(gpio_chip, "DEV", tmp_path)
+    monkeypatch.setattr(lines, "DEV", tmp_path)
     return tmp_path
 
 

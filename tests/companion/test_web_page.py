@@ -21,7 +21,15 @@ from companion.errors import ConfigError
 from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
 from companion.web.child import Limits, run_child
-from companion.web.frames import frame_of, packed
+from companion.web.frames import (
+    PAYLOAD_MAX,
+    SLOTS,
+    RingReader,
+    RingWriter,
+    frame_of,
+    new_memory,
+    packed,
+)
 from companion.web.live import (
     ADVICE,
     Live,
@@ -33,7 +41,6 @@ from companion.web.live import (
     wanted_rate,
 )
 from companion.web.page import ORDER_BYTES_MAX, parse_order
-from companion.web.ring import PAYLOAD_MAX, SLOTS, RingReader, RingWriter, new_memory
 from tests.companion.web_site import SETUP, Site, about, aged, served, until
 
 IN_LOOP = pytest.mark.asyncio(loop_scope="module")  # one page for all: it starts slowly

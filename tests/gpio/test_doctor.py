@@ -7,7 +7,7 @@ import pytest
 from companion.cli.sensor_parts import GpiodEdges
 from companion.doctor.check import Check
 from companion.doctor.gpio import gpio_checks, read_chip
-from companion.output.engine.gpiod_lines import GpiodLines, load_gpiod
+from companion.output.engine.lines import GpiodLines, load_gpiod
 from companion.output.engine.setup import Wiring
 from tests.gpio.sim import SimChip
 

@@ -19,7 +19,7 @@ import pytest
 
 from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
-from companion.output.engine.gpiod_lines import GpiodLines, load_gpiod
+from companion.output.engine.lines import GpiodLines, load_gpiod
 from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack
 from companion.output.gpio import COMMAND, EngineChild, GpioExecutor

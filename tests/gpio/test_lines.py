@@ -10,8 +10,7 @@ import pytest
 from companion.core.nozzle import PwmLimits
 from companion.errors import ActuatorError
 from companion.output.engine import closer
-from companion.output.engine.gpiod_lines import GpiodLines, find_chip, load_gpiod
-from companion.output.engine.lines import Lines, open_lines
+from companion.output.engine.lines import GpiodLines, Lines, find_chip, load_gpiod, open_lines
 from companion.output.engine.setup import EngineSetup, Wiring
 from tests.gpio.sim import SimChip
 

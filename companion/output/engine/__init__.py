@@ -2,5 +2,5 @@
 
 Read in this order: `setup` and `wiring` (what hangs on which line), `wire` (what passes between
 companion and engine), `late` and `schedule` (pure: from plans to edges), `engine` (one turn of
-the loop), `lines` with `gpiod_lines` and `spi595` (the hardware), `process` (the loop itself).
+the loop), `lines` (the hardware), `process` (the loop itself).
 """

@@ -17,10 +17,8 @@ from pathlib import Path
 from typing import TypeVar
 
 from companion.errors import ActuatorError
-from companion.output.engine.gpiod_lines import GpiodLines, load_gpiod
-from companion.output.engine.lines import Lines
+from companion.output.engine.lines import GpiodLines, Lines, SpiRegister, load_gpiod, open_port
 from companion.output.engine.setup import EngineSetup
-from companion.output.engine.spi595 import SpiRegister, open_port
 
 # An engine that is just dying still holds its lines.
 PATIENCE_S = 2.0

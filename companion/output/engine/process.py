@@ -19,8 +19,7 @@ from contextlib import suppress
 
 from companion.errors import ActuatorError
 from companion.output.engine.engine import Engine
-from companion.output.engine.gpiod_lines import keeps_levels
-from companion.output.engine.lines import open_lines
+from companion.output.engine.lines import keeps_levels, open_lines
 from companion.output.engine.selftest import self_test
 from companion.output.engine.setup import EngineSetup, hazards
 from companion.output.engine.wire import PACKET_MAX, Kind, RefusedError, pack, unpack

@@ -19,9 +19,8 @@ from companion.cli.answer import AsJson, Overrides, answer, problem_line, proble
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.core.frame import LocalFrame
-from companion.errors import MapError
+from companion.errors import MapError, Problem
 from companion.flight_map import SUFFIX, FlightMap, is_flight_map
-from companion.problem import Problem
 from companion.wording import counted
 from missions.maps.cli.convert import convert, show
 from missions.maps.cli.grid import GRID_EXAMPLE, grid, parse_mark

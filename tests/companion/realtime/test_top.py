@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from companion.cli.top import Overheard
 from companion.core.types import SprayerState
 from companion.link.encode import Encoder
-from companion.link.overhear import Overheard
 
 CONFIG = Path(__file__).resolve().parents[3] / "examples" / "anyang" / "config.toml"
 PROGRAM = [sys.executable, "-m", "companion"]
