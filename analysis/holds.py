@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from analysis.flight_record import joined
-from analysis.spared import closed_by_order
+from analysis.strips import closed_by_order
 from analysis.transitions import LEVEL_FROM, LEVEL_TO, ML_M_PER_L_HA_M, Sides
 
 if TYPE_CHECKING:

@@ -36,8 +36,8 @@ from analysis.evaluation import Distances, Evaluation, evaluate_strips
 from analysis.flown.applied_flight import ValveChanges
 from analysis.flown.applied_record import EvaluationError, record_of
 from analysis.flown.read_applied import read_applied
-from analysis.journals.blocks import Entry
 from analysis.journals.content import JournalContent, read_journal
+from analysis.journals.unpacking import Entry
 from analysis.strips import strips_of
 from companion.core.controller import Memory, expected_coverage, step
 from companion.core.estimator import Track, estimate, observe
@@ -55,8 +55,7 @@ from companion.simulated import Word
 
 if TYPE_CHECKING:
     from analysis.flown.applied_flight import AppliedFlight
-    from companion.core.controller import Memory
-    from companion.core.types import Decision, VehicleState
+    from companion.core.types import VehicleState
 
 
 # What other decisions on a flight's inputs would have put on the ground.

@@ -1,4 +1,11 @@
-"""Everything about one strip that more than one metric needs, computed once."""
+"""Everything about one strip that more than one metric needs, computed once.
+
+Where a valve was rightly closed because its strip was treated before. A guard
+(`coverage.switch_off_percent`) closes valves over treated ground. What it spares was not to be
+sprayed: nothing is asked for there, and no change is missed. As everything here it is found from
+the truth, the liquid that fell, and not from what the controller took for treated. A valve that is
+closed where nothing fell before has no such excuse.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +15,115 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.changes import Run, find_runs, stretches_of
-from analysis.spared import spared_of
 from analysis.track import Bools, Floats, Ints, Track, tracks_of
 from analysis.transitions import ML_M_PER_L_HA_M
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from analysis.flight_record import FlightRecord
     from companion.core.prescription import Prescription
     from companion.core.types import TimedChange
+
+# Ground is treated in squares of this, looked at in so many metres across a strip, and a valve that
+# gives less than this part of its usual dose treats none.
+SQUARE_M, ACROSS_M, TREATS_FROM = 0.2, 0.14, 0.2
+# The guard's own squares are as large: of a strip's width so much may be bare and count as treated.
+SLACK_M = 0.2
+_OFFSET = 2**31
+
+
+def closed_by_order(orders: Sequence[TimedChange], at_s: Floats) -> Bools:
+    """Return at which times a valve is closed by its orders; before the first it is."""
+    duty = np.array([0.0, *(order.duty for order in orders)])
+    given = np.searchsorted(np.array([order.at_s for order in orders]), at_s, "right")
+    closed: Bools = ~(duty[given] > 0.0)
+    return closed
+
+
+def spared_of(
+    record: FlightRecord, tracks: Sequence[Track], orders: Sequence[Sequence[TimedChange]]
+) -> list[Bools]:
+    """Return for each track, at its marks, whether its valve is spared; nowhere without a guard."""
+    guard = record.guard
+    if guard is None:
+        return [np.zeros(len(track.marks), dtype=np.bool_) for track in tracks]
+    ground = _Treated(record, tracks)
+    found = []
+    for track, own in zip(tracks, orders, strict=True):
+        least = guard.switch_off_percent / 100.0 - SLACK_M / track.width_m
+        treated = ground.share(track, guard.fresh_s) >= max(least, 0.05)
+        closed = closed_by_order(own, track.time_s[track.marks])
+        found.append(_mostly(treated, closed))
+    return found
+
+
+def _mostly(treated: Bools, closed: Bools) -> Bools:
+    """Return the treated stretches on most of which the valve is closed: lags are at their ends."""
+    found = treated.copy()
+    edges = np.flatnonzero(np.diff(treated, prepend=False, append=False))
+    for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        found[first:end] = bool(closed[first:end].mean() > 0.5)
+    return found
+
+
+class _Treated:
+    """When each square of the ground was treated for the first time."""
+
+    def __init__(self, record: FlightRecord, tracks: Sequence[Track]) -> None:
+        self._before = record.treated
+        keys, times_s = [np.empty(0, dtype=np.int64)], [np.empty(0)]
+        for track in tracks:
+            marks = track.marks[_treats(track)]
+            east_m, north_m = _across(track, marks)
+            keys.append(_keys(east_m, north_m).ravel())
+            times_s.append(np.repeat(track.time_s[marks], east_m.shape[1]))
+        every, at_s = np.concatenate(keys), np.concatenate(times_s)
+        order = np.argsort(at_s, kind="stable")
+        self._keys, first = np.unique(every[order], return_index=True)
+        self._first_s = at_s[order][first]
+
+    def share(self, track: Track, fresh_s: float) -> Floats:
+        """Return which part of a strip was treated more than `fresh_s` ago, at its marks."""
+        east_m, north_m = _across(track, track.marks)
+        keys = _keys(east_m, north_m)
+        at = np.minimum(np.searchsorted(self._keys, keys), max(len(self._keys) - 1, 0))
+        old_s = track.time_s[track.marks][:, None] - fresh_s
+        done = np.zeros(keys.shape, dtype=np.bool_)
+        if len(self._keys):
+            done = (self._keys[at] == keys) & (self._first_s[at] < old_s)
+        if self._before is not None:
+            done |= self._before.covered_at(east_m, north_m)
+        share: Floats = done.mean(axis=1)
+        return share
+
+
+def _treats(track: Track) -> Bools:
+    """Return at which marks the valve gives what it usually gives, or a good part of it."""
+    metres = np.gradient(track.distance_m[track.marks])
+    dose = np.gradient(track.volume_ml[track.marks]) / np.maximum(metres, 1e-6)
+    some = dose[(dose > 1e-6) & (metres > 1e-3)]
+    usual = float(np.median(some)) if len(some) else np.inf
+    treats: Bools = dose > TREATS_FROM * usual
+    return treats
+
+
+def _across(track: Track, marks: Ints) -> tuple[Floats, Floats]:
+    """Return places across the strip, a row a mark."""
+    count = max(int(np.ceil(track.width_m / ACROSS_M)), 3)
+    aside_m = ((np.arange(count) + 0.5) / count - 0.5) * track.width_m
+    heading = track.heading_rad[marks][:, None]
+    east_m = track.east_m[marks][:, None] + np.cos(heading) * aside_m
+    north_m = track.north_m[marks][:, None] - np.sin(heading) * aside_m
+    return east_m, north_m
+
+
+def _keys(east_m: Floats, north_m: Floats) -> Ints:
+    """Return one number for the square of each place."""
+    column, row = (np.floor(each / SQUARE_M).astype(np.int64) for each in (east_m, north_m))
+    keys: Ints = (column + _OFFSET) * 2**32 + (row + _OFFSET)
+    return keys
+
 
 # Sideways over the border by less than this is no border crossing: aircraft hold a line to some
 # centimetres, and the outer strip of a field often ends on its border. What it drops there is

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from analysis.report.figures import style
-from analysis.report.figures.style import FAINT, INK, QUIET
+from analysis.report import figure_style
+from analysis.report.figure_style import FAINT, INK, QUIET
 
 if TYPE_CHECKING:
     from sitl.demo import DemoResult, Flown
@@ -38,7 +38,7 @@ TITLES = {
     "look-ahead-stated": "look-ahead 0.97 s, as stated",
     "scheduled": "scheduled",
 }
-STYLE: dict[Any, Any] = {**style.STYLE, "font.size": 9.0, "axes.titlesize": 10.0}
+STYLE: dict[Any, Any] = {**figure_style.STYLE, "font.size": 9.0, "axes.titlesize": 10.0}
 DPI = 150
 
 

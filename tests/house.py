@@ -19,7 +19,6 @@ PACKAGES = ("companion", "missions", "sitl", "analysis")
 LINES_MAX = 600
 # A module that has one importer and stays a file of its own, and why.
 EXCEPTIONS: dict[str, str] = {
-    "analysis.journals.show": "one sub-command a file",
     "analysis.journals.salvage": "what is done to a journal, apart from the command line",
     "analysis.journals.stray_rows": "what a page may be of; pure, apart from the copy it serves",
     "missions.maps.cli.plan": "one sub-command a file",
@@ -27,7 +26,6 @@ EXCEPTIONS: dict[str, str] = {
     "missions.make.settled": "the optimum along a pass, apart from what it is of; pure",
     "missions.worth": "its price of a layout is another than the one that the layouts share",
     "sitl.stub.actions": "knows both firmwares' commands, which know the autopilot's protocol",
-    "analysis.wsp.outlines": "pure geometry of stains; the statistics that use it are apart",
 }
 # Longer than 600 lines, to be cut; nothing is added here.
 TOO_LONG: tuple[str, ...] = ()

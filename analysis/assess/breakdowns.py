@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.assess.intervals import NOTHING, Interval, crossings_of, mean_interval
 from analysis.flow_accuracy import flow_samples
 from analysis.lag import Verdict
+from analysis.student import NOTHING, Interval, crossings_of, mean_interval
 
 if TYPE_CHECKING:
     from analysis.changes import Change

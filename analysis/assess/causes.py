@@ -16,13 +16,12 @@ import numpy as np
 import shapely
 
 from analysis.assess.ground_elements import SquareGrid, slices_of, summed
-from analysis.changes import SPEED_MIN_M_S
+from analysis.changes import SPEED_MIN_M_S, ground_rates
 from analysis.flown.modelled_flow import ML_S_PER_L_MIN
 from analysis.holds import CLEAR_M
 from analysis.lag import Verdict
 from analysis.smoothing import rise_over
 from analysis.transitions import ML_M_PER_L_HA_M
-from analysis.zone_lookup import ground_rates
 from companion.core.nozzle import is_override
 
 if TYPE_CHECKING:

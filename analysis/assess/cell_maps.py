@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from analysis.assess.ground_elements import Grid, Slices, SquareGrid, slices_of, summed
-from analysis.zone_lookup import rates_of_squares
+from analysis.changes import rates_of_squares
 from companion.core.nozzle import flow_for_rate
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 import shapely
 from numpy.typing import NDArray
 
-from analysis.exports.about import utc_text
+from analysis.exports.columns import utc_text
 from analysis.exports.output import zipped
 
 if TYPE_CHECKING:

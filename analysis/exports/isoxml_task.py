@@ -19,11 +19,11 @@ import shapely
 from numpy.typing import NDArray
 from shapely import MultiPolygon, Polygon
 
-from analysis.exports.about import utc_ms
+from analysis.exports.columns import utc_ms
 from analysis.exports.output import geographic, zipped
 
 if TYPE_CHECKING:
-    from analysis.exports.about import About
+    from analysis.exports.columns import About
     from analysis.exports.output import Content
     from analysis.exports.samples import Samples
     from analysis.exports.source import Source

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from mcap.writer import CompressionType, Writer
 
-from analysis.exports.about import utc_ms
+from analysis.exports.columns import utc_ms
 
 if TYPE_CHECKING:
     import numpy as np

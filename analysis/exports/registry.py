@@ -52,12 +52,13 @@ class Format:
 
 FORMATS = (
     Format(
-        name="csv", description="points, one a row", make="csv_points:make",
+        name="csv", description="points, one a row", make="csv_tables:make_points",
         suffixes=(".csv",), has_units=True,
     ),
     Format(
         name="csv-samples", description="path and flow of each valve every 10 ms",
-        make="csv_samples:make", suffixes=(), also=(".csv",), shapes=("steps",), has_rate=False,
+        make="csv_tables:make_samples", suffixes=(), also=(".csv",), shapes=("steps",),
+        has_rate=False,
     ),
     Format(
         name="geojson", description="points or swaths", make="geojson:make",

@@ -6,8 +6,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
-from analysis.exports.about import About, about
-from analysis.exports.columns import Column, System, Unit, point_columns, swath_columns, units_of
+from analysis.exports.columns import (
+    About,
+    Column,
+    System,
+    Unit,
+    about,
+    point_columns,
+    swath_columns,
+    units_of,
+)
 from analysis.exports.samples import Samples, samples_of
 from analysis.exports.swaths import Swaths, swaths_of
 from analysis.flight_record import FlightRecord

@@ -21,11 +21,10 @@ from typing import Any, Literal, NamedTuple
 
 from shapely.errors import ShapelyError
 
-from analysis.assess.assessment import essentials_of
-from analysis.assess.figures import figures_of
+from analysis.assess.assessment import essentials_of, figures_of
 from analysis.flown.applied_record import EvaluationError
+from analysis.flown.holes import GAP_S
 from analysis.flown.read_applied import OFFSET_S_MAX, flight_of
-from analysis.flown.unknown import GAP_S
 from analysis.journals.content import damages
 from analysis.report.legal_fields import told_in
 from analysis.report.treated import treated_of

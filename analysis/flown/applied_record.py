@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from analysis.flight_record import FlightMeta, FlightRecord
+from analysis.flown.holes import with_gaps
 from analysis.flown.modelled_flow import metered, ordered_s, pumped_ml, valve_flows
-from analysis.flown.unknown import with_gaps
 from companion.core.types import TimedChange
 from companion.errors import VrsprayError
 

@@ -3,6 +3,10 @@
 What nobody can read must not become spray: without a hole's rows the last duty would stand until
 the end of the flight. So valves count as closed from the last row before a hole; behind one in the
 changes each of them until its first change, behind one in the samples as the changes say.
+
+Of which times nobody can tell what a valve did: where rows of its flight are missing. There a valve
+counts as closed, so that what nobody can read becomes no spray. But it must not become
+a change that was missed or came metres late either.
 """
 
 from __future__ import annotations
@@ -13,12 +17,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.flight_record import Spans, joined
 from analysis.flown.applied_flight import Floats, Ints, ValveChanges
 
 UNREAD = "unread"
 # `applied` has ten rows a second; a journal has at least ten entries a second, mostly fifty. Fewer
 # mean that the computer stood still, and not that rows are gone.
-GAP_S = 0.5
+ROWS_GAP_S = 0.5
 ENTRIES_PER_S = 10.0
 # What the changes and the samples say may differ for so long: a plan's changes lie ahead of it.
 DIFFERENT_S = 1.0
@@ -69,7 +74,7 @@ def sample_holes(
     order = np.argsort(numbers, kind="stable")
     numbers, times_s = numbers[order], times_s[order]
     lasted_s, entries = np.diff(times_s), np.diff(numbers)
-    gone = np.flatnonzero((lasted_s > GAP_S) & (entries >= ENTRIES_PER_S * lasted_s))
+    gone = np.flatnonzero((lasted_s > ROWS_GAP_S) & (entries >= ENTRIES_PER_S * lasted_s))
     holes = [Hole(float(times_s[i]), float(times_s[i + 1]), 0) for i in gone.tolist()]
     first_s, last_s = float(time_s[0]), float(time_s[-1])
     return _few(
@@ -195,3 +200,45 @@ def _few(holes: list[Hole]) -> list[Hole]:
     if len(holes) <= HOLES_MAX:
         return holes
     return [Hole(holes[0].from_s, _INF, sum(hole.rows for hole in holes))]
+
+
+# Longer than this between two samples nobody knows what the sprayer did.
+GAP_S = 1.0
+
+
+def unknown_times(
+    changes: ValveChanges,
+    samples: Sequence[Hole],
+    missing: Sequence[Hole],
+    *,
+    valves: int,
+) -> tuple[Spans, ...]:
+    """Return the times of each valve; none at all where no rows are missing.
+
+    Of a hole in the samples the changes tell how it ended. Behind one in the changes (`missing`)
+    nothing is known of a valve until its next change.
+    """
+    if not samples and not missing:
+        return ()
+    at_s = np.where(np.isfinite(changes.actual_s), changes.actual_s, changes.planned_s)
+    found = []
+    for valve in range(valves):
+        own_s = np.sort(at_s[changes.valve == valve])
+        spans = [(hole.from_s, hole.until_s) for hole in samples]
+        spans += [(hole.from_s, _first_from_s(own_s, hole.until_s)) for hole in missing]
+        found.append(joined(spans))
+    return tuple(found)
+
+
+def with_gaps(unknown: Sequence[Spans], time_s: Floats, *, valves: int) -> tuple[Spans, ...]:
+    """Return the times of each valve with those over which no sample was taken."""
+    gaps = np.flatnonzero(np.diff(time_s) > GAP_S).tolist()
+    if not gaps:
+        return tuple(unknown)
+    spans = [(float(time_s[i]), float(time_s[i + 1])) for i in gaps]
+    return tuple(joined([*own, *spans]) for own in unknown or ((),) * valves)
+
+
+def _first_from_s(at_s: Floats, from_s: float) -> float:
+    index = int(np.searchsorted(at_s, from_s))
+    return float(at_s[index]) if index < len(at_s) else _INF

@@ -26,11 +26,11 @@ from analysis.flown.holes import (
     doubtful_holes,
     marked,
     sample_holes,
+    unknown_times,
     within,
 )
-from analysis.flown.unknown import unknown_times
-from analysis.journals.blocks import Entry
 from analysis.journals.content import damages, read_entries
+from analysis.journals.unpacking import Entry
 from companion.core.label import from_deg
 from companion.core.setup import Setup
 from companion.core.types import Decision

@@ -2,18 +2,177 @@
 
 from __future__ import annotations
 
+import json
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from analysis.journals.content import read_entries
 from analysis.journals.remaining import remaining
 from analysis.journals.salvage import recover_folder
-from analysis.journals.show import content_lines, content_of
 from companion.cli.answer import AsJson, answer
 from companion.cli.flights import FAILED, ConfigFile, Folder, as_object, line_of, place_of
-from companion.errors import JournalError
+from companion.errors import JournalError, UnreadableError
 from companion.journal.folder import look_at
+from companion.journal.read_only import DAMAGE, one_line
+from companion.journal.reader import OpenJournal, damaged_pages, opened, readable_rows
+from companion.journal.versions import SEE_SHOW, OtherVersionError
+from companion.journal.writer import missing_rows
+from companion.wording import counted
+
+# In `meta` for programs, or shown elsewhere.
+_LONG = frozenset({"setup", "config_toml"})
+_FLIGHT_MAP = "flight_map_json"
+_LINK = (
+    "SELECT count(*), max(lost_percent), max(round_trip_s), min(position_hz), max(bad_frames), "
+    "max(unsent_frames) FROM link_stats"
+)
+_LINK_KEYS = (
+    "samples",
+    "lost_percent",
+    "round_trip_max_s",
+    "position_min_hz",
+    "bad_frames",
+    "unsent_frames",
+)
+_COUNTED = ("applied", "valve_changes", "link_stats", "coverage_tiles", "zones", "events")
+
+
+def content_of(path: Path) -> dict[str, Any]:
+    """Return all of it; `unread` says in a line each what is damaged or unknown.
+
+    JournalError for what is no journal.
+    """
+    result: dict[str, Any] = {
+        "meta": {},
+        "entries": {},
+        "tables": {},
+        "events": [],
+        "link": None,
+        "unread": [],
+    }
+    unread: list[str] = result["unread"]
+    try:
+        with opened(path, is_lenient=True) as journal:
+            _fill(result, journal)
+    except OtherVersionError as error:
+        result["meta"] = _shown(error.meta)
+        unread.append(str(error))
+    except UnreadableError as error:
+        unread.append(str(error).partition("is damaged: ")[2] or str(error))
+    return result
+
+
+def _shown(meta: Mapping[str, str]) -> dict[str, str]:
+    return {key: value for key, value in meta.items() if key not in _LONG}
+
+
+def _fill(result: dict[str, Any], journal: OpenJournal) -> None:
+    unread: list[str] = result["unread"]
+    result["meta"] = _shown(journal.meta)
+    unread += journal.unread
+    kinds: Counter[str] = Counter()
+    result["entries"] = kinds
+    connection = journal.connection
+    unread += damaged_pages(connection)
+    try:
+        for entry in read_entries(connection, journal.version, unread=unread):
+            kinds[entry.kind] += 1
+    except sqlite3.DatabaseError as error:
+        unread.append(f"inputs and decisions behind the first {kinds.total()}: {error}")
+    try:
+        journal.setup()
+    except UnreadableError as error:
+        unread.append(str(error).partition("is damaged: ")[2].removesuffix(SEE_SHOW))
+    except DAMAGE as error:
+        unread.append(f"what earlier flights treated: {one_line(error)}")
+    _fill_tables(result, journal)
+    sql = "SELECT time, time_s, kind, text FROM events ORDER BY sequence"
+    marks = _tried(unread, "events", connection, sql)
+    keys = ("time", "time_s", "kind", "text")
+    result["events"] = [dict(zip(keys, row, strict=True)) for row in marks or []]
+
+
+def _fill_tables(result: dict[str, Any], journal: OpenJournal) -> None:
+    unread: list[str] = result["unread"]
+    connection = journal.connection
+    there = {row[0] for row in connection.execute("SELECT name FROM sqlite_master")}
+    for name in _COUNTED:
+        if name in there:
+            result["tables"][name] = _count(unread, name, connection)
+    told = {text.partition(":")[0] for text in unread}
+    for text in missing_rows(connection, journal.meta):
+        unread += [] if text.partition(":")[0] in told else [text]
+    if "link_stats" in there:
+        rows = _tried(unread, "link_stats", connection, _LINK)
+        if rows and rows[0][0]:
+            result["link"] = dict(zip(_LINK_KEYS, rows[0], strict=True))
+
+
+def _count(unread: list[str], name: str, connection: sqlite3.Connection) -> int:
+    """Return how many rows of a table there are, or can be read."""
+    try:
+        return int(connection.execute(f"SELECT count(*) FROM {name}").fetchone()[0])
+    except sqlite3.DatabaseError as error:
+        count = sum(1 for _ in readable_rows(connection, name, [True]))
+        unread.append(f"{name}: only {count} rows can be read: {one_line(error)}")
+        return count
+
+
+def _tried(
+    unread: list[str], what: str, connection: sqlite3.Connection, sql: str
+) -> list[tuple[Any, ...]]:
+    """Return all rows of a question; what damage hinders is said in `unread`."""
+    try:
+        return connection.execute(sql).fetchall()
+    except sqlite3.DatabaseError as error:
+        unread.append(f"{what}: {' '.join(str(error).split())}")
+        return []
+
+
+def content_lines(content: Mapping[str, Any]) -> Iterator[str]:
+    """Yield it for a person."""
+    for key, value in content["meta"].items():
+        if key == _FLIGHT_MAP:
+            yield f"flight map: {_told_of_map(str(value))}"
+            continue
+        text = " ".join(str(value).split())
+        yield f"{key}: {text if len(text) <= 90 else text[:87] + '...'}"
+    if content["entries"]:
+        counts = ", ".join(f"{count} {kind}" for kind, count in content["entries"].items())
+        yield f"inputs and decisions: {counts}"
+    if content["tables"]:
+        rows = ", ".join(f"{name} {count}" for name, count in content["tables"].items())
+        yield f"rows: {rows}"
+    if content["link"]:
+        link = ", ".join(f"{key} {_number(value)}" for key, value in content["link"].items())
+        yield f"link: {link}"
+    for event in content["events"]:
+        yield f"{event['time'] or '-'} {event['kind']}: {event['text']}"
+    for text in content["unread"]:
+        yield f"not read: {text}"
+
+
+def _told_of_map(text: str) -> str:
+    """Return in a line which flight map was flown; a journal may say anything there."""
+    try:
+        found = json.loads(text)
+        line = (
+            f"{str(found['sha256'])[:8]} of {found['source']}, compiled {found['compiled_utc']} by "
+            f"{found['compiled_by']}, {counted(len(found['findings']), 'finding')}"
+        )
+    except (ValueError, TypeError, LookupError, RecursionError):
+        line = text
+    return " ".join(line.split())[:200]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:g}"
+
 
 SHOW, REMAINING, RECOVER = (
     typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(3)

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from analysis.journals.blocks import Entry, read_blocks, span_text
-from analysis.journals.unpacking import inflated
+from analysis.journals.unpacking import Entry, inflated, read_blocks, span_text
 from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import UnreadableError

@@ -11,8 +11,7 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from analysis.journals.kept_pages import KeptPages, kept_pages
-from analysis.journals.stray_rows import stray_rows, torn_rows
+from analysis.journals.stray_rows import KeptPages, kept_pages, stray_rows, torn_rows
 from companion.atomic_write import sync_folder
 from companion.core.frame import LocalFrame
 from companion.journal import recovery

@@ -1,4 +1,9 @@
-"""From a journal to the files of its report."""
+"""From a journal to the files of its report.
+
+On paper it is the page itself, printed on A4 by a browser that is installed. The page is the only
+design, and a browser prints it best. Nothing else is installed for it: where there is no browser,
+the page can be printed on any other computer.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,10 @@ import csv
 import io
 import json
 import math
+import os
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib import resources
@@ -17,23 +26,18 @@ import shapely
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from analysis.assess.assessment import Assessment, assess
-from analysis.assess.figures import Figures, figures_of
+from analysis.assess.assessment import Assessment, Figures, assess, figures_of
 from analysis.flown.applied_record import EvaluationError
 from analysis.flown.read_applied import read_applied
 from analysis.report.contents import contents_of
-from analysis.report.facts import facts_of
 from analysis.report.legal import LegalRecord, legal_record
-from analysis.report.legal_fields import Told, told_with
+from analysis.report.legal_fields import Told, facts_of, told_with
 from analysis.report.treated import Clock, Treated, clock_of, duration_text, treated_of
 from companion.config.application_table import PROFILES, Profile
+from companion.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from analysis.flown.applied_flight import AppliedFlight
-    from analysis.report.legal import LegalRecord
-
 
 Say = Callable[[str], None]
 TOO_LITTLE = "too little of the journal can be read"
@@ -160,8 +164,6 @@ def _with_files(
     page = page_of(contents, figures)
     files["report.html"] = page.encode()
     if options.with_pdf:
-        from analysis.report.pdf import pdf_of
-
         files["report.pdf"] = pdf_of(page)
     return Report(contents=contents, files=files)
 
@@ -171,7 +173,7 @@ def _figures(
 ) -> tuple[dict[str, bytes], dict[str, dict[str, str]]]:
     """Return the files of all figures, and how they stand in the page."""
     from analysis.report.drawing import drawn_of
-    from analysis.report.figures.style import inline_svg, png_of, stamp, styled, svg_of
+    from analysis.report.figure_style import inline_svg, png_of, stamp, styled, svg_of
 
     files: dict[str, bytes] = {}
     figures: dict[str, dict[str, str]] = {}
@@ -334,3 +336,67 @@ def record_csv(record: LegalRecord) -> bytes:
     writer.writeheader()
     writer.writerow(row)
     return text.getvalue().encode()
+
+
+# Chromium and what is made of it; all take the same options.
+BROWSERS = (
+    "chromium",
+    "chromium-browser",
+    "google-chrome",
+    "google-chrome-stable",
+    "chrome",
+    "microsoft-edge",
+    "brave-browser",
+)
+WITHIN_S = 120.0
+# No network, no first-run pages, nothing kept: the page is whole by itself.
+_OPTIONS = (
+    "--headless",
+    "--disable-gpu",
+    "--no-first-run",
+    "--no-default-browser-check",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-extensions",
+    "--host-resolver-rules=MAP * ~NOTFOUND",
+    "--no-pdf-header-footer",
+)
+
+
+def browser(which: Callable[[str], str | None] = shutil.which) -> str:
+    """Return a browser that prints; ConfigError, in one line, where none is installed."""
+    found = next((path for name in BROWSERS if (path := which(name))), None)
+    if found is None:
+        raise ConfigError(
+            "--pdf: no Chromium or Chrome is installed; install chromium, or leave --pdf out and "
+            "print report.html from any browser"
+        )
+    return found
+
+
+def pdf_of(page: str, *, program: str | None = None) -> bytes:
+    """Return a page as PDF; ConfigError where the browser does not make one."""
+    program = program or browser()
+    with tempfile.TemporaryDirectory(prefix="vrspray-pdf-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        source, target = folder / "report.html", folder / "report.pdf"
+        source.write_text(page, encoding="utf-8")
+        # A browser refuses its sandbox to root, who needs none against a page of our own.
+        is_root = hasattr(os, "geteuid") and os.geteuid() == 0
+        command = [
+            program,
+            *_OPTIONS,
+            *(["--no-sandbox"] if is_root else []),
+            f"--user-data-dir={folder / 'profile'}",
+            f"--print-to-pdf={target}",
+            source.as_uri(),
+        ]
+        try:
+            subprocess.run(command, capture_output=True, timeout=WITHIN_S, check=False)
+            found = target.read_bytes()
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise ConfigError(
+                f"--pdf: {program} did not print the page; print report.html from a browser"
+            ) from error
+    return found

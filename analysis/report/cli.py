@@ -61,9 +61,8 @@ def report_flight(
     Exit 0: written; 1: of a journal that was cut, is damaged, lacks rows or is of another version:
     what can be read is written; 2: no journal, an option is wrong, or DIR cannot be written.
     """
-    from analysis.report.build import ReportOptions, build_report
+    from analysis.report.build import ReportOptions, browser, build_report
     from analysis.report.folder import check_folder, earlier_files, write_files
-    from analysis.report.pdf import browser
     from analysis.report.treated import zone_of
 
     began_s = time.perf_counter()

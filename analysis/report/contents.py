@@ -10,22 +10,18 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, Literal
 
 from analysis.assess.causes import Cause, rate_wishes
-from analysis.flown.holes import UNREAD
-from analysis.flown.unknown import GAP_S
+from analysis.flown.holes import GAP_S, UNREAD
 from analysis.journals.content import content_sha256
 from analysis.published import P1_RESULTS
-from analysis.report.facts import wind_note
 from analysis.report.label import label_of
+from analysis.report.legal_fields import wind_note
 from analysis.report.treated import duration_text
 from companion.core.types import Inhibit
 from companion.simulated import SIMULATED
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from analysis.assess.assessment import Assessment
+    from analysis.assess.assessment import Assessment, Figures
     from analysis.assess.breakdowns import AccuracyGroup
-    from analysis.assess.figures import Figures
     from analysis.flown.applied_flight import AppliedFlight
     from analysis.report.legal import LegalRecord
     from analysis.report.legal_fields import Told

@@ -14,22 +14,25 @@ from matplotlib.path import Path
 from matplotlib.ticker import NullLocator
 
 from analysis.report.contents import CAUSES
-from analysis.report.figures.sheet import NOTHING_COLOUR, Sheet, dress, sheet_of
-from analysis.report.figures.style import (
+from analysis.report.figure_style import (
     BLUE,
     DEVIATION_MAP,
     FAINT,
     GRID,
     INK,
+    NOTHING_COLOUR,
     RATES_MAP,
     RED,
     SKY,
     Drawn,
+    Sheet,
+    dress,
     new_figure,
+    sheet_of,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Sequence
 
     from matplotlib.axes import Axes
     from matplotlib.collections import QuadMesh
@@ -38,12 +41,10 @@ if TYPE_CHECKING:
     from analysis.assess.assessment import Assessment
     from analysis.assess.breakdowns import Group
     from analysis.assess.cell_maps import CellMaps, Histogram
-    from analysis.assess.intervals import Interval
     from analysis.evaluation import Evaluation
     from analysis.lag import Step
-    from analysis.report.figures.sheet import Sheet
-    from analysis.report.figures.style import Drawn
     from analysis.report.treated import Clock, Treated
+    from analysis.student import Interval
     from analysis.track import Floats, Ints
 
 
@@ -51,7 +52,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.ticker import MaxNLocator
 
-from analysis.report.figures.style import GREEN, Drawn
+from analysis.report.figure_style import GREEN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

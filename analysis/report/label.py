@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.report.facts import is_estimate, while_spraying
+from analysis.report.legal_fields import is_estimate, while_spraying
 from companion.config.limits import WATCH_S, LimitsFile, limits_of
 from companion.core.label import DAY_S, LabelLimits, is_from
 

@@ -52,7 +52,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import field
 
-from analysis.wsp.quality import FUNGICIDE_PER_CM2, INSECTICIDE_PER_CM2, OVERSPRAY_PERCENT
+from analysis.wsp.card import FUNGICIDE_PER_CM2, INSECTICIDE_PER_CM2, OVERSPRAY_PERCENT
 
 FIGURE = "distributions.png"
 

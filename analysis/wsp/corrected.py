@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from analysis.wsp.outlines import Outlines, outlines_of
 from analysis.wsp.sizes import LEAST_DROP_UM, Spread, sizes, stain_um
-from analysis.wsp.stains import LEAST_CONTRAST, Stains, drops_px, segment
+from analysis.wsp.stains import LEAST_CONTRAST, Outlines, Stains, drops_px, outlines_of, segment
 
 # Stains at the limit of what counts: found where blur leaves no pixel dark, sized by their peaks.
 #

@@ -10,8 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from analysis.wsp.card import Card, Method, SheetResult
-from analysis.wsp.quality import FUNGICIDE_PER_CM2, INSECTICIDE_PER_CM2, OVERSPRAY_PERCENT
+from analysis.wsp.card import (
+    FUNGICIDE_PER_CM2,
+    INSECTICIDE_PER_CM2,
+    OVERSPRAY_PERCENT,
+    Card,
+    Method,
+    SheetResult,
+)
 from analysis.wsp.sizes import LEAST_DROP_UM, second_of
 from analysis.wsp.stains import LAW, UNRELIABLE_PERCENT
 

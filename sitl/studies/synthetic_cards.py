@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from analysis.wsp.rectangle import Rectangle
+from analysis.wsp.image import Rectangle
 from analysis.wsp.sizes import LEAST_DROP_UM
 
 Bytes = NDArray[np.uint8]

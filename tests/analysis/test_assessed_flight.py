@@ -14,7 +14,7 @@ import pytest
 
 from analysis.assess.assessment import Assessment, assess
 from analysis.evaluation import Evaluation, evaluate
-from analysis.exports import csv_samples
+from analysis.exports import csv_tables
 from analysis.exports.source import Source
 from analysis.flown.applied_flight import AppliedFlight
 from analysis.flown.applied_record import record_of
@@ -68,7 +68,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
 
 def test_figures_agree_with_those_of_an_independent_script(flown: Flown, tmp_path: Path) -> None:
     samples = tmp_path / "samples.csv"
-    for name, chunks in csv_samples.make(
+    for name, chunks in csv_tables.make_samples(
         Source(flight=flown.flight, shape="points"), samples
     ).items():
         (tmp_path / name).write_bytes(b"".join(chunks))

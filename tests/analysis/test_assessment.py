@@ -17,11 +17,17 @@ from analysis.assess.assessment import Assessment, _no_less_than_0, assess, bala
 from analysis.assess.breakdowns import speed_bin
 from analysis.assess.causes import Cause
 from analysis.assess.cell_maps import cell_maps
-from analysis.assess.intervals import NOTHING, Interval, crossings_of, mean_interval, ratio_interval
 from analysis.flown.applied_flight import Series
 from analysis.flown.applied_record import record_of
 from analysis.strips import strips_of
-from analysis.student import t_factor
+from analysis.student import (
+    NOTHING,
+    Interval,
+    crossings_of,
+    mean_interval,
+    ratio_interval,
+    t_factor,
+)
 from companion.core.cells import CellGrid, Warp
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup

@@ -19,8 +19,7 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from analysis.bucket import BucketCurve, Catch, fit_bucket
-from analysis.bucket_table import valves_of
-from analysis.calibrate_flow import flow
+from analysis.calibrate_flow import flow, valves_of
 from analysis.csv_rows import TableError
 from analysis.published import EIGHT, SETS, TWELVE, disagreements, excess_percent
 from sitl.profile import load_profile

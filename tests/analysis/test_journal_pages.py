@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.journals.kept_pages import kept_pages
-from analysis.journals.stray_rows import stray_rows
+from analysis.journals.stray_rows import kept_pages, stray_rows
 from companion.journal.geopackage import PAGE_BYTES, SCHEMA
 from companion.journal.leaf_page import (
     COLUMNS,

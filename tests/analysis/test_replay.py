@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from numpy._core import _multiarray_umath
 
-from analysis.journals.blocks import Entry
+from analysis.journals.unpacking import Entry
 from analysis.replay import FlownCore, first_difference, override, replay
 from companion.cli.app import execute
 from companion.core.setup import Setup

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from analysis.report.pdf import BROWSERS, pdf_of
+from analysis.report.build import BROWSERS, pdf_of
 from companion.cli.app import execute
 from companion.errors import ConfigError
 from tests.analysis.report_flight import EU_TOLD, fly

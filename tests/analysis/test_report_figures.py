@@ -12,11 +12,9 @@ import shapely.affinity
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.assess.assessment import assess
+from analysis.assess.assessment import assess, bound_m, figures_of, uncertainty_m, worst_of
 from analysis.assess.causes import _shares
-from analysis.assess.figures import figures_of
 from analysis.assess.ground_elements import SquareGrid
-from analysis.assess.worst import bound_m, uncertainty_m, worst_of
 from analysis.flown.applied_flight import AppliedFlight, Series
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import ReportOptions, build_report

@@ -12,9 +12,8 @@ import pytest
 
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import record_csv, record_json
-from analysis.report.facts import facts_of
 from analysis.report.legal import legal_record
-from analysis.report.legal_fields import Facts, Told, told_with
+from analysis.report.legal_fields import Facts, Told, facts_of, told_with
 from analysis.report.treated import Clock, treated_of
 from companion.config.application_table import PROFILES, Profile
 from companion.simulated import Simulated

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from analysis.assess.assessment import assess
+from analysis.assess.assessment import assess, figures_of
 from analysis.assess.causes import Cause
 from analysis.assess.cell_maps import Histogram
-from analysis.assess.figures import figures_of
 from analysis.flown.read_applied import read_applied
 from analysis.report.build import Report, ReportOptions, build_report, embedded, page_of
 from analysis.report.contents import (

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from analysis.wsp import cli
-from analysis.wsp.rectangle import Rectangle
+from analysis.wsp.image import Rectangle
 from companion.cli.app import execute
 from sitl.studies.synthetic_cards import Scanner, Spray, draw_sheet, save
 from tests.analysis.test_wsp_flight import flown

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from analysis.wsp.corrected import Counted, at_edge, crossings, drops_on, notches, seen_share
-from analysis.wsp.outlines import Outlines, outlines_of
-from analysis.wsp.stains import drops_px, segment
+from analysis.wsp.stains import Outlines, drops_px, outlines_of, segment
 
 SIDE, BEYOND = 700, 30
 PAPER, STAIN, LEVEL = 180.0, 80.0, 130

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from analysis.wsp.card import INSET_MM, Method, Reading, SheetResult, read_sheet
-from analysis.wsp.image import Sheet, find_cards
-from analysis.wsp.rectangle import Rectangle, around
+from analysis.wsp.image import Rectangle, Sheet, around, find_cards
 from sitl.studies.synthetic_cards import Scanner, Spray, TrueSheet, draw_card, draw_sheet
 
 DPI = 300.0

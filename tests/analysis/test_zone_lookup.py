@@ -7,7 +7,7 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.zone_lookup import PIECE, lookup_of
+from analysis.changes import PIECE, lookup_of
 from companion.core.prescription import Prescription, Zone
 from tests.builders import plots
 

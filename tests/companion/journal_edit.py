@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
-from analysis.journals.blocks import Entry, read_blocks
+from analysis.journals.unpacking import Entry, read_blocks
 from companion.journal.rows import Block
 
 

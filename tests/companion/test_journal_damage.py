@@ -13,9 +13,9 @@ from typing import Any
 
 import pytest
 
+from analysis.journals.cli import content_of
 from analysis.journals.content import read_journal
 from analysis.journals.salvage import recover, recover_folder
-from analysis.journals.show import content_of
 from companion.cli.app import execute
 from companion.cli.record_parts import made_ready
 from companion.config.tables import JournalTable

@@ -1,1 +1,0 @@
-"""The figures of a report, one kind a file; every function returns a `Drawn`."""
