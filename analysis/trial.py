@@ -8,12 +8,13 @@ treatment is that over all blocks (least squares), so that a plot which is left 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from shapely.affinity import translate
 
 from analysis.assess.ground_elements import slices_of
 
@@ -31,6 +32,8 @@ PIECE_M = 0.25
 APART_S = 0.02
 CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
 M2_PER_HA, ML_PER_L = 10_000.0, 1000.0
+# Standard deviations to either side within which 95 % lie.
+NORMAL_95 = 1.96
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,6 +108,45 @@ def achieved(
             )
         )  # fmt: skip
     return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Errors:
+    """How far the record may be off, one standard deviation each.
+
+    Of the position and of the time of a change, which moves it along the pass, and of the meter or
+    the flow curve, which is one factor for all plots.
+    """
+
+    position_m: float
+    lag_s: float
+    speed_m_s: float
+    meter_percent: float
+
+
+def half_intervals(
+    found: Sequence[Achieved], strips: Sequence[Strip], errors: Errors
+) -> list[float]:
+    """Return half the 95 % interval of what each plot got [L/ha].
+
+    The plot is moved under the strips by one standard deviation each way: what that changes, and
+    the meter's share of the rate, add up as squares.
+    """
+    moved_m = float(np.hypot(errors.position_m, errors.speed_m_s * errors.lag_s))
+    loose = Tolerance(rate_percent=100.0, covered_percent=0.0)
+    squares = [(errors.meter_percent / 100.0 * one.rate_l_ha) ** 2 for one in found]
+    for east_m, north_m in ((moved_m, 0.0), (0.0, moved_m)):
+        changes = np.zeros(len(found))
+        for sign in (-1.0, 1.0):
+            plots = [
+                replace(one.plot, inner=translate(one.plot.inner, sign * east_m, sign * north_m))
+                for one in found
+            ]
+            there = achieved(plots, strips, loose)
+            change = [abs(a.rate_l_ha - b.rate_l_ha) for a, b in zip(there, found, strict=True)]
+            changes = np.maximum(changes, change)
+        squares = [square + change**2 for square, change in zip(squares, changes, strict=True)]
+    return [NORMAL_95 * float(np.sqrt(square)) for square in squares]
 
 
 def _ground(slices: Slices) -> NDArray[np.object_]:

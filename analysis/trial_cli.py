@@ -69,6 +69,16 @@ def evaluate_trial(
             metavar="PCT", help="A plot fails with less of it sprayed.", min=1.0, max=100.0
         ),
     ] = 90.0,
+    position_m: Annotated[
+        float, typer.Option(metavar="M", help="Error of positions, 1 sd.", min=0.0, max=10.0)
+    ] = 0.05,
+    lag_s: Annotated[
+        float, typer.Option(metavar="S", help="Error of the lags, 1 sd.", min=0.0, max=1.0)
+    ] = 0.02,
+    meter_percent: Annotated[
+        float,
+        typer.Option(metavar="PCT", help="Of flow meter or curve, 1 sd.", min=0.0, max=50.0),
+    ] = 3.0,
     keep_failed: Annotated[
         bool, typer.Option("--keep-failed", help="Compare yields of plots that failed, too.")
     ] = False,
@@ -81,7 +91,7 @@ def evaluate_trial(
 
     Exit 0: evaluated; 1: plots failed, or yields cannot be compared; 2: a file cannot be used.
     """
-    from analysis.trial import Tolerance, achieved
+    from analysis.trial import Errors, Tolerance, achieved, half_intervals
 
     if (harvest is None) != (value is None):
         raise typer.BadParameter("--harvest and --value go together")
@@ -92,14 +102,24 @@ def evaluate_trial(
     plots = local_plots(features, frame)
     tolerance = Tolerance(rate_percent=tolerance_percent, covered_percent=covered_percent)
     found = achieved(plots, strips, tolerance)
+    errors = Errors(
+        position_m=position_m, lag_s=lag_s, speed_m_s=float(trial.get("speed_m_s") or 0.0),
+        meter_percent=meter_percent,
+    )  # fmt: skip
+    halves = half_intervals(found, strips, errors)
     result: dict[str, Any] = {
         "trial": trial,
         "journals": [str(path) for path in journals],
-        "plots": [_row(one) for one in found],
+        "plots": [_row(one, half) for one, half in zip(found, halves, strict=True)],
+        "errors": {"position_m": position_m, "lag_s": lag_s, "meter_percent": meter_percent},
         "failed": sum(bool(one.reasons) for one in found),
         "yield": None,
     }
-    lines = [_line(one) for one in found]
+    lines = [_line(one, half) for one, half in zip(found, halves, strict=True)]
+    lines.append(
+        f"95 % intervals: positions {position_m:g} m, lags {lag_s:g} s, meter {meter_percent:g} %, "
+        "1 sd each; the meter's is one factor for all plots"
+    )
     if harvest is not None and value is not None:
         lines += _yields(result, found, harvest, value, frame, keep_failed=keep_failed)
     if out is not None:
@@ -304,13 +324,14 @@ def _shape_rows(path: Path, value: str) -> list[tuple[float, float, float]]:
     return list(zip(latitude.tolist(), longitude.tolist(), values, strict=True))
 
 
-def _row(one: Achieved) -> dict[str, Any]:
+def _row(one: Achieved, half: float) -> dict[str, Any]:
     error = one.error_l_ha
     return {
         "plot": one.plot.number,
         "block": one.plot.block,
         "rate_l_ha": one.plot.rate_l_ha,
         "achieved_l_ha": one.rate_l_ha,
+        "achieved_half_95_l_ha": half,
         "error_l_ha": error,
         "error_percent": None
         if not one.plot.rate_l_ha > 0.0
@@ -322,12 +343,13 @@ def _row(one: Achieved) -> dict[str, Any]:
     }
 
 
-def _line(one: Achieved) -> str:
+def _line(one: Achieved, half: float) -> str:
     plot = one.plot
     sd = "" if one.sd_l_ha is None else f", sd {one.sd_l_ha:.2f}"
     text = (
         f"plot {plot.number} (block {plot.block}, {plot.rate_l_ha:g} L/ha): "
-        f"{one.rate_l_ha:.2f} L/ha ({one.error_l_ha:+.2f}{sd}), {one.covered_percent:.0f} % sprayed"
+        f"{one.rate_l_ha:.2f} ± {half:.2f} L/ha ({one.error_l_ha:+.2f}{sd}), "
+        f"{one.covered_percent:.0f} % sprayed"
     )
     return f"{text}; FAILED: {', '.join(one.reasons)}" if one.reasons else text
 

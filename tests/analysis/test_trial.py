@@ -11,7 +11,15 @@ import shapely
 
 from analysis.strips import strips_of
 from analysis.student import f_above, t_factor
-from analysis.trial import Plot, Tolerance, achieved, plot_means, treatment_means
+from analysis.trial import (
+    Errors,
+    Plot,
+    Tolerance,
+    achieved,
+    half_intervals,
+    plot_means,
+    treatment_means,
+)
 from analysis.trial_cli import TrialError, read_harvest, read_trial
 from tests.analysis.report_flight import fly
 
@@ -112,6 +120,27 @@ def test_a_plots_rate_is_the_volume_on_its_ground(strips: list[object]) -> None:
     (twice,) = achieved([plot], [strips[0], strips[0]], tolerance)  # type: ignore[list-item]
     assert twice.rate_l_ha == pytest.approx(2.0 * found.rate_l_ha)
     assert any("times" in one for one in twice.reasons)
+
+
+def test_the_interval_of_a_plot_is_of_place_lag_and_meter(strips: list[object]) -> None:
+    tolerance = Tolerance(rate_percent=10.0, covered_percent=90.0)
+    found = achieved([plot_under(strips, 14.0, 20.0, 20.0)], strips[:1], tolerance)  # type: ignore[arg-type]
+
+    def half(**errors: float) -> float:
+        given = {"position_m": 0.0, "lag_s": 0.0, "speed_m_s": 5.0, "meter_percent": 0.0}
+        (one,) = half_intervals(found, strips[:1], Errors(**given | errors))  # type: ignore[arg-type]
+        return one
+
+    meter = half(meter_percent=3.0)
+    assert meter == pytest.approx(1.96 * 0.03 * found[0].rate_l_ha)
+    assert half() == 0.0
+    # A strip 1 m wide covers the plot's 0.8 m: moved by 0.6 m across it leaves half of it dry.
+    assert half(position_m=0.6) > 1.96 * 0.3 * found[0].rate_l_ha
+    assert half(position_m=0.02) < half(position_m=0.3) < half(position_m=0.6)
+    assert half(lag_s=0.12) == pytest.approx(half(position_m=0.6))
+    assert half(position_m=0.6, meter_percent=3.0) == pytest.approx(
+        np.hypot(half(position_m=0.6), meter)
+    )
 
 
 def test_a_plot_that_nobody_flew_over_fails_unless_it_gets_nothing(strips: list[object]) -> None:
