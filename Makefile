@@ -9,6 +9,8 @@ WORKERS ?= 2
 FLIGHT_WORKERS ?= 4
 # Python's development mode, but for its guards around memory: those are for modules in C, and slow.
 STRICT := PYTHONDEVMODE=1 PYTHONMALLOC=pymalloc
+# Files whole, and those first that tests/conftest.py puts first: not those of the most tests.
+BY_FILE := --dist loadfile --no-loadscope-reorder
 # What goes by the wall clock.
 IN_REAL_TIME := $(wildcard tests/*/realtime)
 # Each Python needs its own: make PYTHON=python3.13 VENV=.venv-3.13 test
@@ -39,14 +41,14 @@ test: $(INSTALLED) ## all tests (ARGS="-k lag" for some; WORKERS=0 for one proce
 ifeq ($(strip $(ARGS)),)
 	@$(BIN)/python -m tests.whole $(MAKE)
 else
-	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(ARGS)
+	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) $(BY_FILE) $(ARGS)
 endif
 
 test-computing: $(INSTALLED) ## of these all but the flights in real time
-	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile $(IN_REAL_TIME:%=--ignore %) $(ARGS)
+	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) $(BY_FILE) $(IN_REAL_TIME:%=--ignore %) $(ARGS)
 
 test-flights: $(INSTALLED) ## of these the flights in real time: leave them two idle cores
-	$(BIN)/pytest --numprocesses $(FLIGHT_WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS) $(IN_REAL_TIME)
+	$(BIN)/pytest --numprocesses $(FLIGHT_WORKERS) $(BY_FILE) $(ARGS) $(IN_REAL_TIME)
 
 # A change runs the tests of its own package first. What flies replays the recorded flights, too.
 test-companion: ## the companion's tests, but for its flights in real time
@@ -54,7 +56,7 @@ test-missions test-analysis test-sitl: ## the same of another package
 test-companion: ALSO := tests/golden
 test-companion test-missions test-analysis test-sitl: export PYTHONDONTWRITEBYTECODE :=
 test-companion test-missions test-analysis test-sitl: test-%: $(INSTALLED)
-	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) --dist loadfile --ignore tests/$*/realtime $(ARGS) $* tests/$* $(ALSO)
+	$(STRICT) $(BIN)/pytest --numprocesses $(WORKERS) $(BY_FILE) --ignore tests/$*/realtime $(ARGS) $* tests/$* $(ALSO)
 
 lint: format-check ruff mypy imports ## format, ruff, mypy, import rules
 
