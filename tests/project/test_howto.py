@@ -18,7 +18,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyogrio
 import pytest
+import rasterio
+import shapely
 import typer
 from click.testing import Result
 from typer.testing import CliRunner
@@ -64,7 +68,8 @@ def commands(page: Path, kinds: Collection[str] = ("", "sh", "text")) -> list[st
     return [line.strip() for line in lines if line.strip().startswith("vrspray ")]
 
 
-EVERY = [(page.name, command) for page in PAGES for command in commands(page)]
+REAL_FIELDS = ROOT / "docs" / "measurements" / "real-fields.md"
+EVERY = [(page.name, command) for page in (*PAGES, REAL_FIELDS) for command in commands(page)]
 
 
 @cache
@@ -198,3 +203,44 @@ def test_the_shipped_action_file_has_the_buttons_that_the_page_names() -> None:
     assert all(f"*{one['label']}*" in page for one in actions)
     assert [one["mavCmd"] for one in actions] == [DO_SPRAYER, DO_SPRAYER, USER_ESTOP]
     assert {one["compId"] for one in actions} == {191}
+
+
+@pytest.mark.timeout(400)
+def test_the_commands_of_a_real_field_run_one_after_the_other(tmp_path: Path) -> None:
+    """The page's data are others' and not here: a made-up image takes their name, on 0.2 ha."""
+    outline = [(0.0, 0.0), (60.0, 0.0), (60.0, 36.0), (0.0, 36.0)]
+    east_m, north_m = 284_000.0, 6_131_000.0  # GDA94, MGA zone 54
+    ground = shapely.Polygon([(east_m + x, north_m + y) for x, y in outline])
+    name = "area1_onebox_94mga54.shp"
+    pyogrio.raw.write(
+        tmp_path / name, np.array([shapely.to_wkb(ground)]), [np.array([1])], ["id"],
+        geometry_type="Polygon", crs="EPSG:28354",
+    )  # fmt: skip
+    values = np.full((16, 26), 0.2)
+    values[:, 13:] = 0.3
+    with rasterio.open(
+        tmp_path / "area1_onebox_NDVI_250cm.tif", "w", driver="GTiff", width=26, height=16,
+        count=1, dtype="float64", crs="EPSG:28354",
+        transform=rasterio.Affine(2.5, 0.0, east_m - 2.5, 0.0, -2.5, north_m + 38.0),
+    ) as image:  # fmt: skip
+        image.write(values, 1)
+    config = tmp_path / "made.toml"
+    text = (ROOT / "examples/zones/config.toml").read_text(encoding="utf-8")
+    text = text.replace('file = "map.gpkg"', 'file = "made.geojson"')
+    config.write_text(text.replace('boundary = "boundary.geojson"', f'boundary = "{name}"'))
+    typed = commands(REAL_FIELDS)
+    assert [shlex.split(one)[1] for one in typed] == ["make", "plan", "sitl", "report"]
+    for command in typed:
+        words = shlex.split(command)[1:]
+        if words[0] == "make":
+            words.append("--json")
+        done = vrspray(tmp_path, *words)
+        assert done.exit_code == 0, f"{command}\n{done.output}{done.exception!r}"
+        if words[0] == "make":
+            course = json.loads(done.stdout)["course_deg"]
+            said = ('angle_deg = "auto"', f"angle_deg = {course}")
+            config.write_text(config.read_text().replace(*said))
+        elif words[0] == "plan":
+            said = ("[mission]", '[mission]\nlines = "made.lines.geojson"')
+            config.write_text(config.read_text().replace(*said))
+    assert (tmp_path / "report" / "report.html").is_file()
