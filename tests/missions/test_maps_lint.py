@@ -160,6 +160,12 @@ CASES = [
     ),
     Case(
         code="uncovered",
+        given=cells_map([[1.0, NAN]], boundary=cell(0, width=1.4)),
+        says=r"40\.0 m2 .* in no cell with a rate",
+        place="row 1, column 2 at 35.996050, 114.543150",
+    ),
+    Case(
+        code="uncovered",
         given=cells_map([[1.0]], boundary=cell(0, width=2)),
         says=r"100\.0 m2",
         place="the largest part at 35.996050, 114.543150",

@@ -345,11 +345,14 @@ def _of_cells(survey: Survey, cells: MapCells, boundary: Geometry) -> Ground:
     beyond = shapely.difference(boundary, grid)
     bare = survey.cells_inside & ~survey.rated
     outside = ~survey.cells_inside & survey.rated & (survey.rates > 0.0)
-    where = survey.cell_spots(bare) or _largest(survey, beyond)
     share_m2 = survey.area_m2
     if survey.boundary_deg is not None:
         share_m2 = shares_inside(cells, survey.boundary_deg) * survey.area_m2
-    empty_m2 = beyond.area + float(share_m2[~survey.rated].sum())
+    # Along a slanted edge a cell whose centre lies outside holds ground of the field, too.
+    cut_m2 = float(share_m2[~survey.rated].sum())
+    cut = survey.cell_spots(~survey.rated & (share_m2 > 0.0))
+    where = survey.cell_spots(bare) or (_largest(survey, beyond) if beyond.area > cut_m2 else cut)
+    empty_m2 = beyond.area + cut_m2
     sprayed = survey.rated & (survey.rates > 0.0)
     outside_m2 = float((survey.area_m2 - share_m2)[sprayed].sum())
     return (empty_m2, where), (outside_m2, survey.cell_spots(outside))
@@ -357,6 +360,7 @@ def _of_cells(survey: Survey, cells: MapCells, boundary: Geometry) -> Ground:
 
 def _largest(survey: Survey, ground: Geometry) -> str:
     parts = shapely.get_parts(ground)
+    parts = parts[~shapely.is_empty(parts)]  # an empty polygon is a part of itself
     if not len(parts):
         return ""
     largest = parts[int(np.argmax(shapely.area(parts)))]
