@@ -132,9 +132,13 @@ def _without_runs(stops: list[Stop]) -> list[Stop]:
 
 @dataclass(slots=True)
 class _Row:
-    """Places in a row that are no waypoints, and the first of them at which a line ends."""
+    """Places in a row that are no waypoints, and the first of them at which a line ends.
+
+    Of those `passed` the `straight` ones lie straight on.
+    """
 
     passed: list[Place] = field(default_factory=list)
+    straight: list[Place] = field(default_factory=list)
     ended: Place | None = None
 
     def leaves_out(
@@ -145,13 +149,18 @@ class _Row:
         A line whose leg begins or ends too far beyond it stays dry: of a gap one place stays.
         """
         before, here, after = ends
+        # Most places are corners: what is no run and not passed is known at once.
+        if not _is_beside(before, here, after, SAME_M / 2.0):
+            return False
         ended = here if self.ended is None and opens is False else self.ended
         is_far = opens is True and math.dist(before, here) > RUN_M
         is_far |= ended is not None and math.dist(ended, after) > RUN_M
-        is_straight = self.ended is None and is_run(*ends)
+        is_straight = self.ended is None and is_run(*ends, self.passed, self.straight)
         if is_far or not (is_straight or (on_line and is_passed(*ends, self.passed))):
             return False
         self.passed.append(here)
+        if is_straight:
+            self.straight.append(here)
         self.ended = ended
         return True
 
@@ -171,14 +180,26 @@ def is_passed(before: Place, here: Place, after: Place, passed: Sequence[Place] 
     return near and all(_is_beside(before, each, after, SAME_M / 2.0) for each in (here, *passed))
 
 
-def is_run(before: Place, here: Place, after: Place) -> bool:
+def is_run(
+    before: Place,
+    here: Place,
+    after: Place,
+    passed: Sequence[Place] = (),
+    straight: Sequence[Place] = (),
+) -> bool:
     """Return whether a place between two others needs no waypoint: straight on, near to one.
+
+    What was passed before keeps as near to the way: small bends of a long row would add up.
 
     >>> is_run((0.0, 0.0), (0.0, 7.2), (0.0, 90.0)), is_run((0.0, 0.0), (0.0, 80.0), (6.0, 80.0))
     (True, False)
     """
     near_m = min(math.dist(before, here), math.dist(here, after))
-    return near_m <= RUN_M and _is_beside(before, here, after, ASIDE_M)
+    return (
+        near_m <= RUN_M
+        and all(_is_beside(before, each, after, ASIDE_M) for each in (here, *straight))
+        and all(_is_beside(before, each, after, SAME_M / 2.0) for each in passed)
+    )
 
 
 def _is_beside(before: Place, here: Place, after: Place, aside_m: float) -> bool:

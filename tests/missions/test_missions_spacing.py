@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import shapely
-from shapely import LineString, box
+from shapely import LineString, Point, box
 
 from missions.boom import Boom
 from missions.demand import Uniform
@@ -155,6 +155,17 @@ def test_no_line_before_or_behind_a_long_gap_is_taken_for_a_ferry(
                 low - 30.0 <= min(leg) <= low and high <= max(leg) <= high + 30.0
                 for leg in pairwise(x)
             )
+
+
+@pytest.mark.parametrize("length_m", [4.0, 10.0, 24.0])
+def test_small_bends_of_a_long_row_of_lines_do_not_add_up(length_m: float) -> None:
+    # A border of 100 km radius: each line ends less than 6 mm beside the straight of the last two.
+    x_m = length_m * np.arange(61)
+    places = [(float(x), 30.0 + float(x**2 / 200_000.0)) for x in x_m]
+    stops = waypoints_of(sortie_of(*pairwise(places)))
+    way = LineString([stop.place for stop in stops[1:]])
+    assert max(way.distance(Point(place)) for place in places[:-1]) < 0.05
+    assert len(stops) < len(places) / 2
 
 
 def test_a_row_of_short_lines_is_timed_as_it_is_flown() -> None:
