@@ -19,7 +19,7 @@ from companion.cli.answer import AsJson, Tell, answer, note, progress
 from companion.errors import MapError
 from companion.wording import counted
 from missions.errors import PlanError
-from missions.files.fence import Fences, fence_warnings
+from missions.files.fence import Fences, Ground, fence_warnings
 from missions.files.pilot_sheet import (
     check_sheet,
     ground_text,
@@ -36,7 +36,7 @@ from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan
 from missions.planner import plan_mission
 from missions.prices import closing_hint, overlap_warnings, prices
-from missions.reading import Asked, Task, assumed, names_of, read_task
+from missions.reading import Asked, assumed, names_of, read_task
 from missions.reading_fleet import BreakAsked
 from missions.reading_ground import Autopilot, GroundAsked, label_warnings, parse_run_in, parse_wind
 from missions.reading_outline import CORRIDOR_MAX_M, RADIUS_MAX_M
@@ -260,12 +260,15 @@ def plan(
     }
     if sprayer and ends_over:
         raise typer.BadParameter("--ends-over needs valves that close one by one, not --sprayer")
+    is_fenced = out.suffix.casefold() == ".plan"
     with _seldom_collected():
         task = read_task(asked, reading.config, changes)
         with progress(after_s=BAR_AFTER_S) as tell, _stoppable(tell) as watch:
-            planned, fences = _fenced(
-                task, with_sprayer=sprayer, looks=out.suffix.casefold() == ".plan"
-            )
+            fences = Fences(Ground(field=task.field, settings=task.settings))
+            planned = plan_mission(
+                task.field, task.settings, task.rates, depots=task.depots, left=task.left,
+                around=task.around, with_sprayer=sprayer, fences=fences if is_fenced else None,
+            )  # fmt: skip
     flown_s = [planned.airborne_s(sortie) for sortie in planned.sorties]
     by_label = label_warnings(reading.config, flown_s, datetime.now(tz=UTC).timestamp())
     planned = replace(
@@ -286,7 +289,7 @@ def plan(
     removed = _removed(older_sorties(out, files))
     if png is not None:
         draw_plan(planned, png, title=field.stem)
-    if out.suffix.casefold() == ".plan":
+    if is_fenced:
         planned = replace(planned, warnings=(*planned.warnings, *fence_warnings(planned, fences)))
     warnings = planned.warnings
     once = isinstance(task.rates, UntreatedRates)
@@ -333,29 +336,6 @@ _FLOWN_ONCE = (
     "fly it with `vrspray run --continue`: its guard closes the valves on treated ground and on "
     "what is covered twice, and the litres count neither"
 )
-
-
-def _fenced(task: Task, *, with_sprayer: bool, looks: bool) -> tuple[Plan, Fences]:
-    """Return the plan and its fences; where one has no room, with more sorties."""
-
-    def planned(*, fenced: bool = False) -> Plan:
-        return plan_mission(
-            task.field, task.settings, task.rates, depots=task.depots, left=task.left,
-            around=task.around, with_sprayer=with_sprayer, fenced=fenced,
-        )  # fmt: skip
-
-    plan = planned()
-    fences = Fences(plan)
-    lack = sum(not fences.has_room(each) for each in plan.sorties) if looks else 0
-    if not lack:
-        return plan, fences
-    more = planned(fenced=True)
-    text = (
-        f"{counted(lack, 'sortie')} would have a fence with more corners than the autopilot has "
-        f"room for: they are flown as several, {counted(len(more.sorties), 'sortie')} in place of "
-        f"{len(plan.sorties)}"
-    )
-    return replace(more, warnings=(*more.warnings, text)), Fences(more)
 
 
 @contextmanager

@@ -64,6 +64,7 @@ def fleet_sorties(
     all_places = np.unique(np.concatenate(places), axis=0) if not len(depots) else depots
     sorties: list[Sortie] = []
     misses = []
+    unfenced = uncut = 0
     for aircraft in range(settings.aircraft):
         ways = build_ways(field, places[aircraft])
         for part in (False, True):
@@ -82,7 +83,12 @@ def fleet_sorties(
                     )
                 )  # fmt: skip
             misses += [(numbers[number], miss) for number, miss in found.misses]
-    return Fleet(paced=Paced(sorties=tuple(sorties), misses=tuple(misses)), depots=all_places)
+            unfenced += found.unfenced
+            uncut += found.uncut or len(found.sorties)
+    paced = Paced(
+        sorties=tuple(sorties), misses=tuple(misses), unfenced=unfenced, uncut=uncut
+    )  # fmt: skip
+    return Fleet(paced=paced, depots=all_places)
 
 
 def _borders(lines: Floats, demand: list[Demand], settings: Settings, across: Floats) -> Floats:

@@ -256,6 +256,9 @@ def _fitted_in_part(part: Polygon, width_m: float, motion: Motion) -> Floats:
     for end in range(1, last + 1):
         for start in range(end):
             some = across_part(part, evenly(edges[start], edges[end], width_m), width_m)
+            # The time of the lines alone may be too much: what they leave out only adds to it.
+            if best[start] + _legs_s(lengths_m(some), width_m, motion) >= best[end]:
+                continue
             band = shapely.box(part.bounds[0], edges[start], part.bounds[2], edges[end])
             cost = best[start] + _cost_s(some, part.intersection(band), width_m, motion)
             if cost < best[end]:
@@ -265,10 +268,14 @@ def _fitted_in_part(part: Polygon, width_m: float, motion: Motion) -> Floats:
 
 def _cost_s(lines: Floats, ground: BaseGeometry, width_m: float, motion: Motion) -> float:
     """Return the time of lines with a turn after each, and of passes over what they leave out."""
-    turn_s = motion.between_passes_s(width_m)
     left = shapely.get_parts(ground.difference(united(lines, width_m)))
     left = left[shapely.area(left) > CRUMB_M2]
     bounds = shapely.bounds(left).reshape(-1, 4)
     passes_m = np.maximum(bounds[:, 2] - bounds[:, 0], bounds[:, 3] - bounds[:, 1])
     whole_m = np.concatenate([lengths_m(lines), passes_m])
-    return float(motion.legs_s(whole_m).sum()) + len(whole_m) * turn_s
+    return _legs_s(whole_m, width_m, motion)
+
+
+def _legs_s(length_m: Floats, width_m: float, motion: Motion) -> float:
+    """Return the time of lines with a turn after each."""
+    return float(motion.legs_s(length_m).sum()) + len(length_m) * motion.between_passes_s(width_m)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from companion.core.frame import LocalFrame
+from companion.wording import counted
 from missions.demand import Rates
 from missions.errors import PlanError
 from missions.heights import capped, slowed
@@ -24,10 +25,15 @@ PART_MIN_M = 2.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Paced:
-    """Sorties with their speeds, and what no allowed speed brings into range."""
+    """Sorties with their speeds, and what no allowed speed brings into range.
+
+    `unfenced` is how many of the `uncut` ones had no room for a fence and are flown as several.
+    """
 
     sorties: tuple[Sortie, ...]
     misses: tuple[tuple[int, Miss], ...]
+    unfenced: int = 0
+    uncut: int = 0
 
 
 def paced(
@@ -216,3 +222,14 @@ def _joins(sortie: Sortie) -> list[int]:
     """Return the numbers of the ways between lines."""
     inner = range(1, len(sortie.legs) - 1)
     return [number for number in inner if sortie.legs[number].kind != "spray"]
+
+
+def room_warnings(found: Paced) -> tuple[str, ...]:
+    """Return how many sorties were cut because there was no room for their fences."""
+    if not found.unfenced:
+        return ()
+    return (
+        f"{counted(found.unfenced, 'sortie')} would have a fence with more corners than the "
+        f"autopilot has room for: they are flown as several, "
+        f"{counted(len(found.sorties), 'sortie')} in place of {found.uncut}",
+    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -19,13 +20,13 @@ from missions.coverage import measure, narrow_patches, narrow_warnings, of_rated
 from missions.demand import M2_PER_HA, Demand, Rates, demands, valve_places
 from missions.errors import OutOfReachError, PlanError
 from missions.field import Field, local_points
-from missions.files.fence import Fences, Ground
+from missions.files.fence import Fences
 from missions.files.items import count_of, stops_of
 from missions.files.plan_rules import ITEMS_MAX
 from missions.fleet import fleet_sorties
 from missions.free_space import free_space
 from missions.layouts import flyable, is_small, spray_lines
-from missions.paced import Paced, in_room, range_warnings
+from missions.paced import Paced, in_room, range_warnings, room_warnings
 from missions.plan import Leg, Plan, Settings, Sortie, flown_lines, nose_s, sortie_wh
 from missions.remaining import Remaining
 from missions.schedule import scheduled
@@ -46,7 +47,7 @@ from missions.strips import (
     no_lines,
     whole,
 )
-from missions.surroundings import NOTHING_AROUND, Surroundings
+from missions.surroundings import NOTHING_AROUND, Pacing, Surroundings
 from missions.treated_rates import UntreatedRates, demands_once
 from missions.ways import Ways, build_ways, edge_places, far_warnings, suggested_depot
 
@@ -76,12 +77,12 @@ def plan_mission(
     left: Remaining | None = None,
     around: Surroundings = NOTHING_AROUND,
     with_sprayer: bool = False,
-    fenced: bool = False,
+    fences: Fences | None = None,
 ) -> Plan:
     """Return the mission for a field; depots are (latitude, longitude).
 
     No sortie has more items than its autopilot has room for; `with_sprayer` they are more.
-    With `fenced` those for whose fence it has no room are flown as several, too.
+    With `fences` those for which it has no room for one are flown as several, too.
     With `left` its lines are flown, and no others. `around` is the ground that the plan follows,
     and the room that passes get beyond their ends.
 
@@ -89,7 +90,7 @@ def plan_mission(
         PlanError: where there is none, in one line with what to change.
     """
     try:
-        return _planned(field, settings, rates, depots, left, around, with_sprayer, fenced)
+        return _planned(field, settings, rates, depots, left, around, with_sprayer, fences)
     except ShapelyError as error:
         raise PlanError(
             f"the field's geometry cannot be used ({str(error)[:120]}); simplify its outline"
@@ -104,7 +105,7 @@ def _planned(
     left: Remaining | None,
     around: Surroundings,
     with_sprayer: bool,
-    fenced: bool,
+    fences: Fences | None,
 ) -> Plan:
     width_m = settings.swath_width_m
     settings = _of_its_size(settings, field)
@@ -125,10 +126,10 @@ def _planned(
         raise PlanError("nothing of the field has a rate above zero; check the prescription")
     given = _depots(field.frame, depots)
     lines_are_drawn()
-    fences = Fences(Ground(field=field, settings=settings)) if fenced else None
 
     def one(some: Floats, needs: list[Demand], ways: Ways, *, any_depot: bool = False) -> Paced:
         spacing = Spacing(ways=ways, settings=settings, apart=with_sprayer)
+        pacing = Pacing(around=around, rates=rates, spacing=spacing, settings=settings)
 
         def count(sortie: Sortie) -> int:
             home = ways.depots[sortie.depot].tolist()
@@ -137,16 +138,17 @@ def _planned(
             )
             return count_of(stops, settings, with_sprayer=with_sprayer)
 
-        def pace(sorties: Sequence[Sortie]) -> Paced:
+        def pace(
+            sorties: Sequence[Sortie], fenced: Callable[[Sortie], bool] | None = None
+        ) -> Paced:
             return in_room(
-                sorties, ways, lambda some: around.paced(some, rates, spacing, settings), count,
-                room=ITEMS_MAX[settings.autopilot],
-                fenced=None if fences is None else fences.has_room,
+                sorties, ways, pacing.paced, count,
+                room=ITEMS_MAX[settings.autopilot], fenced=fenced,
             )  # fmt: skip
 
         around.check(field, ways.depots)
         return flown(
-            some, needs, ways, settings, motion=motion, rates=rates, pace=pace,
+            some, needs, ways, settings, motion=motion, rates=rates, pace=pace, fences=fences,
             any_depot=any_depot,
         )  # fmt: skip
 
@@ -181,6 +183,7 @@ def _planned(
             *over_warnings(lines, field.limit, boom),
             *narrow_warnings(covered, field.frame, width_m),
             *around.warnings(sorties.sorties, places, field.frame, settings),
+            *room_warnings(sorties),
         ),
         terrain=around.terrain,
     )
@@ -403,7 +406,15 @@ LESS = 0.995
 # Flights take up to 0.8 % more of a battery than they are planned with: 383 ha, 230 sorties.
 MARGIN = 0.991
 
-Pace = Callable[[Sequence[Sortie]], Paced]
+
+class Pace(Protocol):
+    """Gives sorties the speeds that rates and ground need, and cuts those without room."""
+
+    def __call__(
+        self, sorties: Sequence[Sortie], fenced: Callable[[Sortie], bool] | None = None
+    ) -> Paced:
+        """Return the sorties; with `fenced` each has a fence, as far as cutting helps."""
+        ...
 
 
 def flown(
@@ -415,9 +426,10 @@ def flown(
     motion: Motion,
     rates: Rates,
     pace: Pace,
+    fences: Fences | None = None,
     any_depot: bool = False,
 ) -> Paced:
-    """Return the sorties; `pace` gives them the speeds that rates and ground need.
+    """Return the sorties, with `fences` such that each has room for one.
 
     With `any_depot` one sortie is to be flown from the best of the depots.
 
@@ -429,11 +441,27 @@ def flown(
     pace_s_m = line_pace(lines, rates, settings) if math.isfinite(usable_wh) else None
     flying = Flying(motion=motion, pace_s_m=pace_s_m, any_depot=any_depot)
     search = SortieSearch(lines=lines, demand=demand, ways=ways, settings=settings, flying=flying)
+    sorties, found = _lasting(search, pace, usable_wh)
+    lack = 0 if fences is None else sum(not fences.has_room(each) for each in found.sorties)
+    if fences is None or not lack:
+        return found
+    cut = partial(pace, fenced=fences.has_room)
+    more = cut(sorties)
+    if max(each_wh(more.sorties, settings)) > usable_wh:
+        _, more = _lasting(search, cut, usable_wh)
+    return replace(more, unfenced=lack, uncut=len(found.sorties))
+
+
+def _lasting(
+    search: SortieSearch, pace: Callable[[Sequence[Sortie]], Paced], usable_wh: float
+) -> tuple[tuple[Sortie, ...], Paced]:
+    """Return sorties as they were found and as they are flown: the battery lasts for each."""
+    settings = search.settings
     one = search.in_one()
     if one is not None:
         found = pace(one)
         if max(each_wh(found.sorties, settings)) <= usable_wh:
-            return found
+            return one, found
     share = 1.0
     parts, sorties = search.several()
     for _ in range(ROUNDS):
@@ -441,7 +469,7 @@ def flown(
         used_wh = each_wh(found.sorties, settings)
         worst_wh = max(used_wh)
         if worst_wh <= usable_wh:
-            return found
+            return sorties, found
         better = None
         # Those with more items than an autopilot has room for are flown as several.
         if len(used_wh) == len(parts):

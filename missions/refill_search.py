@@ -128,7 +128,7 @@ def several(
     trials = min(int(moves / (MOVES_A_PART * parts)), TRIALS_A_SORTIE * len(best))
     better = regrouped(passes, limits, best, course, trials=trials, seed=seed)
     # What takes clearly longer by the search's model is not drawn and timed as it is flown.
-    longest_s = CLEARLY * min(costs)
+    longest_s = CLEARLY * sum(flown_by(passes, limits, each).seconds for each in better)
     is_near = plain is not None and costs[0] <= longest_s
     return [better, plain] if plain and is_near else [better]
 

@@ -107,15 +107,17 @@ class SortieSearch:
         Raises:
             PlanError: where a tank or a battery does not last for any.
         """
-        passes, settings, pieces = self._passes, self.settings, self._pieces
+        passes, settings = self._passes, self.settings
         limits = build_limits(settings, battery_share)
         if not before:
             self._check_reach()
         order = self._in_order(settings.moves // (MOVES_A_KICK * FEWER_KICKS))
         known: list[list[list[Part]]] = []
-        if not before and len(pieces) <= ANNEALED_MAX:
+        # Cut lines are no fewer than whole ones: where those are too many, none is cut.
+        few = len(self._whole) <= ANNEALED_MAX and len(self._pieces) <= ANNEALED_MAX
+        if not before and few:
             orders = self._annealed(battery_share)
-            annealed = [[_part(passes, pieces, enter) for enter in order] for order in orders]
+            annealed = [[_part(passes, self._pieces, enter) for enter in order] for order in orders]
             # Its budget lets each ferry take the nearest depot; a sortie ends where it began.
             if all(flown_by(passes, limits, each).wh <= limits.usable_wh for each in annealed):
                 known = [annealed]
@@ -124,6 +126,7 @@ class SortieSearch:
             before=before, moves=settings.moves, seed=settings.seed,
         )  # fmt: skip
         if not found:
+            pieces = self._pieces
             parts = [_part(passes, pieces, 2 * at) for at in range(len(pieces))]
             raise _too_far(passes, limits, parts, self.ways, settings)
         drawn = [self._as_flown(each) for each in found]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import islice, pairwise, product
 
 import numpy as np
@@ -201,6 +201,7 @@ class Spacing:
         first, last = max(min(ways, default=0) - AROUND, 0), max(ways, default=0) + AROUND
         first -= first > 0 and legs[first].kind == "spray"
 
+        @cache  # the kinds of ways below share most of them
         def near(number: int, leg: Leg) -> int:
             shown = (*legs[first:number], leg, *legs[number + 1 : last + 1])
             return len(self._near(Sortie(number=1, depot=0, legs=shown)))

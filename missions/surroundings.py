@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from companion.core.frame import LocalFrame
 from missions.demand import Rates
 from missions.field import Field
 from missions.heights import return_warnings, slowed
 from missions.paced import Paced, paced
-from missions.plan import Settings, Sortie, at_ferry_height
+from missions.plan import Leg, Settings, Sortie, at_ferry_height
 from missions.run_in import RunIn, slow_starts, with_run_ins
 from missions.spacing import Spacing
+from missions.speeds import Miss
 from missions.stops import timed
 from missions.strips import Floats
 from missions.terrain import Terrain
@@ -69,3 +70,36 @@ class Surroundings:
 
 
 NOTHING_AROUND = Surroundings()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pacing:
+    """Paces each sortie once: most come again when others are laid out anew or cut."""
+
+    around: Surroundings
+    rates: Rates
+    spacing: Spacing
+    settings: Settings
+    _known: dict[tuple[Leg, ...], tuple[tuple[Leg, ...], list[Miss]]] = field(
+        default_factory=dict, repr=False, compare=False
+    )
+
+    def paced(self, sorties: Sequence[Sortie]) -> Paced:
+        """Return what `Surroundings.paced` does."""
+        new = [each for each in sorties if each.legs not in self._known]
+        if new:
+            found = self.around.paced(new, self.rates, self.spacing, self.settings)
+            for given, made in zip(new, found.sorties, strict=True):
+                misses = [miss for number, miss in found.misses if number == given.number]
+                self._known[given.legs] = made.legs, misses
+        known = [self._known[each.legs] for each in sorties]
+        return Paced(
+            sorties=tuple(
+                replace(each, legs=legs) for each, (legs, _) in zip(sorties, known, strict=True)
+            ),
+            misses=tuple(
+                (each.number, miss)
+                for each, (_, misses) in zip(sorties, known, strict=True)
+                for miss in misses
+            ),
+        )

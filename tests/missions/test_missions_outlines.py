@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from shapely import Polygon, box
 from shapely.affinity import rotate, translate
 
+import missions.planner
 from companion.cli.app import execute
 from companion.errors import MapError
 from missions.demand import Uniform
@@ -30,6 +32,7 @@ from missions.files.fence_corners import with_corners
 from missions.files.plan_rules import FENCE_CORNERS_MAX
 from missions.files.write import geojson_text, plan_text
 from missions.free_space import CORNERS_MAX, free_space
+from missions.layouts import spray_lines
 from missions.maps.local import make_valid
 from missions.plan import Plan, Settings
 from missions.planner import plan_mission
@@ -349,6 +352,13 @@ def test_a_sortie_for_whose_fence_there_is_no_room_is_flown_as_several(
 ) -> None:
     room, drawn = 24, Drawn(outline=degrees(comb(8)))
     monkeypatch.setitem(FENCE_CORNERS_MAX, "ardupilot", room)
+    searched = []
+
+    def counted_lines(*asked: Any) -> Any:
+        searched.append(asked)
+        return spray_lines(*asked)
+
+    monkeypatch.setattr(missions.planner, "spray_lines", counted_lines)
     path = tmp_path / "f.geojson"
     path.write_text(shapely.to_geojson(drawn.outline))
     words = [path, "--rate-l-ha", "20", "--tank-l", "400", "--json", "--out"]
@@ -356,6 +366,8 @@ def test_a_sortie_for_whose_fence_there_is_no_room_is_flown_as_several(
     found = json.loads(capsys.readouterr().out)
     assert code == 0, found
     assert len(found["sorties"]) > 1
+    # Cut as they are: nothing is planned twice.
+    assert len(searched) == 1
     assert any(
         "1 sortie would have a fence with more corners" in each for each in found["warnings"]
     )
