@@ -26,10 +26,10 @@ from companion.core.setup import Setup
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
 from companion.simulated import SIMULATED, Simulated
-from sitl.anyang import anyang_passes
-from sitl.demo_field import (
+from sitl.anyang import (
     MAP_SPEED_M_S,
     START_S,
+    anyang_passes,
     demo_lags,
     demo_setup,
     demo_trajectory,
@@ -48,7 +48,6 @@ from sitl.workers import do_all
 if TYPE_CHECKING:
     from analysis.flight_record import FlightRecord
     from companion.core.frame import LocalFrame
-    from companion.core.setup import Setup
 
 
 __all__ = [

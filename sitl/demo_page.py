@@ -14,8 +14,8 @@ from analysis.published import (
     p1_accuracy_percent,
     p1_lag_distance_m,
 )
+from sitl.anyang import MAP_SPEED_M_S
 from sitl.demo import CALIBRATED, METHODS, SCHEDULED, DemoResult, Flown
-from sitl.demo_field import MAP_SPEED_M_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.errors import ConfigError
-from sitl.imperfections import Parts
 from sitl.meter import Metering, MeterStream
-from sitl.profile import draw_scatter, flow_table
+from sitl.profile import Parts, draw_scatter, flow_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -11,8 +11,9 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -32,25 +33,11 @@ from sitl.serve_mission import (
     mission_items,
     waiting_place,
 )
+from sitl.stub.autopilot import Autopilot
 from sitl.stub.build import StubOptions, TruthLog, build_autopilot, firmware_of
 from sitl.stub.firmware import Firmware
-from sitl.stub.liquid import TAKE_OFF, LiquidOptions, words_of
-from sitl.stub.mission_items import MissionItem
+from sitl.stub.mission_items import AUTO, LAND, LOITER, MissionItem, Phase
 from sitl.stub.parameters import OUTPUT_COUNT
-from sitl.stub.px4 import px4_parameters
-from sitl.stub.scenario import Scenario, load_scenario
-from sitl.stub.server import StubServer
-from sitl.stub.sprayer import BoardKind, Sprayer, SprayerOptions
-from sitl.vehicle import Corners
-
-if TYPE_CHECKING:
-    from companion.core.setup import Setup
-
-
-from enum import Enum
-
-from sitl.stub.autopilot import Autopilot
-from sitl.stub.mission_items import AUTO, LAND, LOITER, Phase
 from sitl.stub.protocol import (
     AUTOPILOT_SYSTEM,
     COMPANION_COMPONENT,
@@ -62,6 +49,11 @@ from sitl.stub.protocol import (
     dialect,
     sender,
 )
+from sitl.stub.px4 import px4_parameters
+from sitl.stub.scenario import Scenario, load_scenario
+from sitl.stub.server import StubServer
+from sitl.stub.sprayer import TAKE_OFF, BoardKind, LiquidOptions, Sprayer, SprayerOptions, words_of
+from sitl.vehicle import Corners
 
 # The friendly operator: waits for mission and companion, flies, enables spraying, lands.
 #

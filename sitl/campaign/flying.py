@@ -19,11 +19,9 @@ from analysis.strips import strips_of
 from companion.config import load
 from companion.errors import ConfigError
 from missions.maps.compiling import compiled_setup
-from sitl.anyang import EXAMPLE
-from sitl.board import SERVO_FRAME_S
-from sitl.campaign.settings import P1S_FIELD, Settings, Value, overrides_of, with_plant
-from sitl.demo_field import (
+from sitl.anyang import (
     ACCELERATION_M_S2,
+    EXAMPLE,
     LAGS,
     MAP_SPEED_M_S,
     PLANT,
@@ -33,6 +31,8 @@ from sitl.demo_field import (
     demo_route,
     scaled,
 )
+from sitl.board import SERVO_FRAME_S
+from sitl.campaign.settings import P1S_FIELD, Settings, Value, overrides_of, with_plant
 from sitl.disturbances import RATE_HZ, Disturbance, displaced, drifted, shortened
 from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.fly import DEFAULT_ACCELERATION_M_S2, FlyOptions, Task, prepare, with_faults

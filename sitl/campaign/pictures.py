@@ -36,7 +36,7 @@ def draw_pictures(
     try:
         from matplotlib import rc_context
 
-        from sitl.demo_style import DPI, STYLE
+        from sitl.demo_pictures import DPI, STYLE
     except ImportError as error:
         raise ConfigError(
             f"no pictures without matplotlib; {install_command('campaign')}"
@@ -77,7 +77,7 @@ def _title(rows: Rows, text: str) -> tuple[str, str]:
 
 def _responses(rows: Rows, groups: Sequence[Group]) -> Figure | None:
     """Draw each figure over each setting: flights as dots, means with their intervals."""
-    from sitl.demo_style import new_figure
+    from sitl.demo_pictures import new_figure
 
     settings = list(dict.fromkeys(group.setting for group in groups))
     if not rows.settings:
@@ -192,7 +192,7 @@ def _parallel(rows: Rows) -> Figure | None:
     """Draw a line for each setting through all it was given and all it gave."""
     from matplotlib import colormaps
 
-    from sitl.demo_style import new_figure
+    from sitl.demo_pictures import new_figure
 
     settings, figures = _columns(rows)
     if not settings or not figures:
@@ -239,7 +239,7 @@ def _mark(axis: Axes, place: float, height: float, text: str) -> None:
 
 def _sensitivity(rows: Rows, found: Sequence[Index]) -> Figure | None:
     """Draw every index with its interval: a panel a figure, for the first case."""
-    from sitl.demo_style import new_figure
+    from sitl.demo_pictures import new_figure
 
     if not found:
         return None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sitl.stub.ardupilot_commands import write_servo
+from sitl.stub.ardupilot import write_servo
 from sitl.stub.protocol import dialect
-from sitl.stub.px4_commands import set_actuators
+from sitl.stub.px4 import set_actuators
 
 if TYPE_CHECKING:
     from sitl.stub.firmware import Autopilot

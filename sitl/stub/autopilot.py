@@ -16,7 +16,6 @@ from sitl.leaning import MEAN_S, Leaning, leaning
 from sitl.stub import actions, mission, services
 from sitl.stub.faults import Fault, FaultClock, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Parts, Upload
-from sitl.stub.liquid import Battery
 from sitl.stub.mission_items import AUTO, INFO, MissionItem
 from sitl.stub.outputs import OutputState
 from sitl.stub.protocol import (
@@ -29,6 +28,7 @@ from sitl.stub.protocol import (
     sender,
     target,
 )
+from sitl.stub.sprayer import Battery
 from sitl.stub.streams import Strangers
 from sitl.stub.world import Pose
 

@@ -1,6 +1,6 @@
 """How a command comes in and is answered, and what both firmwares do alike.
 
-`ardupilot_commands.py` and `px4_commands.py` hold what each of them does; what is in neither
+`ardupilot.py` and `px4.py` hold what each of them does; what is in neither
 table is UNSUPPORTED.
 """
 

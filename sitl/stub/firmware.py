@@ -15,11 +15,11 @@ from typing import Protocol
 from sitl.leaning import Leaning
 from sitl.stub.faults import Fault, FaultClock, FaultKind
 from sitl.stub.flight import Flight
-from sitl.stub.liquid import Battery
 from sitl.stub.mission_items import INFO, MissionItem
 from sitl.stub.outputs import Outputs
 from sitl.stub.parameters import Parameters
 from sitl.stub.protocol import Channel, Message, SigningKey, dialect
+from sitl.stub.sprayer import Battery
 from sitl.stub.world import Estimator, Pose
 
 Params = tuple[float, ...]

@@ -15,7 +15,7 @@ from typing import Any
 from companion.errors import ConfigError
 from sitl.stub.faults import Fault, FaultKind, read_faults, read_table
 from sitl.stub.firmware import Version
-from sitl.stub.liquid import LiquidEntry, read_liquid
+from sitl.stub.sprayer import LiquidEntry, read_liquid
 from sitl.stub.world import EstimatorNoise
 
 _KNOWN: dict[str, tuple[str, ...]] = {

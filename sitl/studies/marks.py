@@ -29,8 +29,7 @@ from companion.core.boom import Boom
 from companion.core.frame import LocalFrame
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
-from sitl.anyang import anyang_lag
-from sitl.demo_field import example
+from sitl.anyang import anyang_lag, example
 from sitl.flight import MESSAGE_DELAY_S, FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.vehicle import Leg, Route, Vehicle

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.core.schedule import LagModel
+from sitl.plants import PumpPlant
 from sitl.profile import PlantProfile, load_profile
-from sitl.pump_plant import PumpPlant
 from sitl.section_plant import SectionPlant
 
 Floats = NDArray[np.float64]

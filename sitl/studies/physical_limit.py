@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from companion.core.estimator import Track, estimate, observe
 from companion.core.types import Telemetry
-from sitl.demo_field import demo_setup, demo_trajectory
+from sitl.anyang import demo_setup, demo_trajectory
 from sitl.earth import Earth
 from sitl.navigation import Navigation
 from sitl.vehicle import DRAG_1_S, SPEED_GAIN_1_S

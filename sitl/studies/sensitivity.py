@@ -255,7 +255,7 @@ def write_plot(result: Result, path: Path) -> None:
         raise ConfigError(f"no picture without matplotlib; {install_command('office')}")
     from matplotlib import rc_context
 
-    from sitl.demo_style import COLOURS, DPI, INK, STYLE, new_figure
+    from sitl.demo_pictures import COLOURS, DPI, INK, STYLE, new_figure
 
     height_in = 1.3 + 0.28 * len(result.rows)
     with rc_context(STYLE):

@@ -19,8 +19,7 @@ import typer
 from companion.cli.answer import AsJson, answer, note
 from companion.errors import ConfigError, VrsprayError
 from companion.wording import install_command
-from sitl.studies.validation_flights import Validation, validate
-from sitl.studies.validation_page import COMMAND, summary_lines, write_page
+from sitl.studies.validation_flights import COMMAND, Validation, summary_lines, validate, write_page
 
 IMAGES = "images"
 

@@ -20,8 +20,8 @@ from companion.core.schedule import LagModel
 from companion.core.types import Decision, FlowReport, SprayPlan, TimedChange
 from companion.journal.journal import Journal
 from missions.maps.compiling import compiled_setup
+from sitl.anyang import demo_setup
 from sitl.calibration_mission import make_layout, write_calibration
-from sitl.demo_field import demo_setup
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.routes import read_route

@@ -26,8 +26,7 @@ from companion.core.types import (
     Telemetry,
     VehicleState,
 )
-from sitl.anyang import HEIGHT_M
-from sitl.demo_field import MAP_SPEED_M_S, START_S, demo_lags, demo_setup
+from sitl.anyang import HEIGHT_M, MAP_SPEED_M_S, START_S, demo_lags, demo_setup
 from sitl.navigation import Navigation
 from sitl.vehicle import Leg, Route, Vehicle
 

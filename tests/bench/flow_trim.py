@@ -20,7 +20,7 @@ from statistics import fmean
 from analysis.evaluation import evaluate
 from companion.core.options.flow_trim import FlowTrim
 from companion.core.types import Decision
-from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
+from sitl.anyang import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from tests.bench.figures import Figure

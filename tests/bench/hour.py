@@ -35,7 +35,7 @@ from companion.core.types import (
     SpeedReport,
     WindReport,
 )
-from sitl.demo_field import START_S, demo_route
+from sitl.anyang import START_S, demo_route
 from sitl.flight import FlightOptions, fly
 from sitl.fly import ON_INPUTS, with_faults
 from sitl.outputs import PlanFollower

@@ -15,7 +15,7 @@ from companion.core.options.liquid_evidence import Detection, Watching
 from companion.core.options.liquid_faults import WatchMemory, follow
 from companion.core.setup import Setup
 from companion.core.types import Decision, FlowReport, PressureReport, SprayPlan, VehicleState
-from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
+from sitl.anyang import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly, sprayer
 from sitl.liquid_faults import LiquidFault, LiquidFaultKind, LiquidSensors, healthy_kpa
 from sitl.profile import load_profile

@@ -5,7 +5,7 @@ from __future__ import annotations
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from sitl.demo_field import START_S, demo_route
+from sitl.anyang import START_S, demo_route
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.vehicle import Vehicle

@@ -30,7 +30,7 @@ from companion.core.types import Input, OperatorCommand, VehicleState
 from companion.journal.continuing import SWITCH_OFF_PERCENT
 from companion.ports import COMMIT_EVERY_S
 from companion.runtime import COVERAGE_EVERY_S, coverage_ahead_s
-from sitl.demo_field import START_S, demo_route
+from sitl.anyang import START_S, demo_route
 from sitl.deposit import L_HA_PER_ML_M2, Deposit
 from sitl.flight import FlightOptions, FlightResult, OnStep, fly
 from sitl.profile import PlantProfile, load_profile

@@ -18,7 +18,7 @@ from statistics import fmean
 from analysis.evaluation import Evaluation, evaluate
 from companion.core.inputs import Input, Telemetry
 from companion.core.setup import Setup
-from sitl.demo_field import ACCELERATION_M_S2, START_S, demo_route
+from sitl.anyang import ACCELERATION_M_S2, START_S, demo_route
 from sitl.earth import Earth
 from sitl.flight import MESSAGE_DELAY_S, FlightOptions, fly
 from sitl.profile import PlantProfile, load_profile

@@ -11,7 +11,7 @@ from typing import Literal
 
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
-from sitl.demo_field import MAP_SPEED_M_S, PLANT, demo_lags, demo_setup
+from sitl.anyang import MAP_SPEED_M_S, PLANT, demo_lags, demo_setup
 from sitl.flight import FlightOptions
 from sitl.knowledge import perfect_setup, with_sprayer
 from sitl.profile import PlantProfile, load_profile

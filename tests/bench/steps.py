@@ -11,7 +11,7 @@ from shapely import STRtree
 
 from companion.core.controller import Memory, step
 from companion.core.setup import Setup
-from sitl.demo_field import demo_route
+from sitl.anyang import demo_route
 from tests.bench.fields import (
     PLOT_LENGTH_M,
     Moment,

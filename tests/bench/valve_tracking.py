@@ -24,7 +24,7 @@ from companion.core.options.valve_tracking import TrackMemory, ValveTracking
 from companion.core.prescription import Prescription, Zone
 from companion.core.setup import Setup
 from companion.core.types import FlowReport, VehicleState
-from sitl.demo_field import demo_trajectory
+from sitl.anyang import demo_trajectory
 from sitl.flight import FlightResult, fly
 from sitl.liquid_faults import LiquidFault, LiquidFaultKind
 from sitl.profile import draw_scatter, load_profile

@@ -23,8 +23,7 @@ import numpy as np
 
 from analysis.evaluation import Evaluation, evaluate
 from sitl.flight import fly
-from sitl.imperfections import TYPICAL, Parts
-from sitl.profile import PlantProfile, draw_scatter, load_profile
+from sitl.profile import TYPICAL, Parts, PlantProfile, draw_scatter, load_profile
 from sitl.valve_calibration import Calibrated, calibrate_valves, with_figures
 from sitl.workers import do_all
 from tests.bench.flights import Task, perfect, place
@@ -209,7 +208,7 @@ def main() -> None:
     parser.add_argument("--outputs", default="gpio,servo")
     parser.add_argument("--plant", default=PLANT)
     parser.add_argument("--others-open", action="store_true")
-    parser.add_argument("--imperfect", action="store_true", help="parts as sitl/imperfections.py")
+    parser.add_argument("--imperfect", action="store_true", help="parts as sitl/profile.py")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--page", action="store_true", help="write docs/measurements/valves.md")

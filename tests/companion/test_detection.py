@@ -38,7 +38,7 @@ from companion.core.types import (
     TimedChange,
 )
 from companion.journal.codec import decode, encode
-from sitl.demo_field import demo_setup, demo_trajectory
+from sitl.anyang import demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.liquid_faults import LiquidFault, LiquidFaultKind
 from sitl.profile import load_profile

@@ -12,7 +12,7 @@ import pytest
 from analysis.evaluation import Distances, evaluate
 from companion.core.setup import Setup
 from companion.core.types import ClockReport, Input, Telemetry
-from sitl.demo_field import ACCELERATION_M_S2, START_S, demo_lags, demo_route, demo_setup
+from sitl.anyang import ACCELERATION_M_S2, START_S, demo_lags, demo_route, demo_setup
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.studies.message_way import Way, sent_over

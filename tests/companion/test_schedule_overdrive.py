@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from companion.core.crossings import Crossing
 from companion.core.schedule import LagModel, Overdrive, Timing, orders, schedule
 from sitl.knowledge import measured_sets
+from sitl.plants import PumpPlant
 from sitl.profile import load_profile
-from sitl.pump_plant import PumpPlant
 from tests.bench.pump import flights
 
 PUMP = load_profile("pump")

@@ -13,8 +13,8 @@ import pytest
 
 from analysis.evaluation import evaluate
 from companion.core.nozzle import flow_for_rate
+from sitl.anyang import demo_trajectory
 from sitl.campaign.design import read_campaign
-from sitl.demo_field import demo_trajectory
 from sitl.flight import fly
 from sitl.hard_fields import CONDITIONS, condition_of, laid_out
 from sitl.profile import load_profile

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from sitl.imperfections import TYPICAL, Imperfections
-from sitl.profile import PROFILES
+from sitl.profile import PROFILES, TYPICAL, Imperfections
 
 INTRODUCTION = """# Simulated sprayers
 
@@ -40,7 +39,7 @@ Below the first point the flow falls in proportion to zero.
 ## Imperfect parts
 
 A table `[imperfections]` in a sprayer's file gives its valves what real parts have and the program does not model. All of it
-is off by default. *Typical* is `TYPICAL` of `sitl/imperfections.py`, which the measurements of
+is off by default. *Typical* is `TYPICAL` of `sitl/profile.py`, which the measurements of
 [single valves](../measurements/valves.md) use.
 
 | Key | What it does | Default | Typical | After |

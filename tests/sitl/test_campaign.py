@@ -24,6 +24,7 @@ from typer.testing import CliRunner
 from analysis.evaluation import evaluate
 from companion.cli.app import execute
 from companion.errors import ConfigError
+from sitl.anyang import demo_lags, demo_setup, demo_trajectory
 from sitl.campaign import cli, executors, pictures
 from sitl.campaign.bundle import program_files
 from sitl.campaign.dataset import part_size
@@ -33,7 +34,6 @@ from sitl.campaign.flying import fly_flight
 from sitl.campaign.running import LOST, Tally, fly_missing
 from sitl.campaign.sensitivity import notes_of, sensitivity_lines, sensitivity_of
 from sitl.campaign.show import groups_of, read_rows
-from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.profile import PROFILES, load_profile
 from tests.sitl.campaign_files import files_of, fly_here, opened, write_campaign

@@ -14,7 +14,7 @@ import shapely
 from analysis.replay import replay
 from companion.core.prescription import Prescription
 from companion.errors import ConfigError
-from sitl.anyang import anyang_route
+from sitl.anyang import anyang_route, demo_lags, demo_route, demo_setup, demo_trajectory
 from sitl.demo import (
     CALIBRATED,
     CELL_M,
@@ -29,7 +29,6 @@ from sitl.demo import (
     scaled,
 )
 from sitl.demo_cli import WIDE, _print, _write
-from sitl.demo_field import demo_lags, demo_route, demo_setup, demo_trajectory
 from sitl.demo_page import ACCURACY, COLUMNS, SETTLED, page, rows_of, sentence
 from sitl.knowledge import perfect_setup
 from sitl.profile import load_profile

@@ -10,7 +10,7 @@ import pytest
 
 from companion.core.types import SprayPlan, TimedChange
 from companion.errors import ConfigError
-from sitl.demo_field import demo_setup, demo_trajectory
+from sitl.anyang import demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly, sprayer
 from sitl.knowledge import lags, measured_sets, perfect_setup, true_sets
 from sitl.profile import FLOW_LAWS, PROFILES, FlowLaw, flow_by_law, flow_table, load_profile

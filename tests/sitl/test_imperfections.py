@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from companion.errors import ConfigError
-from sitl.imperfections import TYPICAL, Imperfections, Parts
 from sitl.meter import BoardEdge as Edge
 from sitl.plant import PulsedPlant
-from sitl.profile import PROFILES, PlantProfile, load_profile
+from sitl.profile import PROFILES, TYPICAL, Imperfections, Parts, PlantProfile, load_profile
 
 WANG = load_profile("wang-2024")
 STILL = replace(WANG, lag_scatter=0.0, flow_scatter=0.0)

@@ -16,7 +16,7 @@ from analysis.evaluation import evaluate
 from companion.cli.app import execute
 from companion.core.setup import Setup
 from companion.core.types import HeartbeatReport, Input, SprayPlan, Telemetry, TimedChange
-from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
+from sitl.anyang import demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, FlightResult, fly
 from sitl.outputs import PlanFollower
 from sitl.own_method import (

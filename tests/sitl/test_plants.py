@@ -26,8 +26,8 @@ from missions.maps.compiling import compiled_setup
 from sitl.flight import FlightOptions, fly, sprayer
 from sitl.knowledge import lags, measured_sets, pwm_limits
 from sitl.plant import AveragedPlant, PulsedPlant
+from sitl.plants import PumpFlow, PumpPlant
 from sitl.profile import ML_S_PER_L_MIN, PlantProfile, flow_table, load_profile
-from sitl.pump_plant import PumpFlow, PumpPlant
 from sitl.studies.measure_pump import measure
 from tests.bench.pump import SPEED_M_S, TUNED_S, flights, path, setup
 from tests.builders import flying

@@ -12,8 +12,7 @@ import shapely
 from analysis.evaluation import Evaluation, evaluate
 from analysis.flight_record import Fidelity
 from companion.core.frame import LocalFrame
-from sitl.anyang import EXAMPLE
-from sitl.demo_field import demo_lags, demo_setup, demo_trajectory
+from sitl.anyang import EXAMPLE, demo_lags, demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.profile import FlowLaw, load_profile
 from tests.bench.flow_laws import second

@@ -17,9 +17,8 @@ from sitl.drives import DriveFollower, Motors
 from sitl.flight import FlightOptions, sprayer
 from sitl.knowledge import lags, pwm_limits
 from sitl.plant import AveragedPlant, PulsedPlant
-from sitl.plants import SuppliedAveraged, SuppliedPulsed
+from sitl.plants import PumpPlant, SuppliedAveraged, SuppliedPulsed
 from sitl.profile import ML_S_PER_L_MIN, PlantProfile, flow_table, load_profile
-from sitl.pump_plant import PumpPlant
 from sitl.section_plant import SectionPlant
 
 SECTIONS, PWM_PUMP, SPINNING = (

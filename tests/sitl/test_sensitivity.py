@@ -12,9 +12,8 @@ from typer.testing import CliRunner
 
 from companion.core.types import Input, Telemetry
 from companion.errors import ConfigError
-from sitl.anyang import anyang_lag
+from sitl.anyang import anyang_lag, demo_setup
 from sitl.campaign.design import read_campaign
-from sitl.demo_field import demo_setup
 from sitl.disturbances import BORDER, INSIDE, Disturbance, displaced, on_ground, shortened
 from sitl.studies.sensitivity import (
     Cost,

@@ -8,10 +8,10 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.stub.ardupilot_commands import COMMANDS
+from sitl.stub.ardupilot import COMMANDS
 from sitl.stub.mission_items import FLOWN, MissionItem, item_message
 from sitl.stub.protocol import dialect
-from sitl.stub.px4_commands import COMMANDS as PX4_COMMANDS
+from sitl.stub.px4 import COMMANDS as PX4_COMMANDS
 from tests.sitl.stub_bench import Bench, mission
 
 AWKWARD = st.sampled_from(

@@ -26,14 +26,14 @@ from analysis.published import (
 )
 from analysis.strips import strips_of
 from companion.errors import ConfigError
+from sitl.anyang import demo_setup, demo_trajectory
 from sitl.campaign.dataset import read_columns
 from sitl.campaign.design import read_campaign
 from sitl.campaign.flying import fly_flight
 from sitl.demo import PROFILE
-from sitl.demo_field import demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
-from sitl.studies import validation, validation_page
+from sitl.studies import validation, validation_flights
 from sitl.studies.validation_flights import (
     BOUND_M,
     BOUND_METHODS,
@@ -241,7 +241,7 @@ def test_the_page_in_docs_says_what_the_code_says() -> None:
     for name in (
         "INTRODUCTION", "LAG_TEXT", "OURS_TEXT", "CLOSE_TEXT", "ACCURACY_TEXT", "EQ_2_TEXT",
     ):  # fmt: skip
-        assert getattr(validation_page, name) in page, name
+        assert getattr(validation_flights, name) in page, name
     assert "seeds 1 to 20" in page
 
 
@@ -281,7 +281,7 @@ def test_rows_without_a_published_figure_have_none(result: Validation) -> None:
     row: Row = replace(result.row(NONE, SPEED_M_S), published=None)
     empty = replace(row.settled, all_m=Distances.of([]), rate_means_m=(), seed_means_m=None)
     shown = replace(result, rows=(replace(row, settled=empty),))
-    lines = validation_page.summary_lines(shown)
+    lines = validation_flights.summary_lines(shown)
     assert "none at 5 m/s within 0.3 m of P1: NO" in lines
     assert lines[1].split()[-2:] == ["-", "-"]
     assert isinstance(p1_lag_distance_m("none", SPEED_M_S), P1LagDistance)

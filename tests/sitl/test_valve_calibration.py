@@ -38,9 +38,8 @@ from companion.ground.work import PIECE_MAX_S, GroundReason, GroundTask
 from companion.link.component import Component, ComponentOptions
 from companion.sensors.flow_meter import Meter, VirtualEdges
 from sitl.flight import FlightOptions
-from sitl.imperfections import Imperfections, Parts
-from sitl.profile import PlantProfile, draw_scatter, load_profile
-from sitl.stub.liquid import FLIGHT_BATTERY, Battery
+from sitl.profile import Imperfections, Parts, PlantProfile, draw_scatter, load_profile
+from sitl.stub.sprayer import FLIGHT_BATTERY, Battery
 from sitl.valve_calibration import calibrate_valves, recorded, with_figures
 from tests.bench.sprayers import options_of, sprayer_setup
 from tests.sitl import stub_bench

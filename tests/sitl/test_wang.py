@@ -17,7 +17,7 @@ from analysis.published import p1_lag_distance_m
 from analysis.settled import SettledStep, measure_settled
 from analysis.strips import strips_of
 from companion.core.types import Telemetry
-from sitl.demo_field import demo_setup, demo_trajectory
+from sitl.anyang import demo_setup, demo_trajectory
 from sitl.flight import FlightOptions, fly
 from sitl.profile import load_profile
 from sitl.wang import (
