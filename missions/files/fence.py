@@ -23,9 +23,8 @@ from shapely.geometry.polygon import orient
 
 from companion.wording import counted
 from missions.errors import FenceError, PlanError
-from missions.fewer_corners import around_with_fewer_corners, each_inside
+from missions.fewer_corners import around_with_fewer_corners, each_inside, with_corners
 from missions.field import Field
-from missions.files.fence_corners import with_corners
 from missions.files.plan_rules import FENCE_CORNERS_MAX, NAMES
 from missions.maps.local import polygons_of
 from missions.plan import Place, Plan, Settings, Sortie

@@ -25,8 +25,13 @@ from missions.maps.csvfile.reader import read_csv
 from missions.maps.declared import Given
 from missions.maps.geojson import is_geojson, read_geojson
 from missions.maps.geopackage.reader import read_geopackage
-from missions.maps.geotiff.dji import RX_FOLDER, SHAPE_FOLDER, read_dji
-from missions.maps.geotiff.reader import grid_of_tiff, read_geotiff
+from missions.maps.geotiff.reader import (
+    RX_FOLDER,
+    SHAPE_FOLDER,
+    grid_of_tiff,
+    read_dji,
+    read_geotiff,
+)
 from missions.maps.isoxml.reader import read_isoxml
 from missions.maps.kml.reader import read_kml
 from missions.maps.layer import Grid, Layer, Value

@@ -18,7 +18,6 @@ from companion.wording import counted
 from missions.errors import UploadError
 from missions.maps.compiling import compiled_setup
 from missions.upload.checks import FIRMWARES
-from missions.upload.following import each_when_flown, sorties_from
 from missions.upload.items import (
     GLOBAL,
     SAME_FRAME,
@@ -29,7 +28,14 @@ from missions.upload.items import (
     elsewhere,
 )
 from missions.upload.mavsdk_vehicle import connected
-from missions.upload.transfer import TransferError, Uploaded, What, put
+from missions.upload.transfer import (
+    TransferError,
+    Uploaded,
+    What,
+    each_when_flown,
+    put,
+    sorties_from,
+)
 
 WAIT_S = 15.0
 FAILED = 1

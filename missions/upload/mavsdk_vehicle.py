@@ -13,9 +13,8 @@ from typing import Any
 from companion.errors import LinkError
 from companion.link.transport import parse_url
 from companion.wording import install_command
-from missions.upload.following import Seen
 from missions.upload.items import Firmware, WireItem
-from missions.upload.transfer import NotNowError, Progress, RefusedError, What
+from missions.upload.transfer import NotNowError, Progress, RefusedError, Seen, What
 
 _logger = logging.getLogger(__name__)
 

@@ -26,8 +26,7 @@ from missions.maps.assemble import map_of
 from missions.maps.cells import bounds_deg
 from missions.maps.declared import Given
 from missions.maps.geotiff.bands import parse_world_file
-from missions.maps.geotiff.dji import read_dji
-from missions.maps.geotiff.reader import read_geotiff
+from missions.maps.geotiff.reader import read_dji, read_geotiff
 from missions.maps.layer import Grid
 from missions.maps.registry import read_adapt
 

@@ -445,7 +445,7 @@ def test_dictionary_says_unit_and_resolution(
 def test_dictionary_agrees_with_an_independent_one() -> None:
     from isoxml.models.ddi_entities import DDEntity
 
-    from missions.maps.isoxml.ddi import FAMILIES
+    from missions.maps.isoxml.values import FAMILIES
     from missions.maps.units import rate_unit
 
     roles = ("setpoint", "actual", "default", "minimum", "maximum")

@@ -580,7 +580,7 @@ def test_pairs_that_are_not_all_counted_are_said_to_be_at_least_so_many(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(overlaps_module, "PAIRS_MAX", 3)
-    monkeypatch.setattr("missions.maps.lint.shapes.PAIRS_MAX", 3)
+    monkeypatch.setattr("missions.maps.lint.zones.PAIRS_MAX", 3)
     stack = a_map(*((cell(0), float(rate)) for rate in range(2, 7)))
     (problem,) = (one for one in check_map(stack) if one.code == "overlap")
     assert problem.text.startswith("at least 10 pairs of zones overlap, by at least ")

@@ -21,7 +21,7 @@ from shapely import Polygon, box
 import missions.cli
 import missions.files.write
 from companion.cli.app import INTERRUPTED, execute
-from missions.upload.following import sorties_from
+from missions.upload.transfer import sorties_from
 from sitl.stub.mission_items import read_mission
 from tests.bench.missions import to_degrees
 

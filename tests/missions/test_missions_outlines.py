@@ -25,10 +25,10 @@ from missions.fewer_corners import (
     around_with_fewer_corners,
     each_inside,
     inside_with_fewer_corners,
+    with_corners,
 )
 from missions.field import Field, build_field
 from missions.files.fence import Fences, fence_warnings
-from missions.files.fence_corners import with_corners
 from missions.files.plan_rules import FENCE_CORNERS_MAX
 from missions.files.write import geojson_text, plan_text
 from missions.free_space import CORNERS_MAX, free_space

@@ -10,7 +10,7 @@ import pytest
 
 from companion.cli.app import execute
 from missions.errors import UploadError
-from missions.upload.following import Flight, Seen, each_when_flown, sorties_from
+from missions.upload.transfer import Flight, Seen, each_when_flown, sorties_from
 from tests.missions.test_missions_cli import written
 
 GROUND, LAST = Seen(is_armed=False, sequence=0), 9

@@ -9,17 +9,19 @@ from pathlib import Path
 from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
-from missions.maps.isoxml.ddi import (
+from missions.maps.isoxml.task import ById, Task, TreatmentZone, Variable
+from missions.maps.isoxml.values import (
+    EXPORT_AGAIN,
     Family,
     Presentation,
     check_presentation,
+    children,
     ddi_meaning,
     ddi_name,
     meaning,
     presentation_of,
+    text,
 )
-from missions.maps.isoxml.task import ById, Task, TreatmentZone, Variable
-from missions.maps.isoxml.values import EXPORT_AGAIN, children, text
 from missions.maps.model import Problem, map_error
 
 

@@ -7,8 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element, tostring
 
-from missions.maps.isoxml.ddi import ddi_of, meaning
-from missions.maps.isoxml.values import EXPORT_AGAIN, children, integer, required, tag, text
+from missions.maps.isoxml.values import (
+    EXPORT_AGAIN,
+    children,
+    ddi_of,
+    integer,
+    meaning,
+    required,
+    tag,
+    text,
+)
 from missions.maps.layer import check_counts
 from missions.maps.model import map_error
 from missions.maps.units import rate_unit

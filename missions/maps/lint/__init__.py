@@ -4,8 +4,8 @@
 docs/reference/map-problems.md lists every code.
 """
 
+from missions.maps.build import point_rates
 from missions.maps.lint.check import check_map, summary
-from missions.maps.lint.short import Plan, Sprayer
-from missions.maps.points import point_rates
+from missions.maps.lint.zones import Plan, Sprayer
 
 __all__ = ["Plan", "Sprayer", "check_map", "point_rates", "summary"]

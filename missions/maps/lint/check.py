@@ -12,9 +12,8 @@ from shapely.errors import ShapelyError
 
 from companion.core.frame import WGS84
 from missions.maps.cells import shares_inside, to_degrees
-from missions.maps.lint.shapes import overlap_problems, shape_problems
-from missions.maps.lint.short import Plan, short_problems
 from missions.maps.lint.survey import Survey, area_text, latitude_longitude
+from missions.maps.lint.zones import Plan, overlap_problems, shape_problems, short_problems
 from missions.maps.local import project
 from missions.maps.model import MapCells, MapFile, Problem, map_error
 from missions.maps.overlaps import check_outline

@@ -223,8 +223,8 @@ async def test_a_link_without_a_vehicle_is_one_line(tmp_path: Path) -> None:
 async def test_the_next_sortie_follows_when_the_one_before_is_flown_and_landed(
     autopilot: str, tmp_path: Path
 ) -> None:
-    from missions.upload.following import Seen, each_when_flown
     from missions.upload.mavsdk_vehicle import connected
+    from missions.upload.transfer import Seen, each_when_flown
 
     files = [(path, len(read_mission(path))) for path in sorties(tmp_path, 3)[:2]]
     counts = [count - (autopilot == "px4") - 1 for _, count in files]
