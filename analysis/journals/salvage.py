@@ -21,8 +21,9 @@ from companion.journal.geopackage import (
     LOCAL_ID,
     USER_VERSION,
     WGS84_ID,
+    box_of_points,
+    set_box,
 )
-from companion.journal.layers import box_of_points, set_box
 from companion.journal.leaf_page import COLUMNS, Row, is_of
 from companion.journal.read_only import (
     DAMAGE,

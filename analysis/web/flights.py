@@ -17,8 +17,7 @@ from fastapi import APIRouter, HTTPException, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
-from companion.web.child import Limits, Outcome, journal_to_read, run_child
-from companion.web.parts import Host, Part, or_refused
+from companion.web.parts import Host, Limits, Outcome, Part, journal_to_read, or_refused, run_child
 
 NAME = re.compile(r"\w[\w .()+-]{0,79}")
 LIST = Limits(cpu_s=30, wait_s=90.0)

@@ -48,14 +48,12 @@ from companion.doctor.computer import (
     service_checks,
 )
 from companion.doctor.gpio import engine_checks, gpio_checks, read_chip, read_engine, read_register
-from companion.doctor.listen import listen, rest_pulses
 from companion.doctor.sensors import Read, read_sensors, sensor_check
-from companion.doctor.vehicle import Heard, link_checks, no_link
+from companion.doctor.vehicle import Heard, link_checks, listen, no_link, rest_pulses
 from companion.errors import ConfigError, LinkError, MapError
 from companion.flight_map import FlightMap
 from companion.link.signing import read_key
-from companion.output.autopilot_findings import Finding, findings, px4_wiring
-from companion.output.autopilot_guard import REFUSALS
+from companion.output.autopilot_guard import REFUSALS, Finding, findings, px4_wiring
 from companion.output.autopilot_options import TOLERANCE_US, ServoOptions
 from companion.wording import counted
 

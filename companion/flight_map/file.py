@@ -32,9 +32,10 @@ from companion.journal.geopackage import (
     GROUND_TABLES,
     META_TABLE,
     REGISTERS,
+    Ground,
+    read_ground,
     wkb_of,
 )
-from companion.journal.layers import Ground, read_ground
 from companion.journal.read_only import DAMAGE, check_programs, distrust, one_line
 
 VERSION = "1"

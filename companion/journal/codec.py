@@ -5,6 +5,9 @@ Python's JSON writes them. A tuple is an array; a dataclass is `{"Name": [values
 its fields, an enumeration `{"Name": value}`, a set `{"frozenset": [values]}`. The names of the
 fields are kept once a file, so that a version with more fields still reads the older ones.
 Nothing but the core's own types can come out: a journal is read, never executed.
+
+All that is constant in a flight is such text, too. Its ground (zones and field) is not in it: the
+journal keeps that as layers, see `geopackage.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from companion.core import boom, frame, nozzle, safety, schedule, setup, types
 from companion.core.options import atomisers, pump
 from companion.core.prescription import Overlap, Prescription, Zone
 from companion.core.setup import Setup
-from companion.journal.layers import Ground
+from companion.journal.geopackage import Ground
 
 _MODULES = (types, boom, nozzle, schedule, safety, frame, pump, atomisers, setup)
 _SCALARS = frozenset({float, int, str, bool, type(None)})

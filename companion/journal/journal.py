@@ -3,6 +3,8 @@
 The control loop only puts what it has into a bounded queue; everything else happens in the
 writer's thread (`writer.py`). Rows that find the queue full are dropped and counted: a slow disk
 may cost the record of a moment, never the moment itself.
+
+A new journal's file is complete and empty before anybody sees it, then open for one flight.
 """
 
 from __future__ import annotations
@@ -30,8 +32,7 @@ from companion.core.types import Decision, Input
 from companion.errors import JournalError
 from companion.journal.codec import calibration_sha256, setup_to_json
 from companion.journal.coverage import write_treated
-from companion.journal.geopackage import JOURNAL_VERSION, RESERVE, SCHEMA
-from companion.journal.layers import write_layers
+from companion.journal.geopackage import JOURNAL_VERSION, RESERVE, SCHEMA, write_layers
 from companion.journal.rows import ValveOrder
 from companion.journal.writer import Event, Item, LinkSample, Writer
 from companion.ports import COMMIT_EVERY_S

@@ -9,6 +9,8 @@ written, some pages reach the disk and others do not, in any order; its commit m
 page before it not. But no transaction begins before the one before is on the disk (`synchronous =
 FULL`). So a commit behind the first bad frame that yet another frame follows was once safe, and
 the log is damaged. Damage within the very last transaction looks like an ordinary cut.
+
+Of a damaged log is told where it is damaged, and how much of the flight went with that.
 """
 
 from __future__ import annotations

@@ -13,8 +13,7 @@ from companion.core.setup import Setup
 from companion.errors import NoMapError, UnreadableError
 from companion.journal.codec import setup_from_json
 from companion.journal.coverage import read_treated
-from companion.journal.geopackage import APPLICATION_ID, RESERVE
-from companion.journal.layers import read_ground
+from companion.journal.geopackage import APPLICATION_ID, RESERVE, read_ground
 from companion.journal.read_only import (
     DAMAGE,
     allow_damaged_list,

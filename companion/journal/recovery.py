@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 from companion.errors import JournalError
 from companion.journal.folder import journals
-from companion.journal.geopackage import APPLICATION_ID
-from companion.journal.layers import box_of_points, set_box
+from companion.journal.geopackage import APPLICATION_ID, box_of_points, set_box
 from companion.journal.read_only import (
     DAMAGE,
     check_beside,

@@ -3,6 +3,8 @@
 One commit a second, or sooner where it is told so, so that a cut of power costs a second. Whatever
 the disk does, it does to this thread: a failure costs the rows of that second, is counted, and the
 next second is tried anew.
+
+What the flight's tables come to is told in `meta` at its end: missing rows are noticed by it.
 """
 
 from __future__ import annotations
@@ -27,8 +29,7 @@ from companion.core.types import (
 )
 from companion.journal.codec import encode
 from companion.journal.coverage import write_coverage
-from companion.journal.geopackage import point_blob, time_text
-from companion.journal.layers import set_box
+from companion.journal.geopackage import point_blob, set_box, time_text
 from companion.journal.read_only import one_line
 from companion.journal.rows import Block, Row, ValveOrder, ValveRows
 from companion.simulated import BECAUSE, SIMULATED, Simulated, parsed

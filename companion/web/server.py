@@ -26,11 +26,10 @@ from pydantic import BaseModel, Field
 from starlette.types import Receive, Send
 from starlette.types import Scope as Connection
 
-from companion.web.child import Work
 from companion.web.entrance import REFUSED, Body, add_sessions, unusable
 from companion.web.guard import API, Guard
 from companion.web.live import Live, map_parts
-from companion.web.parts import Host, Part
+from companion.web.parts import Host, Part, Work
 
 STATIC = Path(__file__).parent / "static"
 STATE_S = 0.2  # 5 Hz

@@ -34,8 +34,13 @@ from companion.flight_map import FlightMap, frozen_settings, is_flight_map, read
 from companion.flight_map.child import sources_of
 from companion.flight_map.file import SCHEMA, VERSION, content_sha256
 from companion.flight_map.model import named_files
-from companion.journal.geopackage import LOCAL_ID, geometry_blob, layer_sql
-from companion.journal.layers import register_frame, write_ground
+from companion.journal.geopackage import (
+    LOCAL_ID,
+    geometry_blob,
+    layer_sql,
+    register_frame,
+    write_ground,
+)
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.layer import read_bytes
 from missions.maps.local import grown, make_valid, project

@@ -21,8 +21,7 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from companion.web.child import Limits, Outcome, journal_to_read, run_child
-from companion.web.parts import Host, Part, or_refused
+from companion.web.parts import Host, Limits, Outcome, Part, journal_to_read, or_refused, run_child
 from missions.reading_fleet import NO_LINES
 
 FILE_BYTES_MAX, ALL_BYTES_MAX, FILES_MAX = 64_000_000, 256_000_000, 60

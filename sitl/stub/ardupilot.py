@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from sitl.stub import commands, mission, services
+from sitl.stub import commands, mission
 from sitl.stub.commands import ACCEPTED, DENIED, FAILED
 from sitl.stub.faults import FaultKind
 from sitl.stub.firmware import Builder, CommandHandler, Firmware, MessageHandler, Params, Version
@@ -170,12 +170,12 @@ MESSAGES: dict[str, MessageHandler] = {
     "MISSION_REQUEST": mission.handle_request,
     "MISSION_CLEAR_ALL": mission.handle_clear,
     "MISSION_SET_CURRENT": mission.handle_set_current,
-    "PARAM_REQUEST_LIST": services.handle_parameter_list,
-    "PARAM_REQUEST_READ": services.handle_parameter_read,
-    "PARAM_SET": services.handle_parameter_set,
-    "TIMESYNC": services.handle_timesync,
-    "PING": services.handle_ping,
-    "FILE_TRANSFER_PROTOCOL": services.handle_file_transfer,
+    "PARAM_REQUEST_LIST": commands.handle_parameter_list,
+    "PARAM_REQUEST_READ": commands.handle_parameter_read,
+    "PARAM_SET": commands.handle_parameter_set,
+    "TIMESYNC": commands.handle_timesync,
+    "PING": commands.handle_ping,
+    "FILE_TRANSFER_PROTOCOL": commands.handle_file_transfer,
 }
 
 

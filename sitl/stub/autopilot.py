@@ -13,7 +13,7 @@ from itertools import count
 from typing import Protocol
 
 from sitl.leaning import MEAN_S, Leaning, leaning
-from sitl.stub import actions, mission, services
+from sitl.stub import actions, commands, mission
 from sitl.stub.faults import Fault, FaultClock, FaultKind, rc_pulses_us
 from sitl.stub.firmware import Parts, Upload
 from sitl.stub.mission_items import AUTO, INFO, MissionItem
@@ -242,7 +242,7 @@ class Autopilot:
         self._beats.tick(self, now_s)
         self._acknowledgements.tick(self, now_s)
         for channel in list(self.channels):
-            services.send_parameters(self, channel, now_s)
+            commands.send_parameters(self, channel, now_s)
             self._stream(channel, now_s)
 
     def next_due_s(self) -> float:
@@ -321,7 +321,7 @@ class Beats:
             autopilot.relay(frame)
         if self._timesync_due_s <= now_s:
             self._timesync_due_s = max(self._timesync_due_s + self._timesync_s, now_s)
-            autopilot.broadcast(services.timesync_request(autopilot, now_s))
+            autopilot.broadcast(commands.timesync_request(autopilot, now_s))
         if dialect.MAVLINK_MSG_ID_MISSION_CURRENT not in autopilot.firmware.builders:
             self._tell_current(autopilot, now_s)
 

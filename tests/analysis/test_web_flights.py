@@ -12,8 +12,7 @@ import pytest_asyncio
 
 from analysis.replay import FlownCore
 from companion.journal.journal import Journal
-from companion.web.child import journal_to_read
-from companion.web.parts import registered
+from companion.web.parts import journal_to_read, registered
 from tests.analysis.report_flight import fly
 from tests.analysis.test_replay import inputs_of
 from tests.builders import setup
@@ -147,7 +146,7 @@ def test_a_copy_of_a_journal_that_keeps_changing_is_not_taken(
     log = tmp_path / "flight-0001.gpkg-wal"
     log.write_bytes(b"log")
     counted = iter(range(100))
-    monkeypatch.setattr("companion.web.child._moment", lambda *_: (next(counted), 0, b""))
+    monkeypatch.setattr("companion.web.parts._moment", lambda *_: (next(counted), 0, b""))
     with pytest.raises(OSError, match="is being written"), journal_to_read(journal, copies):
         pass
     assert not list(copies.iterdir())

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.output.autopilot_findings import dead_man, findings, wanted_parameters
+from companion.output.autopilot_guard import dead_man, findings, wanted_parameters
 from companion.output.autopilot_options import OutputCheck, ardupilot_places
 from companion.output.servo import (
     OrderBudget,

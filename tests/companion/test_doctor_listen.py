@@ -12,9 +12,8 @@ from companion.cli.run import component_options
 from companion.config import Config, load
 from companion.core.frame import LocalFrame
 from companion.core.types import Fix
-from companion.doctor import listen as listening
-from companion.doctor.listen import listen
-from companion.doctor.vehicle import Heard
+from companion.doctor import vehicle as listening
+from companion.doctor.vehicle import Heard, listen
 from companion.link import outputs
 from companion.link.vehicle_link import VehicleLink
 from tests.companion.wire_peer import WirePeer, free_port, over_udp

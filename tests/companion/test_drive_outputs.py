@@ -12,7 +12,7 @@ import pytest
 from companion.cli.output_parts import CompositeExecutor, Part
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from companion.errors import ActuatorError
-from companion.output.autopilot_findings import findings
+from companion.output.autopilot_guard import findings
 from companion.output.autopilot_options import DriveOutput, ServoOptions
 from companion.output.engine import closer
 from companion.output.hardware_pwm import HardwarePwmExecutor, PwmDrive

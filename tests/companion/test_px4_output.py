@@ -18,8 +18,7 @@ from companion.link import outputs
 from companion.link.component import Component, ComponentOptions
 from companion.link.encode import Encoder
 from companion.link.outputs import ParameterReader
-from companion.output.autopilot_findings import px4_wiring, wanted_parameters
-from companion.output.autopilot_guard import OutputGuard
+from companion.output.autopilot_guard import OutputGuard, px4_wiring, wanted_parameters
 from companion.output.servo import ServoExecutor, ServoOptions
 from tests.builders import now, plan
 

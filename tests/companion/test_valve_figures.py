@@ -21,7 +21,7 @@ from companion.core.setup import Setup
 from companion.doctor.check import Status
 from companion.errors import ConfigError
 from companion.journal.codec import calibration_sha256, setup_from_json, setup_to_json
-from companion.journal.layers import Ground
+from companion.journal.geopackage import Ground
 from tests import builders
 
 FACTORS = (0.97, 1.01, 1.03, 0.99, 1.02, 0.98)

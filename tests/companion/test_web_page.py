@@ -20,7 +20,6 @@ from companion.core.types import Inhibit, SprayerState
 from companion.errors import ConfigError
 from companion.link.component import Component, ComponentOptions
 from companion.web import OperatorPage, Order, Outcome, listen
-from companion.web.child import Limits, run_child
 from companion.web.frames import (
     PAYLOAD_MAX,
     SLOTS,
@@ -41,6 +40,7 @@ from companion.web.live import (
     wanted_rate,
 )
 from companion.web.page import ORDER_BYTES_MAX, parse_order
+from companion.web.parts import Limits, run_child
 from tests.companion.web_site import SETUP, Site, about, aged, served, until
 
 IN_LOOP = pytest.mark.asyncio(loop_scope="module")  # one page for all: it starts slowly

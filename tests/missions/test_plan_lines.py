@@ -22,7 +22,7 @@ from companion.core.frame import LocalFrame
 from companion.core.options.lines import Lines
 from companion.errors import ConfigError, MapError
 from companion.journal.codec import field_names_of, setup_from_json, setup_to_json
-from companion.journal.layers import Ground
+from companion.journal.geopackage import Ground
 from missions.maps.compiling import compiled_setup, read_plan_lines
 from tests.builders import setup
 

@@ -14,8 +14,7 @@ import pytest
 import pytest_asyncio
 from fastapi import APIRouter, HTTPException
 
-from companion.web.child import Limits
-from companion.web.parts import Host, registered, uploads
+from companion.web.parts import Host, Limits, registered, uploads
 from missions.web import office as module
 from missions.web.office import Office
 from tests.companion.web_site import OPERATE, VIEW, Reply, Site, served, until

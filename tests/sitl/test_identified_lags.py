@@ -13,7 +13,7 @@ import pytest
 
 from analysis.calibration.identify import Identified
 from analysis.calibration.result import settings
-from sitl.demo_field import PLANT
+from sitl.anyang import PLANT
 from sitl.profile import draw_scatter, load_profile
 from tests.bench.identification import Task, fly_once
 
