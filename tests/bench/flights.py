@@ -233,6 +233,7 @@ def _here(bundle: Bundle) -> Iterator[Workers]:
 
 class _Here:
     deaths = 1
+    lost_count = 0
 
     def __init__(self, folder: Path) -> None:
         self.folder: Path | None = folder
