@@ -50,6 +50,7 @@ app = typer.Typer(
     help="The simulated flight: stub autopilot and twin.",
     epilog="Example: vrspray sitl serve --autopilot px4",
     no_args_is_help=True,
+    add_completion=False,
     pretty_exceptions_enable=False,
 )
 

@@ -56,6 +56,25 @@ def test_a_trapezoid_whose_flanks_meet_is_even() -> None:
     assert cv_percent(trapezoid, 8.0, to_and_fro=True) == pytest.approx(expected)
 
 
+FOOT_M = 0.3048
+
+
+@pytest.mark.parametrize("to_and_fro", [True, False])
+def test_the_worked_example_of_a_pattern_test_is_even_at_its_effective_swath(
+    to_and_fro: bool,
+) -> None:
+    # Ohio State University Extension, Bulletin 817, Figure 20: 4 inches in the first bottles, 3 to
+    # 4 feet out, and 2 inches at 6 feet to each side make an effective swath of 12 feet.
+    right_m = tuple(FOOT_M * feet for feet in (-8.0, -6.0, -4.0, -3.0, 0.0, 3.0, 4.0, 6.0, 8.0))
+    inches = pattern(right_m, (0.0, 2.0, 4.0, 4.0, 4.0, 4.0, 4.0, 2.0, 0.0))
+    assert cv_percent(inches, 12.0 * FOOT_M, to_and_fro=to_and_fro) == pytest.approx(0.0, abs=1e-4)
+    for feet in (10.5, 13.5):
+        assert cv_percent(inches, feet * FOOT_M, to_and_fro=to_and_fro) > 5.0
+    found = evaluate([inches], 25.0).swath_m["to_and_fro" if to_and_fro else "one_way"]
+    assert found is not None
+    assert found > 12.0 * FOOT_M
+
+
 def summed(one: Pattern, spacing: float, to_and_fro: bool) -> float:
     """Return the CV [%] of forty passes, added up every 2 mm between the middle ones."""
     at = np.arange(0.0, 2.0 * spacing, 0.002) + 0.001

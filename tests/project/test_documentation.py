@@ -21,6 +21,10 @@ def test_reference_page_is_that_of_the_code(name: str) -> None:
     assert current, f"docs/reference/{name} is old: run `make reference` and commit it"
 
 
+def test_no_command_of_vrspray_offers_to_install_completion_for_itself() -> None:
+    assert "--install-completion" not in written("commands.md")
+
+
 def test_every_page_of_the_reference_is_generated() -> None:
     by_hand = [
         page.name for page in FOLDER.glob("*.md") if not GENERATED.match(page.read_text("utf-8"))

@@ -16,7 +16,7 @@ What `vrspray COMMAND --help` prints, in one place. Exit codes: 0 done, 1 a prob
 the work failed, 2 wrong usage, configuration or input, 130 interrupted. `--json` prints one JSON
 object on standard output, also for an error.
 """
-_COMMON = {"--help", "--install-completion", "--show-completion"}
+_COMMON = {"--help"}
 
 
 def page() -> str:
