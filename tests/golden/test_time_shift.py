@@ -24,7 +24,7 @@ OURS = {
     "wind_received_s", "issued_s", "lease_until_s", "at_s",
 }  # fmt: skip
 LENGTHS = {"gap_s", "round_trip_s", "acceleration_fade_s"}
-UTC = {"utc_s"}
+UTC = {"utc_s", "observed_s"}
 # After eleven days a clock's last bit is 0.1 ns.
 ROUNDED = 1e-6
 # A limit that is met to the last bit, as by reports exactly two seconds apart, may be judged met
