@@ -179,7 +179,8 @@ def declared(desk: Desk, report: DeclarationReport) -> Answer:
     """Take what the operator observed: on the ground only, where somebody can look again."""
     if desk.is_armed or desk.is_open:
         return Answer(result=REJECTED_FOR_NOW, text="declare: land and disarm first")
-    text = f"declared, not kept: {len(report.broken)}" if report.broken else "declared, all kept"
+    # Where nothing is limited nothing is kept either: it is for the record.
+    text = f"declared, not kept: {len(report.broken)}" if report.broken else "declared"
     return Answer(
         result=ACCEPTED, inputs=(report,), text=text, event=f"declared by page: {report.said}"
     )
