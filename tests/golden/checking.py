@@ -22,7 +22,7 @@ from typing import Any
 from analysis.journals.content import read_journal
 from analysis.replay import FlownCore
 from companion.core.setup import Setup
-from companion.core.types import Decision
+from companion.core.types import Decision, Input
 from companion.journal import codec
 from companion.journal.codec import FieldNames, encode
 from companion.journal.coverage import read_coverage
@@ -33,6 +33,22 @@ TIME_WITHIN_S = 1e-6
 WITHIN = 1e-9
 SUMS_CHANGED = (3, 12)
 _BEGIN = '{"Decision":['
+
+
+class Beside:
+    """Sees what the core is given in a replay, and what it decides; this one does nothing."""
+
+    def begin(self, given: Setup) -> None:
+        """Take in what is constant in the flight."""
+
+    def observe(self, item: Input) -> None:
+        """Take in one input."""
+
+    def compare(self, decided: Decision) -> None:
+        """Take in what was decided."""
+
+
+ALONE = Beside()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +97,7 @@ def replayed(
     is_tolerant: bool | None = False,
     until_s: float = math.inf,
     core: Callable[[Setup], FlownCore] = FlownCore,
+    beside: Beside = ALONE,
 ) -> Replayed:
     """Return how the decisions of today differ from those in a journal.
 
@@ -91,6 +108,7 @@ def replayed(
     if is_tolerant is None:
         is_tolerant = not is_of_this_arithmetic(content.meta)
     flown = core(content.setup)
+    beside.begin(content.setup)
     has_same_text = _is_written_alike(content.field_names)
     decisions = differences = 0
     first, begin_s, is_left_out = None, None, False
@@ -99,6 +117,7 @@ def replayed(
             recorded = content.value(entry)
             assert not isinstance(recorded, Decision)
             flown.observe(recorded)
+            beside.observe(recorded)
             continue
         time_s = float(entry.body[len(_BEGIN) : entry.body.index(",")])
         begin_s = time_s if begin_s is None else begin_s
@@ -107,6 +126,7 @@ def replayed(
             break
         decisions += 1
         decided = flown.decide(time_s)
+        beside.compare(decided)
         # The same text is the same value to the bit, and is sooner compared.
         if has_same_text and encode(decided) == _in_names_of_today(entry.body):
             continue

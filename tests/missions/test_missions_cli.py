@@ -25,6 +25,8 @@ from missions.upload.transfer import sorties_from
 from sitl.stub.mission_items import read_mission
 from tests.bench.missions import to_degrees
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 ANYANG = Path(__file__).parents[2] / "examples" / "anyang"
 
 

@@ -23,6 +23,8 @@ from tests.bench.small_fields import VALVES
 from tests.mission_fields import degrees
 from tests.small_fields import DITCH_M, made_up
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 WIDTH_M = 6.0
 PLACES = np.array(VALVES)
 

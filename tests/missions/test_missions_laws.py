@@ -41,6 +41,8 @@ from missions.ways import build_ways
 from tests.bench.missions import FRAME, random_field, to_degrees
 from tests.mission_fields import blob
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 WIDTH_M = 7.0
 MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5)
 SETTINGS = Settings(swath_width_m=WIDTH_M, speed_m_s=6.0, moves=0)

@@ -23,6 +23,8 @@ from missions.reading_outline import read_obstacles
 from tests.bench.missions import to_degrees
 from tests.missions.test_missions_cli import written
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 pyogrio = pytest.importorskip("pyogrio")
 
 DRIVERS = {".geojson": "GeoJSON", ".shp": "ESRI Shapefile", ".kml": "LIBKML", ".gpkg": "GPKG"}

@@ -44,6 +44,8 @@ from tests.bench.parcels import parcel
 from tests.mission_fields import blob, degrees, recorded, trees
 from tests.mission_judge import Drawn, judge, judge_fence
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 SETTINGS = Settings(swath_width_m=6.0, speed_m_s=6.0, moves=500)
 
 

@@ -16,6 +16,8 @@ from missions.picture import colour_of, draw_plan, sprayed_twice
 from missions.strips import rectangles
 from tests.missions.test_missions_cli import written
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 pytest.importorskip("matplotlib")
 
 

@@ -23,6 +23,8 @@ from missions.strips import lengths_m, rectangles
 from missions.ways import build_ways, edge_places
 from tests.bench.missions import FRAME, comb, outside_m2, to_degrees, transit_outside_m
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 WIDTH_M = 6.0
 
 

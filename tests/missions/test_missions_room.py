@@ -18,6 +18,8 @@ from missions.planner import plan_mission
 from missions.sheet import sheet, sortie_lines
 from tests.bench.missions import FRAME, to_degrees
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 
 def planned(*, tank_l: float = 400.0, depot_m: tuple[float, float] | None = None) -> Plan:
     field = build_field(to_degrees(box(0, 0, 120, 240)), swath_width_m=6.0, frame=FRAME)

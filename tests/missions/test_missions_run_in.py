@@ -26,6 +26,8 @@ from tests.bench.missions import FRAME, to_degrees
 from tests.missions.test_missions_cli import ANYANG, run, written
 from tests.missions.test_missions_wind import config_with
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 GROUND = box(0, 0, 60, 200)
 # A jerk of 1 m/s3 up and down again, 0.3 s of its own coming and going; half of 6 m/s meanwhile.
 NEEDED_M = (2.0 * math.sqrt(6.0) + 0.3) * 6.0 / 2.0

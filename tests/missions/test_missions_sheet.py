@@ -16,6 +16,8 @@ from shapely import box
 from companion.cli.app import execute
 from tests.missions.test_missions_cli import written
 
+pytestmark = pytest.mark.usefixtures("searched_briefly")
+
 BATTERY = """
 [mission]
 swath_width_m = 6.0

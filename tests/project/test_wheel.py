@@ -74,7 +74,11 @@ def vrspray(
     return subprocess.run(
         [sys.executable, "-P", "-c", start, *arguments],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": str(installed)},
+        env={
+            **os.environ,
+            "PYTHONPATH": str(installed),
+            "PYTHONPYCACHEPREFIX": f"{installed}-compiled",
+        },
         capture_output=True,
         text=True,
         check=False,

@@ -1,17 +1,22 @@
 from __future__ import annotations
 
+import json
 import math
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import shapely
 
 from analysis.replay import replay
+from companion.cli.app import execute
 from companion.core.prescription import Prescription
 from companion.errors import ConfigError
 from sitl.anyang import anyang_route, demo_lags, demo_route, demo_setup, demo_trajectory
@@ -28,12 +33,12 @@ from sitl.demo import (
     jobs_of,
     scaled,
 )
-from sitl.demo_cli import WIDE, _print, _write
+from sitl.demo_cli import FILES, PICTURES, WIDE, _print, _write
 from sitl.demo_page import ACCURACY, COLUMNS, SETTLED, page, rows_of, sentence
 from sitl.knowledge import perfect_setup
 from sitl.profile import load_profile
 
-OPTIONS = DemoOptions(speeds_m_s=(5.0,), fidelity="averaged")
+ONE = ["--speed", "5", "--fidelity", "averaged"]
 CONTRACT_KEYS = {
     "speed_m_s",
     "method",
@@ -58,16 +63,30 @@ class Shown:
     result: DemoResult
     folder: Path
     told: int
+    said: str
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
-    folder = tmp_path_factory.mktemp("demo")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Shown:
+    """Return what the command made, in one process: `test_wheel.py` flies with its pool."""
+    out = tmp_path_factory.mktemp("demo") / "made" / "demo"
     told: list[int] = []
-    result = fly_demo(
-        OPTIONS, journal_folder=folder, processes=1, on_flown=lambda: told.append(len(told))
-    )
-    yield Shown(result, folder, len(told))
+    results: list[DemoResult] = []
+
+    def fly_here(options: DemoOptions, *, on_flown: Callable[[], None], **more: Any) -> DemoResult:
+        def tell() -> None:
+            told.append(len(told))
+            on_flown()
+
+        results.append(fly_demo(options, processes=1, on_flown=tell, **more))
+        return results[0]
+
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(StringIO()) as said:
+        patch.setattr("sitl.demo.fly_demo", fly_here)
+        with redirect_stderr(StringIO()) as noise:
+            code = execute(["demo", "--out", str(out), *ONE, "--json"])
+    assert (code, noise.getvalue()) == (0, "")
+    return Shown(results[0], out, len(told), said.getvalue())
 
 
 # ------------------------------------------------------------------------------------ what is flown
@@ -151,6 +170,15 @@ def test_speed_is_reached_before_the_field(speed_m_s: float) -> None:
 
 def test_each_flight_is_told_once(shown: Shown) -> None:
     assert shown.told == len(shown.result.flights) + len(shown.result.perfect) == 6
+
+
+def test_demo_makes_its_files_and_one_object_on_stdout(shown: Shown) -> None:
+    found: dict[str, Any] = json.loads(shown.said)
+    assert [flight["method"] for flight in found["flights"]] == [*METHODS, CALIBRATED]
+    assert json.loads((shown.folder / "demo.json").read_text()) == found
+    assert sorted(path.name for path in shown.folder.iterdir()) == sorted(FILES)
+    for name in PICTURES:
+        assert (shown.folder / name).read_bytes().startswith(b"\x89PNG")
 
 
 def test_json_has_the_keys_of_the_contract(shown: Shown) -> None:

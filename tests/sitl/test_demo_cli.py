@@ -1,33 +1,15 @@
 from __future__ import annotations
 
-import json
 import signal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from analysis.replay import replay
 from companion.cli.app import execute
-from sitl.demo import CALIBRATED, METHODS
-from sitl.demo_cli import FILES, PICTURES, _move, _staging
+from sitl.demo_cli import FILES, _move, _staging
 from sitl.workers import termination_as_interrupt
 
 Captured = pytest.CaptureFixture[str]
-ONE = ["--speed", "5", "--fidelity", "averaged"]
-
-
-def test_demo_makes_its_files_and_one_object_on_stdout(tmp_path: Path, capsys: Captured) -> None:
-    out = tmp_path / "made" / "demo"
-    assert execute(["demo", "--out", str(out), *ONE, "--json"]) == 0
-    captured = capsys.readouterr()
-    found: dict[str, Any] = json.loads(captured.out)
-    assert captured.err == ""
-    assert [flight["method"] for flight in found["flights"]] == [*METHODS, CALIBRATED]
-    assert json.loads((out / "demo.json").read_text()) == found
-    assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
-    assert all((out / name).read_bytes().startswith(b"\x89PNG") for name in PICTURES)
-    assert replay(out / "flight-0001.gpkg").differences == 0
 
 
 def test_demo_has_help_with_an_example(capsys: Captured) -> None:
