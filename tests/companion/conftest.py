@@ -6,13 +6,11 @@ import contextlib
 import os
 import pty
 import tty
-from collections.abc import Iterator, Sequence
-from contextlib import redirect_stderr, redirect_stdout
-from io import StringIO
+from collections.abc import Iterator
 
 import pytest
 
-from companion.cli.app import execute
+from tests.compiling_here import compiled_here
 
 
 @pytest.fixture
@@ -29,15 +27,7 @@ def terminal() -> Iterator[tuple[int, str]]:
 
 
 @pytest.fixture
-def compiles_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compile maps in this process, for tests of what becomes of a map and not of the child.
-
-    A child imports for 0.7 s what is imported here; `test_flight_map.py` is about the child.
-    """
-
-    def ended(words: Sequence[str], memory_max: int) -> tuple[int, bytes]:
-        with redirect_stdout(StringIO()) as said, redirect_stderr(StringIO()):
-            code = execute(words)
-        return code, said.getvalue().encode()
-
-    monkeypatch.setattr("companion.flight_map.child._ended", ended)
+def compiles_here() -> Iterator[None]:
+    """Compile maps in this process, not in a child."""
+    with compiled_here():
+        yield

@@ -30,6 +30,7 @@ from typer.testing import CliRunner
 from companion.cli.app import app
 from companion.config.model import Config
 from companion.link.commands import DO_SPRAYER, USER_ESTOP
+from tests.compiling_here import compiled_here
 from tests.reference.words import words_in
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -171,7 +172,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def vrspray(within: Path, *words: str) -> Result:
     """Run a command in a folder, in this process and not at the low priority of a command."""
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, compiled_here():
         patch.chdir(within)
         patch.setattr("companion.cli.app.give_way", lambda *_: None)
         return CliRunner().invoke(app, words)

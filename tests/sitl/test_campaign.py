@@ -180,7 +180,7 @@ def test_a_flight_that_kills_its_worker_is_a_row_and_the_others_are_flown(tmp_pa
     )
     (tmp_path / "killer.py").write_text(KILLER)
     dataset, bundle = opened(file, tmp_path / "out")
-    with pool_of(2, bundle) as pool:
+    with pool_of(1, bundle) as pool:
         fly_missing(dataset, bundle, pool, Tally(), tell=lambda _: None)
     rows = rows_of(tmp_path / "out")
     assert [(row["case"], row["error"]) for row in rows] == [

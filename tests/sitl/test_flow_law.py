@@ -120,11 +120,11 @@ def test_without_knowledge_the_same_valves_differ() -> None:
 
 
 def test_a_flight_takes_the_law_that_it_is_given() -> None:
-    setup, path = demo_setup(5.0), demo_trajectory(5.0, 1)
+    setup, path = demo_setup(12.0), demo_trajectory(12.0, 1)
     volumes = set()
     for law in (None, *FLOW_LAWS):
         options = FlightOptions(fidelity="averaged", flow_law=law, noise=False)
         setup = replace(setup, lag=lags(WANG))
-        record = fly(setup, path, WANG, options, speed_m_s=5.0).record
+        record = fly(setup, path, WANG, options, speed_m_s=12.0).record
         volumes.add(round(float(record.volume_ml[-1].sum()), 3))
     assert len(volumes) == 3
