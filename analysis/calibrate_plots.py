@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from analysis.bucket import BucketCurve
+    from analysis.calibration.curve import SetCurve
     from analysis.calibration.valves import IdentifiedValves
     from analysis.marks import Mark, MarksFit
     from analysis.swath import Found
@@ -115,6 +116,36 @@ def plot_flow(
         axes.set_xlabel(what)
         axes.set_ylabel("flow [L/min]")
         axes.set_title("Bucket test")
+        axes.legend()
+
+
+def plot_set_curves(found: Sequence[SetCurve], names: Sequence[str], path: Path) -> None:
+    """Draw how far each point is from the straight line between weighed duties."""
+    with _axes(path) as axes:
+        axes.axhline(0.0, color=FAINT, lw=0.8)
+        for number, (curve, name) in enumerate(zip(found, names, strict=True)):
+            colour = COLOURS[number % len(COLOURS)]
+            straight = [100.0 / point.straight_l_min for point in curve.points]
+            axes.errorbar(
+                [100.0 * point.duty for point in curve.points],
+                [
+                    over * point.flow_l_min - 100.0
+                    for over, point in zip(straight, curve.points, strict=True)
+                ],
+                yerr=[
+                    0.5 * over * (point.high - point.low)
+                    for over, point in zip(straight, curve.points, strict=True)
+                ],
+                color=colour,
+                lw=1.2,
+                capsize=3,
+                label=f"valves {name}",
+            )
+            weighed = [100.0 * duty for duty in curve.weighed_duty]
+            axes.scatter(weighed, [0.0] * len(weighed), s=24, color=colour, zorder=3)
+        axes.set_xlabel("duty [%]")
+        axes.set_ylabel("flow over the straight line [%]")
+        axes.set_title("Between the weighed duties (dots)")
         axes.legend()
 
 

@@ -34,6 +34,7 @@ from companion.errors import ConfigError
 if TYPE_CHECKING:
     from analysis.calibration.valves import Course, IdentifiedValves
     from companion.config import Config
+    from companion.core.nozzle import NozzleSet
     from companion.core.types import Input
     from companion.ground.shell import GroundLink, GroundOutcome
     from companion.ground.work import GroundDecision, GroundTask
@@ -244,6 +245,26 @@ def _measured_here(
     config: Config, given: tuple[str, ...], course: Course, *, is_lines: bool
 ) -> list[Piece]:
     """Do all pieces with the configured outputs and the meter, while a key is held."""
+    from companion.cli.sensor_parts import pulse_meter
+
+    if pulse_meter(config) is None and not course.is_counted:
+        raise ConfigError(
+            'calibrate valves: needs a flow meter ([flow_meter] source = "gpio", or "autopilot" '
+            "for the flow alone); without one catch each valve by itself and give --catch CSV"
+        )
+    told = [*course_lines(config, course)]
+    if course.is_counted:
+        told.append(
+            "The autopilot counts whole millilitres, late by an unknown time: flow factors only. "
+            'Lags need the pulses themselves ([flow_meter] source = "gpio").'
+        )
+    return measured_pieces(config, course, measuring(config, given, told, is_lines=is_lines))
+
+
+def measuring(
+    config: Config, given: tuple[str, ...], told: Sequence[str], *, is_lines: bool
+) -> Measure:
+    """Say what will be done, ask for the word, and return what does each piece."""
     from companion.cli.ground_doing import (
         INTERRUPTED,
         Hand,
@@ -256,25 +277,14 @@ def _measured_here(
     from companion.cli.sensor_parts import pulse_meter
 
     parts = pulse_meter(config)
-    if parts is None and not course.is_counted:
-        raise ConfigError(
-            'calibrate valves: needs a flow meter ([flow_meter] source = "gpio", or "autopilot" '
-            "for the flow alone); without one catch each valve by itself and give --catch CSV"
-        )
     log = ready_log(config.resolve(config.journal.folder))
     descriptor = listening(is_lines)
-    names = [valve.name for valve in config.valve]
-    for line in course_lines(config, course):
+    for line in told:
         note(line)
-    if course.is_counted:
-        note(
-            "The autopilot counts whole millilitres, late by an unknown time: flow factors only. "
-            'Lags need the pulses themselves ([flow_meter] source = "gpio").'
-        )
     ask("spray", config, descriptor)
 
     def measure(task: GroundTask) -> Measured:
-        plans = CarriedOut(valve_count=len(names))
+        plans = CarriedOut(valve_count=len(config.valve))
         counts = CountRecorder(config.flow_meter.battery)
         pulses = None if parts is None else PulseRecorder(*parts)
 
@@ -311,7 +321,7 @@ def _measured_here(
             fault=meter.fault if outcome.is_done else "",
         )
 
-    return measured_pieces(config, course, measure)
+    return measure
 
 
 def _as_it_is(link: GroundLink) -> GroundLink:
@@ -324,35 +334,48 @@ def measured_pieces(config: Config, course: Course, measure: Measure) -> list[Pi
     Raises:
         ValveCourseError: naming the piece that could not be done.
     """
-    from companion.cli.ground_doing import in_words
-
     names = [valve.name for valve in config.valve]
-    lag, largest = config.lag_model(), config.nozzle_sets()[-1]
+    largest = config.nozzle_sets()[-1]
     pieces: list[Piece] = []
     for valve, number in course.rounds(len(names)):
         what = f"valve {names[valve]}, piece {number} of {course.pieces}"
-        for _ in range(TRIES):
-            note(f"{what}: {course.piece_s:.0f} s")
-            done = measure(course.task(valve, len(names)))
-            why = done.fault or (
-                "" if done.outcome.is_done else in_words(done.outcome.reasons, done.outcome.text)
-            )
-            if not why:
-                break
-            note(f"{what}: {why}")
-            if not done.outcome.has_begun:
-                raise ValveCourseError(f"{what}: nothing was opened: {why}")
-        else:
-            raise ValveCourseError(f"{what}: given up after {TRIES} tries: {why}")
-        record = FlowRecord(
-            orders=orders_of(done.plans, largest),
-            time_s=np.array(done.time_s, dtype=np.float64),
-            volume_ml=np.array(done.volume_ml, dtype=np.float64),
-            period_s=config.pwm_limits().period_s,
-            lag=lag,
-        )
+        done = done_at_last(measure, course.task(valve, len(names)), what)
+        record = record_of_piece(done, config, largest)
         pieces.append(Piece(valve=valve, record=record, is_counted=course.is_counted))
     return pieces
+
+
+def done_at_last(measure: Measure, task: GroundTask, what: str) -> Measured:
+    """Do one piece; one that was broken off is done again, some times.
+
+    Raises:
+        ValveCourseError: naming the piece that could not be done.
+    """
+    from companion.cli.ground_doing import in_words
+
+    for _ in range(TRIES):
+        note(f"{what}: {task.seconds:.0f} s")
+        done = measure(task)
+        why = done.fault or (
+            "" if done.outcome.is_done else in_words(done.outcome.reasons, done.outcome.text)
+        )
+        if not why:
+            return done
+        note(f"{what}: {why}")
+        if not done.outcome.has_begun:
+            raise ValveCourseError(f"{what}: nothing was opened: {why}")
+    raise ValveCourseError(f"{what}: given up after {TRIES} tries: {why}")
+
+
+def record_of_piece(done: Measured, config: Config, nozzles: NozzleSet) -> FlowRecord:
+    """Return what a piece has recorded; its orders with the flow of a set's curve."""
+    return FlowRecord(
+        orders=orders_of(done.plans, nozzles),
+        time_s=np.array(done.time_s, dtype=np.float64),
+        volume_ml=np.array(done.volume_ml, dtype=np.float64),
+        period_s=config.pwm_limits().period_s,
+        lag=config.lag_model(),
+    )
 
 
 def course_lines(config: Config, course: Course) -> Iterator[str]:
@@ -376,52 +399,70 @@ FORMAT = "vrspray-valves-1"
 def write_record(path: Path, names: Sequence[str], pieces: Sequence[Piece], day: str) -> None:
     """Write what was recorded as JSON; ConfigError where that cannot be."""
     first = pieces[0].record
-    document = {
-        "format": FORMAT,
-        "valves": list(names),
-        "measured_on": day,
-        "is_counted": pieces[0].is_counted,
-        "period_s": first.period_s,
-        "lag": asdict(first.lag),
-        "pieces": [
-            {
-                "valve": names[piece.valve],
-                "orders": [asdict(order) for order in piece.record.orders],
-                "time_s": [round(at_s, 6) for at_s in piece.record.time_s.tolist()],
-                "volume_ml": [round(ml, 4) for ml in piece.record.volume_ml.tolist()],
-            }
-            for piece in pieces
-        ],
-    }
+    write_json(
+        path,
+        {
+            "format": FORMAT,
+            "valves": list(names),
+            "measured_on": day,
+            "is_counted": pieces[0].is_counted,
+            "period_s": first.period_s,
+            "lag": asdict(first.lag),
+            "pieces": [{"valve": names[piece.valve], **shape_of(piece.record)} for piece in pieces],
+        },
+    )
+
+
+def write_json(path: Path, document: dict[str, Any]) -> None:
+    """Write a record; ConfigError where that cannot be."""
     try:
         path.write_text(json.dumps(document, allow_nan=False) + "\n", encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"--out {path}: cannot be written ({error})") from error
 
 
-def read_record(path: Path, names: Sequence[str]) -> tuple[list[Piece], str | None]:
-    """Return what `write_record` wrote, and its day; ConfigError where it is of other valves."""
+def shape_of(record: FlowRecord) -> dict[str, Any]:
+    """Return a piece's orders and readings as JSON has them."""
+    return {
+        "orders": [asdict(order) for order in record.orders],
+        "time_s": [round(at_s, 6) for at_s in record.time_s.tolist()],
+        "volume_ml": [round(ml, 4) for ml in record.volume_ml.tolist()],
+    }
+
+
+def read_json(path: Path, names: Sequence[str], kind: str) -> dict[str, Any]:
+    """Return a record of a kind; ConfigError where it is none, or of other valves."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"--from {path}: cannot be read ({error})") from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
+    if not isinstance(document, dict) or document.get("format") != kind:
         raise ConfigError(f"--from {path}: is no record that --out has written")
     if document.get("valves") != list(names):
         raise ConfigError(f"--from {path}: is of other valves than the configuration has")
+    return document
+
+
+def record_in(document: dict[str, Any], piece: dict[str, Any]) -> FlowRecord:
+    """Return a piece of a record as it was measured; KeyError and such where it is damaged."""
+    return FlowRecord(
+        orders=tuple(Order(**order) for order in piece["orders"]),
+        time_s=np.array(piece["time_s"], dtype=np.float64),
+        volume_ml=np.array(piece["volume_ml"], dtype=np.float64),
+        period_s=float(document["period_s"]),
+        lag=LagModel(**document["lag"]),
+    )
+
+
+def read_record(path: Path, names: Sequence[str]) -> tuple[list[Piece], str | None]:
+    """Return what `write_record` wrote, and its day; ConfigError where it is of other valves."""
+    document = read_json(path, names, FORMAT)
     try:
-        lag = LagModel(**document["lag"])
         pieces = [
             Piece(
                 is_counted=bool(document.get("is_counted", False)),
                 valve=list(names).index(piece["valve"]),
-                record=FlowRecord(
-                    orders=tuple(Order(**order) for order in piece["orders"]),
-                    time_s=np.array(piece["time_s"], dtype=np.float64),
-                    volume_ml=np.array(piece["volume_ml"], dtype=np.float64),
-                    period_s=float(document["period_s"]),
-                    lag=lag,
-                ),
+                record=record_in(document, piece),
             )
             for piece in document["pieces"]
         ]

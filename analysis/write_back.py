@@ -25,8 +25,8 @@ from companion.errors import ConfigError
 
 _HEADER = re.compile(r"\s*\[(\[?)\s*([A-Za-z0-9_]+)\s*\]")
 _KEY = re.compile(r"\s*([A-Za-z0-9_]+)\s*=")
-# A set with measured points has no published law any more.
-_REPLACED = {"nozzle_set": ("preset",)}
+# A set with measured points has no published law any more, and what was weighed is new.
+_REPLACED = {"nozzle_set": ("preset", "weighed_duty")}
 # What tells the tables of a list apart.
 _NAMED_BY = {"nozzle_set": "valves", "valve": "name"}
 
@@ -100,9 +100,14 @@ def _wanted(old: dict[str, Any], tables: Mapping[str, Any], config: Path) -> dic
         for each in given:
             there = new[name][_place(old, name, each, config)]
             there.update({key: value for key, value in each.items() if key != _NAMED_BY[name]})
-            for key in _REPLACED.get(name, ()):
+            for key in _dropped(name, each):
                 there.pop(key, None)
     return new
+
+
+def _dropped(name: str, each: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the keys that no longer hold once a table was measured anew."""
+    return tuple(key for key in _REPLACED.get(name, ()) if key not in each)
 
 
 def _place(old: Mapping[str, Any], name: str, each: Mapping[str, Any], config: Path) -> int:
@@ -129,7 +134,7 @@ def _edited(before: str, tables: Mapping[str, Any], config: Path) -> str:
         for each in given:
             number = _place(old, name, each, config)
             keys = {key: value for key, value in each.items() if key != _NAMED_BY[name]}
-            _set(lines, name, number, keys, drop=_REPLACED.get(name, ()))
+            _set(lines, name, number, keys, drop=_dropped(name, each))
     return "\n".join(lines) + "\n"
 
 

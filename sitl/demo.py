@@ -41,7 +41,12 @@ from sitl.flight import FlightOptions, FlightResult, fly, true_profile
 from sitl.knowledge import perfect_setup
 from sitl.own_method import load_controller
 from sitl.profile import FlowLaw, PlantProfile, load_profile
-from sitl.valve_calibration import calibrate_valves, with_figures
+from sitl.valve_calibration import (
+    calibrate_curves,
+    calibrate_valves,
+    with_curves,
+    with_figures,
+)
 from sitl.wang import LOOK_AHEAD_S, LOOK_AHEAD_STATED_S, WangController, table_2_sets
 from sitl.workers import do_all
 
@@ -425,7 +430,9 @@ def _fly(
         setup = perfect_setup(setup, profile, seed=job.seed, output_s=setup.lag.output_s)
     if job.method == CALIBRATED:
         by_pulses = replace(options, fidelity="pulsed", output="gpio")
-        setup = with_figures(setup, calibrate_valves(setup, profile, by_pulses).found)
+        found = calibrate_valves(setup, profile, by_pulses).found
+        curves, _ = calibrate_curves(setup, profile, by_pulses)
+        setup = with_figures(with_curves(setup, curves), found)
     wang = None
     if look_ahead_s is not None:
         wang = WangController(setup=setup, look_ahead_s=look_ahead_s)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.calibration.curve import Weighed, curve_course, identify_curve
 from analysis.calibration.flow_record import CarriedOut, FlowRecord, orders_of
 from analysis.calibration.steps import Kind
 from analysis.calibration.valves import (
@@ -36,6 +37,9 @@ from companion.ground.work import (
 from sitl.flight import FlightOptions, sprayer, true_profile
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.calibration.curve import CurveCourse, SetCurve
     from analysis.calibration.valves import Course, IdentifiedValves
     from companion.core.setup import Setup
     from companion.ground.work import GroundTask
@@ -109,6 +113,55 @@ def recorded(
         )
         pieces.append(Piece(valve=valve, record=record, is_counted=course.is_counted))
     return pieces, now_s
+
+
+def calibrate_curves(
+    setup: Setup, profile: PlantProfile, options: FlightOptions
+) -> tuple[tuple[SetCurve, ...], float]:
+    """Return what the meter says of each set between its weighed duties, and how long it took."""
+    weighed = [
+        Weighed(valves=each.valves, duty=each.curve.duty, flow_l_min=each.curve.flow_l_min)
+        for each in setup.nozzle_sets
+    ]
+    courses = [curve_course(each, setup.pwm, setup.lag) for each in weighed]
+    records, now_s = recorded_curve(setup, profile, options, courses)
+    found = (identify_curve(*each) for each in zip(records, weighed, strict=True))
+    return tuple(found), now_s
+
+
+def recorded_curve(
+    setup: Setup, profile: PlantProfile, options: FlightOptions, courses: Sequence[CurveCourse]
+) -> tuple[list[list[FlowRecord]], float]:
+    """Return the records of each set's course, and how long all of it took in seconds."""
+    plant, output = sprayer(true_profile(profile, options), options, 0.0)
+    count = len(setup.boom.valves)
+    sets = {each.valves: each for each in setup.nozzle_sets}
+    memory, now_s, found = GroundMemory(), 0.0, []
+    for course in courses:
+        records = []
+        for duties in course.pieces():
+            now_s += REST_S
+            began_s = now_s
+            plans, memory, now_s = _perform(course.task(duties, count), output, memory, now_s)
+            time_s, volume_ml = _readings(plant, began_s, now_s + 0.5 * REST_S)
+            records.append(
+                FlowRecord(
+                    orders=orders_of(plans, sets[course.valves]),
+                    time_s=time_s,
+                    volume_ml=volume_ml,
+                    period_s=setup.pwm.period_s,
+                    lag=setup.lag,
+                )
+            )
+        found.append(records)
+    return found, now_s
+
+
+def with_curves(setup: Setup, curves: Sequence[SetCurve]) -> Setup:
+    """Return a set-up that knows the flow of its sets between the weighed duties."""
+    found = {curve.valves: curve.curve for curve in curves}
+    sets = tuple(replace(each, curve=found[each.valves]) for each in setup.nozzle_sets)
+    return replace(setup, nozzle_sets=sets)
 
 
 def with_figures(setup: Setup, found: IdentifiedValves) -> Setup:

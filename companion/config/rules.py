@@ -240,7 +240,7 @@ def _valves(config: Document) -> Rule:
                 text="another valve has this name; give each its own",
             )
         seen.add(valve.name)
-    for key, text in own_figures(config.valve, config.lag):
+    for key, text in own_figures(config.valve, config.lag, config.nozzle_set):
         yield Contradiction(key=key, text=text)
     for number, (left, right) in enumerate(pairwise(config.valve), start=1):
         if not left.right_m < right.right_m:

@@ -98,6 +98,10 @@ class NozzleSetTable(Table):
         tuple[Annotated[FiniteFloat, Field(ge=0, le=10_000)], ...],
         Field(strict=False, min_length=2, max_length=1000),
     ] = Field(default=(), description="flow of the whole set at these duties, increasing")
+    weighed_duty: Annotated[tuple[Duty, ...], Field(strict=False, max_length=1000)] = Field(
+        default=(),
+        description="which of these were weighed, where `calibrate curve` added others; none: all",
+    )
     preset: Literal["wang-2024-eq2"] | None = Field(
         default=None,
         description="a published law instead of measured points; needs `valve.nozzles`",
@@ -118,6 +122,17 @@ class NozzleSetTable(Table):
             if law.nozzles == count:
                 return law.curve.duty, law.curve.flow_l_min
         return (), ()
+
+    def weighed(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return the duties and flows that a bucket test found: only these carry the dose."""
+        if not self.weighed_duty:
+            return self.duty, self.flow_l_min
+        kept = [
+            (duty, flow)
+            for duty, flow in zip(self.duty, self.flow_l_min, strict=True)
+            if duty in self.weighed_duty
+        ]
+        return tuple(duty for duty, _ in kept), tuple(flow for _, flow in kept)
 
 
 class LagTable(Table):
@@ -164,8 +179,18 @@ class LagTable(Table):
 FACTOR_MEAN_TOLERANCE = 0.005
 
 
-def own_figures(valves: Sequence[ValveTable], lag: LagTable) -> Iterator[tuple[str, str]]:
-    """Yield (key, what is wrong) of what was measured of single valves."""
+def own_figures(
+    valves: Sequence[ValveTable], lag: LagTable, sets: Sequence[NozzleSetTable]
+) -> Iterator[tuple[str, str]]:
+    """Yield (key, what is wrong) of what was measured of single valves, or weighed of a set."""
+    for number, table in enumerate(sets):
+        strange = [duty for duty in table.weighed_duty if duty not in table.duty]
+        if strange or len(table.weighed_duty) == 1:
+            what = f"{strange[0]:g} is not in nozzle_set[{number}].duty" if strange else "one duty"
+            yield (
+                f"nozzle_set[{number}].weighed_duty",
+                f"{what}; name the duties of the bucket test, two at least, or remove the key",
+            )
     factors = [valve.flow_factor for valve in valves]
     mean = sum(factors) / len(factors)
     if not abs(mean - 1.0) <= FACTOR_MEAN_TOLERANCE:

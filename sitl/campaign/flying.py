@@ -42,7 +42,12 @@ from sitl.motor_parts import ranges_us
 from sitl.outputs import WIRE_S
 from sitl.own_method import MakeController, load_controller
 from sitl.profile import load_profile
-from sitl.valve_calibration import calibrate_valves, with_figures
+from sitl.valve_calibration import (
+    calibrate_curves,
+    calibrate_valves,
+    with_curves,
+    with_figures,
+)
 from sitl.vehicle import Vehicle
 from sitl.wang import (
     LOOK_AHEAD_S,
@@ -363,10 +368,12 @@ def _flown(
     method: str | None = None
     if name == "perfect":
         return _knowing(scene, path, options)
-    if name == "calibrated":  # each valve measured by itself beforehand
+    if name == "calibrated":  # each valve measured by itself beforehand, and the set's curve
         by_pulses = replace(options, fidelity="pulsed", output="gpio")
-        found = calibrate_valves(setup, true_profile(task.profile, options), by_pulses).found
-        setup, method = with_figures(setup, found), "calibrated"
+        profile = true_profile(task.profile, options)
+        found = calibrate_valves(setup, profile, by_pulses).found
+        curves, _ = calibrate_curves(setup, profile, by_pulses)
+        setup, method = with_figures(with_curves(setup, curves), found), "calibrated"
     if look_ahead_s is not None:
         wang, setup = _wang(setup, look_ahead_s, given, task)
         method = str(name or "look-ahead")

@@ -23,11 +23,17 @@ from sitl.earth import Earth
 from sitl.flight import MESSAGE_DELAY_S, FlightOptions, fly
 from sitl.profile import PlantProfile, load_profile
 from sitl.trajectory import Trajectory
+from sitl.valve_calibration import (
+    calibrate_curves,
+    calibrate_valves,
+    with_curves,
+    with_figures,
+)
 from sitl.vehicle import Vehicle
 from sitl.workers import do_all
 from tests.bench.flights import Task, place
 from tests.bench.report import made_by
-from tests.bench.sprayers import PLANT, Output, known_setup, options_of
+from tests.bench.sprayers import PLANT, Output, known_setup, options_of, sprayer_setup
 
 PAGE = Path(__file__).parents[2] / "docs" / "measurements" / "split.md"
 PAGE_TEXT = """<!-- Written by `python -m tests.bench.split --page`; do not edit. -->
@@ -45,7 +51,8 @@ How to read it:
   is not known here. With GPIO what is left beyond the buffer is the spread of the valves' delays:
   the slowest and the quickest are reckoned with. The buffer covers the error of the position.
 - **Misapplied.** The scatter of the valves' flow and the flow between the points of the bucket test
-  cost most. The first is measured by `vrspray calibrate valves`, the second by more points.
+  cost most. `vrspray calibrate valves` measures the first, `vrspray calibrate curve` the second:
+  their rows fly with what the twin's meter said.
 - **Lag.** Messages, gusts and the valves' lags each cost about a centimetre; none dominates.
 """
 
@@ -130,6 +137,16 @@ def _options(**changed: object) -> Callable[[Case, float, int], Evaluation]:
     return flown
 
 
+def _calibrated(case: Case, speed_m_s: float, seed: int, *, shaped: bool) -> Evaluation:
+    """Fly the same sprayer with what its meter says of it on the ground, through GPIO."""
+    ground, on_ground = sprayer_setup(PLANT, "gpio"), options_of("gpio", seed)
+    setup = case.setup
+    if shaped:
+        setup = with_curves(setup, calibrate_curves(ground, case.profile, on_ground)[0])
+    found = calibrate_valves(ground, case.profile, on_ground).found
+    return replace(case, setup=with_figures(setup, found)).flown(speed_m_s)
+
+
 def _perfect(case: Case, speed_m_s: float, seed: int) -> Evaluation:
     known = known_setup(case.setup, case.profile, "gpio", seed)
     options = FlightOptions(seed=seed, knows=True)
@@ -162,6 +179,8 @@ CASES: dict[str, Callable[[Case, float, int], Evaluation]] = {
         profile=_alike(case.profile, flow=True),
         options=replace(case.options, flow_law="straight"),
     ).flown(speed, place=True, velocity=True, arrival=True),
+    "each valve measured": lambda case, speed, seed: _calibrated(case, speed, seed, shaped=False),
+    "and the curve's shape": lambda case, speed, seed: _calibrated(case, speed, seed, shaped=True),
     "no gusts": lambda case, speed, seed: replace(case, path=calm(speed, seed)).flown(speed),
     "no border buffer": lambda case, speed, _: replace(
         case, setup=replace(case.setup, border_buffer_m=0.0)

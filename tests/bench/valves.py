@@ -4,7 +4,8 @@
 
 Each seed is another sprayer whose valves scatter. It is measured by the twin's own meter through
 the companion's ground work, then flown over the example: with the set's figures alone, with those
-of each valve, with identical valves (the noise floor), and with perfect knowledge.
+of each valve, with the curve between the weighed duties too, with identical valves (the noise
+floor), and with perfect knowledge.
 """
 
 from __future__ import annotations
@@ -21,10 +22,17 @@ from statistics import fmean
 
 import numpy as np
 
+from analysis.calibration.curve import SetCurve
 from analysis.evaluation import Evaluation, evaluate
 from sitl.flight import fly
 from sitl.profile import TYPICAL, Parts, PlantProfile, draw_scatter, load_profile
-from sitl.valve_calibration import Calibrated, calibrate_valves, with_figures
+from sitl.valve_calibration import (
+    Calibrated,
+    calibrate_curves,
+    calibrate_valves,
+    with_curves,
+    with_figures,
+)
 from sitl.workers import do_all
 from tests.bench.flights import Task, perfect, place
 from tests.bench.report import made_by
@@ -36,16 +44,18 @@ PAGE_TEXT = """<!-- Written by `python -m tests.bench.valves --page`; do not edi
 
 `{command}`, {today}, in simulation. Each sprayer is another draw of valves (1 sd: 2 % in flow, 5 %
 in lag). They are measured by the twin's meter (3 % gain, 1 % noise a PWM period, 4600 pulses a
-litre) through the companion's ground work. Then the sprayer flies the example's field: by the set's
-figures, by each valve's, with identical valves and the same noise, and with perfect knowledge.
+litre) through the companion's ground work, and so is the flow between the points of the bucket
+test (*and the curve*). Then the sprayer flies the example's field: by the set's figures, by each
+valve's, these and the curve, with identical valves and the same noise, and with perfect knowledge.
 
 ```text
 {figures}
 ```
 
-What remains above perfect knowledge is the noise of position and speed, and the flow between the
-points of the bucket test, which perfect knowledge has.
+*Limit* is what is misapplied over that of perfect knowledge. What remains above it once the curve
+is measured is the noise of position and speed.
 """
+PERFECT = "perfect knowledge"
 PAGE = Path(__file__).parents[2] / "docs" / "measurements" / "valves.md"
 
 
@@ -57,6 +67,15 @@ class Found:
     factor_held: bool
     lags_s: tuple[float, ...]
     lags_held: tuple[bool, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Point:
+    """How far the flow between two weighed duties is off: measured, and on the straight line."""
+
+    error: float
+    straight: float
+    held: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,12 +98,15 @@ class Row:
     output: Output
     minutes: float
     litres: float
+    curve_minutes: float
+    curve_litres: float
+    points: tuple[Point, ...]
     valves: tuple[Found, ...]
     flights: dict[str, Flight]
 
 
 def measure(todo: tuple[str, int, float, Output, bool, bool]) -> Row:
-    """Calibrate one sprayer and fly it four times."""
+    """Calibrate one sprayer and fly it by what is known of it."""
     plant, seed, speed_m_s, output, is_alone, is_imperfect = todo
     profile, options = _profile(plant, is_imperfect), options_of(output, seed)
     ground = _calibrated(plant, seed, is_alone, is_imperfect)
@@ -109,6 +131,8 @@ def measure(todo: tuple[str, int, float, Output, bool, bool]) -> Row:
     task = Task(plant=plant, speed_m_s=speed_m_s, seed=seed)
     setup, path = place(task, output)
     known = with_figures(setup, ground.found)
+    curves, curve_s, curve_errors = _curves(plant, seed, is_imperfect)
+    shaped = with_figures(with_curves(setup, curves), ground.found)
     alike = replace(options, scatter=False)
     best = perfect(task, profile)
     flights = {
@@ -116,16 +140,20 @@ def measure(todo: tuple[str, int, float, Output, bool, bool]) -> Row:
             fly(setup, path, profile, options, speed_m_s=speed_m_s).record
         ),
         "each valve's": evaluate(fly(known, path, profile, options, speed_m_s=speed_m_s).record),
+        "and the curve": evaluate(fly(shaped, path, profile, options, speed_m_s=speed_m_s).record),
         "identical valves": evaluate(fly(setup, path, profile, alike, speed_m_s=speed_m_s).record),
     }
     if best is not None:
-        flights["perfect knowledge"] = best
+        flights[PERFECT] = best
     return Row(
         seed=seed,
         speed_m_s=speed_m_s,
         output=output,
         minutes=ground.minutes,
         litres=ground.litres,
+        curve_minutes=curve_s / 60.0,
+        curve_litres=sum(curve.volume_ml for curve in curves) / 1000.0,
+        points=curve_errors,
         valves=valves,
         flights={name: _flight(each) for name, each in flights.items()},
     )
@@ -143,6 +171,30 @@ def _calibrated(plant: str, seed: int, is_alone: bool, is_imperfect: bool) -> Ca
     return calibrate_valves(
         setup, _profile(plant, is_imperfect), options_of("gpio", seed), is_alone=is_alone
     )
+
+
+@lru_cache(maxsize=32)
+def _curves(
+    plant: str, seed: int, is_imperfect: bool
+) -> tuple[tuple[SetCurve, ...], float, tuple[Point, ...]]:
+    """Return how the flow is found to run between weighed duties, the time, and the errors."""
+    profile, setup = _profile(plant, is_imperfect), sprayer_setup(plant, "gpio")
+    curves, seconds = calibrate_curves(setup, profile, options_of("gpio", seed))
+    weighed = {each.valves: each for each in profile.nozzle_sets}
+    points = []
+    for curve in curves:
+        between = [point for point in curve.points if not point.is_weighed]
+        duty = np.array([point.duty for point in between])
+        true = weighed[curve.valves].flows_l_min(profile.flow_law, duty).tolist()
+        points += [
+            Point(
+                error=point.flow_l_min / flow - 1.0,
+                straight=point.straight_l_min / flow - 1.0,
+                held=point.low <= flow <= point.high,
+            )
+            for point, flow in zip(between, true, strict=True)
+        ]
+    return curves, seconds, tuple(points)
 
 
 def _flight(found: Evaluation) -> Flight:
@@ -175,6 +227,15 @@ def lines(rows: Sequence[Row]) -> list[str]:
         f"lags: 95 % within {1000 * np.quantile(lags, 0.95):.2f} ms, worst "
         f"{1000 * lags.max():.2f} ms; interval holds the truth in {100 * fmean(held):.0f} %",
     ]
+    points = [point for row in rows for point in row.points]
+    errors, straight = np.abs([(point.error, point.straight) for point in points]).T
+    told += [
+        f"curve: {fmean(row.curve_minutes for row in rows):.1f} min and "
+        f"{fmean(row.curve_litres for row in rows):.1f} L; between weighed duties 95 % within "
+        f"{100 * np.quantile(errors, 0.95):.2f} %, worst {100 * errors.max():.2f} % (straight: "
+        f"{100 * np.quantile(straight, 0.95):.2f} and {100 * straight.max():.2f} %); interval "
+        f"holds the truth in {100 * fmean(point.held for point in points):.0f} %",
+    ]
     for output in sorted({row.output for row in rows}):
         for speed in sorted({row.speed_m_s for row in rows}):
             told += _of_speed([r for r in rows if (r.output, r.speed_m_s) == (output, speed)])
@@ -190,9 +251,15 @@ def _of_speed(rows: Sequence[Row]) -> list[str]:
             / row.flights["identical valves"].misapplied_percent
             for row in rows
         ]
+        limits = [
+            row.flights[name].misapplied_percent / row.flights[PERFECT].misapplied_percent
+            for row in rows
+            if PERFECT in row.flights
+        ]
+        limit = f"; limit {fmean(limits):.2f}" if limits else ""
         told.append(
             f"  {name:18s} misapplied {fmean(f.misapplied_percent for f in flights):.2f} %, "
-            f"{fmean(over):.3f} x identical valves (worst {max(over):.3f}); accuracy "
+            f"{fmean(over):.3f} x identical valves (worst {max(over):.3f}){limit}; accuracy "
             f"{fmean(f.accuracy_percent for f in flights):.2f} %; lag "
             f"{fmean(f.mean_m for f in flights):.3f} m, worst "
             f"{max(f.worst_m for f in flights):.3f} m; missed {sum(f.missed for f in flights)}"
