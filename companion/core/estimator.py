@@ -43,12 +43,10 @@ from companion.core.motion import (
     doubted,
     drawn_after,
     follow_pair,
-    mixed,
-    moved,
+    later,
     seen_of,
     stretch,
     together,
-    told,
     turning,
 )
 from companion.core.nozzle import is_override
@@ -131,13 +129,11 @@ class Motion(NamedTuple):
         """
         cruise, manoeuvre, share = self.agreed.cruise, self.agreed.manoeuvre, self.agreed.share
         calm, nimble = stretch(CRUISE.fade_s, dt_s), stretch(MANOEUVRE.fade_s, dt_s)
-        east = told(mixed(moved(cruise.east, calm), moved(manoeuvre.east, nimble), share))
-        north = told(mixed(moved(cruise.north, calm), moved(manoeuvre.north, nimble), share))
-        return self._drawn(east, self.drawn[0], dt_s), self._drawn(north, self.drawn[1], dt_s)
-
-    def _drawn(self, axis: Told, by: Drawn, dt_s: float) -> Told:
-        velocity_m_s = axis.velocity_m_s + self.doubt_share * by.after(dt_s)
-        return axis._replace(velocity_m_s=velocity_m_s)
+        doubt, (by_east, by_north) = self.doubt_share, self.drawn
+        return (
+            later(cruise.east, manoeuvre.east, calm, nimble, share, doubt * by_east.after(dt_s)),
+            later(cruise.north, manoeuvre.north, calm, nimble, share, doubt * by_north.after(dt_s)),
+        )
 
     @property
     def acceleration_fade_s(self) -> float:
@@ -374,31 +370,33 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
     order, kind = sorted_in(track.order, item)
     if kind is Arrival.AGAIN:
         return track._replace(order=order)  # a copy, or not yet known to be anything else
-    track = track._replace(order=order)
     if kind is Arrival.ANEW:
-        track = _restarted(track)
+        track = _restarted(track, order)
     place = place_of(item, setup.frame)
     if place is None:
+        track = track._replace(order=order)
         return track._replace(position_valid=False, position_received_s=item.received_s)
     before = track.motion
     stand = _stand(track, item)
     if before is not None and stand.is_frozen:
         # It is kept out of the filters, and what comes after it has to be confirmed.
         still = before._replace(boot_s=item.boot_s, confirm_left=CONFIRM_COUNT)
+        track = track._replace(order=order)
         return track._replace(motion=still, last_place=stand)
     at_once = not track.consent.enabled or before is None
     ticked = tick(track.clock, item, track.clock_report, at_once=at_once)
     clock = ticked.clock
-    # Its age counts from its sending, for the limit on it too.
-    sent_s = item.boot_s + clock.sent_offset_s
-    item = replace(item, received_s=min(item.received_s, sent_s))
     if ticked.is_set:
         before = None
     if before is not None and ticked.moved_s != 0.0:
         before = before._replace(time_s=before.time_s + ticked.moved_s)
     time_s = item.boot_s + clock.sent_offset_s - setup.lag.position_s
     motion = begun(item, place, time_s) if before is None else followed(before, item, place, time_s)
+    # Its age counts from its sending, for the limit on it too.
+    sent_s = item.boot_s + clock.sent_offset_s
+    motion = motion._replace(received_s=min(item.received_s, sent_s))
     return track._replace(
+        order=order,
         motion=motion,
         inertia=track.inertia.after_position(
             motion.boot_s, motion.seen, motion.agreed.cruise, motion.likely
@@ -409,14 +407,14 @@ def _observe_position(track: Track, item: Telemetry, setup: Setup) -> Track:
         counted=None,
         last_place=stand,
         position_valid=motion.confirm_left == 0,
-        position_received_s=item.received_s,
-        braking_m_s2=_learned_braking(track, motion, item.received_s),
+        position_received_s=motion.received_s,
+        braking_m_s2=_learned_braking(track, motion, motion.received_s),
     )
 
 
-def _restarted(track: Track) -> Track:
+def _restarted(track: Track, order: PositionStream) -> Track:
     """Forget what was known by the autopilot's old clock, but an exchange with the new one."""
-    exchange = track.order.exchange
+    exchange = order.exchange
     return track._replace(
         motion=None,
         clock=None,
@@ -430,7 +428,9 @@ def _restarted(track: Track) -> Track:
 def _stand(track: Track, item: Telemetry) -> LastPlace:
     """Return what shows a place that stands still while the vehicle does not."""
     motion, expected_m_s = track.motion, None
-    if motion is not None and 0.0 < item.boot_s - motion.boot_s < BRIDGED_MAX_S:
+    # How fast it should be takes a while to find out, and only one that stands is asked.
+    stands = item.velocity_east_m_s == 0.0 and item.velocity_north_m_s == 0.0
+    if stands and motion is not None and 0.0 < item.boot_s - motion.boot_s < BRIDGED_MAX_S:
         east, north = motion.after(item.boot_s - motion.boot_s)
         expected_m_s = math.hypot(east.velocity_m_s, north.velocity_m_s)
     checked_m_s = _checked_speed(track, item.received_s)

@@ -302,7 +302,12 @@ def follow(
 
 
 def _correct(by: Gains, before: Axis, over: Stretch, seen: Seen) -> tuple[Axis, float] | None:
-    position_m, velocity_m_s, acceleration, astray_m_s = moved(before, over)
+    # As `moved` has it: what it makes is only taken apart again here, eight times a message.
+    position_m, velocity_m_s, acceleration, astray_m_s = before
+    dt_s, carried_s2, gained_s, kept, astray_kept = over
+    position_m = position_m + velocity_m_s * dt_s + acceleration * carried_s2
+    velocity_m_s = velocity_m_s + acceleration * gained_s
+    acceleration, astray_m_s = acceleration * kept, astray_m_s * astray_kept
     off_m = seen.position_m - position_m
     if not abs(off_m) <= JUMP_M:
         return None
@@ -424,17 +429,37 @@ class Told(NamedTuple):
     outrun_m_s: float
 
 
-def told(axis: Axis) -> Told:
-    """Return one direction with the velocity that is told in place of the place's own.
+def later(
+    first: Axis,
+    second: Axis,
+    first_over: Stretch,
+    second_over: Stretch,
+    share: float,
+    by_m_s: float,
+) -> Told:
+    """Return `share` of the second direction and the rest of the first, as told, some time later.
 
-    >>> told(Axis(7.0, 5.0, 0.0, astray_m_s=-0.25))
+    Each goes by its own stretch of time, as by `moved` and `mixed`; `by_m_s` is added to the told
+    velocity, which stands in place of the place's own.
+
+    >>> axis, now = Axis(7.0, 5.0, 0.0, astray_m_s=-0.25), stretch(0.5, 0.0)
+    >>> later(axis, axis, now, now, 0.5, 0.0)
     Told(position_m=7.0, velocity_m_s=4.75, acceleration_m_s2=0.0, outrun_m_s=0.25)
     """
+    place, pace, gain, astray = first
+    dt_s, carried_s2, gained, kept, astray_kept = first_over
+    place, pace = place + pace * dt_s + gain * carried_s2, pace + gain * gained
+    gain, astray = gain * kept, astray * astray_kept
+    place_2, pace_2, gain_2, astray_2 = second
+    dt_s, carried_s2, gained, kept, astray_kept = second_over
+    place_2, pace_2 = place_2 + pace_2 * dt_s + gain_2 * carried_s2, pace_2 + gain_2 * gained
+    gain_2, astray_2 = gain_2 * kept, astray_2 * astray_kept
+    astray += share * (astray_2 - astray)
     return Told(
-        axis.position_m,
-        axis.velocity_m_s + axis.astray_m_s,
-        axis.acceleration_m_s2,
-        -axis.astray_m_s,
+        place + share * (place_2 - place),
+        pace + share * (pace_2 - pace) + astray + by_m_s,
+        gain + share * (gain_2 - gain),
+        -astray,
     )
 
 
@@ -495,11 +520,22 @@ def followed(before: Drawn, dt_s: float, gone_m: float, told_m_s: float) -> Draw
         # A jump, or no number.
         return Drawn(square_m2_s2=before.square_m2_s2)
     outrun_m_s = outrun_m / dt_s
-    slow_m_s = _mean(before.slow_m_s, outrun_m_s, dt_s / SLOW_TIME_S)
+    quick, slow, square = _shares(dt_s)
+    slow_m_s = before.slow_m_s + slow * (outrun_m_s - before.slow_m_s)
     return Drawn(
-        _mean(before.quick_m_s, outrun_m_s, dt_s / QUICK_TIME_S),
+        before.quick_m_s + quick * (outrun_m_s - before.quick_m_s),
         slow_m_s,
-        _mean(before.square_m2_s2, slow_m_s * slow_m_s, dt_s / MEMORY_S),
+        before.square_m2_s2 + square * (slow_m_s * slow_m_s - before.square_m2_s2),
+    )
+
+
+@lru_cache(maxsize=8)
+def _shares(dt_s: float) -> tuple[float, float, float]:
+    """Return how much a message counts in the means after `dt_s`; both directions ask for it."""
+    return (
+        1.0 - exp(-(dt_s / QUICK_TIME_S)),
+        1.0 - exp(-(dt_s / SLOW_TIME_S)),
+        1.0 - exp(-(dt_s / MEMORY_S)),
     )
 
 
@@ -509,10 +545,6 @@ def drawn_after(by: Drawn, dt_s: float, before: Seen, now: Seen) -> Drawn:
         return NOT_DRAWN
     told_m_s = 0.5 * (before.velocity_m_s + now.velocity_m_s)
     return followed(by, dt_s, now.position_m - before.position_m, told_m_s)
-
-
-def _mean(before: float, now: float, times: float) -> float:
-    return before + (1.0 - exp(-times)) * (now - before)
 
 
 def turning(
