@@ -55,9 +55,10 @@ def log(x: float) -> float:
     # 2 artanh(f), to f^21; what is left out is below 1e-18 for |f| <= 0.172.
     f = (mantissa - 1.0) / (mantissa + 1.0)
     f2 = f * f
-    total = 0.0
-    for odd in range(21, 1, -2):
-        total = (total + 1.0 / odd) * f2
+    # Written out: a loop takes twice as long, and each position asks three times.
+    total = (((1.0 / 21.0 * f2 + 1.0 / 19.0) * f2 + 1.0 / 17.0) * f2 + 1.0 / 15.0) * f2 + 1.0 / 13.0
+    total = (((total * f2 + 1.0 / 11.0) * f2 + 1.0 / 9.0) * f2 + 1.0 / 7.0) * f2 + 1.0 / 5.0
+    total = (total * f2 + 1.0 / 3.0) * f2
     return halvings * _LN_2_HIGH + (halvings * _LN_2_LOW + 2.0 * f * total + 2.0 * f)
 
 

@@ -532,7 +532,7 @@ def _decision(
         sprayer=shown(permission.sprayer, is_open=plan.opens),
         out_of_range_count=sum([flow in too_much for flow in flows]) if too_much else 0,
     )
-    return decision, ordering._replace(trim=trim)
+    return decision, ordering if trim is ordering.trim else ordering._replace(trim=trim)
 
 
 def _flow(setup: Setup, plan: SprayPlan, nozzles: NozzleSet) -> float:

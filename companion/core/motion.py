@@ -20,7 +20,6 @@ last change says how it goes on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -136,16 +135,14 @@ class Axis(NamedTuple):
     astray_m_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Belief:
+class Belief(NamedTuple):
     """One filter's state in both directions."""
 
     east: Axis
     north: Axis
 
 
-@dataclass(frozen=True, slots=True)
-class Pair:
+class Pair(NamedTuple):
     """A calm and a nimble filter, and how far the vehicle is believed to manoeuvre."""
 
     cruise: Belief
