@@ -6,6 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.laid_out_once import laid_out_once
+
 
 @pytest.fixture(scope="module")
 def searched_briefly() -> Iterator[None]:
@@ -18,4 +20,11 @@ def searched_briefly() -> Iterator[None]:
         patch.setattr("missions.worth.KICKS", 48_000)
         patch.setattr("missions.worth.KICKS_MIN", 2)
         patch.setattr("missions.worth.KICKS_MAX", 30)
+        yield
+
+
+@pytest.fixture(scope="module", name="laid_out_once")
+def _laid_out_once() -> Iterator[None]:
+    """Remember for a module which lines cover a field."""
+    with laid_out_once():
         yield

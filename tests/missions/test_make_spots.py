@@ -23,6 +23,8 @@ from companion.errors import VrsprayError
 from missions.make.spots import Budget, Part, misses, openings
 from missions.make.spots_cli import read_weeds, spots
 
+pytestmark = pytest.mark.usefixtures("laid_out_once")
+
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "zones" / "config.toml"
 PLANE = CRS.from_proj4("+proj=tmerc +lat_0=48.27 +lon_0=16.9 +k=1 +datum=WGS84")

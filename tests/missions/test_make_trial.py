@@ -21,6 +21,8 @@ from missions.make.trial import Design, lay_out
 from missions.make.trial_cli import trial
 from missions.maps.cli.plan import plan_of
 
+pytestmark = pytest.mark.usefixtures("laid_out_once")
+
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "zones"
 app = typer.Typer(add_completion=False)

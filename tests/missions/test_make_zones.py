@@ -29,6 +29,8 @@ from missions.make.passes import Passes, passes_of, places_in
 from missions.make.settled import settled
 from missions.make.zones import Limits, Wish, make_zones
 
+pytestmark = pytest.mark.usefixtures("laid_out_once")
+
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "zones"
 Floats = NDArray[np.float64]

@@ -23,7 +23,7 @@ from missions.reading_outline import read_obstacles
 from tests.bench.missions import to_degrees
 from tests.missions.test_missions_cli import written
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 pyogrio = pytest.importorskip("pyogrio")
 

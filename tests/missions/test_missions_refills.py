@@ -32,7 +32,7 @@ from tests.mission_judge import Drawn
 from tests.naive_sorties import Flight, Pass, figures, least_idle_m, legs_of, naive
 from tests.naive_sorties import passes_of as passes_in
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 MOTION = Motion(speed_m_s=6.0, acceleration_m_s2=2.5, jerk_m_s3=1.0, corners="ardupilot")
 WIDTH_M, RATE_L_HA = 6.0, 20.0

@@ -28,7 +28,7 @@ from missions.terrain import WGS84_CRS, Dem, Terrain, kept_points, read_dem
 from tests.bench.missions import FRAME, to_degrees
 from tests.missions.test_missions_cli import run, written
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 Height = Callable[[Floats, Floats], Floats]
 

@@ -24,7 +24,7 @@ from tests.missions.test_missions_cli import written
 from tests.missions.test_missions_plan import field_of
 from tests.missions.test_missions_sheet import planned
 
-pytestmark = pytest.mark.usefixtures("searched_briefly")
+pytestmark = pytest.mark.usefixtures("searched_briefly", "laid_out_once")
 
 ANYANG = Path(__file__).parents[2] / "examples/anyang/config.toml"
 # Twenty passes of 6 m and 100 m, a hair closer than 6 m: 1.2 ha at 20 L/ha are 24 L.
