@@ -70,35 +70,54 @@ def pytest_asyncio_loop_factories(item: pytest.Item) -> Mapping[str, LoopFactory
     return {"real": asyncio.new_event_loop}
 
 
-# Modules that take longest begin first: the other processes have enough to do meanwhile.
+# Modules that take longest begin first, the longest of all before: the other processes have enough
+# to do meanwhile. Those in real time, and then those that compute.
 LONGEST = (
+    "test_tutorial.py",
+    "test_page_field.py",
     "test_mission_chain.py",
+    "test_operators_page.py",
+    "test_upload.py",
+    "test_wire_flight.py",
+    "test_doctor_click.py",
     "test_clients_mavsdk.py",
-    "test_liquid_wire.py",
     "test_ground.py",
-    "test_doctor_watchdogs.py",
-    "test_campaign.py",
+    "test_office_page.py",
+    "test_fault_campaign.py",
+    "test_run_process.py",
     "test_golden.py",
-    "test_missions_outlines.py",
+    "test_campaign.py",
     "test_sample_flight.py",
-    "test_make_zones.py",
-    "test_cli_map_convert.py",
+    "test_howto.py",
+    "test_web_office.py",
+    "test_missions_outlines.py",
+    "test_liquid_wire.py",
+    "test_wheel.py",
     "test_simulated_records.py",
+    "test_cli_map_convert.py",
     "test_own_method.py",
-    "test_plan_lines.py",
-    "test_px4_flight.py",
-    "test_sitl_fly.py",
     "test_bench.py",
-    "test_demo_cli.py",
-    "test_missions_plan.py",
     "test_web_flights.py",
+    "test_plan_lines.py",
+    "test_sitl_fly.py",
+    "test_demo.py",
+    "test_run_lines.py",
+    "test_make_zones.py",
+    "test_report_figures.py",
+    "test_make_flown.py",
+    "test_valve_calibration.py",
+    "test_commands.py",
+    "test_px4_flight.py",
+    "test_missions_plan.py",
     "test_missions_ends_over.py",
+    "test_doctor_watchdogs.py",
 )
+FIRST = {name: place for place, name in enumerate(LONGEST)}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the modules that take longest first, and look for tasks wherever a loop turns."""
-    items.sort(key=lambda item: item.path.name not in LONGEST)
+    items.sort(key=lambda item: FIRST.get(item.path.name, len(FIRST)))
     for item in items:
         if isinstance(item, pytest.Function) and _has_loop(item):
             # Behind what a module has once: a page for all its tests is left by none of them.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -32,6 +33,7 @@ POSITION_SD_M = 0.02
 MAY_STAY_CLOSED_M = 1.0
 
 
+@cache
 def real_setup(samples: Path) -> Setup:
     """Return the sprayer of the orchard over the real map and its boundary."""
     folder = samples / SAMPLE
