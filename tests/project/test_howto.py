@@ -46,7 +46,7 @@ BLOCK = re.compile(
 NEEDS_MORE = {
     ("run",), ("upload",), ("doctor",), ("ground",), ("service",), ("sitl", "serve"), ("wsp",),
     ("campaign",),
-    ("demo",), ("examples",), ("calibrate", "lag"), ("calibrate", "valves"),
+    ("demo",), ("examples",), ("calibrate", "lag"), ("calibrate", "valves"), ("calibrate", "curve"),
 }  # fmt: skip
 # Options with which one of these needs nothing else.
 ALONE = ("--no-link", "--dry-run", "--catch")
