@@ -74,11 +74,7 @@ def vrspray(
     return subprocess.run(
         [sys.executable, "-P", "-c", start, *arguments],
         cwd=folder,
-        env={
-            **os.environ,
-            "PYTHONPATH": str(installed),
-            "PYTHONPYCACHEPREFIX": f"{installed}-compiled",
-        },
+        env={**os.environ, "PYTHONPATH": str(installed)},
         capture_output=True,
         text=True,
         check=False,
