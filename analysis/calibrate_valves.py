@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, date, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -274,6 +274,7 @@ def measuring(
         perform,
         ready_log,
     )
+    from companion.cli.ground_tasks import drives_while
     from companion.cli.sensor_parts import pulse_meter
 
     parts = pulse_meter(config)
@@ -293,6 +294,9 @@ def measuring(
 
         hand = Hand(descriptor, is_lines=is_lines)
         sensors, hear = ([], counts.around) if pulses is None else ([pulses], _as_it_is)
+        # The same for all of a piece: what changes with the duty would change the pressure, too.
+        most = max(max(phase.duty) for phase in task.phases)
+        task = replace(task, drives=drives_while(config, range(len(config.valve)), most))
         outcome = perform(config, given, task, hand, sensors=sensors, on_step=on_step, hear=hear)
         if outcome.has_begun:
             entry = {

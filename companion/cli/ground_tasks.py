@@ -120,8 +120,11 @@ def _drives(
     config: Config, kind: GroundKind, valves: Sequence[int], duty: float
 ) -> tuple[float, ...]:
     """Return what pump and atomisers do; nothing while valves click dry."""
-    if kind is GroundKind.CLICK:
-        return ()
+    return () if kind is GroundKind.CLICK else drives_while(config, valves, duty)
+
+
+def drives_while(config: Config, valves: Sequence[int], duty: float) -> tuple[float, ...]:
+    """Return what pump and atomisers do while these valves spray at a duty."""
     pump = pump_of(config)
     drives = [] if pump is None else [duty if pump.curve is not None else pump.run_fraction]
     flow_l_min = _flow_l_min(config, valves, duty)
