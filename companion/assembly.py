@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from companion.config import Config
 from companion.config.rules import mismatches, tank_capacity_l
 from companion.config.tables import PrescriptionTable
-from companion.config.wording import show_value
 from companion.core.frame import LocalFrame
 from companion.core.inputs import AutopilotLiquid
 from companion.core.nozzle import NozzleSet, PwmLimits, flow_for_rate
@@ -33,6 +32,7 @@ from companion.flight_map import (
     named_files,
     read_flight_map,
 )
+from companion.wording import show_value
 
 # The autopilot tells whole millilitres ten times a second, up to a tenth of a second old: over half
 # a second that is a quarter of the flow, from one bin to the next.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import re
 import sys
-from pathlib import PurePath
-from typing import Literal
+from pathlib import Path, PurePath
+from typing import Any, Literal
 
 # What a computer is for: the extras of pyproject.toml.
 Role = Literal["vehicle", "office", "campaign", "cluster"]
@@ -40,3 +42,25 @@ def install_command(role: Role, prefix: str = sys.prefix) -> str:
     if (above, folder) == ("uv", "tools"):
         return f"uv pip install --python {prefix}/bin/python {wanted}"
     return f"pip install {wanted}"
+
+
+VALUE_LENGTH_MAX = 60
+_LINE = re.compile(r"at line (\d+)")
+
+
+def show_value(value: Any, *, length_max: int = VALUE_LENGTH_MAX) -> str:
+    """Return a value as one short piece of text, whatever it is."""
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= length_max else f"{text[: length_max - 4]} ..."
+
+
+def say_syntax(path: Path, text: str, message: str) -> str:
+    """Return one line on a file that is not valid TOML: where, what, and the line itself."""
+    match = _LINE.search(message)
+    if match is None:
+        advice = "a quote or bracket is not closed at the end of the file"
+        return f"{path}: not valid TOML: {message}; {advice}"
+    number = int(match[1])
+    lines = text.splitlines()
+    line = show_value(lines[number - 1].strip()) if number <= len(lines) else "the end"
+    return f"{path}: line {number}: {line}: {message}; write key = value, with text in quotes"

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from companion.config.limits import limits_meta
 from companion.core.types import Decision
 from companion.errors import ConfigError
 from companion.journal.journal import Journal
@@ -90,7 +89,7 @@ def write_journal(flown: Flown, folder: Path) -> Path:
         setup=flown.task.setup,
         setup_text={
             "config_toml": flown.task.config.source_text,
-            **limits_meta(flown.task.config.label),
+            **({} if flown.task.config.label is None else flown.task.config.label.as_meta()),
         },
         started_s=float(flown.trajectory.time_s[0]),
         waits=True,

@@ -25,6 +25,7 @@ SOURCES = (
     "companion/output/engine/engine.py",
     "companion/output/pulse_train.py",
     "companion/output/pwm.py",
+    "companion/output/return_valve.py",
     "companion/output/timed.py",
 )
 TESTS = (

@@ -23,7 +23,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from analysis.report.legal_fields import FIELDS, LABELS, REAL_FLIGHT, Facts, label_of
-from companion.config.application_table import ASKED, Profile, is_told, missing
+from companion.config.application_table import Profile, is_told
+from companion.config.legal_entries import ASKED, missing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

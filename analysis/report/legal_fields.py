@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.config.application_table import Profile, check, is_number, is_told, known
+from companion.config.application_table import Profile, is_told
+from companion.config.legal_entries import check, is_number, known
 from companion.config.limits import declared_over
 from companion.config.load import parse_value
 from companion.errors import ConfigError

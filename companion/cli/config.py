@@ -14,8 +14,8 @@ from companion.cli.answer import AsJson, Overrides, answer, note, problem_line, 
 from companion.cli.app import refusal
 from companion.config import Config, load
 from companion.config.rules import mismatches, remarks, without_effect
-from companion.config.wording import show_value
 from companion.errors import ConfigError, MapError, Problem
+from companion.wording import show_value
 
 app = typer.Typer(
     add_completion=False,

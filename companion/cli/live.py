@@ -12,16 +12,14 @@ import json
 import logging
 import math
 import os
-import select
-import signal
 import subprocess
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from typing import TYPE_CHECKING, Any, Self
+from dataclasses import asdict, dataclass, field
+from typing import Any, Self
 
 import numpy as np
 
@@ -29,16 +27,11 @@ from companion.core.frame import Floats
 from companion.core.types import Decision
 from companion.tally import SPEED_MIN_M_S, Tally, next_change_s, speed_of, wanted_l_ha
 
-if TYPE_CHECKING:
-    from rich.console import RenderableType
-
 # So often something is drawn, and so often a plain line tells how it goes.
 DRAWN_EVERY_S = 0.25
 PLAIN_EVERY_S = 10.0
 # With a change of a valve so near, the loop has better things to do.
 QUIET_S = 0.01
-# Nothing new for so long is no live state any more.
-STALE_S = 2.0
 # A pipe takes up to this as one piece, or nothing of it (PIPE_BUF of Linux).
 _PIECE_MAX_BYTES = 4096
 _LINES_KEPT = 200
@@ -47,13 +40,6 @@ _FAULTS_MAX = 4
 _TEXT_MAX = 200
 # Each point costs a look at the map, 5 us on a laptop.
 _AHEAD_M = np.arange(0.0, 31.0)
-_COLOURS = {
-    "spraying": "bold white on dark_green",
-    "armed": "bold white on blue",
-    "ready": "bold white on blue",
-    "fault": "bold white on red",
-    "estop": "bold white on red",
-}
 # A latched state whose fault is over: nothing is left to name, but to release.
 _NO_FAULT = {"fault": "over, but latched: disable, then enable again"}
 TRAINING = {"water": "TRAINING WITH WATER", "dry": "DRY RUN", "ground": "GROUND WORK"}
@@ -281,7 +267,7 @@ class _Child:
 
     def open(self) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", __name__],
+            [sys.executable, "-P", "-m", "companion.cli.drawing"],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             start_new_session=False,
@@ -387,64 +373,3 @@ def _print(text: str) -> None:
     """Write a line before the loop begins or after it has ended: it may wait."""
     with contextlib.suppress(OSError):
         os.write(2, (text + "\n").encode(errors="replace"))
-
-
-# The side that draws: rich, in a process of its own, or in the one of `vrspray top`.
-
-
-def drawn(shown: Shown, *, silent_s: float = 0.0) -> RenderableType:
-    """Return the block as rich draws it."""
-    from rich.panel import Panel
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table.grid(padding=(0, 2))
-    table.add_column(style="dim", no_wrap=True)
-    table.add_column(overflow="fold")
-    for label, text in shown.rows():
-        style = ""
-        if label == "state":
-            style = _COLOURS.get(shown.state, "bold yellow")
-        elif label == "training" or (label == "faults" and shown.faults):
-            style = "bold red"
-        table.add_row(label, Text(text, style=style))
-    title = "vrspray"
-    if silent_s > STALE_S:
-        title = f"vrspray: NOTHING NEW FOR {silent_s:.0f} s"
-    return Panel(table, title=title, title_align="left", border_style="dim")
-
-
-def shown_of(content: Mapping[str, Any]) -> Shown:
-    """Return what was handed over as JSON."""
-    names = {each.name for each in fields(Shown)}
-    return Shown(**{key: value for key, value in content.items() if key in names})
-
-
-def main(source: int = 0) -> None:
-    """Draw what comes in on a descriptor until it ends."""
-    from rich.console import Console
-    from rich.live import Live
-
-    # Ctrl-C is for the run, which then ends the pipe.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.nice(10)
-    console = Console(stderr=True, highlight=False)
-    shown, heard_s, left = Shown(), time.monotonic(), b""
-    with Live(drawn(shown), console=console, auto_refresh=False) as live:
-        while True:
-            ready, _, _ = select.select([source], [], [], 1.0)
-            if ready:
-                got = os.read(source, 1 << 16)
-                if not got:
-                    return
-                *lines, left = (left + got).split(b"\n")
-                for content in map(json.loads, lines):
-                    if "line" in content:
-                        console.print(content["line"], markup=False)
-                    elif content:
-                        shown, heard_s = shown_of(content), time.monotonic()
-            live.update(drawn(shown, silent_s=time.monotonic() - heard_s), refresh=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,132 +1,60 @@
 """From the configuration to what carries plans out: one executor, or several that share.
 
-What drives lines of this computer is loaded by a configuration that has such, when it is put
-together.
+What drives outputs, of this computer or of the autopilot, is loaded by a configuration that has
+such, when it is put together.
 """
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from companion.config import Config
-from companion.core.types import SprayPlan
 from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
-from companion.output.autopilot_options import DriveOutput
-from companion.output.servo import ServoExecutor, ServoOptions
-from companion.output.timed import DryRunExecutor
 from companion.ports import PlanExecutor
 
 if TYPE_CHECKING:
+    from companion.output.autopilot_options import DriveOutput, ServoOptions
     from companion.output.engine.setup import EngineSetup
     from companion.output.gpio import GpioExecutor
     from companion.output.hardware_pwm import PwmDrive
+    from companion.output.servo import ServoExecutor
 
 
 def build_outputs(config: Config, link: VehicleLink) -> PlanExecutor:
     """Return the executor of all valves and motors."""
     output = config.output
     if output.kind == "none":
+        from companion.output.timed import DryRunExecutor
+
         return DryRunExecutor(len(config.valve), has_return=output.return_channel is not None)
+    options, local = servo_options(config), pwm_drives(config)
+    if output.kind == "gpio" and options is None and not local:
+        return build_gpio(config)
+    if output.kind != "gpio" and options is not None and options.channels and not local:
+        return build_servo(config, options, link)
+    from companion.output.composite import CompositeExecutor, Part
+
     parts: list[Part] = []
     if output.kind == "gpio":
         parts.append(Part(executor=build_gpio(config), has_valves=True))
-    options = servo_options(config)
     if options is not None:
         servo = build_servo(config, options, link)
         numbers = drive_numbers(config, is_pwm=False)
         parts.append(Part(executor=servo, has_valves=bool(options.channels), drives=numbers))
-    local = pwm_drives(config)
     if local:
         from companion.output.hardware_pwm import HardwarePwmExecutor
 
         numbers = drive_numbers(config, is_pwm=True)
         parts.append(Part(executor=HardwarePwmExecutor(local), drives=numbers))
-    if len(parts) == 1 and parts[0].has_valves:
-        return parts[0].executor
     return CompositeExecutor(parts)
 
 
 def parts_of(executor: PlanExecutor) -> tuple[PlanExecutor, ...]:
     """Return the executors that an executor is made of."""
-    return executor.executors if isinstance(executor, CompositeExecutor) else (executor,)
-
-
-# Several executors as one: for a pump that hangs elsewhere than its valves.
-#
-# A fault of one stops all: a pump without its valves has no way out, valves without their pump
-# spray what nobody ordered.
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
-    """An executor, and what of each plan is its: the valves, drives by their numbers."""
-
-    executor: PlanExecutor
-    has_valves: bool = False
-    drives: tuple[int, ...] = ()
-
-    def submit(self, plan: SprayPlan) -> None:
-        """Hand it its part of a plan; a plan without drives has them stopped."""
-        own = tuple(plan.drives[number] for number in self.drives) if plan.drives else ()
-        if self.has_valves:
-            self.executor.submit(replace(plan, drives=own))
-        else:
-            self.executor.submit(replace(plan, duty=(), changes=(), drives=own))
-
-
-class CompositeExecutor:
-    """Hands each part of a plan to the executor whose it is.
-
-    At one moment a pump starts behind its valves and stops ahead of them, so that there is always
-    a way out.
-    """
-
-    def __init__(self, parts: Sequence[Part]) -> None:
-        if not parts or sum(part.has_valves for part in parts) > 1:
-            raise ValueError("parts are needed, of which one at most has the valves")
-        self._drives_first = sorted(parts, key=lambda part: part.has_valves)
-
-    @property
-    def executors(self) -> tuple[PlanExecutor, ...]:
-        """Return the executors, that of the valves last."""
-        return tuple(part.executor for part in self._drives_first)
-
-    @property
-    def fault(self) -> str | None:
-        """Why the outputs cannot be trusted; the first that is known."""
-        faults = (executor.fault for executor in self.executors)
-        return next((fault for fault in faults if fault is not None), None)
-
-    async def start(self) -> None:
-        """Take all outputs; where one cannot be had, the others are let go again."""
-        for number, executor in enumerate(self.executors):
-            try:
-                await executor.start()
-            except BaseException:
-                for started in self.executors[:number]:
-                    await started.stop()
-                raise
-
-    def submit(self, plan: SprayPlan) -> None:
-        """Replace what has not happened; with a fault of any, everything stops."""
-        if self.fault is not None:
-            plan = replace(plan, duty=(0.0,) * len(plan.duty), changes=(), drives=())
-        starts = any(drive.fraction for drive in plan.drives)
-        for part in reversed(self._drives_first) if starts else self._drives_first:
-            part.submit(plan)
-
-    async def stop(self) -> None:
-        """Stop the drives, close the valves; none waits for another."""
-        ended = await asyncio.gather(
-            *(executor.stop() for executor in self.executors), return_exceptions=True
-        )
-        for error in ended:
-            if isinstance(error, BaseException):
-                raise error
+    found: tuple[PlanExecutor, ...] = getattr(executor, "executors", (executor,))
+    return found
 
 
 # From the configuration to what the valve engine must know.
@@ -176,8 +104,10 @@ class Motor:
 
 def motors(config: Config) -> tuple[Motor, ...]:
     """Return all motors in the order of a plan's drives; none in a dry run."""
-    if config.output.kind == "none":
+    if config.output.kind == "none" or not config.has_motors:
         return ()
+    from companion.output.autopilot_options import DriveOutput
+
     found = []
     if config.pump is not None:
         pump = config.pump
@@ -224,6 +154,8 @@ def servo_options(config: Config) -> ServoOptions | None:
     drives = tuple(motor.drive for motor in motors(config) if motor.chip is None)
     if not has_valves and not drives:
         return None
+    from companion.output.autopilot_options import ServoOptions
+
     return ServoOptions(
         channels=channels if has_valves else (),
         closed_us=output.closed_us,
@@ -236,6 +168,8 @@ def servo_options(config: Config) -> ServoOptions | None:
 
 def build_servo(config: Config, options: ServoOptions, link: VehicleLink) -> ServoExecutor:
     """Return the executor of these outputs; it hears what the vehicle says of them."""
+    from companion.output.servo import ServoExecutor
+
     executor = ServoExecutor(
         options,
         link.order,
@@ -247,3 +181,14 @@ def build_servo(config: Config, options: ServoOptions, link: VehicleLink) -> Ser
     link.on_order_ack(executor.acknowledge)
     link.follow_outputs(executor)
     return executor
+
+
+def line_warnings(config: Config) -> list[str]:
+    """Return what the line to the autopilot cannot carry of what is to be ordered over it."""
+    if config.output.kind != "servo" or not config.output.dither_us:
+        return []
+    from companion.output.servo import DITHER_S, dither_too_much
+
+    baud = serial_baud(config.link.url)
+    much = dither_too_much(baud=baud, valves=len(config.valve), every_s=DITHER_S)
+    return [] if much is None else [f"warning: {much}"]

@@ -13,7 +13,6 @@ from companion.errors import JournalError
 from companion.journal.journal import Journal
 from companion.journal.read_only import DAMAGE, one_line
 from companion.link.vehicle_link import VehicleLink
-from companion.output.timed import DryRunExecutor, TimedExecutor
 from companion.ports import PlanExecutor
 
 if TYPE_CHECKING:
@@ -70,6 +69,8 @@ def made_ready(folder: Path, journal: JournalTable) -> Iterator[str]:
 
 def follow(journal: Journal, link: VehicleLink, executor: PlanExecutor) -> None:
     """Have the link and the outputs tell the journal what they do, from now on."""
+    from companion.output.timed import DryRunExecutor, TimedExecutor
+
     link.on_event(journal.record_event)
     link.on_statistics(journal.record_link)
     for part in parts_of(executor):

@@ -6,13 +6,11 @@ import json
 import logging
 import os
 import re
-import socket
-import time
-from collections.abc import Callable, MutableMapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,24 +20,25 @@ from companion.cli.answer import AsJson, Overrides, answer, note
 from companion.cli.beside import shown
 from companion.cli.link_parts import build_link, load_with_kept
 from companion.cli.live import Screen, Watcher
-from companion.cli.output_parts import build_outputs
+from companion.cli.output_parts import build_outputs, line_warnings
 from companion.cli.record_parts import FREE_MIN_BYTES, follow, made_ready
 from companion.config import Config
-from companion.config.application_table import missing, told
-from companion.config.limits import limits_meta
+from companion.config.application_table import told
 from companion.config.rules import unbounded, without_effect
 from companion.core.setup import Setup
 from companion.errors import ActuatorError, LinkError, SensorError
 from companion.flight_map import FlightMap
 from companion.journal.journal import Journal
 from companion.link.component import ComponentOptions
-from companion.link.transport import serial_baud
 from companion.link.vehicle_link import VehicleLink
-from companion.output.servo import DITHER_S, dither_too_much
 from companion.ports import COMMIT_EVERY_S, PlanExecutor, Recorder, Sensor
 
 if TYPE_CHECKING:
+    from companion.cli.notifier import Notifier
     from companion.web import OperatorPage
+
+# By these systemd, or a container, asks to be told of the steps.
+_NOTIFY = frozenset({"NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID", "VRSPRAY_ALIVE_FILE"})
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
@@ -125,7 +124,7 @@ def run_companion(
     )
     follow(journal, link, executor)
     recorder = _recorder(page, journal, link)
-    notifier = Notifier.from_environment(os.environ, pid=os.getpid())
+    notifier = _notifier()
     try:
         screen.watcher = Watcher(
             width_m=config.boom_table.width_m,
@@ -133,7 +132,7 @@ def run_companion(
             faults=lambda: (executor.fault, link.fault, journal.fault),
             rates_at=setup.prescription.rates_at,
         )
-        with journal, notifier, shown(), screen:
+        with journal, notifier or nullcontext(), shown(), screen:
             runtime.execute(
                 lambda: runtime.run(
                     setup,
@@ -142,7 +141,7 @@ def run_companion(
                     recorder=recorder,
                     sensors=sensors if page is None else [*sensors, page],
                     duration_s=duration_s,
-                    on_step=notifier.stepped,
+                    on_step=None if notifier is None else notifier.stepped,
                     watch=screen.take,
                     record_fault=(lambda: journal.fault) if config.journal.required else None,
                     commit_every_s=commit_s,
@@ -169,6 +168,15 @@ def _kept(path: Path, link: VehicleLink) -> tuple[str | None, str]:
         return str(path), f"journal: {path}"
     path.unlink(missing_ok=True)
     return None, "no journal is kept: nothing was heard on the link"
+
+
+def _notifier() -> Notifier | None:
+    """Return what tells systemd, or a container, of each step; None where neither asks."""
+    if not _NOTIFY & os.environ.keys():
+        return None
+    from companion.cli.notifier import Notifier
+
+    return Notifier.from_environment(os.environ, pid=os.getpid())
 
 
 def _guard_lines(setup: Setup) -> list[str]:
@@ -270,11 +278,7 @@ def _recorder(page: OperatorPage | None, journal: Journal, link: VehicleLink) ->
 def _warnings(config: Config) -> list[str]:
     found = [f"warning: {found.key}: {found.text}" for found in without_effect(config)]
     found += [f"note: {found.key}: {found.text}" for found in unbounded(config)]
-    if config.output.kind == "servo" and config.output.dither_us:
-        baud = serial_baud(config.link.url)
-        much = dither_too_much(baud=baud, valves=len(config.valve), every_s=DITHER_S)
-        found += [] if much is None else [f"warning: {much}"]
-    return found
+    return found + line_warnings(config)
 
 
 def _about(config: Config, overrides: Sequence[str], flight_map: FlightMap) -> dict[str, str]:
@@ -284,7 +288,7 @@ def _about(config: Config, overrides: Sequence[str], flight_map: FlightMap) -> d
         "config_toml": config.source_text,
         "config_overrides": "\n".join(overrides),
         "application_json": json.dumps(told(config.application, config.product)),
-        **limits_meta(config.label),
+        **({} if config.label is None else config.label.as_meta()),
         "flight_map_json": json.dumps(flight_map.as_object()),
     }
 
@@ -309,6 +313,8 @@ def _application_notes(config: Config, training: str) -> list[str]:
     profile = config.application.profile
     if profile is None or training != "no":
         return []
+    from companion.config.legal_entries import missing
+
     absent = missing(profile, told(config.application, config.product))
     if not absent:
         return []
@@ -319,94 +325,6 @@ def _application_notes(config: Config, training: str) -> list[str]:
 
 
 run = typer.main.get_command(app)
-
-
-# Tells systemd that the control loop makes its steps; without systemd it does nothing.
-#
-# The protocol is a datagram of `KEY=VALUE` lines to the socket in NOTIFY_SOCKET (sd_notify(3)). In
-# a container, where there is no systemd, the same steps touch the file in VRSPRAY_ALIVE_FILE, whose
-# age the image's health check looks at.
-
-# A journal takes up to 30 s to close; the valves are closed by then, and no step follows.
-CLOSING_MAX_S = 35.0
-# The file of a container is touched half as often as this says.
-ALIVE_S = 2.0
-
-
-class Notifier:
-    """Sends READY=1 at the first step, and WATCHDOG=1 at most twice in the watchdog's time.
-
-    It has no timer: a loop that stands still is silent, and systemd ends it.
-    """
-
-    def __init__(
-        self,
-        send: Callable[[bytes], None] | None = None,
-        *,
-        watchdog_s: float | None = None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._send = send
-        self._pause_s = None if watchdog_s is None else 0.5 * watchdog_s
-        self._clock = clock
-        self._fed_s: float | None = None
-
-    @classmethod
-    def from_environment(cls, environment: MutableMapping[str, str], *, pid: int) -> Notifier:
-        """Return what the environment asks for, and take it out: it is not for our children."""
-        address = environment.pop("NOTIFY_SOCKET", "")
-        watchdog_us = environment.pop("WATCHDOG_USEC", "")
-        meant = environment.pop("WATCHDOG_PID", str(pid))
-        alive = environment.pop("VRSPRAY_ALIVE_FILE", "")
-        if not address.startswith(("/", "@")):
-            return cls(_toucher(Path(alive)), watchdog_s=ALIVE_S) if alive else cls()
-        is_watched = watchdog_us.isdecimal() and int(watchdog_us) > 0 and meant == str(pid)
-        return cls(
-            _sender(address.replace("@", "\0", 1) if address[0] == "@" else address),
-            watchdog_s=int(watchdog_us) / 1e6 if is_watched else None,
-        )
-
-    def stepped(self) -> None:
-        """Take that the control loop has made a step."""
-        if self._send is None:
-            return
-        now_s = self._clock()
-        if self._fed_s is None:
-            self._fed_s = now_s
-            self._send(b"READY=1\nWATCHDOG=1")
-        elif self._pause_s is not None and now_s - self._fed_s >= self._pause_s:
-            self._fed_s = now_s
-            self._send(b"WATCHDOG=1")
-
-    def __enter__(self) -> Self:
-        """Begin; nothing is sent before the first step."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Take that the loop has ended and all is closed: the journal may take its time."""
-        if self._send is not None:
-            self._send(f"STOPPING=1\nWATCHDOG_USEC={round(CLOSING_MAX_S * 1e6)}".encode())
-
-
-def _toucher(file: Path) -> Callable[[bytes], None]:
-    def send(_: bytes) -> None:
-        with suppress(OSError):
-            file.touch()
-
-    return send
-
-
-def _sender(address: str) -> Callable[[bytes], None]:
-    def send(message: bytes) -> None:
-        # What cannot be sent now is missed by systemd, which is what it is for.
-        with (
-            suppress(OSError),
-            socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as channel,
-        ):
-            channel.setblocking(False)
-            channel.sendto(message, address)
-
-    return send
 
 
 # How often a flight is committed: once a second, sooner where that is too much of the field.

@@ -18,7 +18,8 @@ from typing import Annotated, Any
 import typer
 
 from companion.cli.answer import AsJson, answer, note
-from companion.cli.live import DRAWN_EVERY_S, PLAIN_EVERY_S, Shown, drawn
+from companion.cli.drawing import drawn
+from companion.cli.live import DRAWN_EVERY_S, PLAIN_EVERY_S, Shown
 from companion.core.types import SprayerState
 from companion.errors import LinkError
 from companion.link.census import AUTOPILOT_COMPONENT, mode_name

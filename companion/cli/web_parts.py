@@ -14,7 +14,7 @@ from typing import Any
 
 from companion.cli.answer import note
 from companion.config import Config
-from companion.config.application_table import check
+from companion.config.legal_entries import check
 from companion.config.limits import DROPLETS, OBSERVED_AT, WEATHER, declared_over
 from companion.config.rules import tank_capacity_l
 from companion.core.options.coverage import Coverage

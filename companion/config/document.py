@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, PrivateAttr
 
 from companion.config import application_table, sprayer_tables, tables
-from companion.config.limits import Buffer, LimitsFile
 from companion.core.boom import Boom, Valve
+
+if TYPE_CHECKING:
+    from companion.config.limits import LimitsFile
 
 Origin = Literal["file", "override", "default"]
 
@@ -83,7 +85,7 @@ class Document(tables.Table):
         return self._label
 
     @property
-    def buffers(self) -> tuple[Buffer, ...]:
+    def buffers(self) -> tuple[tables.Buffer, ...]:
         """Return the ground that label and permit keep away from."""
         file = self.limits_table.file
         return () if self._label is None or file is None else self._label.buffers(file)

@@ -14,16 +14,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path, PurePath
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from companion.config.tables import Rate, Table, Text, Texts
-from companion.config.wording import findings, one_line, say_syntax
+from companion.config.tables import Buffer, Rate, Table, Text, Texts
+from companion.config.wording import findings, one_line
 from companion.core.label import LabelLimits, Span, is_from
 from companion.core.types import Inhibit
 from companion.errors import ConfigError
+from companion.wording import say_syntax
 
 SIZE_MAX_BYTES = 100_000
 # Where the journal keeps them.
@@ -134,6 +135,10 @@ class LimitsFile(Table):
         if any(text[:5] == text[6:] for text in self.hours):
             raise _contradiction("hours", "a span of no time; leave hours out for the whole day")
         return self
+
+    def as_meta(self) -> dict[str, str]:
+        """Return the limits as the journal keeps them."""
+        return {LIMITS_META: self.model_dump_json()}
 
     def ends(self, name: str) -> tuple[float | None, float | None]:
         """Return least and most of a quantity such as `wind_m_s`; None: not limited."""
@@ -258,14 +263,6 @@ class LimitsFile(Table):
             )  # fmt: skip
 
 
-class Buffer(NamedTuple):
-    """Ground to keep away from; `files` are named as seen from the configuration's folder."""
-
-    kind: str
-    distance_m: float
-    files: tuple[str, ...]
-
-
 @dataclass(frozen=True, slots=True)
 class Declared:
     """A limit that the operator answers for; `value` is None where nothing was declared."""
@@ -307,11 +304,6 @@ def declared_over(before: Mapping[str, Any], said: Mapping[str, Any]) -> dict[st
     {'product.name': 'A', 'application.wind_m_s': 2.0}
     """
     return {key: value for key, value in before.items() if key not in WEATHER} | dict(said)
-
-
-def limits_meta(label: LimitsFile | None) -> dict[str, str]:
-    """Return the limits as the journal keeps them; nothing without any."""
-    return {} if label is None else {LIMITS_META: label.model_dump_json()}
 
 
 def limits_of(meta: Mapping[str, str]) -> LimitsFile | None:

@@ -12,10 +12,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from companion.config.document import Origin, leaves
-from companion.config.limits import read_limits
 from companion.config.model import Config
-from companion.config.wording import findings, one_line, say_syntax, show_value
 from companion.errors import ConfigError
+from companion.wording import say_syntax, show_value
 
 # A configuration is a page of text; whatever is larger is another file, given by mistake.
 SIZE_MAX_BYTES = 1_000_000
@@ -41,12 +40,16 @@ def load(path: Path, *, overrides: Sequence[str] = ()) -> Config:
     try:
         config = Config.model_validate(raw)
     except ValidationError as error:
+        from companion.config.wording import findings, one_line
+
         found = findings(error.errors(), raw, Config)
         raise ConfigError(
             f"{path}: {one_line(found)}", problems=[each.problem() for each in found]
         ) from error
     name, label = config.limits_table.file, None
     if name is not None:
+        from companion.config.limits import read_limits
+
         label = read_limits(path.parent / name, f"{path}: limits.file: {path.parent / name}")
     return config.came_from(path, source_text=text, origins=origins, label=label)
 

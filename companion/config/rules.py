@@ -9,7 +9,7 @@ import difflib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import chain, combinations, pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 from companion.config.sprayer_tables import own_figures
@@ -30,6 +30,8 @@ GPIO_LAST = {"lines": 1023, "spi595": LINES_MAX - 1}
 SPAN_MIN_US = 100
 # Passes spaced by another width than the flow law's leave skips or overlaps in every pass.
 SWATH_TOLERANCE = 0.02
+# Where none of these is written there is nothing of sensors that could contradict anything.
+_SENSOR_TABLES = frozenset({"flow_meter", "pressure", "tank", "detection", "valve_tracking"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,8 +50,7 @@ def contradictions(config: Document) -> list[Contradiction]:
     """Return all that makes the configuration unusable."""
     rules: tuple[Callable[[Document], Rule], ...] = (
         _link, _prescription, _valves, _channels, _nozzle_sets, _pwm, _lags, _output, _safety,
-        _mission, _keyed(line_contradictions), _keyed(_motors),
-        _keyed(sensor_contradictions),
+        _mission, _keyed(_lines), _keyed(_motors), _keyed(_sensors),
     )  # fmt: skip
     found: list[Contradiction] = []
     for rule in rules:
@@ -82,6 +83,36 @@ def _motor_warnings(config: Document) -> Found:
         from companion.config.motor_rules import motor_warnings
 
         yield from motor_warnings(config)
+
+
+def _has_wiring(config: Document) -> bool:
+    """Whether anything is written of lines or sensors of this computer."""
+    return (
+        config.output.kind == "gpio"
+        or config.safety.estop_line is not None
+        or bool(_SENSOR_TABLES & config.model_fields_set)
+    )
+
+
+def _lines(config: Document) -> Found:
+    if _has_wiring(config):
+        from companion.config.wiring_rules import line_contradictions
+
+        yield from line_contradictions(config)
+
+
+def _line_warnings(config: Document) -> Found:
+    if _has_wiring(config):
+        from companion.config.wiring_rules import line_warnings
+
+        yield from line_warnings(config)
+
+
+def _sensors(config: Document) -> Found:
+    if _has_wiring(config):
+        from companion.config.wiring_rules import sensor_contradictions
+
+        yield from sensor_contradictions(config, tank_capacity_l(config))
 
 
 def _prescription(config: Document) -> Rule:
@@ -171,7 +202,7 @@ def without_effect(config: Document) -> Rule:
                 text="a published curve: its own authors measured up to 22 % more flow; "
                 "measure yours (vrspray calibrate flow)",
             )
-    for key, text in chain(line_warnings(config), _motor_warnings(config)):
+    for key, text in chain(_line_warnings(config), _motor_warnings(config)):
         yield Contradiction(key=key, text=text)
 
 
@@ -462,134 +493,6 @@ def _mission(config: Document) -> Rule:
                 key="mission.lines_aside_m",
                 text=f"reaches the next line; write at most half a swath, {half_m:g}",
             )
-
-
-# Lines of this computer: each belongs to one thing, whichever table names it.
-#
-# The second who asks the kernel for a line is refused, so that a line claimed twice is a start that
-# fails in the field. Hardware PWM and the outputs of shift registers count from 0 on their own.
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Claim:
-    """A key, and the line that it names."""
-
-    key: str
-    line: int
-    chip_key: str
-    chip: str
-
-
-def line_contradictions(config: Document) -> Found:
-    """Yield (key, what is wrong) of a line that is claimed a second time on one chip."""
-    for first, second in _shared(config):
-        if first.chip == second.chip:
-            yield second.key, f"{first.key} uses the same line; give each its own"
-
-
-def line_warnings(config: Document) -> Found:
-    """Yield lines of one number on chips of two names: these may be one chip.
-
-    A chip is found by its name or by its label, and which labels there are only the computer knows.
-    """
-    for first, second in _shared(config):
-        if first.chip != second.chip:
-            yield (
-                second.key,
-                f"{first.key} has line {first.line} too; if {first.chip} ({first.chip_key}) and "
-                f"{second.chip} ({second.chip_key}) are one chip, give each its own line",
-            )
-
-
-def claims(config: Document) -> tuple[Claim, ...]:
-    """Return what claims lines, the valves first."""
-    output = config.output
-    found: dict[str, int | None] = {}
-    if output.kind == "gpio" and config.gpio.driver == "lines":
-        found |= {f"valve[{n}].channel": valve.channel for n, valve in enumerate(config.valve)}
-        found["output.return_channel"] = output.return_channel
-        found["gpio.alive_line"] = config.gpio.alive_line
-    found["safety.estop_line"] = config.safety.estop_line
-    every = [(key, line, "output.chip", output.chip) for key, line in found.items()]
-    meter = config.flow_meter
-    if meter.source == "gpio":
-        every.append(("flow_meter.line", meter.line, "flow_meter.chip", meter.chip))
-    return tuple(
-        Claim(key=key, line=line, chip_key=chip_key, chip=chip.removeprefix("/dev/"))
-        for key, line, chip_key, chip in every
-        if line is not None
-    )
-
-
-def _shared(config: Document) -> Iterator[tuple[Claim, Claim]]:
-    """Yield each two that name the same number."""
-    return (pair for pair in combinations(claims(config), 2) if pair[0].line == pair[1].line)
-
-
-# What the tables of the sensors must say together with the others.
-
-
-def sensor_contradictions(config: Document) -> Found:
-    """Yield (key, what is wrong and what to write instead)."""
-    yield from _meter(config)
-    yield from _pressure(config)
-    yield from _tank(config)
-    if config.detection.enabled and config.flow_meter.source == "none":
-        yield (
-            "detection.enabled",
-            'needs a flow meter to detect faults; set flow_meter.source = "gpio", or write false',
-        )
-    if config.valve_tracking.enabled and not config.can_track_valves:
-        why = 'needs flow_meter.source = "gpio" and one nozzle set of valves dosed one by one'
-        yield "valve_tracking.enabled", f"{why}; or write false"
-
-
-def _meter(config: Document) -> Found:
-    table = config.flow_meter
-    if table.source != "gpio":
-        return
-    if table.line is None:
-        yield "flow_meter.line", "missing; write the GPIO line of the pulses"
-    if table.pulses_per_l is None:
-        yield (
-            "flow_meter.pulses_per_l",
-            "missing; write the pulses per litre, measured with a bucket",
-        )
-
-
-def _pressure(config: Document) -> Found:
-    table = config.pressure
-    if not table.at_4_ma_kpa < table.at_20_ma_kpa:
-        yield (
-            "pressure.at_20_ma_kpa",
-            f"not above pressure.at_4_ma_kpa = {table.at_4_ma_kpa:g}; write the range's end",
-        )
-    if len(table.duty) != len(table.kpa) or len(table.duty) == 1:
-        yield (
-            "pressure.kpa",
-            f"{len(table.kpa)} pressures for {len(table.duty)} duties; write as many of both, "
-            "two or more, or none",
-        )
-    if not all(a < b for a, b in pairwise(table.duty)):
-        yield "pressure.duty", "must increase; write the measured points in order of duty"
-
-
-def _tank(config: Document) -> Found:
-    table = config.tank
-    if table.source == "none":
-        return
-    capacity_l = tank_capacity_l(config)
-    if capacity_l is None:
-        yield "tank.capacity_l", "missing; write it here, or as mission.tank_l"
-    elif table.filled_l is not None and not table.filled_l <= capacity_l:
-        yield "tank.filled_l", f"more than the tank holds ({capacity_l:g} L); write at most that"
-    if table.source == "flow" and config.flow_meter.source == "none":
-        yield "tank.source", '"flow" needs a flow meter; set flow_meter.source, or "none"'
-    if not table.at_4_ma_l < table.at_20_ma_l:
-        yield (
-            "tank.at_20_ma_l",
-            f"not above tank.at_4_ma_l = {table.at_4_ma_l:g}; write the range's end",
-        )
 
 
 def tank_capacity_l(config: Document) -> float | None:

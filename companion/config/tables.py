@@ -8,7 +8,7 @@ corrections and of the sensors have files of their own.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import (
     BaseModel,
@@ -365,6 +365,14 @@ class ProductTable(Table):
         default=None, description="of the product, with their content, for the record"
     )
     droplet_class: Text | None = Field(default=None, description="for the record")
+
+
+class Buffer(NamedTuple):
+    """Ground to keep away from; `files` are named as seen from the configuration's folder."""
+
+    kind: str
+    distance_m: float
+    files: tuple[str, ...]
 
 
 class LimitsTable(Table):

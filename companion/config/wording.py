@@ -1,22 +1,22 @@
-"""Turning what pydantic and tomllib report into one line that an operator can act on."""
+"""Turning what pydantic reports into one line that an operator can act on.
+
+Loaded where something is wrong, and only there.
+"""
 
 from __future__ import annotations
 
 import difflib
-import json
 import re
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from pydantic import BaseModel
 from pydantic_core import ErrorDetails
 
 from companion.errors import Problem
+from companion.wording import show_value
 
-VALUE_LENGTH_MAX = 60
 BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
-LINE = re.compile(r"at line (\d+)")
 
 WRONG = {
     "float_type": "not a number",
@@ -40,24 +40,6 @@ WRONG = {
     "model_type": "not a table",
     "missing": "missing",
 }
-
-
-def show_value(value: Any, *, length_max: int = VALUE_LENGTH_MAX) -> str:
-    """Return a value as one short piece of text, whatever it is."""
-    text = json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= length_max else f"{text[: length_max - 4]} ..."
-
-
-def say_syntax(path: Path, text: str, message: str) -> str:
-    """Return one line on a file that is not valid TOML: where, what, and the line itself."""
-    match = LINE.search(message)
-    if match is None:
-        advice = "a quote or bracket is not closed at the end of the file"
-        return f"{path}: not valid TOML: {message}; {advice}"
-    number = int(match[1])
-    lines = text.splitlines()
-    line = show_value(lines[number - 1].strip()) if number <= len(lines) else "the end"
-    return f"{path}: line {number}: {line}: {message}; write key = value, with text in quotes"
 
 
 def say(errors: Sequence[ErrorDetails], raw: dict[str, Any], model: type[BaseModel]) -> str:

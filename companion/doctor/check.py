@@ -9,7 +9,8 @@ from enum import StrEnum
 
 from companion.assembly import beyond_label
 from companion.config import Config
-from companion.config.application_table import missing, told, zone_named
+from companion.config.application_table import told, zone_named
+from companion.config.legal_entries import missing
 from companion.config.limits import LimitsFile
 from companion.core.label import is_hour
 

@@ -24,7 +24,6 @@ from typing import Any
 from companion.commands import is_there
 from companion.config import Config
 from companion.config.tables import PrescriptionTable
-from companion.config.wording import show_value
 from companion.errors import NOT_ENOUGH_MEMORY, ConfigError, MapError
 from companion.flight_map.file import VERSION, read_flight_map
 from companion.flight_map.model import (
@@ -35,6 +34,7 @@ from companion.flight_map.model import (
     is_flight_map,
     named_files,
 )
+from companion.wording import show_value
 
 _logger = logging.getLogger(__name__)
 

@@ -12,8 +12,7 @@ import shapely
 from shapely import Geometry, MultiPolygon, Polygon
 
 from companion.config import Config
-from companion.config.limits import Buffer
-from companion.config.tables import PrescriptionTable
+from companion.config.tables import Buffer, PrescriptionTable
 from companion.core.cells import CellGrid, Warp
 from companion.core.frame import LocalFrame
 from companion.core.options.lines import Polyline

@@ -27,6 +27,7 @@ from companion.core.options.coverage import (
     Coverage,
     TileKey,
 )
+from companion.journal.writer import COVERAGE_AHEAD_KEY
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -137,43 +138,8 @@ def _carried(places: Floats, source: LocalFrame, target: LocalFrame) -> tuple[Fl
 
 
 _Kind = Literal["before", "flight"]
-_TABLE = (
-    "CREATE TABLE IF NOT EXISTS coverage_tiles (id INTEGER PRIMARY KEY NOT NULL, "
-    "kind TEXT NOT NULL, tile_east INTEGER NOT NULL, tile_north INTEGER NOT NULL, "
-    "cells BLOB NOT NULL, UNIQUE (kind, tile_east, tile_north))",
-    "INSERT OR IGNORE INTO gpkg_contents (table_name, data_type, identifier, description) VALUES "
-    f"('coverage_tiles', 'attributes', 'coverage_tiles', 'treated ground: {TILE_CELLS} x "
-    f"{TILE_CELLS} cells of {CELL_M} m a row, one bit each, deflated')",
-)
-_PUT = (
-    "INSERT INTO coverage_tiles (kind, tile_east, tile_north, cells) VALUES (?, ?, ?, ?) "
-    "ON CONFLICT (kind, tile_east, tile_north) DO UPDATE SET cells = excluded.cells"
-)
-_DROP = "DELETE FROM coverage_tiles WHERE kind = ? AND tile_east = ? AND tile_north = ?"
-_SET_META = (
-    "INSERT INTO meta (key, value) VALUES (?, ?) "
-    "ON CONFLICT (key) DO UPDATE SET value = excluded.value"
-)
-AHEAD_KEY = "coverage_ahead_s"
 # A number of a tile that is no damage: 655 ha are some 250 tiles across.
 _NUMBER_MAX = 2**24
-
-
-def write_coverage(
-    connection: sqlite3.Connection, coverage: Coverage, before: Coverage | None
-) -> None:
-    """Write what differs from `before`, the coverage that was written last.
-
-    Within the caller's transaction. A tile that is the same object as before is not touched.
-    """
-    _write(connection, "flight", coverage, before)
-    connection.execute(_SET_META, (AHEAD_KEY, repr(coverage.ahead_s)))
-
-
-def write_treated(connection: sqlite3.Connection, treated: Coverage | None) -> None:
-    """Write what earlier flights treated; nothing for a flight that begins on bare ground."""
-    if treated is not None:
-        _write(connection, "before", treated, None)
 
 
 def read_coverage(
@@ -198,7 +164,7 @@ def read_coverage(
 def _ahead(connection: sqlite3.Connection, unread: list[str] | None) -> tuple[str] | None:
     sql = "SELECT value FROM meta WHERE key = ?"
     try:
-        found: tuple[str] | None = connection.execute(sql, (AHEAD_KEY,)).fetchone()
+        found: tuple[str] | None = connection.execute(sql, (COVERAGE_AHEAD_KEY,)).fetchone()
     except sqlite3.DatabaseError as error:
         if unread is None:
             raise
@@ -216,26 +182,6 @@ def read_treated(
     """
     before = _read(connection, "before", unread)
     return before if before is not None and before.tiles else None
-
-
-def _write(
-    connection: sqlite3.Connection, kind: _Kind, coverage: Coverage, before: Coverage | None
-) -> None:
-    for sql in _TABLE if before is None else ():
-        connection.execute(sql)
-    last = {} if before is None else before.tiles
-    if coverage.tiles is last:
-        return
-    connection.executemany(
-        _PUT,
-        (
-            (kind, *key, zlib.compress(tile, level=1))
-            for key, tile in coverage.tiles.items()
-            if last.get(key) is not tile
-        ),
-    )
-    gone = [(kind, *key) for key in last if key not in coverage.tiles]
-    connection.executemany(_DROP, gone)
 
 
 def _read(

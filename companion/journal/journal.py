@@ -31,10 +31,9 @@ from companion.core.setup import Setup
 from companion.core.types import Decision, Input
 from companion.errors import JournalError
 from companion.journal.codec import calibration_sha256, setup_to_json
-from companion.journal.coverage import write_treated
 from companion.journal.geopackage import JOURNAL_VERSION, RESERVE, SCHEMA, write_layers
 from companion.journal.rows import ValveOrder
-from companion.journal.writer import Event, Item, LinkSample, Writer
+from companion.journal.writer import Event, Item, LinkSample, Writer, write_treated
 from companion.ports import COMMIT_EVERY_S
 from companion.simulated import BECAUSE, NOT_ASKED, SIMULATED, Simulated
 

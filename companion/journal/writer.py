@@ -13,11 +13,13 @@ import json
 import logging
 import math
 import sqlite3
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Literal
 
 from companion.core.frame import LocalFrame, course_deg
+from companion.core.options.coverage import CELL_M, TILE_CELLS, Coverage
 from companion.core.types import (
     Decision,
     DeclarationReport,
@@ -28,14 +30,10 @@ from companion.core.types import (
     VehicleState,
 )
 from companion.journal.codec import encode
-from companion.journal.coverage import write_coverage
 from companion.journal.geopackage import point_blob, set_box, time_text
 from companion.journal.read_only import one_line
 from companion.journal.rows import Block, Row, ValveOrder, ValveRows
 from companion.simulated import BECAUSE, SIMULATED, Simulated, parsed
-
-if TYPE_CHECKING:
-    from companion.core.options.coverage import Coverage
 
 # Behind the name of a table: how many rows it has.
 _COUNTED = {"rows_applied": "applied", "rows_valve_changes": "valve_changes"}
@@ -485,3 +483,61 @@ class FlightClock:
     def text(self, at_s: float) -> str | None:
         """Return a monotonic time as UTC; None for what is no time."""
         return time_text(at_s + self.offset_s)
+
+
+# Treated ground: one row a tile, only those that changed (`coverage.py` reads them).
+
+_TILES_TABLE = (
+    "CREATE TABLE IF NOT EXISTS coverage_tiles (id INTEGER PRIMARY KEY NOT NULL, "
+    "kind TEXT NOT NULL, tile_east INTEGER NOT NULL, tile_north INTEGER NOT NULL, "
+    "cells BLOB NOT NULL, UNIQUE (kind, tile_east, tile_north))",
+    "INSERT OR IGNORE INTO gpkg_contents (table_name, data_type, identifier, description) VALUES "
+    f"('coverage_tiles', 'attributes', 'coverage_tiles', 'treated ground: {TILE_CELLS} x "
+    f"{TILE_CELLS} cells of {CELL_M} m a row, one bit each, deflated')",
+)
+_PUT_TILE = (
+    "INSERT INTO coverage_tiles (kind, tile_east, tile_north, cells) VALUES (?, ?, ?, ?) "
+    "ON CONFLICT (kind, tile_east, tile_north) DO UPDATE SET cells = excluded.cells"
+)
+_DROP_TILE = "DELETE FROM coverage_tiles WHERE kind = ? AND tile_east = ? AND tile_north = ?"
+COVERAGE_AHEAD_KEY = "coverage_ahead_s"
+
+
+def write_coverage(
+    connection: sqlite3.Connection, coverage: Coverage, before: Coverage | None
+) -> None:
+    """Write what differs from `before`, the coverage that was written last.
+
+    Within the caller's transaction. A tile that is the same object as before is not touched.
+    """
+    _write_tiles(connection, "flight", coverage, before)
+    connection.execute(SET_META, (COVERAGE_AHEAD_KEY, repr(coverage.ahead_s)))
+
+
+def write_treated(connection: sqlite3.Connection, treated: Coverage | None) -> None:
+    """Write what earlier flights treated; nothing for a flight that begins on bare ground."""
+    if treated is not None:
+        _write_tiles(connection, "before", treated, None)
+
+
+def _write_tiles(
+    connection: sqlite3.Connection,
+    kind: Literal["before", "flight"],
+    coverage: Coverage,
+    before: Coverage | None,
+) -> None:
+    for sql in _TILES_TABLE if before is None else ():
+        connection.execute(sql)
+    last = {} if before is None else before.tiles
+    if coverage.tiles is last:
+        return
+    connection.executemany(
+        _PUT_TILE,
+        (
+            (kind, *key, zlib.compress(tile, level=1))
+            for key, tile in coverage.tiles.items()
+            if last.get(key) is not tile
+        ),
+    )
+    gone = [(kind, *key) for key in last if key not in coverage.tiles]
+    connection.executemany(_DROP_TILE, gone)

@@ -29,6 +29,7 @@ from companion.core.types import (
     ImuReport,
     Input,
     LandedReport,
+    LegReport,
     RcReport,
     Telemetry,
     WindReport,
@@ -51,7 +52,6 @@ from companion.link.messages import (
     Tank,
     TimesyncReceived,
 )
-from companion.link.mission_reader import MissionReader
 from companion.link.outputs import ORDERS, Outputs
 from companion.link.parameters import Parameters
 from companion.link.service import OnEvent, Service
@@ -60,6 +60,7 @@ from companion.link.streams import Meter, Stream, StreamRequest, StreamSuperviso
 from companion.simulated import SIMULATED
 
 if TYPE_CHECKING:
+    from companion.link.mission_reader import MissionReader
     from companion.link.signing import Signing
 
 _POSITION = 33
@@ -129,13 +130,7 @@ class Component:
         self._service = Service(
             self._desk, self._encoder, self._announcer, self._send, version=options.version
         )
-        self._mission = MissionReader(
-            self._encoder,
-            self._send,
-            self.warn,
-            is_used=options.use_mission,
-            is_needed=options.need_mission,
-        )
+        self._mission = self._mission_reader()
         self._wind = WindWatch()
         self.simulation = SimulationWatch()
         self._flies_mission = False
@@ -229,9 +224,7 @@ class Component:
             elif isinstance(message, ParamAsked | ParamSet):
                 inputs.extend(self._service.serve(message))
             elif isinstance(message, MissionCurrent | MissionTransfer):
-                if isinstance(message, MissionCurrent):
-                    self.mission_active = message.is_active
-                inputs.extend(self._mission.take(message))
+                inputs.extend(self._take_mission(message))
             else:
                 self._answer(message)
         for report in self.clock.take_reports():
@@ -257,7 +250,10 @@ class Component:
             self._send(frame)
         self._service.tick(now_s)
         self.outputs.tick(now_s)
-        self._mission.tick(now_s, is_armed=self._desk.is_armed, flies_mission=self._flies_mission)
+        if self._mission is not None:
+            self._mission.tick(
+                now_s, is_armed=self._desk.is_armed, flies_mission=self._flies_mission
+            )
         self._ask_what_it_is(now_s)
         if self._supervisor is None:
             return
@@ -279,6 +275,20 @@ class Component:
             self._meet(now_s)
 
     # ------------------------------------------------------------------------------- inside
+
+    def _mission_reader(self) -> MissionReader | None:
+        """Return what reads the mission; where no mission is used, nothing of it is loaded."""
+        if not self._options.use_mission:
+            return None
+        from companion.link.mission_reader import MissionReader
+
+        return MissionReader(
+            self._encoder,
+            self._send,
+            self.warn,
+            is_used=True,
+            is_needed=self._options.need_mission,
+        )
 
     def _ask_what_it_is(self, now_s: float) -> None:
         """Ask whether the vehicle is simulated, and have it in the record when that is known."""
@@ -303,7 +313,8 @@ class Component:
         self._encoder.system_id = vehicle.system_id
         self.outputs.meet(vehicle)
         self.simulation.meet(vehicle)
-        self._mission.meet(vehicle.system_id, is_streamed=not vehicle.is_px4)
+        if self._mission is not None:
+            self._mission.meet(vehicle.system_id, is_streamed=not vehicle.is_px4)
         self.met_s, self.is_answered = now_s, False
         self.mission_active = None
         if self._options.training:
@@ -366,6 +377,11 @@ class Component:
             self.outputs.parameter(message)
             self.simulation.parameter(message)
 
+    def _take_mission(self, message: MissionCurrent | MissionTransfer) -> tuple[LegReport, ...]:
+        if isinstance(message, MissionCurrent):
+            self.mission_active = message.is_active
+        return () if self._mission is None else self._mission.take(message)
+
     def _take_ack(self, ack: AckReceived) -> None:
         # 0, 0 is an acknowledgement in the old form, which named nobody.
         if (ack.target_system, ack.target_component) not in (self.address, (0, 0)):
@@ -375,7 +391,7 @@ class Component:
             self.on_order_ack(ack.result)
         elif ack.command == SET_MESSAGE_INTERVAL and self._supervisor is not None:
             self._supervisor.answered(ack.result, ack.received_s)
-        elif ack.command == REQUEST_MESSAGE:
+        elif ack.command == REQUEST_MESSAGE and self._mission is not None:
             self._mission.answered(ack.result)
 
     def _take_timesync(self, message: TimesyncReceived) -> None:

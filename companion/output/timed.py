@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from itertools import chain
 
 from companion.core.types import SprayPlan
-from companion.output.pwm import ReturnValve
+from companion.output.return_valve import ReturnValve
 
 # What is told of an order: valve, duty, when a plan wanted it (None: a fault did), when it left.
 OnOrder = Callable[[int, float, float | None, float], None]

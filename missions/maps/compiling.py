@@ -22,9 +22,7 @@ from shapely import Geometry, LineString, MultiPolygon
 from companion.assembly import build_setup, check_mark
 from companion.atomic_write import write_atomically
 from companion.config import Config
-from companion.config.limits import Buffer
-from companion.config.tables import PrescriptionTable
-from companion.config.wording import show_value
+from companion.config.tables import Buffer, PrescriptionTable
 from companion.core.frame import LocalFrame, Place
 from companion.core.options.lines import Polyline
 from companion.core.prescription import FIELD, Prescription
@@ -41,6 +39,7 @@ from companion.journal.geopackage import (
     register_frame,
     write_ground,
 )
+from companion.wording import show_value
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.layer import read_bytes
 from missions.maps.local import grown, make_valid, project

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.config import load
-from companion.config.wording import say_syntax
 from companion.errors import ConfigError
-from companion.wording import install_command
+from companion.wording import install_command, say_syntax
 from sitl.anyang import EXAMPLE
 from sitl.campaign.settings import (
     NOT_IN_CONDITIONS,

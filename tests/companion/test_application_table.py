@@ -11,7 +11,8 @@ import pytest
 from analysis.report.legal_fields import LABELS
 from companion.cli.run import _about, _application_notes
 from companion.config import application_table, load
-from companion.config.application_table import ASKED, PROFILES, missing, told
+from companion.config.application_table import PROFILES, told
+from companion.config.legal_entries import ASKED, missing
 from companion.doctor.check import Status, application_check
 from companion.errors import ConfigError
 from tests.analysis.report_flight import EU_TOLD

@@ -52,10 +52,9 @@ from companion.journal.coverage import (
     polygons,
     read_coverage,
     read_treated,
-    write_coverage,
-    write_treated,
 )
 from companion.journal.journal import Journal
+from companion.journal.writer import write_coverage, write_treated
 from companion.runtime import coverage_ahead_s
 from tests.builders import setup
 

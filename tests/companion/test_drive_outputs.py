@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from companion.cli.output_parts import CompositeExecutor, Part
 from companion.core.types import DriveChange, DrivePlan, SprayPlan, TimedChange
 from companion.errors import ActuatorError
 from companion.output.autopilot_guard import findings
 from companion.output.autopilot_options import DriveOutput, ServoOptions
+from companion.output.composite import CompositeExecutor, Part
 from companion.output.engine import closer
 from companion.output.hardware_pwm import HardwarePwmExecutor, PwmDrive
 from companion.output.servo import ServoExecutor

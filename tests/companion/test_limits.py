@@ -15,7 +15,7 @@ import shapely
 from companion.assembly import above_label, beyond_label, build_setup
 from companion.cli.run import label_notes as of_run
 from companion.config import Config, load
-from companion.config.limits import LimitsFile, limits_meta, limits_of, read_limits
+from companion.config.limits import LimitsFile, limits_of, read_limits
 from companion.core.estimator import Track, estimate, observe
 from companion.core.frame import LocalFrame
 from companion.core.inputs import UtcReport
@@ -382,7 +382,7 @@ def test_without_a_file_nothing_is_limited() -> None:
     given = load(EXAMPLE)
     assert given.limits().label is None
     assert label_check(given, NOW).status is Status.NOT_APPLICABLE
-    assert limits_meta(given.label) == {}
+    assert given.label is None
 
 
 def test_hours_and_days_are_those_of_the_files_offset(tmp_path: Path) -> None:
@@ -396,7 +396,7 @@ def test_hours_and_days_are_those_of_the_files_offset(tmp_path: Path) -> None:
 def test_a_journal_keeps_the_limits_and_what_are_none_is_none(tmp_path: Path) -> None:
     given = config(tmp_path, "rate_max_l_ha = 25\nspeed_max_m_s = 7").label
     assert given is not None
-    assert limits_of(limits_meta(given)) == given
+    assert limits_of(given.as_meta()) == given
     for text in ("", "{", "[]", '{"version": 2, "title": "x"}', '{"version": 1, "title": ""}'):
         assert limits_of({"limits_json": text}) is None
 

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from companion.config import load
-from companion.config.rules import claims, without_effect
+from companion.config.rules import without_effect
+from companion.config.wiring_rules import claims
 from companion.errors import ConfigError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "anyang" / "config.toml"

@@ -16,7 +16,8 @@ import pytest
 from rich.console import Console
 
 from analysis.journals.content import read_journal
-from companion.cli.live import Screen, Shown, Watcher, drawn, shown_of
+from companion.cli.drawing import drawn, shown_of
+from companion.cli.live import Screen, Shown, Watcher
 from companion.core.types import Decision, Inhibit, SprayerState, SprayPlan, TimedChange
 from companion.tally import Tally, next_change_s
 from tests.builders import flying

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from companion.cli.output_parts import (
-    CompositeExecutor,
     build_outputs,
     motor_closer_arguments,
     parts_of,
@@ -21,6 +20,7 @@ from companion.config.motor_rules import atomisers_of, pump_of
 from companion.config.rules import without_effect
 from companion.errors import ConfigError
 from companion.link.vehicle_link import VehicleLink
+from companion.output.composite import CompositeExecutor
 from companion.output.hardware_pwm import HardwarePwmExecutor
 from companion.output.servo import ServoExecutor
 from companion.output.timed import DryRunExecutor

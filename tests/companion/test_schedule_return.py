@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from companion.core.nozzle import PwmLimits
 from companion.core.types import SprayPlan, TimedChange
-from companion.output.pwm import PulseEngine, ReturnValve, spray_spans
+from companion.output.pwm import PulseEngine
+from companion.output.return_valve import ReturnValve, spray_spans
 from companion.output.servo import ServoExecutor, ServoOptions
 
 PWM = PwmLimits(frequency_hz=11.0, duty_min=0.2, duty_max=0.9, min_on_s=0.01, min_off_s=0.01)

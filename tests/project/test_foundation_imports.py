@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.bench import house
+
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("companion", "missions", "sitl", "analysis")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
@@ -142,3 +144,19 @@ def test_command_line_imports_other_packages_only_when_they_are_called() -> None
         names += imports("\n".join(ast.unparse(node) for node in at_once))
     assert names
     assert [name for name in names if name.split(".")[0] in PACKAGES[1:]] == []
+
+
+def test_run_loads_what_every_flight_needs_and_no_more() -> None:
+    _, _, files = house.loaded(ROOT, tries=1)
+    assert len(files) <= 100
+    assert sum(map(house.code_lines, files)) <= 17_000
+    # Each of these is loaded by the configuration that switches it on.
+    optional = {
+        "companion/config": {"legal_entries", "limits", "motor_rules", "wiring_rules", "wording"},
+        "companion/cli": {"drawing", "folders_own", "notifier", "sensor_parts", "web_parts"},
+        "companion/link": {"mission_reader", "serial_port", "signing"},
+        "companion/output": {"composite", "gpio", "hardware_pwm", "pulse_train", "pwm", "servo"},
+    }
+    of_options = {f"{folder}/{name}.py" for folder, names in optional.items() for name in names}
+    assert all((ROOT / name).is_file() for name in of_options)
+    assert of_options & set(map(relative, files)) == set()

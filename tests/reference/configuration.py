@@ -6,7 +6,7 @@ import json
 import re
 from typing import Any
 
-from companion.config.application_table import ASKED
+from companion.config.legal_entries import ASKED
 from companion.config.limits import LimitsFile
 from companion.config.model import Config
 from companion.config.wording import allowed_text

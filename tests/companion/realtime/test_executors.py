@@ -9,10 +9,10 @@ from itertools import count
 
 import pytest
 
-from companion.cli.output_parts import CompositeExecutor, Part
 from companion.core.nozzle import PwmLimits
 from companion.core.types import TimedChange
 from companion.output.autopilot_options import DriveOutput
+from companion.output.composite import CompositeExecutor, Part
 from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.gpio import GpioExecutor
 from companion.output.servo import ServoExecutor, ServoOptions
