@@ -413,9 +413,13 @@ class Motion:
         """Return what ways between two long passes add, with a square corner at both ends."""
         if self.corners == "stop":
             return self.legs_s(length_m)
-        added: Floats = self.legs_s(length_m) - np.interp(
-            length_m, ASIDE_KNOTS_M, _spared_at_corners_s(self)
-        )
+        spared_s = _spared_at_corners_s(self)
+        added: Floats = length_m / self.speed_m_s
+        added += _short_legs(self).reaching_s - spared_s[-1]
+        # Long ways, most of a table's, all spare the same.
+        is_short = length_m < LONG * self.speed_m_s * _short_legs(self).reaching_s
+        short_m = length_m[is_short]
+        added[is_short] = self.legs_s(short_m) - np.interp(short_m, ASIDE_KNOTS_M, spared_s)
         return added
 
     def spared_straight_s(self, one_m: Floats, other_m: Floats) -> Floats:

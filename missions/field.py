@@ -41,6 +41,8 @@ MITRE_LIMIT = 5.0
 # not, the outline's tolerance is made less, and after so many times it stays as it was drawn. A
 # plan covers 99.8 %.
 LOST_MAX, TOLERANCE_LESS, TOLERANCES = 0.0017, 0.6, 6
+# A tolerance so many times the one that would lose just what may be lost is not tried.
+CLEARLY = 1.5
 EXTENT_MAX_M = 20_000.0
 # 383 ha with a swath of 1 m have so many.
 PASSES_MAX = 1_000
@@ -188,10 +190,16 @@ def _around(outline: Area, kept: BaseGeometry) -> BaseGeometry:
     if grown.is_empty:
         return grown
     free_m2 = outline.difference(grown).area
+    allowed_m2, likely_m = OBSTACLE_SHARE * free_m2, math.inf
     for tolerance_m in OBSTACLE_TOLERANCES_M:
+        if tolerance_m > likely_m:
+            continue
         around = around_with_fewer_corners(grown, tolerance_m)
-        if outline.difference(around).area >= (1.0 - OBSTACLE_SHARE) * free_m2:
+        lost_m2 = free_m2 - outline.difference(around).area
+        if lost_m2 <= allowed_m2:
             return around
+        # What is lost is about as much as the tolerance: those clearly too large are not drawn.
+        likely_m = CLEARLY * tolerance_m * allowed_m2 / lost_m2
     return grown
 
 
@@ -246,11 +254,18 @@ def _simpler(
     if inside is None:
         return None, 0.0
     reached_m2 = reachable(inside.difference(kept), swath_width_m).area
+    spare_m2 = reachable(inside.difference(around), swath_width_m).area
+    spare_m2 -= (1.0 - LOST_MAX) * reached_m2
+    likely_m = math.inf if spare_m2 > 0.0 else 0.0
     for _ in range(TOLERANCES if tolerance_m > 0.0 else 0):
-        simple = inside_with_fewer_corners(inside, tolerance_m)
-        left = reachable(simple.difference(around), swath_width_m)
-        if left.area >= (1.0 - LOST_MAX) * reached_m2:
-            return simple, tolerance_m
+        if tolerance_m <= likely_m:
+            simple = inside_with_fewer_corners(inside, tolerance_m)
+            left_m2 = reachable(simple.difference(around), swath_width_m).area
+            short_m2 = (1.0 - LOST_MAX) * reached_m2 - left_m2
+            if short_m2 <= 0.0:
+                return simple, tolerance_m
+            # What is lost is about as much as the tolerance, as with obstacles.
+            likely_m = CLEARLY * tolerance_m * spare_m2 / (spare_m2 + short_m2)
         tolerance_m *= TOLERANCE_LESS
     return inside, 0.0
 

@@ -20,7 +20,14 @@ from missions.coverage import patches, reachable
 from missions.field import Field
 from missions.free_space import FreeSpace, free_space
 from missions.maps.local import polygons_of
-from missions.open_lines import LEFT_SHARE, fitted_lines, has_edges_along, needed_passes, open_lines
+from missions.open_lines import (
+    LEFT_SHARE,
+    fitted_lines,
+    has_edges_along,
+    likely_passes,
+    needed_passes,
+    open_lines,
+)
 from missions.plan import LEAVE_PERCENT, Settings
 from missions.selection import Aim, chosen, families
 from missions.strips import (
@@ -153,7 +160,7 @@ def shadowed(lines: Floats) -> Bools:
 
 def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Floats, float]:
     """Return the lines that cover the field, and the course of the parallel ones."""
-    width_m, area_m2 = settings.swath_width_m, field.spray.area
+    width_m = settings.swath_width_m
     plain = None
     if settings.ends_over:
         plain = spray_lines(field, replace(settings, ends_over=False), motion)
@@ -165,9 +172,7 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
     boom = boom_of(settings, field)
     drawn = _layouts(field, settings, motion, inner, angles[:ANGLES_TRIED], boom, left_share=few)
     if max(len(lines) for _, lines in drawn) > LINES_MAX:
-        costs = [
-            cost_s(lines, motion, width_m, area_m2, weight=LAYOUT_WEIGHT) for _, lines in drawn
-        ]
+        costs = [_layout_s(lines, field, settings, motion) for _, lines in drawn]
         angle_deg, lines = drawn[costs.index(min(costs))]
         return lines, angle_deg
     target, left_share = (
@@ -270,28 +275,87 @@ def _layouts(
     width_m, ground = settings.swath_width_m, field.spray
     passes = border_passes(ground, width_m)
     drawn: list[tuple[float, Floats]] = []
+    bare: list[_Bare] = []
     for number, angle_deg in enumerate(angles):
-        choices = []
         if number == 0:
-            choices.append(joined([passes, inner_lines(inner, width_m, angle_deg)]))
+            lines = joined([passes, inner_lines(inner, width_m, angle_deg)])
+            bare.append(_Bare(angle_deg=angle_deg, lines=lines))
         straights = [open_lines(ground, width_m, angle_deg, packed=settings.closing_share < 1.0)]
         if boom.closes:
             straights.append(lines_over(ground, boom, angle_deg))
         if number == 0 and has_edges_along(ground, width_m, angle_deg):
             straights.append(fitted_lines(ground, width_m, angle_deg, motion))
-        for straight in straights:
-            if len(straight):
-                more = needed_passes(
-                    straight, passes, ground, width_m, left_share=left_share,
-                    covered=boom.united(straight),
-                )  # fmt: skip
-                choices.append(joined([more, straight]))
-        for lines in choices:
-            more = patches(
-                lines, ground, width_m, left_share=left_share, covered=boom.united(lines)
-            )
-            drawn.append((angle_deg, joined([lines, more])))
+        bare += [
+            _Bare(angle_deg=angle_deg, lines=straight, covered=boom.united(straight))
+            for straight in straights
+            if len(straight)
+        ]
+    is_screened = len(passes) > LINES_MAX
+    if is_screened:
+        bare = _likely(bare, passes, field, settings, motion)
+    layouts = [_with_passes(each, passes, ground, boom, left_share) for each in bare]
+    if is_screened:
+        costs = [_layout_s(each.lines, field, settings, motion) for each in layouts]
+        layouts = [layouts[costs.index(min(costs))]]
+    for each in layouts:
+        covered = boom.united(each.lines) if each.covered is None else each.covered
+        more = patches(each.lines, ground, width_m, left_share=left_share, covered=covered)
+        drawn.append((each.angle_deg, joined([each.lines, more])))
     return drawn
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Bare:
+    """Lines of a layout without those that what they leave needs.
+
+    `covered` is their ground; None where all passes along the border are among them.
+    """
+
+    angle_deg: float
+    lines: Floats
+    covered: BaseGeometry | None = None
+
+
+def _with_passes(
+    layout: _Bare, passes: Floats, ground: BaseGeometry, boom: Boom, left_share: float
+) -> _Bare:
+    """Return a layout with the passes along the border that it needs, and its ground."""
+    if layout.covered is None:
+        return layout
+    more = needed_passes(
+        layout.lines, passes, ground, boom.width_m, left_share=left_share, covered=layout.covered
+    )
+    covered = whole(np.array([layout.covered, *boom.strips(more)]))
+    return replace(layout, lines=joined([more, layout.lines]), covered=covered)
+
+
+def _likely(
+    layouts: list[_Bare], passes: Floats, field: Field, settings: Settings, motion: Motion
+) -> list[_Bare]:
+    """Return the layouts with all passes, and of the others the one that will cost least.
+
+    Where passes are so many that layouts are compared by their lines alone, looking for those
+    needed takes longer than all else. It is done once, for the layout that is the best one with
+    every pass over ground that it leaves.
+    """
+    width_m = settings.swath_width_m
+    target = reachable(field.spray, width_m)
+    whole_ones = [each for each in layouts if each.covered is None]
+    others = [each for each in layouts if each.covered is not None]
+    if len(others) < 2:
+        return layouts
+    costs = []
+    for each in others:
+        assert each.covered is not None
+        likely = likely_passes(passes, target.difference(each.covered), width_m)
+        costs.append(_layout_s(joined([likely, each.lines]), field, settings, motion))
+    return [*whole_ones, others[costs.index(min(costs))]]
+
+
+def _layout_s(lines: Floats, field: Field, settings: Settings, motion: Motion) -> float:
+    """Return what the lines of a layout cost."""
+    width_m, area_m2 = settings.swath_width_m, field.spray.area
+    return cost_s(lines, motion, width_m, area_m2, weight=LAYOUT_WEIGHT)
 
 
 # Which way the passes run: along an edge, or what a coarse and then a fine search find.

@@ -20,12 +20,20 @@ TOGETHER = 256
 # So many pairs are looked at for free sight; where there are more, each end's nearest ones.
 SIGHTS_MAX = 60_000
 NEAR = 24
+# Of more ends than these fewer are near, and times are kept to seven digits.
+ENDS_MANY, NEAR_OF_MANY = 1500, 14
 # Two lines of one border are flown without a stop where they meet this close and this straight:
 # at 15 degrees an arc of 23 m leaves the corner by 0.2 m, and a copter of 2.5 m/s2 flies it at
 # 7.6 m/s.
 JOIN_M, JOIN_DEG = 0.6, 15.0
+# ArduCopter begins the next leg before the end of the last one: up to such a bend as early as if it
+# were none, for its waypoint's radius of 2 m lets both be 2.6 m from their common end.
+SOFT_DEG = 45.0
+SOFT = math.cos(math.radians((JOIN_DEG + SOFT_DEG) / 2.0))
 # Parts of one line on both sides of ground that is not sprayed, flown on without a turn.
 ACROSS_M, STRAIGHT_M, ONWARD = 60.0, 0.05, 1.0 - 1e-6
+# Ways as long as the straight one, but for rounding.
+SAME_M = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +84,9 @@ def build_network(
     """
     ends = pieces.ends.reshape(-1, 2)
     count = len(ends)
-    between = np.zeros((count + 2, count + 2))
-    # Distances become times in place: of a thousand lines they fill 32 MB.
+    # Distances become times in place: of a thousand lines 32 MB, of more half as much.
+    is_large = count > ENDS_MANY
+    between = np.zeros((count + 2, count + 2), dtype=np.float32 if is_large else np.float64)
     far_m = between[:count, :count]
     near = _measured(far_m, ends)
     if not space.is_convex:
@@ -86,11 +95,12 @@ def build_network(
     for first in range(0, count, TOGETHER):
         far_m[first : first + TOGETHER] = motion.ways_s(far_m[first : first + TOGETHER])
     length_m = lengths_m(pieces.ends)
-    rows, columns = _flown_through(pieces.ends, near_m, near)
+    bend = math.cos(math.radians(soft_bend_deg(motion)))
+    rows, columns = _flown_through(pieces.ends, near_m, near, bend)
     spared_s = motion.spared_straight_s(length_m[rows >> 1], length_m[columns >> 1])
     between[rows, columns] = between[columns, rows] = -spared_s
     rows, columns = _flown_on(pieces)
-    across = _flown_across(ends, pieces.ends, near_m, near)
+    across = _flown_across(ends, pieces.ends, near_m, near, bend)
     rows, columns = np.append(rows, across[0]), np.append(columns, across[1])
     along_m = np.hypot(*(ends[rows] - ends[columns]).T)
     onward_s = _onward_s(motion, length_m[rows >> 1], along_m, length_m[columns >> 1])
@@ -115,14 +125,14 @@ def _measured(far_m: Floats, ends: Floats) -> Ints:
     """Put in the distances between all ends; return the nearest ones of each, nearest first."""
     count = len(ends)
     own = np.arange(count)
-    kept = min(NEAR, max(count - 2, 1))
+    kept = min(NEAR if count <= ENDS_MANY else NEAR_OF_MANY, max(count - 2, 1))
     near = np.empty((count, kept), dtype=np.int64)
     for first in range(0, count, TOGETHER):
         some = own[first : first + TOGETHER]
-        here = far_m[some] = np.hypot(
-            ends[some, 0][:, None] - ends[:, 0][None, :],
-            ends[some, 1][:, None] - ends[:, 1][None, :],
-        )
+        here = np.square(ends[some, 0][:, None] - ends[:, 0][None, :])
+        here += np.square(ends[some, 1][:, None] - ends[:, 1][None, :])
+        np.sqrt(here, out=here)
+        far_m[some] = here
         here[some - first, some] = here[some - first, some ^ 1] = np.inf
         if count <= 2:
             near[some] = some[:, None] ^ 1
@@ -133,13 +143,21 @@ def _measured(far_m: Floats, ends: Floats) -> Ints:
     return near
 
 
-def _flown_through(lines: Floats, near_m: Floats, near: Ints) -> tuple[Ints, Ints]:
-    """Return pairs of ends at which a line goes on in the next so straight that none stops."""
+def soft_bend_deg(motion: Motion) -> float:
+    """Return up to which bend short legs are timed as if they went straight on."""
+    return SOFT_DEG if motion.corners == "ardupilot" else JOIN_DEG
+
+
+def _flown_through(lines: Floats, near_m: Floats, near: Ints, bend: float) -> tuple[Ints, Ints]:
+    """Return pairs of ends at which a line goes on in the next so straight that none stops.
+
+    `bend` is the cosine of what is as good as straight.
+    """
     away = np.repeat(directions(lines), 2, axis=0)
     away[::2] *= -1.0  # how the line leaves at each of its ends
     rows, columns = np.repeat(np.arange(len(near)), near.shape[1]), near.ravel()
     straight = -(away[rows] * away[columns]).sum(axis=1)
-    through = (near_m.ravel() < JOIN_M) & (straight > math.cos(math.radians(JOIN_DEG)))
+    through = (near_m.ravel() < JOIN_M) & (straight > bend)
     through &= (rows >> 1) != (columns >> 1)
     return rows[through], columns[through]
 
@@ -158,10 +176,13 @@ def _flown_on(pieces: Pieces) -> tuple[Ints, Ints]:
     return 2 * follows + 1, 2 * follows + 2
 
 
-def _flown_across(ends: Floats, lines: Floats, near_m: Floats, near: Ints) -> tuple[Ints, Ints]:
-    """Return pairs of ends at which a line goes on behind ground that is not sprayed.
+def _flown_across(
+    ends: Floats, lines: Floats, near_m: Floats, near: Ints, bend: float
+) -> tuple[Ints, Ints]:
+    """Return pairs of ends at which a line goes on behind a gap.
 
     A low tree is a gap in its lines: straight on over it with closed valves, or other lines first.
+    So is what a pass around an obstacle leaves to others, where the bends at both ends are small.
     """
     away = np.repeat(directions(lines), 2, axis=0)
     away[::2] *= -1.0
@@ -169,10 +190,13 @@ def _flown_across(ends: Floats, lines: Floats, near_m: Floats, near: Ints) -> tu
     way = ends[columns] - ends[rows]
     gap_m = np.hypot(*way.T)
     aside_m = np.abs(way[:, 0] * away[rows, 1] - way[:, 1] * away[rows, 0])
-    across = (gap_m >= JOIN_M) & (gap_m <= ACROSS_M) & (aside_m <= STRAIGHT_M)
-    across &= (way * away[rows]).sum(axis=1) > 0.0
+    ahead_m, onward_m = (way * away[rows]).sum(axis=1), -(way * away[columns]).sum(axis=1)
+    across = (aside_m <= STRAIGHT_M) & (ahead_m > 0.0)
     across &= -(away[rows] * away[columns]).sum(axis=1) > ONWARD
-    across &= ((rows >> 1) != (columns >> 1)) & (near_m.ravel() < gap_m + 1e-6)
+    if bend < SOFT:
+        across |= (ahead_m > bend * gap_m) & (onward_m > bend * gap_m)
+    across &= (gap_m >= JOIN_M) & (gap_m <= ACROSS_M)
+    across &= ((rows >> 1) != (columns >> 1)) & (near_m.ravel() < gap_m + SAME_M)
     return rows[across], columns[across]
 
 

@@ -32,6 +32,8 @@ from missions.strips import (
     united,
 )
 
+Ints = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+
 # So much of the reachable ground may be left for patches.
 LEFT_SHARE = 0.0005
 # Ground to be covered is looked at in parts of so many corners, or this wide.
@@ -89,7 +91,7 @@ def evenly(low: float, high: float, width_m: float) -> Floats:
     return np.linspace(low + width_m / 2.0, high - width_m / 2.0, count)
 
 
-def across_part(part: Polygon, middles: Floats, width_m: float) -> Floats:
+def across_part(part: BaseGeometry, middles: Floats, width_m: float) -> Floats:
     """Return lines along the first axis at these places, where their strips lie on the part."""
     west, _, east, _ = part.bounds
     count = len(middles)
@@ -137,10 +139,9 @@ def needed_passes(
     allowed_m2 = left_share * target.area
     left_m2 = float(shapely.area(missing).sum())
     strips = rectangles(passes, width_m)
-    one, patch = shapely.STRtree(missing).query(strips, predicate="intersects")
+    one, patch, common = _common(strips, missing)
     over = np.split(patch, np.searchsorted(one, np.arange(1, len(passes))))
-    common = shapely.area(shapely.intersection(strips[one], missing[patch]))
-    gain_m2 = np.bincount(one, weights=common, minlength=len(passes))
+    gain_m2 = np.bincount(one, weights=shapely.area(common), minlength=len(passes))
     # A pass never gains more than it did before others were chosen: the best of those that are
     # looked at anew is the best of all.
     waiting = [(-float(gain), at) for at, gain in enumerate(gain_m2) if gain > LEAST_M2]
@@ -163,6 +164,32 @@ def needed_passes(
         left_m2 += float(shapely.area(left).sum() - shapely.area(own).sum())
         missing[over[at]] = left
     return joined(chosen)
+
+
+def likely_passes(passes: Floats, bare: BaseGeometry, width_m: float) -> Floats:
+    """Return the parts of passes that have bare ground in their strips, whatever others cover.
+
+    Those needed are fewer, but which layout needs less of them is seen by these, in no time.
+    """
+    missing = _in_tiles(shapely.get_parts(bare))
+    one, _, common = _common(rectangles(passes, width_m), missing)
+    some = shapely.area(common) > LEAST_M2
+    points, row = shapely.get_coordinates(common[some], return_index=True)
+    at = one[some][row]
+    along_m = ((points - passes[at, :2]) * directions(passes)[at]).sum(axis=1)
+    start_m, end_m = np.full(len(passes), np.inf), np.full(len(passes), -np.inf)
+    np.minimum.at(start_m, at, along_m)
+    np.maximum.at(end_m, at, along_m)
+    found = end_m > start_m
+    way, begin = directions(passes)[found], passes[found, :2]
+    start_m, end_m = start_m[found, None], end_m[found, None]
+    return np.column_stack([begin + way * start_m, begin + way * end_m])
+
+
+def _common(strips: Objects, missing: Objects) -> tuple[Ints, Ints, Objects]:
+    """Return which strip lies over which missing ground, by strip, and what both share."""
+    one, patch = shapely.STRtree(missing).query(strips, predicate="intersects")
+    return one, patch, np.asarray(shapely.intersection(strips[one], missing[patch]), dtype=object)
 
 
 def _in_tiles(parts: Objects) -> Objects:
@@ -211,6 +238,9 @@ def _trimmed(line: Floats, points: Floats) -> Floats:
 # An edge off the course by more across than this is not along the lines.
 ALONG_M = 0.02
 EDGES_MAX = 12
+# Lines from each edge to each other are laid over ground of so many corners in all; fewer edges
+# are looked at where there are more, the longest.
+EDGES_MIN, EDGE_CORNERS = 4, 8_000
 # Less than this left out is no pass, but crumbs for the patches.
 CRUMB_M2 = 1.0
 
@@ -230,7 +260,7 @@ def has_edges_along(ground: BaseGeometry, width_m: float, angle_deg: float) -> b
     return any(len(edges_along(part, width_m)) > 2 for part in shapely.get_parts(turned))
 
 
-def edges_along(part: Polygon, width_m: float) -> Floats:
+def edges_along(part: Polygon, width_m: float, *, most: int = EDGES_MAX) -> Floats:
     """Return where edges run along the lines, lowest and highest place of the part among them."""
     low, high = part.bounds[1], part.bounds[3]
     found: list[tuple[float, float]] = []
@@ -243,24 +273,31 @@ def edges_along(part: Polygon, width_m: float) -> Floats:
     places: list[float] = []
     for _, place in sorted(found, reverse=True):
         apart = all(abs(place - other) > ALONG_M for other in (*places, low, high))
-        if apart and len(places) < EDGES_MAX:
+        if apart and len(places) < most:
             places.append(place)
     return np.array([low, *sorted(places), high])
 
 
 def _fitted_in_part(part: Polygon, width_m: float, motion: Motion) -> Floats:
-    edges = edges_along(part, width_m)
+    corners = int(shapely.get_num_coordinates(part))
+    most = min(max(EDGE_CORNERS // corners, EDGES_MIN), EDGES_MAX)
+    edges = edges_along(part, width_m, most=most)
     last = len(edges) - 1
     best = [0.0] + [np.inf] * last
     lines: list[Floats] = [np.empty((0, 4))] * (last + 1)
+    west, _, east, _ = part.bounds
     for end in range(1, last + 1):
+        tried = []
         for start in range(end):
-            some = across_part(part, evenly(edges[start], edges[end], width_m), width_m)
-            # The time of the lines alone may be too much: what they leave out only adds to it.
-            if best[start] + _legs_s(lengths_m(some), width_m, motion) >= best[end]:
-                continue
-            band = shapely.box(part.bounds[0], edges[start], part.bounds[2], edges[end])
-            cost = best[start] + _cost_s(some, part.intersection(band), width_m, motion)
+            ground = part.intersection(shapely.box(west, edges[start], east, edges[end]))
+            some = across_part(ground, evenly(edges[start], edges[end], width_m), width_m)
+            # The time of the lines alone: what they leave out only adds to it.
+            least_s = best[start] + _legs_s(lengths_m(some), width_m, motion)
+            tried.append((least_s, start, ground, some))
+        for least_s, start, ground, some in sorted(tried, key=lambda each: each[:2]):
+            if least_s >= best[end]:
+                break
+            cost = best[start] + _cost_s(some, ground, width_m, motion)
             if cost < best[end]:
                 best[end], lines[end] = cost, joined([lines[start], some])
     return lines[last]
@@ -268,12 +305,25 @@ def _fitted_in_part(part: Polygon, width_m: float, motion: Motion) -> Floats:
 
 def _cost_s(lines: Floats, ground: BaseGeometry, width_m: float, motion: Motion) -> float:
     """Return the time of lines with a turn after each, and of passes over what they leave out."""
-    left = shapely.get_parts(ground.difference(united(lines, width_m)))
+    left = shapely.get_parts(_beside(lines, ground, width_m))
     left = left[shapely.area(left) > CRUMB_M2]
     bounds = shapely.bounds(left).reshape(-1, 4)
     passes_m = np.maximum(bounds[:, 2] - bounds[:, 0], bounds[:, 3] - bounds[:, 1])
     whole_m = np.concatenate([lengths_m(lines), passes_m])
     return _legs_s(whole_m, width_m, motion)
+
+
+def _beside(lines: Floats, ground: BaseGeometry, width_m: float) -> BaseGeometry:
+    """Return the ground that strips of evenly spaced lines leave.
+
+    Strips of every other line lie apart: as they are they are one area, with nothing to put
+    together, which takes ten times as long.
+    """
+    strips, row = rectangles(lines, width_m), np.unique(lines[:, 1], return_inverse=True)[1]
+    left = ground
+    for odd in (0, 1):
+        left = shapely.difference(left, shapely.multipolygons(strips[row % 2 == odd]))
+    return left
 
 
 def _legs_s(length_m: Floats, width_m: float, motion: Motion) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from missions.corners import Motion
 from missions.demand import Demand
 from missions.free_space import FreeSpace
-from missions.network import ACROSS_M, JOIN_DEG, JOIN_M, STRAIGHT_M
+from missions.network import ACROSS_M, JOIN_M, STRAIGHT_M, soft_bend_deg
 from missions.strips import Floats, directions, lengths_m
 
 # A line, and from where to where along it [m]; the second is the lesser where it is flown back.
@@ -48,6 +48,9 @@ class Times:
         self._way_more_s: float = self._ways[KNOTS] - float(knots_m[KNOTS]) / motion.speed_m_s
         self._reaching_s = float(motion.legs_s(np.array([1e5]))[0]) - 1e5 / motion.speed_m_s
         self._begins_early = motion.corners == "ardupilot"
+        # The cosine of the bends that are as good as none.
+        self.bend = math.cos(math.radians(soft_bend_deg(motion)))
+        self.is_soft = self._begins_early
 
     def leg_s(self, length_m: float) -> float:
         """Return the time of a straight leg from rest to rest."""
@@ -173,7 +176,9 @@ class _Many:
         gap_m: Floats = np.hypot(*(starts - ends).T)
         is_back = (end_m < start_m)[:, None]
         away = np.where(is_back, -self._along[lines], self._along[lines])
-        is_on = (gap_m < ACROSS_M) & ((away[:-1] * away[1:]).sum(axis=1) > COSINE)
+        # Two bends of a soft one each may be a square one together.
+        least = -1e-9 if self._passes.times.is_soft else self._passes.times.bend
+        is_on = (gap_m < ACROSS_M) & ((away[:-1] * away[1:]).sum(axis=1) > least)
         hidden = np.flatnonzero((gap_m > SEEN_M) & ~is_on)
         if len(hidden) and not self._passes.space.is_convex:
             gap_m[hidden] = self._passes.gaps_m(ends[hidden], starts[hidden])
@@ -309,19 +314,19 @@ class Passes:
             east, north = -east, -north
         if after[2] < after[1]:
             x, y = -x, -y
-        if not east * x + north * y > COSINE:
-            return False
+        bend = self.times.bend
         if gap_m < JOIN_M:
-            return True
+            return east * x + north * y > bend
         way = other[0] - one[0], other[1] - one[1]
+        ahead_m, onward_m = way[0] * east + way[1] * north, way[0] * x + way[1] * y
+        if self.times.is_soft and min(ahead_m, onward_m) > bend * gap_m:
+            return gap_m <= SEEN_M or self.gap_m(one, other) < gap_m + TOUCH_M
         return (
-            abs(way[0] * north - way[1] * east) <= STRAIGHT_M
-            and way[0] * east + way[1] * north > 0.0
+            east * x + north * y > bend
+            and abs(way[0] * north - way[1] * east) <= STRAIGHT_M
+            and ahead_m > 0.0
             and abs(east * y - north * x) < STRAIGHT_M / gap_m
         )
-
-
-COSINE = math.cos(math.radians(JOIN_DEG))
 
 
 def turned(run: Sequence[Part]) -> list[Part]:

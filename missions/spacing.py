@@ -41,10 +41,9 @@ RING = 12
 CROWDED_M, SKIPPED_MAX = 4.0, 3
 # A waypoint more is worth so much way, and one that is too near more than any detour tried here.
 WAYPOINT_M, TOO_NEAR_M = 6.0, 1000.0
-# So many pairs that stay too near are looked at one by one, with so many legs around them.
-PAIRS_MAX, AROUND, TOUCH_M = 20, 6, 1e-6
-# Cosine of what is straight on.
-STRAIGHT = 1.0 - 1e-6
+# So many pairs too near are looked at, with so many legs around, and at first so many ways each.
+PAIRS_MAX, AROUND, TRIED_MAX, TOUCH_M = 20, 6, 8, 1e-6
+STRAIGHT = 1.0 - 1e-6  # the cosine of what is straight on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -214,7 +213,8 @@ class Spacing:
                 kind = _Crowded(
                     straight=here if is_straight else NOWHERE, few=here if are_few else NOWHERE
                 )
-                changed = self._changes(given[number], self._others(given, number, kind))
+                most = None if is_straight and are_few else TRIED_MAX
+                changed = self._changes(given[number], self._others(given, number, kind)[:most])
                 better = (leg for leg in changed if near(number, leg) < now)
                 found += [
                     (leg.length_m - legs[number].length_m, number, leg) for leg in islice(better, 1)

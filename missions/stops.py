@@ -217,10 +217,14 @@ def _add(stops: list[Stop], place: Place, speed_m_s: float, *, apart: bool) -> N
     """Add the start of a line; one that the last line goes on in is already there."""
     last = stops[-1]
     if last.opens is False and math.dist(last.place, place) < SAME_M and not apart:
-        middle = ((last.place[0] + place[0]) / 2.0, (last.place[1] + place[1]) / 2.0)
+        middle = _middle(last.place, place)
         stops[-1] = Stop(place=middle, speed_m_s=last.speed_m_s, on_line=True)
         return
     stops.append(Stop(place=place, speed_m_s=speed_m_s, opens=True, on_line=True))
+
+
+def _middle(one: Place, other: Place) -> Place:
+    return (one[0] + other[0]) / 2.0, (one[1] + other[1]) / 2.0
 
 
 # How long each leg of a sortie takes, as its autopilot flies it: one model for all figures.
@@ -316,10 +320,15 @@ def _ways(sortie: Sortie, lines_m: float) -> list[_Way]:
                 )
             )  # fmt: skip
         if _is_no_way(sortie, number):
-            # The ends of both lines are one waypoint.
-            here = leg.points[-1]
+            # The ends of both lines are one waypoint, in the middle: beside another place than
+            # that it might be left out where it is written, or the other way round.
+            here = _middle(leg.points[0], leg.points[-1])
+            if found:
+                found[-1] = replace(found[-1], end=here)
             continue
-        for place in leg.points:
+        # A line that begins at one waypoint with the last one has no way to it.
+        is_met = number > 0 and _is_no_way(sortie, number - 1)
+        for place in leg.points[1:] if is_met else leg.points:
             length_m = math.dist(here, place)
             if length_m > TOUCH_M:
                 found.append(

@@ -26,6 +26,8 @@ AXIS_M, FLATTENING = 6_378_137.0, 1.0 / 298.257_223_563
 STRAIGHT_M = 0.03
 # A strip and the border that it is flown along differ by the digits of coordinates in files.
 DIGITS_M = 1e-3
+# Missed ground that is no more than the edge of some.
+CRUMB_M2 = 1.0
 STRIPS_GRID_M = 1e-6
 
 
@@ -141,12 +143,20 @@ def judge_legs(drawn: Drawn, legs: Legs, *, speed_m_s: float, a_m_s2: float) -> 
         "covered_percent": 100.0 * covered.intersection(ground).area / ground.area,
         "reachable_percent": 100.0 * reached / reachable.area,
         "missed_m2": reachable.area - reached,
+        "missed_places": _places(reachable.difference(covered), drawn.width_m),
         "twice_percent": 100.0 * (float(total_m.sum()) * drawn.width_m - covered.area)
         / ground.area,
         "off_m2": off.area if off.area > DIGITS_M else 0.0,
         "transit_outside_m": sum(way.difference(free).length for way in ways),
         "transit_km": sum(way.length for way in ways) / 1e3,
     }  # fmt: skip
+
+
+def _places(missed: BaseGeometry, width_m: float) -> int:
+    """Return at how many places ground is missed: what lies a swath apart is flown in one pass."""
+    parts = shapely.get_parts(missed)
+    together = shapely.union_all(parts[shapely.area(parts) > CRUMB_M2]).buffer(width_m / 2.0)
+    return 0 if together.is_empty else len(shapely.get_parts(together))
 
 
 def _strip(start: Floats, end: Floats, width_m: float) -> BaseGeometry:

@@ -1,12 +1,14 @@
 """Plans for real, recorded and made-up outlines, each judged apart, beside what peers fly.
 
     python -m tests.bench.outlines [--count 210] [--seed 1] [--fields DIR] [--only NAME]
-        [--jobs 2] [--keep DIR] [--json FILE]
+        [--jobs 2] [--keep DIR] [--json FILE] [--bound]
 
 Every outline is written as GeoJSON and planned by `vrspray plan` itself, in a process of its own
 with a limit of processor time. What it writes is judged by `tests.mission_judge` (shapely and the
 shape of the Earth alone), and its missions are flown by `tests.mission_flight`. The real outlines
-are those of VRSPRAY_SAMPLES and of --fields. Exit 1 where a criterion fails.
+are those of VRSPRAY_SAMPLES and of --fields. Exit 1 where a criterion fails. With --bound nothing
+is planned: it tells what the grid's lines would take if they left no more than a plan may, on
+fields below 1 ha.
 """
 
 from __future__ import annotations
@@ -299,9 +301,52 @@ def _peers(drawn: Drawn, planned: Planned) -> dict[str, dict[str, float]]:
         sprayed_m = float(np.hypot(*(lines[:, 2:] - lines[:, :2]).T).sum())
         flights = [_way(way_of_lines(sortie, home)) for sortie in rows]
         judged = judge_legs(drawn, legs, speed_m_s=SPEED_M_S, a_m_s2=ACCELERATION_M_S2)
-        kept = ("missed_m2", "off_m2", "transit_outside_m", "twice_percent", "reachable_percent")
+        kept = (
+            "missed_m2",
+            "missed_places",
+            "off_m2",
+            "transit_outside_m",
+            "twice_percent",
+            "reachable_percent",
+        )
         found[peer] = _summed(flights, sprayed_m) | {key: judged[key] for key in kept}
     return found
+
+
+def bounds(each: Parcel) -> tuple[float, float]:
+    """Return what the grid's lines and passes over what they miss take, of the lines' own time.
+
+    Without a turn for those passes, and with one for each place: at equal coverage less than the
+    first is not to be had with these lines, and hardly less than the second.
+    """
+    drawn = Drawn(outline=each.outline, width_m=WIDTH_M, obstacle_buffer_m=OBSTACLE_BUFFER_M)
+    lines = lines_of("grid", drawn.plane.area(drawn.outline), WIDTH_M)
+    legs: Legs = [("spray", row.reshape(2, 2)) for row in lines]
+    judged = judge_legs(drawn, legs, speed_m_s=SPEED_M_S, a_m_s2=ACCELERATION_M_S2)
+    lines_s = flown_s(_way(lines.reshape(-1, 2)))
+    long_m = 100.0
+    two = np.array([[0.0, 0.0], [0.0, long_m], [WIDTH_M, long_m], [WIDTH_M, 0.0]])
+    turn_s = flown_s(_way(two)) - flown_s(_way(two[:2])) - long_m / SPEED_M_S
+    spare_m2 = (1.0 - REACHED_PERCENT / 100.0) * drawn.reachable.area
+    missed_m2 = max(judged["missed_m2"] - spare_m2, 0.0)
+    passes_s = missed_m2 / WIDTH_M / SPEED_M_S
+    turns_s = judged["missed_places"] * turn_s if missed_m2 > 0.0 else 0.0
+    return 1.0 + passes_s / lines_s, 1.0 + (passes_s + turns_s) / lines_s
+
+
+def say_bounds(cases: Sequence[Parcel]) -> None:
+    """Tell the medians of `bounds` of small fields without obstacles."""
+    found = [
+        bounds(each)
+        for each in cases
+        if not each.obstacles and Drawn(outline=each.outline).ground.area < SIZES[0][0] * 1e4
+    ]
+    bare, turning = (statistics.median(some) for some in zip(*found, strict=True))
+    say(
+        f"{len(found)} fields below {SIZES[0][0]:g} ha without obstacles: the grid's lines and "
+        f"passes over what they miss take {bare:.2f} of the lines' time, {turning:.2f} with a "
+        "turn for each place (medians)"
+    )
 
 
 def _way(places: Floats) -> Way:
@@ -397,10 +442,14 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--keep", type=Path, help="folder for the outlines that fail")
     parser.add_argument("--json", type=Path, help="file for all figures")
+    parser.add_argument("--bound", action="store_true", help="what covering as much must take")
     given = parser.parse_args()
     cases = [
         each for each in parcels(given.count, given.seed, given.fields) if given.only in each.name
     ]
+    if given.bound:
+        say_bounds(cases)
+        return 0
     if given.keep is not None:
         given.keep.mkdir(parents=True, exist_ok=True)
     results: dict[str, dict[str, Any]] = {}

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from missions.corners import LAGS_S, PX4_DRAG_S, PX4_TURNING_S, Motion, parts_s
 from missions.energy import VERTICALS
 from missions.plan import JERKS_M_S3, Leg, Settings, Sortie
-from missions.stops import timed
+from missions.stops import timed, waypoints_of
 from sitl.vehicle import Leg as Flown
 from sitl.vehicle import Route, Vehicle
 
@@ -196,7 +196,7 @@ def test_an_outline_of_a_point_a_metre_is_not_flown_in_no_time() -> None:
 
 
 @pytest.mark.parametrize("through", [True, False])
-def test_ends_of_lines_that_are_one_waypoint_take_no_time(through: bool) -> None:
+def test_ends_of_lines_that_are_one_waypoint_take_no_stop(through: bool) -> None:
     def border(gap_m: float) -> float:
         half = (100.0 + gap_m, 0.0)
         legs = (
@@ -211,7 +211,41 @@ def test_ends_of_lines_that_are_one_waypoint_take_no_time(through: bool) -> None
         )
         return sum(leg.seconds for leg in found.legs[:-1])
 
-    assert border(0.5) == pytest.approx(border(0.0), abs=0.01)
+    # Their one waypoint is in the middle: what lies between them is flown without a stop.
+    assert border(0.5) == pytest.approx(border(0.0) + 0.5 / 5.0, abs=0.01)
+
+
+@given(
+    side_m=st.floats(1.5, 4.0), bend_deg=st.floats(0.5, 12.0), gap_m=st.floats(0.0, 0.55),
+    aside_m=st.floats(-0.2, 0.2),
+)  # fmt: skip
+def test_a_row_of_short_lines_is_timed_between_the_waypoints_that_are_written(
+    side_m: float, bend_deg: float, gap_m: float, aside_m: float
+) -> None:
+    settings = Settings(swath_width_m=6.0, speed_m_s=6.0)
+    home = here = (0.0, -40.0)
+    start, legs = (0.0, 0.0), []
+    for number in range(12):
+        course = math.radians(number * bend_deg)
+        end = (start[0] + side_m * math.sin(course), start[1] + side_m * math.cos(course))
+        kind: Literal["ferry", "transit"] = "transit" if number else "ferry"
+        legs += [
+            Leg(kind=kind, points=(here, start), speed_m_s=6.0),
+            Leg(kind="spray", points=(start, end), speed_m_s=6.0),
+        ]
+        here, start = end, (end[0] + aside_m, end[1] + gap_m)
+    legs.append(Leg(kind="ferry", points=(here, home), speed_m_s=6.0))
+    (found,) = timed([Sortie(number=1, depot=0, legs=tuple(legs))], settings)
+    places = [stop.place for stop in waypoints_of(found)]
+    ways = [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(places)]
+    courses = [math.degrees(math.atan2(*way)) for way in ways]
+    flown_s = parts_s(
+        [math.hypot(*way) for way in ways],
+        [(after - before + 180.0) % 360.0 - 180.0 for before, after in pairwise(courses)],
+        [settings.motion.at(6.0)] * len(ways),
+        settings.motion.corners,
+    )
+    assert sum(leg.seconds for leg in found.legs[:-1]) == pytest.approx(sum(flown_s), rel=1e-6)
 
 
 def test_a_flight_of_arducopter_from_take_off_to_disarmed() -> None:
