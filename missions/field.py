@@ -153,14 +153,7 @@ def build_field(
             above = _simply_around(shapely.union_all(tall), BLOCKED_TOLERANCE_M)
             high = High(fly=over, blocked=shapely.union_all([*holes, above]))
     off = [translate(local_area(area, frame), *offset_m) for area in no_spray]
-    closed = shapely.union_all(
-        [
-            _grown(area, no_spray_buffer_m)
-            if wind is None
-            else wind.around(area, no_spray_buffer_m)
-            for area in off
-        ]
-    )
+    closed = _kept_away_from(off, no_spray_buffer_m, wind)
     spray = fly
     if fly is not None and not closed.is_empty:
         apart = around_with_fewer_corners(_grown(closed, MARGIN_M), tolerance_m)
@@ -181,6 +174,15 @@ def build_field(
         tolerance_m=tolerance_m,
         given_up_m2=given_up_m2,
         high=high,
+    )
+
+
+def _kept_away_from(
+    areas: Sequence[Area], buffer_m: float, wind: WindBuffer | None
+) -> BaseGeometry:
+    """Return no-spray areas with the ground around them; a wind widens it where it blows."""
+    return shapely.union_all(
+        [_grown(area, buffer_m) if wind is None else wind.around(area, buffer_m) for area in areas]
     )
 
 

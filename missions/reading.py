@@ -128,12 +128,8 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
     mission = None if config is None else config.mission
     offset_m = (0.0, 0.0) if table is None else (table.offset_east_m, table.offset_north_m)
     _check_places(asked, mission, map_file, frame)
-    closed = [near_area(path, frame, asked.opens) for path in asked.no_spray]
-    if config is not None and table is not None:
-        closed += _exclusions(asked, config, table, frame)
     keeps_m = no_spray_buffer_m(asked.ground, config)
-    if config is not None:
-        closed += buffered(config, keeps_m, frame, asked.opens)
+    closed = _no_spray_areas(asked, config, frame, keeps_m)
     ground = build_field(
         boundary,
         obstacles=_obstacles(asked, frame),
@@ -179,6 +175,18 @@ def read_task(asked: Asked, config: Config | None, changes: dict[str, float | in
         said=tuple(said),
         wind=asked.ground.wind or (None if mission is None else mission.wind),
     )
+
+
+def _no_spray_areas(
+    asked: Asked, config: Config | None, frame: LocalFrame, keeps_m: float
+) -> list[MultiPolygon]:
+    """Return what is not sprayed: of the command line, of the map, of label and permit."""
+    closed = [near_area(path, frame, asked.opens) for path in asked.no_spray]
+    if config is None:
+        return closed
+    if config.prescription is not None:
+        closed += _exclusions(asked, config, config.prescription, frame)
+    return closed + buffered(config, keeps_m, frame, asked.opens)
 
 
 def _with_ends_over(asked: Asked, settings: Settings, ground: Field) -> Settings:

@@ -151,25 +151,12 @@ def fly(
     elif wang is not None:
         said = _fly_wang(wang, inputs, output, start_s)
     else:
-        meter = LiquidSensors(
-            plant,
-            meter_rate_hz=options.meter_rate_hz,
-            pressure_rate_hz=options.pressure_rate_hz,
-            start_s=start_s,
-            faults=options.liquid_faults,
-            seed=options.seed,
-        )
+        meter = _liquid_sensors(plant, options, start_s)
         said = _fly_ours(setup, inputs, output, meter, start_s, observer, on_input, on_step)
     output.finish(end_s + TAIL_S / 2)
-    sample_s = SAMPLE_S[options.fidelity]
-    samples = math.floor((end_s + TAIL_S - start_s) / sample_s) + 1
-    times: Floats = start_s + sample_s * np.arange(samples, dtype=np.float64)
+    times = _sampled(start_s, end_s, options)
     path = trajectory.at(times)
     volume_ml = plant.volume_ml(times)
-    # Where a pump makes the flow an open valve says nothing of being at its limit.
-    limits = (
-        (0.0, math.inf) if profile.has_sections else (profile.pwm.duty_min, profile.pwm.duty_max)
-    )
     record = FlightRecord(
         time_s=times,
         east_m=path.east_m,
@@ -182,7 +169,7 @@ def fly(
         guard=setup.overlap,
         treated=setup.treated,
         pwm_period_s=profile.pwm.period_s,
-        duty_limits=limits,
+        duty_limits=_duty_limits(profile),
         nozzle_sets=() if profile.has_sections else setup.nozzle_sets,
         orders=tuple(output.orders),
         # White noise averages out over some messages; what wanders does not.
@@ -207,6 +194,34 @@ def fly(
         ),
         coverage=said.coverage,
     )
+
+
+def _liquid_sensors(plant: Plant, options: FlightOptions, start_s: float) -> LiquidSensors:
+    """Return what measures the liquid of a flight."""
+    return LiquidSensors(
+        plant,
+        meter_rate_hz=options.meter_rate_hz,
+        pressure_rate_hz=options.pressure_rate_hz,
+        start_s=start_s,
+        faults=options.liquid_faults,
+        seed=options.seed,
+    )
+
+
+def _duty_limits(profile: PlantProfile) -> tuple[float, float]:
+    """Return the duties at which a valve can do no more, or no less."""
+    # Where a pump makes the flow an open valve says nothing of being at its limit.
+    if profile.has_sections:
+        return (0.0, math.inf)
+    return (profile.pwm.duty_min, profile.pwm.duty_max)
+
+
+def _sampled(start_s: float, end_s: float, options: FlightOptions) -> Floats:
+    """Return the times that are recorded, until the last drop is out."""
+    sample_s = SAMPLE_S[options.fidelity]
+    samples = math.floor((end_s + TAIL_S - start_s) / sample_s) + 1
+    times: Floats = start_s + sample_s * np.arange(samples, dtype=np.float64)
+    return times
 
 
 def true_profile(profile: PlantProfile, options: FlightOptions) -> PlantProfile:

@@ -6,7 +6,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
@@ -83,54 +83,27 @@ def run_companion(
     refuse_mismatch(config)
     flight_map = flight_map_of(config, given)
     setup = build_setup(config, flight_map)
-    simulated: list[str] = []
+    simulated = _simulated_lines(continue_from)
     if continue_from:
-        from companion.journal.continuing import continued, simulated_lines
-
-        simulated = simulated_lines(continue_from)
-        setup = continued(
-            setup,
-            continue_from,
-            training=training,
-            takes_unmarked=takes_unmarked,
-            by_default=config.coverage.switch_off_percent is None,
-        )
+        setup = _resumed(setup, continue_from, config, training, takes_unmarked=takes_unmarked)
     for line in (*_guard_lines(setup), *simulated):
         note(line)
     link = build_link(config, given, component_options(config, training=training))
     executor = build_executor(config, link)
     sensors = _sensors(config, link)
     page = _page(config, given, setup, link, training=training)
-    for line in (*_warnings(config), *label_notes(config), *_application_notes(config, training)):
-        note(line)
-    if config.mission is not None:
-        for problem in deliverable(setup, config.mission.speed_m_s):
-            note(f"{problem.severity}: {problem.text}; {problem.fix}")
-    folder = config.resolve(config.journal.folder)
-    for line in made_ready(folder, config.journal):
-        note(line)
-    for line in _left_lines(folder, setup, training):
-        note(line)
+    _note_what_may_surprise(config, setup, training)
     commit_s = config.journal.commit_s or commit_every_s(
         setup, None if config.mission is None else config.mission.speed_m_s
     )
-    journal = Journal.create(
-        folder,
-        setup=setup,
-        setup_text=_about(config, given, flight_map),
-        training=training,
-        free_min_bytes=FREE_MIN_BYTES,
-        commit_every_s=commit_s,
-    )
+    about = _about(config, given, flight_map)
+    journal = _new_journal(config, setup, about, training=training, commit_s=commit_s)
     follow(journal, link, executor)
     recorder = _recorder(page, journal, link)
     notifier = _notifier()
     try:
-        screen.watcher = Watcher(
-            width_m=config.boom_table.width_m,
-            training=training,
-            faults=lambda: (executor.fault, link.fault, journal.fault),
-            rates_at=setup.prescription.rates_at,
+        screen.watcher = _watcher(
+            config, setup, training, lambda: (executor.fault, link.fault, journal.fault)
         )
         with journal, notifier or nullcontext(), shown(), screen:
             runtime.execute(
@@ -159,6 +132,70 @@ def run_companion(
         {"journal": kept, "lost_rows": journal.lost, "training": training},
         [line],
         as_json=as_json,
+    )
+
+
+def _resumed(
+    setup: Setup, journals: Sequence[Path], config: Config, training: str, *, takes_unmarked: bool
+) -> Setup:
+    """Return the set-up with the ground that the flights of these journals treated."""
+    from companion.journal.continuing import continued
+
+    return continued(
+        setup,
+        journals,
+        training=training,
+        takes_unmarked=takes_unmarked,
+        by_default=config.coverage.switch_off_percent is None,
+    )
+
+
+def _simulated_lines(journals: Sequence[Path] | None) -> Sequence[str]:
+    """Return which of the journals that are gone on from are of a simulated flight."""
+    if not journals:
+        return ()
+    from companion.journal.continuing import simulated_lines
+
+    return simulated_lines(journals)
+
+
+def _note_what_may_surprise(config: Config, setup: Setup, training: str) -> None:
+    """Say what the settings come to in this flight, and what cannot be delivered as it stands."""
+    for line in (*_warnings(config), *label_notes(config), *_application_notes(config, training)):
+        note(line)
+    if config.mission is not None:
+        for problem in deliverable(setup, config.mission.speed_m_s):
+            note(f"{problem.severity}: {problem.text}; {problem.fix}")
+
+
+def _new_journal(
+    config: Config, setup: Setup, about: Mapping[str, str], *, training: str, commit_s: float
+) -> Journal:
+    """Return the journal of this flight, in a folder that is in order and has room."""
+    folder = config.resolve(config.journal.folder)
+    for line in made_ready(folder, config.journal):
+        note(line)
+    for line in _left_lines(folder, setup, training):
+        note(line)
+    return Journal.create(
+        folder,
+        setup=setup,
+        setup_text=about,
+        training=training,
+        free_min_bytes=FREE_MIN_BYTES,
+        commit_every_s=commit_s,
+    )
+
+
+def _watcher(
+    config: Config, setup: Setup, training: str, faults: Callable[[], Sequence[str | None]]
+) -> Watcher:
+    """Return what makes of decisions what is shown."""
+    return Watcher(
+        width_m=config.boom_table.width_m,
+        training=training,
+        faults=faults,
+        rates_at=setup.prescription.rates_at,
     )
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import house as rules
 from tests.bench import house
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -160,3 +161,13 @@ def test_run_loads_what_every_flight_needs_and_no_more() -> None:
     of_options = {f"{folder}/{name}.py" for folder, names in optional.items() for name in names}
     assert all((ROOT / name).is_file() for name in of_options)
     assert of_options & set(map(relative, files)) == set()
+
+
+def test_a_function_says_its_lines_without_signature_and_docstring(tmp_path: Path) -> None:
+    lines = ["class A:", "    def b(", "        self,", "    ) -> None:", '        """Do."""']
+    lines += ["        print()"] * (rules.FUNCTION_LINES_MAX + 1)
+    file = tmp_path / "long.py"
+    file.write_text("\n".join(lines))
+    assert rules.long_functions({"long": file})[0] == "long.A.b: 61 lines, more than 60"
+    file.write_text("\n".join(lines[:-1]))
+    assert not any(line.startswith("long.A.b") for line in rules.long_functions({"long": file}))
