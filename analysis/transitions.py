@@ -115,11 +115,18 @@ def levels_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
 
 def usual_doses_of(smooth: SmoothTrack, stretches: Sequence[Run]) -> list[float]:
     """Return the dose [mL/m] that the flow mostly had in each stretch; 0 outside the field."""
+    # A stretch stands behind one change and before the next: its median is worked out once.
+    medians: dict[tuple[int, int], float] = {}
     found = []
     for stretch in stretches:
+        if not stretch.inside:
+            found.append(0.0)
+            continue
         start_s, end_s = (stretch.start_s + at * stretch.dwell_s for at in (LEVEL_FROM, LEVEL_TO))
-        part = slice(smooth.track.sample(start_s), smooth.track.sample(end_s) + 1)
-        found.append(float(np.median(smooth.dose_ml_m[part])) if stretch.inside else 0.0)
+        part = (smooth.track.sample(start_s), smooth.track.sample(end_s) + 1)
+        if part not in medians:
+            medians[part] = float(np.median(smooth.dose_ml_m[slice(*part)]))
+        found.append(medians[part])
     return found
 
 
@@ -134,8 +141,7 @@ def find_transitions(
     """Return the transition of each pair of neighbouring stretches."""
     levels_before = levels_of(smooth, [each.before for each in sides])
     levels_after = levels_of(smooth, [each.after for each in sides])
-    usual_before = usual_doses_of(smooth, [each.before for each in sides])
-    usual_after = usual_doses_of(smooth, [each.after for each in sides])
+    usual = usual_doses_of(smooth, [run for each in sides for run in (each.before, each.after)])
     found: list[Transition] = []
     for i, change in enumerate(changes):
         before, after = sides[i].before, sides[i].after
@@ -152,9 +158,9 @@ def find_transitions(
         asked *= after.rate_l_ha - before.rate_l_ha
         progress = (pair[1] - pair[0]) / asked
         if progress > 0.0 and late_s - early_s > smooth.track.step_s:
-            usual = (usual_before[i], usual_after[i])
-            is_told = (usual[1] - usual[0]) / asked >= USUAL_STEP_MIN
-            located = _located(smooth, usual if is_told else pair, early_s, late_s)
+            mostly = (usual[2 * i], usual[2 * i + 1])
+            is_told = (mostly[1] - mostly[0]) / asked >= USUAL_STEP_MIN
+            located = _located(smooth, mostly if is_told else pair, early_s, late_s)
             found.append(replace(located, progress=progress, levels_ml_m=pair))
         else:
             found.append(_nominal(smooth.track, at_s, progress, pair))

@@ -6,10 +6,11 @@ import sqlite3
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 
@@ -88,16 +89,19 @@ def part_of(content: bytes, leader: Part | None = None) -> Part:
 
 
 class _Column:
-    """The numbers of one place, to be given out in the order of the lines."""
+    """The numbers of one place, to be given out in the order of the lines.
 
-    __slots__ = ("before", "codes", "fresh", "is_int", "words")
+    `code`, `fresh` and `word` each give the next one: looked up once, asked for each number.
+    """
+
+    __slots__ = ("before", "code", "fresh", "is_int", "word")
 
     def __init__(
         self, *, codes: Sequence[int] = (), fresh: Sequence[str] = (), is_int: bool
     ) -> None:
-        self.codes = iter(codes)
-        self.fresh = iter(fresh)
-        self.words: Iterator[int] | None = None
+        self.code = iter(codes).__next__
+        self.fresh = iter(fresh).__next__
+        self.word: Callable[[], int] | None = None
         self.before = ""
         self.is_int = is_int
 
@@ -150,7 +154,8 @@ def _columns(
     for key, how_many in news.items():
         if how_many:
             fresh, words = reader.floats(how_many)
-            columns[key].fresh, columns[key].words = iter(fresh), iter(words) if words else None
+            columns[key].fresh = iter(fresh).__next__
+            columns[key].word = iter(words).__next__ if words else None
     return columns
 
 
@@ -161,20 +166,20 @@ def _numbers(columns: Sequence[_Column], seen: list[str]) -> list[str]:
     anchor_word: int | None = None
     for column in columns:
         if column.is_int:
-            found.append(next(column.fresh))
+            found.append(column.fresh())
             continue
-        code = next(column.codes)
+        code = column.code()
         if code == SAME:
             text = column.before
         elif code != NEW:
             text = column.before = seen[BACK - 1 - code]
         else:
-            words = column.words
-            if words is None:
-                text = next(column.fresh)
+            if column.word is None:
+                text = column.fresh()
             else:
-                anchor_word = _word_of(anchor) if anchor_word is None else anchor_word
-                text = _float_of(anchor_word + next(words))
+                if anchor_word is None:
+                    anchor_word = _word_of(anchor)
+                text = _float_of(anchor_word + column.word())
             column.before = text
             seen.append(text)
         anchor = anchor or text
@@ -304,8 +309,7 @@ _SELECT = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(NamedTuple):
     """One input or decision as it lies in the file; `kind` is the name of its type."""
 
     sequence: int
