@@ -141,7 +141,7 @@ def find_transitions(
     """Return the transition of each pair of neighbouring stretches."""
     levels_before = levels_of(smooth, [each.before for each in sides])
     levels_after = levels_of(smooth, [each.after for each in sides])
-    usual = usual_doses_of(smooth, [run for each in sides for run in (each.before, each.after)])
+    doses = usual_doses_of(smooth, [run for each in sides for run in (each.before, each.after)])
     found: list[Transition] = []
     for i, change in enumerate(changes):
         before, after = sides[i].before, sides[i].after
@@ -158,9 +158,9 @@ def find_transitions(
         asked *= after.rate_l_ha - before.rate_l_ha
         progress = (pair[1] - pair[0]) / asked
         if progress > 0.0 and late_s - early_s > smooth.track.step_s:
-            mostly = (usual[2 * i], usual[2 * i + 1])
-            is_told = (mostly[1] - mostly[0]) / asked >= USUAL_STEP_MIN
-            located = _located(smooth, mostly if is_told else pair, early_s, late_s)
+            usual = (doses[2 * i], doses[2 * i + 1])
+            is_told = (usual[1] - usual[0]) / asked >= USUAL_STEP_MIN
+            located = _located(smooth, usual if is_told else pair, early_s, late_s)
             found.append(replace(located, progress=progress, levels_ml_m=pair))
         else:
             found.append(_nominal(smooth.track, at_s, progress, pair))

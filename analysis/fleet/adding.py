@@ -2,12 +2,13 @@
 
 First every journal's row is written with what its tables hold, so that all flights can be asked
 for within seconds. Then the flights are evaluated, which takes as long as their reports do; what
-is interrupted there is gone on with by the next `add`.
+is interrupted, in either step, is gone on with by the next `add`.
 """
 
 from __future__ import annotations
 
 import ctypes
+import gc
 import multiprocessing
 import os
 import signal
@@ -40,7 +41,7 @@ _Read = Row | Problem | str
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Added:
-    """What became of journals; seconds are those of the two steps."""
+    """What became of the journals that were read; seconds are those of the two steps."""
 
     journals: int
     added: int = 0
@@ -85,7 +86,9 @@ def add(
     """Take journals in; what is there already, to the same last row, stays as it is."""
     with _Pool(_processes(processes, len(paths))) as pool:
         result, waiting = _record(pool, store, paths, machine, tell)
-        return _evaluate(pool, store, waiting, result, tell) if evaluate else result
+        if result.is_interrupted or not evaluate:
+            return result
+        return _evaluate(pool, store, waiting, result, tell)
 
 
 def _record(
@@ -103,16 +106,23 @@ def _record(
     rows: dict[Path, Row] = {}
     problems: list[Problem] = []
     waiting: list[tuple[Path, str | None]] = []
+    count, is_interrupted = 0, False
     read = partial(recorded, machine=machine, known=done)
-    for path, found in pool.each(read, paths, partial(tell, "reading journals")):
-        if isinstance(found, Problem):
-            problems.append(found)
-        elif isinstance(found, str):
-            if not by_sha[found].is_evaluated:
-                waiting.append((path, by_sha[found].machine))
-        else:
-            before = known.get(found["flight_id"])
-            rows[path] = found if before is None else flown_by(found, before.machine)
+    try:
+        for path, found in pool.each(read, paths, partial(tell, "reading journals")):
+            count += 1
+            if isinstance(found, Problem):
+                problems.append(found)
+            elif isinstance(found, str):
+                if not by_sha[found].is_evaluated:
+                    waiting.append((path, by_sha[found].machine))
+            else:
+                before = known.get(found["flight_id"])
+                rows[path] = found if before is None else flown_by(found, before.machine)
+    except KeyboardInterrupt:
+        # Of many thousand journals this is an hour's work: what was read is kept.
+        is_interrupted = True
+        pool.close(at_once=True)
     change = store.merge(rows.values(), known)
     store.list_damaged(problems)
     news = change.added | change.replaced
@@ -121,12 +131,13 @@ def _record(
     waiting += [(path, row["machine"]) for key, (path, row) in first.items() if key in news]
     there = known.keys() | first.keys()
     return Added(
-        journals=len(paths),
+        journals=count,
         added=len(change.added),
         replaced=len(change.replaced),
         problems=tuple(each for each in problems if each.flight_id not in there),
         not_evaluated=len(waiting),
         record_s=time.monotonic() - began_s,
+        is_interrupted=is_interrupted,
     ), waiting
 
 
@@ -249,5 +260,7 @@ def _started(processes: int) -> ProcessPoolExecutor:
 
 def _end_with_parent() -> None:
     """Leave Ctrl-C to the parent, and end when it does, also by a kill."""
+    # What is imported by now stays: the garbage of each flight is looked for among its own.
+    gc.freeze()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

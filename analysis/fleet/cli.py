@@ -115,6 +115,11 @@ def add(
         lines.append(f"{counted(done.evaluated, 'flight')} evaluated")
     if done.not_evaluated:
         lines.append(f"{done.not_evaluated} not evaluated yet: run the same command again")
+    if done.journals < len(paths):
+        lines.append(
+            f"interrupted after {done.journals} of {counted(len(paths), 'journal')}: run the same "
+            "command again"
+        )
     answer(result, lines, as_json=as_json)
     if done.is_interrupted:
         raise typer.Exit(INTERRUPTED)

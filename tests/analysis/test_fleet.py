@@ -104,6 +104,26 @@ def test_what_was_not_evaluated_is_evaluated_by_the_next_add(
     assert contents(tmp_path / "f") == contents(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("step", ["reading journals", "evaluating flights"])
+def test_what_was_done_before_an_interrupt_is_kept_and_gone_on_with(
+    several: list[Path], tmp_path: Path, step: str
+) -> None:
+    def interrupt(what: str, done: int, _total: int) -> None:
+        if (what, done) == (step, 3):
+            raise KeyboardInterrupt
+
+    is_reading = step == "reading journals"
+    cut = taken(several, tmp_path / "f", tell=interrupt)
+    assert cut.is_interrupted
+    assert (cut.journals, cut.unchanged) == (2 if is_reading else 5, 0)
+    flags = [row["is_evaluated"] for row in rows(tmp_path / "f")]
+    assert (len(flags), sum(flags)) == ((2, 0) if is_reading else (5, 2))
+    then = taken(several, tmp_path / "f")
+    assert (then.added, then.evaluated) == ((3, 5) if is_reading else (0, 3))
+    taken(several, tmp_path / "whole")
+    assert contents(tmp_path / "f") == contents(tmp_path / "whole")
+
+
 def test_a_row_says_what_the_report_says(
     several: list[Path], tmp_path: Path, capsys: Captured
 ) -> None:
