@@ -49,8 +49,9 @@ from missions.worth import LINES_MAX, WORTH, Tour, tour_of, without_stubs, worth
 # line, and only the best one where it has more lines than this.
 ANGLES_TRIED, LAYOUTS_TRIED, MANY_LINES = 2, 2, 100
 # Simpler borders and what lines leave out come to 0.2 % of the ground at most, with a little for
-# how both are measured; lines alone may always leave out 0.02 %.
-LOST_SHARE, LEFT_MIN = 0.9, 0.0002
+# how both are measured; lines alone may always leave out 0.02 %. What the passes along a ragged
+# border leave beyond that counts against a layout where both come to more than 99 % of it.
+LOST_SHARE, LEFT_MIN, BARELY_SHARE = 0.9, 0.0002, 0.99
 # Where more may be left than that, a line must bring half of what its time brings elsewhere.
 LEFT_WORTH = 0.5
 # Of smaller fields, 1 ha with a swath of 6 m, lines are chosen from all that could be flown.
@@ -191,7 +192,8 @@ def spray_lines(field: Field, settings: Settings, motion: Motion) -> tuple[Float
     better = [(angle_deg, covering.worthwhile(tour)) for angle_deg, tour in best]
     if plain is not None:
         better.append((plain[1], covering.tour(plain[0])))
-    better.sort(key=lambda each: covering.value_s(each[1]))
+    barely_m2 = max(_spare(field, settings, BARELY_SHARE), left_share) * target.area
+    better.sort(key=lambda each: (covering.left_m2(each[1]) > barely_m2, covering.value_s(each[1])))
     angle_deg, tour = better[0]
     is_asked = (
         settings.leave_max_percent > LEAVE_PERCENT or settings.overlap_max_percent is not None
@@ -235,9 +237,9 @@ def is_small(field: Field, settings: Settings) -> bool:
     return field.spray.area <= SMALL_SWATHS2 * settings.swath_width_m**2
 
 
-def _spare(field: Field, settings: Settings) -> float:
+def _spare(field: Field, settings: Settings, lost_share: float = LOST_SHARE) -> float:
     """Return what share of the ground lines may leave out, beside what simpler borders gave up."""
-    lost_max = LOST_SHARE * settings.leave_max_percent / 100.0
+    lost_max = lost_share * settings.leave_max_percent / 100.0
     reached_m2 = reachable(field.limit, settings.swath_width_m).area
     return max(lost_max - field.given_up_m2 / reached_m2, LEFT_MIN)
 
