@@ -110,10 +110,21 @@ def test_an_undisturbed_plan_says_nothing_of_it(
     assert SAID not in said.err
 
 
+@pytest.fixture
+def as_in_a_process_of_its_own() -> Iterator[None]:
+    """Python's own thresholds: the tests' (tests/conftest.py) are those of a plan."""
+    before = gc.get_threshold()
+    gc.set_threshold(700, 10, 10)
+    yield
+    gc.set_threshold(*before)
+
+
 @pytest.mark.parametrize("around", [missions.cli._seldom_collected, missions.cli._undisturbed])
 @pytest.mark.parametrize("breaks", [False, True])
 def test_what_a_plan_changes_of_the_process_is_as_before(
-    around: Callable[[], AbstractContextManager[None]], breaks: bool
+    around: Callable[[], AbstractContextManager[None]],
+    breaks: bool,
+    as_in_a_process_of_its_own: None,
 ) -> None:
     before = gc.get_threshold(), signal.getsignal(signal.SIGINT)
     with suppress(ValueError), around():
