@@ -12,8 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from analysis.calibrate_valves import (
+    ConfigFile,
+    HoldLines,
+    Keep,
     Measure,
+    Record,
     done_at_last,
+    failed,
     measuring,
     read_json,
     record_in,
@@ -31,7 +36,7 @@ from analysis.calibration.curve import (
 )
 from analysis.calibration.valves import ValveCourseError
 from analysis.write_back import Write, written_lines
-from companion.cli.answer import AsJson, Overrides, answer, note
+from companion.cli.answer import AsJson, Overrides, answer
 from companion.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -44,26 +49,13 @@ Records = dict[tuple[int, ...], list["FlowRecord"]]
 
 
 def curve(
-    config_file: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
-    ],
+    config_file: ConfigFile,
     passes: Annotated[
         int, typer.Option(min=2, max=20, help="How often each duty is measured; up, then down.")
     ] = PASSES,
-    is_lines: Annotated[
-        bool,
-        typer.Option(
-            "--hold-lines", help="Lines on stdin hold instead of the space bar: for scripts."
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Keep what was recorded (JSON), to evaluate it again."),
-    ] = None,
-    record: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="FILE", help="Evaluate such a record; nothing is opened."),
-    ] = None,
+    is_lines: HoldLines = False,
+    out: Keep = None,
+    record: Record = None,
     plot: Annotated[Path | None, typer.Option(metavar="PNG", help="Picture of all sets.")] = None,
     overrides: Overrides = None,
     is_write: Write = False,
@@ -94,9 +86,7 @@ def curve(
                 write_records(out, names, records)
         found = [identify_curve(records.get(each.valves, ()), each) for each in sets]
     except (CurveCourseError, ValveCourseError) as error:
-        answer({"error": str(error)} if as_json else {}, (), as_json=as_json)
-        note(f"error: {error}")
-        raise typer.Exit(1) from error
+        raise failed(error, as_json=as_json) from error
     result = as_shape(found, names)
     if plot is not None:
         from analysis.calibrate_plots import plot_set_curves

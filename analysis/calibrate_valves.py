@@ -40,6 +40,23 @@ if TYPE_CHECKING:
     from companion.ground.work import GroundDecision, GroundTask
     from companion.sensors.flow_meter import EdgeSource, Meter
 
+# Options of what is measured by pieces of ground work.
+ConfigFile = Annotated[
+    Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
+]
+HoldLines = Annotated[
+    bool,
+    typer.Option("--hold-lines", help="Lines on stdin hold instead of the space bar: for scripts."),
+]
+Keep = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Keep what was recorded (JSON), to evaluate it again."),
+]
+Record = Annotated[
+    Path | None,
+    typer.Option("--from", metavar="FILE", help="Evaluate such a record; nothing is opened."),
+]
+
 MS = 1000.0
 # A piece that was broken off is done again so many times before it is given up.
 TRIES = 3
@@ -151,9 +168,7 @@ class CountRecorder:
 
 
 def valves(
-    config_file: Annotated[
-        Path, typer.Option("--config", metavar="FILE", help="Configuration, a TOML file.")
-    ],
+    config_file: ConfigFile,
     cycles: Annotated[
         int, typer.Option(min=6, max=200, help="How often each kind of change is made of a valve.")
     ] = CYCLES,
@@ -164,20 +179,9 @@ def valves(
             help="The other valves spray meanwhile: where one alone is too little for the meter.",
         ),
     ] = False,
-    is_lines: Annotated[
-        bool,
-        typer.Option(
-            "--hold-lines", help="Lines on stdin hold instead of the space bar: for scripts."
-        ),
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Keep what was recorded (JSON), to evaluate it again."),
-    ] = None,
-    record: Annotated[
-        Path | None,
-        typer.Option("--from", metavar="FILE", help="Evaluate such a record; nothing is opened."),
-    ] = None,
+    is_lines: HoldLines = False,
+    out: Keep = None,
+    record: Record = None,
     catch: Annotated[
         Path | None,
         typer.Option(
@@ -222,9 +226,7 @@ def valves(
         try:
             found = identify_valves(pieces, len(names))
         except ValveCourseError as error:
-            answer({"error": str(error)} if as_json else {}, (), as_json=as_json)
-            note(f"error: {error}")
-            raise typer.Exit(1) from error
+            raise failed(error, as_json=as_json) from error
         result = as_shape(found, names, config.lag_model(), day)
         if plot is not None:
             from analysis.calibrate_plots import plot_valves
@@ -232,6 +234,13 @@ def valves(
             plot_valves(found, names, plot)
     changed = written_lines(config_file, result, is_write=is_write)
     answer(result, [*lines(result), *changed], as_json=as_json)
+
+
+def failed(error: Exception, *, as_json: bool) -> typer.Exit:
+    """Say why a measurement failed, and return the end of the command that goes with it."""
+    answer({"error": str(error)} if as_json else {}, (), as_json=as_json)
+    note(f"error: {error}")
+    return typer.Exit(1)
 
 
 def _course(config: Config, cycles: int, *, is_alone: bool) -> Course:
