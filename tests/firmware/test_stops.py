@@ -31,7 +31,8 @@ from tests.firmware.flights import (
     until_landed,
     until_spraying,
 )
-from tests.firmware.judge import geojson_zones, obeyed, treated_ground
+from tests.firmware.judge import geojson_zones, obeyed
+from tests.firmware.judge_ground import treated_ground
 from tests.firmware.station import COMPANION
 
 pytestmark = [pytest.mark.firmware, pytest.mark.timeout(300)]

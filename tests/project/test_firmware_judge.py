@@ -9,14 +9,15 @@ import pytest
 import shapely
 
 from tests.firmware.judge import (
+    Change,
     Verdict,
     Zone,
     apart_m,
     judge,
     judge_perfect,
     obeyed,
-    treated_ground,
 )
+from tests.firmware.judge_ground import sprayed_before, treated_ground
 from tests.firmware.station import Place, Pulses
 
 # The valve's mean lag: dead time, half the rise, half a servo frame.
@@ -174,22 +175,24 @@ def test_a_board_closes_what_stands_still_and_opens_with_the_next_move() -> None
     assert obeyed(pulsed([1000] * 40))[1] == []
 
 
-def test_ground_that_one_flight_left_is_found_and_what_two_treated_too() -> None:
-    def flight(
-        start_s: float, open_m: tuple[float, float], east_m: float
-    ) -> tuple[list[Place], list[Pulses]]:
-        places, pulses = [], []
-        for number in range(1000):
-            at_s = number * 0.01
-            place = (5.0 * at_s / NORTH_M, east_m / EQUATOR_M)
-            places.append(Place(start_s + at_s, start_s + at_s, number, *place, 0.0))
-            is_open = open_m[0] <= 5.0 * at_s < open_m[1]
-            us = pulse_us(20.0, 5.0) if is_open else 1000
-            pulses.append(Pulses(start_s + at_s, start_s + at_s, (1500,) * 8 + (us,) * 6 + (0, 0)))
-        return places, pulses
+def flown_north(
+    start_s: float, open_m: tuple[float, float], east_m: float
+) -> tuple[list[Place], list[Pulses]]:
+    """Fly 50 m north at 5 m/s, all valves open from one place to another."""
+    places, pulses = [], []
+    for number in range(1000):
+        at_s = number * 0.01
+        place = (5.0 * at_s / NORTH_M, east_m / EQUATOR_M)
+        places.append(Place(start_s + at_s, start_s + at_s, number, *place, 0.0))
+        is_open = open_m[0] <= 5.0 * at_s < open_m[1]
+        us = pulse_us(20.0, 5.0) if is_open else 1000
+        pulses.append(Pulses(start_s + at_s, start_s + at_s, (1500,) * 8 + (us,) * 6 + (0, 0)))
+    return places, pulses
 
-    one = flight(0.0, (0.0, 20.0), 0.0)
-    other = flight(20.0, (15.0, 30.0), 0.7)
+
+def test_ground_that_one_flight_left_is_found_and_what_two_treated_too() -> None:
+    one = flown_north(0.0, (0.0, 20.0), 0.0)
+    other = flown_north(20.0, (15.0, 30.0), 0.7)
     # Judged from 0.6 m to 40.6 m: treated once to 15, twice to 20, once to 30, left from there.
     ends = (0.6 / NORTH_M, 0.0), (40.6 / NORTH_M, 0.0)
     ground = treated_ground(
@@ -198,3 +201,19 @@ def test_ground_that_one_flight_left_is_found_and_what_two_treated_too() -> None
     assert ground.whole_m2 == pytest.approx(40.0 * 6.0, abs=3.0)
     assert ground.left_m2 == pytest.approx(10.6 * 6.0, abs=3.0)
     assert ground.twice_m2 == pytest.approx(5.0 * 6.0, abs=3.0)
+
+
+def test_a_change_on_ground_that_was_sprayed_before_is_told() -> None:
+    one = flown_north(0.0, (0.0, 20.0), 0.0)
+    other = flown_north(20.0, (2.0, 50.0), 0.7)
+
+    def is_again(valve: int, north_m: float, start_s: float = 20.0) -> bool:
+        change = Change(valve, start_s + north_m / 5.0, north_m, 20.0, 30.0, 5.0, 0.0)
+        places, pulses = one[0] + other[0], one[1] + other[1]
+        return sprayed_before(places, pulses, [zone(-1.0, 60.0, 20.0)], [change])[0]
+
+    assert is_again(1, 10.0)
+    assert is_again(5, 22.0)  # what is measured begins 4 m before
+    assert not is_again(5, 26.0)
+    assert not is_again(6, 10.0)  # three tenths of its strip
+    assert not is_again(1, 10.0, 0.0)  # its own spray
