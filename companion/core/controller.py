@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
-from companion.core.boom import Paths
-from companion.core.border import Intervals
+from companion.core.boom import Intervals, Paths
 from companion.core.crossings import NO_ROUTES, KnownRoutes, Route, carried_on, find_routes
 from companion.core.dose import (
     SetOfRate,

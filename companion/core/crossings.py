@@ -6,7 +6,7 @@ cuts. A side is half-open, so that a path through a vertex crosses once. Edges h
 on the left, so that each cut says which zone is entered or left, and nothing is sampled.
 
 At the border the whole strip counts, not its centre: it is closed while any part of it is
-outside (`border.py`).
+outside (`boom.py`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,17 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from companion.core.boom import STRAIGHT_YAW_RATE_DEG_S, Boom, Paths, place_velocity, predict
-from companion.core.border import Intervals, add_contacts, joined, swept
+from companion.core.boom import (
+    STRAIGHT_YAW_RATE_DEG_S,
+    Boom,
+    Intervals,
+    Paths,
+    add_contacts,
+    joined,
+    place_velocity,
+    predict,
+    swept,
+)
 from companion.core.frame import Floats, Ints, Offset
 from companion.core.prescription import FIELD, SLIVER_M, Prescription
 from companion.core.types import VehicleState

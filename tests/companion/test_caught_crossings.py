@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import shapely
 
-from companion.core import border, crossings
+from companion.core import boom as geometry
+from companion.core import crossings
 from companion.core.boom import Boom, Paths, Valve, predict
 from companion.core.controller import Memory, step
 from companion.core.crossings import Route, find_routes
@@ -106,8 +107,8 @@ def test_a_straight_pass_meets_what_chords_of_any_direction_meet(
     assert met == sorted(crossings._met(paths, edges.ends, edges.owner))
     assert len(met) > 5
     half_m = boom.half_width_m + 0.1
-    touched = border._contacts_of_one_chord(paths, edges.ends, half_m.tolist())
-    by_arrays = border._contacts(paths, 0, edges.ends, half_m)
+    touched = geometry._contacts_of_one_chord(paths, edges.ends, half_m.tolist())
+    by_arrays = geometry._contacts(paths, 0, edges.ends, half_m)
     assert (touched is None) == (by_arrays is None) == (off_deg == 89.0)
     assert sorted(touched or ()) == sorted(by_arrays or ())
 

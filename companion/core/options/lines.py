@@ -17,8 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.core.boom import Boom, Paths, time_on_chord
-from companion.core.border import Intervals
+from companion.core.boom import Boom, Intervals, Paths, time_on_chord
 from companion.core.frame import Floats, Place
 from companion.core.inputs import MISSION_MODES
 from companion.core.types import MissionLeg, VehicleState
