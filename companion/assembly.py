@@ -15,7 +15,7 @@ from companion.config.rules import mismatches, tank_capacity_l
 from companion.config.tables import PrescriptionTable
 from companion.core.frame import LocalFrame
 from companion.core.inputs import AutopilotLiquid
-from companion.core.nozzle import NozzleSet, PwmLimits, flow_for_rate
+from companion.core.nozzle import NozzleSet, flow_for_rate
 from companion.core.options.atomisers import Atomiser
 from companion.core.options.flow_trim import FlowTrim
 from companion.core.options.lines import Lines
@@ -24,6 +24,7 @@ from companion.core.options.overlap import OverlapGuard
 from companion.core.options.pump import Pump
 from companion.core.options.valve_tracking import ValveTracking
 from companion.core.setup import Setup
+from companion.core.types import PwmLimits
 from companion.errors import ConfigError, MapError, Problem
 from companion.flight_map import (
     FlightMap,

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from companion.core.boom import Boom, Valve
-from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.schedule import LagModel
+from companion.core.types import PwmLimits
 from sitl.meter import BoardEdge
 from sitl.profile import draw_scatter, flow_table
 

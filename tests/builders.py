@@ -11,12 +11,20 @@ import shapely
 
 from companion.core.boom import Boom, Valve
 from companion.core.frame import LocalFrame
-from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.prescription import Prescription, Zone
 from companion.core.safety import Limits
 from companion.core.schedule import LagModel
 from companion.core.setup import Setup
-from companion.core.types import Fix, Method, SprayPlan, Telemetry, TimedChange, VehicleState
+from companion.core.types import (
+    Fix,
+    Method,
+    PwmLimits,
+    SprayPlan,
+    Telemetry,
+    TimedChange,
+    VehicleState,
+)
 
 CURVE = FlowCurve(
     duty=(0.2, 0.4, 0.5, 0.7, 0.8, 0.9, 1.0),

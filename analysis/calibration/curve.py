@@ -25,8 +25,8 @@ from companion.output.pwm import stagger
 
 if TYPE_CHECKING:
     from analysis.calibration.flow_record import Floats, FlowRecord
-    from companion.core.nozzle import PwmLimits
     from companion.core.schedule import LagModel
+    from companion.core.types import PwmLimits
 
 # A duty is measured at every 5 %: the twin's curve is straight to 0.1 % over that.
 SPACING = 0.05

@@ -34,8 +34,8 @@ from companion.ground.work import PIECE_MAX_S, GroundKind, GroundTask, Phase
 
 if TYPE_CHECKING:
     from analysis.calibration.flow_record import Floats, FlowRecord
-    from companion.core.nozzle import PwmLimits
     from companion.core.schedule import LagModel
+    from companion.core.types import PwmLimits
 
 # How often each kind of change is made of every valve: 2.4 ms of lag in 95 % of the twin's valves.
 CYCLES = 20

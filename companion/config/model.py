@@ -10,11 +10,11 @@ from pydantic_core import PydanticCustomError
 from companion.config.application_table import told
 from companion.config.document import Document
 from companion.config.rules import contradictions
-from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.options.drift import Drift, blowing, fall_s
 from companion.core.safety import Limits
 from companion.core.schedule import LagModel
-from companion.core.types import Fix, Method
+from companion.core.types import Fix, Method, PwmLimits
 
 FIXES = {
     "3d": Fix.FIX_3D,

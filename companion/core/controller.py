@@ -15,17 +15,19 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from companion.core.boom import Intervals, Paths
 from companion.core.crossings import NO_ROUTES, KnownRoutes, Route, carried_on, find_routes
-from companion.core.dose import (
+from companion.core.frame import Offset
+from companion.core.nozzle import (
+    NozzleSet,
     SetOfRate,
     dosing_by_valve,
     dosing_of,
+    flow_for_rate,
     overdrive_of,
+    overridden,
     sets_ahead,
     skew_of,
     speed_soon,
 )
-from companion.core.frame import Offset
-from companion.core.nozzle import NozzleSet, flow_for_rate, overridden
 from companion.core.options import flow_trim, treated_area, valve_tracking
 from companion.core.options.atomisers import flows_ahead, spinning
 from companion.core.options.coverage import Coverage

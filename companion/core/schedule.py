@@ -17,8 +17,7 @@ from typing import Literal, NamedTuple
 
 from companion.core.boom import Valve
 from companion.core.crossings import Crossing, Route
-from companion.core.nozzle import PwmLimits
-from companion.core.types import Method, TimedChange
+from companion.core.types import Method, PwmLimits, TimedChange
 
 Reference = Literal["volume", "settled"]
 

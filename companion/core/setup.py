@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 
 from companion.core.boom import Boom
 from companion.core.crossings import ROUTES_KEPT_S, Across, Border
-from companion.core.dose import Sprayer
 from companion.core.frame import LocalFrame
 from companion.core.inputs import AutopilotLiquid
-from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.nozzle import NozzleSet, Sprayer
 from companion.core.options.atomisers import Atomiser
 from companion.core.options.coverage import Coverage
 from companion.core.options.drift import Drift
@@ -23,7 +22,7 @@ from companion.core.options.valve_tracking import Tracking, ValveTracking
 from companion.core.prescription import Prescription
 from companion.core.safety import Limits
 from companion.core.schedule import LagModel, Timing
-from companion.core.types import Method
+from companion.core.types import Method, PwmLimits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -89,6 +89,34 @@ __all__ = [
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PwmLimits:
+    """What the valves can follow; `duty_max` is the last duty below fully open."""
+
+    frequency_hz: float
+    duty_min: float
+    duty_max: float
+    min_on_s: float
+    min_off_s: float
+
+    def __post_init__(self) -> None:
+        if not 0.1 <= self.frequency_hz <= 1000.0:
+            raise ValueError(f"frequency_hz must lie in [0.1, 1000], got {self.frequency_hz}")
+        if not 0.0 <= self.duty_min < self.duty_max <= 1.0:
+            raise ValueError(
+                f"0 <= duty_min < duty_max <= 1 must hold, got {self.duty_min}, {self.duty_max}"
+            )
+        if not (self.min_on_s >= 0.0 and self.min_off_s >= 0.0):
+            raise ValueError("min_on_s and min_off_s must not be negative")
+        if not self.min_on_s + self.min_off_s < self.period_s:
+            raise ValueError("min_on_s and min_off_s together must be shorter than a period")
+
+    @property
+    def period_s(self) -> float:
+        """Return the length of a PWM period."""
+        return 1.0 / self.frequency_hz
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TimedChange:
     """Valve number `valve` (index from the left) takes `duty` at `at_s`.
 

@@ -7,7 +7,7 @@ from collections import deque
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
-    from companion.core.nozzle import PwmLimits
+    from companion.core.types import PwmLimits
 
 # After a restart a period is stretched or shortened by at most this fraction, until the valve
 # is back in the stagger of the phases.

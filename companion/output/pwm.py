@@ -15,8 +15,7 @@ from companion.output.pulse_train import Edge, PulseTrain, stagger
 from companion.output.return_valve import ReturnValve
 
 if TYPE_CHECKING:
-    from companion.core.nozzle import PwmLimits
-    from companion.core.types import SprayPlan, TimedChange
+    from companion.core.types import PwmLimits, SprayPlan, TimedChange
 
 __all__ = ["Edge", "PulseEngine", "needs_restart", "stagger"]
 

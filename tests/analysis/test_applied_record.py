@@ -20,9 +20,9 @@ from analysis.flown.modelled_flow import (
     ramped,
     valve_flows,
 )
-from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.schedule import LagModel, Timing
-from companion.core.types import Method
+from companion.core.types import Method, PwmLimits
 from tests.analysis.applied_flights import SPEED_M_S, changes_of, eastwards, with_meter
 from tests.builders import CURVE, LAG
 

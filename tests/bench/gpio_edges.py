@@ -20,8 +20,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.engine import Engine
 from companion.output.engine.lines import MemoryLines
 from companion.output.engine.process import boot_s

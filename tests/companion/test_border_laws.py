@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from shapely import Polygon
 
 from companion.core.crossings import Crossing, Route
-from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.nozzle import FlowCurve, NozzleSet
 from companion.core.prescription import Prescription, Zone
 from companion.core.schedule import LagModel, Overdrive, Timing, orders
 from companion.core.setup import Setup
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.pwm import PulseEngine
 from tests.border_flight import Ground, Way, flows, spilled_by_valve
 from tests.builders import CURVE, boom, setup

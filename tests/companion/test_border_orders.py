@@ -11,12 +11,12 @@ import shapely
 from companion.config.load import load
 from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
-from companion.core.nozzle import PwmLimits
 from companion.core.options.lines import Lines
 from companion.core.options.pump import PumpOutlet
 from companion.core.prescription import Prescription, Zone
 from companion.core.schedule import LagModel, Order, Overdrive, Timing, orders, schedule, shut_spans
 from companion.core.setup import Setup
+from companion.core.types import PwmLimits
 from missions.maps.compiling import compiled_setup
 from tests.border_flight import Way, flows, orders_of, pump_orders_of, spilled_by_valve, spilled_s
 from tests.builders import plots, setup

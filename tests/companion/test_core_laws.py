@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from companion.core.controller import Memory, step
 from companion.core.crossings import find_routes
 from companion.core.frame import LocalFrame, look_ahead_point
-from companion.core.nozzle import FlowCurve, PwmLimits, allowed_duty, flow_for_rate
+from companion.core.nozzle import FlowCurve, allowed_duty, flow_for_rate
 from companion.core.prescription import Prescription, Zone
-from companion.core.types import Fix, VehicleState
+from companion.core.types import Fix, PwmLimits, VehicleState
 from tests.builders import CURVE, SPRAYING, along, boom, flying, setup
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)

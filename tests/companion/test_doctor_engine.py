@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
+from companion.core.types import PwmLimits
 from companion.doctor import gpio
 from companion.doctor.check import Status
 from companion.doctor.gpio import engine_checks, read_engine

@@ -21,8 +21,7 @@ from companion.cli.doctor_watchdogs import (
     systemd_checks,
     try_script,
 )
-from companion.core.nozzle import PwmLimits
-from companion.core.types import HeartbeatReport, Input, LandedReport, SprayPlan
+from companion.core.types import HeartbeatReport, Input, LandedReport, PwmLimits, SprayPlan
 from companion.doctor import gpio
 from companion.doctor.check import Check, Status, is_ready
 from companion.doctor.gpio import EngineTrial, try_engine

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.engine import GAP_S, Engine
 from companion.output.engine.lines import MemoryLines
 from companion.output.engine.setup import EngineSetup, Wiring

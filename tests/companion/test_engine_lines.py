@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
+from companion.core.types import PwmLimits
 from companion.errors import ActuatorError
 from companion.output.engine import closer, lines
 from companion.output.engine.lines import (

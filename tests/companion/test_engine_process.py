@@ -15,8 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.errors import ActuatorError
 from companion.output.engine import process
 from companion.output.engine.selftest import WAKES, SelfTest

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
+from companion.core.types import PwmLimits
 from companion.output.engine.lines import MemoryLines
 from companion.output.engine.selftest import ROUNDS, WAKE_S, WAKES, SelfTest, self_test
 from companion.output.engine.setup import WAKE_LATE_MAX_S, EngineSetup, Wiring

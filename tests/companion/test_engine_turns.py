@@ -8,8 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.engine import BEAT_S, GAP_S, Engine
 from companion.output.engine.lines import MemoryLines
 from companion.output.engine.setup import EngineSetup, Wiring

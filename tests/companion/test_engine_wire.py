@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.setup import EngineSetup, Wiring, hazards
 from companion.output.engine.wire import (
     CHANGES_MAX,

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.pulse_train import STRETCH_MAX, carried_debt
 from companion.output.pwm import Edge, PulseEngine, needs_restart, stagger
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from companion.core.controller import Memory, step
 from companion.core.crossings import Crossing, Route
-from companion.core.nozzle import PwmLimits, allowed_duty
+from companion.core.nozzle import allowed_duty
 from companion.core.schedule import Timing, orders, resolve, schedule
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.pwm import PulseEngine
 from tests.builders import LAG, flying, setup
 

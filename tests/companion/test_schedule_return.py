@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.pwm import PulseEngine
 from companion.output.return_valve import ReturnValve, spray_spans
 from companion.output.servo import ServoExecutor, ServoOptions

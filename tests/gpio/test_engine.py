@@ -17,8 +17,7 @@ from itertools import pairwise
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import SprayPlan, TimedChange
+from companion.core.types import PwmLimits, SprayPlan, TimedChange
 from companion.output.engine.lines import GpiodLines, load_gpiod
 from companion.output.engine.setup import EngineSetup, Wiring
 from companion.output.engine.wire import PACKET_MAX, Kind, pack, unpack

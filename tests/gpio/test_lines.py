@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
+from companion.core.types import PwmLimits
 from companion.errors import ActuatorError
 from companion.output.engine import closer
 from companion.output.engine.lines import GpiodLines, Lines, find_chip, load_gpiod, open_lines

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from companion.config import load
 from companion.core import inputs as core_inputs
 from companion.core.controller import Memory, step
-from companion.core.dose import TRIM_AGE_S
+from companion.core.nozzle import TRIM_AGE_S
 from companion.core.types import FlowReport, Input, SprayPlan, Telemetry, TimedChange
 from companion.errors import ConfigError
 from companion.output.pwm import PulseEngine

@@ -13,7 +13,6 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from companion.core.nozzle import PwmLimits
 from companion.core.options.flow_meter import (
     ML_S_PER_L_MIN,
     STALE_S,
@@ -26,7 +25,7 @@ from companion.core.options.flow_meter import (
     with_order,
 )
 from companion.core.schedule import LagModel
-from companion.core.types import FlowReport, FlowTrimState
+from companion.core.types import FlowReport, FlowTrimState, PwmLimits
 
 # Flows are compared over whole PWM periods of about this time: the pulses cancel in them, and 4.6
 # pulses a millilitre over a second tell 4 L/min to 0.3 %.

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
-from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.nozzle import NozzleSet
 from companion.core.options.flow_meter import ML_S_PER_L_MIN, STALE_S, is_usable
 from companion.core.schedule import LagModel
-from companion.core.types import FaultKind, FlowReport, PressureReport
+from companion.core.types import FaultKind, FlowReport, PressureReport, PwmLimits
 
 # Whole periods of about this time: short enough to see a fault within a second, long enough that
 # 1 % of noise a period and the meter's pulses leave about 1 %.

@@ -14,13 +14,13 @@ from typing import Literal
 
 from companion.core.boom import Boom
 from companion.core.crossings import Crossing, Route, boom_route, bridged
-from companion.core.dose import dosing_of, overdrive_of, speed_soon
-from companion.core.nozzle import FlowCurve, NozzleSet, PwmLimits
+from companion.core.nozzle import FlowCurve, NozzleSet, dosing_of, overdrive_of, speed_soon
 from companion.core.schedule import LagModel, Timing, rate_at, resolve, schedule, sticky_border_s
 from companion.core.types import (
     DriveChange,
     DrivePlan,
     Method,
+    PwmLimits,
     SprayPlan,
     TimedChange,
     VehicleState,

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from companion.core.arithmetic import exp
-from companion.core.nozzle import NozzleSet, PwmLimits
+from companion.core.nozzle import NozzleSet
 from companion.core.options.flow_meter import ML_S_PER_L_MIN, is_usable
 from companion.core.schedule import LagModel
-from companion.core.types import FaultKind, Finding, FlowReport, SprayPlan
+from companion.core.types import FaultKind, Finding, FlowReport, PwmLimits, SprayPlan
 
 if TYPE_CHECKING:
     from companion.core.boom import Boom

@@ -29,7 +29,7 @@ T = TypeVar("T")
 def closer_arguments(setup: EngineSetup) -> list[str]:
     """Return the arguments with which the closer makes these outputs safe.
 
-    >>> from companion.core.nozzle import PwmLimits
+    >>> from companion.core.types import PwmLimits
     >>> from companion.output.engine.setup import Wiring
     >>> pwm = PwmLimits(frequency_hz=11, duty_min=0.2, duty_max=0.9, min_on_s=0, min_off_s=0)
     >>> wiring = Wiring(valves=(17, 18), return_line=22, return_normally_open=False)

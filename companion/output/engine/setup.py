@@ -7,7 +7,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
-from companion.core.nozzle import PwmLimits
+from companion.core.types import PwmLimits
 
 # What hangs on the lines: which level opens, which one is safe, what remains without a program.
 #

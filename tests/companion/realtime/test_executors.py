@@ -9,8 +9,7 @@ from itertools import count
 
 import pytest
 
-from companion.core.nozzle import PwmLimits
-from companion.core.types import TimedChange
+from companion.core.types import PwmLimits, TimedChange
 from companion.output.autopilot_options import DriveOutput
 from companion.output.composite import CompositeExecutor, Part
 from companion.output.engine.setup import EngineSetup, Wiring
