@@ -23,7 +23,6 @@ from companion.core.braking import (
     stop_ahead,
 )
 from companion.core.clock import Clock, on_time_s, tick
-from companion.core.inertial import NO_INERTIA, Inertia, blended
 from companion.core.inputs import MISSION_MODES
 from companion.core.motion import (
     BELIEVING,
@@ -50,6 +49,7 @@ from companion.core.motion import (
     turning,
 )
 from companion.core.nozzle import is_override
+from companion.core.options.inertial import NO_INERTIA, Inertia, blended
 from companion.core.positions import (
     Arrival,
     LastPlace,

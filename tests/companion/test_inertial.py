@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from companion.core.estimator import Track, estimate, observe
-from companion.core.inertial import (
+from companion.core.motion import SHARE_MIN
+from companion.core.options.inertial import (
     GAP_MAX_S,
     GRAVITY_M_S2,
     Inertia,
@@ -19,7 +20,6 @@ from companion.core.inertial import (
     recent_of,
     turned,
 )
-from companion.core.motion import SHARE_MIN
 from companion.core.types import AttitudeReport, ImuReport, Input, Telemetry, VehicleState
 from tests import builders
 from tests.builders import LAG, setup

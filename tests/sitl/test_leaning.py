@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from companion.core.inertial import Inertia
+from companion.core.options.inertial import Inertia
 from companion.core.types import AttitudeReport, ImuReport
 from companion.link.codec import Codec
 from sitl.leaning import DRAG_1_S, GRAVITY_M_S2, MEAN_S, Leaning, leaning
