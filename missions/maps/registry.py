@@ -16,8 +16,14 @@ from shapely.geometry.base import BaseGeometry
 
 from companion.core.frame import LocalFrame
 from companion.flight_map import is_flight_map, read_flight_map
-from missions.maps.adapt.catalogue import NAME, Operation, chosen, operations_in
-from missions.maps.adapt.geoparquet import layer_of_parquet, read_geoparquet
+from missions.maps.adapt import (
+    NAME,
+    Operation,
+    chosen,
+    layer_of_parquet,
+    operations_in,
+    read_geoparquet,
+)
 from missions.maps.assemble import crs_of, ground_of, map_of, zone_names
 from missions.maps.bundle import Bundle, open_bundle
 from missions.maps.crs import Floats, to_longitude_latitude

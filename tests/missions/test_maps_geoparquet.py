@@ -16,7 +16,7 @@ from pyproj import CRS, Geod
 from shapely import MultiPolygon, Point, Polygon, box
 
 from companion.errors import MapError
-from missions.maps.adapt.geoparquet import read_geoparquet, read_table
+from missions.maps.adapt import read_geoparquet, read_table
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
 from missions.maps.layer import Layer

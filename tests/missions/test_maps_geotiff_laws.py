@@ -21,7 +21,7 @@ from pyproj import CRS
 from shapely import MultiPolygon, box
 
 from companion.errors import MapError
-from missions.maps.adapt.geoparquet import read_geoparquet
+from missions.maps.adapt import read_geoparquet
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
 from missions.maps.geotiff.reader import read_dji, read_geotiff, write_dji, write_geotiff

@@ -27,7 +27,7 @@ import shapely
 from pyproj import CRS
 from shapely import MultiPolygon
 
-from missions.maps.adapt.catalogue import Operation, described_beside
+from missions.maps.adapt import Operation, described_beside
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.geotiff.bands import (
     ReadBand,

@@ -1,1 +1,0 @@
-"""ADAPT Standard: GeoTIFF or GeoParquet with a catalogue."""
