@@ -21,7 +21,7 @@ from companion.wording import counted, install_command
 from missions.boom import boom_of
 from missions.errors import PlanError
 from missions.maps.local import polygons_of
-from missions.maps.picture.draw import Sheet, printable, scale_length_m, sheet_for
+from missions.maps.picture import Sheet, printable, scale_length_m, sheet_for
 from missions.maps.whole_file import write_whole
 from missions.plan import Leg, Plan, Sortie
 from missions.strips import GRID_M, Objects, whole
@@ -115,7 +115,7 @@ def _bounds_m(plan: Plan) -> tuple[float, float, float, float]:
 def _fill(axes: Axes, areas: Iterable[BaseGeometry], **style: Any) -> None:
     from matplotlib.collections import PathCollection
 
-    from missions.maps.picture.ground import outline_of
+    from missions.maps.picture_ground import outline_of
 
     paths = [outline_of(part) for area in areas for part in polygons_of(area)]
     if paths:

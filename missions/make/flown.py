@@ -201,7 +201,7 @@ def written(
 
 def draw_picture(map_file: MapFile, path: Path, *, title: str) -> None:
     """Draw the map that was made."""
-    from missions.maps.picture.draw import draw  # matplotlib, which not everybody has
+    from missions.maps.picture import draw  # matplotlib, which not everybody has
 
     draw(map_file, path, title=title)
 

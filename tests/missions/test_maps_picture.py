@@ -20,8 +20,8 @@ from companion.errors import MapError
 from missions.maps.build import frame_for
 from missions.maps.convert.rasterise import metres_per_degree
 from missions.maps.model import MapCells, MapFile, MapZone
-from missions.maps.picture.draw import DPI, _bounds_m, draw, printable, scale_length_m, sheet_for
-from missions.maps.picture.ground import Colours
+from missions.maps.picture import DPI, _bounds_m, draw, printable, scale_length_m, sheet_for
+from missions.maps.picture_ground import Colours
 from missions.maps.totals import as_sprayed
 
 LON, LAT = 8.73, 47.42

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from missions.maps.picture.ground import Colours
+    from missions.maps.picture_ground import Colours
 
 SUFFIXES = (".png", ".svg", ".pdf")
 # 1600 by 1200 pixels at most; the map's own part of them, and what legend and title take.
@@ -106,7 +106,7 @@ def _drawn(map_file: MapFile, title: str, suffix: str) -> tuple[bytes, Totals]:
 def _figure(map_file: MapFile, frame: LocalFrame, found: Totals, title: str) -> Figure:
     from matplotlib.figure import Figure
 
-    from missions.maps.picture.ground import Colours, draw_ground
+    from missions.maps.picture_ground import Colours, draw_ground
 
     sheet = sheet_for(_bounds_m(map_file, frame))
     wide, high = sheet.size_in
@@ -275,7 +275,7 @@ def draw_legend(
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    from missions.maps.picture.ground import BARE, HATCH, LINE
+    from missions.maps.picture_ground import BARE, HATCH, LINE
 
     shown = found.rates_l_ha >= 0.0 if colours.are_listed else found.rates_l_ha == 0.0
     shades = colours(found.rates_l_ha[shown]).tolist()
