@@ -39,7 +39,7 @@ from missions.maps.geotiff.reader import (
     read_geotiff,
 )
 from missions.maps.isoxml.reader import read_isoxml
-from missions.maps.kml.reader import read_kml
+from missions.maps.kml import read_kml
 from missions.maps.layer import Grid, Layer, Value
 from missions.maps.local import BOUNDARY_NAME, Area, polygons_of
 from missions.maps.model import MapFile, MapZone, map_error

@@ -17,7 +17,7 @@ from shapely import LinearRing, MultiPolygon, Polygon, box
 from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
-from missions.maps.kml.reader import read_kml, write_kml
+from missions.maps.kml import read_kml, write_kml
 from missions.maps.layer import Layer
 from missions.maps.model import MapFile, MapZone
 
@@ -430,7 +430,7 @@ def test_links_in_a_circle_or_out_of_the_archive_end(tmp_path: Path) -> None:
 def test_linked_files_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = zipped(tmp_path, {"doc.kml": kml(links("a.kml")), "a.kml": MAY})
     assert len(read_kml(path).geometries) == 1
-    monkeypatch.setattr("missions.maps.kml.reader.MAX_ELEMENTS", 15)
+    monkeypatch.setattr("missions.maps.kml.MAX_ELEMENTS", 15)
     assert refused(path).code == "too-large"
 
 

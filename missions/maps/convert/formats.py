@@ -77,7 +77,7 @@ def _geopackage(map_file: MapFile, path: Path, _: Wish) -> None:
 
 
 def _kml(map_file: MapFile, path: Path, _: Wish) -> None:
-    from missions.maps.kml.reader import write_kml
+    from missions.maps.kml import write_kml
 
     write_kml(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
 

@@ -24,7 +24,7 @@ from missions.maps.bundle import Bundle, open_bundle
 from missions.maps.crs import WGS84
 from missions.maps.fields import column_of, stated_unit
 from missions.maps.geopackage.layers import areas_of
-from missions.maps.kml.geometry import Ground, ground_of, local_name
+from missions.maps.kml_polygons import Ground, ground_of, local_name
 from missions.maps.layer import MAX_RECORDS, Column, Layer, check_counts, digest, read_bytes
 from missions.maps.local import BOUNDARY_NAME, outline_of
 from missions.maps.model import MapZone, Problem, map_error
