@@ -20,7 +20,7 @@ from missions.maps.build import build_prescription, frame_for
 from missions.maps.lint import point_rates, summary
 from missions.maps.model import MapFile, MapZone
 from missions.maps.registry import read_area, read_map
-from missions.maps.shapefile.reader import area_of_rings
+from missions.maps.shapefile import area_of_rings
 
 WEST, SOUTH, CELL = 114.543, 35.996, 0.0005
 SUFFIXES = (".shp", ".shx", ".dbf", ".prj", ".cpg")

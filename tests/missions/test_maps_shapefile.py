@@ -18,12 +18,11 @@ from pyproj import CRS, Geod
 from shapely import Geometry, MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from missions.maps import layer
+from missions.maps import dbf, layer
 from missions.maps.assemble import Repair, repair_problems
 from missions.maps.model import MapFile
 from missions.maps.registry import read_area, read_map
-from missions.maps.shapefile import dbf
-from missions.maps.shapefile.reader import read_shapefile
+from missions.maps.shapefile import read_shapefile
 
 # A degree of latitude is 111.0 km here, a degree of longitude 90.2 km.
 WEST, SOUTH = 114.543, 35.996

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
+from missions.maps import shapefile
 from missions.maps.geojson import write_geojson
 from missions.maps.model import MapZone
 from missions.maps.registry import read_map
-from missions.maps.shapefile import reader
-from missions.maps.shapefile.reader import read_shapefile, write_shapefile
+from missions.maps.shapefile import read_shapefile, write_shapefile
 
 WEST, SOUTH, CELL = 114.543_123_456_789, 35.996_987_654_321, 0.001
 Writer = Callable[..., None]
@@ -151,14 +151,14 @@ def test_a_shapefile_half_written_is_no_map(
 ) -> None:
     path = tmp_path / "rx.shp"
     write_shapefile(ZONES, path)
-    whole = reader.write_whole
+    whole = shapefile.write_whole
 
     def fail_at_the_index(path: Path, content: bytes) -> None:
         if path.suffix == ".shx":
             raise MapError("disk full")
         whole(path, content)
 
-    monkeypatch.setattr(reader, "write_whole", fail_at_the_index)
+    monkeypatch.setattr(shapefile, "write_whole", fail_at_the_index)
     with pytest.raises(MapError, match="disk full"):
         write_shapefile(ZONES[:1], path)
     assert not path.exists()

@@ -58,7 +58,7 @@ def keeps_cells(map_file: MapFile, wish: Wish) -> bool:
 
 
 def _shapefile(map_file: MapFile, path: Path, _: Wish) -> None:
-    from missions.maps.shapefile.reader import write_shapefile
+    from missions.maps.shapefile import write_shapefile
 
     # Beside the zones a zip has the boundary too, but few programs heed it.
     write_shapefile(plain_zones(map_file, clip=True), path, boundary=_boundary(map_file))

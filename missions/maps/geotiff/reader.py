@@ -29,6 +29,7 @@ from shapely import MultiPolygon
 
 from missions.maps.adapt import Operation, described_beside
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
+from missions.maps.dbf import find_shapefile
 from missions.maps.geotiff.bands import (
     ReadBand,
     class_problem,
@@ -41,8 +42,7 @@ from missions.maps.geotiff.file import Raster, gdal, read_raster
 from missions.maps.layer import Band, Grid, digest
 from missions.maps.local import outline_of
 from missions.maps.model import Affine, MapCells, Problem, map_error
-from missions.maps.shapefile.dbf import find_shapefile
-from missions.maps.shapefile.reader import read_shapefile
+from missions.maps.shapefile import read_shapefile
 from missions.maps.whole_file import write_whole
 
 # What programs fill with lies below and above all indices, reflectances and yields.
