@@ -54,7 +54,7 @@ from missions.make.spots import Budget, Opening, Part, grounds, misses, openings
 from missions.maps.assemble import crs_of, ground_of, zone_names
 from missions.maps.convert.formats import writer_for
 from missions.maps.crs import to_longitude_latitude
-from missions.maps.csvfile.reader import read_point_table
+from missions.maps.csvfile import read_point_table
 from missions.maps.layer import Grid, digest, read_bytes
 from missions.maps.local import places as local_places
 from missions.maps.local import project_all

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from companion.errors import MapError
 from missions.maps.cli.grid import GRID_EXAMPLE
 from missions.maps.cli.new import NEW_EXAMPLE, grid, new
-from missions.maps.csvfile.reader import read_csv
+from missions.maps.csvfile import read_csv
 from missions.maps.layer import Grid
 from missions.maps.text.reader import read_text_map
 

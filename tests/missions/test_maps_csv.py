@@ -16,8 +16,8 @@ from shapely import box
 
 from companion.errors import MapError
 from missions.maps.assemble import map_of
-from missions.maps.csvfile.csv_points import find_lattice
-from missions.maps.csvfile.reader import read_csv
+from missions.maps.csv_points import find_lattice
+from missions.maps.csvfile import read_csv
 from missions.maps.declared import Given
 from missions.maps.layer import Grid, Layer
 

@@ -18,7 +18,7 @@ from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
 from missions.maps.crs import WGS84, parse_crs
-from missions.maps.csvfile.csv_points import cells_of_coordinates, cells_of_degrees
+from missions.maps.csv_points import cells_of_coordinates, cells_of_degrees
 from missions.maps.fields import NONE, score, words
 from missions.maps.layer import (
     COORDINATE_MAX,
@@ -39,7 +39,6 @@ from missions.maps.model import Floats, map_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
 
 # Names of columns in lower case, without blanks, underscores and brackets.
 _LATITUDE = ("lat", "latitude", "latdeg", "latitudedeg", "latdd", "latwgs84")

@@ -1,1 +1,0 @@
-"""CSV of points or of polygons."""
