@@ -25,7 +25,7 @@ from companion.errors import MapError
 from companion.wording import install_command
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.crs import WGS84, parse_crs
-from missions.maps.geopackage.layers import CurvedError, Found, areas_of, polygons_in
+from missions.maps.geopackage_layers import CurvedError, Found, areas_of, polygons_in
 from missions.maps.layer import Column, Layer, Value, check_counts, digest, read_bytes
 from missions.maps.local import Area
 from missions.maps.model import map_error

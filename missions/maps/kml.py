@@ -23,7 +23,7 @@ from shapely import LinearRing, MultiPolygon, Polygon
 from missions.maps.bundle import Bundle, open_bundle
 from missions.maps.crs import WGS84
 from missions.maps.fields import column_of, stated_unit
-from missions.maps.geopackage.layers import areas_of
+from missions.maps.geopackage_layers import areas_of
 from missions.maps.kml_polygons import Ground, ground_of, local_name
 from missions.maps.layer import MAX_RECORDS, Column, Layer, check_counts, digest, read_bytes
 from missions.maps.local import BOUNDARY_NAME, outline_of

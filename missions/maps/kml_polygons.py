@@ -11,7 +11,7 @@ from shapely import MultiLineString, MultiPoint
 from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
-from missions.maps.geopackage.layers import Floats, Rings
+from missions.maps.geopackage_layers import Floats, Rings
 from missions.maps.layer import MAX_VERTICES, check_coordinates
 
 _GEOMETRIES = frozenset(

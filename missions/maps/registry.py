@@ -30,7 +30,7 @@ from missions.maps.crs import Floats, to_longitude_latitude
 from missions.maps.csvfile import read_csv
 from missions.maps.declared import Given
 from missions.maps.geojson import is_geojson, read_geojson
-from missions.maps.geopackage.reader import read_geopackage
+from missions.maps.geopackage import read_geopackage
 from missions.maps.geotiff.reader import (
     RX_FOLDER,
     SHAPE_FOLDER,

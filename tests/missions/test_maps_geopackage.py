@@ -20,7 +20,7 @@ from shapely import MultiPolygon, Polygon, box
 from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
-from missions.maps.geopackage.reader import read_geopackage, write_geopackage
+from missions.maps.geopackage import read_geopackage, write_geopackage
 from missions.maps.layer import Layer
 from missions.maps.model import MapFile, MapZone
 
@@ -407,8 +407,8 @@ def test_a_virtual_table_is_no_layer(tmp_path: Path) -> None:
 def test_work_without_end_is_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = by_gdal(tmp_path / "rx.gpkg", grounds=[SQUARE] * 2000, rates=[1.0] * 2000)
     assert len(read_geopackage(path).geometries) == 2000
-    monkeypatch.setattr("missions.maps.geopackage.layers._STEPS_MAX", 1000)
-    monkeypatch.setattr("missions.maps.geopackage.layers._STEPS_PER_CALL", 500)
+    monkeypatch.setattr("missions.maps.geopackage_layers._STEPS_MAX", 1000)
+    monkeypatch.setattr("missions.maps.geopackage_layers._STEPS_PER_CALL", 500)
     assert refused(path).code == "too-large"
 
 

@@ -71,7 +71,7 @@ def _geojson(map_file: MapFile, path: Path, _: Wish) -> None:
 
 
 def _geopackage(map_file: MapFile, path: Path, _: Wish) -> None:
-    from missions.maps.geopackage.reader import write_geopackage
+    from missions.maps.geopackage import write_geopackage
 
     write_geopackage(plain_zones(map_file, clip=False), path, boundary=_boundary(map_file))
 

@@ -22,7 +22,7 @@ from shapely.geometry.base import BaseGeometry
 from missions.maps.bundle import one_of, open_bundle
 from missions.maps.crs import WGS84, parse_crs
 from missions.maps.fields import column_of, stated_unit
-from missions.maps.geopackage.layers import (
+from missions.maps.geopackage_layers import (
     Cell,
     CurvedError,
     Database,

@@ -1,1 +1,0 @@
-"""GeoPackage, an SQLite database of layers."""
