@@ -17,7 +17,7 @@ from pyproj import CRS, Transformer
 from companion.core.frame import LocalFrame
 from missions.errors import PlanError
 from missions.field import Field
-from missions.maps.geotiff.file import read_raster
+from missions.maps.geotiff_file import read_raster
 from missions.maps.layer import read_bytes
 from missions.strips import Floats
 

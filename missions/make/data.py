@@ -38,7 +38,7 @@ from missions.maps.cells import to_cells_of
 from missions.maps.convert.rasterise import painted, spans_of
 from missions.maps.crs import WGS84, parse_crs, to_longitude_latitude
 from missions.maps.csvfile import read_point_table
-from missions.maps.geotiff.reader import read_bands
+from missions.maps.geotiff import read_bands
 from missions.maps.layer import Column, Grid, Layer, as_number
 from missions.maps.local import places as local_places
 from missions.maps.local import project_all

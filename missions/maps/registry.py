@@ -31,7 +31,7 @@ from missions.maps.csvfile import read_csv
 from missions.maps.declared import Given
 from missions.maps.geojson import is_geojson, read_geojson
 from missions.maps.geopackage import read_geopackage
-from missions.maps.geotiff.reader import (
+from missions.maps.geotiff import (
     RX_FOLDER,
     SHAPE_FOLDER,
     grid_of_tiff,

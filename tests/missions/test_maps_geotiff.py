@@ -25,8 +25,8 @@ from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.cells import bounds_deg
 from missions.maps.declared import Given
-from missions.maps.geotiff.bands import parse_world_file
-from missions.maps.geotiff.reader import read_dji, read_geotiff
+from missions.maps.geotiff import read_dji, read_geotiff
+from missions.maps.geotiff_bands import parse_world_file
 from missions.maps.layer import Grid
 from missions.maps.registry import read_adapt
 

@@ -24,7 +24,7 @@ from companion.errors import MapError
 from missions.maps.adapt import read_geoparquet
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
-from missions.maps.geotiff.reader import read_dji, read_geotiff, write_dji, write_geotiff
+from missions.maps.geotiff import read_dji, read_geotiff, write_dji, write_geotiff
 from missions.maps.layer import Grid, Layer
 from missions.maps.model import MapCells
 from missions.maps.registry import read_adapt

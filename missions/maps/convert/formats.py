@@ -121,7 +121,7 @@ def keeps_raster(map_file: MapFile, wish: Wish) -> bool:
 
 
 def _geotiff(map_file: MapFile, path: Path, wish: Wish) -> None:
-    from missions.maps.geotiff.reader import write_geotiff
+    from missions.maps.geotiff import write_geotiff
 
     cells = map_file.cells
     if cells is None or not keeps_raster(map_file, wish):
@@ -132,7 +132,7 @@ def _geotiff(map_file: MapFile, path: Path, wish: Wish) -> None:
 
 
 def _dji(map_file: MapFile, path: Path, wish: Wish) -> None:
-    from missions.maps.geotiff.reader import write_dji
+    from missions.maps.geotiff import write_dji
 
     cells = _cells(map_file, wish, clip=False)
     write_dji(cells, path, _field(map_file))

@@ -30,7 +30,7 @@ from shapely import MultiPolygon
 from missions.maps.adapt import Operation, described_beside
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.dbf import find_shapefile
-from missions.maps.geotiff.bands import (
+from missions.maps.geotiff_bands import (
     ReadBand,
     class_problem,
     difference,
@@ -38,7 +38,7 @@ from missions.maps.geotiff.bands import (
     usable,
     world_file_of,
 )
-from missions.maps.geotiff.file import Raster, gdal, read_raster
+from missions.maps.geotiff_file import Raster, gdal, read_raster
 from missions.maps.layer import Band, Grid, digest
 from missions.maps.local import outline_of
 from missions.maps.model import Affine, MapCells, Problem, map_error

@@ -1,1 +1,0 @@
-"""GeoTIFF, and DJI's package of it."""
