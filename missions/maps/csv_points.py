@@ -17,9 +17,9 @@ from pyproj import CRS
 from companion.core.frame import LocalFrame
 from missions.maps.crs import WGS84
 from missions.maps.model import Affine, Floats, Problem, map_error
-from missions.maps.text.reader import MAX_CELLS, grid_of_points, named_crs, tied_down
-from missions.maps.text.text_lattice import GridLayout, cell_numbers, layout_for, merged
-from missions.maps.text.text_points import TextMap
+from missions.maps.text_lattice import GridLayout, cell_numbers, layout_for, merged
+from missions.maps.text_map import MAX_CELLS, grid_of_points, named_crs, tied_down
+from missions.maps.text_points import TextMap
 
 # Points that stand in rows and columns: the lattice they stand on, however it is turned.
 #

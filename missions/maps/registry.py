@@ -44,7 +44,7 @@ from missions.maps.layer import Grid, Layer, Value
 from missions.maps.local import BOUNDARY_NAME, Area, polygons_of
 from missions.maps.model import MapFile, MapZone, map_error
 from missions.maps.shapefile import read_shapefile
-from missions.maps.text.reader import read_text_map
+from missions.maps.text_map import read_text_map
 
 # ADAPT Standard: a folder or a zip with an `adapt.json` and the maps that it names.
 

@@ -15,7 +15,7 @@ from missions.maps.cli.grid import GRID_EXAMPLE
 from missions.maps.cli.new import NEW_EXAMPLE, grid, new
 from missions.maps.csvfile import read_csv
 from missions.maps.layer import Grid
-from missions.maps.text.reader import read_text_map
+from missions.maps.text_map import read_text_map
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)
 app.command(epilog=NEW_EXAMPLE)(new)

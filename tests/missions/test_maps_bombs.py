@@ -23,7 +23,7 @@ from missions.maps.geotiff_bands import parse_world_file
 from missions.maps.layer import Grid, Layer
 from missions.maps.lint import summary
 from missions.maps.registry import read_map
-from missions.maps.text.reader import read_text_map
+from missions.maps.text_map import read_text_map
 
 MORE_BYTES = 512 * 1024**2
 # Reads, checks and builds every map that it is given, within so much memory beyond its own.

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from companion.core.frame import LocalFrame
-from missions.maps.text.text_points import TangentPlane
+from missions.maps.text_points import TangentPlane
 
 
 def degrees(limit: float) -> st.SearchStrategy[float]:

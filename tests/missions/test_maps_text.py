@@ -20,14 +20,14 @@ from missions.maps.cli.new import Plots, Points, make_plots, make_points, plot_r
 from missions.maps.declared import Given
 from missions.maps.layer import Grid
 from missions.maps.model import MapCells, MapFile, MapZone
-from missions.maps.text.reader import (
+from missions.maps.text_lattice import MERGES, cell_numbers, cell_size, layout_for, merged
+from missions.maps.text_map import (
     grid_of_points,
     read_text_map,
     text_map_of,
     write_text_map,
 )
-from missions.maps.text.text_lattice import MERGES, cell_numbers, cell_size, layout_for, merged
-from missions.maps.text.text_points import MAX_POINTS, TextMap, parse_text_map, text_of
+from missions.maps.text_points import MAX_POINTS, TextMap, parse_text_map, text_of
 
 ORIGIN = (39.5, -0.4, 50.0)
 WIDTH_M, SPEED_M_S = 5.0, 4.0

@@ -11,9 +11,9 @@ import typer
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
 from missions.maps.layer import read_bytes
 from missions.maps.model import map_error
-from missions.maps.text.reader import PointGrid, grid_of_points, grid_problems
-from missions.maps.text.text_lattice import M2_PER_HA, MERGES
-from missions.maps.text.text_points import parse_text_map
+from missions.maps.text_lattice import M2_PER_HA, MERGES
+from missions.maps.text_map import PointGrid, grid_of_points, grid_problems
+from missions.maps.text_points import parse_text_map
 from missions.maps.whole_file import write_whole
 
 GRID_EXAMPLE = "Example: vrspray map grid field.txt --origin 37.85,-4.8,120 --merge mean --json"

@@ -18,7 +18,7 @@ from companion.core.frame import LocalFrame
 from missions.maps.cli.grid import Force, check_new, grid, parse_numbers, parse_place
 from missions.maps.layer import digest, read_bytes
 from missions.maps.model import Floats, MapFile, MapZone
-from missions.maps.text.text_points import MAX_POINTS, TangentPlane, TextMap, write_text_map
+from missions.maps.text_points import MAX_POINTS, TangentPlane, TextMap, write_text_map
 
 __all__ = ["NEW_EXAMPLE", "grid", "new"]
 

@@ -145,8 +145,8 @@ def _cells(map_file: MapFile, wish: Wish, *, clip: bool) -> MapCells:
 
 
 def _text_map(map_file: MapFile, path: Path, wish: Wish) -> None:
-    from missions.maps.text.text_lattice import text_map_of
-    from missions.maps.text.text_points import write_text_map
+    from missions.maps.text_lattice import text_map_of
+    from missions.maps.text_points import write_text_map
 
     width_m, speed_m_s = wish.flow_width_m, wish.flow_speed_m_s
     if width_m is None or speed_m_s is None or not (width_m > 0.0 and speed_m_s > 0.0):

@@ -18,7 +18,7 @@ from companion.core.frame import LocalFrame
 from missions.maps.crs import EXTENT_MAX_M
 from missions.maps.layer import Band, Grid, digest, read_bytes
 from missions.maps.model import Affine, Floats, Problem, map_error
-from missions.maps.text.text_lattice import (
+from missions.maps.text_lattice import (
     MERGES,
     GridLayout,
     cell_numbers,
@@ -26,7 +26,7 @@ from missions.maps.text.text_lattice import (
     merged,
     text_map_of,
 )
-from missions.maps.text.text_points import TangentPlane, TextMap, parse_text_map, write_text_map
+from missions.maps.text_points import TangentPlane, TextMap, parse_text_map, write_text_map
 
 __all__ = ["PointGrid", "grid_of_points", "read_text_map", "text_map_of", "write_text_map"]
 

@@ -26,7 +26,7 @@ from companion.core.nozzle import flow_for_rate
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.cells import to_degrees
 from missions.maps.model import Floats, MapCells, MapFile, map_error
-from missions.maps.text.text_points import ALTITUDE_MAX_M, ALTITUDE_MIN_M, MAX_POINTS, TextMap
+from missions.maps.text_points import ALTITUDE_MAX_M, ALTITUDE_MIN_M, MAX_POINTS, TextMap
 
 # P2's grid (Rovira-Más et al. 2024, equations 1 to 3): from points with rates to square cells.
 #

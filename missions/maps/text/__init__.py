@@ -1,1 +1,0 @@
-"""P2's open text map and its grid."""
