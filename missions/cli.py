@@ -28,7 +28,7 @@ from missions.files.pilot_sheet import (
     write_sheet,
 )
 from missions.files.write import check_suffix, older_sorties, write_fleet
-from missions.maps.cli.grid import parse_mark
+from missions.maps.cli.new import parse_mark
 from missions.maps.cli.options import Reading, reading_options
 from missions.maps.whole_file import check_folder
 from missions.mix import mix_lines, mix_of, with_tank

@@ -130,7 +130,7 @@ def serve(
     from dataclasses import replace
 
     from companion.errors import VrsprayError
-    from missions.maps.cli.grid import parse_mark
+    from missions.maps.cli.new import parse_mark
     from sitl.serve import ServeOptions
     from sitl.serve_mission import home_of_file
 

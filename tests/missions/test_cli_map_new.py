@@ -11,8 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from companion.errors import MapError
-from missions.maps.cli.grid import GRID_EXAMPLE
-from missions.maps.cli.new import NEW_EXAMPLE, grid, new
+from missions.maps.cli.new import GRID_EXAMPLE, NEW_EXAMPLE, grid, new
 from missions.maps.csvfile import read_csv
 from missions.maps.layer import Grid
 from missions.maps.text_map import read_text_map

@@ -13,7 +13,7 @@ from companion.cli.answer import Option, Overrides, with_options
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.core.prescription import Overlap
-from missions.maps.cli.grid import parse_place
+from missions.maps.cli.new import parse_place
 from missions.maps.model import MapFile
 from missions.maps.registry import read_map
 
