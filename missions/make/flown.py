@@ -29,7 +29,7 @@ from missions.errors import PlanError
 from missions.layouts import spray_lines
 from missions.make.passes import Passes, by_valve, passes_of
 from missions.make.zones import EDGE_MAX_M, GRID_M, Limits
-from missions.maps.cli.plan import plan_of, sprayer_problems
+from missions.maps.cli.options import plan_of, sprayer_problems
 from missions.maps.compiling import MapOrder, compile_map, write_flight_map
 from missions.maps.convert.formats import write_map
 from missions.maps.lint import Sprayer, check_map

@@ -26,7 +26,7 @@ from companion.doctor.vehicle import Heard, wind_check
 from companion.errors import ConfigError, MapError
 from companion.flight_map import difference
 from missions.errors import PlanError
-from missions.maps.cli.plan import plan_of, sprayer_problems
+from missions.maps.cli.options import plan_of, sprayer_problems
 from missions.maps.compiling import MapOrder, compile_map
 from missions.maps.local import project
 from missions.maps.registry import read_map

@@ -19,7 +19,7 @@ from companion.errors import ConfigError, VrsprayError
 from missions.make.flown import limits_of
 from missions.make.trial import Design, lay_out
 from missions.make.trial_cli import trial
-from missions.maps.cli.plan import plan_of
+from missions.maps.cli.options import plan_of
 
 pytestmark = pytest.mark.usefixtures("laid_out_once")
 

@@ -24,8 +24,15 @@ from companion.flight_map import SUFFIX, FlightMap, is_flight_map
 from companion.wording import counted
 from missions.maps.cli.convert import convert, show
 from missions.maps.cli.new import GRID_EXAMPLE, NEW_EXAMPLE, grid, new, parse_mark
-from missions.maps.cli.options import File, OverlapPolicy, Reading, check_overlap, reading_options
-from missions.maps.cli.plan import plan_of, sprayer_problems
+from missions.maps.cli.options import (
+    File,
+    OverlapPolicy,
+    Reading,
+    check_overlap,
+    plan_of,
+    reading_options,
+    sprayer_problems,
+)
 from missions.maps.compiling import (
     MapOrder,
     compile_map,

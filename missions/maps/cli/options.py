@@ -1,21 +1,27 @@
-"""What every command on a map asks: the file, and what the file itself may leave open."""
+"""What every command on a map asks: the file, what it leaves open, and what the flight adds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
 import typer
+from shapely import MultiPolygon
 
-from companion.cli.answer import Option, Overrides, with_options
+from companion.assembly import above_label, beyond_label, undelivered
+from companion.cli.answer import Option, Overrides, note, with_options
 from companion.config import Config, load
 from companion.config.tables import PrescriptionTable
 from companion.core.prescription import Overlap
+from companion.errors import MapError
 from missions.maps.cli.new import parse_place
-from missions.maps.model import MapFile
-from missions.maps.registry import read_map
+from missions.maps.lint import Plan, Sprayer
+from missions.maps.lint.survey import Survey
+from missions.maps.local import frame_around, grown
+from missions.maps.model import MapFile, Problem
+from missions.maps.registry import read_area, read_map, read_records
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="Prescription map.")]
 _RateField = Annotated[
@@ -175,3 +181,182 @@ def _reading(
 
 # Gives a command that takes `reading: Reading` one option for each answer instead.
 reading_options = with_options("reading", _OPTIONS, _reading)
+
+
+# ----------------------------------------------------------------------------- what the flight adds
+
+# The rates between the least and the largest say nothing more of a sprayer's range.
+RATES_MAX = 1_000
+# Less than this is what rounding moves.
+KEPT_MIN_M2 = 0.01
+
+
+def plan_of(config: Config | None, home: tuple[float, float] | None) -> tuple[Plan, list[Problem]]:
+    """Return the flight that the configuration describes, and what is wrong with its boundary."""
+    homes: tuple[tuple[float, float], ...] = () if home is None else (home,)
+    if config is None:
+        return Plan(homes=homes), []
+    table, mission = config.prescription, config.mission
+    if home is None and mission is not None:
+        homes = mission.depots
+    problems: list[Problem] = []
+    boundary, exclusions = None, []
+    buffers = list(_buffers(config, problems))
+    if table is not None:
+        if table.boundary is not None:
+            boundary = _area(config, table.boundary, "prescription.boundary", problems)
+        for number, name in enumerate(table.exclusions):
+            area = _area(config, name, f"prescription.exclusions[{number}]", problems)
+            exclusions += [] if area is None else [area]
+    plan = Plan(
+        boundary=boundary,
+        exclusions=(*exclusions, *buffers),
+        buffers=tuple(buffers),
+        default_rate_l_ha=None if table is None else table.default_rate_l_ha,
+        homes=homes,
+        sprayer=_sprayer(config),
+    )
+    return plan, problems
+
+
+def _area(config: Config, name: str, key: str, problems: list[Problem]) -> MultiPolygon | None:
+    """Return a boundary or an exclusion, or None with what is wrong with it."""
+    path = config.resolve(name)
+    try:
+        return read_area(path)
+    except MapError as error:
+        if error.code == "no-file":
+            note(f"{key}: {path} is not there; the map is checked without it")
+        else:
+            problems.append(_refused_area(error, key))
+    return None
+
+
+def _buffers(config: Config, problems: list[Problem]) -> Iterator[MultiPolygon]:
+    """Yield the ground that the label keeps free; what cannot be read is an error."""
+    for number, each in enumerate(config.buffers):
+        for name in each.files:
+            try:
+                kept = [record.geometry for record in read_records(config.resolve(name))]
+            except MapError as error:
+                problems.append(_refused_area(error, f"limits.buffer[{number}].files"))
+            else:
+                yield grown(kept, each.distance_m, frame_around(kept))
+
+
+def _refused_area(error: MapError, key: str) -> Problem:
+    what = {"prescription.boundary": "the boundary"}.get(key, "an exclusion")
+    what = "a buffer's file" if key.startswith("limits.") else what
+    return Problem(
+        severity="error",
+        code=error.code,
+        text=f"{what} cannot be used: {str(error).removesuffix('; ' + error.fix)}",
+        where=key,
+        fix=error.fix,
+    )
+
+
+def _sprayer(config: Config) -> Sprayer | None:
+    mission, table, lag = config.mission, config.prescription, config.lag
+    if mission is None:
+        return None
+    return Sprayer(
+        speed_m_s=mission.speed_m_s,
+        lag_s=max(lag.on_s, lag.off_s, lag.up_s, lag.down_s) + lag.output_s,
+        period_s=config.pwm_limits().period_s,
+        strip_m=min(valve.width_m for valve in config.boom().valves),
+        across="centre" if table is None else table.across,
+        angle_deg=None if mission.angle_deg == "auto" else mission.angle_deg,
+        speed_min_m_s=config.safety.speed_min_m_s,
+    )
+
+
+def sprayer_problems(config: Config | None, map_file: MapFile, plan: Plan) -> list[Problem]:
+    """Return what this sprayer and this product have against the rates of the map."""
+    rates = rates_in_force(map_file, plan)
+    if config is None or not rates:
+        return []
+    of_label = [*beyond_label(config), *_kept_free(config, map_file, plan)]
+    label = above_label(
+        config,
+        map_file.path,
+        rates_l_ha=map_file.rates_l_ha,
+        default_rate_l_ha=_default(config, map_file),
+    )
+    found = [] if label is None else [label]
+    if config.mission is not None:
+        found += undelivered(
+            _fewer(rates),
+            sets=config.nozzle_sets(),
+            pwm=config.pwm_limits(),
+            width_m=config.boom_table.width_m,
+            speed_m_s=config.mission.speed_m_s,
+            speeds_m_s=(config.safety.speed_min_m_s, config.safety.speed_max_m_s),
+        )
+    if not found:
+        return of_label
+    survey = Survey(map_file)
+    positive = [rate for rate in rates if rate > 0.0]
+    where = {
+        "above-label": max(positive, default=0.0),
+        "below-label": min(positive, default=0.0),
+        "rate-too-high": max(positive, default=0.0),
+        "rate-too-low": min(positive, default=0.0),
+    }
+    return of_label + [
+        replace(problem, where=problem.where or _where(survey, where[problem.code], plan))
+        for problem in found
+    ]
+
+
+def _kept_free(config: Config, map_file: MapFile, plan: Plan) -> list[Problem]:
+    """Return how much that has a rate is not sprayed for the label's buffers."""
+    if not plan.buffers:
+        return []
+    others = plan.exclusions[: -len(plan.buffers)]
+    areas_m2 = []
+    for exclusions in (others, plan.exclusions):
+        survey = Survey(map_file, boundary=plan.boundary, exclusions=exclusions)
+        areas_m2.append(float(survey.inside_m2[survey.rates > 0.0].sum()))
+    kept_m2 = areas_m2[0] - areas_m2[1]
+    if not kept_m2 > KEPT_MIN_M2:
+        return []
+    kinds = ", ".join(f"{each.distance_m:g} m from {each.kind}" for each in config.buffers)
+    return [Problem(
+        severity="warning",
+        code="label-buffer",
+        text=f"{kept_m2 / 1e4:.4f} ha with a rate are not sprayed for the buffers of "
+        f"{config.limits_table.file}: {kinds}",
+        where="limits.buffer",
+        fix="set these places to 0 in the map, or count on less spray",
+    )]  # fmt: skip
+
+
+def _default(config: Config, map_file: MapFile) -> float | None:
+    table = config.prescription
+    if table is not None and table.default_rate_l_ha is not None:
+        return table.default_rate_l_ha
+    return map_file.default_rate_l_ha
+
+
+def rates_in_force(map_file: MapFile, plan: Plan) -> list[float]:
+    """Return all different rates that would be sprayed, the default among them."""
+    default = plan.default_rate_l_ha
+    if default is None and map_file.boundary is not None:
+        default = map_file.default_rate_l_ha
+    return sorted({*map_file.rates_l_ha, *([] if default is None else [default])})
+
+
+def _fewer(rates: Sequence[float]) -> Sequence[float]:
+    """Return a map's rates thinned out, with both ends, where each cell has one of its own."""
+    if len(rates) <= RATES_MAX:
+        return rates
+    step = len(rates) // RATES_MAX + 1
+    return [*rates[::step], rates[-1]]
+
+
+def _where(survey: Survey, rate_l_ha: float, plan: Plan) -> str:
+    place = survey.rate_spots(rate_l_ha)
+    if not place and rate_l_ha in (plan.default_rate_l_ha, survey.map_file.default_rate_l_ha):
+        place = "the default rate"
+    return f"{rate_l_ha:g} L/ha: {place}" if place else f"{rate_l_ha:g} L/ha"
