@@ -30,7 +30,7 @@ from missions.files.pilot_sheet import (
 from missions.files.write import check_suffix, older_sorties, write_fleet
 from missions.maps.cli.new import parse_mark
 from missions.maps.cli.options import Reading, reading_options
-from missions.maps.whole_file import check_folder
+from missions.maps.model import check_folder
 from missions.mix import mix_lines, mix_of, with_tank
 from missions.picture import check_picture, draw_plan
 from missions.plan import LEAVE_PERCENT, Plan

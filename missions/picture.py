@@ -21,8 +21,8 @@ from companion.wording import counted, install_command
 from missions.boom import boom_of
 from missions.errors import PlanError
 from missions.maps.local import polygons_of
+from missions.maps.model import write_whole
 from missions.maps.picture import Sheet, printable, scale_length_m, sheet_for
-from missions.maps.whole_file import write_whole
 from missions.plan import Leg, Plan, Sortie
 from missions.strips import GRID_M, Objects, whole
 

@@ -21,9 +21,8 @@ from companion.errors import MapError
 from missions.errors import PlanError
 from missions.maps.build import frame_for
 from missions.maps.cells import grid_of
-from missions.maps.layer import Value, as_number
 from missions.maps.local import Area, as_area, make_valid, polygons_of, project_all
-from missions.maps.model import MapFile
+from missions.maps.model import MapFile, Value, as_number
 from missions.maps.registry import Record, read_area, read_map, read_records
 from missions.strips import Floats
 

@@ -18,7 +18,7 @@ from companion.core.frame import LocalFrame
 from missions.errors import PlanError
 from missions.field import Field
 from missions.maps.geotiff_file import read_raster
-from missions.maps.layer import read_bytes
+from missions.maps.model import read_bytes
 from missions.strips import Floats
 
 # An elevation model: heights of the ground in rows and columns, read between its posts.

@@ -39,7 +39,7 @@ from companion.journal.geopackage import (
 from companion.journal.read_only import DAMAGE, check_programs, distrust, one_line
 
 VERSION = "1"
-# Bounds on what a stranger may hand over; those of any map file (missions/maps/layer.py).
+# Bounds on what a stranger may hand over; those of any map file (missions/maps/model.py).
 FILE_BYTES_MAX = 256 * 1024 * 1024
 VERTICES_MAX = 5_000_000
 ZONES_MAX = 1_000_000

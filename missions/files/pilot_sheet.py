@@ -15,7 +15,7 @@ from typing import Any
 
 from companion.config import Config
 from missions.errors import PlanError
-from missions.maps.whole_file import write_whole
+from missions.maps.model import write_whole
 from missions.mix import amount_words, product_words, rinse_words, scale_of
 from missions.plan import Plan
 

@@ -65,9 +65,7 @@ from missions.make.spots_cli import spots
 from missions.make.trial_cli import trial
 from missions.make.zones import Limits, Made, Wish, cells, make_zones, polygons
 from missions.maps.convert.formats import writer_for
-from missions.maps.layer import digest, read_bytes
-from missions.maps.model import MapFile, map_error
-from missions.maps.whole_file import check_folder
+from missions.maps.model import MapFile, check_folder, digest, map_error, read_bytes
 
 app = typer.Typer(
     add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False,

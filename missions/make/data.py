@@ -39,12 +39,19 @@ from missions.maps.convert.rasterise import painted, spans_of
 from missions.maps.crs import WGS84, parse_crs, to_longitude_latitude
 from missions.maps.csvfile import read_point_table
 from missions.maps.geotiff import read_bands
-from missions.maps.layer import Column, Grid, Layer, as_number
 from missions.maps.local import places as local_places
 from missions.maps.local import project_all
-from missions.maps.model import Affine, Floats, map_error
+from missions.maps.model import (
+    Affine,
+    Column,
+    Floats,
+    Grid,
+    Layer,
+    as_number,
+    map_error,
+    write_whole,
+)
 from missions.maps.registry import read_layer
-from missions.maps.whole_file import write_whole
 from missions.strips import Objects
 
 # Indices by the bands they are made of. Normalised differences: NDVI (Rouse et al. 1974), GNDVI

@@ -34,9 +34,8 @@ from missions.maps.compiling import MapOrder, compile_map, write_flight_map
 from missions.maps.convert.formats import write_map
 from missions.maps.lint import Sprayer, check_map
 from missions.maps.local import polygons_of
-from missions.maps.model import MapFile
+from missions.maps.model import MapFile, not_written
 from missions.maps.registry import read_area
-from missions.maps.whole_file import not_written
 from missions.reading import Asked, Task, read_task
 from missions.strips import Floats
 

@@ -55,12 +55,10 @@ from missions.maps.assemble import crs_of, ground_of, zone_names
 from missions.maps.convert.formats import writer_for
 from missions.maps.crs import to_longitude_latitude
 from missions.maps.csvfile import read_point_table
-from missions.maps.layer import Grid, digest, read_bytes
 from missions.maps.local import places as local_places
 from missions.maps.local import project_all
-from missions.maps.model import MapFile, MapZone, map_error
+from missions.maps.model import Grid, MapFile, MapZone, check_folder, digest, map_error, read_bytes
 from missions.maps.registry import read_layer
-from missions.maps.whole_file import check_folder
 from missions.plan import Plan
 from missions.planner import plan_mission
 from missions.remaining import Remaining

@@ -39,9 +39,7 @@ from missions.make.flown import (
 )
 from missions.make.trial import Design, Plot, lay_out
 from missions.maps.convert.formats import writer_for
-from missions.maps.layer import digest, read_bytes
-from missions.maps.model import MapFile, MapZone
-from missions.maps.whole_file import check_folder, not_written
+from missions.maps.model import MapFile, MapZone, check_folder, digest, not_written, read_bytes
 
 VERSION = 1
 BLOCKS_MAX, TREATMENTS_MAX = 50, 20

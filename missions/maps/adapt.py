@@ -26,9 +26,8 @@ from companion.wording import install_command
 from missions.maps.bundle import Bundle, files_beside, one_of, open_bundle
 from missions.maps.crs import WGS84, parse_crs
 from missions.maps.geopackage_layers import CurvedError, Found, areas_of, polygons_in
-from missions.maps.layer import Column, Layer, Value, check_counts, digest, read_bytes
 from missions.maps.local import Area
-from missions.maps.model import map_error
+from missions.maps.model import Column, Layer, Value, check_counts, digest, map_error, read_bytes
 from missions.maps.units import rate_unit
 
 # --------------------------------------------------------------------------------------- adapt.json

@@ -26,14 +26,18 @@ from missions.maps.crs import (
 )
 from missions.maps.declared import Given, Unit, unit_of
 from missions.maps.fields import choose
-from missions.maps.layer import Band, Column, Grid, Layer, as_number
 from missions.maps.local import Area, frame_around, make_valid, project_all
 from missions.maps.model import (
     RATE_MAX_L_HA,
+    Band,
+    Column,
+    Grid,
+    Layer,
     MapCells,
     MapFile,
     MapZone,
     Problem,
+    as_number,
     map_error,
     unusable_polygons,
 )

@@ -20,8 +20,7 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 from companion.errors import MapError
-from missions.maps.layer import MAX_FILE_BYTES, read_bytes
-from missions.maps.model import map_error
+from missions.maps.model import MAX_FILE_BYTES, map_error, read_bytes
 
 # A prescription with boundary and task data has a few files; a data carrier some hundred.
 MAX_MEMBERS = 2_000

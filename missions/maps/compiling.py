@@ -41,9 +41,8 @@ from companion.journal.geopackage import (
 )
 from companion.wording import show_value
 from missions.maps.build import build_prescription, frame_for
-from missions.maps.layer import read_bytes
 from missions.maps.local import grown, make_valid, project
-from missions.maps.model import MapFile, map_error
+from missions.maps.model import MapFile, map_error, read_bytes
 from missions.maps.registry import read_area, read_map, read_records
 
 

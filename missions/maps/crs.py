@@ -16,8 +16,7 @@ from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from companion.errors import MapError
-from missions.maps.layer import MAX_VERTICES
-from missions.maps.model import Problem, map_error
+from missions.maps.model import MAX_VERTICES, Problem, map_error
 
 __all__ = [
     "EXTENT_MAX_M",

@@ -20,12 +20,13 @@ from shapely.errors import ShapelyError
 from missions.maps.crs import WGS84, parse_crs
 from missions.maps.csv_points import cells_of_coordinates, cells_of_degrees
 from missions.maps.fields import NONE, score, words
-from missions.maps.layer import (
+from missions.maps.model import (
     COORDINATE_MAX,
     MAX_FILE_BYTES,
     MAX_RECORDS,
     Band,
     Column,
+    Floats,
     Grid,
     Layer,
     Value,
@@ -33,9 +34,9 @@ from missions.maps.layer import (
     check_counts,
     cut_off,
     digest,
+    map_error,
     read_bytes,
 )
-from missions.maps.model import Floats, map_error
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

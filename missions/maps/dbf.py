@@ -18,8 +18,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from missions.maps.bundle import Bundle, files_beside, open_bundle
-from missions.maps.layer import Column, Value, check_counts, digest
-from missions.maps.model import Problem, map_error
+from missions.maps.model import Column, Problem, Value, check_counts, digest, map_error
 
 _HEADER_BYTES = 32
 _END_OF_FIELDS = 0x0D

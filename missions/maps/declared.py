@@ -8,8 +8,7 @@ from pathlib import Path
 
 from companion.errors import ConfigError
 from missions.maps.fields import words
-from missions.maps.layer import Band, Column, Grid, Layer
-from missions.maps.model import Problem, map_error
+from missions.maps.model import Band, Column, Grid, Layer, Problem, map_error
 from missions.maps.units import (
     RateUnit,
     is_mass_per_area,

@@ -15,8 +15,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from missions.maps.layer import Band, Column, Value, as_number
-from missions.maps.model import Problem, map_error
+from missions.maps.model import Band, Column, Problem, Value, as_number, map_error
 from missions.maps.units import is_mass_per_area, quantity_in_name, unit_in_name, unit_name
 
 # What rate columns are called; DBF cuts names at ten characters (`TargetRate`, `Tgt_Rate_l`).

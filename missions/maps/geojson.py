@@ -19,18 +19,20 @@ from shapely.geometry.base import BaseGeometry
 
 from missions.maps.bundle import Bundle, one_of, open_bundle
 from missions.maps.crs import WGS84, crs_name, parse_crs
-from missions.maps.layer import (
+from missions.maps.local import BOUNDARY_NAME, Area, as_area, outline_of
+from missions.maps.model import (
     Column,
     Layer,
+    MapZone,
+    Problem,
     Value,
     check_coordinates,
     check_counts,
     digest,
+    map_error,
     read_bytes,
+    write_whole,
 )
-from missions.maps.local import BOUNDARY_NAME, Area, as_area, outline_of
-from missions.maps.model import MapZone, Problem, map_error
-from missions.maps.whole_file import write_whole
 
 _OUTLINES = ("Polygon", "MultiPolygon")
 _COLUMNS_MAX = 255  # as many as a shapefile can have

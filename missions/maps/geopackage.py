@@ -41,10 +41,18 @@ from missions.maps.geopackage_layers import (
     quoted,
     value_of,
 )
-from missions.maps.layer import Column, Layer, Value, check_counts, digest, read_bytes
 from missions.maps.local import BOUNDARY_NAME, Area, outline_of
-from missions.maps.model import MapZone, map_error
-from missions.maps.whole_file import write_whole
+from missions.maps.model import (
+    Column,
+    Layer,
+    MapZone,
+    Value,
+    check_counts,
+    digest,
+    map_error,
+    read_bytes,
+    write_whole,
+)
 
 # Bytes of the envelope by its code in the header's flags (section 2.1.3.1.1).
 _ENVELOPE_BYTES = (0, 32, 48, 48, 64)

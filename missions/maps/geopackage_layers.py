@@ -18,9 +18,8 @@ from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
 from missions.maps.fields import column_of
-from missions.maps.layer import Value, check_coordinates, check_counts
 from missions.maps.local import BOUNDARY_NAME, Area, as_area
-from missions.maps.model import map_error
+from missions.maps.model import Value, check_coordinates, check_counts, map_error
 
 # Declared types that can hold no polygon; GEOMETRY and the others can.
 _NO_GROUND = frozenset({"POINT", "MULTIPOINT", "LINESTRING", "MULTILINESTRING"})

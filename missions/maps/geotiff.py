@@ -39,11 +39,18 @@ from missions.maps.geotiff_bands import (
     world_file_of,
 )
 from missions.maps.geotiff_file import Raster, gdal, read_raster
-from missions.maps.layer import Band, Grid, digest
 from missions.maps.local import outline_of
-from missions.maps.model import Affine, MapCells, Problem, map_error
+from missions.maps.model import (
+    Affine,
+    Band,
+    Grid,
+    MapCells,
+    Problem,
+    digest,
+    map_error,
+    write_whole,
+)
 from missions.maps.shapefile import read_shapefile
-from missions.maps.whole_file import write_whole
 
 # What programs fill with lies below and above all indices, reflectances and yields.
 FILL_LEAST, FILL_MOST = 5_000.0, 65_000.0

@@ -21,8 +21,7 @@ from companion.errors import MapError
 from missions.maps.bundle import Bundle
 from missions.maps.cells import corner
 from missions.maps.crs import METRES_PER_DEGREE
-from missions.maps.layer import Band, cut_off
-from missions.maps.model import Affine, Problem, map_error
+from missions.maps.model import Affine, Band, Problem, cut_off, map_error
 
 Cells = NDArray[Any]
 Bools = NDArray[np.bool_]

@@ -25,10 +25,19 @@ from missions.maps.crs import WGS84
 from missions.maps.fields import column_of, stated_unit
 from missions.maps.geopackage_layers import areas_of
 from missions.maps.kml_polygons import Ground, ground_of, local_name
-from missions.maps.layer import MAX_RECORDS, Column, Layer, check_counts, digest, read_bytes
 from missions.maps.local import BOUNDARY_NAME, outline_of
-from missions.maps.model import MapZone, Problem, map_error
-from missions.maps.whole_file import write_whole
+from missions.maps.model import (
+    MAX_RECORDS,
+    Column,
+    Layer,
+    MapZone,
+    Problem,
+    check_counts,
+    digest,
+    map_error,
+    read_bytes,
+    write_whole,
+)
 from missions.maps.xmltree import MAX_ELEMENTS, parse_xml
 
 _CONTAINERS = ("kml", "Document", "Folder")

@@ -12,7 +12,7 @@ from shapely.errors import ShapelyError
 from shapely.geometry.base import BaseGeometry
 
 from missions.maps.geopackage_layers import Floats, Rings
-from missions.maps.layer import MAX_VERTICES, check_coordinates
+from missions.maps.model import MAX_VERTICES, check_coordinates
 
 _GEOMETRIES = frozenset(
     {"Point", "LineString", "LinearRing", "Polygon", "Model", "Track", "MultiTrack"}

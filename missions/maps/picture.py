@@ -22,9 +22,8 @@ from companion.wording import install_command
 from missions.maps.build import frame_for
 from missions.maps.cells import bounds_deg
 from missions.maps.local import project_all
-from missions.maps.model import MapFile, map_error, unusable_polygons
+from missions.maps.model import MapFile, map_error, unusable_polygons, write_whole
 from missions.maps.totals import Totals, as_sprayed, totals
-from missions.maps.whole_file import write_whole
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

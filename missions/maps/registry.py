@@ -40,9 +40,8 @@ from missions.maps.geotiff import (
 )
 from missions.maps.isoxml.reader import read_isoxml
 from missions.maps.kml import read_kml
-from missions.maps.layer import Grid, Layer, Value
 from missions.maps.local import BOUNDARY_NAME, Area, polygons_of
-from missions.maps.model import MapFile, MapZone, map_error
+from missions.maps.model import Grid, Layer, MapFile, MapZone, Value, map_error
 from missions.maps.shapefile import read_shapefile
 from missions.maps.text_map import read_text_map
 

@@ -27,10 +27,19 @@ from shapely.geometry.base import BaseGeometry
 
 from missions.maps.crs import parse_crs
 from missions.maps.dbf import ShapeFiles, find_shapefile, read_columns
-from missions.maps.layer import MAX_RECORDS, Column, Layer, check_coordinates, check_counts
 from missions.maps.local import BOUNDARY_NAME, Area, as_area
-from missions.maps.model import MapZone, Problem, map_error
-from missions.maps.whole_file import not_written, write_whole
+from missions.maps.model import (
+    MAX_RECORDS,
+    Column,
+    Layer,
+    MapZone,
+    Problem,
+    check_coordinates,
+    check_counts,
+    map_error,
+    not_written,
+    write_whole,
+)
 
 _POLYGONS = frozenset({5, 15, 25})
 # Why a record of another type has no ground.

@@ -16,8 +16,7 @@ from pyproj import CRS
 
 from companion.core.frame import LocalFrame
 from missions.maps.crs import EXTENT_MAX_M
-from missions.maps.layer import Band, Grid, digest, read_bytes
-from missions.maps.model import Affine, Floats, Problem, map_error
+from missions.maps.model import Affine, Band, Floats, Grid, Problem, digest, map_error, read_bytes
 from missions.maps.text_lattice import (
     MERGES,
     GridLayout,

@@ -17,9 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from missions.maps.layer import cut_off
-from missions.maps.model import map_error
-from missions.maps.whole_file import write_whole
+from missions.maps.model import cut_off, map_error, write_whole
 
 # The local tangent plane of P2's maps: metres east, north and up of an origin that is chosen.
 #

@@ -15,7 +15,7 @@ from companion.atomic_write import write_atomically
 from companion.cli.systemd import write_unit
 from companion.link.parameters import read_state, write_state
 from companion.link.signing import STATE_NAME, Signing
-from missions.maps.whole_file import write_whole
+from missions.maps.model import write_whole
 
 KEY = bytes(range(32))
 NOW_S = 1_800_000_000.0

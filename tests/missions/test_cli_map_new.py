@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from companion.errors import MapError
 from missions.maps.cli.new import GRID_EXAMPLE, NEW_EXAMPLE, grid, new
 from missions.maps.csvfile import read_csv
-from missions.maps.layer import Grid
+from missions.maps.model import Grid
 from missions.maps.text_map import read_text_map
 
 app = typer.Typer(add_completion=False, rich_markup_mode=None)

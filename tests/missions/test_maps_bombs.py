@@ -20,8 +20,8 @@ from companion.errors import MapError
 from missions.maps.build import build_prescription, frame_for
 from missions.maps.csvfile import read_csv
 from missions.maps.geotiff_bands import parse_world_file
-from missions.maps.layer import Grid, Layer
 from missions.maps.lint import summary
+from missions.maps.model import Grid, Layer
 from missions.maps.registry import read_map
 from missions.maps.text_map import read_text_map
 

@@ -13,7 +13,7 @@ import shapely
 from shapely import box
 
 from companion.errors import MapError
-from missions.maps import geojson, layer
+from missions.maps import geojson, model
 from missions.maps.geojson import read_geojson
 from missions.maps.registry import read_area, read_map
 
@@ -327,9 +327,9 @@ def test_a_file_of_too_many_things_is_refused_before_it_is_parsed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, most: int, text: str
 ) -> None:
     path = saved(tmp_path, collection(feature(), feature()))
-    monkeypatch.setattr(layer, name, most + 1)
+    monkeypatch.setattr(model, name, most + 1)
     assert read_geojson(path)
-    monkeypatch.setattr(layer, name, most)
+    monkeypatch.setattr(model, name, most)
     monkeypatch.setattr(geojson.json, "loads", lambda *_, **__: pytest.fail("it was parsed"))
     with pytest.raises(MapError, match=f"{text} are more than {most}"):
         read_geojson(path)

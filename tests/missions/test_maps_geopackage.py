@@ -21,8 +21,7 @@ from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
 from missions.maps.geopackage import read_geopackage, write_geopackage
-from missions.maps.layer import Layer
-from missions.maps.model import MapFile, MapZone
+from missions.maps.model import Layer, MapFile, MapZone
 
 WEST, SOUTH, CELL = 15.14, 48.12, 0.001
 SQUARE = box(WEST, SOUTH, WEST + CELL, SOUTH + CELL)

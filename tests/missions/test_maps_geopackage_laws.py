@@ -21,8 +21,7 @@ from missions.maps.declared import Given
 from missions.maps.geopackage import read_geopackage, write_geopackage
 from missions.maps.geopackage_layers import CurvedError, areas_of, polygons_in
 from missions.maps.kml import read_kml, write_kml
-from missions.maps.layer import Layer
-from missions.maps.model import MapFile, MapZone
+from missions.maps.model import Layer, MapFile, MapZone
 
 WEST, SOUTH, CELL = 114.543, 35.996, 0.0005
 READERS: dict[str, Callable[[Path], Layer]] = {

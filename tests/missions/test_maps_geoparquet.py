@@ -19,7 +19,7 @@ from companion.errors import MapError
 from missions.maps.adapt import read_geoparquet, read_table
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
-from missions.maps.layer import Layer
+from missions.maps.model import Layer
 from missions.maps.registry import read_adapt
 
 WEST, SOUTH, CELL = 114.5, 36.0, 1e-3

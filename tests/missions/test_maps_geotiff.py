@@ -27,7 +27,7 @@ from missions.maps.cells import bounds_deg
 from missions.maps.declared import Given
 from missions.maps.geotiff import read_dji, read_geotiff
 from missions.maps.geotiff_bands import parse_world_file
-from missions.maps.layer import Grid
+from missions.maps.model import Grid
 from missions.maps.registry import read_adapt
 
 WEST, NORTH, CELL = 114.5, 36.0, 1e-4

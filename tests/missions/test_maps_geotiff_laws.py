@@ -25,8 +25,7 @@ from missions.maps.adapt import read_geoparquet
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
 from missions.maps.geotiff import read_dji, read_geotiff, write_dji, write_geotiff
-from missions.maps.layer import Grid, Layer
-from missions.maps.model import MapCells
+from missions.maps.model import Grid, Layer, MapCells
 from missions.maps.registry import read_adapt
 
 WEST, NORTH, CELL = 114.5, 36.0, 1e-4

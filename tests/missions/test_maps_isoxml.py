@@ -16,7 +16,7 @@ from shapely import Polygon, box
 
 from companion.errors import MapError
 from missions.maps.isoxml.reader import read_isoxml
-from missions.maps.layer import Grid, Layer
+from missions.maps.model import Grid, Layer
 from missions.maps.registry import read_map
 
 WEST, SOUTH = 15.0, 48.0

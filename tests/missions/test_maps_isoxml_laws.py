@@ -19,8 +19,7 @@ from companion.errors import MapError
 from missions.maps.crs import WGS84
 from missions.maps.isoxml.reader import read_isoxml
 from missions.maps.isoxml.writer import write_isoxml
-from missions.maps.layer import Grid, Layer
-from missions.maps.model import MapCells, MapFile, MapZone
+from missions.maps.model import Grid, Layer, MapCells, MapFile, MapZone
 
 WEST, SOUTH, STEP = 15.0, 48.0, 0.0005
 FIELD = MultiPolygon([box(WEST, SOUTH, WEST + 4 * STEP, SOUTH + 3 * STEP)])

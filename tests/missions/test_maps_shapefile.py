@@ -18,7 +18,7 @@ from pyproj import CRS, Geod
 from shapely import Geometry, MultiPolygon, Polygon, box
 
 from companion.errors import MapError
-from missions.maps import dbf, layer
+from missions.maps import dbf, model
 from missions.maps.assemble import Repair, repair_problems
 from missions.maps.model import MapFile
 from missions.maps.registry import read_area, read_map
@@ -554,9 +554,9 @@ def test_a_file_beyond_all_bounds_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str, most: int
 ) -> None:
     path = simple(tmp_path)
-    monkeypatch.setattr(layer, limit, most + 1)
+    monkeypatch.setattr(model, limit, most + 1)
     assert read_map(path)
-    monkeypatch.setattr(layer, limit, most)
+    monkeypatch.setattr(model, limit, most)
     with pytest.raises(MapError, match=f"are more than {most}"):
         read_map(path)
 
@@ -565,7 +565,7 @@ def test_a_file_too_large_to_read_is_refused_unread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = simple(tmp_path)
-    monkeypatch.setattr(layer, "MAX_FILE_BYTES", 100)
+    monkeypatch.setattr(model, "MAX_FILE_BYTES", 100)
     with pytest.raises(MapError, match="more than 0 MB"):
         read_map(path)
 
@@ -1055,7 +1055,7 @@ def test_one_shape_named_many_times_counts_each_time(
     content = bytearray(shx.read_bytes()[:108] + shx.read_bytes()[100:108] * 9)
     content[24:28] = struct.pack(">i", len(content) // 2)
     shx.write_bytes(content)
-    monkeypatch.setattr(layer, "MAX_VERTICES", 49)
+    monkeypatch.setattr(model, "MAX_VERTICES", 49)
     with pytest.raises(MapError, match="50 vertices are more than 49"):
         read_shapefile(path)
 

@@ -18,8 +18,7 @@ from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.declared import Given
 from missions.maps.geotiff import read_dji, read_geotiff, write_dji, write_geotiff
-from missions.maps.layer import Grid
-from missions.maps.model import Affine, MapCells
+from missions.maps.model import Affine, Grid, MapCells
 
 WEST, NORTH, WIDTH, HEIGHT = 114.5, 36.0, 1.1e-5, 0.9e-5
 NORTH_UP: Affine = (WIDTH, 0.0, WEST, 0.0, -HEIGHT, NORTH)

@@ -23,8 +23,7 @@ from companion.errors import MapError
 from missions.maps.crs import WGS84
 from missions.maps.isoxml.reader import read_isoxml
 from missions.maps.isoxml.writer import write_isoxml
-from missions.maps.layer import Grid, Layer
-from missions.maps.model import Affine, MapCells, MapFile, MapZone
+from missions.maps.model import Affine, Grid, Layer, MapCells, MapFile, MapZone
 
 WEST, SOUTH, STEP = 114.543, 35.996, 0.0005
 PLACES = ["TASKDATA.XML", "map.zip", "field"]

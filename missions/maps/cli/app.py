@@ -40,10 +40,8 @@ from missions.maps.compiling import (
     read_ordered_map,
     write_flight_map,
 )
-from missions.maps.layer import cut_off
 from missions.maps.lint import check_map, point_rates, summary
-from missions.maps.model import MapFile, map_error
-from missions.maps.whole_file import check_folder, not_written
+from missions.maps.model import MapFile, check_folder, cut_off, map_error, not_written
 
 # `vrspray map compile`: the flight map, the only map that a flight opens.
 

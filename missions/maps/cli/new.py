@@ -15,8 +15,7 @@ import typer
 
 from companion.cli.answer import AsJson, answer, note, problem_line, problem_object
 from companion.core.frame import LocalFrame
-from missions.maps.layer import digest, read_bytes
-from missions.maps.model import Floats, MapFile, MapZone, map_error
+from missions.maps.model import Floats, MapFile, MapZone, digest, map_error, read_bytes, write_whole
 from missions.maps.text_lattice import M2_PER_HA, MERGES
 from missions.maps.text_map import PointGrid, grid_of_points, grid_problems
 from missions.maps.text_points import (
@@ -26,7 +25,6 @@ from missions.maps.text_points import (
     parse_text_map,
     write_text_map,
 )
-from missions.maps.whole_file import write_whole
 
 # --------------------------------------------------------------------------------- vrspray map grid
 

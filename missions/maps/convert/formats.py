@@ -21,8 +21,7 @@ from missions.maps.convert.cell_zones import outline_of_rates, plain_zones
 from missions.maps.convert.rasterise import cells_of, in_field, north_up
 from missions.maps.crs import is_wgs84
 from missions.maps.local import polygons_of
-from missions.maps.model import MapCells, MapFile, map_error, unusable_polygons
-from missions.maps.whole_file import not_written
+from missions.maps.model import MapCells, MapFile, map_error, not_written, unusable_polygons
 
 # Where the operator does not say: narrower than any section of a boom.
 CELL_M = 1.0

@@ -43,9 +43,19 @@ from missions.maps.isoxml.task import (
     point_count,
 )
 from missions.maps.isoxml.values import EXPORT_AGAIN, children, integer, number, required, tag, text
-from missions.maps.layer import MAX_FILE_BYTES, Band, Column, Grid, Layer, check_counts, digest
 from missions.maps.local import as_area, polygons_of
-from missions.maps.model import Affine, Problem, map_error
+from missions.maps.model import (
+    MAX_FILE_BYTES,
+    Affine,
+    Band,
+    Column,
+    Grid,
+    Layer,
+    Problem,
+    check_counts,
+    digest,
+    map_error,
+)
 from missions.maps.xmltree import MAX_ELEMENTS, parse_xml
 
 # ------------------------------------------------------------------------------ the files of a task

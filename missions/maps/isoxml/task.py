@@ -24,9 +24,8 @@ from missions.maps.isoxml.values import (
     tag,
     text,
 )
-from missions.maps.layer import check_coordinates, check_counts
 from missions.maps.local import Area, as_area, outline_of, polygons_of
-from missions.maps.model import Affine, Problem, map_error
+from missions.maps.model import Affine, Problem, check_coordinates, check_counts, map_error
 from missions.maps.units import rate_unit
 
 # The standard ends at 254; some programs number their polygons beyond.

@@ -23,8 +23,7 @@ from shapely import MultiPolygon, Polygon
 from shapely.errors import ShapelyError
 
 from missions.maps.local import frame_around, polygons_of, project
-from missions.maps.model import MapCells, MapFile, MapZone, map_error
-from missions.maps.whole_file import not_written, write_whole
+from missions.maps.model import MapCells, MapFile, MapZone, map_error, not_written, write_whole
 
 GRID_NAME = "GRD00001"
 _TASK_DATA = "TASKDATA.XML"
