@@ -24,8 +24,7 @@ from missions.maps.crs import (
     parse_crs,
     to_longitude_latitude,
 )
-from missions.maps.declared import Given, Unit, unit_of
-from missions.maps.fields import choose
+from missions.maps.fields import Given, Unit, choose, unit_of
 from missions.maps.local import Area, frame_around, make_valid, project_all
 from missions.maps.model import (
     RATE_MAX_L_HA,

@@ -28,7 +28,7 @@ from missions.maps.assemble import crs_of, ground_of, map_of, zone_names
 from missions.maps.bundle import Bundle, open_bundle
 from missions.maps.crs import Floats, to_longitude_latitude
 from missions.maps.csvfile import read_csv
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.geojson import is_geojson, read_geojson
 from missions.maps.geopackage import read_geopackage
 from missions.maps.geotiff import (

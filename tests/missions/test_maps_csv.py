@@ -18,7 +18,7 @@ from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.csv_points import find_lattice
 from missions.maps.csvfile import read_csv
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.model import Grid, Layer
 
 WEST, SOUTH = 114.543, 35.996

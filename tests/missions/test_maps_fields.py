@@ -13,8 +13,7 @@ import shapely
 from pyproj import CRS
 
 from companion.errors import MapError
-from missions.maps.declared import Given, unit_of
-from missions.maps.fields import Choice, choose, stated_unit
+from missions.maps.fields import Choice, Given, choose, stated_unit, unit_of
 from missions.maps.model import Column, Layer, Value
 from missions.maps.registry import read_map
 from missions.maps.units import is_mass_per_area, l_ha_per_unit, other_quantity, unit_name

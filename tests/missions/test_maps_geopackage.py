@@ -19,7 +19,7 @@ from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
 from missions.maps.assemble import map_of
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.geopackage import read_geopackage, write_geopackage
 from missions.maps.model import Layer, MapFile, MapZone
 

@@ -17,7 +17,7 @@ from shapely import MultiPolygon, Polygon, box
 
 from companion.errors import MapError
 from missions.maps.assemble import map_of
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.geopackage import read_geopackage, write_geopackage
 from missions.maps.geopackage_layers import CurvedError, areas_of, polygons_in
 from missions.maps.kml import read_kml, write_kml

@@ -18,7 +18,7 @@ from shapely import MultiPolygon, Point, Polygon, box
 from companion.errors import MapError
 from missions.maps.adapt import read_geoparquet, read_table
 from missions.maps.assemble import map_of
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.model import Layer
 from missions.maps.registry import read_adapt
 

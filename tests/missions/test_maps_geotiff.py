@@ -24,7 +24,7 @@ from shapely import MultiPolygon, box
 from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.cells import bounds_deg
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.geotiff import read_dji, read_geotiff
 from missions.maps.geotiff_bands import parse_world_file
 from missions.maps.model import Grid

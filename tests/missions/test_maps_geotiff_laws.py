@@ -23,7 +23,7 @@ from shapely import MultiPolygon, box
 from companion.errors import MapError
 from missions.maps.adapt import read_geoparquet
 from missions.maps.assemble import map_of
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.geotiff import read_dji, read_geotiff, write_dji, write_geotiff
 from missions.maps.model import Grid, Layer, MapCells
 from missions.maps.registry import read_adapt

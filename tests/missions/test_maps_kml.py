@@ -16,7 +16,7 @@ from shapely import LinearRing, MultiPolygon, Polygon, box
 
 from companion.errors import MapError
 from missions.maps.assemble import map_of
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.kml import read_kml, write_kml
 from missions.maps.model import Layer, MapFile, MapZone
 

@@ -17,7 +17,7 @@ from companion.core.frame import LocalFrame
 from companion.errors import MapError
 from missions.maps.assemble import map_of
 from missions.maps.cli.new import Plots, Points, make_plots, make_points, plot_rates
-from missions.maps.declared import Given
+from missions.maps.fields import Given
 from missions.maps.model import Grid, MapCells, MapFile, MapZone
 from missions.maps.text_lattice import MERGES, cell_numbers, cell_size, layout_for, merged
 from missions.maps.text_map import (
