@@ -1,4 +1,4 @@
-"""Which column is the rate, and which unit is declared for it: one clear candidate, or the operator says.
+"""Which column is the rate, and in which unit: one clear candidate, or the operator says.
 
 A wrong column is a wrong dose on the whole field, so nothing is guessed: a column becomes a
 candidate by its name alone, and two candidates that say different things are refused.

@@ -1,4 +1,4 @@
-"""What a prescription file says, before it becomes the core's `Prescription`; what readers hand over.
+"""What a prescription file says, before it becomes the core's `Prescription`.
 
 Everything here is already decided: coordinates are WGS84 longitude and latitude, rates are L/ha.
 What was found on the way is kept as `Problem`s, so that nothing is repaired in silence.

@@ -1,4 +1,4 @@
-"""`vrspray map new` and `vrspray map grid`: maps for trials, and the cells that P2's text map makes."""
+"""`vrspray map new` and `vrspray map grid`: maps for trials, and the cells of P2's text map."""
 
 from __future__ import annotations
 
