@@ -19,6 +19,15 @@ from shapely.errors import ShapelyError
 
 from missions.maps.bundle import Bundle, open_bundle
 from missions.maps.crs import WGS84
+from missions.maps.isoxml.field import (
+    FIELD,
+    OBSTACLES,
+    ZONE,
+    check_grid_in_field,
+    field_of,
+    ground_of_polygons,
+    point_count,
+)
 from missions.maps.isoxml.rates import (
     Rates,
     References,
@@ -29,19 +38,7 @@ from missions.maps.isoxml.rates import (
     shown_in_zones,
     special_problems,
 )
-from missions.maps.isoxml.task import (
-    FIELD,
-    OBSTACLES,
-    ZONE,
-    Task,
-    TreatmentZone,
-    check_grid_in_field,
-    chosen_task,
-    field_of,
-    ground_of_polygons,
-    instead_of,
-    point_count,
-)
+from missions.maps.isoxml.task import Task, TreatmentZone, chosen_task, instead_of
 from missions.maps.isoxml.values import EXPORT_AGAIN, children, integer, number, required, tag, text
 from missions.maps.local import as_area, polygons_of
 from missions.maps.model import (
