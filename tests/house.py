@@ -22,7 +22,6 @@ LINES_MAX = 600
 EXCEPTIONS: dict[str, str] = {
     "analysis.journals.salvage": "what is done to a journal, apart from the command line",
     "analysis.journals.stray_rows": "what a page may be of; pure, apart from the copy it serves",
-    "missions.maps.cli.options": "one sub-command a file",
     "companion.output.hardware_pwm": "one output a file",
     "missions.make.settled": "the optimum along a pass, apart from what it is of; pure",
     "missions.worth": "its price of a layout is another than the one that the layouts share",
